@@ -74,7 +74,7 @@ class ThreePage:
             raise UsageError(f"three.js needs Chromium, and the npm package three unpacked in {package}")
         from playwright.sync_api import sync_playwright
 
-        folders = {"three": package, "models": models, "work": work}
+        folders = {"three": package, "models": models, "page": work}
         (work / "index.html").write_text(_PAGE)
         # three.js looks along +y up; its columns grow toward +z, which is our -y, and its row 0 is the bottom.
         flipped = np.concatenate([radiance[::-1, ::-1], np.ones((*radiance.shape[:2], 1))], axis=-1)
@@ -97,10 +97,10 @@ class ThreePage:
         self._browser = self._playwright.chromium.launch(executable_path=browser, args=_FLAGS)
         self._page = self._browser.new_page()
         self._page.set_default_timeout(300_000)
-        self._page.goto(f"{self._root}/work/index.html")
+        self._page.goto(f"{self._root}/page/index.html")
         self._page.wait_for_function("window.ready")
         height, width = radiance.shape[:2]
-        self._page.evaluate("([u, w, h]) => window.environment(u, w, h)", ["/work/light.bin", width, height])
+        self._page.evaluate("([u, w, h]) => window.environment(u, w, h)", ["/page/light.bin", width, height])
 
     def __enter__(self) -> ThreePage:
         return self

@@ -19,10 +19,10 @@ from pathlib import Path
 import numpy as np
 
 from tests.test_budget import COSTS, ERRORS, Machine, best_error
-from warp_ar.accuracy.budget import AIM
+from warp_ar.accuracy.controller import AIM
 from warp_ar.accuracy.cost_table import SETTINGS, chosen, load_errors
 from warp_ar.accuracy.costs import BASE as BASE_QUALITY
-from warp_ar.accuracy.costs import Costs
+from warp_ar.accuracy.costs import Costs, fill_between
 
 RECORDED = Path(__file__).parent / "results" / "desk_budget_costs.json"
 SETTLING = (20.0, 40.0, 100.0, 400.0)
@@ -77,7 +77,7 @@ def run(kind: str, budget: float, seed: int) -> tuple[float, float, int]:
 def recorded() -> Costs:
     """Costs of ``desk`` as they were measured."""
     kept = json.loads(RECORDED.read_text(encoding="utf-8"))
-    return Costs(**{name: kept[name] for name in ("base", "methods", "scales", "track", "work")})
+    return fill_between(Costs(**{name: kept[name] for name in ("base", "methods", "scales", "track", "work")}))
 
 
 def machine_like(costs: Costs, seed: int) -> Costs:

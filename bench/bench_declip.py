@@ -8,7 +8,7 @@ import warp as wp
 from bench.common import measure, report
 from warp_ar.kernels import declip
 from warp_ar.kernels.color import decode_table
-from warp_ar.kernels.structs import FrameParams, Probe, RayScene
+from warp_ar.kernels.structs import FrameParams, Probe, RayScene, make_picture
 
 H, W = 480, 640
 
@@ -24,6 +24,7 @@ def time_case(case: str, radius: float, device: str) -> None:
     levels = wp.zeros(declip.level_texels(H, W), wp.vec4, device=device)
     marked, active = (wp.zeros(declip.tile_shape(H, W), wp.int32, device=device) for _ in range(2))
     params, rays = wp.zeros(1, FrameParams, device=device), wp.zeros((H, W), wp.vec2, device=device)
+    picture = make_picture(frame, None, rays)
     probes, scene = wp.zeros(0, Probe, device=device), RayScene()
 
     def run() -> None:
@@ -34,7 +35,7 @@ def time_case(case: str, radius: float, device: str) -> None:
         declip.complete(active, frame, decode, levels, out)
         declip.pull_completed(active, frame, out, levels)
         declip.fill_levels(active, (H, W), levels)
-        declip.complete_core(declip.DeclipConfig(), frame, levels, params, rays, scene, probes, None, out)
+        declip.complete_core(declip.DeclipConfig(), picture, levels, params, scene, probes, None, out)
 
     run()
     assert (out.numpy().max() > 1.5) == (radius > 0.0)

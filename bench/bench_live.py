@@ -39,7 +39,7 @@ import cv2
 import numpy as np
 
 from bench.bench_transport import descendants
-from bench.common import report
+from bench.common import find_chromium, report
 from warp_ar.input.sources import open_source
 from warp_ar.output.sinks import VideoSink
 from warp_ar.scene import SourceSpec, dumps_scene, load_scene
@@ -335,15 +335,12 @@ def camera_delays(shown: list[list[Any]], taken: list[list[float]]) -> list[floa
 @contextlib.contextmanager
 def browsing(camera: Path, server: Served) -> Iterator[Any]:
     """The page in Chromium, whose camera plays a file; None without playwright and Chromium."""
-    chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-    try:
-        from playwright.sync_api import sync_playwright
-    except ImportError:
-        chromium = None
+    chromium = find_chromium()
     if chromium is None:
-        print(json.dumps({"case": "browser", "left_out": "needs playwright and Chromium"}))
         yield None
         return
+    from playwright.sync_api import sync_playwright
+
     fake = ["--use-fake-ui-for-media-stream", "--use-fake-device-for-media-stream"]
     with sync_playwright() as driver:
         browser = driver.chromium.launch(

@@ -6,6 +6,7 @@ import numpy as np
 import warp as wp
 
 from bench.common import measure, report
+from tests.kernel_rig import records, shape
 from warp_ar.kernels import color, mirror_ball
 from warp_ar.kernels.receiver import Receiver, RelightConfig, make_receiver
 from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
@@ -33,18 +34,6 @@ CASES = {"light": (False, True, False), "objects": (True, False, False), "all": 
 """By name: whether there are objects, light and shadows."""
 
 
-def _records(struct: type, device: str, *values: dict) -> wp.array:
-    out = np.zeros(len(values), np.dtype(struct.numpy_dtype()))
-    for record, value in zip(out, values, strict=True):
-        for key, item in value.items():
-            record[key] = item
-    return wp.array(out, dtype=struct, device=device)
-
-
-def _shape(kind: int, position: tuple, extent: tuple) -> dict:
-    return {"kind": kind, "rotation": np.eye(3), "position": position, "scale": 1.0, "extent": extent}
-
-
 def main(device: str) -> None:
     columns, rows = np.meshgrid((np.arange(W) - W / 2) / FOCAL, (np.arange(H) - H / 2) / FOCAL)
     rays = wp.array(np.stack([columns, rows], -1), dtype=wp.vec2, device=device)
@@ -58,14 +47,16 @@ def main(device: str) -> None:
         "principal": (W / 2, H / 2),
         "ball_rect": (H // 2 - 42, H // 2 + 42, W // 2 - 42, W // 2 + 42),
     }
-    params = _records(FrameParams, device, camera)
+    params = records(FrameParams, camera, device=device)
     sun = {"kind": DIRECTIONAL, "direction": (0.0, 0.0, -1.0), "intensity": (0.5,) * 3}
-    lights = _records(Light, device, sun)
+    lights = records(Light, sun, device=device)
     scene = RayScene()
-    scene.proxies = _records(Shape, device, _shape(PLANE, (0, 0, 0), (2, 2, 0)))
-    scene.objects = _records(Shape, device, _shape(SPHERE, (0.12, 0.0, 0.04), (0.04,) * 3))
-    scene.materials = _records(
-        Material, device, {"model": LAMBERT, "base_color": (0.8,) * 3, "base_texture": -1, "specular_texture": -1}
+    scene.proxies = records(Shape, shape(PLANE, (0, 0, 0), (2, 2, 0)), device=device)
+    scene.objects = records(Shape, shape(SPHERE, (0.12, 0.0, 0.04), (0.04,) * 3, 0), device=device)
+    scene.materials = records(
+        Material,
+        {"model": LAMBERT, "base_color": (0.8,) * 3, "base_texture": -1, "specular_texture": -1},
+        device=device,
     )
     decode_table = color.decode_table("srgb")
     ratio = wp.full((H, W), wp.vec3(SHADOW, SHADOW, SHADOW), dtype=wp.vec3, device=device)
@@ -93,8 +84,8 @@ def main(device: str) -> None:
                 relighting if lit else None,
                 shaded,
             )
-            probes = _records(Probe, device, {"center": center, "radius": radius, "reflectance": (RHO,) * 3})
-            keys = _records(KeyLight, device, {"direction": (0.6, 0, 0.8), "directionality": 0.5})
+            probes = records(Probe, {"center": center, "radius": radius, "reflectance": (RHO,) * 3}, device=device)
+            keys = records(KeyLight, {"direction": (0.6, 0, 0.8), "directionality": 0.5}, device=device)
             decode = wp.array(decode_table, dtype=wp.vec3, device=device)
             picture = make_picture(frame, decode, rays)
             receiver = make_receiver(relighting, picture, probes=probes, key_lights=keys, irradiance=irradiance)

@@ -15,7 +15,7 @@ import argparse
 import dataclasses
 import json
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -114,6 +114,25 @@ def measure_set(folder: Path, device: str) -> list[Row]:
     return rows
 
 
+def summarise(sets: Mapping[str, Sequence[Row]]) -> dict[str, Any]:
+    """Means of each set over its photographs, and of all sets, each counting once; a set without any is left out.
+
+    Args:
+        sets: Figures by a set's name.
+
+    Returns:
+        ``sets``, a dict of means each; then the means over them, None where there are none.
+    """
+    keys = ("error", "scaled", "clipping")
+    means = {
+        name: {key: float(np.mean([getattr(row, key) for row in rows])) for key in keys}
+        for name, rows in sets.items()
+        if rows
+    }
+    every = {key: float(np.mean([own[key] for own in means.values()])) if means else None for key in keys}
+    return {"sets": means, **every}
+
+
 def main(device: str, arguments: Sequence[str] = ()) -> None:
     """Measure all sets of a folder and print figures of each and of all."""
     parser = argparse.ArgumentParser(prog="python -m bench photographs", description=__doc__.splitlines()[0])
@@ -123,10 +142,4 @@ def main(device: str, arguments: Sequence[str] = ()) -> None:
         print("bench photographs: expected a folder that holds a folder of photographs for each bracket")
         return
     sets = {path.name: measure_set(path, device) for path in sorted(options.folder.iterdir()) if path.is_dir()}
-    means = {
-        name: {key: float(np.mean([getattr(row, key) for row in rows])) for key in ("error", "scaled", "clipping")}
-        for name, rows in sets.items()
-        if rows
-    }
-    every = {key: float(np.mean([own[key] for own in means.values()])) for key in ("error", "scaled", "clipping")}
-    print(json.dumps({"bench": "photographs", "sets": means, **every}))
+    print(json.dumps({"bench": "photographs", **summarise(sets)}))

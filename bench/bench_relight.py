@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 
 from bench.common import measure, report
+from tests.kernel_rig import records, shape
 from warp_ar.kernels import color, environment_samples, receiver_cells, relight, summed_area
 from warp_ar.kernels.edges import EdgeLists
 from warp_ar.kernels.environment_samples import EnvironmentSample
@@ -32,18 +33,6 @@ from warp_ar.kernels.structs import (
 from warp_ar.kernels.trace import TraceConfig
 
 H, W = 480, 640
-
-
-def _records(struct: type, device: str, *values: dict) -> wp.array:
-    out = np.zeros(len(values), np.dtype(struct.numpy_dtype()))
-    for record, value in zip(out, values, strict=True):
-        for key, item in value.items():
-            record[key] = item
-    return wp.array(out, dtype=struct, device=device)
-
-
-def _shape(kind: int, position: tuple, extent: tuple) -> dict:
-    return {"kind": kind, "rotation": np.eye(3), "position": position, "scale": 1.0, "extent": extent, "material": -1}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,7 +78,7 @@ def _cells(world: World, out: wp.array) -> dict[str, Callable[[], None]]:
         scratch = wp.zeros(receiver_cells.partial_sums_shape(partials, *shape), wp.vec3, device=device)
     passes: dict[str, Callable[[], None]] = {
         "ambient_visibility": lambda: receiver_cells.estimate_ambient_visibility(
-            place, *inputs, samples, 128, cells, sums_out=scratch
+            place, *inputs, samples[:128], cells, sums_out=scratch
         ),
         "send_light": lambda: receiver_cells.send_light(place, *inputs, patch_stride, patches),
         "list_patches": lambda: receiver_cells.list_patches(patches, listed, count),
@@ -143,15 +132,15 @@ def main(device: str) -> None:
         "light_rect": (0, H, 0, W),
         "direct_rect": (0, H, 0, W),
     }
-    params = _records(FrameParams, device, {**camera, "focal": (600, 600)})
+    params = records(FrameParams, {**camera, "focal": (600, 600)}, device=device)
     light = {"kind": POINT, "position": (0.1, 0.1, 0.3), "intensity": (0.3,) * 3, "attenuation": (0, 0, 1)}
-    lights = _records(Light, device, light)
-    keys = _records(KeyLight, device, {"direction": (0.6, 0, 0.8), "directionality": 0.5})
-    probes = _records(Probe, device, {"center": (-0.1, 0, 0.04), "radius": 0.035})
+    lights = records(Light, light, device=device)
+    keys = records(KeyLight, {"direction": (0.6, 0, 0.8), "directionality": 0.5}, device=device)
+    probes = records(Probe, {"center": (-0.1, 0, 0.04), "radius": 0.035}, device=device)
     scene = RayScene()
-    scene.objects = _records(Shape, device, _shape(SPHERE, (0.05, 0, 0.05), (0.03, 0, 0)))
-    scene.proxies = _records(
-        Shape, device, _shape(PLANE, (0, 0, 0), (2, 2, 0)), _shape(BOX, (0, 0.15, 0.05), (0.1, 0.04, 0.05))
+    scene.objects = records(Shape, shape(SPHERE, (0.05, 0, 0.05), (0.03, 0, 0)), device=device)
+    scene.proxies = records(
+        Shape, shape(PLANE, (0, 0, 0), (2, 2, 0)), shape(BOX, (0, 0.15, 0.05), (0.1, 0.04, 0.05)), device=device
     )
     sh = np.zeros((9, 3), np.float32)
     sh[0] = np.pi / 0.28209479

@@ -13,7 +13,7 @@ from bench.common import measure, report
 from warp_ar.kernels import structs
 from warp_ar.kernels.lobes import lobe_texels
 from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
-from warp_ar.kernels.shade import ShadeConfig, shade
+from warp_ar.kernels.shade import ShadeConfig, make_object_light, shade
 from warp_ar.kernels.split_sum import integrate_dfg
 from warp_ar.kernels.visibility import make_visible
 
@@ -76,7 +76,7 @@ def main(device: str) -> None:
         config = ShadeConfig(forms, case.lights, case.edge_samples)
         light_array = wp.array(light, dtype=structs.Light, device=device)
         virtual = wp.zeros((H, W), dtype=wp.vec4, device=device)
-        inputs = (frame.params, frame.rays, frame.scene, light_array, surroundings)
+        inputs = (frame.params, frame.rays, frame.scene, make_object_light(surroundings, light_array))
 
         def call(config=config, inputs=inputs, frame=frame, virtual=virtual):
             shade(config, *inputs, make_visible(frame.found, frame.hits), virtual, rows=frame.launch_rows)

@@ -13,7 +13,6 @@ import contextlib
 import fractions
 import json
 import os
-import shutil
 import statistics
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
@@ -25,7 +24,7 @@ import cv2
 import numpy as np
 from aiohttp import web
 
-from bench.common import report
+from bench.common import find_chromium, report
 from warp_ar.input.sources import open_source
 from warp_ar.scene import load_scene
 from warp_ar.viewer.encoding import encode_jpeg
@@ -340,14 +339,11 @@ def children_seconds() -> float:
 
 
 async def ends(images: list[Image]) -> None:
-    chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-    try:
-        from playwright.async_api import async_playwright
-    except ImportError:
-        chromium = None
+    chromium = find_chromium()
     if chromium is None:
-        print(json.dumps({"case": "browser", "left_out": "needs playwright and Chromium"}))
         return
+    from playwright.async_api import async_playwright
+
     async with async_playwright() as driver:
         # Without this a browser hides its address behind a name that needs multicast.
         arguments = ["--no-sandbox", "--disable-features=WebRtcHideLocalIpsWithMdns"]

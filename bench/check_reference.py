@@ -13,6 +13,8 @@ the pipeline finds, all of it distant. One JSON line per scene and mode:
   beyond  share of scores beyond 3 standard errors
   ratio   mean of ours over mean of theirs, all blocks
 
+With ``--keep FILE`` lines are kept there, and what it holds at these samples, size and device is not rendered again.
+
 Mitsuba's noise is that of the means of RUNS pictures, ours what the picture says of itself. In the mode ``known`` only
 pixels count whose neighbours show the same proxy, for elsewhere a frame's pixel is a mean over surfaces. Where vertex
 normals are smooth both renderers treat directions below the surface in their own ways: silhouettes of meshes differ.
@@ -31,7 +33,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bench.common import commit
+from bench.common import KeptLines, commit
 from warp_ar.accuracy.known_frame import light_up_to
 from warp_ar.accuracy.path_tracer import PathTracer
 from warp_ar.device import resolve_device
@@ -161,20 +163,25 @@ def main() -> int:
     parser.add_argument("--size", default="160x120", help="of the pictures; the height follows the camera")
     parser.add_argument("--modes", default="whole,known")
     parser.add_argument("--device", default="auto")
+    parser.add_argument("--keep", type=Path, metavar="FILE", help="JSON lines: go on where a run was ended")
     options = parser.parse_args()
     import mitsuba as mi
 
     device = str(resolve_device(options.device))
     mi.set_variant("cuda_ad_rgb" if device.startswith("cuda") else "llvm_ad_rgb")
     width, height = (int(side) for side in options.size.split("x"))
+    lines = KeptLines(options.keep)
+    more = {"samples": options.samples, "size": options.size, "device": device}
     for name in options.scenes or sorted(bundled_scenes()):
         about = {"scene": name if "/" not in name else "/".join(Path(name).parts[-2:])}
+        modes = [mode for mode in options.modes.split(",") if not lines.has(**about, mode=mode, **more)]
         try:
+            if not modes:
+                continue
             case = open_case(name, (width, height), device)
-            for mode in options.modes.split(","):
+            for mode in modes:
                 row = check(mi, case, mode, options.samples, device)
-                more = {"samples": options.samples, "device": device, "commit": commit()}
-                print(json.dumps({**about, "mode": mode, **row, **more}), flush=True)
+                lines.add({**about, "mode": mode, **row, **more, "commit": commit()})
         except UsageError as error:
             print(json.dumps({**about, "left_out": str(error)}), flush=True)
     return 0

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import functools
+import importlib.util
 import json
 import os
+import shutil
 import statistics
 import subprocess
 import time
@@ -19,6 +21,15 @@ from warp_ar.device import capturing
 
 WARM_UP = 3
 RUNS = 30
+
+
+def find_chromium() -> str | None:
+    """Path of a Chromium that playwright can drive; None, and a line that says so, where either is missing."""
+    chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if chromium is None or importlib.util.find_spec("playwright") is None:
+        print(json.dumps({"case": "browser", "left_out": "needs playwright and Chromium"}))
+        return None
+    return chromium
 
 
 @functools.cache
@@ -118,3 +129,35 @@ def report_map(stage: str, height: int, milliseconds: list[float], texel_bytes: 
     """Print one JSON line for a stage on a map of so many rows, with its share of the copy bandwidth."""
     rate = texel_bytes * 2 * height**2 / (float(np.median(milliseconds)) * 1e-3) / copy_bandwidth(device)
     report(f"{stage}_{height}", milliseconds, device, of_copy_bandwidth=round(rate, 4))
+
+
+class KeptLines:
+    """JSON lines of a long run, printed and kept in a file, so that a later run goes on where one was ended."""
+
+    def __init__(self, path: Path | None) -> None:
+        """Read what is there; None keeps nothing. A last line that was cut off is left out, and made again."""
+        self._path = path
+        self.records: list[dict[str, Any]] = []
+        if path is None or not path.exists():
+            return
+        for line in path.read_text(encoding="utf-8").splitlines():
+            try:
+                record = json.loads(line)
+            except json.JSONDecodeError:
+                continue
+            if isinstance(record, dict):
+                self.records.append(record)
+        path.write_text("".join(json.dumps(record) + "\n" for record in self.records), encoding="utf-8")
+
+    def has(self, **key: Any) -> bool:
+        """Whether a record with these values is kept."""
+        return any(all(record.get(name) == value for name, value in key.items()) for record in self.records)
+
+    def add(self, record: Mapping[str, Any]) -> None:
+        """Print a record, and keep it."""
+        line = json.dumps(record)
+        print(line, flush=True)
+        self.records.append(json.loads(line))
+        if self._path is not None:
+            with self._path.open("a", encoding="utf-8") as file:
+                file.write(line + "\n")

@@ -32,7 +32,7 @@ from warp_ar.scene import bundled_scenes
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "bench" / "results"
-ERROR_OPTIONS = ("--quick", "--shrink", "2", "--frames", "10")
+ERROR_OPTIONS = ("--shrink", "2", "--frames", "10")
 PRESET_OPTIONS = ("--presets", "--frames", "1000")
 KEYS = ("case", "setting", "method", "quality")
 """Of a line: what it is about."""

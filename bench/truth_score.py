@@ -5,7 +5,8 @@
 CASE is a folder with ``case.json``, ``camera``, ``env`` and a folder and a scene file of each version. The pictures
 have the frames' own size, for the truth was clipped there: a highlight that clips is dimmer after averaging down. One
 JSON line per case and version; ``kept`` is the mean FLIP to the truth where the truth differs from the camera's frame,
-over that of the frame itself; ``noise`` is the same between the halves of the samples.
+over that of the frame itself; ``noise`` is the same between the halves of the samples. With ``--keep FILE`` lines
+of single frames are kept there, and what it holds at these samples is not rendered again.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from bench.common import commit
+from bench.common import KeptLines, commit
 from bench.judge import encoded_by
 from warp_ar.accuracy.metrics import changed_region, flip_map
 from warp_ar.accuracy.path_tracer import PathTracer
@@ -72,17 +73,26 @@ def main() -> int:
     parser.add_argument("--frames", default="0,6,11")
     parser.add_argument("--samples", type=int, default=512)
     parser.add_argument("--device", default="auto")
+    parser.add_argument("--keep", type=Path, metavar="FILE", help="JSON lines: go on where a run was ended")
     options = parser.parse_args()
+    lines = KeptLines(options.keep)
     for name in options.cases:
         for version in options.versions.split(","):
             start = time.perf_counter()
             frames = [int(number) for number in options.frames.split(",")]
-            found = [score(Path(name), version, frame, options.samples, options.device) for frame in frames]
-            rows = [row for row in found if row is not None]
+            key = {"case": Path(name).name, "version": version, "samples": options.samples}
+            rows = []
+            for frame in frames:
+                if not lines.has(**key, frame=frame):
+                    row = score(Path(name), version, frame, options.samples, options.device)
+                    if row is not None:
+                        lines.add({**key, "frame": frame, **row, "commit": commit()})
+                rows += [record for record in lines.records if record | key | {"frame": frame} == record]
             if not rows:
                 continue
-            means: dict[str, Any] = {key: round(float(np.mean([row[key] for row in rows])), 4) for key in rows[0]}
-            about = {"case": Path(name).name, "version": version, **means, "samples": options.samples}
+            names = ("nothing", "kept", "noise")
+            means: dict[str, Any] = {own: round(float(np.mean([row[own] for row in rows])), 4) for own in names}
+            about = {**key, **means, "frames": len(rows)}
             about |= {"seconds": round(time.perf_counter() - start, 1), "commit": commit()}
             print(json.dumps(about), flush=True)
     return 0

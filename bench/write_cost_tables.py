@@ -70,6 +70,7 @@ def method_table(cpu: list[dict[str, Any]], cuda: list[dict[str, Any]], listed: 
         rows.append([f"**{setting.name.replace('_', ' ')}**", what, "", "", "", ""])
         for method in setting.methods:
             known = method in listed["errors"][setting.name]
+            error = f"{errors[setting.name][method]:.4f}"
             if not known and not any((setting.name, method) in found for found in (ours, theirs)):
                 continue  # between two others; never measured
             apart = arrays.get(setting.name, {}).get(method)
@@ -77,7 +78,7 @@ def method_table(cpu: list[dict[str, Any]], cuda: list[dict[str, Any]], listed: 
                 [
                     f"`{method}`",
                     words.get(method, ""),
-                    f"{errors[setting.name][method]:.4f}" if known else "0",
+                    error if known else "0" if method == "brute_force" else f"({error})",
                     f"{apart:.1%}" if apart else "",
                     milliseconds(ours.get((setting.name, method))),
                     milliseconds(theirs.get((setting.name, method))),

@@ -48,7 +48,7 @@ from warp_ar.kernels.color import decode
 from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.kernels.launch import Rows, launch, launch_rows
 from warp_ar.kernels.shapes import FAR, intersect_sphere
-from warp_ar.kernels.structs import FrameParams, Probe, RayScene
+from warp_ar.kernels.structs import FrameParams, Picture, Probe, RayScene
 from warp_ar.kernels.trace import TraceConfig, make_trace
 
 wp.set_module_options({"enable_backward": False})
@@ -317,15 +317,14 @@ def complete_kernel(
 
 
 @functools.cache
-def make_complete_core_kernel(config: DeclipConfig) -> wp.Kernel:
-    """Kernel specialised to ``config``; equal configs share one kernel."""
+def make_seen_by_ball(config: DeclipConfig) -> wp.Function:
+    """``seen_by_ball(environment, probes, params, scene, ray) -> vec3``: by the recovered light; 0 for none."""
     trace = make_trace(TraceConfig(objects=(), proxies=config.proxies))
 
     @wp.func(module="unique")
     def seen_by_ball(
         environment: wp.array2d[wp.vec3], probes: wp.array[Probe], params: FrameParams, scene: RayScene, ray: wp.vec2
     ) -> wp.vec3:
-        """Radiance that the recovered light gives for a pixel that clips in all channels; 0 where it knows none."""
         origin = params.camera_position
         direction = wp.normalize(params.world_from_camera * wp.vec3(ray[0], ray[1], 1.0))
         nearest = wp.float32(FAR)
@@ -340,8 +339,8 @@ def make_complete_core_kernel(config: DeclipConfig) -> wp.Kernel:
                 return wp.vec3()
         if ball >= 0:
             normal = wp.normalize(origin + nearest * direction - probes[ball].center)
-            mirrored = direction - 2.0 * wp.dot(direction, normal) * normal
-            return wp.cw_mul(probes[ball].reflectance, sample_latlong(environment, mirrored))
+            wi = direction - 2.0 * wp.dot(direction, normal) * normal
+            return wp.cw_mul(probes[ball].reflectance, sample_latlong(environment, wi))
         found = wp.vec3()
         best = float(1.0)
         for step in range(STEPS):
@@ -356,16 +355,23 @@ def make_complete_core_kernel(config: DeclipConfig) -> wp.Kernel:
                 break
         return found
 
+    return seen_by_ball
+
+
+@functools.cache
+def make_complete_core_kernel(config: DeclipConfig) -> wp.Kernel:
+    """Kernel specialised to ``config``; equal configs share one kernel."""
+    seen_by_ball = make_seen_by_ball(config) if config.ball else None
+
     @wp.kernel(module="unique", enable_backward=False)
     def complete_core_kernel(
         # In:
         row_start: wp.int32,
-        frame: wp.array2d[wp.vec3ub],
+        picture: Picture,
         levels: wp.array[wp.vec4],
         rows: wp.int32,
         columns: wp.int32,
         params: wp.array[FrameParams],
-        rays: wp.array2d[wp.vec2],
         scene: RayScene,
         probes: wp.array[Probe],
         environment: wp.array2d[wp.vec3],
@@ -374,7 +380,7 @@ def make_complete_core_kernel(config: DeclipConfig) -> wp.Kernel:
     ):
         i, j = wp.tid()
         i += row_start
-        clipped = clipping(frame[i, j])
+        clipped = clipping(picture.frame[i, j])
         if wp.min(clipped) == 0.0:
             return
         filled = sample_coarser(levels, 0, rows, columns, i, j)
@@ -383,7 +389,7 @@ def make_complete_core_kernel(config: DeclipConfig) -> wp.Kernel:
         inside = 2.0 * edge
         rate = float(0.5)
         if wp.static(config.ball):
-            seen = seen_by_ball(environment, probes, params[0], scene, rays[i, j])
+            seen = seen_by_ball(environment, probes, params[0], scene, picture.rays[i, j])
             if wp.max(seen) > 0.0:
                 inside = seen
                 rate = 1.0
@@ -521,10 +527,9 @@ def complete(
 
 def complete_core(
     config: DeclipConfig,
-    frame: wp.array,
+    picture: Picture,
     levels: wp.array,
     params: wp.array,
-    rays: wp.array,
     scene: RayScene,
     probes: wp.array,
     environment: wp.array | None,
@@ -536,21 +541,21 @@ def complete_core(
 
     Args:
         config: Whether the ball's light is used, and which kinds of proxy there are.
-        frame: (H, W) vec3ub, RGB.
+        picture: The frame's codes, (H, W), and where its pixels look.
         levels: Filled levels of ``pull_completed`` and ``fill_levels``.
         params: (1,) FrameParams; the camera's pose.
-        rays: (H, W) vec2, undistorted (x / z, y / z).
         scene: Proxies.
         probes: Balls; ``environment`` is the light at the first.
         environment: (rows, columns) vec3, with clipped energy put back; None without ``config.ball``.
         declipped_out: (H, W) vec3; other pixels stay.
         rows: Band of rows; None means all.
     """
+    frame = picture.frame
     shape = level_shapes(*frame.shape)[0]
     launch_rows(
         make_complete_core_kernel(config),
         frame.shape,
-        [frame, levels, *shape, params, rays, scene, probes, environment],
+        [picture, levels, *shape, params, scene, probes, environment],
         [declipped_out],
         rows=rows,
         device=frame.device,

@@ -84,3 +84,43 @@ def correct_parallax(emitters: wp.array[Emitter], point: wp.vec3, direction: wp.
     along = wp.dot(axis, direction) * axis
     turned = along + wp.cos(angle) * (direction - along) + wp.sin(angle) * wp.cross(axis, direction)
     return wp.normalize(turned)
+
+
+@wp.func
+def seen_from(emitter: Emitter, place: wp.vec3) -> Emitter:
+    """An emitter as a map of the light at another place holds it; a distant one as it is."""
+    out = emitter
+    if emitter.distance > 0.0 and emitter.distance < MAX_DISTANCE:
+        to_emitter = emitter.origin + emitter.distance * emitter.direction - place
+        away = wp.max(wp.length(to_emitter), 1.0e-4)
+        gain = emitter.distance / away
+        out.origin = place
+        out.direction = to_emitter / away
+        out.distance = away
+        out.power = wp.min(gain * gain, MAX_GAIN) * emitter.power
+    return out
+
+
+@wp.func
+def solid_angle_gain(emitters: wp.array[Emitter], point: wp.vec3, direction: wp.vec3) -> wp.float32:
+    """How much larger what is seen along a unit direction is from a point than in the environment.
+
+    (D / |r|)^2 where an emitter stands, 1 far from all, between them by the weights of ``correct_parallax``.
+    """
+    gain = float(1.0)
+    weights = float(1.0)
+    for k in range(emitters.shape[0]):
+        emitter = emitters[k]
+        if emitter.distance > 0.0 and emitter.distance < MAX_DISTANCE:
+            offset = emitter.origin + emitter.distance * emitter.direction - point
+            away = wp.max(wp.length(offset), 1.0e-4)
+            to_emitter = offset / away
+            off = wp.length(emitter.direction - to_emitter)
+            s = wp.length(direction - to_emitter) / wp.max(REACH, 2.5 * off)
+            if s < 1.0:
+                s4 = s * s * s * s
+                weight = (1.0 - s4) * (1.0 - s4) / wp.max(s4 * (2.0 - s4), NEARLY_ALL)
+                weights += weight
+                near = emitter.distance / away
+                gain += weight * wp.min(near * near, MAX_GAIN)
+    return gain / weights

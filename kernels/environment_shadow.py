@@ -25,13 +25,14 @@ import functools
 import warp as wp
 
 from warp_ar.kernels.cells import cell_pixel
-from warp_ar.kernels.environment_samples import SampleSets, sample_toward
+from warp_ar.kernels.environment_samples import SampleSets
 from warp_ar.kernels.environment_shadow_bounce import (
     Before,
+    Meeting,
+    ReflectedLight,
     caustic_alpha,
-    make_bounced,
-    make_estimated,
     make_look_before,
+    make_reflect_back,
 )
 from warp_ar.kernels.environment_shadow_cells import (
     CHUNK,
@@ -45,12 +46,12 @@ from warp_ar.kernels.environment_shadow_cells import (
     first_of_set,
     ratio_of,
 )
-from warp_ar.kernels.environment_shadow_rays import make_find_sender, make_masks
+from warp_ar.kernels.environment_shadow_rays import make_aim, make_find_sender, make_masks
 from warp_ar.kernels.environment_shadow_wavefront import Wavefront, shade_wavefront
 from warp_ar.kernels.launch import Rows, launch_rows, slow_to_compile
 from warp_ar.kernels.reflect import DistantLight
 from warp_ar.kernels.sampling import pcg3d_hash
-from warp_ar.kernels.shapes import FAR, surface_key
+from warp_ar.kernels.shapes import surface_key
 from warp_ar.kernels.structs import FrameParams, Hit, Picture, RayScene
 from warp_ar.kernels.trace import make_trace, offset_origin
 from warp_ar.kernels.visibility import make_visible_proxy
@@ -65,12 +66,10 @@ def make_environment_shadow_kernel(config: EnvironmentShadowConfig) -> wp.Kernel
     closest_object, occluded_by_objects = trace.closest_object, trace.occluded_by_objects
     mask_objects, mask_physical = make_masks(config, min(config.count, CHUNK))
     visible_proxy = make_visible_proxy(config.distant.trace, config.distant.probes)
-    find_sender = make_find_sender(config)
+    aim, find_sender = make_aim(config.emitters), make_find_sender(config)
     traced = config.bounce == "traced"
-    bounced = make_bounced(config.distant) if traced else None
-    estimated, look_before = (
-        (None, None) if traced else (make_estimated(config.distant), make_look_before(config.distant))
-    )
+    look_before = None if traced else make_look_before(config.distant)
+    reflect_back = make_reflect_back(config.distant, traced)
     side = config.side
     chunk = min(config.count, CHUNK)
     secondary_count = config.secondary_count
@@ -110,8 +109,7 @@ def make_environment_shadow_kernel(config: EnvironmentShadowConfig) -> wp.Kernel
         own = hit.shape
         without = wp.vec3(0.0)
         hidden = wp.vec3(0.0)
-        sent = wp.vec3(0.0)
-        returned = wp.vec3(0.0)
+        reflected = ReflectedLight()
         before = Before()
         # A set is in the order of its sequence: any first part of it is a smaller set.
         first = first_of_set(i, j, side, sets.samples.shape[0])
@@ -127,29 +125,18 @@ def make_environment_shadow_kernel(config: EnvironmentShadowConfig) -> wp.Kernel
             bit = wp.uint64(1)
             size = wp.int32(wp.static(chunk))  # a variable: unrolled, the kernel would hold its rays many times over
             for k in range(size):
-                direction = sets.directions[at + k]
-                reach = float(FAR)
-                grown = float(1.0)
-                if wp.static(config.emitters):
-                    toward = sample_toward(sets.samples[at + k], point)
-                    direction = toward.direction
-                    reach = toward.distance
-                    grown = toward.measure / sets.samples[at + k].measure
-                cosine = wp.min(wp.dot(hit.normal, direction), wp.dot(hit.geometric_normal, direction))
-                if cosine > 0.0:
+                ray = aim(sets, at + k, hit)
+                if ray.cosine > 0.0:
                     if (met & bit) == wp.uint64(0):
-                        without += cosine * grown * sets.flux[at + k]
+                        without += ray.cosine * ray.grown * sets.flux[at + k]
                     else:
                         measure = sets.samples[at + k].measure
-                        weight = cosine * grown * measure
-                        origin = offset_origin(point, hit.geometric_normal, direction, hit.error)
+                        weight = ray.cosine * ray.grown * measure
+                        ray.origin = offset_origin(point, hit.geometric_normal, ray.direction, hit.error)
                         by_proxy = (physical.proxies & bit) != wp.uint64(0)
                         by_ball = (physical.balls & bit) != wp.uint64(0)
-                        sender = find_sender(
-                            params, picture, scene, distant, sets, at + k, origin, direction, reach, by_proxy, by_ball
-                        )
+                        sender = find_sender(params, picture, scene, distant, sets, at + k, ray, by_proxy, by_ball)
                         radiance = sender.radiance
-                        reach = sender.distance
                         without += weight * radiance
                         if (virtual_mask & bit) != wp.uint64(0):
                             other = Hit()
@@ -157,37 +144,31 @@ def make_environment_shadow_kernel(config: EnvironmentShadowConfig) -> wp.Kernel
                             if wp.static(secondary_count == config.count) or block * wp.static(chunk) + k < wp.static(
                                 secondary_count
                             ):
-                                other = closest_object(scene, origin, direction, reach)
+                                other = closest_object(scene, ray.origin, ray.direction, sender.distance)
                                 if other.shape >= 0:
                                     hidden += weight * radiance
-                            elif occluded_by_objects(scene, origin, direction, reach):
+                            elif occluded_by_objects(scene, ray.origin, ray.direction, sender.distance):
                                 hidden += weight * radiance
                             if other.shape >= 0:
-                                stands_for = weight * wp.static(config.count / secondary_count)
-                                alpha = caustic_alpha(scene.objects[other.shape], point)
+                                meeting = Meeting()
+                                meeting.hit = other
+                                meeting.direction = ray.direction
+                                meeting.alpha = caustic_alpha(scene.objects[other.shape], point)
+                                meeting.stands_for = weight * wp.static(config.count / secondary_count)
+                                seed = wp.vec3ui()
                                 if wp.static(traced):
                                     seed = pcg3d_hash(wp.uint32(at + k), wp.uint32(row), wp.uint32(column))
-                                    sent += stands_for * bounced(
-                                        params[0], picture, scene, distant, other, direction, alpha, seed
-                                    )
-                                else:
-                                    if before.up == wp.vec3(0.0, 0.0, 0.0):
-                                        before = look_before(distant, hit.geometric_normal, direction)
-                                    light = estimated(
-                                        scene, distant, other, direction, alpha, before.up, before.from_receiver
-                                    )
-                                    if wp.static(config.distant.textures):
-                                        sent += stands_for * light.emitted
-                                    brightness = wp.max(light.distant + light.receiver)
-                                    stands_for *= wp.min(before.brightest / wp.max(brightness, 1.0e-20), 1.0)
-                                    sent += stands_for * light.distant
-                                    returned += stands_for * light.receiver
+                                elif before.up == wp.vec3(0.0, 0.0, 0.0):
+                                    before = look_before(distant, hit.geometric_normal, ray.direction)
+                                reflected = reflect_back(
+                                    params[0], picture, scene, distant, meeting, before, seed, reflected
+                                )
                 bit = bit << wp.uint64(1)
-        unchanged = hidden + sent == wp.vec3(0.0, 0.0, 0.0)
+        unchanged = hidden + reflected.sent == wp.vec3(0.0, 0.0, 0.0)
         if cells_out.shaded.shape[0] > 0 and not unchanged:
             cells_out.shaded[i / SHADED_TILE, j / SHADED_TILE] = params[0].frame_index
         cells_out.ratio[i, j] = ratio_of(without, hidden, hit.t)
-        cells_out.bounced[i, j] = bounced_of(without, hidden, sent, returned)
+        cells_out.bounced[i, j] = bounced_of(without, hidden, reflected.sent, reflected.returned)
 
     return environment_shadow_kernel
 

@@ -293,3 +293,63 @@ def make_look_before(config: DistantLightConfig) -> wp.Function:
         return before
 
     return look_before
+
+
+@wp.struct
+class Meeting:
+    """Where a ray from the receiver met an object, and how much light from there counts."""
+
+    hit: Hit
+    direction: wp.vec3
+    alpha: wp.float32  # least width of the object's lobe
+    stands_for: wp.float32  # weight of its radiance, which is that of several samples where one ray stands for them
+
+
+@wp.struct
+class ReflectedLight:
+    """What objects send to a point of the receiver, times its weight."""
+
+    sent: wp.vec3  # of the environment
+    returned: wp.vec3  # of what the receiver sent them
+
+
+@functools.cache
+def make_reflect_back(config: DistantLightConfig, traced: bool) -> wp.Function:
+    """``reflect_back(params, picture, scene, distant, meeting, before, seed, so_far) -> ReflectedLight``.
+
+    Adds what an object sends back to what others do: found by another ray if ``traced``, else estimated from what lies
+    ``before`` the receiver, of which nothing is believed to be brighter than ``before.brightest``.
+    """
+    bounced = make_bounced(config) if traced else None
+    estimated = None if traced else make_estimated(config)
+
+    @wp.func(module="unique")
+    def reflect_back(
+        params: FrameParams,
+        picture: Picture,
+        scene: RayScene,
+        distant: DistantLight,
+        meeting: Meeting,
+        before: Before,
+        seed: wp.vec3ui,
+        so_far: ReflectedLight,
+    ) -> ReflectedLight:
+        out = so_far
+        weight = meeting.stands_for
+        if wp.static(traced):
+            out.sent += weight * bounced(
+                params, picture, scene, distant, meeting.hit, meeting.direction, meeting.alpha, seed
+            )
+        else:
+            light = estimated(
+                scene, distant, meeting.hit, meeting.direction, meeting.alpha, before.up, before.from_receiver
+            )
+            if wp.static(config.textures):
+                out.sent += weight * light.emitted
+            brightness = wp.max(light.distant + light.receiver)
+            weight *= wp.min(before.brightest / wp.max(brightness, 1.0e-20), 1.0)
+            out.sent += weight * light.distant
+            out.returned += weight * light.receiver
+        return out
+
+    return reflect_back

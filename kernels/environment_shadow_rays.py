@@ -20,7 +20,7 @@ from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.kernels.materials import reflect
 from warp_ar.kernels.reflect import DistantLight, look_up, make_find_in_frame
 from warp_ar.kernels.shapes import FAR, intersect_sphere
-from warp_ar.kernels.structs import BOX, PLANE, FrameParams, Picture, RayScene
+from warp_ar.kernels.structs import BOX, PLANE, FrameParams, Hit, Picture, RayScene
 from warp_ar.kernels.trace import make_trace
 
 wp.set_module_options({"enable_backward": False})
@@ -114,6 +114,38 @@ def make_masks(config: EnvironmentShadowConfig, count: int) -> tuple[wp.Function
 
 
 @wp.struct
+class SampleRay:
+    """From a point of the receiver toward a sample of the environment."""
+
+    origin: wp.vec3  # set where the ray is traced
+    direction: wp.vec3
+    distance: wp.float32  # of the sample, metres
+    grown: wp.float32  # the sample's measure as the point sees it, over that from the ball
+    cosine: wp.float32  # at the receiver; the point sees the sample if it is above 0
+
+
+@functools.cache
+def make_aim(emitters: bool) -> wp.Function:
+    """``aim(sets, index, hit) -> SampleRay``: less its origin."""
+
+    @wp.func(module="unique")
+    def aim(sets: SampleSets, index: wp.int32, hit: Hit) -> SampleRay:
+        ray = SampleRay()
+        ray.direction = sets.directions[index]
+        ray.distance = FAR
+        ray.grown = 1.0
+        if wp.static(emitters):
+            toward = sample_toward(sets.samples[index], hit.point)
+            ray.direction = toward.direction
+            ray.distance = toward.distance
+            ray.grown = toward.measure / sets.samples[index].measure
+        ray.cosine = wp.min(wp.dot(hit.normal, ray.direction), wp.dot(hit.geometric_normal, ray.direction))
+        return ray
+
+    return aim
+
+
+@wp.struct
 class Sender:
     """What sends light along a sample's direction where no virtual object stands."""
 
@@ -123,9 +155,9 @@ class Sender:
 
 @functools.cache
 def make_find_sender(config: EnvironmentShadowConfig) -> wp.Function:
-    """``find_sender(params, picture, scene, distant, sets, index, origin, ...) -> Sender``.
+    """``find_sender(params, picture, scene, distant, sets, index, ray, by_proxy, by_ball) -> Sender``.
 
-    The sample itself, ``distance`` away, or the physical before it: a proxy if ``by_proxy``, a mirror ball if
+    The sample itself, or the physical before it: a proxy if ``by_proxy``, a mirror ball if
     ``by_ball``; those that the ray cannot meet need not be asked.
     """
     closest_proxy = make_trace(config.distant.trace).closest_proxy
@@ -141,17 +173,15 @@ def make_find_sender(config: EnvironmentShadowConfig) -> wp.Function:
         distant: DistantLight,
         sets: SampleSets,
         index: wp.int32,
-        origin: wp.vec3,
-        direction: wp.vec3,
-        distance: wp.float32,
+        ray: SampleRay,
         by_proxy: wp.bool,
         by_ball: wp.bool,
     ) -> Sender:
         sender = Sender()
         sender.radiance = sets.samples[index].radiance
-        sender.distance = distance
+        sender.distance = ray.distance
         if by_proxy:
-            proxy = closest_proxy(scene, origin, direction, distance)
+            proxy = closest_proxy(scene, ray.origin, ray.direction, ray.distance)
             if proxy.shape >= 0:
                 sender.distance = proxy.t
                 at = wp.vec2(-1.0, -1.0)
@@ -167,11 +197,12 @@ def make_find_sender(config: EnvironmentShadowConfig) -> wp.Function:
             if by_ball:
                 for ball in range(distant.probes.shape[0]):
                     probe = distant.probes[ball]
-                    t = intersect_sphere(probe.radius, origin - probe.center, direction, sender.distance)
+                    t = intersect_sphere(probe.radius, ray.origin - probe.center, ray.direction, sender.distance)
                     if t < sender.distance:
                         sender.distance = t
-                        normal = (origin + t * direction - probe.center) / probe.radius
-                        sender.radiance = wp.cw_mul(probe.reflectance, look_wide(distant, reflect(-direction, normal)))
+                        normal = (ray.origin + t * ray.direction - probe.center) / probe.radius
+                        wi = reflect(-ray.direction, normal)
+                        sender.radiance = wp.cw_mul(probe.reflectance, look_wide(distant, wi))
         return sender
 
     return find_sender

@@ -12,8 +12,15 @@ import functools
 import warp as wp
 
 from warp_ar.kernels.cells import cell_pixel
-from warp_ar.kernels.environment_samples import SampleSets, sample_toward
-from warp_ar.kernels.environment_shadow_bounce import caustic_alpha, make_bounced, make_estimated, make_look_before
+from warp_ar.kernels.environment_samples import SampleSets
+from warp_ar.kernels.environment_shadow_bounce import (
+    Before,
+    Meeting,
+    ReflectedLight,
+    caustic_alpha,
+    make_look_before,
+    make_reflect_back,
+)
 from warp_ar.kernels.environment_shadow_cells import (
     CHUNK,
     SHADED_TILE,
@@ -26,7 +33,7 @@ from warp_ar.kernels.environment_shadow_cells import (
     first_of_set,
     ratio_of,
 )
-from warp_ar.kernels.environment_shadow_rays import make_find_sender, make_masks
+from warp_ar.kernels.environment_shadow_rays import make_aim, make_find_sender, make_masks
 from warp_ar.kernels.launch import MOST_REGISTERS, launch
 from warp_ar.kernels.reflect import DistantLight
 from warp_ar.kernels.sampling import pcg3d_hash
@@ -64,7 +71,7 @@ def make_find_occluded_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
     secondary_count = config.secondary_count
     side = config.side
     mask_objects, mask_physical = make_masks(config, size)
-    trace = make_trace(config.distant.trace)
+    aim, trace = make_aim(config.emitters), make_trace(config.distant.trace)
     closest_proxy, occluded_by_objects = trace.closest_proxy, trace.occluded_by_objects
     visible_proxy = make_visible_proxy(config.distant.trace, config.distant.probes)
 
@@ -107,25 +114,21 @@ def make_find_occluded_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
                         bit = wp.uint64(1) << wp.uint64(k - begin)
                         if (virtual_mask & bit) == wp.uint64(0):
                             continue
-                        direction = sets.directions[at + k - begin]
-                        reach = float(FAR)
-                        if wp.static(config.emitters):
-                            toward = sample_toward(sets.samples[at + k - begin], hit.point)
-                            direction = toward.direction
-                            reach = toward.distance
-                        if wp.min(wp.dot(hit.normal, direction), wp.dot(hit.geometric_normal, direction)) <= 0.0:
+                        ray = aim(sets, at + k - begin, hit)
+                        if ray.cosine <= 0.0:
                             continue
-                        origin = offset_origin(hit.point, hit.geometric_normal, direction, hit.error)
+                        ray.origin = offset_origin(hit.point, hit.geometric_normal, ray.direction, hit.error)
                         if (physical.proxies & bit) != wp.uint64(0):
-                            proxy = closest_proxy(scene, origin, direction, reach)
-                            reach = wp.min(reach, proxy.t)
+                            proxy = closest_proxy(scene, ray.origin, ray.direction, ray.distance)
+                            ray.distance = wp.min(ray.distance, proxy.t)
                         if wp.static(config.distant.probes):
                             if (physical.balls & bit) != wp.uint64(0):
                                 for index in range(distant.probes.shape[0]):
                                     probe = distant.probes[index]
-                                    t = intersect_sphere(probe.radius, origin - probe.center, direction, reach)
-                                    reach = wp.min(reach, t)
-                        if occluded_by_objects(scene, origin, direction, reach):
+                                    from_ball = ray.origin - probe.center
+                                    t = intersect_sphere(probe.radius, from_ball, ray.direction, ray.distance)
+                                    ray.distance = wp.min(ray.distance, t)
+                        if occluded_by_objects(scene, ray.origin, ray.direction, ray.distance):
                             found = found | (wp.uint32(1) << wp.uint32(k - begin))
                             if k < secondary_count:
                                 count += 1
@@ -159,7 +162,7 @@ def make_sum_light_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
     side = config.side
     _, mask_physical = make_masks(config, size)
     visible_proxy = make_visible_proxy(config.distant.trace, config.distant.probes)
-    find_sender = make_find_sender(config)
+    aim, find_sender = make_aim(config.emitters), make_find_sender(config)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def sum_light_kernel(
@@ -190,25 +193,15 @@ def make_sum_light_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
         hidden = wp.vec3(0.0)
         for k in range(at, at + size):
             bit = wp.uint64(1) << wp.uint64(k - at)
-            direction = sets.directions[k]
-            reach = float(FAR)
-            grown = float(1.0)
-            if wp.static(config.emitters):
-                toward = sample_toward(sets.samples[k], hit.point)
-                direction = toward.direction
-                reach = toward.distance
-                grown = toward.measure / sets.samples[k].measure
-            cosine = wp.min(wp.dot(hit.normal, direction), wp.dot(hit.geometric_normal, direction))
-            if cosine > 0.0:
-                light = cosine * grown * sets.flux[k]
+            ray = aim(sets, k, hit)
+            if ray.cosine > 0.0:
+                light = ray.cosine * ray.grown * sets.flux[k]
                 if (met & bit) != wp.uint64(0):
-                    origin = offset_origin(hit.point, hit.geometric_normal, direction, hit.error)
+                    ray.origin = offset_origin(hit.point, hit.geometric_normal, ray.direction, hit.error)
                     by_proxy = (physical.proxies & bit) != wp.uint64(0)
                     by_ball = (physical.balls & bit) != wp.uint64(0)
-                    sender = find_sender(
-                        params, picture, scene, distant, sets, k, origin, direction, reach, by_proxy, by_ball
-                    )
-                    light = cosine * grown * sets.samples[k].measure * sender.radiance
+                    sender = find_sender(params, picture, scene, distant, sets, k, ray, by_proxy, by_ball)
+                    light = ray.cosine * ray.grown * sets.samples[k].measure * sender.radiance
                 without += light
                 if (found & bit) != wp.uint64(0):
                     hidden += light
@@ -223,13 +216,12 @@ def make_trace_secondary_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
     """Kernel of the third pass: what objects send along the queued rays."""
     secondary_count = config.secondary_count
     side = config.side
+    aim = make_aim(config.emitters)
     closest_object = make_trace(config.distant.trace).closest_object
     visible_proxy = make_visible_proxy(config.distant.trace, config.distant.probes)
     traced = config.bounce == "traced"
-    bounced = make_bounced(config.distant) if traced else None
-    estimated, look_before = (
-        (None, None) if traced else (make_estimated(config.distant), make_look_before(config.distant))
-    )
+    look_before = None if traced else make_look_before(config.distant)
+    reflect_back = make_reflect_back(config.distant, traced)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def trace_secondary_kernel(
@@ -255,36 +247,28 @@ def make_trace_secondary_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
             row = cell_pixel(i, stride, rays.shape[0])
             column = cell_pixel(j, stride, rays.shape[1])
             hit = visible_proxy(params[0], rays[row, column], scene, distant.probes)
-            direction = sets.directions[index]
-            measure = sets.samples[index].measure
-            if wp.static(config.emitters):
-                toward = sample_toward(sets.samples[index], hit.point)
-                direction = toward.direction
-                measure = toward.measure
-            cosine = wp.min(wp.dot(hit.normal, direction), wp.dot(hit.geometric_normal, direction))
-            origin = offset_origin(hit.point, hit.geometric_normal, direction, hit.error)
-            sent = wp.vec3(0.0)
-            returned = wp.vec3(0.0)
+            ray = aim(sets, index, hit)
+            ray.origin = offset_origin(hit.point, hit.geometric_normal, ray.direction, hit.error)
+            reflected = ReflectedLight()
             # What is nearer than all that is physical is nearest.
-            other = closest_object(scene, origin, direction, FAR)
+            other = closest_object(scene, ray.origin, ray.direction, FAR)
             if other.shape >= 0:
-                stands_for = cosine * measure * wp.static(config.count / secondary_count)
-                alpha = caustic_alpha(scene.objects[other.shape], hit.point)
+                weight = ray.cosine * ray.grown * sets.samples[index].measure
+                meeting = Meeting()
+                meeting.hit = other
+                meeting.direction = ray.direction
+                meeting.alpha = caustic_alpha(scene.objects[other.shape], hit.point)
+                meeting.stands_for = weight * wp.static(config.count / secondary_count)
+                seed = wp.vec3ui()
+                before = Before()
                 if wp.static(traced):
                     seed = pcg3d_hash(wp.uint32(index), wp.uint32(row), wp.uint32(column))
-                    sent = stands_for * bounced(params[0], picture, scene, distant, other, direction, alpha, seed)
                 else:
-                    before = look_before(distant, hit.geometric_normal, direction)
-                    light = estimated(scene, distant, other, direction, alpha, before.up, before.from_receiver)
-                    if wp.static(config.distant.textures):
-                        sent = stands_for * light.emitted
-                    brightness = wp.max(light.distant + light.receiver)
-                    stands_for *= wp.min(before.brightest / wp.max(brightness, 1.0e-20), 1.0)
-                    sent += stands_for * light.distant
-                    returned = stands_for * light.receiver
-            wave_out.reflected[0, place] = sent
+                    before = look_before(distant, hit.geometric_normal, ray.direction)
+                reflected = reflect_back(params[0], picture, scene, distant, meeting, before, seed, reflected)
+            wave_out.reflected[0, place] = reflected.sent
             if wp.static(not traced):
-                wave_out.reflected[1, place] = returned
+                wave_out.reflected[1, place] = reflected.returned
 
     return trace_secondary_kernel
 

@@ -79,6 +79,7 @@ def make_fill_frame_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
         scene: RayScene,
         height: wp.int32,
         width: wp.int32,
+        ball: wp.int32,
         # In and out:
         levels_out: wp.array[wp.vec4],
     ):
@@ -99,7 +100,7 @@ def make_fill_frame_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
                 direction = direction_from_latlong(y, x, height, width)
                 ray = direction
                 reach = wp.float32(FAR)
-                hit = trace.closest_proxy(scene, probes[0].center, direction, FAR)
+                hit = trace.closest_proxy(scene, probes[ball].center, direction, FAR)
                 shaded = wp.bool(False)
                 if hit.shape >= 0:
                     shaded = shaded_by_ball(probes, hit.point)
@@ -132,6 +133,7 @@ def fill_frame(
     shape: tuple[int, int],
     *,
     proxies: tuple[int, ...],
+    ball: int = 0,
     rows: Rows | None = None,
 ) -> None:
     """Put what the frame shows into a seeded fill pyramid, where balls left trust open.
@@ -139,17 +141,18 @@ def fill_frame(
     Args:
         picture: (frame rows, columns) the camera's; its rays are not read.
         params: ``FrameParams`` (1): the camera.
-        probes: ``Probe`` (P), at least one: the map is the light at the first; all hide what is behind them.
+        probes: ``Probe`` (P), at least one; all hide what is behind them.
         scene: Its proxies are seen where they are.
         levels_out: From ``fill.seed_fill``; its level 0 changes.
         shape: Rows and columns of the map.
         proxies: Kinds of proxy in the scene.
+        ball: The one whose light the map is.
         rows: Band of rows, None for all.
     """
     launch_rows(
         make_fill_frame_kernel(proxies),
         shape,
-        [picture, params, probes, scene, *shape],
+        [picture, params, probes, scene, *shape, ball],
         [levels_out],
         rows=rows,
         device=levels_out.device,

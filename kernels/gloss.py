@@ -144,18 +144,18 @@ class Sight:
 
 
 @wp.struct
-class Mirrored:
+class Reflected:
     """What one ray brings, by its weight."""
 
     change: wp.vec3
-    before: wp.vec3  # what the receiver mirrored there, where that was asked for
+    before: wp.vec3  # what the receiver reflected there, where that was asked for
 
 
 @functools.cache
 def make_follow(config: GlossConfig) -> wp.Function:
-    """``follow(params, sight, lights, hit, wi, weight, width, asked, turn) -> Mirrored``: along one mirrored ray.
+    """``follow(params, sight, lights, hit, wi, weight, width, asked, turn) -> Reflected``: along one reflected ray.
 
-    ``width`` is the alpha that one ray stands for; ``asked``: what was mirrored before is to be known in any case.
+    ``width`` is the alpha that one ray stands for; ``asked``: what was reflected before is to be known in any case.
     """
     trace = make_trace(config.trace)
     closest_object, closest_proxy = trace.closest_object, trace.closest_proxy
@@ -173,8 +173,8 @@ def make_follow(config: GlossConfig) -> wp.Function:
         width: wp.float32,
         asked: wp.bool,
         turn: wp.float32,
-    ) -> Mirrored:
-        result = Mirrored()
+    ) -> Reflected:
+        result = Reflected()
         scene = sight.scene
         distant = sight.distant
         layers = sight.layers
@@ -253,6 +253,30 @@ def make_highlights(config: GlossConfig) -> wp.Function:
     return highlights
 
 
+@wp.struct
+class FacetRay:
+    """What a facet of a rough receiver reflects toward the camera."""
+
+    wi: wp.vec3
+    masking: wp.float32  # share of it that other facets let pass; 0: none, it leads onto another facet
+    cos_d: wp.float32  # between the facet's normal and the ray
+
+
+@wp.func
+def draw_facet(u: wp.vec2, normal: wp.vec3, wo: wp.vec3, alpha: wp.float32) -> FacetRay:
+    """One of the facets that the camera sees, by a point of the unit square."""
+    out = FacetRay()
+    basis = frame_from_normal(normal)
+    local = wp.transpose(basis) * wo
+    facet = sample_ggx_visible(u, local, alpha)
+    away = reflect(local, facet)
+    if away[2] > 0.0:
+        out.masking = ggx_masking_shadowing(away, local, alpha) / ggx_masking(local, alpha)
+        out.cos_d = wp.max(wp.dot(local, facet), 0.0)
+        out.wi = wp.normalize(basis * away)
+    return out
+
+
 @functools.cache
 def make_gloss_kernel(config: GlossConfig) -> wp.Kernel:
     """Kernel specialised to ``config``; equal configs share one kernel."""
@@ -321,7 +345,6 @@ def make_gloss_kernel(config: GlossConfig) -> wp.Kernel:
                 count = 1  # into the middle of the lobe, which the environment is filtered for
             hashes = pcg3d_hash(wp.uint32(i), wp.uint32(j), wp.uint32(0))
             shift = wp.vec2(uniform_from_bits(hashes[0]), uniform_from_bits(hashes[1]))
-            basis = frame_from_normal(hit.normal)
             for sample in range(count):
                 wi = mirror
                 masking = float(1.0)
@@ -330,15 +353,14 @@ def make_gloss_kernel(config: GlossConfig) -> wp.Kernel:
                 if not is_near:
                     width = alpha
                 elif is_rough:
-                    local = wp.transpose(basis) * wo
                     u = hammersley(sample, count) + shift
-                    facet = sample_ggx_visible(wp.vec2(u[0] - wp.floor(u[0]), u[1] - wp.floor(u[1])), local, alpha)
-                    away = reflect(local, facet)
-                    if away[2] <= 0.0:
+                    at = wp.vec2(u[0] - wp.floor(u[0]), u[1] - wp.floor(u[1]))
+                    drawn = draw_facet(at, hit.normal, wo, alpha)
+                    if drawn.masking <= 0.0:
                         continue  # onto another facet
-                    masking = ggx_masking_shadowing(away, local, alpha) / ggx_masking(local, alpha)
-                    cos_d = wp.max(wp.dot(local, facet), 0.0)
-                    wi = wp.normalize(basis * away)
+                    masking = drawn.masking
+                    cos_d = drawn.cos_d
+                    wi = drawn.wi
                     width = alpha / wp.sqrt(wp.float32(count))
                 else:
                     direction = wp.normalize(sample_direction(params, ray, sample))

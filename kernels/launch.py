@@ -103,7 +103,8 @@ def noting() -> Iterator[list[Note]]:
         _NOTES.list = before
 
 
-def _do_or_note(note: Note) -> None:
+def do_or_note(note: Note) -> None:
+    """Do what a note says, or leave it noted."""
     notes = getattr(_NOTES, "list", None)
     if notes is None:
         note.do()
@@ -124,7 +125,7 @@ def launch(
     """Launch a kernel that is not split, as ``wp.launch`` does."""
     given = {"dim": dim, "inputs": inputs, "outputs": outputs, "device": device, "stream": stream}
     given["block_dim"] = None if wp.get_device(device).is_cpu else block_dim
-    _do_or_note(
+    do_or_note(
         Note(
             kernel,
             None,
@@ -137,7 +138,7 @@ def launch(
 
 def copy(target: wp.array, source: wp.array) -> None:
     """Copy an array into another of its size and type, on the same device."""
-    _do_or_note(Note(None, None, lambda: wp.copy(target, source), arrays=(target, source)))
+    do_or_note(Note(None, None, lambda: wp.copy(target, source), arrays=(target, source)))
 
 
 def launch_rows(
@@ -172,7 +173,7 @@ def launch_rows(
         given = {"inputs": [0, *inputs], "outputs": outputs, "device": device, "stream": stream}
         return wp.launch(kernel, dim=tuple(shape), **given, record_cmd=True)
 
-    _do_or_note(Note(kernel, rows, do, record))
+    do_or_note(Note(kernel, rows, do, record))
 
 
 # On CPU a module's tiles lie on the stack of the kernel that began last, for there is one pointer to them per module:
@@ -225,7 +226,7 @@ def launch_tiles(
         with _CPU_TILES if wp.get_device(device).is_cpu else contextlib.nullcontext():
             return wp.launch_tiled(kernel, dim=(stop - start, *dim[1:]), inputs=given, outputs=outputs, **more)
 
-    _do_or_note(Note(kernel, rows, do, functools.partial(do, True), block_dim=block_dim, tiles=True))
+    do_or_note(Note(kernel, rows, do, functools.partial(do, True), block_dim=block_dim, tiles=True))
 
 
 @wp.func_native("""

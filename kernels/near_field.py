@@ -45,10 +45,9 @@ import math
 import warp as wp
 
 from warp_ar.kernels.color import brightness
-from warp_ar.kernels.emitters import correct_parallax
 from warp_ar.kernels.environment_samples import EnvironmentSample, sample_toward, sobol_second
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows, slow_to_compile
-from warp_ar.kernels.lobes import level_from_alpha, sample_levels
+from warp_ar.kernels.lobes import level_from_alpha
 from warp_ar.kernels.materials import Surface, make_surface, material_at, reflect, roughness_at, surface_point
 from warp_ar.kernels.reflect import (
     RAY_SPREAD,
@@ -57,6 +56,7 @@ from warp_ar.kernels.reflect import (
     look_up,
     make_distant_irradiance,
     make_find_in_frame,
+    make_radiance_along,
     make_reflected_radiance,
     make_shade_unoccluded,
 )
@@ -209,20 +209,66 @@ class NearRay:
     leaves: wp.bool  # into the open; else into the surface
 
 
+@wp.struct
+class SeenPoint:
+    """A point of an object that a pixel shows."""
+
+    hit: Hit
+    wo: wp.vec3
+    normal: wp.vec3  # for shading; this one and the next on the camera's side
+    geometric: wp.vec3  # of the surface that rays meet
+    surface: Surface
+    alpha: wp.float32  # width of its lobe; 0 for a mirror
+    pixel: wp.vec2  # undistorted (x / z, y / z)
+    place: wp.int32  # of the pixel in its tile
+
+
+@functools.cache
+def make_see_point(config: NearFieldConfig) -> wp.Function:
+    """``see_point(params, picture, scene, dfg, hit, i, j) -> SeenPoint``: what pixel (i, j) shows of an object."""
+    surface_at = make_surface(config.distant.models, config.distant.textures)
+    side = config.side
+
+    @wp.func(module="unique")
+    def see_point(
+        params: wp.array[FrameParams],
+        picture: Picture,
+        scene: RayScene,
+        dfg: wp.array2d[wp.vec2],
+        hit: Hit,
+        i: wp.int32,
+        j: wp.int32,
+    ) -> SeenPoint:
+        at = SeenPoint()
+        at.hit = hit
+        at.pixel = picture.rays[i, j]
+        at.place = (i % side) * side + j % side
+        at.wo = -wp.normalize(params[0].world_from_camera * wp.vec3(at.pixel[0], at.pixel[1], 1.0))
+        at.normal = hit.normal
+        at.geometric = hit.geometric_normal
+        if wp.dot(at.geometric, at.wo) < 0.0:
+            at.normal = -at.normal
+            at.geometric = -at.geometric
+        cos_o = wp.max(wp.dot(at.normal, at.wo), 1.0e-3)
+        at.surface = surface_at(scene, dfg, hit, cos_o, scene.pixel_spread)
+        at.alpha = lobe_alpha(at.surface.model, at.surface.roughness, at.surface.shininess)
+        return at
+
+    return see_point
+
+
 @wp.func
-def make_sample_ray(
-    sample: EnvironmentSample, hit: Hit, normal: wp.vec3, geometric: wp.vec3, share: wp.float32
-) -> NearRay:
+def make_sample_ray(sample: EnvironmentSample, at: SeenPoint, share: wp.float32) -> NearRay:
     """Toward a sample of the environment; its weight is 0 where the surface does not see it."""
     out = NearRay()
-    toward = sample_toward(sample, hit.point)
-    cosine = wp.dot(normal, toward.direction)
+    toward = sample_toward(sample, at.hit.point)
+    cosine = wp.dot(at.normal, toward.direction)
     if cosine > 0.0:
         out.weight = share * cosine * toward.measure
-        if wp.dot(geometric, toward.direction) > 0.0:
+        if wp.dot(at.geometric, toward.direction) > 0.0:
             out.leaves = True
             out.radiance = sample.radiance
-            out.origin = offset_origin(hit.point, geometric, toward.direction, hit.error)
+            out.origin = offset_origin(at.hit.point, at.geometric, toward.direction, at.hit.error)
             out.direction = toward.direction
             out.reach = toward.distance
             out.spread = RAY_SPREAD
@@ -230,27 +276,25 @@ def make_sample_ray(
 
 
 @wp.func
-def make_lobe_ray(
-    u: wp.vec2, surface: Surface, hit: Hit, wo: wp.vec3, normal: wp.vec3, geometric: wp.vec3, alpha: wp.float32
-) -> NearRay:
+def make_lobe_ray(u: wp.vec2, at: SeenPoint) -> NearRay:
     """Into the lobe of a glossy surface, by two numbers of [0, 1)."""
     out = NearRay()
-    if surface.model == PHONG:
-        center = reflect(wo, normal)
-        wi = frame_from_normal(center) * sample_phong_lobe(u, surface.shininess)
-        width = phong_ray_width(wp.dot(wi, center), surface.shininess, alpha)
+    if at.surface.model == PHONG:
+        center = reflect(at.wo, at.normal)
+        wi = frame_from_normal(center) * sample_phong_lobe(u, at.surface.shininess)
+        width = phong_ray_width(wp.dot(wi, center), at.surface.shininess, at.alpha)
     else:
-        basis = frame_from_normal(normal)
-        half = basis * sample_ggx_visible(u, wp.transpose(basis) * wo, alpha)
-        wi = reflect(wo, half)
-        width = ggx_ray_width(wp.dot(half, normal), alpha)
-    if wp.dot(wi, geometric) > 0.0:
+        basis = frame_from_normal(at.normal)
+        half = basis * sample_ggx_visible(u, wp.transpose(basis) * at.wo, at.alpha)
+        wi = reflect(at.wo, half)
+        width = ggx_ray_width(wp.dot(half, at.normal), at.alpha)
+    if wp.dot(wi, at.geometric) > 0.0:
         out.leaves = True
-        out.origin = offset_origin(hit.point, geometric, wi, hit.error)
+        out.origin = offset_origin(at.hit.point, at.geometric, wi, at.hit.error)
         out.direction = wi
         out.reach = FAR
         out.spread = width
-        out.point = hit.point
+        out.point = at.hit.point
     return out
 
 
@@ -285,18 +329,73 @@ def make_mirror_ray(config: NearFieldConfig) -> wp.Function:
 
 
 @functools.cache
+def make_pick_ray(config: NearFieldConfig) -> wp.Function:
+    """``pick_ray(params, scene, samples, at, n, diffuse) -> NearRay``: ray number ``n`` of a pixel.
+
+    The first ``diffuse`` go toward samples of the environment, the others into the lobe.
+    """
+    mirror_ray = make_mirror_ray(config) if config.mirror_samples > 0 else None
+    side, lobes = config.side, config.lobe_count
+    shift = 0.5 / (max(lobes, 1) * side * side)
+
+    @wp.func(module="unique")
+    def pick_ray(
+        params: wp.array[FrameParams],
+        scene: RayScene,
+        samples: wp.array[EnvironmentSample],
+        at: SeenPoint,
+        n: wp.int32,
+        diffuse: wp.int32,
+    ) -> NearRay:
+        ray = NearRay()
+        if wp.static(config.distant.diffuse != "none"):
+            if n < diffuse:
+                # A sample's measure is its share of all sets. A set is in the order of its sequence: any first part of
+                # it is a smaller set.
+                stride = samples.shape[0] / wp.static(side * side)
+                share = wp.float32(stride * side * side) / wp.static(float(config.count))
+                ray = make_sample_ray(samples[at.place * stride + n], at, share)
+        if wp.static(config.distant.specular):
+            if n >= diffuse:
+                k = n - diffuse
+                if wp.static(config.mirror_samples > 0):
+                    if at.alpha < SHARP:
+                        ray = mirror_ray(params, scene, at.hit.shape, at.pixel, k)
+                if wp.static(lobes > 0):
+                    if at.alpha >= SHARP:
+                        index = wp.uint32(at.place * wp.static(lobes) + k)
+                        u = wp.vec2(radical_inverse(index) + wp.static(shift), sobol_second(index) + wp.static(shift))
+                        ray = make_lobe_ray(u, at)
+        return ray
+
+    return pick_ray
+
+
+@functools.cache
+def make_look_beyond(config: NearFieldConfig) -> wp.Function:
+    """``look_beyond(distant, ray) -> vec3``: the environment along a lobe's ray, as wide as the ray."""
+    radiance_along = make_radiance_along(config.distant)
+    ray_width = RAY_WIDTH / (math.sqrt(max(config.lobe_count, 1)) * config.side)
+
+    @wp.func(module="unique")
+    def look_beyond(distant: DistantLight, ray: NearRay) -> wp.vec3:
+        level = level_from_alpha(wp.static(ray_width) * ray.spread, distant.level_height)
+        return radiance_along(distant, ray.point, ray.direction, level)
+
+    return look_beyond
+
+
+@functools.cache
 def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
     """Kernel specialised to ``config``; equal configs share one kernel.
 
     Rays of all kinds go through one loop, so that the walk through the scene is there once: a copy for each kind, and
     for each turn of an unrolled loop, takes NVRTC nine times as long.
     """
-    look_near = make_look_near(config)
-    surface_at = make_surface(config.distant.models, config.distant.textures)
+    see_point, pick_ray, look_near = make_see_point(config), make_pick_ray(config), make_look_near(config)
+    look_beyond = make_look_beyond(config) if config.lobe_count > 0 else None
     reflected_radiance = make_reflected_radiance(config.distant) if config.mirror_samples > 0 else None
     distant_irradiance = make_distant_irradiance(config.distant)
-    mirror_ray = make_mirror_ray(config) if config.mirror_samples > 0 else None
-    side = config.side
     lobes = config.lobe_count
 
     @slow_to_compile
@@ -320,21 +419,9 @@ def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
             return
         if visible.objects[i, j] < 0:
             return
-        hit = visible.hits[i, j]
-        pixel = picture.rays[i, j]
-        direction = wp.normalize(params[0].world_from_camera * wp.vec3(pixel[0], pixel[1], 1.0))
-        wo = -direction
-        normal = hit.normal
-        geometric = hit.geometric_normal
-        if wp.dot(geometric, wo) < 0.0:
-            normal = -normal
-            geometric = -geometric
-        cos_o = wp.max(wp.dot(normal, wo), 1.0e-3)
-        surface = surface_at(scene, distant.dfg, hit, cos_o, scene.pixel_spread)
-        alpha = lobe_alpha(surface.model, surface.roughness, surface.shininess)
-        set_index = (i % side) * side + j % side
-
-        # Samples of the environment come first, then rays into the lobe.
+        at = see_point(params, picture, scene, distant.dfg, visible.hits[i, j], i, j)
+        surface = at.surface
+        alpha = at.alpha
         diffuse = wp.int32(0)
         glossy = wp.int32(0)
         if wp.static(config.distant.diffuse != "none"):
@@ -348,26 +435,7 @@ def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
         transmitted = wp.vec4(0.0)
         leaving = float(0.0)  # rays; those into the surface are part of its reflectance
         for n in range(diffuse + glossy):
-            ray = NearRay()
-            if wp.static(config.distant.diffuse != "none"):
-                if n < diffuse:
-                    # A sample's measure is its share of all sets. A set is in the order of its sequence: any first
-                    # part of it is a smaller set.
-                    stride = samples.shape[0] / wp.static(side * side)
-                    share = wp.float32(stride * side * side) / wp.static(float(config.count))
-                    ray = make_sample_ray(samples[set_index * stride + n], hit, normal, geometric, share)
-            if wp.static(config.distant.specular):
-                if n >= diffuse:
-                    k = n - diffuse
-                    if wp.static(config.mirror_samples > 0):
-                        if alpha < SHARP:
-                            ray = mirror_ray(params, scene, hit.shape, pixel, k)
-                    if wp.static(lobes > 0):
-                        if alpha >= SHARP:
-                            index = wp.uint32(set_index * wp.static(lobes) + k)
-                            shift = wp.static(0.5 / (max(lobes, 1) * side * side))
-                            u = wp.vec2(radical_inverse(index) + shift, sobol_second(index) + shift)
-                            ray = make_lobe_ray(u, surface, hit, wo, normal, geometric, alpha)
+            ray = pick_ray(params, scene, samples, at, n, diffuse)
             near = wp.vec4(0.0)
             if ray.leaves:
                 near = look_near(
@@ -400,19 +468,12 @@ def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
                     reflected += near
                     if wp.static(lobes > 0):
                         if alpha >= SHARP:
-                            level = level_from_alpha(
-                                wp.static(RAY_WIDTH / (math.sqrt(max(lobes, 1)) * side)) * ray.spread,
-                                distant.level_height,
-                            )
-                            turned = ray.direction
-                            if wp.static(config.distant.emitters):
-                                turned = correct_parallax(distant.emitters, ray.point, turned)
-                            beyond = sample_levels(distant.levels, turned, level, distant.level_height)
+                            beyond = look_beyond(distant, ray)
                             missed = (1.0 - near[3]) * beyond
                             transmitted += wp.vec4(missed[0], missed[1], missed[2], brightness(beyond))
         if wp.static(config.distant.diffuse != "none"):
             if wp.static(config.known):
-                total += distant_irradiance(distant, hit.point, normal)
+                total += distant_irradiance(distant, at.hit.point, at.normal)
             near_out.irradiance[i, j] = total
         if wp.static(config.distant.specular):
             near_out.reflected[i, j] = reflected / wp.max(leaving, 1.0)

@@ -112,9 +112,9 @@ class RelightConfig:
     area_samples: int = 0
     """Samples of what emits, per point; ``area_lights.POINT_SAMPLES``: as lights at points; 0: nothing emits."""
 
-    def general(self, *, soft: bool) -> RelightConfig:
-        """For any scene in which as much is known of the receiver."""
-        return dataclasses.replace(self, trace=self.trace.general(), soft=soft)
+    def general(self, *, soft: bool, by_call: bool = False) -> RelightConfig:
+        """For any scene in which as much is known of the receiver; ``by_call`` as in ``TraceConfig.general``."""
+        return dataclasses.replace(self, trace=self.trace.general(by_call=by_call), soft=soft)
 
     def __post_init__(self) -> None:
         known = dict.fromkeys((*METHODS, *READINGS))
@@ -245,6 +245,24 @@ class Receiver:
     cells: ReceiverCells
 
 
+@wp.func
+def look_up_ambient(scene: RayScene, receiver: Receiver, hit: Hit, row: wp.int32, col: wp.int32) -> wp.vec4:
+    """Ambient visibility of what a pixel shows, and 1; zero where no cell around it knows (``look_up_cells``)."""
+    cells = receiver.cells
+    key = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
+    size = wp.vec2i(receiver.picture.frame.shape[0], receiver.picture.frame.shape[1])
+    return look_up_cells(cells.ambient_visibility, cells.ambient_surface, cells.ambient_stride, key, size, row, col)
+
+
+@wp.func
+def look_up_bounced(scene: RayScene, receiver: Receiver, hit: Hit, row: wp.int32, col: wp.int32) -> wp.vec4:
+    """Irradiance by virtual light that other proxies send to what a pixel shows, and 1; zero where there is none."""
+    cells = receiver.cells
+    key = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
+    size = wp.vec2i(receiver.picture.frame.shape[0], receiver.picture.frame.shape[1])
+    return look_up_cells(cells.bounced, cells.bounced_surface, cells.bounced_stride, key, size, row, col)
+
+
 @wp.struct
 class Matter:
     """What a point of the receiver is taken to be."""
@@ -279,8 +297,8 @@ def make_find_matter(config: RelightConfig) -> wp.Function:
         if wp.static(reading is not None):
             if wp.static(reading is not None and reading.values == "video"):
                 seen = receiver.picture
-                lacking = cut_luma(seen.frame, seen.decode_table, seen.linear, row, col)
-                matter.m = wp.clamp((wp.float32(intensity(seen.frame[row, col])) + lacking) / 255.0, 0.0, 1.0)
+                cut = cut_luma(seen.frame, seen.decode_table, seen.linear, row, col)
+                matter.m = wp.clamp((wp.float32(intensity(seen.frame[row, col])) + cut) / 255.0, 0.0, 1.0)
             else:
                 matter.m = luminance(coded)
         else:
@@ -302,12 +320,7 @@ def make_find_matter(config: RelightConfig) -> wp.Function:
                     distant = add_emitters(distant, receiver.emitters, hit.point, hit.normal)
                 if wp.static(config.ambient_visibility):
                     if not is_mirrored:
-                        cells = receiver.cells
-                        key = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
-                        size = wp.vec2i(receiver.picture.frame.shape[0], receiver.picture.frame.shape[1])
-                        visibility = cells.ambient_visibility
-                        stride = cells.ambient_stride
-                        left = look_up_cells(visibility, cells.ambient_surface, stride, key, size, row, col)
+                        left = look_up_ambient(scene, receiver, hit, row, col)
                         if left[3] > 0.0:
                             distant = wp.cw_mul(distant, wp.vec3(left[0], left[1], left[2]))
                 matter.kd = wp.vec3(

@@ -32,16 +32,16 @@ import functools
 
 import warp as wp
 
-from warp_ar.kernels.cells import cell_pixel, look_up_cells
-from warp_ar.kernels.environment_samples import EnvironmentSample, sample_toward
+from warp_ar.kernels.cells import cell_pixel
+from warp_ar.kernels.environment_samples import EnvironmentSample, Incidence, sample_toward
 from warp_ar.kernels.irradiance import sh_irradiance
 from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch, launch_rows
-from warp_ar.kernels.receiver import DEFAULT_REFLECTANCE, Receiver, ReceiverCells, RelightConfig
+from warp_ar.kernels.receiver import DEFAULT_REFLECTANCE, Receiver, ReceiverCells, RelightConfig, look_up_bounced
 from warp_ar.kernels.relight import make_direct_lighting
 from warp_ar.kernels.shadow import sample_light, tile_turn
 from warp_ar.kernels.shapes import intersect_sphere, surface_key
-from warp_ar.kernels.structs import PLANE, FrameParams, Light, RayScene
+from warp_ar.kernels.structs import PLANE, FrameParams, Hit, Light, RayScene
 from warp_ar.kernels.trace import TraceConfig, make_trace, offset_origin
 from warp_ar.kernels.visibility import inside_rect, make_visible_proxy
 
@@ -135,13 +135,75 @@ def make_mean_facing(config: CellConfig) -> wp.Function:
     return mean_facing
 
 
+@wp.func
+def bound_solids(scene: RayScene) -> wp.vec4:
+    """Middle and radius of one ball around all proxies that can hide light: all but planes."""
+    middle = wp.vec3()
+    solid = float(0.0)
+    for index in range(scene.proxies.shape[0]):
+        if scene.proxies[index].kind != PLANE:
+            middle += scene.proxies[index].position
+            solid += 1.0
+    middle = middle / wp.max(solid, 1.0)
+    reach = float(0.0)
+    for index in range(scene.proxies.shape[0]):
+        shape = scene.proxies[index]
+        if shape.kind != PLANE:
+            reach = wp.max(reach, wp.length(shape.position - middle) + shape.scale * wp.length(shape.extent))
+    return wp.vec4(middle[0], middle[1], middle[2], reach)
+
+
+@wp.struct
+class Hider:
+    """What stands between a point of the receiver and a sample of the environment."""
+
+    hides: wp.bool
+    radiance: wp.vec3  # that it sends along the sample's direction
+
+
+@functools.cache
+def make_find_hider(config: CellConfig) -> wp.Function:
+    """``find_hider(scene, receiver, hit, toward, solids) -> Hider``; ``solids`` of ``bound_solids``."""
+    mean_facing = make_mean_facing(config)
+    closest_proxy = make_trace(config.trace).closest_proxy
+    only_planes = set(config.trace.proxies) <= {PLANE}
+
+    @wp.func(module="unique")
+    def find_hider(scene: RayScene, receiver: Receiver, hit: Hit, toward: Incidence, solids: wp.vec4) -> Hider:
+        found = Hider()
+        nearest = toward.distance
+        for index in range(receiver.probes.shape[0]):
+            probe = receiver.probes[index]
+            away = probe.center - hit.point
+            if meets_ball(away, probe.radius, toward.direction):
+                t = intersect_sphere(probe.radius, -away, toward.direction, nearest)
+                if t < nearest:
+                    nearest = t
+                    found.hides = True
+                    normal = (t * toward.direction - away) / probe.radius
+                    found.radiance = wp.cw_mul(probe.reflectance, mean_facing(receiver, normal))
+        if wp.static(not only_planes):
+            # Most samples pass by the ball around all proxies.
+            if meets_ball(wp.vec3(solids[0], solids[1], solids[2]) - hit.point, solids[3], toward.direction):
+                origin = offset_origin(hit.point, hit.geometric_normal, toward.direction, hit.error)
+                hidden = closest_proxy(scene, origin, toward.direction, nearest)
+                if hidden.shape >= 0:
+                    if scene.proxies[hidden.shape].kind != PLANE:
+                        facing = hidden.normal
+                        if wp.dot(facing, toward.direction) > 0.0:
+                            facing = -facing
+                        found.hides = True
+                        found.radiance = DEFAULT_REFLECTANCE * mean_facing(receiver, facing)
+        return found
+
+    return find_hider
+
+
 @functools.cache
 def make_ambient_visibility_kernel(config: CellConfig) -> wp.Kernel:
     """Kernel of ``estimate_ambient_visibility``."""
     visible_proxy = make_visible_proxy(config.trace, config.relight.probes)
-    mean_facing = make_mean_facing(config)
-    closest_proxy = make_trace(config.trace).closest_proxy
-    only_planes = set(config.trace.proxies) <= {PLANE}
+    find_hider = make_find_hider(config)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def ambient_visibility_kernel(
@@ -152,9 +214,7 @@ def make_ambient_visibility_kernel(config: CellConfig) -> wp.Kernel:
         lights: wp.array[Light],
         receiver: Receiver,
         samples: wp.array[EnvironmentSample],
-        count: wp.int32,
         bounced: wp.bool,
-        partials: wp.int32,
         # Out:
         cells_out: ReceiverCells,
         sums_out: wp.array3d[wp.vec3],
@@ -165,6 +225,7 @@ def make_ambient_visibility_kernel(config: CellConfig) -> wp.Kernel:
         stride = cells_out.ambient_stride
         share_out = cells_out.ambient_visibility
         surface_out = cells_out.ambient_surface
+        partials = wp.max(sums_out.shape[0] / KINDS, 1)
         partial = ci / share_out.shape[0]
         ci = ci % share_out.shape[0]
         # One thread of a cell writes its surface, and no surface that another may still read as found before.
@@ -183,9 +244,7 @@ def make_ambient_visibility_kernel(config: CellConfig) -> wp.Kernel:
         key = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
         needed = bool(False)
         if bounced:
-            cells = receiver.cells
-            size = wp.vec2i(rays.shape[0], rays.shape[1])
-            sent = look_up_cells(cells.bounced, cells.bounced_surface, cells.bounced_stride, key, size, i, j)
+            sent = look_up_bounced(scene, receiver, hit, i, j)
             needed = sent[0] + sent[1] + sent[2] > 0.0
         else:
             for index in range(lights.shape[0]):
@@ -196,22 +255,10 @@ def make_ambient_visibility_kernel(config: CellConfig) -> wp.Kernel:
             return
         if partial == 0:
             surface_out[ci, cj] = wp.where(partials > 1, PENDING - key, key)
-        # One ball around all that can hide light and is no mirror ball: most samples pass it by.
-        middle = wp.vec3()
-        solid = float(0.0)
-        reach = float(0.0)
-        if wp.static(not only_planes):
-            for index in range(scene.proxies.shape[0]):
-                if scene.proxies[index].kind != PLANE:
-                    middle += scene.proxies[index].position
-                    solid += 1.0
-            middle = middle / wp.max(solid, 1.0)
-            for index in range(scene.proxies.shape[0]):
-                shape = scene.proxies[index]
-                if shape.kind != PLANE:
-                    reach = wp.max(reach, wp.length(shape.position - middle) + shape.scale * wp.length(shape.extent))
+        solids = bound_solids(scene)
         whole = wp.vec3()
         lost = wp.vec3()
+        count = samples.shape[0]
         for k in range(count * partial / partials, count * (partial + 1) / partials):
             sample = samples[k]
             toward = sample_toward(sample, hit.point)
@@ -219,32 +266,9 @@ def make_ambient_visibility_kernel(config: CellConfig) -> wp.Kernel:
             if cosine > 0.0:
                 flux = cosine * toward.measure * sample.radiance
                 whole += flux
-                nearest = toward.distance
-                hides = bool(False)
-                radiance = wp.vec3()  # of what hides the sample
-                for index in range(receiver.probes.shape[0]):
-                    probe = receiver.probes[index]
-                    away = probe.center - hit.point
-                    if meets_ball(away, probe.radius, toward.direction):
-                        t = intersect_sphere(probe.radius, -away, toward.direction, nearest)
-                        if t < nearest:
-                            nearest = t
-                            hides = True
-                            normal = (t * toward.direction - away) / probe.radius
-                            radiance = wp.cw_mul(probe.reflectance, mean_facing(receiver, normal))
-                if wp.static(not only_planes):
-                    if meets_ball(middle - hit.point, reach, toward.direction):
-                        origin = offset_origin(hit.point, hit.geometric_normal, toward.direction, hit.error)
-                        hidden = closest_proxy(scene, origin, toward.direction, nearest)
-                        if hidden.shape >= 0:
-                            if scene.proxies[hidden.shape].kind != PLANE:
-                                facing = hidden.normal
-                                if wp.dot(facing, toward.direction) > 0.0:
-                                    facing = -facing
-                                hides = True
-                                radiance = DEFAULT_REFLECTANCE * mean_facing(receiver, facing)
-                if hides:
-                    lost += cosine * toward.measure * (sample.radiance - radiance)
+                hider = find_hider(scene, receiver, hit, toward, solids)
+                if hider.hides:
+                    lost += cosine * toward.measure * (sample.radiance - hider.radiance)
         if partials > 1:
             sums_out[partial * KINDS, ci, cj] = whole
             sums_out[partial * KINDS + 1, ci, cj] = lost
@@ -402,7 +426,6 @@ def estimate_ambient_visibility(
     lights: wp.array[Light],
     receiver: Receiver,
     samples: wp.array[EnvironmentSample],
-    count: int,
     cells_out: ReceiverCells,
     *,
     bounced: bool = False,
@@ -418,9 +441,8 @@ def estimate_ambient_visibility(
         lights: (n,) Light.
         receiver: From ``make_receiver``: picture, balls and the environment's irradiance; with the cells of
             ``gather_light`` if ``bounced``.
-        samples: (n,) of the environment.
-        count: How many of them are used, the first ones. The same for all cells, so there is no noise; an aligned block
-            of Sobol's sequence if it is a power of 2.
+        samples: (n,) of the environment. The same for all cells, so there is no noise; the first n of a longer
+            sequence are an aligned block of Sobol's if n is a power of 2.
         cells_out: Cells whose ambient visibility and its surface are written.
         bounced: Whether to add cells that get bounced light to those that were estimated before.
         sums_out: Scratch of ``partial_sums_shape`` in which several threads share a cell; ``rows`` must be None then.
@@ -432,7 +454,7 @@ def estimate_ambient_visibility(
     launch_rows(
         make_ambient_visibility_kernel(config),
         (shape[0] * partials, shape[1]),
-        [params, scene, lights, receiver, samples, min(count, samples.shape[0]), bounced, partials],
+        [params, scene, lights, receiver, samples, bounced],
         [cells_out, sums_out],
         rows=rows,
         device=device,

@@ -170,7 +170,7 @@ def add_recovered_kernel(
     # Out:
     recovered_out: wp.array2d[wp.vec3],
 ):
-    """Every texel of a cell plus its share of the cell's excess."""
+    """Every texel of a cell plus its share of the cell's recovered radiance."""
     band_row, column = wp.tid()
     row = row_start + band_row
     height = radiance.shape[0]
@@ -211,15 +211,15 @@ def add_recovered(
 ) -> None:
     """Give texels back what they lost.
 
-    Where more or less of a cell clips than when its excess was found, the energy stays what was found: a thousandth
-    that clips can have a high excess, and in the next frame be half of the cell; a video codec takes the weakest
-    channel of an emitter across the limit and back. Below a quarter of the share the energy falls with it.
+    Where more or less of a cell clips than when its radiance was recovered, the energy stays what was found: a
+    thousandth that clips can have a high radiance, and in the next frame be half of the cell; a video codec takes the
+    weakest channel of an emitter across the limit and back. Below a quarter of the share the energy falls with it.
 
     Args:
         radiance: As captured and completed, ``wp.vec3`` (h, w).
         confidence: How well each texel was seen, ``wp.float32`` (h, w).
         missing: Share at clipping per channel from ``weigh_boundaries``, ``wp.vec3`` (h, w).
-        cells: ``Cell``, ``cell_shape(h, w)``, of when the excess was found.
+        cells: ``Cell``, ``cell_shape(h, w)``, of when that was.
         recovered: Radiance that a wholly clipped texel lacks, per cell: ``wp.vec3``, ``cell_shape(h, w)``.
         recovered_out: ``wp.vec3`` (h, w).
         rows: Band of rows of cells, None for all.

@@ -5,6 +5,7 @@ the proxies place in space. Near an object the two differ by parallax, so a ray 
 the picture. A point outside the picture, on a face turned away, or hidden from the camera by a proxy or a ball, is
 looked up in the environment instead. Proxies are taken as matt: they look the same from the camera and from the point.
 Emitters of the environment that are known by their places are seen, and light objects, from there (see ``emitters``).
+The light of several mirror balls is interpolated (see ``probe_weights``).
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.kernels.lobes import level_from_roughness, level_from_shininess, sample_levels
 from warp_ar.kernels.materials import lobe_axis, make_surface, reflect, specular_occlusion
 from warp_ar.kernels.pixels import shown_radiance
+from warp_ar.kernels.probe_weights import probe_weight
 from warp_ar.kernels.structs import (
     LAMBERT,
     METALLIC_ROUGHNESS,
@@ -66,19 +68,23 @@ class DistantLightConfig:
     """Whether emitters of the environment are known by their places."""
     captured: bool = False
     """Whether the environment is known without mirror balls, from a file."""
+    several: bool = False
+    """Whether the light is interpolated between that of several mirror balls."""
     gathered: bool = True
     """Whether rays that happen to meet what emits bring its light; else ``area_lights`` are looked for themselves."""
 
-    def general(self, form: DiffuseForm) -> DistantLightConfig:
+    def general(self, form: DiffuseForm, *, by_call: bool = False) -> DistantLightConfig:
         """For any scene with as many mirror balls, textures or not: forms that it does not call for may be empty.
 
         Args:
             form: Where irradiance comes from in scenes that call for it.
+            by_call: As in ``TraceConfig.general``.
         """
         models = tuple(sorted(map(int, (LAMBERT, PHONG, MIRROR, METALLIC_ROUGHNESS))))
         known = self.probes or self.captured
         diffuse: DiffuseForm = form if known else "none"
-        return dataclasses.replace(self, trace=self.trace.general(), models=models, diffuse=diffuse, specular=known)
+        trace = self.trace.general(by_call=by_call)
+        return dataclasses.replace(self, trace=trace, models=models, diffuse=diffuse, specular=known)
 
 
 @wp.struct
@@ -93,6 +99,12 @@ class DistantLight:
     dfg: wp.array2d[wp.vec2]  # of ``integrate_dfg``, for METALLIC_ROUGHNESS
     probes: wp.array[Probe]
     emitters: wp.array[Emitter]
+    # The light at the balls after the first, one of each after another; places are those of all.
+    places: wp.array[wp.vec4]
+    others_sh: wp.array2d[wp.vec3]
+    others_map: wp.array3d[wp.vec3]
+    others_levels: wp.array2d[wp.vec3]
+    others_emitters: wp.array2d[Emitter]
 
 
 @wp.func
@@ -214,9 +226,49 @@ def make_distant_irradiance(config: DistantLightConfig) -> wp.Function:
                     irradiance = sample_latlong(distant.irradiance_map, normal)
                 if wp.static(config.emitters):
                     irradiance = add_emitters(irradiance, distant.emitters, point, normal)
+                if wp.static(config.several):
+                    total = probe_weight(distant.places, 0, point)
+                    for ball in range(1, distant.places.shape[0]):
+                        weight = probe_weight(distant.places, ball, point)
+                        if weight > 0.0:
+                            total += weight
+                            other = wp.vec3(0.0)
+                            if wp.static(config.diffuse == "sh"):
+                                other = sh_irradiance(distant.others_sh[ball - 1], normal)
+                            if wp.static(config.diffuse == "map"):
+                                other = sample_latlong(distant.others_map[ball - 1], normal)
+                            if wp.static(config.emitters):
+                                other = add_emitters(other, distant.others_emitters[ball - 1], point, normal)
+                            irradiance += (weight / total) * (other - irradiance)
         return irradiance
 
     return distant_irradiance
+
+
+@functools.cache
+def make_radiance_along(config: DistantLightConfig) -> wp.Function:
+    """``radiance_along(distant, point, direction, level) -> vec3``: a level of the environment, as a point sees it."""
+
+    @wp.func(module="unique")
+    def radiance_along(distant: DistantLight, point: wp.vec3, direction: wp.vec3, level: wp.float32) -> wp.vec3:
+        toward = direction
+        if wp.static(config.emitters):
+            toward = correct_parallax(distant.emitters, point, direction)
+        radiance = sample_levels(distant.levels, toward, level, distant.level_height)
+        if wp.static(config.several):
+            total = probe_weight(distant.places, 0, point)
+            for ball in range(1, distant.places.shape[0]):
+                weight = probe_weight(distant.places, ball, point)
+                if weight > 0.0:
+                    total += weight
+                    toward = direction
+                    if wp.static(config.emitters):
+                        toward = correct_parallax(distant.others_emitters[ball - 1], point, direction)
+                    other = sample_levels(distant.others_levels[ball - 1], toward, level, distant.level_height)
+                    radiance += (weight / total) * (other - radiance)
+        return radiance
+
+    return radiance_along
 
 
 @functools.cache
@@ -226,6 +278,7 @@ def make_reflected_radiance(config: DistantLightConfig) -> wp.Function:
     The lobe is that of a surface at ``point``, around ``direction`` (unit). ``floor`` is the least level to read: 0 for
     what is looked at, more for what is only one ray of many.
     """
+    radiance_along = make_radiance_along(config)
 
     @wp.func(module="unique")
     def reflected_radiance(
@@ -237,9 +290,6 @@ def make_reflected_radiance(config: DistantLightConfig) -> wp.Function:
         direction: wp.vec3,
         floor: wp.float32,
     ) -> wp.vec3:
-        toward = direction
-        if wp.static(config.emitters):
-            toward = correct_parallax(distant.emitters, point, direction)
         level = level_from_roughness(roughness, distant.level_height)
         if wp.static(PHONG in config.models):
             if model == PHONG:
@@ -247,6 +297,6 @@ def make_reflected_radiance(config: DistantLightConfig) -> wp.Function:
         if wp.static(MIRROR in config.models):
             if model == MIRROR:
                 level = 0.0
-        return sample_levels(distant.levels, toward, wp.max(level, floor), distant.level_height)
+        return radiance_along(distant, point, direction, wp.max(level, floor))
 
     return reflected_radiance

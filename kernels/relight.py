@@ -25,7 +25,7 @@ import math
 import warp as wp
 
 from warp_ar.kernels.area_lights import make_area_count, make_area_sample
-from warp_ar.kernels.cells import any_cell_above_zero, look_up_cells
+from warp_ar.kernels.cells import any_cell_above_zero
 from warp_ar.kernels.edges import EdgeList, EdgeLists, holds_all, list_edge, listed_edges, sample_listed_edges
 from warp_ar.kernels.launch import MOST_REGISTERS, QUICK_TO_COMPILE, Rows, launch, launch_rows, slow_to_compile
 from warp_ar.kernels.receiver import (
@@ -33,6 +33,7 @@ from warp_ar.kernels.receiver import (
     Matter,
     Receiver,
     RelightConfig,
+    look_up_bounced,
     make_find_matter,
     make_respond,
 )
@@ -158,11 +159,7 @@ def make_direct_lighting(config: RelightConfig) -> wp.Function:
                     added += by_areas
         if wp.static(config.bounced):
             if mirror[0] <= 0.0:
-                cells = receiver.cells
-                key = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
-                size = wp.vec2i(receiver.picture.frame.shape[0], receiver.picture.frame.shape[1])
-                stride = cells.bounced_stride
-                bounced = look_up_cells(cells.bounced, cells.bounced_surface, stride, key, size, row, col)
+                bounced = look_up_bounced(scene, receiver, hit, row, col)
                 if bounced[0] + bounced[1] + bounced[2] > 0.0:
                     result.visibility |= _LIT
                     if not known:

@@ -112,14 +112,6 @@ def sample_disk(u: wp.vec2) -> wp.vec2:
 
 
 @wp.func
-def sample_uniform_hemisphere(u: wp.vec2) -> wp.vec3:
-    """Direction with pdf 1 / (2 pi)."""
-    sin_theta = wp.sqrt(u[0] * (2.0 - u[0]))  # 1 - (1 - u)^2 without cancellation near the pole
-    phi = 2.0 * PI * u[1]
-    return wp.vec3(sin_theta * wp.cos(phi), sin_theta * wp.sin(phi), 1.0 - u[0])
-
-
-@wp.func
 def sample_cosine_hemisphere(u: wp.vec2) -> wp.vec3:
     """Direction with pdf cos_theta / pi (Malley's method)."""
     disk = sample_disk(u)
@@ -178,23 +170,6 @@ def ggx_masking(w: wp.vec3, alpha: wp.float32) -> wp.float32:
 def ggx_masking_shadowing(wi: wp.vec3, wo: wp.vec3, alpha: wp.float32) -> wp.float32:
     """Height-correlated Smith G2 ([Heitz14] eq. 99)."""
     return 1.0 / (1.0 + ggx_lambda(wi, alpha) + ggx_lambda(wo, alpha))
-
-
-@wp.func
-def sample_ggx(u: wp.vec2, alpha: wp.float32) -> wp.vec3:
-    """Half vector with pdf ``ggx_pdf``: D(wh) cos_theta_h. tan^2 theta = a^2 u / (1 - u)."""
-    a = wp.max(alpha, MIN_ALPHA)
-    denominator = 1.0 - u[0] + a * a * u[0]
-    cos_theta = wp.sqrt((1.0 - u[0]) / denominator)
-    sin_theta = a * wp.sqrt(u[0] / denominator)
-    phi = 2.0 * PI * u[1]
-    return wp.vec3(sin_theta * wp.cos(phi), sin_theta * wp.sin(phi), cos_theta)
-
-
-@wp.func
-def ggx_pdf(wh: wp.vec3, alpha: wp.float32) -> wp.float32:
-    """Pdf of ``sample_ggx``."""
-    return ggx_distribution(wh, alpha) * wp.max(wh[2], 0.0)
 
 
 @wp.func

@@ -91,12 +91,35 @@ class ShadeConfig:
     area_samples: int = 0
     """Samples of what emits, per point; ``area_lights.POINT_SAMPLES``: as lights at points; 0: nothing emits."""
 
-    def general(self, form: DiffuseForm, *, soft: bool) -> ShadeConfig:
-        """For any scene with as many mirror balls; ``form`` is that of ``DistantLightConfig.general``."""
-        return dataclasses.replace(self, distant=self.distant.general(form), lights=ALL_LIGHTS, soft=soft)
+    def general(self, form: DiffuseForm, *, soft: bool, by_call: bool = False) -> ShadeConfig:
+        """For any scene with as many mirror balls; ``form`` and ``by_call`` as in ``DistantLightConfig.general``."""
+        distant = self.distant.general(form, by_call=by_call)
+        return dataclasses.replace(self, distant=distant, lights=ALL_LIGHTS, soft=soft)
 
     def __post_init__(self) -> None:
         check_edge_samples(self.edge_samples)
+
+
+@wp.struct
+class ObjectLight:
+    """All that lights virtual objects; what a ``ShadeConfig`` leaves out may be empty."""
+
+    lights: wp.array[Light]
+    distant: DistantLight  # neither its map nor its probes are read
+    near: NearLight  # of ``filter_near_field``
+
+
+def make_object_light(
+    distant: DistantLight, lights: wp.array | None = None, near: NearLight | None = None
+) -> ObjectLight:
+    """The environment, virtual lights and what is near together; None for what there is not."""
+    light = ObjectLight()
+    light.distant = distant
+    if lights is not None:
+        light.lights = lights
+    if near is not None:
+        light.near = near
+    return light
 
 
 @wp.struct
@@ -312,10 +335,8 @@ def make_shade_sample(config: ShadeConfig) -> wp.Function:
         params: wp.array[FrameParams],
         rays: wp.array2d[wp.vec2],
         scene: RayScene,
-        lights: wp.array[Light],
-        distant: DistantLight,
+        light: ObjectLight,
         visible: VisibleObjects,
-        near: NearLight,
         pixel: wp.vec2i,
         sample: wp.int32,
         centre: Hit,
@@ -339,13 +360,13 @@ def make_shade_sample(config: ShadeConfig) -> wp.Function:
             point.known = alike[0] >= 0
             if point.known:
                 if wp.static(config.distant.diffuse != "none"):
-                    if near.irradiance.shape[0] > 0:
-                        point.irradiance = near.irradiance[alike[0], alike[1]]
+                    if light.near.irradiance.shape[0] > 0:
+                        point.irradiance = light.near.irradiance[alike[0], alike[1]]
                 if wp.static(config.distant.specular):
-                    if near.reflected.shape[0] > 0:
-                        point.reflected = near.reflected[alike[0], alike[1]]
+                    if light.near.reflected.shape[0] > 0:
+                        point.reflected = light.near.reflected[alike[0], alike[1]]
         spread = scene.pixel_spread
-        radiance = shade_hit(scene, lights, distant, hit, direction, point, tile_turn(i, j), spread)
+        radiance = shade_hit(scene, light.lights, light.distant, hit, direction, point, tile_turn(i, j), spread)
         return wp.vec4(radiance[0], radiance[1], radiance[2], 1.0)
 
     return shade_sample
@@ -371,10 +392,8 @@ def make_shade_kernel(config: ShadeConfig, edges: str = SAMPLED) -> wp.Kernel:
         params: wp.array[FrameParams],
         rays: wp.array2d[wp.vec2],
         scene: RayScene,
-        lights: wp.array[Light],
-        distant: DistantLight,
+        light: ObjectLight,
         visible: VisibleObjects,
-        near: NearLight,
         # Out:
         virtual_out: wp.array2d[wp.vec4],
         list_out: EdgeList,
@@ -407,7 +426,7 @@ def make_shade_kernel(config: ShadeConfig, edges: str = SAMPLED) -> wp.Kernel:
             pixel = wp.vec2i(i, j)
             for number in range(samples):
                 sample = wp.where(wp.static(edges == LISTED) or samples == 1, ALONE, number)
-                result += shade_sample(params, rays, scene, lights, distant, visible, near, pixel, sample, hit)
+                result += shade_sample(params, rays, scene, light, visible, pixel, sample, hit)
             if samples > 1:
                 result = result / wp.float32(samples)
         if wp.static(edges == LEFT):
@@ -430,10 +449,8 @@ def make_sample_edges_kernel(config: ShadeConfig) -> wp.Kernel:
         params: wp.array[FrameParams],
         rays: wp.array2d[wp.vec2],
         scene: RayScene,
-        lights: wp.array[Light],
-        distant: DistantLight,
+        light: ObjectLight,
         visible: VisibleObjects,
-        near: NearLight,
         listed: EdgeList,
         # Out:
         samples_out: wp.array[wp.vec4],
@@ -443,7 +460,7 @@ def make_sample_edges_kernel(config: ShadeConfig) -> wp.Kernel:
         while item < stop:
             pixel = listed.edges[item / wp.static(config.edge_samples)]
             sample = item % wp.static(config.edge_samples)
-            samples_out[item] = shade_sample(params, rays, scene, lights, distant, visible, near, pixel, sample, Hit())
+            samples_out[item] = shade_sample(params, rays, scene, light, visible, pixel, sample, Hit())
             item += threads
 
     return sample_edges_kernel
@@ -454,12 +471,10 @@ def shade(
     params: wp.array[FrameParams],
     rays: wp.array2d[wp.vec2],
     scene: RayScene,
-    lights: wp.array[Light] | None,
-    distant: DistantLight,
+    light: ObjectLight,
     visible: VisibleObjects,
     virtual_out: wp.array2d[wp.vec4],
     *,
-    near: NearLight | None = None,
     edge_lists: EdgeLists | None = None,
     rows: Rows | None = None,
 ) -> None:
@@ -473,15 +488,13 @@ def shade(
         params: Frame values: camera and object_rect.
         rays: (H, W) undistorted x / z and y / z of each pixel centre.
         scene: What rays meet, and what it is made of.
-        lights: Virtual lights.
-        distant: The environment; neither its map nor its probes are read.
+        light: From ``make_object_light``; what is near is needed if ``config.near_field``.
         visible: (H, W) as ``trace_pixels`` writes.
         virtual_out: (H, W) premultiplied linear RGB and coverage; zero outside ``params.object_rect``.
-        near: (H, W) as ``filter_near_field`` writes; needed if ``config.near_field``.
         edge_lists: Scratch, for a launch over all rows.
         rows: Band of rows; None means all.
     """
-    inputs = [params, rays, scene, lights, distant, visible, NearLight() if near is None else near]
+    inputs = [params, rays, scene, light, visible]
     device = rays.device
     if edge_lists is None or config.edge_samples == 1:
         launch_rows(make_shade_kernel(config), rays.shape, inputs, [virtual_out, EdgeList()], rows=rows, device=device)

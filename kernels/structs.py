@@ -129,10 +129,6 @@ class Material:
     emissive_texture: wp.int32
 
 
-TEXTURES = tuple(name for name in Material.vars if name.endswith("_texture"))
-"""Fields of a material that are the index of a texture, or -1."""
-
-
 @wp.struct
 class Texture:
     """One use of a picture: where its texels lie, row 0 is v = 1 (the image's top), and how they are read."""
@@ -183,6 +179,7 @@ class RayScene:
     area_lights: wp.array[AreaLight]  # the objects that do
     emitting_faces: wp.array[wp.vec3i]  # object; triangle of its mesh, -1: the whole sphere; 1: only its front emits
     emitting_shares: wp.array[wp.float32]  # of all that is emitted, by this face and those before it; the last is 1
+    walks: wp.uint64  # on CPU the address of its table of kernels/called_walks.py; else 0
 
 
 @wp.struct

@@ -121,7 +121,7 @@ def write_cut(
         frame: (H, W) vec3ub, RGB codes.
         decode_table: (256,) vec3, linear value of each code.
         linear: (H, W) vec3, linear radiance.
-        cut_out: (H, W) vec3ub, greys: ``NOT_CUT`` and ``CUT_STEPS`` for each code that is lacking.
+        cut_out: (H, W) vec3ub, greys: ``NOT_CUT`` and ``CUT_STEPS`` for each code that is cut off.
         rows: Band of rows; None means all.
     """
     inputs = [frame, decode_table, linear]

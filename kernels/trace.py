@@ -1,7 +1,8 @@
 """Rays through the scene: the closest hit and any hit among objects and proxies.
 
 Functions that walk the scene come from ``make_trace``, specialised to the kinds of shape that are there: a scene of
-spheres holds no mesh code. ``kernels/shapes.py`` has the shapes one by one; here rays also leave surfaces
+spheres holds no mesh code. Kernels on CPU that all scenes share call one walk through all kinds by its address
+(``kernels/called_walks.py``). ``kernels/shapes.py`` has the shapes one by one; here rays also leave surfaces
 (``offset_origin``) and meet mirror balls (``meets_probe``).
 
 References:
@@ -16,6 +17,7 @@ from typing import NamedTuple
 
 import warp as wp
 
+from warp_ar.kernels import called_walks
 from warp_ar.kernels.mesh_detail import bumped, intersect_solid
 from warp_ar.kernels.shapes import (
     FAR,
@@ -42,6 +44,8 @@ wp.set_module_options({"enable_backward": False})
 
 ALL_KINDS = tuple(sorted(map(int, (SPHERE, BOX, PLANE, MESH))))
 """Of shapes."""
+BY_CALL = (-1,)
+"""In place of kinds: any, by a walk that is called (``kernels/called_walks.py``). Only scenes on CPU have one."""
 
 
 @wp.func
@@ -83,7 +87,7 @@ class Trace(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class TraceConfig:
-    """Which kinds of shape exist; the others are not compiled in. Kinds are sorted and unique."""
+    """Which kinds of shape exist; the others are not compiled in. Kinds are sorted and unique, or ``BY_CALL``."""
 
     objects: tuple[int, ...]
     """Kinds among the virtual objects."""
@@ -94,8 +98,14 @@ class TraceConfig:
     stretched: bool = False
     """Whether any object may be stretched."""
 
-    def general(self) -> TraceConfig:
-        """For any scene with such triangles or without: each shape's kind is asked for as it is met."""
+    def general(self, *, by_call: bool = False) -> TraceConfig:
+        """For any scene with such triangles or without: each shape's kind is asked for as it is met.
+
+        Args:
+            by_call: Whether walks are called, those of any triangles then; for kernels that run on CPU.
+        """
+        if by_call:
+            return TraceConfig(BY_CALL, BY_CALL)
         return TraceConfig(ALL_KINDS, ALL_KINDS, self.detail, self.stretched)
 
 
@@ -298,35 +308,63 @@ def _make_any_of_both(kinds: tuple[int, ...], detail: bool, stretched: bool) -> 
 @functools.cache
 def make_trace(config: TraceConfig) -> Trace:
     """Functions that trace rays through a scene with the kinds of shape in ``config``; equal configs share them."""
-    closest_shape_object = _make_closest(config.objects, config.detail, config.stretched)
-    closest_shape_proxy = _make_closest(config.proxies, False, False)
-    any_object = _make_any(config.objects, config.detail, config.stretched)
-    any_proxy = _make_any(config.proxies, False, False)
-
-    @wp.func(module="unique")
-    def closest_object(scene: RayScene, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> Hit:
-        return closest_shape_object(scene, scene.objects, origin, direction, t_max)
-
-    @wp.func(module="unique")
-    def closest_proxy(scene: RayScene, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> Hit:
-        return closest_shape_proxy(scene, scene.proxies, origin, direction, t_max)
-
-    @wp.func(module="unique")
-    def occluded_by_objects(scene: RayScene, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
-        return any_object(scene, scene.objects, origin, direction, t_max)
-
-    @wp.func(module="unique")
-    def occluded_by_proxies(scene: RayScene, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
-        return any_proxy(scene, scene.proxies, origin, direction, t_max)
-
-    if config.objects == config.proxies:
+    closest_object, any_object = _through_objects(config)
+    closest_proxy, any_proxy = _through_proxies(config.proxies)
+    if config.objects == config.proxies == BY_CALL:
+        occluded = called_walks.call_any_of_both
+    elif config.objects == config.proxies:
         occluded = _make_any_of_both(config.objects, config.detail, config.stretched)
     else:
 
         @wp.func(module="unique")
         def occluded(scene: RayScene, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
-            if any_object(scene, scene.objects, origin, direction, t_max):
+            if any_object(scene, origin, direction, t_max):
                 return True
-            return any_proxy(scene, scene.proxies, origin, direction, t_max)
+            return any_proxy(scene, origin, direction, t_max)
 
-    return Trace(closest_object, closest_proxy, occluded_by_objects, occluded_by_proxies, occluded)
+    return Trace(closest_object, closest_proxy, any_object, any_proxy, occluded)
+
+
+def _through_objects(config: TraceConfig) -> tuple[wp.Function, wp.Function]:
+    """Closest and any hit among objects."""
+    if config.objects == BY_CALL:
+        return called_walks.call_closest_object, called_walks.call_any_object
+    closest, any_hit = make_walks(config.objects, config.detail, config.stretched)
+
+    @wp.func(module="unique")
+    def closest_object(scene: RayScene, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> Hit:
+        return closest(scene, scene.objects, origin, direction, t_max)
+
+    @wp.func(module="unique")
+    def occluded_by_objects(scene: RayScene, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
+        return any_hit(scene, scene.objects, origin, direction, t_max)
+
+    return closest_object, occluded_by_objects
+
+
+def _through_proxies(kinds: tuple[int, ...]) -> tuple[wp.Function, wp.Function]:
+    """Closest and any hit among proxies."""
+    if kinds == BY_CALL:
+        return called_walks.call_closest_proxy, called_walks.call_any_proxy
+    closest, any_hit = make_walks(kinds, False, False)
+
+    @wp.func(module="unique")
+    def closest_proxy(scene: RayScene, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> Hit:
+        return closest(scene, scene.proxies, origin, direction, t_max)
+
+    @wp.func(module="unique")
+    def occluded_by_proxies(scene: RayScene, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
+        return any_hit(scene, scene.proxies, origin, direction, t_max)
+
+    return closest_proxy, occluded_by_proxies
+
+
+def make_walks(kinds: tuple[int, ...], detail: bool, stretched: bool) -> tuple[wp.Function, wp.Function]:
+    """Closest and any hit among shapes of some kinds, each taking ``(scene, shapes, origin, direction, t_max)``.
+
+    Args:
+        kinds: Of the shapes.
+        detail: As in ``TraceConfig``.
+        stretched: As in ``TraceConfig``.
+    """
+    return _make_closest(kinds, detail, stretched), _make_any(kinds, detail, stretched)

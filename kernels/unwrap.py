@@ -47,6 +47,11 @@ pixel it finds there spreads over another 0.7; the rest is for the tracked outli
 RIM_WIDTH = 1.5
 """Pixels over which confidence then rises to its full value."""
 
+ALL_ALIKE = -1
+"""Number of no ball."""
+BORROWED = wp.constant(wp.float32(1.0e-3))
+"""Share of its vote that a ball has in the map of another one."""
+
 MAX_SAMPLES = wp.constant(8)  # per side of a texel
 HALF_DENSITY = wp.constant(wp.float32(4.0))  # pixels per steradian: a ball of 8 pixels across
 NEWTON_STEPS = wp.constant(12)  # 2 to 4 are taken from half a metre; more only where the camera almost touches the ball
@@ -112,15 +117,16 @@ class ProjectConfig:
 
 
 @functools.cache
-def make_project_corners_kernel(config: ProjectConfig) -> wp.Kernel:
-    """Kernel specialised to ``config``; equal configs share one kernel."""
-    kinds = config.occluders
+def make_hidden_by_proxies(kinds: tuple[int, ...]) -> wp.Function:
+    """``hidden_by_proxies(scene, origin, ray, t_max, pad) -> bool``: whether a proxy stands before a point of a ball.
+
+    Proxies grow by ``pad`` metres, the rim's width: what lies right beside them in the picture may show them.
+    """
 
     @wp.func(name=f"hidden_by_proxies_{'_'.join(map(str, kinds))}", module="unique")
     def hidden_by_proxies(
         scene: RayScene, origin: wp.vec3, ray: wp.vec3, t_max: wp.float32, pad: wp.float32
     ) -> wp.bool:
-        # Proxies grow by `pad` metres, the rim's width: what lies right beside them in the picture may show them.
         for index in range(scene.proxies.shape[0]):
             shape = scene.proxies[index]
             o = to_rigid_point(shape, origin)
@@ -146,6 +152,34 @@ def make_project_corners_kernel(config: ProjectConfig) -> wp.Kernel:
                     if meets_mesh(shape, o, d + up, t_max) or meets_mesh(shape, o, d - up, t_max):
                         return True
         return False
+
+    return hidden_by_proxies
+
+
+@wp.func
+def is_folded(camera: FrameParams, rays: wp.array2d[wp.vec2], point: wp.vec3, at: wp.vec3) -> wp.bool:
+    """Whether the pixel that a point is projected to looks elsewhere, as a polynomial lens beyond its field of view.
+
+    Args:
+        camera: Of the frame.
+        rays: Of its pixels.
+        point: From the camera, along the world's axes.
+        at: Column and row.
+    """
+    i = wp.int32(wp.round(wp.clamp(at[1], 0.0, wp.float32(rays.shape[0] - 1))))
+    j = wp.int32(wp.round(wp.clamp(at[0], 0.0, wp.float32(rays.shape[1] - 1))))
+    if wp.abs(at[1] - wp.float32(i)) < 1.0 and wp.abs(at[0] - wp.float32(j)) < 1.0:
+        p = wp.transpose(camera.world_from_camera) * point
+        off = wp.cw_mul(wp.vec2(p[0] / p[2], p[1] / p[2]) - rays[i, j], camera.focal)
+        return wp.length(off) > FOLD_TOLERANCE
+    return False
+
+
+@functools.cache
+def make_project_corners_kernel(config: ProjectConfig) -> wp.Kernel:
+    """Kernel specialised to ``config``; equal configs share one kernel."""
+    kinds = config.occluders
+    hidden_by_proxies = make_hidden_by_proxies(kinds)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=QUICK_TO_COMPILE)
     def project_corners_kernel(
@@ -195,14 +229,8 @@ def make_project_corners_kernel(config: ProjectConfig) -> wp.Kernel:
             return  # beside or behind the lens
         margin = wp.length(wp.vec2(edge[0] - pixel[0], edge[1] - pixel[1]))
 
-        # A polynomial lens model folds over beyond its field of view: there the pixel's own ray is another one.
-        i = wp.int32(wp.round(wp.clamp(pixel[1], 0.0, wp.float32(rays.shape[0] - 1))))
-        j = wp.int32(wp.round(wp.clamp(pixel[0], 0.0, wp.float32(rays.shape[1] - 1))))
-        if wp.abs(pixel[1] - wp.float32(i)) < 1.0 and wp.abs(pixel[0] - wp.float32(j)) < 1.0:
-            p = wp.transpose(camera.world_from_camera) * point
-            off = wp.cw_mul(wp.vec2(p[0] / p[2], p[1] / p[2]) - rays[i, j], camera.focal)
-            if wp.length(off) > FOLD_TOLERANCE:
-                return
+        if is_folded(camera, rays, point, pixel):
+            return
 
         reach = wp.length(point)
         pad = rim_start * reach / wp.min(camera.focal[0], camera.focal[1])
@@ -285,15 +313,143 @@ def vec_across(value: wp.vec3, reach: wp.int32) -> wp.vec3:
     return wp.vec3(lane_across(value[0], reach), lane_across(value[1], reach), lane_across(value[2], reach))
 
 
+@wp.struct
+class Texel:
+    """Where a frame shows a texel of the environment: its corners, as ``project_corners`` writes them."""
+
+    c00: wp.vec3
+    c01: wp.vec3
+    c10: wp.vec3
+    c11: wp.vec3
+    row: wp.int32
+    height: wp.int32  # rows of the environment
+
+
+@wp.struct
+class Footprint:
+    """Running means over samples of a texel, m += (x - m) w / W.
+
+    They are exact where all x are equal: a constant frame gives a constant map.
+    """
+
+    mean: wp.vec3
+    clipped: wp.vec3
+    total: wp.float32  # weight W
+    possible: wp.float32  # weight that all samples would have inside the rim
+
+
+@wp.func
+def footprint_samples(a0: wp.vec3, a1: wp.vec3, b0: wp.vec3, b1: wp.vec3) -> wp.int32:
+    """Samples along one side of a footprint: one per pixel of the longer of its two edges."""
+    a = wp.vec2(a1[0] - a0[0], a1[1] - a0[1])
+    b = wp.vec2(b1[0] - b0[0], b1[1] - b0[1])
+    longest = wp.sqrt(wp.max(wp.dot(a, a), wp.dot(b, b)))
+    return wp.int32(wp.clamp(wp.ceil(longest), 1.0, wp.float32(MAX_SAMPLES)))
+
+
+@functools.cache
+def make_average_footprint(method: str, linear: bool) -> wp.Function:
+    """``average_footprint(frame, table, texel, rim, lane, lanes) -> Footprint``: over every ``lanes``-th sample.
+
+    ``rim``: pixels from the silhouette at which confidence starts, and over which it rises.
+    """
+    pixel = wp.vec3 if linear else wp.vec3ub
+    to_light = keep_linear if linear else decode
+    find_levels = clip_levels if linear else saturation_codes
+    clips = is_at_clipping if linear else is_saturated
+
+    @wp.func(module="unique")
+    def average_footprint(
+        frame: wp.array2d[pixel],
+        table: wp.array[wp.vec3],
+        texel: Texel,
+        rim: wp.vec2,
+        lane: wp.int32,
+        lanes: wp.int32,
+    ) -> Footprint:
+        out = Footprint()
+        last_row = wp.float32(frame.shape[0] - 1)
+        last_column = wp.float32(frame.shape[1] - 1)
+        saturation = find_levels(table)
+        count_y = 1
+        count_x = 1
+        if wp.static(method == "area"):
+            count_y = footprint_samples(texel.c00, texel.c10, texel.c01, texel.c11)
+            count_x = footprint_samples(texel.c00, texel.c01, texel.c10, texel.c11)
+        line = wp.int32(-1)
+        area = wp.float32(0.0)
+        left = wp.vec3(0.0, 0.0, 0.0)
+        right = wp.vec3(0.0, 0.0, 0.0)
+        for sample in range(lane, count_y * count_x, lanes):
+            a = sample // count_x
+            b = sample % count_x
+            if a != line:
+                line = a
+                y = (wp.float32(a) + 0.5) / wp.float32(count_y)
+                # Solid angle of this part of the texel.
+                area = wp.sin(PI * (wp.float32(texel.row) + y) / wp.float32(texel.height))
+                left = mix(texel.c00, texel.c10, y)
+                right = mix(texel.c01, texel.c11, y)
+            at = mix(left, right, (wp.float32(b) + 0.5) / wp.float32(count_x))
+            out.possible += area
+            # At the frame's border the same ramp as at the rim.
+            inside = wp.min(wp.min(at[0], last_column - at[0]), wp.min(at[1], last_row - at[1]))
+            ramp = wp.clamp(wp.min(at[2] - rim[0], inside) / rim[1], 0.0, 1.0)
+            if inside >= 0.0 and ramp > 0.0:
+                weight = area * ramp * ramp * (3.0 - 2.0 * ramp)
+                i = wp.int32(at[1])
+                j = wp.int32(at[0])
+                fy = at[1] - wp.float32(i)
+                fx = at[0] - wp.float32(j)
+                i1 = wp.min(i + 1, frame.shape[0] - 1)
+                j1 = wp.min(j + 1, frame.shape[1] - 1)
+                p00 = frame[i, j]
+                p01 = frame[i, j1]
+                p10 = frame[i1, j]
+                p11 = frame[i1, j1]
+                top = mix(to_light(table, p00), to_light(table, p01), fx)
+                value = mix(top, mix(to_light(table, p10), to_light(table, p11), fx), fy)
+                top = mix(clips(p00, saturation), clips(p01, saturation), fx)
+                saturated = mix(top, mix(clips(p10, saturation), clips(p11, saturation), fx), fy)
+                out.total += weight
+                out.mean = mix(out.mean, value, weight / out.total)
+                out.clipped = mix(out.clipped, saturated, weight / out.total)
+        return out
+
+    return average_footprint
+
+
+@wp.func
+def join_lanes(part: Footprint, lane: wp.int32, lanes: wp.int32) -> Footprint:
+    """The footprint of which each of a texel's lanes has averaged a part; all lanes get the same bits."""
+    out = part
+    reach = lanes / 2
+    while reach > 0:
+        other = lane_across(out.total, reach)
+        mean = vec_across(out.mean, reach)
+        clipped = vec_across(out.clipped, reach)
+        out.possible += lane_across(out.possible, reach)
+        if out.total + other > 0.0:
+            # The lower lane's mean first.
+            t = other / (out.total + other)
+            if (lane & reach) == 0:
+                out.mean = mix(out.mean, mean, t)
+                out.clipped = mix(out.clipped, clipped, t)
+            else:
+                out.mean = mix(mean, out.mean, out.total / (out.total + other))
+                out.clipped = mix(clipped, out.clipped, out.total / (out.total + other))
+        out.total += other
+        reach = reach / 2
+    return out
+
+
 @functools.cache
 def make_gather_probe_kernel(method: str, linear: bool = False) -> wp.Kernel:
     """Kernel of one method, of frames of 8-bit codes or ``linear`` ones; raises ValueError for an unknown method."""
     if method not in METHODS:
         raise ValueError(f"unwrap: no method {method!r}; expected {', '.join(METHODS)}")
     pixel = wp.vec3 if linear else wp.vec3ub
-    to_light = keep_linear if linear else decode
-    find_levels = clip_levels if linear else saturation_codes
-    clips = is_at_clipping if linear else is_saturated
+    average_footprint = make_average_footprint(method, linear)
 
     @wp.kernel(module="unique", enable_backward=False)
     def gather_probe_kernel(
@@ -304,109 +460,45 @@ def make_gather_probe_kernel(method: str, linear: bool = False) -> wp.Kernel:
         table: wp.array[wp.vec3],
         probes: wp.array[Probe],
         corners: wp.array3d[wp.vec3],
-        rim_start: wp.float32,
-        rim_width: wp.float32,
+        rim: wp.vec2,
+        own: wp.int32,
         # Out:
         view_out: EnvironmentView,
     ):
         band_row, column, lane = wp.tid()
         row = row_start + band_row
-        height = view_out.radiance.shape[0]
         width = view_out.radiance.shape[1]
-        last_row = wp.float32(frame.shape[0] - 1)
-        last_column = wp.float32(frame.shape[1] - 1)
-        saturation = find_levels(table)
-
         radiance = wp.vec3(0.0, 0.0, 0.0)
         clipped = wp.vec3(0.0, 0.0, 0.0)
         confidence = wp.float32(0.0)
         votes = wp.float32(0.0)
+        texel = Texel()
+        texel.row = row
+        texel.height = view_out.radiance.shape[0]
         for index in range(probes.shape[0]):
-            c00 = corners[row, column, index]
-            c01 = corners[row, column + 1, index]
-            c10 = corners[row + 1, column, index]
-            c11 = corners[row + 1, column + 1, index]
-            facing = wp.min(wp.min(c00[2], c01[2]), wp.min(c10[2], c11[2])) >= 0.0
-            closest = wp.max(wp.max(c00[2], c01[2]), wp.max(c10[2], c11[2]))
-            if facing and closest > rim_start:
-                count_y = 1
-                count_x = 1
-                if wp.static(method == "area"):
-                    count_y = footprint_samples(c00, c10, c01, c11)
-                    count_x = footprint_samples(c00, c01, c10, c11)
-                # Running means, m += (x - m) w / W: exact where all x are equal, so a constant frame gives a constant
-                # map.
-                mean = wp.vec3(0.0, 0.0, 0.0)
-                mean_clipped = wp.vec3(0.0, 0.0, 0.0)
-                total = wp.float32(0.0)
-                possible = wp.float32(0.0)
-                line = wp.int32(-1)
-                area = wp.float32(0.0)
-                left = wp.vec3(0.0, 0.0, 0.0)
-                right = wp.vec3(0.0, 0.0, 0.0)
-                for sample in range(lane, count_y * count_x, lanes):
-                    a = sample // count_x
-                    b = sample % count_x
-                    if a != line:
-                        line = a
-                        y = (wp.float32(a) + 0.5) / wp.float32(count_y)
-                        # Solid angle of this part of the texel.
-                        area = wp.sin(PI * (wp.float32(row) + y) / wp.float32(height))
-                        left = mix(c00, c10, y)
-                        right = mix(c01, c11, y)
-                    at = mix(left, right, (wp.float32(b) + 0.5) / wp.float32(count_x))
-                    possible += area
-                    # At the frame's border the same ramp as at the rim.
-                    inside = wp.min(wp.min(at[0], last_column - at[0]), wp.min(at[1], last_row - at[1]))
-                    ramp = wp.clamp(wp.min(at[2] - rim_start, inside) / rim_width, 0.0, 1.0)
-                    if inside >= 0.0 and ramp > 0.0:
-                        weight = area * ramp * ramp * (3.0 - 2.0 * ramp)
-                        i = wp.int32(at[1])
-                        j = wp.int32(at[0])
-                        fy = at[1] - wp.float32(i)
-                        fx = at[0] - wp.float32(j)
-                        i1 = wp.min(i + 1, frame.shape[0] - 1)
-                        j1 = wp.min(j + 1, frame.shape[1] - 1)
-                        p00 = frame[i, j]
-                        p01 = frame[i, j1]
-                        p10 = frame[i1, j]
-                        p11 = frame[i1, j1]
-                        top = mix(to_light(table, p00), to_light(table, p01), fx)
-                        value = mix(top, mix(to_light(table, p10), to_light(table, p11), fx), fy)
-                        top = mix(clips(p00, saturation), clips(p01, saturation), fx)
-                        saturated = mix(top, mix(clips(p10, saturation), clips(p11, saturation), fx), fy)
-                        total += weight
-                        mean = mix(mean, value, weight / total)
-                        mean_clipped = mix(mean_clipped, saturated, weight / total)
-                reach = lanes / 2
-                while reach > 0:
-                    other = lane_across(total, reach)
-                    mean_across = vec_across(mean, reach)
-                    clipped_across = vec_across(mean_clipped, reach)
-                    possible += lane_across(possible, reach)
-                    if total + other > 0.0:
-                        # The lower lane's mean first: all lanes get the same bits.
-                        t = other / (total + other)
-                        if (lane & reach) == 0:
-                            mean = mix(mean, mean_across, t)
-                            mean_clipped = mix(mean_clipped, clipped_across, t)
-                        else:
-                            mean = mix(mean_across, mean, total / (total + other))
-                            mean_clipped = mix(clipped_across, mean_clipped, total / (total + other))
-                    total += other
-                    reach = reach / 2
-                if total > 0.0:
-                    across = c11 - c00
-                    along = c10 - c01
+            texel.c00 = corners[row, column, index]
+            texel.c01 = corners[row, column + 1, index]
+            texel.c10 = corners[row + 1, column, index]
+            texel.c11 = corners[row + 1, column + 1, index]
+            facing = wp.min(wp.min(texel.c00[2], texel.c01[2]), wp.min(texel.c10[2], texel.c11[2])) >= 0.0
+            closest = wp.max(wp.max(texel.c00[2], texel.c01[2]), wp.max(texel.c10[2], texel.c11[2]))
+            if facing and closest > rim[0]:
+                part = average_footprint(frame, table, texel, rim, lane, lanes)
+                found = join_lanes(part, lane, lanes)
+                if found.total > 0.0:
+                    across = texel.c11 - texel.c00
+                    along = texel.c10 - texel.c01
                     pixels = 0.5 * wp.abs(across[0] * along[1] - across[1] * along[0])
-                    density = pixels / texel_solid_angle(row, height, width)
-                    certainty = total / possible * density / (density + HALF_DENSITY)
+                    density = pixels / texel_solid_angle(row, texel.height, width)
+                    certainty = found.total / found.possible * density / (density + HALF_DENSITY)
                     # Of several balls the sharper one has the say: a vote per pixel.
                     vote = certainty * density
+                    if own >= 0 and index != own:
+                        vote *= BORROWED
                     votes += vote
                     if votes > 0.0:
-                        radiance = mix(radiance, wp.cw_div(mean, probes[index].reflectance), vote / votes)
-                        clipped = mix(clipped, mean_clipped, vote / votes)
+                        radiance = mix(radiance, wp.cw_div(found.mean, probes[index].reflectance), vote / votes)
+                        clipped = mix(clipped, found.clipped, vote / votes)
                         confidence = wp.max(confidence, certainty)
         if lane == 0:
             view_out.radiance[row, column] = radiance
@@ -414,15 +506,6 @@ def make_gather_probe_kernel(method: str, linear: bool = False) -> wp.Kernel:
             view_out.clipped[row, column] = clipped
 
     return gather_probe_kernel
-
-
-@wp.func
-def footprint_samples(a0: wp.vec3, a1: wp.vec3, b0: wp.vec3, b1: wp.vec3) -> wp.int32:
-    """Samples along one side of a footprint: one per pixel of the longer of its two edges."""
-    a = wp.vec2(a1[0] - a0[0], a1[1] - a0[1])
-    b = wp.vec2(b1[0] - b0[0], b1[1] - b0[1])
-    longest = wp.sqrt(wp.max(wp.dot(a, a), wp.dot(b, b)))
-    return wp.int32(wp.clamp(wp.ceil(longest), 1.0, wp.float32(MAX_SAMPLES)))
 
 
 def gather_probe(
@@ -435,6 +518,7 @@ def gather_probe(
     method: str = "area",
     rim_start: float = RIM_START,
     rim_width: float = RIM_WIDTH,
+    own: int = ALL_ALIKE,
     rows: Rows | None = None,
 ) -> None:
     """Average the frame over every texel's footprint and undo the ball's reflectance.
@@ -450,6 +534,8 @@ def gather_probe(
             up to 8 x 8.
         rim_start: Pixels from the silhouette that are not used.
         rim_width: Pixels over which confidence then rises.
+        own: The ball whose light is asked for: others then tell only of what it does not see. ``ALL_ALIKE``: all balls
+            make one map, in which the one that sees more sharply has the say.
         rows: Band of texel rows, None for all.
 
     Raises:
@@ -462,7 +548,7 @@ def gather_probe(
     launch_rows(
         make_gather_probe_kernel(method, frame.dtype is wp.vec3),
         (*shape, lanes),
-        [lanes, frame, decode_table, probes, corners, rim_start, rim_width],
+        [lanes, frame, decode_table, probes, corners, wp.vec2(rim_start, rim_width), own],
         [view_out],
         rows=rows,
         device=device,

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from tests.kernel_rig import SMALL_CAMERA
 from tests.reference import area_lights as twin
 from warp_ar.errors import SceneError
 from warp_ar.kernels.area_lights import AreaSample, area_numbers, find_share, make_area_count, make_area_sample
@@ -268,18 +269,11 @@ def test_shares_are_found_at_their_borders(device):
     assert found.numpy().tolist() == [0, 0, 2, 2, 3, 3]
 
 
-TEXT = """schema = 1
-[camera]
-width = 64
-height = 48
-fx = 60.0
-fy = 60.0
-cx = 31.5
-cy = 23.5
-[marker]
+TEXT = f"""schema = 1
+{SMALL_CAMERA}[marker]
 size = 0.08
 [[light]]
-kind = "{kind}"
+kind = "{{kind}}"
 at = [0.0, 0.0, 0.3]
 intensity = 2.0
 """

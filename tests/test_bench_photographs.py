@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from bench.bench_photographs import REFLECTANCE, compare, read_set
+from bench.bench_photographs import REFLECTANCE, Row, compare, read_set, summarise
 
 ROUNDING = 1e-5
 """float32 sums over the map."""
@@ -50,3 +50,14 @@ def test_exposures_are_told_by_a_file_or_left_to_the_pixels(tmp_path: Path) -> N
     photos, exposures = read_set(folder, neutral)
     assert [photo.name for photo in photos] == ["room_a.png", "room_b.png"]
     assert exposures is None
+
+
+def test_sets_count_once_each_and_none_is_no_mean() -> None:
+    """A set of two photographs and one of one weigh the same; without any photograph there is no mean, and no NaN."""
+    rows = {"a": [Row("1", 0.2, 0.1, 0.2, 0.0, 0.0), Row("2", 0.4, 0.1, 0.2, 0.0, 0.0)], "b": [], "c": []}
+    rows["c"] = [Row("3", 0.1, 0.1, 0.0, 0.0, 0.0)]
+    found = summarise(rows)
+    assert set(found["sets"]) == {"a", "c"}
+    assert found["error"] == pytest.approx(0.2)
+    assert found["clipping"] == pytest.approx(0.1)
+    assert summarise({"a": []}) == {"sets": {}, "error": None, "scaled": None, "clipping": None}

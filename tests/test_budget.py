@@ -13,7 +13,8 @@ import pytest
 
 from tests.test_pipeline import Frames, frames, make_scene  # noqa: F401  (a fixture)
 from warp_ar.accuracy import budget as auto_quality
-from warp_ar.accuracy.budget import AIM, FIRST_WINDOW, HELD_SECONDS, LEAST, MEMORY, AutoPipeline, Controller
+from warp_ar.accuracy.budget import AutoPipeline
+from warp_ar.accuracy.controller import AIM, FIRST_WINDOW, HELD_SECONDS, LEAST, MEMORY, Controller
 from warp_ar.accuracy.cost_table import Setting, chosen, load_errors, relevant_settings
 from warp_ar.accuracy.costs import Costs
 from warp_ar.errors import UsageError

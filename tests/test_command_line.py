@@ -3,13 +3,16 @@
 import gc
 import os
 import pathlib
+import signal
 import subprocess
 import sys
+import threading
+import time
 import weakref
 
 import pytest
 
-from warp_ar.command_line import EXIT_INTERRUPTED, EXIT_TERMINATED, Parser, loading
+from warp_ar.command_line import EXIT_INTERRUPTED, EXIT_TERMINATED, Parser, Terminated, ended_by_signals, loading
 from warp_ar.errors import UsageError
 
 
@@ -120,3 +123,66 @@ sys.exit(run_command(command))
 """
     ended = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, timeout=60)
     assert (ended.returncode, ended.stderr) == (code, "")
+
+
+class SlowLock:
+    """A lock during one of whose steps a signal comes."""
+
+    def __init__(self, step, number):
+        self._lock, self._steps, self._number = threading.Lock(), [step], number
+
+    def _pass(self, step):
+        if self._steps == [step]:
+            self._steps.clear()
+            signal.raise_signal(self._number)
+
+    def acquire(self, *how):
+        self._pass("to take")
+        got = self._lock.acquire(*how)
+        self._pass("taken")
+        return got
+
+    def release(self):
+        self._pass("to give back")
+        self._lock.release()
+        self._pass("given back")
+
+    def __enter__(self):
+        return self.acquire()
+
+    def __exit__(self, *_):
+        self.release()
+
+    def locked(self):
+        return self._lock.locked()
+
+
+@pytest.mark.parametrize("where", ["at the first step", "while waiting"])
+@pytest.mark.parametrize("step", ["to take", "taken", "to give back", "given back"])
+@pytest.mark.parametrize(("name", "error"), [("SIGTERM", Terminated), ("SIGINT", KeyboardInterrupt)])
+def test_a_signal_leaves_no_lock_taken(name, error, step, where):
+    """Futures, events and queues take locks in Python: an exception in there would have others wait for ever."""
+    lock = SlowLock(step if where == "at the first step" else "", signal.Signals[name])
+    condition = threading.Condition(lock)
+
+    def wait():
+        with condition:
+            if where == "while waiting":
+                lock._steps = [step]
+            condition.wait(0.001)
+        time.sleep(10.0)
+
+    with pytest.raises(error), ended_by_signals():
+        wait()
+    assert not lock.locked()
+
+
+@pytest.mark.parametrize(("name", "error"), [("SIGTERM", Terminated), ("SIGINT", KeyboardInterrupt)])
+def test_who_waits_for_another_thread_is_interrupted(name, error):
+    never, begun = threading.Event(), time.monotonic()
+    sender = threading.Timer(0.1, lambda: signal.pthread_kill(threading.main_thread().ident, signal.Signals[name]))
+    sender.start()
+    with pytest.raises(error), ended_by_signals():
+        never.wait(20.0)
+    sender.join()
+    assert time.monotonic() - begun < 20.0

@@ -3,6 +3,7 @@ import pytest
 import warp as wp
 
 from tests.error_model import check_error
+from tests.kernel_rig import tables
 from tests.reference import color as reference_color
 from tests.reference import composite as reference
 from warp_ar.kernels import color, composite
@@ -32,13 +33,6 @@ def make_params(
     params["shadow_rect"], params["ball_rect"] = shadow_rect, ball_rect
     params["exposure_scale"], params["time_step"] = scale, time_step
     return wp.array(params, dtype=FrameParams)
-
-
-def tables(transfer="srgb"):
-    return (
-        wp.array(color.decode_table(transfer), dtype=wp.vec3),
-        wp.array(color.encode_table(transfer), dtype=wp.vec3),
-    )
 
 
 def make_layers(seed=0):

@@ -68,6 +68,29 @@ def test_a_held_frame_converges_to_the_reference() -> None:
         assert running.next().other is None
 
 
+def test_a_frame_that_is_held_at_once_gets_a_reference_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Played and held again before the next frame is lit: nothing flowed, and yet another frame is held."""
+    with Running(page_scene()) as running:
+        loop = running.host._loop
+        running.edit(type="compare", other="difference")
+        running.edit(type="play", on=False)
+        first = running.until(lambda: running.frames[-1].other is not None and running.frames[-1])
+        pace = loop._pace
+
+        def hold_next(due: float, step: float) -> float:
+            due = pace(due, step)
+            running.edit(type="play", on=False)
+            return due
+
+        monkeypatch.setattr(loop, "_pace", hold_next)
+        running.edit(type="play", on=True)
+        held = running.until(lambda: not np.array_equal(running.frames[-1].image, first.image) and running.frames[-1])
+        assert held.other is None, "the reference of another frame stands beside this one"
+        running.until(lambda: running.frames[-1].other is not None)
+        np.testing.assert_array_equal(running.frames[-1].image, held.image)
+        assert running.host.state_message()["convergence"]["samples"] >= 1
+
+
 def test_frames_stay_short_while_it_converges() -> None:
     """A slice ends soon after its time: what viewers ask for meanwhile is done between two slices."""
     tracer = PathTracer(boxes(True), latlong_sky(), None, ABOVE, device="cpu", reflectances=RHO, size=(480, 320))

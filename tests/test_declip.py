@@ -8,7 +8,7 @@ from tests.error_model import check_error
 from tests.reference import color as reference_color
 from tests.reference import declip as reference
 from warp_ar.kernels import color, declip
-from warp_ar.kernels.structs import PLANE, FrameParams, Probe, RayScene, Shape
+from warp_ar.kernels.structs import PLANE, FrameParams, Probe, RayScene, Shape, make_picture
 
 # float32 sums over a pyramid of ten levels, and one power per pixel.
 FLOAT = 2e-5
@@ -38,10 +38,9 @@ def run(frame, config=None, environment=None, params=None, proxies=()):
     declip.fill_levels(active, array.shape, levels)
     declip.complete_core(
         config or declip.DeclipConfig(),
-        array,
+        make_picture(array, None, wp.array(rays(height, width), dtype=wp.vec2)),
         levels,
         wp.array([params or FrameParams()], dtype=FrameParams),
-        wp.array(rays(height, width), dtype=wp.vec2),
         scene,
         wp.array([ball], dtype=Probe),
         None if environment is None else wp.array(environment, dtype=wp.vec3),

@@ -92,6 +92,14 @@ def test_wrong_numbers_are_named(fault):
     assert name in [finding.name for finding in check_scene(change(load_scene("desk")))]
 
 
+def test_of_several_balls_the_wrong_one_is_named():
+    scene = load_scene("desk")
+    (good,) = scene.probes
+    sunk = dataclasses.replace(good, center=(0.2, 0.03, 0.0))
+    found = [f for f in check_scene(dataclasses.replace(scene, probes=(good, sunk))) if f.name == "ball.sunk"]
+    assert [finding.text.startswith("[[probe]] 1") for finding in found] == [True]
+
+
 def test_guess_is_named():
     scene = loads_scene("schema = 1\n[camera]\nfield_of_view = 60.0\n")
     assert [finding.name for finding in check_scene(scene)] == ["camera.guessed"]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from tests.kernel_rig import records
 from warp_ar.kernels.emitters import MAX_GAIN, REACH, add_emitters, correct_parallax
 from warp_ar.kernels.structs import Emitter
 
@@ -33,12 +34,9 @@ def evaluate_kernel(
 
 
 def evaluate(device, irradiance, lamps, points, normals):
-    records = np.zeros(len(lamps), np.dtype(Emitter.numpy_dtype()))
-    for record, (direction, distance, power) in zip(records, lamps, strict=True):
-        record["origin"], record["direction"] = CENTER, direction
-        record["distance"], record["power"] = distance, power
+    known = [{"origin": CENTER, "direction": d, "distance": r, "power": power} for d, r, power in lamps]
     out = wp.zeros(len(points), dtype=wp.vec3, device=device)
-    inputs = [wp.array(records, dtype=Emitter, device=device)]
+    inputs = [records(Emitter, *known, device=device)]
     inputs += [wp.array(np.array(a, np.float32), dtype=wp.vec3, device=device) for a in (points, normals)]
     wp.launch(evaluate_kernel, len(points), [wp.vec3(*irradiance), *inputs], [out], device=device)
     return out.numpy()
@@ -93,11 +91,9 @@ def turn_kernel(
 
 
 def turn(device, lamps, point, directions):
-    records = np.zeros(len(lamps), np.dtype(Emitter.numpy_dtype()))
-    for record, (direction, distance) in zip(records, lamps, strict=True):
-        record["origin"], record["direction"], record["distance"] = CENTER, direction, distance
+    known = [{"origin": CENTER, "direction": d, "distance": r} for d, r in lamps]
     out = wp.zeros(len(directions), dtype=wp.vec3, device=device)
-    inputs = [wp.array(records, dtype=Emitter, device=device)]
+    inputs = [records(Emitter, *known, device=device)]
     inputs += [
         wp.array(np.array(a, np.float32), dtype=wp.vec3, device=device) for a in ([point] * len(directions), directions)
     ]

@@ -5,9 +5,9 @@ import pytest
 import warp as wp
 
 from tests.error_model import check_error
+from tests.kernel_rig import TEXTURES, records, shape, tables
 from tests.reference import environment_shadow as reference
-from tests.test_composite import tables
-from tests.test_relight import CAMERA, DESK, LOOK_DOWN, POINTS, RAYS, H, W, records, shape
+from tests.test_relight import CAMERA, DESK, LOOK_DOWN, POINTS, RAYS, H, W
 from warp_ar.engine.graph import make_plan
 from warp_ar.kernels import (
     environment_samples,
@@ -28,7 +28,6 @@ from warp_ar.kernels.structs import (
     LAMBERT,
     PLANE,
     SPHERE,
-    TEXTURES,
     Emitter,
     FrameParams,
     Material,

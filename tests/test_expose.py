@@ -3,10 +3,11 @@ import pytest
 import warp as wp
 
 from tests.error_model import check_error
+from tests.kernel_rig import tables
 from tests.reference import color as reference_color
 from tests.reference import composite as reference_composite
 from tests.reference import expose as reference
-from tests.test_composite import CONFIGS, H, make_arrays, make_layers, make_params, tables
+from tests.test_composite import CONFIGS, H, make_arrays, make_layers, make_params
 from warp_ar.kernels import color, expose, summed_area
 from warp_ar.kernels.structs import make_picture
 

@@ -114,3 +114,52 @@ def test_explain_shows_the_method_that_runs(tmp_path: Path, capsys: pytest.Captu
     said = explained(scene, tmp_path, capsys, "--quality", "high")
     assert "relight flat runs" in said
     assert "relight bounce" not in said
+
+
+def test_only_several_balls_call_for_interpolation() -> None:
+    """One ball: the plan that there was before; two: the same stages, for both."""
+    (ball,) = make_scene().probes
+    two = (ball, dataclasses.replace(ball, center=(0.2, 0.0, 0.04)))
+    for preset in ("low", "medium", "high", "reference"):
+        single, several = plan_of(preset), plan_of(preset, probes=two)
+        assert [stage.name for stage, _ in several.stages] == [stage.name for stage, _ in single.stages]
+        resources = {name for _, wiring in single.stages for name in (*wiring.reads, *wiring.writes)}
+        assert not [name for name in resources if name.startswith(("others", "probes_seen", "probe_places"))]
+        assert (single.features.others, several.features.others) == (0, 1)
+        assert not single.features.distant.several
+        assert several.features.distant.several
+        assert several.features.recovered == single.features.recovered
+    three = plan_of("medium", probes=(*two, dataclasses.replace(ball, center=(0.0, 0.3, 0.04))))
+    assert three.features.others == 2
+
+
+@pytest.mark.parametrize(
+    ("preset", "count", "exposures", "changes", "said"),
+    [
+        ("medium", 0, (), {}, ""),
+        ("medium", 1, (), {}, ""),
+        ("medium", 2, (), {"objects": ()}, ""),
+        ("medium", 3, (), {}, "objects are lit by what is interpolated between 3 mirror balls"),
+        ("medium", 2, (1.0, 0.1), {}, "of several exposures 2 mirror balls make one map"),
+        ("paper", 2, (), {}, "sphere map is a texture of one mirror ball, the first"),
+    ],
+)
+def test_which_balls_light_objects_is_said(
+    preset: str, count: int, exposures: tuple[float, ...], changes: dict[str, object], said: str
+) -> None:
+    (ball,) = make_scene().probes
+    balls = tuple(dataclasses.replace(ball, center=(0.2 * k, 0.0, 0.04)) for k in range(count))
+    found = features_of(preset, exposures, **{**changes, "probes": balls})
+    assert said in found.balls
+    assert bool(said) == bool(found.balls)
+    assert bool(found.others) == ("interpolated" in said)
+
+
+def test_explain_says_which_balls_light_objects(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = make_scene()
+    file = tmp_path / "two.toml"
+    two = (scene.probes[0], dataclasses.replace(scene.probes[0], center=(0.2, 0.0, 0.04)))
+    for balls, said in ((two, True), (two[:1], False)):
+        file.write_text(dumps_scene(dataclasses.replace(scene, probes=balls)))
+        assert explain.main([str(file)]) == 0
+        assert ("interpolated between 2 mirror balls" in " ".join(capsys.readouterr().out.split())) == said

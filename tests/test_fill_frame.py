@@ -45,15 +45,15 @@ CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """``world_from_camera``."""
 
 
-def filled(device, frame, text, seed):
+def filled(device, frame, text, seed, *, balls=((0.0, 0.0, 0.1),), ball=0):
     """Level 0 of the pyramid, (h, w, 4), after the frame was put into ``seed``."""
     scene = loads_scene(text)
     host = HostScene(scene, device)
     params = np.zeros(1, np.dtype(structs.FrameParams.numpy_dtype()))
     params["camera_position"], params["world_from_camera"] = EYE, CAMERA
     params["focal"], params["principal"] = (160.0, 160.0), (159.5, 119.5)
-    probes = np.zeros(1, np.dtype(structs.Probe.numpy_dtype()))
-    probes["center"], probes["radius"], probes["reflectance"] = (0.0, 0.0, 0.1), 0.03, 0.85
+    probes = np.zeros(len(balls), np.dtype(structs.Probe.numpy_dtype()))
+    probes["center"], probes["radius"], probes["reflectance"] = balls, 0.03, 0.85
     levels = wp.array(seed.reshape(-1, 4), dtype=wp.vec4, device=device)
     fill_frame(
         structs.make_picture(
@@ -67,6 +67,7 @@ def filled(device, frame, text, seed):
         levels,
         (HEIGHT, WIDTH),
         proxies=trace_config(scene).proxies,
+        ball=ball,
     )
     return levels.numpy().reshape(HEIGHT, WIDTH, 4)
 
@@ -92,6 +93,14 @@ def pixels_of(points):
 
 def inside(pixel, margin):
     return ((pixel > margin) & (pixel < np.array([319.0, 239.0]) - margin)).all(axis=-1)
+
+
+def test_a_map_is_that_of_its_ball(device):
+    """Of two, the second one's map is what it would be as the first; and not the first one's."""
+    balls, seed = ((0.0, 0.0, 0.1), (0.1, 0.15, 0.06)), np.zeros((HEIGHT, WIDTH, 4), np.float32)
+    second = filled(device, ramp(), SCENE + PLANE, seed, balls=balls, ball=1).copy()
+    np.testing.assert_array_equal(second, filled(device, ramp(), SCENE + PLANE, seed, balls=balls[::-1]))
+    assert (second != filled(device, ramp(), SCENE + PLANE, seed, balls=balls)).any()
 
 
 def test_at_infinity_a_direction_is_where_the_camera_looks_along_it(device):

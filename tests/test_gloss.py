@@ -10,12 +10,11 @@ import warp as wp
 
 from tests.error_model import check_error
 from tests.hard_cases.rig import SIZE, look_at, make_quality, make_scene
+from tests.kernel_rig import SMALL_CAMERA, TEXTURES, constant_environment, records, shape, tables
 from tests.reference import color as reference_color
 from tests.reference import gloss as reference
 from tests.reference.visibility import Body
-from tests.test_composite import tables
-from tests.test_mirror_ball import CHALK, DESK, FOCAL, RAYS, H, W, grey_frame, shape
-from tests.test_relight import constant_environment, records
+from tests.test_mirror_ball import CHALK, DESK, FOCAL, RAYS, H, W, grey_frame
 from warp_ar.engine.graph import make_plan
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SceneError
@@ -26,7 +25,6 @@ from warp_ar.kernels.structs import (
     LAMBERT,
     POINT,
     SPHERE,
-    TEXTURES,
     FrameParams,
     Light,
     Material,
@@ -243,15 +241,8 @@ def test_bands_are_the_whole(device):
 
 # --- scenes and the stage
 
-PLANE = """schema = 1
-[camera]
-width = 64
-height = 48
-fx = 60.0
-fy = 60.0
-cx = 31.5
-cy = 23.5
-[marker]
+PLANE = f"""schema = 1
+{SMALL_CAMERA}[marker]
 size = 0.08
 [[proxy]]
 shape = "plane"

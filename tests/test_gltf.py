@@ -11,7 +11,7 @@ import pytest
 
 from tests.gltf_files import SQUARE, SQUARE_FACES, SQUARE_UVS, Gltf
 from warp_ar.errors import SceneError
-from warp_ar.scene import MetallicRoughnessMaterial, Object
+from warp_ar.scene import MetallicRoughnessMaterial, Object, Play
 from warp_ar.scene.mesh_files import load_mesh
 from warp_ar.scene.mesh_materials import dump_materials, parse_materials
 from warp_ar.scene.object_materials import look_of
@@ -153,6 +153,47 @@ def test_nodes_and_skins(tmp_path: pathlib.Path) -> None:
     np.testing.assert_allclose(first.mean(axis=0), first.mean(axis=0) * [0, 0, 1], atol=1.1)
     np.testing.assert_allclose([first.min(axis=0), first.max(axis=0)], [[-1, 0, 2], [1, 0, 4]], atol=SINGLE)
     np.testing.assert_allclose([second.min(axis=0), second.max(axis=0)], [[4, -7, -1], [6, -7, 1]], atol=SINGLE)
+
+
+@pytest.mark.parametrize("play", [None, Play(0)])
+@pytest.mark.parametrize(
+    ("skinned", "morphed", "said"),
+    [
+        (True, True, "skins and morph targets"),
+        (True, False, "skins"),
+        (False, True, "morph targets"),
+        (False, False, ""),
+    ],
+)
+def test_skins_and_morph_targets_that_move_are_named_once(
+    tmp_path: pathlib.Path, caplog: pytest.LogCaptureFixture, play: Play | None, skinned: bool, morphed: bool, said: str
+) -> None:
+    """In one sentence, however many nodes have them; what moves beside them does not take their mesh along."""
+    made = Gltf()
+    ones, joints = np.tile(np.float32([1, 0, 0, 0]), (4, 1)), np.zeros((4, 4), np.uint8)
+    for _ in range(2):
+        skin = {"JOINTS_0": made.array(joints), "WEIGHTS_0": made.array(ones)} if skinned else {}
+        primitive = made.square(**skin)
+        primitive["targets"] = [{"POSITION": made.array(SQUARE)}]
+        made.node(primitive, **({"skin": 0} if skinned else {}))
+    made.tree["nodes"].append({"translation": [0, 0, 7]})
+    made.tree["skins"] = [{"joints": [2]}]
+    times = made.array(np.float32([0.0, 1.0]), min=[0.0], max=[1.0])
+    samplers = [
+        {"input": times, "output": made.array(values)} for values in (np.zeros((2, 3), "f4"), np.zeros(2, "f4"))
+    ]
+    channels = [{"sampler": 0, "target": {"node": 2, "path": "translation"}}]
+    channels += [{"sampler": 1, "target": {"node": k, "path": "weights"}} for k in range(2 * morphed)]
+    made.tree["animations"] = [{"samplers": samplers, "channels": channels}]
+    path = made.save(tmp_path / "a.glb")
+    with caplog.at_level(logging.WARNING):
+        for _ in range(3):
+            look_of(Object("mesh", file=path, play=play))
+    expected = ["animations (an object's key play names one)"] if play is None else []
+    expected += [f"movement of {said} (they stand as at the start)"] if said else []
+    assert [record.getMessage() for record in caplog.records] == (
+        [f"{path}: not shown: {', '.join(expected)}"] if expected else []
+    )
 
 
 def test_what_is_not_shown_is_said_once(tmp_path: pathlib.Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -5,6 +5,7 @@ import pytest
 import warp as wp
 
 from tests.error_model import check_error
+from tests.kernel_rig import SMALL_CAMERA
 from tests.reference import irradiance as reference
 from tests.reference import latlong
 from warp_ar.engine.graph import make_plan
@@ -33,17 +34,10 @@ SH4_ERROR = 0.05
 SIZES = [(64, 128), (16, 32), (7, 13), (1, 9), (9, 1), (1, 1), (5, 10)]
 METHODS = [method for method in Irradiance.methods if method != "sphere_mip"]  # which filters the frame
 
-SCENE = """
+SCENE = f"""
 schema = 1
 name = "test"
-[camera]
-width = 64
-height = 48
-fx = 60.0
-fy = 60.0
-cx = 31.5
-cy = 23.5
-[marker]
+{SMALL_CAMERA}[marker]
 size = 0.1
 [probe]
 center = [0.1, 0.0, 0.03]

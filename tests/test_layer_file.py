@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import pathlib
 
 import cv2
 import numpy as np
@@ -206,6 +207,30 @@ def test_frames_of_an_earlier_run_go(rendered, tmp_path):
     assert [path.name for path in sorted(tmp_path.glob("*.exr"))] == ["0000.exr"]
     assert [path.name for path in (tmp_path / "depth").iterdir()] == ["0000.png"]
     assert sink.replaced == f"{tmp_path}: 6 numbered frames of an earlier run are replaced"
+
+
+@pytest.mark.parametrize("gone", range(1, 6))
+def test_who_is_stopped_while_earlier_frames_go_leaves_whole_ones(rendered, tmp_path, monkeypatch, gone):
+    scene, frame, result = rendered
+    with LayerSink(tmp_path, pictures=("depth",)) as sink:
+        for _ in range(3):
+            sink.write(layer_frame(frame, result, scene))
+    plain, left = pathlib.Path.unlink, list(range(gone))
+
+    def unlink(path, **how):
+        if not left.pop():
+            raise KeyboardInterrupt
+        plain(path, **how)
+
+    with monkeypatch.context() as patch, LayerSink(tmp_path, pictures=("depth",)) as sink:
+        patch.setattr(pathlib.Path, "unlink", unlink)
+        with pytest.raises(KeyboardInterrupt):
+            sink.write(layer_frame(frame, result, scene))
+    frames = sorted(path.stem for path in tmp_path.glob("*.exr"))
+    pictures = sorted(path.stem for path in (tmp_path / "depth").iterdir())
+    assert len(frames) + len(pictures) == 6 - (gone - 1)
+    assert frames == ["0000", "0001", "0002"][: len(frames)], "the beginning of a run"
+    assert set(pictures) <= set(frames), "a picture of a frame that is gone"
 
 
 def test_what_cannot_be_written_is_said(rendered, tmp_path):

@@ -9,6 +9,7 @@ import pytest
 import warp as wp
 
 from tests.error_model import check_error
+from tests.kernel_rig import TEXTURES
 from tests.reference import materials as reference
 from warp_ar.kernels.materials import (
     MIN_ALPHA,
@@ -20,7 +21,7 @@ from warp_ar.kernels.materials import (
     reflect,
 )
 from warp_ar.kernels.split_sum import integrate_dfg
-from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, MIRROR, PHONG, TEXTURES, Hit, Material, RayScene, Shape
+from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, MIRROR, PHONG, Hit, Material, RayScene, Shape
 
 MODELS = (LAMBERT, PHONG, METALLIC_ROUGHNESS, MIRROR)
 

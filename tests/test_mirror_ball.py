@@ -11,12 +11,11 @@ import warp as wp
 
 from tests.error_model import check_error
 from tests.hard_cases.rig import look_at
+from tests.kernel_rig import TEXTURES, constant_environment, records, shape, tables
 from tests.reference import color as reference_color
 from tests.reference import mirror_ball as reference
 from tests.reference import relight as reference_relight
 from tests.reference.visibility import Body
-from tests.test_composite import tables
-from tests.test_relight import constant_environment, records
 from warp_ar.engine.graph import make_plan
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.kernels import color, mirror_ball
@@ -36,7 +35,6 @@ from warp_ar.kernels.structs import (
     POINT,
     SPHERE,
     SPOT,
-    TEXTURES,
     FrameParams,
     KeyLight,
     Light,
@@ -72,17 +70,6 @@ RHO = (0.85, 0.8, 0.7)
 BALL = {"center": CENTER, "radius": RADIUS, "reflectance": RHO}
 KEY, DIRECTIONALITY = np.array([-0.48, 0.36, 0.8]), 0.7
 ENVIRONMENT = np.array([0.8, 0.7, 0.5])
-
-
-def shape(kind, position, extent, material=-1):
-    return {
-        "kind": kind,
-        "rotation": np.eye(3),
-        "position": position,
-        "scale": 1.0,
-        "extent": extent,
-        "material": material,
-    }
 
 
 DESK = shape(PLANE, (0.0, 0.0, 0.0), (5.0, 5.0, 0.0))

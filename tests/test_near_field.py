@@ -7,10 +7,10 @@ import trimesh
 import warp as wp
 
 from tests.error_model import check_error
+from tests.kernel_rig import TEXTURES, records, tables
 from tests.reference import near_field as reference
-from tests.test_composite import tables
 from tests.test_environment_shadow import COUNT, SIDE, draw, sky, sphere
-from tests.test_relight import CAMERA, DESK, LOOK_DOWN, POINTS, RAYS, H, W, records
+from tests.test_relight import CAMERA, DESK, LOOK_DOWN, POINTS, RAYS, H, W
 from warp_ar.engine.graph import make_plan
 from warp_ar.kernels import near_field, shade
 from warp_ar.kernels.lobes import lobe_texels
@@ -20,7 +20,6 @@ from warp_ar.kernels.structs import (
     MIRROR,
     PHONG,
     SPHERE,
-    TEXTURES,
     FrameParams,
     Hit,
     Material,

@@ -321,7 +321,7 @@ def test_what_is_not_played_is_named(tmp_path: pathlib.Path, caplog: pytest.LogC
     with caplog.at_level(logging.WARNING):
         object_shapes(Scene(CAMERA, objects=(Object("mesh", file=path, play=Play(1)),)))
     (record,) = caplog.records
-    assert record.getMessage() == f"{path}: not shown: animated morph targets"
+    assert record.getMessage() == f"{path}: not shown: movement of morph targets (they stand as at the start)"
     with pytest.raises(SceneError, match="animation 2 is asked for; it has 2"):
         load_moving_mesh(path, 2)
 

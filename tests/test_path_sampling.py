@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from tests.kernel_rig import TEXTURES
 from warp_ar.kernels import structs
 from warp_ar.kernels.emitters import add_emitters
 from warp_ar.kernels.materials import make_surface
@@ -27,7 +28,7 @@ from warp_ar.kernels.path_sampling import (
     split_emitters,
     surface_density,
 )
-from warp_ar.kernels.sampling import sample_cosine_hemisphere, sample_uniform_hemisphere
+from warp_ar.kernels.sampling import sample_cosine_hemisphere
 from warp_ar.kernels.shapes import FAR
 from warp_ar.kernels.split_sum import integrate_dfg
 from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, PHONG, Emitter, Hit, RayScene
@@ -109,7 +110,9 @@ def surface_kernel(
     if wp.length(drawn.direction) == 0.0:
         missing[i] = 1
     v = random_triple(key, 0, 1)
-    wi = sample_uniform_hemisphere(wp.vec2(v[0], v[1]))
+    sin_theta = wp.sqrt(v[0] * (2.0 - v[0]))
+    phi = 2.0 * wp.pi * v[1]
+    wi = wp.vec3(sin_theta * wp.cos(phi), sin_theta * wp.sin(phi), 1.0 - v[0])  # uniform over the hemisphere
     estimates[1, i] = 2.0 * wp.pi * reflect_direct(surface, normal, wo, wi)[0]
     estimates[2, i] = 2.0 * wp.pi * surface_density(surface, normal, wo, wi)
 
@@ -246,7 +249,7 @@ MATTER = {
 def test_surfaces_are_drawn_as_their_density_says(name: str, device: str) -> None:
     fields, cosine = MATTER[name]
     records = np.zeros(1, np.dtype(structs.Material.numpy_dtype()))
-    for name in structs.TEXTURES:
+    for name in TEXTURES:
         records[name] = -1
     for field, value in fields.items():
         records[field] = value

@@ -5,6 +5,7 @@ import pytest
 import warp as wp
 
 from tests.error_model import check_error
+from tests.kernel_rig import SMALL_CAMERA
 from tests.reference import latlong
 from tests.reference import prefilter as reference
 from tests.reference import pyramid as reference_pyramid
@@ -53,17 +54,10 @@ MATERIALS = {
     "lambert": 'model = "lambert"',
 }
 
-SCENE = """
+SCENE = f"""
 schema = 1
 name = "test"
-[camera]
-width = 64
-height = 48
-fx = 60.0
-fy = 60.0
-cx = 31.5
-cy = 23.5
-[marker]
+{SMALL_CAMERA}[marker]
 size = 0.1
 [probe]
 center = [0.1, 0.0, 0.03]

@@ -11,12 +11,12 @@ import warp as wp
 from tests.error_model import check_error
 from tests.hard_cases.generators import frames
 from tests.hard_cases.rig import SIZE, Rig, assert_same_bits
+from tests.kernel_rig import constant_environment, records, shape, tables
 from tests.reference import receiver_cells as reference
 from tests.reference import relight as reference_relight
 from tests.reference.environment_shadow import sphere_form_factor
-from tests.test_composite import tables
 from tests.test_environment_shadow import draw, lamp_at, list_texels, sky, with_sun
-from tests.test_relight import CAMERA, DESK, FLOAT_ERROR, LOOK_DOWN, POINTS, constant_environment, point, records, shape
+from tests.test_relight import CAMERA, DESK, FLOAT_ERROR, LOOK_DOWN, POINTS, point
 from warp_ar.kernels import cells as frame_cells
 from warp_ar.kernels import environment_samples, receiver_cells, relight, summed_area
 from warp_ar.kernels.environment_samples import EnvironmentSample
@@ -145,8 +145,7 @@ class View:
             self.scene,
             self.lights,
             self.receiver(cells),
-            samples,
-            count or samples.shape[0],
+            samples[:count],
             written,
             bounced=bounced,
             sums_out=sums,

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from tests.test_relight import H, W, records, shape
+from tests.kernel_rig import records, shape
+from tests.test_relight import H, W
 from warp_ar.kernels.lobes import lobe_texels
 from warp_ar.kernels.reflect import (
     DistantLight,

@@ -3,9 +3,9 @@ import pytest
 import warp as wp
 
 from tests.error_model import check_error
+from tests.kernel_rig import constant_environment, records, shape, tables
 from tests.reference import color as reference_color
 from tests.reference import relight as reference
-from tests.test_composite import tables
 from warp_ar.kernels import color, relight, summed_area
 from warp_ar.kernels.edges import EdgeLists
 from warp_ar.kernels.receiver import (
@@ -53,18 +53,6 @@ RAYS = np.stack([COLUMNS, ROWS], -1).astype(np.float32)
 POINTS = reference.plane_points(CAMERA, RAYS, LOOK_DOWN)
 
 
-def records(struct, *values):
-    out = np.zeros(len(values), np.dtype(struct.numpy_dtype()))
-    for record, value in zip(out, values, strict=True):
-        for key, item in value.items():
-            record[key] = item
-    return wp.array(out, dtype=struct)
-
-
-def shape(kind, position, extent):
-    return {"kind": kind, "rotation": np.eye(3), "position": position, "scale": 1.0, "extent": extent, "material": -1}
-
-
 def turn_z(angle):
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -75,13 +63,6 @@ DESK = shape(PLANE, (0, 0, 0), (5, 5, 0))
 
 def point(at, intensity=(0.3, 0.3, 0.3), **more):
     return {"kind": POINT, "position": at, "intensity": intensity, "attenuation": (0, 0, 1), **more}
-
-
-def constant_environment(radiance):
-    """Spherical harmonics of E = pi L, the same for every normal."""
-    sh = np.zeros((9, 3), np.float32)
-    sh[0] = np.pi * np.asarray(radiance) / 0.28209479
-    return sh
 
 
 def run(

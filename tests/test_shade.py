@@ -10,13 +10,14 @@ import pytest
 import warp as wp
 
 from tests.error_model import check_error
+from tests.kernel_rig import TEXTURES
 from tests.reference import shade as reference
 from tests.test_visibility import GENERAL, World
 from warp_ar.kernels import structs
 from warp_ar.kernels.edges import EdgeLists
 from warp_ar.kernels.lobes import lobe_texels
 from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
-from warp_ar.kernels.shade import ShadeConfig, shade
+from warp_ar.kernels.shade import ShadeConfig, make_object_light, shade
 from warp_ar.kernels.split_sum import integrate_dfg
 from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, MIRROR, PHONG, Hit
 from warp_ar.kernels.trace import TraceConfig
@@ -68,7 +69,7 @@ def make_distant_light(models, device, radiance=1.0):
 
 def materials(*fields, device):
     records = np.zeros(len(fields), np.dtype(structs.Material.numpy_dtype()))
-    for name in structs.TEXTURES:
+    for name in TEXTURES:
         records[name] = -1
     for record, values in zip(records, fields, strict=True):
         for name, value in values.items():
@@ -125,7 +126,7 @@ def render(
         count, edges = (wp.zeros(n, dtype=t, device=device) for n, t in ((1, wp.int32), (listed, wp.vec2i)))
         lists = EdgeLists.of(count, edges, samples)
     for rows in bands:
-        inputs = (params, rays, scene, light_array, surroundings, visible)
+        inputs = (params, rays, scene, make_object_light(surroundings, light_array), visible)
         shade(config, *inputs, virtual, edge_lists=lists, rows=rows)
     return virtual.numpy()
 

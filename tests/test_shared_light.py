@@ -20,6 +20,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
+from tests.browser_rig import CHROMIUM
 from tests.reference import color as reference_color
 from tests.test_viewer import PATIENCE, Site, run, served
 from warp_ar import live
@@ -33,7 +34,6 @@ from warp_ar.viewer.light_record import LightState, describe, key_light
 from warp_ar.viewer.shared_light import FACES, MOST_LISTENERS, check_origin
 
 ROOT = Path(__file__).resolve().parents[1]
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 # A lamp of 4 degrees within a map of 64 rows: half a texel is 1.4 degrees.
 DIRECTION = 0.03
 

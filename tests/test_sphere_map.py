@@ -11,6 +11,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from tests.error_model import check_error
+from tests.kernel_rig import records
 from tests.reference import color as reference_color
 from tests.reference import sphere_map as reference
 from warp_ar.kernels import color, sphere_map
@@ -36,22 +37,15 @@ def look_at(eye, target):
     return np.stack([x, np.cross(z, x), z], 1)
 
 
-def records(struct, **values):
-    out = np.zeros(1, np.dtype(struct.numpy_dtype()))
-    for key, item in values.items():
-        out[key] = item
-    return wp.array(out, dtype=struct)
-
-
 def camera(eye, rotation, distortion=(0.0,) * 8):
     place = {"camera_position": eye, "world_from_camera": rotation, "focal": FOCAL, "principal": PRINCIPAL}
-    return records(FrameParams, **place, distortion=distortion)
+    return records(FrameParams, {**place, "distortion": distortion})
 
 
 def run(frame, eye=EYE, rotation=None, level=0, scale=1.0, distortion=(0.0,) * 8, shape=MAP, rows=(None,), light=None):
     """Texture of all levels, the latlong map of one, confidence and clipping."""
     rotation = look_at(eye, CENTER) if rotation is None else rotation
-    params, probes = camera(eye, rotation, distortion), records(Probe, center=CENTER, radius=RADIUS)
+    params, probes = camera(eye, rotation, distortion), records(Probe, {"center": CENTER, "radius": RADIUS})
     frame = wp.array(frame, dtype=wp.vec3ub)
     decode = wp.array(color.decode_table("srgb"), dtype=wp.vec3)
     linear = None if light is None else wp.array(light, dtype=wp.vec3)

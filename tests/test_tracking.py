@@ -332,15 +332,20 @@ def test_real_photograph_agrees_with_another_implementation(shared):
 # Row 15 of the hard-case atlas.
 
 
+def assert_falls(qualities, first):
+    """From above ``first`` to 0, but for what one pixel more or less makes."""
+    assert qualities[0] > first
+    assert qualities[-1] == 0.0
+    assert all(b <= a + 0.02 for a, b in itertools.pairwise(qualities)), qualities
+
+
 def test_edge_on_loses_quality_and_never_breaks():
     marker, qualities = Marker(), []
     for tilt in (30, 60, 75, 82, 86, 88, 89.5, 90):
         track = Tracker(marker, CAMERA).track(render((marker, look(tilt))), 0.0)
         assert_sane(track)
         qualities.append(track.quality)
-    assert qualities[0] > 0.9
-    assert qualities[-1] == 0.0
-    assert all(b <= a + 0.02 for a, b in itertools.pairwise(qualities)), qualities
+    assert_falls(qualities, 0.9)
 
 
 def test_twelve_pixel_marker():
@@ -358,9 +363,7 @@ def test_quality_falls_with_size():
         track = Tracker(marker, CAMERA).track(render((marker, look(30, 10, distance=0.08 * 640 / pixels))), 0.0)
         assert_sane(track)
         qualities.append(track.quality)
-    assert qualities[0] > 0.95
-    assert qualities[-1] == 0.0
-    assert all(b <= a + 0.02 for a, b in itertools.pairwise(qualities)), qualities
+    assert_falls(qualities, 0.95)
 
 
 def test_leaving_the_frame():

@@ -28,7 +28,12 @@ def test_command_writes_all_three(tmp_path, monkeypatch, capsys, device):
     lines = (tmp_path / "out" / "tradeoff.jsonl").read_text().splitlines()
     methods = list(setting("expose").methods)
     assert [json.loads(line)["method"] for line in lines[: len(methods)]] == methods
-    assert "expose" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "expose" in shown
+    told = [line for line in shown.splitlines() if "% " in line and " left" in line]
+    assert told[-2].split()[-1] == "darken", "shown while the page is written too"
+    assert told[-1].endswith("page: darken: expose")
+    assert told[-1].split()[0] == "100%", "units that were announced are all reported"
     assert all(is_signed(path) for path in (tmp_path / "out").iterdir())
 
 

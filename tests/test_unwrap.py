@@ -6,6 +6,7 @@ import pytest
 import warp as wp
 
 from tests.error_model import check_error
+from tests.kernel_rig import records
 from tests.reference import latlong as latlong_reference
 from tests.reference import unwrap as reference
 from warp_ar.kernels import fill, key_lights, unwrap
@@ -41,27 +42,18 @@ def look(distance=0.5, **more):
 
 
 def make_params(view):
-    value = np.zeros(1, np.dtype(FrameParams.numpy_dtype()))
-    value["camera_position"], value["world_from_camera"] = view.position, view.rotation
-    value["focal"], value["principal"], value["distortion"] = view.focal, view.principal, view.distortion
-    return wp.array(value, dtype=FrameParams)
+    place = {"camera_position": view.position, "world_from_camera": view.rotation}
+    lens = {"focal": view.focal, "principal": view.principal, "distortion": view.distortion}
+    return records(FrameParams, {**place, **lens})
 
 
 def make_probes(balls):
-    value = np.zeros(len(balls), np.dtype(Probe.numpy_dtype()))
-    for item, (center, radius, reflectance) in zip(value, balls, strict=True):
-        item["center"], item["radius"], item["reflectance"] = center, radius, reflectance
-    return wp.array(value, dtype=Probe)
+    return records(Probe, *({"center": c, "radius": r, "reflectance": rho} for c, r, rho in balls))
 
 
 def make_scene(shapes=()):
-    value = np.zeros(len(shapes), np.dtype(Shape.numpy_dtype()))
-    for item, shape in zip(value, shapes, strict=True):
-        item["rotation"], item["scale"] = np.eye(3), 1.0
-        for key, content in shape.items():
-            item[key] = content
     scene = RayScene()
-    scene.proxies = wp.array(value, dtype=Shape) if len(shapes) else wp.zeros(0, dtype=Shape)
+    scene.proxies = records(Shape, *({"rotation": np.eye(3), "scale": 1.0, **shape} for shape in shapes))
     scene.objects = wp.zeros(0, dtype=Shape)
     scene.materials, scene.textures = wp.zeros(0, dtype=Material), wp.zeros(0, dtype=Texture)
     scene.texels, scene.vertex_normals = wp.zeros(0, dtype=wp.uint32), wp.zeros(0, dtype=wp.vec3)
@@ -82,7 +74,17 @@ def project(view, balls=(BALL,), shapes=(), kinds=None, height=HEIGHT):
 
 
 def unwrapped(
-    view, frame, balls=(BALL,), *, method="area", shapes=(), height=HEIGHT, transfer="srgb", kinds=None, rows=None
+    view,
+    frame,
+    balls=(BALL,),
+    *,
+    method="area",
+    shapes=(),
+    height=HEIGHT,
+    transfer="srgb",
+    kinds=None,
+    rows=None,
+    own=unwrap.ALL_ALIKE,
 ):
     corners = project(view, balls, shapes, kinds, height)
     radiance = wp.full((height, 2 * height), wp.vec3(-1.0), dtype=wp.vec3)
@@ -92,7 +94,7 @@ def unwrapped(
     frame = wp.array(np.ascontiguousarray(frame), dtype=wp.vec3ub)
     for band in rows or [None]:
         view = make_environment_view(radiance, confidence, clipped)
-        unwrap.gather_probe(frame, table, make_probes(balls), corners, view, method=method, rows=band)
+        unwrap.gather_probe(frame, table, make_probes(balls), corners, view, method=method, own=own, rows=band)
     return radiance.numpy(), confidence.numpy(), clipped.numpy()
 
 
@@ -479,6 +481,25 @@ def test_balls_vote_by_their_pixels(device):
         assert both.sum() > 200
         # The balls are seen 12 degrees apart: their densities differ by a few percent more.
         assert np.median(radiance[both]) == pytest.approx(16 / 17, abs=0.01)
+
+
+def test_in_a_balls_own_map_others_tell_of_what_it_does_not_see(device):
+    """Its light wherever it has a say, whatever the other one's pixels; the other's in its blind cone."""
+    large, small = ((0.0, -0.1, 0.0), 0.06, (1.0, 1.0, 1.0)), ((0.0, 0.1, 0.0), 0.015, (1.0, 1.0, 1.0))
+    view = reference.View((1.0, 0.0, 0.0), (0.0, 0.0, 0.0), focal=900.0)
+    frame = constant_frame(view, 0)
+    frame[:, : view.width // 2] = 255 if view.project([large[0]])[0][0, 0] < view.width / 2 else 0
+    frame[:, view.width // 2 :] = 255 - frame[:, :1]
+    alone = {ball: unwrapped(view, frame, [ball], transfer="linear") for ball in (large, small)}
+    for balls, own, light in (([large, small], 1, 0.0), ([small, large], 0, 0.0), ([small, large], 1, 1.0)):
+        radiance, confidence, _ = unwrapped(view, frame, balls, transfer="linear", own=own)
+        mine, other = alone[balls[own]][1], alone[balls[1 - own]][1]
+        # A vote of the other one counts a thousandth, 16 times as many pixels 16 of those.
+        assert np.abs(radiance[mine > 0.9] - light).max() < 0.02
+        borrowed = (mine == 0.0) & (other > 0.5)
+        assert borrowed.sum() > 20 or balls[own] is large  # which sees all that the small one does
+        np.testing.assert_array_equal(radiance[borrowed], alone[balls[1 - own]][0][borrowed])
+        np.testing.assert_array_equal(confidence, np.maximum(mine, other))
 
 
 @pytest.mark.parametrize(("code", "share"), [(255, 1.0), (254, 1.0), (253, 0.0)])

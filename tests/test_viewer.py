@@ -35,7 +35,7 @@ from tests.rendered_room import look_at
 from tests.test_budget import even_costs
 from tests.test_pipeline import make_scene
 from warp_ar import live
-from warp_ar.accuracy.budget import AIM
+from warp_ar.accuracy.controller import AIM
 from warp_ar.accuracy.cost_table import SETTINGS
 from warp_ar.accuracy.costs import Costs
 from warp_ar.engine.pipeline import Pipeline
@@ -119,6 +119,7 @@ GOOD = [
     {"type": "budget", "ms": None},
     {"type": "compare", "other": "camera"},
     {"type": "play", "on": True},
+    {"type": "animate", "index": 0, "key": "speed", "value": 2.0},
     {"type": "scene", "name": "torus"},
     {"type": "reset"},
     {"type": "undo"},

@@ -127,12 +127,16 @@ def test_from_the_card_to_a_lit_object(
     folder = Path(os.environ.get("WARP_AR_ARTEFACTS") or tmp_path)
     folder.mkdir(parents=True, exist_ok=True)
     phone = size[0] < 800
-    with served(["desk"], tmp_path) as url:
-        context = browser.new_context(viewport={"width": size[0], "height": size[1]}, has_touch=phone, is_mobile=phone)
+    # A phone comes over the network: only TLS lets its browser open the camera.
+    options = ["desk", "--host", "0.0.0.0", "--tls"] if phone else ["desk"]
+    with served(options, tmp_path) as url:
+        viewport = {"width": size[0], "height": size[1]}
+        context = browser.new_context(viewport=viewport, has_touch=phone, is_mobile=phone, ignore_https_errors=phone)
         camera = CanvasCamera(context, views)
         tab = Tab(context.new_page())
         tab.page.goto(url)
         tab.until("!!window.warpAr && warpAr.view.stats.plan > 0 && !!warpAr.scene", "the first lit frame")
+        assert tab.page.evaluate("isSecureContext")
         camera.begin(tab)
         hands = Hands(tab, camera, phone, folder, f"setup_{size[0]}")
         use_the_card(tab, hands, desk)

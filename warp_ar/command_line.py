@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import _thread
 import argparse
 import contextlib
 import difflib
@@ -13,7 +14,9 @@ import re
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
+from types import FrameType
 from typing import Any, NoReturn
 
 from warp_ar.errors import SinkError, UsageError, WarpArError, printable, reason
@@ -157,22 +160,45 @@ def leave(code: int) -> NoReturn:
     sys.exit(code)
 
 
+_TAKES_A_LOCK = frozenset(
+    getattr(threading.Condition, name).__code__
+    for name in ("__enter__", "__exit__", "_is_owned", "_release_save", "_acquire_restore")
+)
+"""Functions of Python's own, of futures, events and queues, in which an exception leaves a lock taken that nobody gives
+back: who waits for it afterwards waits for ever."""
+_WAITS = threading.Condition.wait.__code__
+_WAITING = "gotit"
+"""The variable that is set in ``Condition.wait`` once it puts the lock back whatever comes."""
+_SOON = 0.001
+"""Seconds after which a signal that came in one of them is sent again."""
+
+
 @contextlib.contextmanager
 def ended_by_signals() -> Iterator[None]:
     """Have SIGTERM and SIGHUP unwind the stack as Ctrl-C does, so that files are closed and folders removed.
 
-    Once: who is ending already is not interrupted by the next of them. One that arrives where Python drops what is
-    raised, in a finaliser or as native code calls back, is sent again, Ctrl-C too.
+    Once: who is ending already is not interrupted by the next of them. A signal that arrives where Python drops what is
+    raised, in a finaliser or as native code calls back, or where Python is taking a lock, is sent again, Ctrl-C too.
     """
     ending, hook = False, sys.unraisablehook
     numbers: list[int] = []
 
-    def handle(number: int, _: object) -> None:
+    def end(number: int, frame: FrameType | None) -> None:
         nonlocal ending
-        if not ending:
-            ending = True
-            numbers.append(number)
-            raise Terminated
+        if ending:
+            return
+        if _takes_a_lock(frame):
+            _send_soon(number)
+            return
+        ending = True
+        numbers.append(number)
+        raise Terminated
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        if _takes_a_lock(frame):
+            _send_soon(number)
+            return
+        raise KeyboardInterrupt
 
     def send_again(dropped: Any) -> None:
         nonlocal ending
@@ -180,13 +206,10 @@ def ended_by_signals() -> Iterator[None]:
             hook(dropped)
             return
         ending = False
-        number = numbers[-1] if isinstance(dropped.exc_value, Terminated) else signal.SIGINT
-        # Not at once: that would be dropped as well.
-        timer = threading.Timer(0.01, signal.raise_signal, (number,))
-        timer.daemon = True
-        timer.start()
+        _send_soon(numbers[-1] if isinstance(dropped.exc_value, Terminated) else signal.SIGINT)
 
-    with handling(handle, "SIGTERM", "SIGHUP"):
+    ctrl_c = ("SIGINT",) if signal.getsignal(signal.SIGINT) is signal.default_int_handler else ()
+    with handling(end, "SIGTERM", "SIGHUP"), handling(interrupt, *ctrl_c):
         sys.unraisablehook = send_again
         try:
             yield
@@ -198,6 +221,32 @@ def ended_by_signals() -> Iterator[None]:
         finally:
             sys.unraisablehook = hook
         ending = True
+
+
+def _takes_a_lock(frame: FrameType | None) -> bool:
+    """Whether what a signal interrupts is in the midst of taking a lock, or of giving it back."""
+    while frame is not None:
+        code = frame.f_code
+        if code in _TAKES_A_LOCK:
+            return True
+        if code is _WAITS and _WAITING in code.co_varnames and _WAITING not in frame.f_locals:
+            return True
+        frame = frame.f_back
+    return False
+
+
+def _send_soon(number: int) -> None:
+    """Send a signal to the main thread once it has gone on."""
+
+    def send() -> None:
+        time.sleep(_SOON)
+        if hasattr(signal, "pthread_kill"):
+            signal.pthread_kill(threading.main_thread().ident or 0, number)
+        else:
+            signal.raise_signal(number)
+
+    # Not by the class `Thread`: that takes locks, and this runs wherever a signal has come.
+    _thread.start_new_thread(send, ())
 
 
 @contextlib.contextmanager

@@ -24,8 +24,8 @@ from warp_ar.accuracy.cases import SIZED, VERSIONS, Case, open_cases
 from warp_ar.accuracy.charts import require_plots
 from warp_ar.accuracy.cost_table import SETTINGS, Setting
 from warp_ar.accuracy.costs import WORK
-from warp_ar.accuracy.figures import make_figures
-from warp_ar.accuracy.progress import WorkProgress
+from warp_ar.accuracy.figures import figure_units, make_figures
+from warp_ar.accuracy.progress import Advance, WorkProgress
 from warp_ar.accuracy.report import MIN_COLUMNS, make_cost_table, make_preset_list, print_report, records
 from warp_ar.accuracy.runs import Clock
 from warp_ar.command_line import EXIT_DONE, Parser, leave, run_command
@@ -105,9 +105,17 @@ def chosen_settings(case: Case, options: argparse.Namespace) -> tuple[Setting, .
     return tuple(setting for setting in settings_of(case) if name in (None, setting.name))
 
 
-def measure(options: argparse.Namespace, device: str, clock: Clock, console: Console) -> list[CaseReport]:
-    """Measure every case that the options ask for, and print its tables."""
-    asked = []
+Asked = Sequence[tuple[Case, tuple[Setting, ...]]]
+"""Cases, and what is turned in each."""
+
+
+def asked_cases(options: argparse.Namespace, console: Console) -> Asked:
+    """Every case that the options ask for.
+
+    Raises:
+        UsageError: There is nothing to turn in any.
+    """
+    asked: list[tuple[Case, tuple[Setting, ...]]] = []
     for case in open_cases(options.scenes, options.truth, options.frames, options.shrink, options.versions):
         settings = chosen_settings(case, options)
         if settings or (options.presets and not case.name.endswith(SIZED)):
@@ -116,13 +124,26 @@ def measure(options: argparse.Namespace, device: str, clock: Clock, console: Con
             console.print(f"{case.name}: nothing to turn", highlight=False)
     if not asked:
         raise UsageError("nothing to turn in any scene that was named")
-    reports = []
+    return asked
+
+
+def units_of(options: argparse.Namespace, asked: Asked) -> float:
+    """Units of all work: of measuring, and of figures and the page where they are written."""
     units = sum(work_units(case, settings, quick=options.quick) for case, settings in asked)
-    with WorkProgress(console, units) as progress:
-        for case, settings in asked:
-            advance = progress.advance
-            reports.append(measure_case(case, device, settings, advance, quick=options.quick, clock=clock))
-            print_report(reports[-1], console)
+    if options.out is None or options.presets:
+        return units
+    units += tradeoff_page.page_units(len(settings) for _, settings in asked)
+    return units + (figure_units(options.truth) if options.stage is None else 0.0)
+
+
+def measure(
+    options: argparse.Namespace, asked: Asked, device: str, clock: Clock, console: Console, advance: Advance
+) -> list[CaseReport]:
+    """Measure every case, and print its tables."""
+    reports = []
+    for case, settings in asked:
+        reports.append(measure_case(case, device, settings, advance, quick=options.quick, clock=clock))
+        print_report(reports[-1], console)
     return reports
 
 
@@ -155,6 +176,7 @@ def write(
     device: str,
     clock: Clock,
     reports: Sequence[CaseReport],
+    advance: Advance,
 ) -> None:
     """Write what was measured: JSON lines, the cost table and the page, or the list of presets."""
     lines = (json.dumps(record) for report in reports for record in records(report, device))
@@ -165,9 +187,10 @@ def write(
     table = make_cost_table(reports, device)
     out.write("cost_table.json", json.dumps(table, indent=1) + "\n")
     whole = options.stage is None
-    figures = list(make_figures(device, options.frames, options.truth, options.shrink, clock)) if whole else []
+    made_figures = make_figures(device, options.frames, options.truth, options.shrink, clock, advance)
+    figures = list(made_figures) if whole else []
     made = table["made"] | {"clock": "processor time" if options.processor_time else "time"}
-    out.write("tradeoff.html", tradeoff_page.render(reports, figures, made, extra))
+    out.write("tradeoff.html", tradeoff_page.render(reports, figures, made, extra, advance))
 
 
 def tradeoff(options: argparse.Namespace) -> int:
@@ -181,12 +204,14 @@ def tradeoff(options: argparse.Namespace) -> int:
     console.width = max(console.width, MIN_COLUMNS)
     extra = read_extra(options.extra)
     out = None if options.out is None else open_out(options)
-    reports = measure(options, str(device), clock, console)
-    for setting, methods in make_cost_table(reports, str(device))["dominated"].items():
-        console.print(f"dominated in every case: {setting} {', '.join(methods)}", highlight=False)
-    if out is not None:
-        write(options, out, extra, str(device), clock, reports)
-        console.print(f"written to {options.out}", highlight=False)
+    asked = asked_cases(options, console)
+    with WorkProgress(console, units_of(options, asked)) as progress:
+        reports = measure(options, asked, str(device), clock, console, progress.advance)
+        for setting, methods in make_cost_table(reports, str(device))["dominated"].items():
+            console.print(f"dominated in every case: {setting} {', '.join(methods)}", highlight=False)
+        if out is not None:
+            write(options, out, extra, str(device), clock, reports, progress.advance)
+            console.print(f"written to {options.out}", highlight=False)
     return EXIT_DONE
 
 

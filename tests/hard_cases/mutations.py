@@ -54,8 +54,8 @@ MUTATIONS = (
         1,
         "the ball shows what lies along its normals",
         "kernels/declip.py",
-        "mirrored = direction - 2.0 * wp.dot(direction, normal) * normal",
-        "mirrored = normal",
+        "wi = direction - 2.0 * wp.dot(direction, normal) * normal",
+        "wi = normal",
         "tests/test_declip.py::test_ball_pixel_off_the_middle_shows_what_it_mirrors",
     ),
     Mutation(
@@ -86,11 +86,11 @@ MUTATIONS = (
         3,
         "samples outside the frame count",
         "kernels/unwrap.py",
-        "                    if inside >= 0.0 and ramp > 0.0:\n",
-        "                    if at[2] > rim_start:\n"
-        "                        ramp = 1.0\n"
-        "                        at[0] = wp.clamp(at[0], 0.0, last_column)\n"
-        "                        at[1] = wp.clamp(at[1], 0.0, last_row)\n",
+        "            if inside >= 0.0 and ramp > 0.0:\n",
+        "            if at[2] > rim[0]:\n"
+        "                ramp = 1.0\n"
+        "                at[0] = wp.clamp(at[0], 0.0, last_column)\n"
+        "                at[1] = wp.clamp(at[1], 0.0, last_row)\n",
         "tests/test_unwrap.py::test_partly_outside_the_frame",
     ),
     Mutation(
@@ -411,9 +411,9 @@ MUTATIONS = (
     Mutation(
         18,
         "objects that take light from the desk give none back",
-        "kernels/environment_shadow.py",
-        "sent += stands_for * light.distant\n",
-        "sent += 0.0 * light.distant\n",
+        "kernels/environment_shadow_bounce.py",
+        "out.sent += weight * light.distant\n",
+        "out.sent += 0.0 * light.distant\n",
         f"{HARD}test_row18_energy.py::test_white_objects_give_back_the_light_that_they_take",
     ),
     Mutation(

@@ -36,6 +36,8 @@ EARLIER = 40
 """Frames that an earlier run left, so many levels brighter."""
 TOLERANCE = 3
 """Levels that a video may be off."""
+PATIENCE = 120.0
+"""Seconds within which a process ends that was told to."""
 
 
 def frame(index: int, brighter: int = 0) -> np.ndarray:
@@ -133,6 +135,22 @@ SINKS: dict[str, tuple[Writer, Callable[..., int]]] = {
 }
 
 
+def ended(child: int) -> int:
+    """Exit code of a process that was told to end; one that does not end is killed.
+
+    Raises:
+        AssertionError: It did not end.
+    """
+    deadline = time.monotonic() + PATIENCE
+    while (found := os.waitpid(child, os.WNOHANG)) == (0, 0):
+        if time.monotonic() > deadline:
+            os.kill(child, signal.SIGKILL)
+            os.waitpid(child, 0)
+            raise AssertionError(f"it did not end within {PATIENCE:g} s")
+        time.sleep(0.005)
+    return os.waitstatus_to_exitcode(found[1])
+
+
 def attempt(name: str, number: int, kind: signal.Signals, folder: pathlib.Path) -> int:
     """Kill one run; returns how many frames it left.
 
@@ -162,8 +180,7 @@ def attempt(name: str, number: int, kind: signal.Signals, folder: pathlib.Path) 
     os.close(begun)
     time.sleep(chance.uniform(0.0, 0.5))
     os.kill(child, kind)
-    _, status = os.waitpid(child, 0)
-    code = os.waitstatus_to_exitcode(status)
+    code = ended(child)
     assert code in (0, -kind if kind == signal.SIGKILL else 143), code
     count = check(place, finished=bool(number % 2))
     if kind == signal.SIGTERM:

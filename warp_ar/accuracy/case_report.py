@@ -30,18 +30,20 @@ from warp_ar.accuracy.cost_table import (
     turn,
 )
 from warp_ar.accuracy.costs import BASE as COST_BASE
-from warp_ar.accuracy.costs import finish_steps, make_method_costs, measure_steps
+from warp_ar.accuracy.costs import MEASURED_FRAMES, finish_steps, make_method_costs, measure_steps
 from warp_ar.accuracy.progress import Advance, ignore
-from warp_ar.accuracy.runs import Clock, LightBefore, run, run_in_turn
+from warp_ar.accuracy.runs import TIMED, Clock, LightBefore, run, run_in_turn
 from warp_ar.accuracy.sweep import BRUTE_FORCE_UNITS, Row, picture_error, region_of, run_units, sweep
 from warp_ar.stages.quality import PRESETS, Quality
 
-TRIES = 6
-"""Runs at most to find what fits a budget or an error."""
+TRIES, QUICK_TRIES = 6, 4
+"""Runs at most to find what fits a budget or an error; where time matters."""
+QUICK_TIMED, QUICK_COST_FRAMES = 3, 3
+"""Frames run at a method, the first of them not timed, and frames that tell a method's cost, where time matters."""
 FITS = 0.0
 """By how much more than the paper's a measured time may be, as a share: nothing, so what runs in its time does."""
-COST_UNITS, SEARCH_UNITS = 20.0, 20.0 + 3.0 * (TRIES + 1)
-"""Units of work of measuring costs, and of that with both searches."""
+COST_UNITS = 20.0
+"""Units of work of measuring costs."""
 SAME_TIME, SAME_ERROR = "ours near the paper's time", "ours near the paper's error"
 """Labels of choices that are looked for; what they are found to take and to err is measured with the presets."""
 RUNS = ("paper", "low", "medium", "high")
@@ -94,7 +96,8 @@ def work_units(case: Case, settings: Sequence[Setting], *, quick: bool = False) 
     if case.name.endswith(SIZED):
         return units
     units += len(RUNS) + (0.0 if case.truth else BRUTE_FORCE_UNITS)
-    return units + (SEARCH_UNITS if is_complete(case, settings) else 0.0)
+    tries = QUICK_TRIES if quick else TRIES
+    return units + (COST_UNITS + 3.0 * (tries + 1) if is_complete(case, settings) else 0.0)
 
 
 def measure_case(
@@ -113,15 +116,23 @@ def measure_case(
         device: Where.
         settings: What to turn.
         advance: Told of what is done, ``work_units`` in all.
-        quick: Leave brute force out, and what lies between two other methods.
+        quick: Leave brute force out, and what lies between two other methods; time fewer frames, and search less.
         clock: Seconds, on CPU.
     """
     rows: list[Row] = []
     pictures: dict[tuple[str, str], Image] = {}
     with LightBefore() as before:
         for setting in settings:
-            methods = setting.measured if quick else setting.methods
-            own, shown = sweep(case, setting, device, methods=methods, clock=clock, advance=advance, before=before)
+            own, shown = sweep(
+                case,
+                setting,
+                device,
+                methods=setting.measured if quick else setting.methods,
+                timed=QUICK_TIMED if quick else TIMED,
+                clock=clock,
+                advance=advance,
+                before=before,
+            )
             rows += own
             pictures.update({(setting.name, method): image for method, image in shown.items()})
     if case.name.endswith(SIZED):
@@ -131,7 +142,7 @@ def measure_case(
     reference = case.truth or _best_images(case, device, advance, quick=quick)
     qualities = {name: PRESETS[name] for name in RUNS}
     if is_complete(case, settings) and "paper" in qualities:
-        qualities |= _find_equals(case, device, settings, rows, reference, clock, advance)
+        qualities |= _find_equals(case, device, settings, rows, reference, clock, advance, quick=quick)
     times, images = run_in_turn(case, qualities, device, clock)
     advance(f"{case.name}: presets", len(RUNS))
     wholes = tuple(
@@ -167,14 +178,17 @@ def _find_equals(
     reference: Mapping[int, Image],
     clock: Clock,
     advance: Advance,
+    *,
+    quick: bool,
 ) -> dict[str, Quality]:
     """Our choices in the paper's time and at its error, as ``--quality auto`` chooses: costs measured, errors known."""
     frame, size = case.frames[-1], (case.scene.camera.width, case.scene.camera.height)
-    steps = measure_steps(case.scene, frame.image, case.poses[-1], device, size, settings, clock)
+    count, tries = (QUICK_COST_FRAMES, QUICK_TRIES) if quick else (MEASURED_FRAMES, TRIES)
+    steps = measure_steps(case.scene, frame.image, case.poses[-1], device, size, settings, clock, frames=count)
     costs = finish_steps(steps, lambda share: advance(f"{case.name}: costs", share * COST_UNITS))
     front = pareto_front(make_method_costs(costs, listed_errors(rows)), costs.scales)
-    same_time = _find_same_time(case, front, costs.base - costs.track, device, clock, advance)
-    same_error = _find_same_error(case, front, device, reference, advance)
+    same_time = _find_same_time(case, front, costs.base - costs.track, device, clock, advance, tries)
+    same_error = _find_same_error(case, front, device, reference, advance, tries)
     return {SAME_TIME: same_time, SAME_ERROR: same_error}
 
 
@@ -190,7 +204,7 @@ def listed_errors(rows: Sequence[Row]) -> Mapping[str, Mapping[str, float]]:
 
 
 def _find_same_time(
-    case: Case, front: Sequence[Choice], base_ms: float, device: str, clock: Clock, advance: Advance
+    case: Case, front: Sequence[Choice], base_ms: float, device: str, clock: Clock, advance: Advance, tries: int
 ) -> Quality:
     """Least error by the list of what is measured, in turn with the paper's preset, to take no more than that.
 
@@ -211,7 +225,7 @@ def _find_same_time(
     paper = fits(front[0])[1]
     place = front.index(choose(front, paper - base_ms))
     low, high = 0, len(front)
-    for _ in range(TRIES):
+    for _ in range(tries):
         if fits(front[place])[0]:
             low = place
         else:
@@ -219,12 +233,12 @@ def _find_same_time(
         if high - low <= 1:
             break
         place = min(low + 2, high - 1) if high == len(front) else (low + high) // 2
-    advance(f"{case.name}: equal time", 2.0 * (TRIES + 1) - units)
+    advance(f"{case.name}: equal time", 2.0 * (tries + 1) - units)
     return _chosen(front[low])
 
 
 def _find_same_error(
-    case: Case, front: Sequence[Choice], device: str, reference: Mapping[int, Image], advance: Advance
+    case: Case, front: Sequence[Choice], device: str, reference: Mapping[int, Image], advance: Advance, tries: int
 ) -> Quality:
     """Cheapest by the list of what is measured to err no more than the paper's preset: only the list orders."""
     units = 0
@@ -239,7 +253,7 @@ def _find_same_error(
     low, high = -1, len(front) - 1
     with LightBefore() as before:
         aim = error(PRESETS["paper"], before)
-        for _ in range(TRIES):
+        for _ in range(tries):
             if high - low <= 1:
                 break
             middle = (low + high) // 2
@@ -247,7 +261,7 @@ def _find_same_error(
                 high = middle
             else:
                 low = middle
-    advance(f"{case.name}: equal error", TRIES + 1.0 - units)
+    advance(f"{case.name}: equal error", tries + 1.0 - units)
     return _chosen(front[high])
 
 

@@ -81,7 +81,7 @@ _SHARED: Mapping[str, tuple[str, Mapping[str, str]]] = {
 }
 _CHOICES = tuple(stage for stage in STAGES if len(stage.methods) > 1)
 SETTINGS: tuple[Setting, ...] = (
-    _shared("environment_height", "32", "48", "64", "96", "128", "160", "192", "224", "256"),
+    _shared("environment_height", "32", "48", "64", "96", "112", "128", "144", "160", "192", "224", "256"),
     _shared("edge_samples", "1", "4", "9", "16"),
     _shared("light_shadow", "hard", "soft"),
     _shared("area_light", *AREA_SAMPLES),
@@ -92,6 +92,8 @@ BETWEEN: Mapping[str, Mapping[str, tuple[str, str, float]]] = {
     "environment_height": {
         "48": ("32", "64", 5 / 12),
         "96": ("64", "128", 5 / 12),
+        "112": ("64", "128", 11 / 16),
+        "144": ("128", "256", 17 / 192),
         "160": ("128", "256", 9 / 48),
         "192": ("128", "256", 20 / 48),
         "224": ("128", "256", 33 / 48),

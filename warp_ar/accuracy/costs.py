@@ -33,14 +33,15 @@ from warp_ar.stages.recover import EVERY_FRAME
 
 BASE = PRESETS["medium"]
 """What costs are measured from, and what runs until something is chosen."""
-_MEASURED_FRAMES = 6
+MEASURED_FRAMES = 6
+"""Frames that tell what a method costs."""
 _WARM_UP = 1
 NOW_AND_THEN = "recover"
 """Stage that works some times a second on a thread of its own: what it takes is shown by all that the process works."""
 _SPREAD_FRAMES = 12
 """Frames over which that is taken: two of its turns."""
 _ENOUGH_MS = 200.0
-"""Of a method: dear ones are measured on fewer frames, for their noise is small beside what they cost."""
+"""Expensive methods use fewer frames: their relative noise is small."""
 WORK = time.thread_time
 """Clock that counts what a thread works: other programs that are busy at the same time then hardly matter."""
 _CACHE_FILE = "costs.json"
@@ -126,6 +127,8 @@ def measure_steps(
     size: tuple[int, int],
     settings: Sequence[Setting],
     clock: Callable[[], float] | None = None,
+    *,
+    frames: int = MEASURED_FRAMES,
 ) -> Generator[float, None, Costs]:
     """``measure_costs`` in small steps, for whoever has other objects to do; yields the share that is done."""
     count, done = sum(len(setting.measured) for setting in settings) + 2, 2
@@ -133,7 +136,7 @@ def measure_steps(
     passed = _time_stages(scene, image, pose, device, size, BASE, time.perf_counter)
     track = passed.pop(TRACK, 0.0)
     yield 1 / count
-    base = _time_stages(scene, image, pose, device, size, BASE, timed)
+    base = _time_stages(scene, image, pose, device, size, BASE, timed, frames=frames)
     base.pop(TRACK, None)
     yield done / count
     work = sum(base.values())
@@ -148,7 +151,10 @@ def measure_steps(
         for method in setting.measured:
             quality = turn(BASE, {setting.name: method})
             known = method == start and not spread
-            times[method] = base if known else _time_stages(scene, image, pose, device, size, quality, timed, spread)
+            if known:
+                times[method] = base
+            else:
+                times[method] = _time_stages(scene, image, pose, device, size, quality, timed, spread, frames)
             times[method].pop(TRACK, None)
             done += 1
             yield done / count
@@ -209,11 +215,12 @@ def _time_stages(
     quality: Quality,
     clock: Callable[[], float],
     spread: bool = False,
+    frames: int = MEASURED_FRAMES,
 ) -> dict[str, float]:
     """Milliseconds by stage, tracking among them where the clock is that of the time that passes."""
     times: dict[str, list[float]] = {}
     spent = 0.0
-    warm_up, count = (EVERY_FRAME, _SPREAD_FRAMES) if spread else (_WARM_UP, _MEASURED_FRAMES)
+    warm_up, count = (EVERY_FRAME, _SPREAD_FRAMES) if spread else (_WARM_UP, frames)
     shown_at = light_only(quality) if spread else quality
     with open_profiled(scene, device, shown_at, size, clock) as pipeline:
         begun = 0.0

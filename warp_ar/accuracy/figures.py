@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ import numpy.typing as npt
 from warp_ar.accuracy.cases import Image, load_case, open_scene, read_truth, truth_folders
 from warp_ar.accuracy.cost_table import light_only, turn
 from warp_ar.accuracy.metrics import clipped_region
+from warp_ar.accuracy.progress import Advance, ignore
 from warp_ar.accuracy.runs import BASE, Clock, LightBefore, run
 from warp_ar.accuracy.sweep import region_of
 from warp_ar.scene import load_scene
@@ -65,18 +66,35 @@ _FIGURES = (
 method."""
 
 
+def _versions_of(truth: Path | None, versions: Sequence[str]) -> Iterator[tuple[Path, str]]:
+    """Cases that have one of the versions, and which."""
+    for folder in truth_folders(truth) if truth is not None else ():
+        version = next((name for name in versions if (folder / f"scene_{name}.toml").is_file()), None)
+        if version is not None:
+            yield folder, version
+
+
+def figure_units(truth: Path | None) -> float:
+    """Units of work, in runs at a usual method, that ``make_figures`` will report as done."""
+    cases = ((methods, 1 + sum(1 for _ in _versions_of(truth, versions))) for _, _, versions, _, methods, _ in _FIGURES)
+    return float(sum(len(methods) * count for methods, count in cases))
+
+
 def make_figures(
-    device: str, count: int, truth: Path | None, times: int = 1, clock: Clock = time.perf_counter
+    device: str,
+    count: int,
+    truth: Path | None,
+    times: int = 1,
+    clock: Clock = time.perf_counter,
+    advance: Advance = ignore,
 ) -> Iterator[Figure]:
     """Figures 7, 8 and 9 of the paper: plain, the paper's way, ours, each against the truth where that is known."""
     for title, bundled, versions, setting, methods, text in _FIGURES:
         cases = [(f"{title}: {bundled.replace('_', ' ')}", open_scene(bundled, count, times))]
-        for folder in truth_folders(truth) if truth is not None else ():
-            version = next((name for name in versions if (folder / f"scene_{name}.toml").is_file()), None)
-            if version is not None:
-                scene = load_scene(folder / f"scene_{version}.toml")
-                case = load_case(folder.name, scene, count, read_truth(folder / version), times)
-                cases.append((f"{title} again: {folder.name.replace('_', ' ')}, {version.replace('_', ' ')}", case))
+        for folder, version in _versions_of(truth, versions):
+            scene = load_scene(folder / f"scene_{version}.toml")
+            case = load_case(folder.name, scene, count, read_truth(folder / version), times)
+            cases.append((f"{title} again: {folder.name.replace('_', ' ')}, {version.replace('_', ' ')}", case))
         for number, (name, case) in enumerate(cases):
             index = case.shown[-1]
             camera = case.frames[index].image
@@ -86,6 +104,7 @@ def make_figures(
                     turned = turn(BASE, {setting: method})
                     between = light_only(turned)
                     outcomes.append(run(case, turned, device, between=between, timed=1, clock=clock, before=before))
+                    advance(f"{name}: {method}", 1.0)
             images = [outcome.images[index] for outcome in outcomes]
             reference = case.truth.get(index)
             labels = (f"plain ({methods[0]})", f"the paper ({methods[1]})", f"ours ({methods[2]})")

@@ -102,6 +102,7 @@ def sweep(
     base: Quality = BASE,
     *,
     methods: Sequence[str] | None = None,
+    timed: int = TIMED,
     clock: Clock = time.perf_counter,
     advance: Advance = ignore,
     before: LightBefore | None = None,
@@ -114,6 +115,7 @@ def sweep(
         device: Where.
         base: What all other settings stay on.
         methods: Some of the setting's, in its order; None means all.
+        timed: Last frames that run at a method, the first of them not timed; by brute force only the last does.
         clock: Seconds, on CPU.
         advance: Told of every method that has run.
         before: As that of ``run``.
@@ -121,9 +123,9 @@ def sweep(
     outcomes: dict[str, Outcome] = {}
     for method in methods or setting.methods:
         turned = turn(base, {**_FAIR.get(setting.name, {}), setting.name: method})
-        timed = 1 if method == "brute_force" else TIMED
+        count = 1 if method == "brute_force" else timed
         between = light_only(turned)
-        outcomes[method] = run(case, turned, device, setting, between=between, timed=timed, clock=clock, before=before)
+        outcomes[method] = run(case, turned, device, setting, between=between, timed=count, clock=clock, before=before)
         advance(f"{case.name}: {setting.name} {method}", run_units(method))
     if setting.name == NOW_AND_THEN and wp.get_device(device).is_cpu:
         count_work(case, outcomes, device, clock)

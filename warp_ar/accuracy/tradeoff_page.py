@@ -19,6 +19,7 @@ from warp_ar.accuracy.cost_table import SETTINGS, WORDS
 from warp_ar.accuracy.figures import Figure
 from warp_ar.accuracy.metrics import flip_map
 from warp_ar.accuracy.pictures import Box, bounding_box, crop, error_colors
+from warp_ar.accuracy.progress import Advance, ignore
 from warp_ar.accuracy.sweep import Row
 from warp_ar.signature import COMMENT
 
@@ -26,6 +27,8 @@ QUALITY = 82
 """Of WebP, for all pictures."""
 SHOWN = ("paper", SAME_TIME, "medium", "high")
 """Wholes whose pictures are shown."""
+SECTION_UNITS = 0.3
+"""Units of work of a section: a chart, and pictures with their errors."""
 REAL_TIME = 1e3 / 30.0
 """Milliseconds of a frame at 30 frames per second."""
 
@@ -340,8 +343,17 @@ def _arithmetic_section(extra: Sequence[Mapping[str, Any]]) -> str:
     )
 
 
+def page_units(settings: Iterable[int]) -> float:
+    """Units of work, in runs at a usual method, that ``render`` reports as done, by numbers of settings per case."""
+    return SECTION_UNITS * sum(count + 2 for count in settings)
+
+
 def render(
-    reports: Sequence[CaseReport], figures: Sequence[Figure], made: Mapping[str, Any], extra: Sequence[Any] = ()
+    reports: Sequence[CaseReport],
+    figures: Sequence[Figure],
+    made: Mapping[str, Any],
+    extra: Sequence[Any] = (),
+    advance: Advance = ignore,
 ) -> str:
     """The whole page.
 
@@ -350,7 +362,13 @@ def render(
         figures: The paper's figures, redone.
         made: On what it was measured: ``device``, ``warp``, and what ``clock`` counts, ``time`` or ``processor time``.
         extra: Lines of the bench of arithmetic.
+        advance: Told of every section that is written.
     """
+
+    def told(text: str, section: str) -> str:
+        advance(f"page: {text}", SECTION_UNITS)
+        return section
+
     anchors = [(f"case{index}", report) for index, report in enumerate(reports)]
     whole = [(anchor, report) for anchor, report in anchors if report.wholes]
     by_clock = made.get("clock", "time") == "time"
@@ -379,7 +397,7 @@ def render(
         '<a href="#arithmetic">Arithmetic</a>' if lines else "",
         "</nav>",
         '<div class="many">' if whole else "",
-        *(_glance(report, anchor, limit) for anchor, report in whole),
+        *(told(report.case.name, _glance(report, anchor, limit)) for anchor, report in whole),
         "</div>" if whole else "",
     ]
     if figures:
@@ -389,9 +407,9 @@ def render(
     parts.append(_list_section(reports))
     for anchor, report in anchors:
         parts.append(f'<section id="{anchor}"><h2>{html.escape(report.case.name)}</h2>')
-        parts.append(_whole_section(report, limit) if report.wholes else "")
-        for _, rows in itertools.groupby(report.rows, lambda row: row.setting):
-            parts.append(_setting_section(report, list(rows)))
+        parts.append(told(report.case.name, _whole_section(report, limit)) if report.wholes else "")
+        for name, rows in itertools.groupby(report.rows, lambda row: row.setting):
+            parts.append(told(f"{report.case.name}: {name}", _setting_section(report, list(rows))))
         parts.append("</section>")
     if lines:
         parts.append(_arithmetic_section(lines))

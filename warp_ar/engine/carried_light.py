@@ -13,9 +13,11 @@ from warp_ar.kernels.change import scale_radiance
 from warp_ar.kernels.structs import Emitter
 from warp_ar.stages.base import Arrays
 
+KEPT_ARRAYS = ("others_kept_radiance", "others_filled")
+"""Remembered radiance of mirror balls after the first; stages carry it over."""
 LIGHT_ARRAYS = ("environment_radiance", "environment_confidence", "environment_clipped")
 """What is remembered of the environment."""
-SCALED_ARRAYS = ("environment_radiance", "filled_radiance", "recover_recovered")
+SCALED_ARRAYS = ("environment_radiance", "filled_radiance", "recover_recovered", *KEPT_ARRAYS)
 """Remembered radiance; the filled map is, while something covers a ball."""
 
 
@@ -43,9 +45,10 @@ class CarriedLight:
         captured = ("environment",) if "environment" in arrays and SCALED_ARRAYS[0] not in arrays else ()
         for name in (*SCALED_ARRAYS, *captured):
             if name in arrays:
-                scale_radiance(arrays[name], ratio)
-        for name in captured:
-            arrays.touch(name)
+                scale_radiance(arrays[name].reshape((-1, arrays[name].shape[-1])), ratio)
+        for name in (*captured, "others_filled"):
+            if name in arrays:
+                arrays.touch(name)
         if "emitters" in arrays and isinstance(arrays["emitters"], wp.array):
             emitters = arrays["emitters"]
             records = np.array(emitters.numpy()).view(np.dtype(Emitter.numpy_dtype()))

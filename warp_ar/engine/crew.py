@@ -176,6 +176,10 @@ class Crew:
         self._waits = np.bincount(reading, minlength=len(stages)).astype(np.int64)
         self._first = _column(self._stages, bands.STAGE, "first_pass").copy()
         self._last = _column(self._stages, bands.STAGE, "last_pass").copy()
+        self._unbegun = self._stages.copy()
+        for name, column in (("waits", self._waits), ("current", self._first), ("ready", 2 * (self._waits == 0))):
+            _column(self._unbegun, bands.STAGE, name)[:] = column
+        self._open, self._has_failed = bands.STATE.index("open"), bands.STATE.index("failed")
         self._start, self._stop, self._time = (
             _column(self._passes, bands.PASS, name) for name in ("start", "stop", "time")
         )
@@ -298,11 +302,9 @@ class Crew:
         Raises:
             BaseException: The first that a step of Python's raised; what was under way is done.
         """
-        self._stages[:, bands.STAGE.index("waits")] = self._waits
-        self._stages[:, bands.STAGE.index("current")] = self._first
-        self._stages[:, bands.STAGE.index("ready")] = np.where(self._waits == 0, 2, 0)
-        self._state[0, bands.STATE.index("open")] = len(self._names)
-        self._state[0, bands.STATE.index("failed")] = 0
+        self._stages[:] = self._unbegun
+        self._state[0, self._open] = len(self._names)
+        self._state[0, self._has_failed] = 0
         if len(self._threads) < len(self._helpers):
             # A crew may be collected without having been closed: what a thread reads until it has returned is its own
             # to keep. The callback, which would keep the crew, is called during frames alone.

@@ -25,6 +25,7 @@ from warp_ar.input.own_markers import Places
 from warp_ar.input.plate import Plate, decode_deep
 from warp_ar.input.saturation import PERIOD, WATCHED, SaturationLevels, ball_discs
 from warp_ar.kernels.color import camera_table, decode_table, encode_table
+from warp_ar.kernels.launch import Note, noting
 from warp_ar.kernels.structs import MESH, Probe
 from warp_ar.kernels.wide_bvh import build_wide_bvh_kernel
 from warp_ar.scene import Camera, Pose, Scene
@@ -89,11 +90,8 @@ class FrameInputs:
         """
         shape = (camera.height, camera.width)
         self._camera, self._arrays = camera, arrays
-        shapes = {shape_kind(item) for item in scene.objects} | {shape_kind(item) for item in scene.proxies}
-        if device.is_cpu and MESH in shapes:
-            load_at_once(build_wide_bvh_kernel, device)
-        self.host_scene = HostScene(scene, device)
-        self.host_scene.ray_scene.pixel_spread = 1.0 / max(camera.fx, camera.fy)
+        self.host_scene, self.first_launches = _make_host_scene(scene, device)
+        self.host_scene.set_pixel_spread(1.0 / max(camera.fx, camera.fy))
         self.block = FrameBlock(device, len(scene.lights), self.host_scene.shape_count, len(scene.proxies))
         self.host_scene.ray_scene.objects = self.block.device_array("objects")
         self.host_scene.ray_scene.proxies = self.block.device_array("proxies")
@@ -101,6 +99,7 @@ class FrameInputs:
         self.block.upload()
         self.frame = wp.zeros(shape, dtype=wp.vec3ub, device=device)
         """The picture that stages read."""
+        self._host_frame = self.frame.numpy() if device.is_cpu else None
         self._linear_frame = wp.zeros(shape if linear else (0, 0), dtype=wp.vec3, device=device)
         self._linear_clip = wp.zeros(2, dtype=wp.vec3, device=device)
         self.transfers = None if device.is_cpu else Transfers(shape, device)
@@ -358,10 +357,10 @@ class FrameInputs:
         elif isinstance(frame.image, wp.array):
             wp.copy(self.frame, frame.image)
         else:
-            target = self.frame.numpy()
-            if frame.index and np.array_equal(target, frame.image):
+            assert self._host_frame is not None
+            if frame.index and np.array_equal(self._host_frame, frame.image):
                 return False
-            np.copyto(target, frame.image)
+            np.copyto(self._host_frame, frame.image)
         return True
 
 
@@ -370,3 +369,12 @@ def _probe_values(probes: Sequence[scenes.Probe]) -> npt.NDArray[Any]:
     for value, probe in zip(values, probes, strict=True):
         value["center"], value["radius"], value["reflectance"] = probe.center, probe.radius, probe.reflectance
     return values
+
+
+def _make_host_scene(scene: Scene, device: Any) -> tuple[HostScene, list[Note]]:
+    """A scene as rays meet it, and what is to be launched for it before the first frame."""
+    shapes = {shape_kind(item) for item in scene.objects} | {shape_kind(item) for item in scene.proxies}
+    if device.is_cpu and MESH in shapes:
+        load_at_once(build_wide_bvh_kernel, device)
+    with noting() as launches:
+        return HostScene(scene, device), launches

@@ -175,6 +175,7 @@ class Pipeline(Closing):
             linear=deep,
         )
         self._scheduler = Scheduler(self.plan, self._arrays, self.device, bands=bands, profile=profile, culling=culling)
+        self._scheduler.launch_first(self.inputs.first_launches)
         short = self.plan.needs("short_frames")
         self._short = ShortFrames(self.plan.features, self._arrays, self.device) if short else None
 

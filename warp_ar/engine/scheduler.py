@@ -13,7 +13,7 @@ import contextlib
 import dataclasses
 import itertools
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 import warp as wp
@@ -102,6 +102,8 @@ class Scheduler:
         self._passes = {stage.name: passes for stage, passes in self._stages}
         self._readers = _find_readers([stage for stage, _ in self._stages])
         # Stages that decide per frame what they do: their passes are part of a frame's pattern.
+        self._late = {stage.name for stage, _ in self._stages if type(stage).changed is not Stage.changed}
+        """Stages that may find that they changed nothing: their readers then rest."""
         self._changing = {stage.name for stage, passes in self._stages if any(step.enabled for step in passes)}
 
     def _build(self) -> None:
@@ -115,6 +117,10 @@ class Scheduler:
                 with noting() as notes:
                     self._stages.append((stage, stage.build(self.arrays, self.device)))
                 self._first_launches += notes
+
+    def launch_first(self, notes: Iterable[Note]) -> None:
+        """Have something launched once before the first frame, beside what the stages ask for."""
+        self._first_launches += notes
 
     def close(self) -> None:
         """Stop the worker threads."""
@@ -182,7 +188,7 @@ class Scheduler:
                             step.launch(None if step.rows is None else (0, step.rows))
                         if noted:  # else it did its work by other means, as it will in each frame
                             notes[id(step)] = noted
-        found = [*self._first_launches, *(note for each in notes.values() for note in each)]
+        found = [*(note for each in notes.values() for note in each), *self._first_launches]
         launched = [(note.kernel, note.block_dim) for note in found if note.kernel is not None]
         kernels = [kernel for kernel, size in launched if self._has_usual_blocks(kernel, size)]
         blocks = [(kernel, size) for kernel, size in launched if not self._has_usual_blocks(kernel, size)]
@@ -278,10 +284,12 @@ class Scheduler:
         """Passes of a stage that take part in this frame."""
         if stage.name not in self._unneeded:
             stage.begin()
+        if stage.name not in self._changing:
+            return passes
         return [step for step in passes if step.enabled is None or step.enabled()]
 
     def _publish(self, stage: Stage) -> None:
-        if stage.name in self._unneeded and type(stage).changed is not Stage.changed:
+        if stage.name in self._unneeded and stage.name in self._late:
             return  # what readers may miss is decided in frames that have readers, whether others are left out or not
         for name in stage.wiring.writes:
             if stage.changed(name) or self.arrays.version(name) == 0:
@@ -317,7 +325,7 @@ class Scheduler:
             if stage.name in open_ended:
                 crew.ask(stage)
                 open_ended.update(self._readers[stage.name])
-            elif self._enter(stage) and _says_in_the_end(stage):
+            elif self._enter(stage) and stage.name in self._late:
                 open_ended.update(self._readers[stage.name])
         try:
             times = crew.run()
@@ -339,7 +347,7 @@ class Scheduler:
         if versions is None:
             return False
         assert self._crew is not None
-        late = _says_in_the_end(stage)
+        late = stage.name in self._late
         due = [(step, self._rows_of(step)) for step in self._begin(stage, self._passes[stage.name])]
         self._crew.begin(stage, due, tell=late)
         self._seen[stage.name] = versions
@@ -465,11 +473,6 @@ def _make_marks(device: Any) -> tuple[Any, Any]:
 
 def _ids(steps: list[Pass]) -> tuple[int, ...]:
     return tuple(map(id, steps))
-
-
-def _says_in_the_end(stage: Stage) -> bool:
-    """Whether a stage may find that it changed nothing: its readers then rest."""
-    return type(stage).changed is not Stage.changed
 
 
 def _in_launch_order(part: list[Step]) -> list[Step]:

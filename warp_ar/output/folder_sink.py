@@ -74,7 +74,8 @@ class FolderSink(ThreadedSink):
         """Take the next frame; the first one clears away those of an earlier run."""
         self._check(image)
         earlier, self._earlier = self._earlier, []
-        for path in earlier:
+        # The last first: who is killed meanwhile leaves the beginning of the earlier run, all parts of its frames.
+        for path in reversed(earlier):
             try:
                 path.unlink(missing_ok=True)
             except OSError as error:

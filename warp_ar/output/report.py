@@ -169,4 +169,6 @@ def print_plan(plan: Plan, log: RunLog | None = None) -> None:
             table.add_row("", "", "", "", f"left out of {frames} frames: {reason}", style="dim")
     for name, reason in left_out(plan):
         table.add_row(name, "", "left out", "", reason, style="dim")
+    if plan.features.balls:
+        table.caption = f"{plan.features.balls[0].upper()}{plan.features.balls[1:]}."
     Console().print(table)

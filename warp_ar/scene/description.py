@@ -284,10 +284,16 @@ class Play:
     """Time at which it begins, in seconds after the first frame; before, it holds its first pose."""
     speed: float = 1.0
     """Seconds of the animation per second."""
+    offset: float = 0.0
+    """Time of the animation with which it begins, in seconds."""
+    paused: bool = False
+    """Whether it holds the pose that it begins with."""
 
     def time_at(self, seconds: float, duration: float) -> float:
         """Time of the animation, ``seconds`` after the first frame; ``duration`` is that of its last key."""
-        passed = max((seconds - self.start) * self.speed, 0.0)
+        passed = self.offset
+        if not self.paused:
+            passed += max((seconds - self.start) * self.speed, 0.0)
         if not self.loop:
             return min(passed, duration)
         return math.fmod(passed, duration) if duration > 0.0 else 0.0

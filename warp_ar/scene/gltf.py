@@ -20,7 +20,7 @@ import numpy.typing as npt
 from warp_ar.errors import SceneError
 from warp_ar.files import limits, too_much
 from warp_ar.pictures import decode_picture, picture_size
-from warp_ar.scene.gltf_animation import animation_names, read_animation
+from warp_ar.scene.gltf_animation import animation_names, moves_morph_targets, read_animation
 from warp_ar.scene.gltf_arrays import GltfArrays
 from warp_ar.scene.gltf_materials import SUPPORTED, GltfMaterials
 from warp_ar.scene.mesh_assets import Assets, fail, image_bytes, objects, read_gltf
@@ -124,15 +124,23 @@ class _Reader:
             node = self._nodes[index]
             if "mesh" in node:
                 place = rig.places.get(index)
-                if place is not None and "skin" in node:
-                    self._note("skins under an animation")
+                if "skin" in node:
                     place = None
                 parts += self._mesh(node, _UP @ transform if place is None else place[1], world)
                 carriers += [-1 if place is None else place[0]] * (len(parts) - len(carriers))
+        self._note_still([self._nodes[index] for index in world], animation)
         return GltfContents(parts, self._decoded, list(self._notes), carriers, tuple(rig.anchors), rig.duration)
 
     def _note(self, what: str) -> None:
         self._notes.setdefault(what)
+
+    def _note_still(self, shown: list[dict[str, Any]], animation: str | int | None) -> None:
+        """Say, once for both, that skins and morph targets do not move, where an animation would have them do so."""
+        animated = bool(animation_names(self._path, self._header))
+        skins = animated and any("skin" in node and "mesh" in node for node in shown)
+        morphs = animated and moves_morph_targets(self._path, self._header, animation)
+        if still := [name for name, there in (("skins", skins), ("morph targets", morphs)) if there]:
+            self._note(f"movement of {' and '.join(still)} (they stand as at the start)")
 
     def _look_at_extensions(self) -> None:
         used, required = (self._header.get(key, []) for key in ("extensionsUsed", "extensionsRequired"))

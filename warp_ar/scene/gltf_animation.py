@@ -38,6 +38,19 @@ def animation_names(path: Path, header: dict[str, Any]) -> list[str]:
     return [str(item.get("name", ""))[:60] for item in objects(path, header, "animations")]
 
 
+def moves_morph_targets(path: Path, header: dict[str, Any], wanted: str | int | None) -> bool:
+    """Whether an animation, or with None any, has a channel that moves morph targets.
+
+    Raises:
+        SceneError: There is no such animation, or it is damaged.
+    """
+    items = objects(path, header, "animations")
+    if wanted is not None:
+        items = [items[_find(path, animation_names(path, header), wanted)]]
+    targets = (channel.get("target") for item in items for channel in objects(path, item, "channels"))
+    return any(isinstance(target, dict) and target.get("path") == "weights" for target in targets)
+
+
 def read_animation(
     path: Path,
     header: dict[str, Any],
@@ -68,7 +81,8 @@ def read_animation(
             fail(path, f"{label} has a channel without a target")
         prop = target.get("path")
         if not isinstance(prop, str) or prop not in WIDTHS:
-            note("animated morph targets" if prop == "weights" else f"animated {str(prop)[:30]}")
+            if prop != "weights":  # what is said of morph targets, `moves_morph_targets` tells
+                note(f"animated {str(prop)[:30]}")
             continue
         if target.get("node") is None:  # said by an extension, if at all
             continue

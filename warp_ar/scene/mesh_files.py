@@ -21,7 +21,8 @@ from warp_ar.files import is_file, read_bytes
 from warp_ar.pictures import read_picture
 from warp_ar.scene.geometry import Mesh, creased_normals, smooth_normals
 from warp_ar.scene.gltf import GltfContents, load_gltf
-from warp_ar.scene.mesh_assets import Assets, check_counts
+from warp_ar.scene.gltf_animation import animation_names
+from warp_ar.scene.mesh_assets import Assets, check_counts, read_gltf
 from warp_ar.scene.mesh_materials import MeshMaterial
 from warp_ar.scene.mesh_parts import LARGEST, MeshPart, join_parts
 from warp_ar.scene.moving_mesh import moving_mesh
@@ -128,6 +129,17 @@ def load_moving_mesh(path: Path, animation: str | int) -> MovingMesh:
     contents = _read_file(path, animation)[0]
     with _said_in_words(path):
         return moving_mesh(f"{path}", contents)
+
+
+def animations_of(path: Path) -> list[str]:
+    """Names of a glTF file's animations, by number; empty where one has none.
+
+    Raises:
+        SceneError: As :func:`load_mesh`.
+    """
+    data = read_bytes(path, "mesh_bytes", SceneError)
+    with _said_in_words(path):
+        return animation_names(path, read_gltf(path, data, Assets(path, library_first=False))[0])
 
 
 def _load(path: Path) -> tuple[Mesh, Assets]:

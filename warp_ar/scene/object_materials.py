@@ -87,7 +87,7 @@ def moving_mesh_of(item: Object) -> MovingMesh | None:
     """
     if item.play is None or item.file is None or item.mesh is not None:
         return None
-    return _read_moving(item.file, _stamp(item.file), item.play.animation)
+    return _read_moving(item.file, file_stamp(item.file), item.play.animation)
 
 
 @functools.lru_cache(maxsize=8)
@@ -98,7 +98,8 @@ def _read_moving(path: Path, stamp: tuple[int, int], animation: str | int) -> Mo
     return moving
 
 
-def _stamp(path: Path) -> tuple[int, int]:
+def file_stamp(path: Path) -> tuple[int, int]:
+    """What is another one once a file has changed."""
     try:
         status = path.stat()
     except OSError:
@@ -112,7 +113,7 @@ def file_mesh(path: Path) -> Mesh:
     Raises:
         SceneError: It cannot be read.
     """
-    return _read_mesh(path, _stamp(path))
+    return _read_mesh(path, file_stamp(path))
 
 
 @functools.lru_cache(maxsize=4)

@@ -137,6 +137,8 @@ def _read_play(parent: SceneTable, shape: str) -> Play | None:
         animation=animation,
         loop=table.flag("loop", Play.loop),
         start=table.number("start", Play.start, unit="seconds"),
+        offset=table.number("offset", Play.offset, low=0.0, unit="seconds"),
+        paused=table.flag("paused", Play.paused),
         speed=table.number("speed", Play.speed, low=SMALLEST),
     )
 

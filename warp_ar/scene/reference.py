@@ -165,6 +165,8 @@ _EXAMPLES: Final[dict[tuple[str, str], tuple[str, str, str]]] = {
     ("object.play", "loop"): ("-", "false", ""),
     ("object.play", "start"): ("seconds", "2.0", ""),
     ("object.play", "speed"): ("-", "0.5", ""),
+    ("object.play", "offset"): ("seconds", "1.5", ""),
+    ("object.play", "paused"): ("-", "true", ""),
     ("object.animate", "turn"): ("degrees per second", "[0.0, 0.0, 30.0]", ""),
     ("object.animate", "pivot"): ("metres", "[0.0, 0.0, 0.0]", "turn = [0.0, 0.0, 30.0]"),
     ("object.animate", "sway"): ("metres", "[0.02, 0.0, 0.0]", ""),

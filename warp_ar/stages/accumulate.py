@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import functools
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
 import warp as wp
 
 from warp_ar.kernels import accumulate
+from warp_ar.kernels.probe_weights import update_places
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring, unobserved
 from warp_ar.stages.features import Features
-from warp_ar.stages.shared.probe_maps import UNWRAPPED, find_view
+from warp_ar.stages.shared.probe_maps import KEPT, OTHERS, UNWRAPPED, find_view, other_maps, other_names, other_views
 
 
 class Accumulate(Stage):
@@ -28,7 +30,12 @@ class Accumulate(Stage):
         measured=9.9e-08,
         rows=(6, 7, 17, 18),
     )
-    remembers: ClassVar[tuple[str, ...]] = ("accumulate_change",)
+    remembers: ClassVar[tuple[str, ...]] = (
+        "accumulate_change",
+        "accumulate_others",
+        "probe_places",
+        *(f"{KEPT}_{part}" for part in UNWRAPPED),
+    )
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
@@ -36,16 +43,24 @@ class Accumulate(Stage):
         if not features.observed:
             return LeftOut(unobserved(features))
         seen = "merged" if features.merged else "probe"
+        others = (*other_names(features, OTHERS), "probes_seen", "pose") if features.others else ()
+        kept = (*other_names(features, KEPT), "probe_places") if features.others else ()
         return Wiring(
-            (*(f"{seen}_{part}" for part in UNWRAPPED), "clock"),
-            ("environment_radiance", "environment_confidence", "environment_clipped"),
+            (*(f"{seen}_{part}" for part in UNWRAPPED), *others, "clock"),
+            ("environment_radiance", "environment_confidence", "environment_clipped", *kept),
         )
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The accumulated maps, and the change of each cell."""
         height = self.request.quality.environment_height
         shape = (height, 2 * height)
+        others = self.features.others
+        places = {"probe_places": ArraySpec((others + 1,), wp.vec4)} if others else {}
+        change = {"accumulate_others": ArraySpec((others, *accumulate.change_shape(*shape)), wp.vec2)} if others else {}
         return {
+            **other_maps(self.features, KEPT, shape),
+            **places,
+            **change,
             "environment_radiance": ArraySpec(shape, wp.vec3),
             "environment_confidence": ArraySpec(shape, wp.float32),
             "environment_clipped": ArraySpec(shape, wp.vec3),
@@ -67,4 +82,24 @@ class Accumulate(Stage):
         def tells() -> bool:
             return not arrays["ball_covered"]()
 
-        return [Pass(measure, enabled=tells), Pass(follow, rows=height, enabled=tells)]
+        passes = [Pass(measure, enabled=tells), Pass(follow, rows=height, enabled=tells)]
+        return [*passes, *self._follow_others(arrays, tells)]
+
+    def _follow_others(self, arrays: Arrays, tells: Callable[[], bool]) -> list[Pass]:
+        """The same for each ball after the first, and how far each ball is to be trusted."""
+        if not self.features.others:
+            return []
+        height, params = self.request.quality.environment_height, arrays["params"]
+        seen, places = (arrays["probes_seen"], arrays["probes"], params), arrays["probe_places"]
+        passes = [Pass(lambda rows: update_places(*seen, places), enabled=tells)]
+        views, kept = (other_views(self.features, arrays, name) for name in (OTHERS, KEPT))
+        for ball, (view, environment) in enumerate(zip(views, kept, strict=True)):
+            change = arrays["accumulate_others"][ball]
+            known = view, change, params, environment
+            measure = functools.partial(accumulate.measure_change, view, environment, change)
+            follow = functools.partial(accumulate.accumulate_environment, *known)
+            passes += [
+                Pass(lambda rows, measure=measure: measure(rows=rows), enabled=tells),  # type: ignore[misc]
+                Pass(lambda rows, follow=follow: follow(rows=rows), rows=height, enabled=tells),  # type: ignore[misc]
+            ]
+        return passes

@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_ar.kernels import declip
+from warp_ar.kernels.structs import make_picture
 from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
@@ -52,16 +53,15 @@ class Declip(Stage):
         declip.make_complete_core_kernel(config)
         frame, decode, out, levels = (arrays[name] for name in ("frame", "decode", "declipped", "declip_levels"))
         marked, active = arrays["declip_marked"], arrays["declip_active"]
-        shape = frame.shape
+        picture, shape = make_picture(frame, None, arrays["rays"]), frame.shape
         half = declip.level_shapes(*shape)[0][0]
 
         def core(rows: Rows | None) -> None:
             declip.complete_core(
                 config,
-                frame,
+                picture,
                 levels,
                 arrays["params"],
-                arrays["rays"],
                 arrays["ray_scene"],
                 arrays["probes"],
                 arrays["environment"] if ball else None,

@@ -72,6 +72,8 @@ class Features:
     """Virtual lights with a size cast soft shadows."""
     area_samples: int
     """Samples of objects that emit, per point that they light; 0: none does."""
+    others: int
+    """Mirror balls after the first whose light is interpolated with the first one's on objects; 0: one map is all."""
     near_field: str
     """Method of ``shade`` by which objects show what surrounds them at close range, themselves included; empty: none.
 
@@ -82,6 +84,19 @@ class Features:
     """Resource that holds the environment's irradiance."""
     distant: DistantLightConfig
     """Forms of the environment that the objects reflect."""
+
+    @property
+    def balls(self) -> str:
+        """Which of several mirror balls light objects, in words; empty where there is one or none."""
+        scene = self.request.scene
+        count = len(scene.probes)
+        if count < 2 or not self.observed or not scene.objects:
+            return ""
+        if self.others:
+            return f"objects are lit by what is interpolated between {count} mirror balls, receivers by the first one"
+        if self.merged:
+            return f"of several exposures {count} mirror balls make one map, which lights all objects"
+        return "the quality's sphere map is a texture of one mirror ball, the first, whose light is that of all objects"
 
     @property
     def shadowed(self) -> bool:
@@ -121,13 +136,15 @@ def find_features(request: Request) -> Features:
     placed = recovered or (environment and not observed and request.emitters)
     emitters = placed and quality.method("recover") == "shading"
     by_series = quality.method("irradiance") == "sh2"
+    merged = bracketed and len(request.exposures) > 1
+    others = len(scene.probes) - 1 if observed and not merged and interpolates(scene, quality) else 0
     return Features(
         request=request,
         environment=environment,
         observed=observed,
         recovered=recovered,
         emitters=emitters,
-        merged=bracketed and len(request.exposures) > 1,
+        merged=merged,
         layers=layers,
         exposed=exposed,
         boxed=darkened and quality.method("expose") in BOXES,
@@ -138,12 +155,14 @@ def find_features(request: Request) -> Features:
         bounced=relight_method in LOCAL and proxies_face(scene),
         soft_lights=quality.method("light_shadow") == "soft" and has_sized_lights(scene),
         area_samples=area_samples,
+        others=others,
         near_field=_near_method(scene, quality) if environment else "",
         irradiance="irradiance_sh" if by_series else "irradiance_map",
         distant=_find_forms(
             scene,
             "sh" if by_series else "map",
             emitters=emitters,
+            several=others > 0,
             gathered=area_samples == 0,
             mirrors="reflected" in layers,
         ),
@@ -162,6 +181,16 @@ def _near_method(scene: Scene, quality: Quality) -> str:
 def has_environment(scene: Scene) -> bool:
     """Whether a mirror ball or a file tells of the environment."""
     return bool(scene.probes) or scene.captured is not None
+
+
+def interpolates(scene: Scene, quality: Quality) -> bool:
+    """Whether the light of several balls is interpolated: there are objects between them, and no sphere map's method.
+
+    A sphere map is a texture of one ball.
+    """
+    ways = ((stage, quality.method(stage)) for stage in ("unwrap", "irradiance", "prefilter"))
+    textures = any(method in ("sphere_map", "sphere_mip") for _, method in ways)
+    return len(scene.probes) > 1 and bool(scene.objects) and not textures
 
 
 def sheds_light(scene: Scene) -> bool:
@@ -197,7 +226,7 @@ def _find_layers(scene: Scene, quality: Quality) -> tuple[str, ...]:
 
 
 def _find_forms(
-    scene: Scene, form: DiffuseForm, *, emitters: bool, gathered: bool, mirrors: bool
+    scene: Scene, form: DiffuseForm, *, emitters: bool, several: bool, gathered: bool, mirrors: bool
 ) -> DistantLightConfig:
     materials = scene_materials(scene)
     environment = has_environment(scene)
@@ -210,5 +239,6 @@ def _find_forms(
         probes=bool(scene.probes),
         emitters=emitters,
         captured=scene.captured is not None,
+        several=several,
         gathered=gathered,
     )

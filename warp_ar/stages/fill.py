@@ -14,6 +14,8 @@ from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring, unobserved
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.picture import find_picture, frame_reads
+from warp_ar.stages.shared.probe_maps import KEPT, other_names
+from warp_ar.stages.shared.variants import trace_variant
 
 
 class Fill(Stage):
@@ -39,13 +41,17 @@ class Fill(Stage):
         if not features.observed:
             return LeftOut(unobserved(features))
         written = "filled_radiance" if features.recovered else "environment"
-        return Wiring(("environment_radiance", "environment_confidence", *frame_reads(features), "pose"), (written,))
+        kept = other_names(features, KEPT)[:2]
+        others = ("others_filled" if features.recovered else "others_environment",) if features.others else ()
+        reads = "environment_radiance", "environment_confidence", *kept, *frame_reads(features), "pose"
+        return Wiring(reads, (written, *others))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The map, the fill pyramid, and what readers have seen."""
         height = self.request.quality.environment_height
         shape = (height, 2 * height)
         return {
+            **{name: ArraySpec((self.features.others, *shape), wp.vec3) for name in self.wiring.writes[1:]},
             self.wiring.writes[0]: ArraySpec(shape, wp.vec3),
             "fill_levels": ArraySpec((fill.fill_level_offsets(*shape)[-1],), wp.vec4),
             "fill_published": ArraySpec(shape, wp.vec3),
@@ -63,41 +69,43 @@ class Fill(Stage):
         if self.features.merged:
             most = 1.0 / max(min(min(probe.reflectance) for probe in self.request.scene.probes), 1e-3)
 
-        def seed(rows: Rows | None) -> None:
-            fill.seed_fill(
-                arrays["environment_radiance"], arrays["environment_confidence"], arrays["fill_levels"], rows=rows
-            )
-
-        proxies = trace_config(self.request.scene).proxies
-        picture = find_picture(arrays)
-
-        def see(rows: Rows | None) -> None:
-            fill_frame.fill_frame(
-                picture,
-                arrays["params"],
-                arrays["probes"],
-                arrays["ray_scene"],
-                arrays["fill_levels"],
-                (height, 2 * height),
-                proxies=proxies,
-                rows=rows,
-            )
-
-        def push_pull(rows: Rows | None) -> None:
-            fill.push_pull(arrays["fill_levels"], height, 2 * height, most=most)
-
-        def finish(rows: Rows | None) -> None:
-            fill.finish_fill(arrays["fill_levels"], arrays[self.wiring.writes[0]], rows=rows)
+        maps = [(arrays["environment_radiance"], arrays["environment_confidence"], arrays[self.wiring.writes[0]])]
+        for ball in range(self.features.others):
+            names = *other_names(self.features, KEPT)[:2], self.wiring.writes[1]
+            maps.append(tuple(arrays[name][ball] for name in names))
 
         def measure(rows: Rows | None) -> None:
             change.measure_difference(
                 arrays[self.wiring.writes[0]], arrays["fill_published"], arrays["fill_difference"], rows=rows
             )
 
-        passes = [Pass(seed, rows=height), Pass(see, rows=height), Pass(push_pull), Pass(finish, rows=height)]
+        passes = [one for ball, known in enumerate(maps) for one in self._complete(arrays, ball, *known, most)]
         if self._on_cpu:
             passes.append(Pass(measure, rows=height))
         return [dataclasses.replace(one, enabled=lambda: not self._holds) for one in passes]
+
+    def _complete(
+        self, arrays: Arrays, ball: int, radiance: Any, confidence: Any, filled: Any, most: float
+    ) -> list[Pass]:
+        """Passes that complete the map of one ball; balls take turns with the pyramid."""
+        shape = height, _ = radiance.shape
+        levels = arrays["fill_levels"]
+        proxies = trace_variant(trace_config(self.request.scene), levels.device).proxies
+        scene = find_picture(arrays), arrays["params"], arrays["probes"], arrays["ray_scene"]
+
+        def seed(rows: Rows | None) -> None:
+            fill.seed_fill(radiance, confidence, levels, rows=rows)
+
+        def see(rows: Rows | None) -> None:
+            fill_frame.fill_frame(*scene, levels, shape, proxies=proxies, ball=ball, rows=rows)
+
+        def push_pull(rows: Rows | None) -> None:
+            fill.push_pull(levels, *shape, most=most)
+
+        def finish(rows: Rows | None) -> None:
+            fill.finish_fill(levels, filled, rows=rows)
+
+        return [Pass(seed, rows=height), Pass(see, rows=height), Pass(push_pull), Pass(finish, rows=height)]
 
     def begin(self) -> None:
         """Keep the last map where something covers a ball: it covers what the frame shows behind it as well."""
@@ -107,9 +115,9 @@ class Fill(Stage):
     def changed(self, name: str) -> bool:
         """Whether some texel moved by more than ``CHANGE_FLOOR + CHANGE_SHARE * value`` since readers last ran.
 
-        On CUDA always: to know it there, the host would have to wait for the device.
+        On CUDA always: to know it there, the host would have to wait for the device. So for the balls after the first.
         """
-        if not self._on_cpu:
+        if not self._on_cpu or name != self.wiring.writes[0]:
             return True
         if not self._arrays["fill_difference"].numpy().max() > 1.0:
             return False

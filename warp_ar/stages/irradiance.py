@@ -56,10 +56,24 @@ class Irradiance(Stage):
         if not features.environment:
             return LeftOut(NO_BALL)
         by_texture = cls.method_for(features) == "sphere_mip"
-        return Wiring(("sphere_map", "pose") if by_texture else ("environment",), (features.irradiance,))
+        reads = ("sphere_map", "pose") if by_texture else ("environment",)
+        if cls._others(features):
+            return Wiring((*reads, "others_environment"), (features.irradiance, "others_irradiance"))
+        return Wiring(reads, (features.irradiance,))
+
+    @staticmethod
+    def _others(features: Features) -> int:
+        return features.others if features.distant.diffuse != "none" else 0
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """Irradiance, and sums on the way to it."""
+        specs, others = self._first(), self._others(self.features)
+        if others:
+            form = specs[self.features.irradiance]
+            specs["others_irradiance"] = ArraySpec((others, *form.shape), form.dtype)
+        return specs
+
+    def _first(self) -> dict[str, ArraySpec]:
         height = self.request.quality.environment_height
         if self.method == "sphere_mip":
             return {"irradiance_map": ArraySpec(MAP_SIZE, wp.vec3)}
@@ -94,27 +108,31 @@ class Irradiance(Stage):
             return [
                 Pass(lambda rows: sphere_map.look_up_level(*known, out, scale=math.pi, rows=rows), rows=MAP_SIZE[0])
             ]
-        environment = settled_environment(arrays, device)
+        passes = self._filter(arrays, settled_environment(arrays, device), arrays[self.features.irradiance])
+        for ball in range(self._others(self.features)):
+            passes += self._filter(arrays, arrays["others_environment"][ball], arrays["others_irradiance"][ball])
+        return passes
+
+    def _filter(self, arrays: Arrays, environment: Any, target: Any) -> list[Pass]:
+        """Passes from one map of the environment to its irradiance; maps take turns with the sums."""
         if self.method == "top_mip":
-            top = arrays["irradiance_map"]
-            return [Pass(lambda rows: pyramid.reduce_latlong(environment, top, scale=math.pi))]
+            return [Pass(lambda rows: pyramid.reduce_latlong(environment, target, scale=math.pi))]
         if self.method in ("sh2", "sh4"):
             order = 2 if self.method == "sh2" else 4
-            tables = irradiance.make_sh_tables(*environment.shape, order, device)
+            tables = irradiance.make_sh_tables(*environment.shape, order, environment.device)
             sums = arrays["irradiance_row_sums"]
             if self.method == "sh2":
-                sh = arrays["irradiance_sh"]
                 return [
-                    Pass(lambda rows: irradiance.project_irradiance_sh(environment, tables, sums, sh)),
-                    Pass(lambda rows: irradiance.window_sh(sh)),
+                    Pass(lambda rows: irradiance.project_irradiance_sh(environment, tables, sums, target)),
+                    Pass(lambda rows: irradiance.window_sh(target)),
                 ]
-            coefficients, target = arrays["irradiance_coefficients"], arrays["irradiance_map"]
+            coefficients = arrays["irradiance_coefficients"]
             return [
                 Pass(lambda rows: irradiance.project_irradiance_sh(environment, tables, sums, coefficients)),
                 Pass(lambda rows: irradiance.evaluate_sh4(coefficients, target, rows=rows), rows=MAP_SIZE[0]),
             ]
         blocks = self._blocks()
-        clusters, target = arrays["irradiance_clusters"], arrays["irradiance_map"]
+        clusters = arrays["irradiance_clusters"]
         return [
             Pass(lambda rows: irradiance.gather_clusters(environment, blocks, clusters, rows=rows), rows=blocks[0]),
             Pass(lambda rows: irradiance.sum_clusters(clusters, target, rows=rows), rows=MAP_SIZE[0]),

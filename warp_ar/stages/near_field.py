@@ -161,5 +161,6 @@ class NearField(Stage):
             SIDE,
             "shadow_ratio" in layers,
             "added_light" in layers,
-            rays.known,
+            # Samples are of the first ball's environment: they can only say what differs.
+            rays.known or self.features.others > 0,
         )

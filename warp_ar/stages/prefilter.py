@@ -80,7 +80,14 @@ class Prefilter(Stage):
         if not features.environment:
             return LeftOut(NO_BALL)
         by_texture = cls.method_for(features) == "sphere_mip"
-        return Wiring(("sphere_map", "pose") if by_texture else ("environment",), ("prefilter_levels",))
+        reads = ("sphere_map", "pose") if by_texture else ("environment",)
+        if cls._others(features):
+            return Wiring((*reads, "others_environment"), ("prefilter_levels", "others_levels"))
+        return Wiring(reads, ("prefilter_levels",))
+
+    @staticmethod
+    def _others(features: Features) -> int:
+        return features.others if features.distant.specular else 0
 
     @property
     def _mirrors_only(self) -> bool:
@@ -94,6 +101,8 @@ class Prefilter(Stage):
         """Levels, and the pyramid that the levels are made from."""
         height = self.request.quality.environment_height
         specs = {"prefilter_levels": ArraySpec((lobe_texels(height),), wp.vec3)}
+        if others := self._others(self.features):
+            specs["others_levels"] = ArraySpec((others, lobe_texels(height)), wp.vec3)
         if self.method == "sphere_mip":
             return specs
         if self.method != "brute_force" and not self._mirrors_only:
@@ -106,11 +115,17 @@ class Prefilter(Stage):
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Launches of the method; weights and samples are made here, once."""
-        height = self.request.quality.environment_height
-        lobe = scene_lobe(self.request.scene)
         if self.method == "sphere_mip":
             return self._look_up(arrays)
-        environment, levels = settled_environment(arrays, device), arrays["prefilter_levels"]
+        passes = self._filter(arrays, settled_environment(arrays, device), arrays["prefilter_levels"])
+        for ball in range(self._others(self.features)):
+            passes += self._filter(arrays, arrays["others_environment"][ball], arrays["others_levels"][ball])
+        return passes
+
+    def _filter(self, arrays: Arrays, environment: Any, levels: Any) -> list[Pass]:
+        """Passes from one map of the environment to its levels; maps take turns with the pyramid."""
+        height, device = self.request.quality.environment_height, environment.device
+        lobe = scene_lobe(self.request.scene)
         if self._mirrors_only:
             return [Pass(lambda rows: pyramid.copy_safe(environment, levels, rows=rows), rows=height)]
         texels = levels.shape[0]

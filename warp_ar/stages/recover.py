@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import time
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -12,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_ar.kernels import change
+from warp_ar.kernels import change, relocate
 from warp_ar.kernels import recover as kernels
 from warp_ar.kernels.recover_cells import Cell, add_recovered, cell_shape, condense_cells
 from warp_ar.kernels.saturation_boundaries import weigh_boundaries
@@ -114,10 +115,12 @@ class Recover(Stage):
         if not features.recovered:
             return LeftOut("the quality takes the light as the camera clipped it")
         seen = "linear_frame" if features.request.linear else "frame"
-        return Wiring(
-            ("filled_radiance", "environment_confidence", "environment_clipped", seen, "pose"),
-            ("environment", "emitters") if features.emitters else ("environment",),
-        )
+        reads = "filled_radiance", "environment_confidence", "environment_clipped", seen, "pose"
+        writes = ("environment", "emitters") if features.emitters else ("environment",)
+        if not features.others:
+            return Wiring(reads, writes)
+        others = ("others_environment", "others_emitters") if features.emitters else ("others_environment",)
+        return Wiring((*reads, "others_filled", "probe_places"), (*writes, *others))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The map, the two sides of the equations, and what readers have seen."""
@@ -126,7 +129,15 @@ class Recover(Stage):
         cells = cell_shape(*shape)
         self._surfaces = find_surfaces(self.request.scene, card_only=self.method == "white_card")
         points = len(self._surfaces.points)
+        others = self.features.others
+        types: dict[str, tuple[tuple[int, ...], Any]] = {"others_environment": (shape, wp.vec3)}
+        types["others_emitters"] = (CONFIG.search.most,), Emitter
         return {
+            **{
+                name: ArraySpec((others, *types[name][0]), types[name][1])
+                for name in self.wiring.writes
+                if name in types
+            },
             "environment": ArraySpec(shape, wp.vec3),
             **{name: ArraySpec((CONFIG.search.most,), Emitter) for name in self.wiring.writes if name == "emitters"},
             "recover_recovered": ArraySpec(cells, wp.vec3),
@@ -178,8 +189,22 @@ class Recover(Stage):
             Pass(self._ask, on_host=True, enabled=lambda: self._asks),
             Pass(self._add, rows=arrays["recover_cells"].shape[0]),
         ]
+        passes += [one for ball in range(self.features.others) for one in self._relocate(ball)]
         if device.is_cpu:
             passes.append(Pass(self._measure, rows=self.request.quality.environment_height))
+        return passes
+
+    def _relocate(self, ball: int) -> list[Pass]:
+        """What was recovered in the first ball's map, put into that of another as it sees it."""
+        arrays, places = self._arrays, self._arrays["probe_places"]
+        emitters = arrays["emitters"] if self.features.emitters else None
+        first = arrays["environment"], arrays["filled_radiance"]
+        known = arrays["others_filled"][ball], *first, emitters, places, arrays["others_environment"][ball]
+        put = functools.partial(relocate.relocate, *known, ball=ball + 1)
+        passes = [Pass(lambda rows: put(rows=rows), rows=self.request.quality.environment_height)]
+        if emitters is not None:
+            moved = arrays["others_emitters"][ball]
+            passes.append(Pass(lambda rows: relocate.move_emitters(emitters, places, moved, ball=ball + 1)))
         return passes
 
     def _weigh(self, rows: Rows | None) -> None:
@@ -381,6 +406,8 @@ class Recover(Stage):
 
     def changed(self, name: str) -> bool:
         """As ``Fill.changed``; emitters change where an estimate takes effect."""
+        if name.startswith("others_"):
+            return True
         if name == "emitters":
             return self._news and (self._arrives or (self._asks and self._at_once()))
         if not self._device.is_cpu:

@@ -185,11 +185,11 @@ class Relight(Stage):
             sums = None
             if partials > 1:
                 sums = wp.empty(receiver_cells.partial_sums_shape(partials, *shape), dtype=wp.vec3, device=device)
-            samples, count = arrays["environment_samples"], _grain(self.features).samples
+            samples = arrays["environment_samples"][: _grain(self.features).samples]
 
             def estimate(rows: Rows | None, bounced: bool = False) -> None:
                 receiver_cells.estimate_ambient_visibility(
-                    place, *inputs, samples, count, cells, bounced=bounced, sums_out=sums, rows=rows
+                    place, *inputs, samples, cells, bounced=bounced, sums_out=sums, rows=rows
                 )
 
             receiver_cells.make_ambient_visibility_kernel(place)

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_ar.kernels.near_field import NearLight
-from warp_ar.kernels.shade import shade
+from warp_ar.kernels.shade import make_object_light, shade
 from warp_ar.stages.base import (
     NO_OBJECT,
     OUT_OF_PICTURE,
@@ -88,26 +88,14 @@ class Shade(Stage):
         config = shade_config(self.features)
         variant = shade_variant(config, self.features, device)
         lists = make_edge_lists(arrays, device, self.name)
-        inputs = (
-            arrays["params"],
-            arrays["rays"],
-            arrays["ray_scene"],
-            arrays["light_array"] if config.lights else None,
-            make_distant_light(self.features, arrays, self.name),
-            find_visible(arrays),
-        )
         near = NearLight()
         for name in self.features.near_names if config.near_field else ():
             setattr(near, name.removeprefix("near_"), arrays[name])
+        distant = make_distant_light(self.features, arrays, self.name)
+        light = make_object_light(distant, arrays["light_array"] if config.lights else None, near)
+        inputs = arrays["params"], arrays["rays"], arrays["ray_scene"], light, find_visible(arrays)
 
         def launch(rows: Rows | None) -> None:
-            shade(
-                variant,
-                *inputs,
-                arrays["virtual"],
-                near=near,
-                edge_lists=lists,
-                rows=rows,
-            )
+            shade(variant, *inputs, arrays["virtual"], edge_lists=lists, rows=rows)
 
         return [Pass(launch, rows=self.request.size[1], extent=GrowingRows(arrays["object_rows"]))]

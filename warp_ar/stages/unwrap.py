@@ -8,11 +8,12 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_ar.kernels import sphere_map, unwrap
+from warp_ar.kernels.probe_weights import measure_seen
 from warp_ar.kernels.structs import BOX, MESH, PLANE
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring, unobserved
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.picture import frame_reads
-from warp_ar.stages.shared.probe_maps import find_view
+from warp_ar.stages.shared.probe_maps import OTHERS, find_view, other_maps, other_names, other_views
 from warp_ar.stages.shared.variants import shares_kernels
 
 _KINDS = {"plane": PLANE, "box": BOX, "mesh": MESH}
@@ -60,7 +61,9 @@ class Unwrap(Stage):
         by_texture = cls.method_for(features) == "sphere_map"
         texture = ("sphere_map",) if by_texture else ()
         frames = frame_reads(features) if by_texture else frame_reads(features)[-1:]
-        return Wiring((*frames, "pose", *texture), ("probe_radiance", "probe_confidence", "probe_clipped"))
+        written = "probe_radiance", "probe_confidence", "probe_clipped"
+        seen = ("probes_seen",) if features.others else ()
+        return Wiring((*frames, "pose", *texture), (*written, *other_names(features, OTHERS), *seen))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The map, and where its texels' corners are seen."""
@@ -70,8 +73,11 @@ class Unwrap(Stage):
             "probe_radiance": ArraySpec((height, width), wp.vec3),
             "probe_confidence": ArraySpec((height, width), wp.float32),
             "probe_clipped": ArraySpec((height, width), wp.vec3),
+            **other_maps(self.features, OTHERS, (height, width)),
         }
         if self.method != "sphere_map":
+            if self.features.others:
+                specs["probes_seen"] = ArraySpec((len(self.request.scene.probes), height + 1), wp.float32)
             specs["unwrap_corners"] = ArraySpec((height + 1, width + 1, len(self.request.scene.probes)), wp.vec3)
         return specs
 
@@ -97,20 +103,27 @@ class Unwrap(Stage):
                 rows=rows,
             )
 
+        frame = arrays["linear_frame" if linear else "frame"], arrays["linear_clip" if linear else "decode"]
+        probes, corners, others = arrays["probes"], arrays["unwrap_corners"], self.features.others
         view = find_view(arrays, "probe")
+        own = 0 if others else unwrap.ALL_ALIKE
 
         def gather(rows: Rows | None) -> None:
-            unwrap.gather_probe(
-                arrays["linear_frame" if linear else "frame"],
-                arrays["linear_clip" if linear else "decode"],
-                arrays["probes"],
-                arrays["unwrap_corners"],
-                view,
-                method=method,
-                rows=rows,
-            )
+            unwrap.gather_probe(*frame, probes, corners, view, method=method, own=own, rows=rows)
 
-        return [Pass(project, rows=height + 1), Pass(gather, rows=height)]
+        passes = [Pass(project, rows=height + 1), Pass(gather, rows=height)]
+        for ball, other in enumerate(other_views(self.features, arrays, OTHERS), 1):
+            alone = probes[ball : ball + 1], corners[:, :, ball : ball + 1], other
+            passes.append(
+                Pass(
+                    lambda rows, alone=alone: unwrap.gather_probe(*frame, *alone, method=method, rows=rows),  # type: ignore[misc]
+                    rows=height,
+                )
+            )
+        if others:
+            seen, size = arrays["probes_seen"], self.request.size
+            passes.append(Pass(lambda rows: measure_seen(corners, size, seen, rim_start=unwrap.RIM_START)))
+        return passes
 
     def _look_up(self, arrays: Arrays) -> list[Pass]:
         """Every direction's place in the sphere map."""

@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from warp_ar.accuracy.budget import Controller
+from warp_ar.accuracy.controller import Controller
 from warp_ar.accuracy.cost_table import Setting, chosen, load_errors, relevant_settings, turn
 from warp_ar.accuracy.costs import BASE, Costs, cost_key, measure_steps, read_costs, write_costs
 from warp_ar.cache_folder import cache_folder

@@ -35,6 +35,7 @@ from warp_ar.scene.object_materials import mesh_of
 from warp_ar.stages import STAGES
 from warp_ar.stages.quality import Quality
 from warp_ar.viewer import protocol
+from warp_ar.viewer.animations import play_record, set_play
 from warp_ar.viewer.protocol import EFFECTS
 
 MOST_PARTS: Final = 16
@@ -336,17 +337,33 @@ def beside(scene: Scene, folder: Path) -> Scene:
     )
 
 
-def make_edit(command: protocol.Command, original: Wanted) -> tuple[Callable[[Wanted], Wanted], str] | None:
+def set_animation(scene: Scene, index: int, key: str, value: float, seconds: float) -> Scene:
+    """The scene with one value of an object's animation changed; arguments and errors as those of ``set_play``."""
+    if index >= len(scene.objects):
+        raise UsageError(f"object {index}: the scene has {len(scene.objects)}")
+    items = list(scene.objects)
+    items[index] = set_play(items[index], key, value, seconds)
+    return _with_list(scene, "object", tuple(items))
+
+
+def make_edit(
+    command: protocol.Command, original: Wanted, seconds: float = 0.0
+) -> tuple[Callable[[Wanted], Wanted], str] | None:
     """What a command makes of what is wanted, and its name in words; None if it is no edit.
 
     Args:
         command: What the page asks for.
         original: The scene before any edit.
+        seconds: Of the newest frame, since the first.
     """
     match command:
         case protocol.Set(part, index, key, value):
             return lambda w: dataclasses.replace(w, scene=set_value(w.scene, part, index, key, value)), (
                 f"set {key} of {_named(part, index)}"
+            )
+        case protocol.Animate(index, key, value):
+            return lambda w: dataclasses.replace(w, scene=set_animation(w.scene, index, key, value, seconds)), (
+                f"set the {'pause' if key == 'paused' else key} of {_named('object', index)}"
             )
         case protocol.Add(part, kind):
             return lambda w: dataclasses.replace(w, scene=add_part(w.scene, part, kind)), f"add {kind}"
@@ -389,6 +406,7 @@ def wanted_record(wanted: Wanted) -> dict[str, Any]:
             model = next(name for name, made in _MODELS.items() if isinstance(material, made))
             record["material"] = {"model": model, **plain(material)}
             record["reach"] = _reach(item)
+            record |= play_record(item)
         return record
 
     marker, ruler = scene.marker, card_ruler(scene)

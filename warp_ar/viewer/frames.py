@@ -114,7 +114,10 @@ class FrameLoop:
         self._busy_ms = 0.0
         self._plan = 0
         self._light_time = self._notice_time = 0.0
+        self.seconds = 0.0
+        """Of the newest frame that was lit, since the first: the time of animations."""
         self._times: collections.deque[float] = collections.deque(maxlen=60)
+        self._at = 0.0
         self.convergence = Convergence()
         """The reference of a held frame."""
         self.latest: Lit | None = None
@@ -212,9 +215,9 @@ class FrameLoop:
             return 0.0
         return _BUILDING_SECONDS if self._helpers.lighting.busy else _STILL_SECONDS
 
-    def _held(self) -> tuple[Wanted, int]:
-        """What a held picture is of; another one is dropped."""
-        return self._controls.wanted, self._plan
+    def _held(self) -> tuple[Wanted, int, float]:
+        """What a held picture is of, the frame's own time among it; another one is dropped."""
+        return self._controls.wanted, self._plan, self._at
 
     def _converges(self) -> bool:
         """Whether samples are to be added to the reference of the held frame, which nothing has changed."""
@@ -250,6 +253,7 @@ class FrameLoop:
         if self._controls.leaving:
             return False
         begin = time.perf_counter()
+        self._at = now  # seconds on the pipeline's clock, which never runs back: another frame has another
         helpers = self._helpers
         pushed = helpers.camera.begin(frame.image, self._busy_ms)
         helpers.calibration.look(frame.image)
@@ -289,6 +293,7 @@ class FrameLoop:
                 self._notify(messages.notice(error))
             return None
         light_ms = (time.perf_counter() - start) * 1e3
+        self.seconds = float(pipeline.arrays["seconds"]())
         self._base = now + 1.0 / PLAY_RATE
         self._lit += 1
         other = self._beside(pipeline, frame, result, now)

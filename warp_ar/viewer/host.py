@@ -152,7 +152,7 @@ class Host:
             case protocol.OpenScene(name):
                 self._open_scene(name)
             case _:
-                if (made := edits.make_edit(command, self._original)) is not None:
+                if (made := edits.make_edit(command, self._original, self._loop.seconds)) is not None:
                     controls.change(*made)
                 else:
                     self._control(command, owner)

@@ -32,6 +32,8 @@ EFFECTS: Final = ("objects", "lights", "environment", "receiver", "exposure", "r
 """What the page can switch off."""
 PARTS: Final = ("object", "light", "proxy", "probe", "exposure", "marker")
 """What of a scene the page can edit."""
+ANIMATED: Final = ("animation", "speed", "loop", "paused")
+"""What of an object's animation the page can change."""
 KINDS: Final = {
     "object": ("sphere", "box", "torus"),
     "light": ("point", "spot", "directional"),
@@ -71,6 +73,15 @@ class Set:
     index: int
     key: str
     value: Any
+
+
+@dataclasses.dataclass(frozen=True)
+class Animate:
+    """Change how an object plays an animation of its file; a flag is 0 or 1."""
+
+    index: int
+    key: str
+    value: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -230,6 +241,7 @@ Command: TypeAlias = (
     Ack
     | Ping
     | Set
+    | Animate
     | Add
     | Remove
     | Show
@@ -324,6 +336,7 @@ _MESSAGES: Final[Mapping[str, tuple[Callable[..., Command], Mapping[str, Callabl
     "ack": (Ack, {"id": _ID}),
     "ping": (Ping, {"sent": _number(0.0, 1e15)}),
     "set": (Set, {"part": _choice(*PARTS), "index": _INDEX, "key": _name, "value": _value}),
+    "animate": (Animate, {"index": _INDEX, "key": _choice(*ANIMATED), "value": _number(-1.0, 1e3)}),
     "add": (Add, {"part": _choice(*KINDS), "kind": _choice(*_ALL_KINDS)}),
     "remove": (Remove, {"part": _choice(*KINDS), "index": _INDEX}),
     "show": (Show, {"part": _choice(*KINDS), "index": _INDEX, "on": _flag}),

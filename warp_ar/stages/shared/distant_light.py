@@ -21,7 +21,18 @@ def distant_light_reads(features: Features) -> tuple[str, ...]:
     config = features.distant
     diffuse = () if config.diffuse == "none" else (f"irradiance_{config.diffuse}",)
     specular = ("prefilter_levels",) if config.specular else ()
-    return (*diffuse, *specular, *(("emitters",) if config.emitters and (diffuse or specular) else ()))
+    placed = config.emitters and bool(diffuse or specular)
+    return (*diffuse, *specular, *(("emitters",) if placed else ()), *_other_reads(features))
+
+
+def _other_reads(features: Features) -> tuple[str, ...]:
+    """The same of the balls after the first, and the places of all."""
+    config = features.distant
+    if not config.several or (config.diffuse == "none" and not config.specular):
+        return ()
+    diffuse = () if config.diffuse == "none" else ("others_irradiance",)
+    specular = ("others_levels",) if config.specular else ()
+    return (*diffuse, *specular, *(("others_emitters",) if config.emitters else ()), "probe_places")
 
 
 def distant_light_arrays(features: Features, stage: str) -> Mapping[str, ArraySpec]:
@@ -51,4 +62,10 @@ def make_distant_light(features: Features, arrays: Arrays, stage: str) -> Distan
     distant.probes = arrays["probes"]
     if config.emitters:
         distant.emitters = arrays["emitters"]
+    fields = {
+        "others_irradiance": f"others_{config.diffuse}",
+        "probe_places": "places",
+    }
+    for name in _other_reads(features):
+        setattr(distant, fields.get(name, name), arrays[name])
     return distant

@@ -2,8 +2,8 @@
 
 A kernel that holds nothing but what its scene needs is faster, and is compiled anew for each combination of shapes,
 materials and lights. On CPU the general one costs a frame a few hundredths more, for it asks a shape for its kind where
-it walks memory anyway; there only what a whole stage does without is left out. On CUDA code that is never reached
-still takes registers from what is.
+it walks memory anyway; there only what a whole stage does without is left out, and kernels call one walk through the
+scene instead of holding it. On CUDA code that is never reached still takes registers from what is.
 """
 
 from __future__ import annotations
@@ -37,22 +37,28 @@ def shares_kernels(device: Any) -> bool:
 
 def trace_variant(config: TraceConfig, device: Any) -> TraceConfig:
     """Kinds of shape to compile in."""
-    return config.general() if shares_kernels(device) else config
+    return config.general(by_call=device.is_cpu) if shares_kernels(device) else config
 
 
 def distant_variant(features: Features, device: Any) -> DistantLightConfig:
     """Shapes, materials and forms of light to compile in."""
-    return features.distant.general(_form(features)) if shares_kernels(device) else features.distant
+    if not shares_kernels(device):
+        return features.distant
+    return features.distant.general(_form(features), by_call=device.is_cpu)
 
 
 def shade_variant(config: ShadeConfig, features: Features, device: Any) -> ShadeConfig:
     """As ``distant_variant``, and kinds of virtual light."""
-    return config.general(_form(features), soft=_asks_soft(features)) if shares_kernels(device) else config
+    if not shares_kernels(device):
+        return config
+    return config.general(_form(features), soft=_asks_soft(features), by_call=device.is_cpu)
 
 
 def relight_variant(config: RelightConfig, features: Features, device: Any) -> RelightConfig:
     """Shapes and shadows to compile in."""
-    return config.general(soft=_asks_soft(features)) if shares_kernels(device) else config
+    if not shares_kernels(device):
+        return config
+    return config.general(soft=_asks_soft(features), by_call=device.is_cpu)
 
 
 def composite_variant(config: CompositeConfig, device: Any) -> CompositeConfig:

@@ -218,7 +218,30 @@ export class ScenePanel {
     number("Shininess", "shininess", { low: 0, high: 1000, curve: 3, step: 1 });
     // Of what emits: 1 is what the camera clips.
     number("Emission", "intensity", { low: 0, high: Math.max(20, material.intensity ?? 0), curve: 3, step: 0.01 });
+    if (item.animations) rows.push(...this.#animation(item, Number(this.#selected.split(" ")[1])));
     return rows;
+  }
+
+  /** Which of the file's animations an object plays, and how; the server keeps its pose where it is. */
+  #animation(item, index) {
+    const tell = (key, value) => {
+      item[key] = value;
+      this.#connection.send("animate", { index, key, value: Number(value) });
+    };
+    const speed = slider("Speed", { low: 0.05, high: 4, curve: 2, step: 0.05, unit: "×" }, item.speed, (value) => tell("speed", Math.max(value, 0.01)));
+    const flip = el("button", { class: "switch", role: "switch", id: "animation-loop", "aria-checked": String(item.loop), "aria-label": "Loop",
+      onclick: () => { tell("loop", !item.loop); flip.setAttribute("aria-checked", String(item.loop)); } });
+    const pause = el("button", { type: "button", id: "animation-pause", onclick: () => { tell("paused", !item.paused); show(); } });
+    const show = () => {
+      const still = item.animation < 0;
+      for (const control of [pause, flip, ...speed.querySelectorAll("input")]) control.disabled = still;
+      pause.textContent = item.paused || still ? "Play" : "Pause";
+    };
+    const pick = el("select", { "aria-label": "Animation", onchange: () => { item.paused = false; tell("animation", Number(pick.value)); show(); } },
+      ...["None", ...item.animations].map((text, k) => el("option", { value: String(k - 1), selected: k - 1 === item.animation }, text)));
+    show();
+    return [el("div", { class: "row" }, el("span", {}, "Animation"), pick, pause), speed,
+      el("label", { class: "toggle", for: "animation-loop" }, el("span", {}, "Loop"), flip)];
   }
 
   #light(item, set) {

@@ -1,0 +1,128 @@
+"""How far one number, the same for all pictures, makes up for light that clips, over a folder of environments.
+
+    python -m bench clipping_prior --folder=FOLDER    # FOLDER/*.hdr: latlong, unclipped
+
+Each map is exposed as a camera would that looks at its horizon, a little down, and meters its frame's mean to 18 %, and
+up to some stops beside that; it is clipped there. What clips then gets so many times the level of clipping more. Errors
+are relative, of irradiance over directions and channels: as clipped, with each number, with the best number of each
+picture, and clipped that many stops later, as a second, shorter photograph would. One JSON line.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.table_world import latlong_directions
+from warp_ar.light.evidence import spread_directions
+
+Map = NDArray[np.float32]
+
+NUMBERS: Final = (0.5, 1.0, 1.25, 1.5, 2.0, 3.0, 4.0)
+"""Times the level of clipping that a wholly clipped texel gets more."""
+SHORTER: Final = (2, 4, 6)
+"""Stops by which a second photograph is shorter."""
+GREY: Final = 0.18
+"""Share of the level of clipping that metering puts a frame's mean at."""
+FRAME: Final = (45.0, 60.0)
+"""Degrees of the frame, high and wide; its upper edge is 10 degrees above the horizon."""
+WORSE: Final = 1.02
+"""Ratio of errors from which on a number made a picture worse."""
+
+
+@functools.cache
+def _form() -> NDArray[np.float32]:
+    """Irradiance of directions by radiance of a map of 64 rows, (64, 8192)."""
+    d, area = latlong_directions(64, 128)
+    cosine = np.maximum(spread_directions(64) @ d.reshape(-1, 3).T, 0.0)
+    return np.asarray(cosine * area.reshape(-1), np.float32)
+
+
+def irradiance(radiance: Map) -> NDArray[np.float64]:
+    """Of a latlong map (h, 2 h, 3), in 64 directions, (64, 3)."""
+    small = cv2.resize(radiance, (128, 64), interpolation=cv2.INTER_AREA)
+    return np.asarray(_form() @ small.reshape(-1, 3), np.float64)
+
+
+def metered_level(radiance: Map, column: int, stops: float) -> float:
+    """Radiance at which a camera clips that meters a frame of a latlong map.
+
+    Args:
+        radiance: (h, 2 h, 3).
+        column: Left edge of the frame.
+        stops: By which it exposes less than metered.
+    """
+    rows, columns = radiance.shape[:2]
+    top, bottom = (round(rows * (90.0 + angle) / 180.0) for angle in (-10.0, FRAME[0] - 10.0))
+    frame = np.roll(radiance, -column, axis=1)[top:bottom, : round(columns * FRAME[1] / 360.0)]
+    return float(max(float(frame.mean()), 1e-9) / GREY * 2.0**stops)
+
+
+def errors_of(radiance: Map, level: float) -> dict[str, float]:
+    """Relative errors of irradiance of one exposure of a map, by what was done with what clips.
+
+    Args:
+        radiance: (h, 2 h, 3).
+        level: Radiance at which all channels clip.
+
+    Returns:
+        ``clipped``; by each number, as text; ``best``; ``stops_N``; and ``lacking``, the mean radiance, over the level,
+        that what clips lacks by all directions' irradiance.
+    """
+    truth, clipped = irradiance(radiance), irradiance(np.minimum(radiance, level))
+    unit = irradiance((radiance >= level).astype(np.float32) * np.float32(level))
+    missing, size = truth - clipped, max(float(np.linalg.norm(truth)), 1e-12)
+    best = max(float((unit * missing).sum()) / max(float((unit * unit).sum()), 1e-12), 0.0)
+
+    def error(added: NDArray[np.float64]) -> float:
+        return float(np.linalg.norm(missing - added)) / size
+
+    found = {"clipped": error(0.0 * unit), "best": error(best * unit)}
+    found |= {str(number): error(number * unit) for number in NUMBERS}
+    for stops in SHORTER:
+        found[f"stops_{stops}"] = error(irradiance(np.minimum(radiance, level * 2.0**stops)) - clipped)
+    return {**found, "lacking": float(missing.sum() / max(float(unit.sum()), 1e-12))}
+
+
+def summarise(rows: Sequence[dict[str, float]]) -> dict[str, Any]:
+    """Means over exposures, and in what share of them each number made the picture worse."""
+    means = {key: round(float(np.mean([row[key] for row in rows])), 3) for key in rows[0] if key != "lacking"}
+    worse = {
+        str(number): round(float(np.mean([row[str(number)] > WORSE * row["clipped"] + 1e-4 for row in rows])), 3)
+        for number in NUMBERS
+    }
+    lacking = np.quantile([row["lacking"] for row in rows], [0.025, 0.25, 0.5, 0.75, 0.975])
+    return {"exposures": len(rows), "error": means, "worse": worse, "lacking": [round(float(q), 2) for q in lacking]}
+
+
+def main(device: str, arguments: Sequence[str] = ()) -> None:
+    """Measure all maps of a folder; nothing runs on the device."""
+    parser = argparse.ArgumentParser(prog="python -m bench clipping_prior", description=__doc__.splitlines()[0])
+    parser.add_argument("--folder", type=Path, help="a folder of latlong .hdr files")
+    parser.add_argument("--stops", type=float, default=1.0, help="largest offset to metering, to either side")
+    parser.add_argument("--exposures", type=int, default=4, help="of each map")
+    options = parser.parse_args(list(arguments))
+    paths = [] if options.folder is None else sorted(options.folder.glob("*.hdr"))
+    if not paths:
+        print("bench clipping_prior: expected a folder that holds latlong .hdr files")
+        return
+    rng, rows = np.random.default_rng(0), []
+    for path in paths:
+        radiance = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        if radiance is None or radiance.ndim != 3 or radiance.shape[1] != 2 * radiance.shape[0]:
+            print(f"{path.name} is left out: it is no latlong map, twice as wide as high")
+            continue
+        radiance = np.clip(np.nan_to_num(radiance.astype(np.float32), posinf=1e6, neginf=0.0), 0.0, 1e6)
+        for _ in range(options.exposures):
+            column, stops = int(rng.integers(radiance.shape[1])), float(rng.uniform(-options.stops, options.stops))
+            rows.append(errors_of(radiance, metered_level(radiance, column, stops)))
+    if rows:
+        print(json.dumps({"bench": "clipping_prior", "maps": len(paths), **summarise(rows)}))

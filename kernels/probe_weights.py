@@ -1,0 +1,142 @@
+"""How much each of several mirror balls says of the light at a point between them.
+
+Gradient bands [Johansen09, section 6.3]. From the place c of ball i toward that of another, j, the point x stands at
+
+    t_ij = clamp((x - c_i).(c_j - c_i) / |c_j - c_i|^2, 0, 1),
+
+0 beside i and behind it, 1 beside j and beyond it. With a trust T of every ball in 0..1 the weights are
+
+    w_i ~ T_i min over j of (1 - T_j t_ij),    sum w_i = 1.
+
+Of two balls that are trusted alike the light is interpolated along the line from one to the other, linearly, and is
+that of one ball alone beside it and behind it, as seen from the other. At a ball's place all others' weights are zero,
+for any number of them. Weights are continuous in places and trusts: a ball whose trust falls to zero goes out without a
+jump, and the others share the room as if it had never been there. The least weight does not vanish where some T is 1:
+of those balls the nearest has all t <= 1/2.
+
+Trust follows what the frame shows of a ball: the share of directions whose light it tells, over ``ENOUGH``, smoothed by
+``TRUST_TIME``. Only ratios count, so trusts are kept with the greatest of them at 1: while no ball is seen, all stay.
+A ball that is lost stays for the weights where it was last seen; there its light is what is remembered of it.
+
+References:
+    [Johansen09] Johansen 2009, Automated Semi-Procedural Animation for Character Locomotion, master's thesis, Aarhus.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from warp_ar.kernels.launch import launch
+from warp_ar.kernels.structs import FrameParams, Probe
+
+wp.set_module_options({"enable_backward": False})
+
+TRUST_TIME = wp.constant(wp.float32(0.4))
+"""Time constant in seconds with which trust follows what is seen of a ball."""
+ENOUGH = wp.constant(wp.float32(0.5))
+"""Share of a map's texels whose light a ball tells from which on it is trusted fully."""
+SEEN_AT_ALL = wp.constant(wp.float32(0.02))
+"""Share from which on a ball's place is believed."""
+
+
+@wp.func
+def probe_weight(places: wp.array[wp.vec4], ball: wp.int32, point: wp.vec3) -> wp.float32:
+    """Weight of a ball at a point, not normalised.
+
+    Args:
+        places: (P,) centre of each ball, and its trust.
+        ball: Which.
+        point: Where light is asked for.
+    """
+    place = places[ball]
+    center = wp.vec3(place[0], place[1], place[2])
+    least = float(1.0)
+    for index in range(places.shape[0]):
+        other = places[index]
+        across = wp.vec3(other[0], other[1], other[2]) - center
+        squared = wp.dot(across, across)
+        if squared > 0.0:  # else it is the ball itself, or one at its place
+            t = wp.clamp(wp.dot(point - center, across) / squared, 0.0, 1.0)
+            least = wp.min(least, 1.0 - other[3] * t)
+    return place[3] * least
+
+
+@wp.kernel(enable_backward=False)
+def measure_seen_kernel(
+    # In:
+    corners: wp.array3d[wp.vec3],
+    frame_height: wp.int32,
+    frame_width: wp.int32,
+    rim_start: wp.float32,
+    # Out:
+    seen_out: wp.array2d[wp.float32],
+):
+    """Corners of one row of a map at which one ball tells the light."""
+    ball, row = wp.tid()
+    count = wp.float32(0.0)
+    for column in range(corners.shape[1]):
+        corner = corners[row, column, ball]
+        inside = corner[0] >= 0.0 and corner[0] <= wp.float32(frame_width - 1)
+        if inside and corner[1] >= 0.0 and corner[1] <= wp.float32(frame_height - 1) and corner[2] > rim_start:
+            count += 1.0
+    seen_out[ball, row] = count / wp.float32(corners.shape[1])
+
+
+@wp.kernel(enable_backward=False)
+def update_places_kernel(
+    # In:
+    seen: wp.array2d[wp.float32],
+    probes: wp.array[Probe],
+    params: wp.array[FrameParams],
+    # In and out:
+    places_out: wp.array[wp.vec4],
+):
+    """All balls, which are few, by one thread: the greatest trust of all is asked for."""
+    blend = 1.0 - wp.exp(-wp.max(params[0].time_step, 0.0) / TRUST_TIME)
+    known = float(0.0)
+    for ball in range(places_out.shape[0]):
+        known = wp.max(known, places_out[ball][3])
+    fresh = params[0].environment_reset != 0 or known == 0.0
+    most = float(0.0)
+    for ball in range(places_out.shape[0]):
+        share = float(0.0)
+        for row in range(seen.shape[1]):
+            share += seen[ball, row] / wp.float32(seen.shape[1])
+        place = places_out[ball]
+        center = wp.vec3(place[0], place[1], place[2])
+        if fresh or share > SEEN_AT_ALL:
+            center = probes[ball].center
+        trust = wp.min(share / ENOUGH, 1.0)
+        if not fresh:
+            trust = place[3] + blend * (trust - place[3])
+        most = wp.max(most, trust)
+        places_out[ball] = wp.vec4(center[0], center[1], center[2], trust)
+    if most > 0.0:
+        for ball in range(places_out.shape[0]):
+            place = places_out[ball]
+            places_out[ball] = wp.vec4(place[0], place[1], place[2], place[3] / most)
+
+
+def measure_seen(corners: wp.array, size: tuple[int, int], seen_out: wp.array, *, rim_start: float) -> None:
+    """Share of every ball's map that the frame shows, row by row.
+
+    Args:
+        corners: From ``unwrap.project_corners``, (h + 1, w + 1, P).
+        size: Width and height of the frame in pixels.
+        seen_out: (P, h + 1) shares, 0..1.
+        rim_start: Pixels from the silhouette from which on a ball is read.
+    """
+    inputs = [corners, size[1], size[0], rim_start]
+    launch(measure_seen_kernel, seen_out.shape, inputs, [seen_out], device=seen_out.device)
+
+
+def update_places(seen: wp.array, probes: wp.array, params: wp.array, places_out: wp.array) -> None:
+    """Draw every ball's trust toward what is seen of it; places and trusts are read and written in place, from zero.
+
+    Args:
+        seen: From ``measure_seen``, (P, h + 1).
+        probes: ``Probe`` (P).
+        params: ``FrameParams`` (1): ``time_step`` and ``environment_reset``.
+        places_out: (P,) ``wp.vec4``: where each ball was last seen, metres, and its trust; the greatest is 1.
+    """
+    launch(update_places_kernel, 1, [seen, probes, params], [places_out], device=places_out.device)

@@ -1,0 +1,55 @@
+"""What tests and benches of kernels hand to launchers: records of structs, shapes, tables, a constant environment."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_ar.kernels import color
+from warp_ar.kernels.structs import Material
+
+SMALL_CAMERA = """[camera]
+width = 64
+height = 48
+fx = 60.0
+fy = 60.0
+cx = 31.5
+cy = 23.5
+"""
+"""Section of a scene file: frames so small that a test lights many."""
+
+TEXTURES = tuple(name for name in Material.vars if name.endswith("_texture"))
+"""Fields of a material that are the index of a texture, or -1."""
+
+
+def records(struct: Any, *values: dict[str, Any], device: Any = None) -> wp.array:
+    """An array of structs, one for each dictionary; fields that it leaves out are zero."""
+    out = np.zeros(len(values), np.dtype(struct.numpy_dtype()))
+    for record, value in zip(out, values, strict=True):
+        for key, item in value.items():
+            record[key] = item
+    return wp.array(out, dtype=struct, device=device)
+
+
+def shape(kind: int, position: Any, extent: Any, material: int = -1) -> dict[str, Any]:
+    """Fields of a ``Shape`` that is not turned."""
+    place = {"kind": kind, "rotation": np.eye(3), "position": position, "scale": 1.0}
+    return {**place, "extent": extent, "material": material}
+
+
+def tables(transfer: str = "srgb") -> tuple[wp.array, wp.array]:
+    """Tables to decode codes, and to encode radiance."""
+    return (
+        wp.array(color.decode_table(transfer), dtype=wp.vec3),
+        wp.array(color.encode_table(transfer), dtype=wp.vec3),
+    )
+
+
+def constant_environment(radiance: Any) -> npt.NDArray[np.float32]:
+    """Spherical harmonics of E = pi L, the same for every normal."""
+    sh = np.zeros((9, 3), np.float32)
+    sh[0] = np.pi * np.asarray(radiance) / 0.28209479
+    return sh
