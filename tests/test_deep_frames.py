@@ -10,6 +10,7 @@ import math
 import pathlib
 import shutil
 import subprocess
+import types
 from typing import Any
 
 import av
@@ -23,7 +24,7 @@ from warp_ar.errors import SinkError, SourceError, UsageError
 from warp_ar.input.plate import Plate, deep_table, srgb8
 from warp_ar.input.sources import open_source
 from warp_ar.kernels.color import decode_codes, encode_codes
-from warp_ar.output.encoders import describe_encoders, encoder_names, find_encoding, parse_options
+from warp_ar.output.encoders import describe_encoders, encoder_names, find_encoding, last_packets, parse_options
 from warp_ar.output.sinks import open_sink
 from warp_ar.session import Session
 from warp_ar.signals import REC_709, REC_2020, hlg_of_light, light_of_hlg, light_of_pq, pq_of_light, rgb_from_rgb
@@ -379,6 +380,33 @@ def test_video_of_10_bits_comes_back(
         open_sink(path, fps=25, coding=coding) as sink,
     ):
         sink.write(np.zeros((48, 64, 3), np.uint8))
+
+
+@pytest.mark.parametrize("frames", [1, 2, 3])
+def test_short_videos_of_10_bits_are_written(tmp_path: pathlib.Path, frames: int) -> None:
+    with open_sink(tmp_path / "a.mp4", fps=25, coding="10bit") as sink:
+        for _ in range(frames):
+            sink.write(ramp())
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        times = [float(packet.pts * packet.time_base) for packet in container.demux(video=0) if packet.size]
+    assert np.subtract(sorted(times), min(times)) == pytest.approx([index / 25 for index in range(frames)])
+
+
+def test_x265_is_not_believed_when_two_frames_are_decoded() -> None:
+    """It computes that from memory that nothing has written: most values no file can hold, and some are late."""
+
+    def left_over(codec: str, frames: int) -> list[int]:
+        packets = [av.Packet(b"x") for _ in range(frames)]
+        for index, packet in enumerate(packets):
+            packet.pts, packet.dts = index, 2**62 + index
+        stream = types.SimpleNamespace(
+            codec_context=types.SimpleNamespace(name=codec), encode=lambda frame: [] if frame else packets
+        )
+        return [packet.dts for packet in last_packets(stream, frames)]
+
+    assert left_over("libx265", 1) == [0]
+    assert left_over("libx265", 2) == [0, 1]
+    assert left_over("libx265", 3)[0] == left_over("libx264", 2)[0] == 2**62
 
 
 def test_folders_of_16_bits_and_openexr_come_back(tmp_path: pathlib.Path) -> None:

@@ -15,6 +15,7 @@ from warp_ar import calibrate, capture
 from warp_ar.errors import UsageError
 from warp_ar.input.camera_calibration import calibrate_camera
 from warp_ar.input.sources import open_source
+from warp_ar.output.encoders import last_packets
 
 HEVC_LEVELS = 6
 """Codes: what x265 at its default quality and chroma at half the size leave of flat patches, measured 3."""
@@ -33,7 +34,7 @@ def write_hevc(path, pictures, *, transfer=1, pixels="yuv420p10le", primaries=1,
             frame = av.VideoFrame.from_ndarray(picture, format="rgb24").reformat(format=pixels, dst_colorspace="itu709")
             frame.pts = number
             container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
+        container.mux(last_packets(stream, len(pictures)))
     return path
 
 

@@ -179,6 +179,59 @@ def test_the_picture_is_the_frame_that_its_header_says(open_tab: Callable[..., T
     assert stats["latency"] > 0
 
 
+OFFSET = """async () => {
+  const { Connection } = await import("/static/net.js");
+  const connection = new Connection();
+  const real = window.WebSocket;
+  let socket;
+  window.WebSocket = class {
+    constructor() { socket = this; }
+    send() {}
+  };
+  connection.open();
+  window.WebSocket = real;
+  socket.onopen();
+  // The server's clock is 5 s ahead. Its answer was 400 ms on the way back; then a frame is quick.
+  const now = performance.now();
+  socket.onmessage({ data: JSON.stringify({ type: "pong", sent: now - 400, clock: now + 4600 }) });
+  const frame = { type: "frame", taken: performance.now() + 4999, sizes: [] };
+  const header = new TextEncoder().encode(JSON.stringify(frame));
+  const data = new Uint8Array(4 + header.length);
+  new DataView(data.buffer).setUint32(0, header.length, true);
+  data.set(header, 4);
+  socket.onmessage({ data: data.buffer });
+  return connection.offset;
+}"""
+
+
+def test_the_clock_of_the_server_is_bounded_by_what_arrives(open_tab: Callable[..., Tab]) -> None:
+    """Half of the way there and back would be 200 ms off, and frames could be shown before they were taken."""
+    offset = open_tab().page.evaluate(OFFSET)
+    # The frame was 1 ms on its way; the page's clock is told in steps of 0.1 ms, and the lines above take a moment.
+    assert 4990.0 < offset <= 5000.5
+
+
+STALE = """() => {
+  const { connection, handles, scene } = warpAr;
+  const before = JSON.parse(JSON.stringify(scene));
+  document.querySelector('[data-key="light 0"]').dispatchEvent(new KeyboardEvent("keydown", { key: "PageUp" }));
+  const edited = warpAr.scene.lights[0].at[2];
+  connection.dispatchEvent(new CustomEvent("scene", { detail: { scene: before, undo: null, redo: null } }));
+  return [before.lights[0].at[2], edited, warpAr.scene.lights[0].at[2]];
+}"""
+
+
+def test_an_older_scene_takes_no_edit_back(open_tab: Callable[..., Tab]) -> None:
+    """On a slow machine the answer to a drag arrives after the next key, which then seemed to do nothing."""
+    tab = open_tab()
+    before, edited, shown = tab.page.evaluate(STALE)
+    assert edited == pytest.approx(before + 0.006)
+    assert shown == edited
+    # The answer to the edit is taken.
+    tab.until("warpAr.connection.settled")
+    assert tab.page.evaluate("warpAr.scene.lights[0].at[2]") == pytest.approx(edited)
+
+
 def test_dragging_switching_and_the_budget(open_tab: Callable[..., Tab], artefacts: Path) -> None:
     tab = open_tab()
     page = tab.page

@@ -19,7 +19,7 @@ import av
 import numpy.typing as npt
 
 from warp_ar.errors import SinkError, SourceError, reason
-from warp_ar.output.encoders import Encoding, find_encoding
+from warp_ar.output.encoders import Encoding, find_encoding, last_packets
 from warp_ar.output.sink import ThreadedSink, check_image, check_radiance
 from warp_ar.output.video_sink import (
     FRAGMENT_SECONDS,
@@ -126,7 +126,7 @@ class PartSink(ThreadedSink):
         try:
             try:
                 if self._error is None:
-                    container.mux(self._stream.encode(None))
+                    container.mux(last_packets(self._stream, self._count))
             finally:
                 container.close()
         except (av.FFmpegError, OSError) as error:

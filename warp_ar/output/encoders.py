@@ -33,6 +33,8 @@ _FORMATS: Final = {
 _HARDWARE: Final = ("_nvenc", "_qsv", "_vaapi", "_videotoolbox", "_amf", "_mf", "_v4l2m2m", "_vulkan")
 _AVX2: Final = 11
 """OpenCV's number of AVX2, ``CPU_AVX2``, which its Python names do not hold."""
+_X265_LEARNS: Final = 2
+"""Frames of which x265 tells no decoding times."""
 _PROBED: Final = 256
 """Pixels of a side of the picture that an encoder is tried with; hardware refuses much smaller ones."""
 
@@ -120,6 +122,24 @@ def _try(encoding: Encoding) -> tuple[str, Sequence[str]]:
     except (av.FFmpegError, OSError, ValueError) as error:
         return reason(error), ()
     return "", tuple(context.options)
+
+
+def last_packets(stream: Any, frames: int) -> list[Any]:
+    """Packets that an encoder still held when the frames ended.
+
+    x265 learns by how much decoding goes ahead of showing from its third frame. Of shorter clips it tells times that it
+    computed from memory which nothing has written, and what writes files refuses most of them. So few frames are
+    decoded in the order in which they are shown.
+
+    Args:
+        stream: PyAV's.
+        frames: Given to it in all.
+    """
+    packets: list[Any] = stream.encode(None)
+    if frames <= _X265_LEARNS and stream.codec_context.name == "libx265":
+        for packet in packets:
+            packet.dts = packet.pts
+    return packets
 
 
 def encoder_names() -> list[str]:

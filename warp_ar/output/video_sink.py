@@ -20,7 +20,7 @@ import numpy.typing as npt
 from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
 
 from warp_ar.errors import SinkError, UsageError, reason
-from warp_ar.output.encoders import Encoding, find_encoding
+from warp_ar.output.encoders import Encoding, find_encoding, last_packets
 from warp_ar.output.places import check_replaceable
 from warp_ar.output.sink import ThreadedSink, check_image, check_radiance, make_folder
 from warp_ar.output.whole_fragments import WholeFragments
@@ -167,7 +167,7 @@ class VideoSink(ThreadedSink):
         try:
             try:
                 if container is not None and not self._broken:
-                    container.mux(self._stream.encode(None))
+                    container.mux(last_packets(self._stream, self._count))
             finally:
                 if container is not None:
                     container.close()

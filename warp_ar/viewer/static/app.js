@@ -52,16 +52,21 @@ const adopt = (next) => {
   $("captured-note").textContent = scene.captured ? `Light of ${scene.captured} stands for what the mirror ball shows.` : "";
 };
 let waiting = null;
+// A scene from before this page's last edit would take that edit back on the screen, and the next key or drag would begin there.
+const adoptWaiting = () => {
+  if (!waiting || handles.busy || !connection.settled) return;
+  const next = waiting;
+  waiting = null;
+  adopt(next);
+};
 connection.addEventListener("scene", ({ detail }) => {
   showEdit("undo", detail.undo, "Undo", "Ctrl+Z");
   showEdit("redo", detail.redo, "Do again", "Ctrl+Shift+Z");
-  if (handles.busy) waiting = detail.scene;
-  else adopt(detail.scene);
+  waiting = detail.scene;
+  adoptWaiting();
 });
-handles.addEventListener("released", () => {
-  // What was on the way while dragging is older than what was dragged: the answer to the last edit follows.
-  waiting = null;
-});
+connection.addEventListener("settled", adoptWaiting);
+handles.addEventListener("released", adoptWaiting);
 
 function showEdit(id, label, verb, keys) {
   // A button that is switched off loses the focus, and the keyboard its place.

@@ -3,6 +3,9 @@
 const token = new URLSearchParams(location.search).get("token");
 const query = token ? `?token=${encodeURIComponent(token)}` : "";
 
+// How far clocks go apart, milliseconds a millisecond: quartz does a tenth of it.
+const DRIFT = 1e-3;
+
 export const downloadUrl = (name) => `download/${name}${query}`;
 
 /** Hand the program a file; whether it took it, and what it says. */
@@ -19,7 +22,9 @@ export class Connection extends EventTarget {
   /** Milliseconds to add to performance.now() for the server's clock. */
   offset = null;
   #socket = null;
-  #bestTrip = Infinity;
+  // What was sent cannot have come before it was sent: that bounds the offset from both sides.
+  #offsets = { low: -Infinity, high: Infinity, at: 0 };
+  #edited = -Infinity;
   #wait = 500;
   #edits = new Map();
   #flushing = false;
@@ -32,7 +37,8 @@ export class Connection extends EventTarget {
     this.#socket = socket;
     socket.onopen = () => {
       this.#wait = 500;
-      this.#bestTrip = Infinity;
+      this.#offsets = { low: -Infinity, high: Infinity, at: 0 };
+      this.#edited = -Infinity;
       this.#emit("open");
       this.#ping();
     };
@@ -49,6 +55,11 @@ export class Connection extends EventTarget {
 
   get ready() {
     return this.#socket?.readyState === WebSocket.OPEN;
+  }
+
+  /** Whether the scene that the program tells has all of this page's edits. */
+  get settled() {
+    return !this.#edits.size && this.#edited === -Infinity;
   }
 
   get backlog() {
@@ -76,8 +87,12 @@ export class Connection extends EventTarget {
   }
 
   #flush() {
+    if (!this.#edits.size) return;
     for (const edit of this.#edits.values()) this.send("set", edit);
     this.#edits.clear();
+    // Answered after the edits: until then a scene that arrives may be older than they are.
+    this.#edited = performance.now();
+    this.send("ping", { sent: this.#edited });
   }
 
   #emit(name, detail) {
@@ -92,22 +107,31 @@ export class Connection extends EventTarget {
 
   #text(message) {
     if (message.type === "pong") {
-      const now = performance.now();
-      const trip = now - message.sent;
-      // The quickest answer was held up least; later ones are let in, for clocks drift.
-      if (trip <= this.#bestTrip * 1.2) {
-        this.#bestTrip = Math.min(trip, this.#bestTrip * 1.05);
-        this.offset = message.clock + trip / 2 - now;
-      }
+      this.#bound(message.clock, message.sent);
+      if (this.#edited <= message.sent) this.#edited = -Infinity;
+      if (this.settled) this.#emit("settled");
       return;
     }
     this.#emit(message.type, message);
+  }
+
+  /** Take in that the server's clock had a value before now, and where it is known, after something was sent. */
+  #bound(clock, sent = -Infinity) {
+    const now = performance.now();
+    const [low, high] = [clock - now, clock - sent];
+    const drift = DRIFT * (now - this.#offsets.at);
+    const bounds = { low: Math.max(low, this.#offsets.low - drift), high: Math.min(high, this.#offsets.high + drift), at: now };
+    // Contradicted: one of the two machines has slept.
+    this.#offsets = bounds.low <= bounds.high ? bounds : { low, high, at: now };
+    const middle = (this.#offsets.low + this.#offsets.high) / 2;
+    if (Number.isFinite(middle)) this.offset = middle;
   }
 
   #binary(data) {
     const length = new DataView(data).getUint32(0, true);
     const header = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, length)));
     let place = 4 + length;
+    if (header.taken !== undefined) this.#bound(header.taken);
     header.pictures = header.sizes.map((size) => new Uint8Array(data, place, ((place += size), size)));
     this.#emit(header.type, header);
   }
