@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import functools
 import inspect
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -238,7 +239,8 @@ _MEANINGS: Final[dict[tuple[str, str], str]] = {
 }
 
 
-def field_docs(kind: type[Any]) -> dict[str, str]:
+@functools.cache
+def field_docs(kind: type[Any]) -> Mapping[str, str]:
     """Docstrings of a dataclass's fields: the strings that stand below them."""
     tree = ast.parse(inspect.getsource(inspect.getmodule(kind) or description))
     body = next(node.body for node in tree.body if isinstance(node, ast.ClassDef) and node.name == kind.__name__)
