@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+
 import imageio.v3
 import numpy as np
 import pytest
@@ -19,19 +21,28 @@ def encode(linear):
     return np.clip(linear, 0, 1) ** (1 / 2.2)
 
 
-@pytest.fixture
-def desk(tmp_path, monkeypatch):
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
     """A folder with a new desk, and pictures of its card from one side, under one light."""
-    monkeypatch.chdir(tmp_path)
-    assert __main__.main(["init", "my_desk", "--radius", "0.03", "--source", "pictures"]) == 0
-    (tmp_path / "pictures").mkdir()
+    folder = tmp_path_factory.mktemp("desk")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        assert __main__.main(["init", "my_desk", "--radius", "0.03", "--source", "pictures"]) == 0
+    (folder / "pictures").mkdir()
     card = PrintedCard(np.random.default_rng(0))
     for k in range(5):
         # Moved across the picture, never tilted: focal length and distance cannot be told apart.
         place = np.array([0.06 * k - 0.12, 0.04 * (k % 2), 0.0])
         pose = Pose(*look_at(place + np.array([0.0, -0.01, 1.0]), place))
-        imageio.v3.imwrite(tmp_path / "pictures" / f"{k}.png", card.photograph(CAMERA, pose, 0.8, encode))
-    return tmp_path
+        imageio.v3.imwrite(folder / "pictures" / f"{k}.png", card.photograph(CAMERA, pose, 0.8, encode))
+    return folder
+
+
+@pytest.fixture
+def desk(made, tmp_path, monkeypatch):
+    """A copy of it to work in."""
+    monkeypatch.chdir(tmp_path)
+    return shutil.copytree(made, tmp_path, dirs_exist_ok=True)
 
 
 def test_pictures_that_tell_too_little_are_not_written(desk, capsys, monkeypatch):
