@@ -12,6 +12,8 @@ import pytest
 import warp as wp
 
 wp.config.log_level = wp.LOG_WARNING
+# A test runs its kernels once or twice: compiled quickly they give the same bits (tests/test_tiers.py).
+os.environ.setdefault("WARP_AR_TIERS", "quick")
 
 MOST_PROCESSES = 4
 """Processes that a run of a folder is spread over at most: each takes 1 to 3 GB."""

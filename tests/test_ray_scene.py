@@ -424,8 +424,10 @@ def test_light_rect_holds_every_pixel_that_gets_bounced_light(device, name, prox
             shapes, np.broadcast_to(inverse.translation, directions.shape), directions
         )
         seen = (which >= 0) & ((normals * directions).sum(-1) < 0)
-        way = sources[None] - (inverse.translation + np.where(seen, t, 0)[:, None] * directions)[:, None]
-        gets = ((way * normals[:, None]).sum(-1) > 1e-6) & ((way * facings[None]).sum(-1) < -1e-6)
+        points = inverse.translation + np.where(seen, t, 0)[:, None] * directions
+        # Of the way from each point to each source, along both normals.
+        leaves = (facings * sources).sum(-1) - points @ facings.T < -1e-6
+        gets = (normals @ sources.T - (points * normals).sum(-1)[:, None] > 1e-6) & leaves
         gets = (gets.any(1) & seen).reshape(CAMERA.height, CAMERA.width)
         inside = np.zeros_like(gets)
         inside[rect[0] : rect[1], rect[2] : rect[3]] = True

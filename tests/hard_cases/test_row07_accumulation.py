@@ -34,18 +34,18 @@ def test_long_runs(device, case, request):
 
 @pytest.mark.atlas(row=7, stage="expose")
 @pytest.mark.parametrize("method", METHODS["expose"])
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -1.0, 0.0])
-def test_an_automatic_exposure_that_was_spoilt_heals(device, method, bad):
-    """Whatever stands in the scale, a second of good frames brings it back to where it belongs."""
+def test_an_automatic_exposure_that_was_spoilt_heals(device, method):
+    """Whatever stands in the scale, seconds of good frames bring it back to where it belongs."""
     with Rig(device, "expose", method, exposure=Exposure("auto")) as rig:
         for _ in range(5):
-            image = rig.frame(FRAMES["ramp"])
+            rig.frame(FRAMES["ramp"])
         expected = rig.get("expose_scale")
-        rig.poke("expose_scale", bad)
-        for _ in range(120):  # 4 seconds, time constant 0.3
-            image = rig.frame(FRAMES["ramp"])
-        np.testing.assert_allclose(rig.get("expose_scale"), expected, rtol=1e-3)
-        assert image.any()
+        for bad in (np.nan, np.inf, -1.0, 0.0):
+            rig.poke("expose_scale", bad)
+            for _ in range(75):  # 2.5 seconds, time constant 0.3: 0.02 % of what was off is left
+                image = rig.frame(FRAMES["ramp"])
+            np.testing.assert_allclose(rig.get("expose_scale"), expected, rtol=1e-3, err_msg=f"after {bad}")
+            assert image.any()
 
 
 @pytest.mark.atlas(row=7, stage="recover")

@@ -37,7 +37,7 @@ def reduce_latlong(radiance, height, width):
     rows /= rows.sum(1, keepdims=True)
     columns = overlap(source_width, width)
     columns /= columns.sum(1, keepdims=True)
-    return np.einsum("ir,jc,rck->ijk", rows, columns, radiance)
+    return np.einsum("ir,jc,rck->ijk", rows, columns, radiance, optimize=True)
 
 
 def build_pyramid(radiance):
