@@ -76,6 +76,16 @@ def test_one_photograph_says_how_much_is_a_lower_bound(bracket):
     assert all(emitter.high is None for emitter in found.light.emitters[:2])
 
 
+def test_a_disc_that_mirrors_nothing_is_said(tmp_path):
+    """The ring on the card where the ball belongs, a plate, a ball that is painted over."""
+    image = np.random.default_rng(0).normal(120.0, 40.0, (120, 160, 3))
+    image = np.clip(cv2.GaussianBlur(image, (0, 0), 1.5), 0, 255).astype(np.uint8)
+    cv2.circle(image, (80, 60), 25, (128, 128, 128), -1)
+    write_photo(tmp_path / "a.jpg", image)
+    found = capture_light([tmp_path / "a.jpg"], device="cpu")
+    assert any("the picture is flat: is a ball there" in note for note in found.notes)
+
+
 def test_lying_exposures_end_the_command(tmp_path, capsys):
     photos = write_bracket(tmp_path, BRACKET[:4], exif=(50, 60, 72, 100), names=["d_4", "d_16", "d_64", "d_1024"])
     assert main([*map(str, photos), "--output", str(tmp_path / "light.exr"), "--device", "cpu"]) == EXIT_USAGE

@@ -15,6 +15,7 @@ from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import UsageError
 from warp_ar.input.ball_finder import BallOutline, far_camera, find_ball, sphere_of_circle
 from warp_ar.input.bracket import MOVED, Aligned, Circle, agree_exposures, align, thin_exposures
+from warp_ar.input.check_ball import DULL, disc_contrast
 from warp_ar.input.photographs import Photograph, exposures_by_exif, exposures_by_name, read_photograph
 from warp_ar.input.response import write_response
 from warp_ar.input.support import Support
@@ -98,6 +99,8 @@ def capture_light(
     outline = find_ball(reference.image, camera, ball)
     bracket = _merge_plan(photos, reference, outline, transfer, exposures)
     notes += [*bracket.notes, _describe_outline(outline)]
+    if disc_contrast(reference.image, (*outline.center, outline.radius)) < DULL:
+        notes.append("where the ball is found, the picture is flat: is a ball there, uncovered and polished?")
     found = None if support is None else support(outline, camera)
     turn = np.array(pose_of_position((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))[0]).reshape(3, 3)
     if found is not None:

@@ -56,8 +56,17 @@ def check_balls(scene: Scene, look: Look, views: int = 4) -> list[Finding]:
 def inside_contrast(views: Sequence[tuple[Image, Pose]], camera: Camera, probe: Probe) -> float:
     """Standard deviation over mean inside a ball's outline, median over frames: of paper and paint below ``DULL``."""
     circles = [(image, rough_circle(camera, pose, probe)) for image, pose in views]
-    parts = [_inside_of(image, circle) for image, circle in circles if circle is not None]
-    return float(np.median([part.std() / max(part.mean(), 1.0) for part in parts])) if parts else 0.0
+    parts = [disc_contrast(image, circle) for image, circle in circles if circle is not None]
+    return float(np.median(parts)) if parts else 0.0
+
+
+def disc_contrast(image: Image, circle: tuple[float, float, float]) -> float:
+    """Standard deviation over mean of a picture within a circle (x, y, radius), pixels; ``DULL`` is its bound."""
+    return _contrast(_inside_of(image, circle))
+
+
+def _contrast(part: NDArray[np.float64]) -> float:
+    return float(part.std() / max(part.mean(), 1.0))
 
 
 def _check_ball(
@@ -72,7 +81,7 @@ def _check_ball(
     ground = _ground(scene, probe)
     outlines = [pair for pair in agreeing_outlines(views, look.camera, probe, ground) if pair[0].support > LOST]
     insides = [_inside_of(image, circle) for image, circle in seen]
-    contrast = float(np.median([part.std() / max(part.mean(), 1.0) for part in insides]))
+    contrast = float(np.median([_contrast(part) for part in insides]))
     if len(outlines) < max(1, len(seen) // 2):
         return [_why_lost(look, views, label, contrast)]
     found = []
