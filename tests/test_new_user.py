@@ -45,6 +45,12 @@ def desk(made, tmp_path, monkeypatch):
     return shutil.copytree(made, tmp_path, dirs_exist_ok=True)
 
 
+def keep_pictures(desk, count):
+    """Looking for a ball takes a second a picture."""
+    for path in sorted((desk / "pictures").iterdir())[count:]:
+        path.unlink()
+
+
 def test_pictures_that_tell_too_little_are_not_written(desk, capsys, monkeypatch):
     monkeypatch.setattr(calibrate, "MOST_DEVIATION", 0.05)  # five pictures under one lamp tell 0.1
     before = (desk / "my_desk" / "scene.toml").read_text()
@@ -58,6 +64,7 @@ def test_pictures_that_tell_too_little_are_not_written(desk, capsys, monkeypatch
 
 
 def test_a_ball_that_is_not_there_is_not_written(desk, capsys):
+    keep_pictures(desk, 2)
     before = (desk / "my_desk" / "scene.toml").read_text()
     assert calibrate.main(["ball", "my_desk", "--write"]) != 0
     told = capsys.readouterr().err
@@ -96,6 +103,7 @@ def test_all_commands_are_listed(capsys):
 
 
 def test_remedies_name_the_scene(desk, capsys):
+    keep_pictures(desk, 2)
     assert doctor.main(["my_desk"]) == 1
     said = capsys.readouterr().out
     assert "do: python -m warp_ar.calibrate camera PICTURES --write my_desk" in said
