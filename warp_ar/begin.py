@@ -14,8 +14,11 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
-from typing import Any, Final, NoReturn
+
+TYPE_CHECKING = False  # see the package's
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from typing import Any, Final, NoReturn
 
 EXIT_INTERRUPTED: Final = 130
 EXIT_TERMINATED: Final = 143
