@@ -36,6 +36,9 @@ A longer exposure, s > 1, is scaled and clipped: what a camera does.
 ``declipped``: each clipped pixel has the radiance that ``declip`` estimates for it, at least what the camera
 shows; s = 1 is the identity.
 
+Frames of more than 8 bits: means of boxes have what 8 bits cut off (``summed_area.write_cut``). Linear light that clips
+above 1, if anywhere, needs no guess: a pixel of code 255 is what the linear picture says.
+
 Pixels that no layer and no guess touches go through a table of 256 codes, made anew for every s.
 
 ``auto`` keeps highlights of virtual light on the receiver below clipping. Over a grid of pixels that virtual light
@@ -73,7 +76,7 @@ from warp_ar.kernels.color import decode, encode, is_clipped
 from warp_ar.kernels.composite import CompositeConfig, Layers, compose, is_changed, make_read_layers
 from warp_ar.kernels.launch import Rows, launch, launch_rows
 from warp_ar.kernels.structs import FrameParams, Picture
-from warp_ar.kernels.summed_area import box_mean
+from warp_ar.kernels.summed_area import fine_mean
 
 wp.set_module_options({"enable_backward": False})
 
@@ -129,7 +132,9 @@ class ClippedEvidence:
     """What tells the radiance of pixels that clip; what a method does not read may be empty."""
 
     summed_area: wp.array2d[wp.uint32]  # (H, W) the frame's summed-area table, for methods that look at boxes
+    cut_table: wp.array2d[wp.uint32]  # that of what 8 bits cut off; empty for frames of 8 bits
     max_box: wp.int32  # pixels: side of the largest box
+    levels: wp.array[wp.vec3]  # (2,) radiance from which channels of a linear frame clip; empty for frames of 8 bits
     declipped: wp.array2d[wp.vec3]  # (H, W) linear radiance with clipped pixels estimated, for ``declipped``
 
 
@@ -143,18 +148,22 @@ class Exposure:
 
 
 @wp.func
-def surrounding_mean(
-    table: wp.array2d[wp.uint32], row: wp.int32, col: wp.int32, scale: wp.float32, max_box: wp.int32
-) -> wp.float32:
+def surrounding_mean(clipped: ClippedEvidence, row: wp.int32, col: wp.int32, scale: wp.float32) -> wp.float32:
     """Mean intensity, 0..255, of the box that a scale in 0..1 calls for.
 
     A size between two odd numbers takes both their boxes, weighted: centred, and continuous as the scale changes.
     """
-    reach = 0.5 * (1.0 - scale) * wp.float32(max_box - 1)
+    reach = 0.5 * (1.0 - scale) * wp.float32(clipped.max_box - 1)
     inner = wp.int32(reach)
     fraction = reach - wp.float32(inner)
-    smaller = box_mean(table, row, col, 2 * inner + 1)
-    return smaller + fraction * (box_mean(table, row, col, 2 * inner + 3) - smaller)
+    smaller = fine_mean(clipped.summed_area, clipped.cut_table, row, col, 2 * inner + 1)
+    return smaller + fraction * (fine_mean(clipped.summed_area, clipped.cut_table, row, col, 2 * inner + 3) - smaller)
+
+
+@wp.func
+def is_light(clipped: ClippedEvidence) -> wp.bool:
+    """Whether the frame is linear light that says by itself how bright what is above 1 is."""
+    return clipped.levels.shape[0] > 0 and clipped.levels[0][0] > 1.0
 
 
 @wp.func
@@ -287,9 +296,9 @@ def make_find_gain(method: str) -> wp.Function:
         gain = float(1.0)
         if wp.static(method in BOXES):
             least = wp.float32(wp.min(wp.min(code[0], code[1]), code[2]))
-            if least > KNEE and s < 1.0:
+            if least > KNEE and s < 1.0 and not is_light(clipped):
                 share = (least - KNEE) / (255.0 - KNEE)
-                mean = surrounding_mean(clipped.summed_area, i, j, s, clipped.max_box)
+                mean = surrounding_mean(clipped, i, j, s)
                 gain = 1.0 + share * (box_gain(mean, s) - 1.0)
         return gain
 
@@ -308,7 +317,7 @@ def make_expose_kernel(config: ExposeConfig, warps: bool) -> wp.Kernel:
         i: wp.int32,
         j: wp.int32,
         params: wp.array[FrameParams],
-        decode_table: wp.array[wp.vec3],
+        picture: Picture,
         layers: Layers,
         clipped: ClippedEvidence,
         exposure: Exposure,
@@ -318,14 +327,17 @@ def make_expose_kernel(config: ExposeConfig, warps: bool) -> wp.Kernel:
         gain = find_gain(code, i, j, clipped, s)
         guessed = bool(gain != 1.0)
         if wp.static(config.method == "declipped"):
-            guessed = s < 1.0 and wp.max(is_clipped(code)) > 0.0
+            guessed = s < 1.0 and wp.max(is_clipped(code)) > 0.0 and not is_light(clipped)
+        known = is_light(clipped) and wp.max(wp.max(code[0], code[1]), code[2]) == wp.uint8(255)
         at = read_layers(params, layers, i, j)
-        if not guessed and not is_changed(at):
+        if not guessed and not known and not is_changed(at):
             return wp.vec3ub(codes[wp.int32(code[0])][0], codes[wp.int32(code[1])][1], codes[wp.int32(code[2])][2])
-        radiance = gain * decode(decode_table, code)
+        radiance = gain * decode(picture.decode_table, code)
         if wp.static(config.method == "declipped"):
             if guessed:
                 radiance = clipped.declipped[i, j]
+        if known:
+            radiance = picture.linear[i, j]
         return encode(exposure.encode_table, s * compose(radiance, at))
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -360,7 +372,7 @@ def make_expose_kernel(config: ExposeConfig, warps: bool) -> wp.Kernel:
                     code = get_code(own, k)
                 else:
                     code = frame[i, j]
-                code = exposed(code, i, j, params, picture.decode_table, layers, clipped, exposure)
+                code = exposed(code, i, j, params, picture, layers, clipped, exposure)
                 if wp.static(warps):
                     set_code(own, k, code)
                 else:
@@ -377,14 +389,20 @@ def largest_box(height: int) -> int:
     return max(1, round(MAX_BOX * height))
 
 
-def make_clipped_evidence(height: int, summed_area: wp.array | None, declipped: wp.array | None) -> ClippedEvidence:
+def make_clipped_evidence(
+    height: int,
+    summed_area: wp.array | None,
+    declipped: wp.array | None,
+    cut_table: wp.array | None = None,
+    levels: wp.array | None = None,
+) -> ClippedEvidence:
     """What is known of the clipped pixels of a frame of ``height`` rows; None for what the method does not read."""
     evidence = ClippedEvidence()
     evidence.max_box = largest_box(height)
-    if summed_area is not None:
-        evidence.summed_area = summed_area
-    if declipped is not None:
-        evidence.declipped = declipped
+    arrays = {"summed_area": summed_area, "declipped": declipped, "cut_table": cut_table, "levels": levels}
+    for name, array in arrays.items():
+        if array is not None:
+            setattr(evidence, name, array)
     return evidence
 
 

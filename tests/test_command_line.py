@@ -12,7 +12,8 @@ import weakref
 
 import pytest
 
-from warp_ar.command_line import EXIT_INTERRUPTED, EXIT_TERMINATED, Parser, Terminated, ended_by_signals, loading
+from warp_ar.begin import EXIT_INTERRUPTED, EXIT_TERMINATED
+from warp_ar.command_line import Parser, Terminated, ended_by_signals, loading
 from warp_ar.errors import UsageError
 
 
@@ -50,7 +51,7 @@ def test_an_error_turns_the_collector_on_again():
 
 
 def test_leaving_gives_the_code_and_runs_what_was_registered():
-    script = "import atexit; from warp_ar.command_line import leave; atexit.register(print, 'end'); leave(3)"
+    script = "import atexit; from warp_ar.begin import leave; atexit.register(print, 'end'); leave(3)"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (3, "end\n", "")
 

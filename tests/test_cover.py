@@ -10,6 +10,7 @@ from tests.test_drift import POSE, encode, linear_picture
 from tests.test_drift import SCENE as WITHOUT_ROOM
 from warp_ar import PRESETS, Pipeline
 from warp_ar.input.cover import PATIENCE, BallCover
+from warp_ar.input.plate import Plate
 from warp_ar.input.saturation import ball_discs
 from warp_ar.scene import Pose, loads_scene
 
@@ -45,11 +46,11 @@ def picture(scene, light=1.0, mirrored=(0.5, 0.45, 0.4)):
     return linear
 
 
-def with_hand(linear, scene):
+def with_hand(linear, scene, hand=HAND):
     """A hand from the left that reaches over the ball."""
     x, y, radius = disc(scene)
     linear = linear.copy()
-    linear[round(y - 3 * radius) : round(y + 3 * radius), : round(x + 0.5 * radius)] = HAND
+    linear[round(y - 3 * radius) : round(y + 3 * radius), : round(x + 0.5 * radius)] = hand
     return linear
 
 
@@ -61,6 +62,39 @@ def watch(pictures, seconds=STEP, gains=None):
         cover.observe(encode(one), [disc(scene)], POSE, seconds * index, gain)
         for index, (one, gain) in enumerate(zip(pictures, gains, strict=True))
     ]
+
+
+def watch_plates(images, plates):
+    scene = loads_scene(SCENE)
+    cover = BallCover(scene, scene.camera)
+    return [
+        cover.observe(image, [disc(scene)], POSE, STEP * index, np.ones(3), plate)
+        for index, (image, plate) in enumerate(zip(images, plates, strict=True))
+    ]
+
+
+def test_codes_of_8_bits_are_read_alike_from_a_plate():
+    """And from nothing else: the picture beside it is black."""
+    scene = loads_scene(SCENE)
+    bare = encode(picture(scene))
+    frames = [bare, bare, encode(with_hand(picture(scene), scene)), bare]
+    plates = [Plate(frame.astype(np.uint16) * 257) for frame in frames]
+    assert watch_plates([np.zeros_like(bare)] * 4, plates) == [False, False, True, False]
+    cover = BallCover(scene, scene.camera)
+    for gain in (np.ones(3), np.array([0.7, 0.8, 1.1])):
+        for x, y, radius in (disc(scene), (3.0, 60.0, 20.0)):  # the other one reaches out of the picture
+            codes, deep = (cover._cells(frames[2], (x, y, radius), gain, plate) for plate in (None, plates[2]))
+            np.testing.assert_array_equal(codes, deep)
+
+
+def test_a_white_hand_before_lamps_above_white_is_told_by_light():
+    """The ball mirrors what is four times as bright as white: its codes are 255 with and without the hand."""
+    scene = loads_scene(SCENE)
+    bare = picture(scene, mirrored=(4.0, 4.0, 4.0))
+    frames = [bare, bare, with_hand(bare, scene, 0.9), bare]
+    codes = [encode(frame) for frame in frames]
+    assert watch_plates(codes, [Plate(frame.astype(np.float32)) for frame in frames]) == [False, False, True, False]
+    assert watch_plates(codes, [None] * 4) == [False] * 4, "8 bits do not hold it"
 
 
 def test_a_hand_is_told_while_it_is_there():

@@ -21,11 +21,13 @@ import pytest
 
 import warp_ar
 from warp_ar.errors import SinkError, SourceError, UsageError
-from warp_ar.input.plate import Plate, deep_table, srgb8
+from warp_ar.input.plate import Plate, codes8, deep_table, srgb8
+from warp_ar.input.saturation import ball_discs
 from warp_ar.input.sources import open_source
 from warp_ar.kernels.color import decode_codes, encode_codes
 from warp_ar.output.encoders import describe_encoders, encoder_names, find_encoding, last_packets, parse_options
 from warp_ar.output.sinks import open_sink
+from warp_ar.scene import Pose
 from warp_ar.session import Session
 from warp_ar.signals import REC_709, REC_2020, hlg_of_light, light_of_hlg, light_of_pq, pq_of_light, rgb_from_rgb
 
@@ -225,9 +227,9 @@ def first() -> Any:
 OUTPUTS = ("image", "radiance", "environment")
 
 
-def lit(frame: Any, pose: Any = None, quality: str = "medium", **more: Any) -> Any:
+def lit(frame: Any, pose: Any = None, quality: str = "medium", scene: str = "desk", **more: Any) -> Any:
     with warp_ar.Pipeline(
-        "desk", device="cpu", quality=quality, size=(160, 120), outputs=OUTPUTS, estimates="synchronous", **more
+        scene, device="cpu", quality=quality, size=(160, 120), outputs=OUTPUTS, estimates="synchronous", **more
     ) as pipeline:
         result = pipeline(frame, pose=pose)
         return result.image, result.radiance, result.environment, result.layers
@@ -240,6 +242,44 @@ def test_8_bits_through_a_deep_pipeline_are_the_same_to_the_bit(first: np.ndarra
     for a, b, c in zip(plain[:3], deep[:3], wide[:3], strict=True):
         np.testing.assert_array_equal(a, b)
         np.testing.assert_array_equal(a, c)
+
+
+@pytest.mark.parametrize("quality", ["paper", "medium"])
+def test_8_bits_at_a_shorter_exposure_are_the_same_to_the_bit(first: np.ndarray, quality: str) -> None:
+    plain, deep = (lit(first, quality=quality, scene="darken", linear=linear)[0] for linear in (False, True))
+    np.testing.assert_array_equal(plain, deep)
+
+
+def test_light_above_white_is_known_at_a_shorter_exposure(first: np.ndarray) -> None:
+    """Half of eight times the light clips where a quarter of white lies; of 8 bits the paper makes a guess."""
+    light = decode_codes("srgb", first.reshape(-1) / 255.0)[:, 0].reshape(first.shape).astype(np.float32) * 8.0
+    pose = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.5]))  # nobody finds the marker
+    image = lit(light, pose, "paper", "darken", linear=True)[0]
+    codes = lit(srgb8(light), pose, "paper", "darken")[0]
+    above = (light > 1.01).all(-1)
+    assert above.sum() > 1000
+    np.testing.assert_allclose(image[above], srgb8(0.5 * light)[above], atol=1)
+    assert np.abs(codes[above].astype(int) - srgb8(0.5 * light)[above]).mean() > 10, "8 bits do not hold it"
+
+
+def test_frames_tell_between_codes_of_8_bits_where_a_camera_saturates(first: np.ndarray) -> None:
+    """Step 950 of 10 bits, of a lamp that takes up half of the ball."""
+    with warp_ar.Pipeline("desk", device="cpu", size=(160, 120), outputs=("pose",)) as pipeline:
+        pose = pipeline(first).pose
+        (x, y, radius), *_ = ball_discs(pipeline.scene.probes, pipeline.camera, pose)
+    step = round(950 * 65535 / 1023)
+    deep = np.minimum(first.astype(np.uint16) * np.uint16(200), step)
+    v, u = np.mgrid[:120, :160]
+    deep[(np.hypot(u - x, v - y) < radius) & (u < x)] = step
+    levels = []
+    for frame, linear in ((deep, True), (codes8(Plate(deep), "srgb"), False)):
+        with warp_ar.Pipeline(
+            "desk", device="cpu", size=(160, 120), outputs=("environment",), linear=linear
+        ) as pipeline:
+            pipeline(frame, pose=pose)
+            levels.append(pipeline.inputs.saturation.levels)
+    np.testing.assert_allclose(levels[0], step / 257.0)
+    np.testing.assert_array_equal(levels[1], round(step / 257.0))
 
 
 def test_light_above_white_lights_as_it_is(first: np.ndarray) -> None:

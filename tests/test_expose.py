@@ -8,7 +8,9 @@ from tests.reference import color as reference_color
 from tests.reference import composite as reference_composite
 from tests.reference import expose as reference
 from tests.test_composite import CONFIGS, H, make_arrays, make_layers, make_params
+from warp_ar.input.plate import srgb8
 from warp_ar.kernels import color, expose, summed_area
+from warp_ar.kernels.color import decode_codes
 from warp_ar.kernels.structs import make_picture
 
 # How far `auto` may miss: one bin of an eighth of a stop, and the share that may clip.
@@ -26,6 +28,8 @@ def run(
     ratio=None,
     mirror_ball=None,
     transfer="srgb",
+    light=None,
+    clips=np.inf,
 ):
     frame_array = wp.array(frame, dtype=wp.vec3ub)
     shape = frame.shape[:2]
@@ -39,8 +43,15 @@ def run(
     expose.expose_codes(decode, encode, scale_array, codes)
     over = make_arrays(virtual, added, ratio, mirror_ball)
     config = expose.ExposeConfig(method, layers)
-    picture, exposure = make_picture(frame_array, decode, None), expose.make_exposure(encode, scale_array, codes)
-    clipped = expose.make_clipped_evidence(height, table, wp.array(declipped(frame, transfer), dtype=wp.vec3))
+    deep = {}
+    light = None if light is None else wp.array(light, dtype=wp.vec3)
+    if light is not None:
+        cut, cut_table = wp.zeros(shape, wp.vec3ub), wp.zeros(shape, wp.uint32)
+        summed_area.write_cut(frame_array, decode, light, cut)
+        summed_area.sum_area(cut, cut_table)
+        deep = {"cut_table": cut_table, "levels": wp.array(np.full((2, 3), clips), dtype=wp.vec3)}
+    picture, exposure = make_picture(frame_array, decode, None, light), expose.make_exposure(encode, scale_array, codes)
+    clipped = expose.make_clipped_evidence(height, table, wp.array(declipped(frame, transfer), dtype=wp.vec3), **deep)
     expose.expose(config, params, picture, over, clipped, exposure, image)
     return image.numpy()
 
@@ -87,6 +98,41 @@ def test_boxes_match_their_twins(device, scale, method):
     gains = reference.gains(frame, scale, expose.largest_box(frame.shape[0]), method)
     exact = reference_color.encoded_srgb(np.clip(linear(frame) * gains[..., None] * np.float64(scale), 0.0, 1.0))
     check_error("expose", run(frame, scale, method), exact)
+
+
+@pytest.mark.parametrize("method", expose.METHODS)
+@pytest.mark.parametrize("scale", [0.1, 0.5, 2.0])
+def test_light_above_white_needs_no_guess(device, scale, method):
+    """A linear frame says what is there; codes of 8 bits would make 1, or a guess, of all that is above."""
+    light = np.random.default_rng(5).uniform(0.0, 4.0, (40, 50, 3)).astype(np.float32)
+    light[10:30, 10:40] += 1.5
+    frame = srgb8(light)
+    shown = np.where((frame == 255).any(-1, keepdims=True), light, linear(frame))
+    exact = reference_color.encoded_srgb(np.clip(shown * np.float64(scale), 0.0, 1.0))
+    check_error("expose", run(frame, scale, method, light=light), exact)
+
+
+@pytest.mark.parametrize("code", [128.4, 128.6, 131.5])
+def test_boxes_of_deep_frames_are_means_of_what_they_show(device, code):
+    """A flat frame around a pixel that clips, at a scale where a third of a code of the mean is two of the picture."""
+    scale, values = 0.01, np.full((96, 96), code)
+    values[48, 48] = 255.0
+    codes = np.repeat(values[..., None], 3, 2)
+    light = decode_codes("srgb", codes.ravel() / 255.0)[:, 0].reshape(codes.shape).astype(np.float32)
+    frame = np.round(codes).astype(np.uint8)
+    mean = reference.surrounding_mean(values, 48, 48, scale, expose.largest_box(96))
+    exact = reference_color.encoded_srgb(np.array(reference.paper_factor(mean, scale)))
+    deep = run(frame, scale, "paper", light=light, clips=0.98)[48, 48]
+    np.testing.assert_allclose(deep, exact, atol=0.51)
+    if abs(code - round(code)) > 0.1:
+        assert abs(float(run(frame, scale, "paper")[48, 48, 0]) - exact) > 1.0, "8 bits do not hold it"
+
+
+@pytest.mark.parametrize("method", expose.METHODS)
+def test_frames_of_8_bits_are_exposed_alike_from_a_linear_picture(device, method):
+    frame = np.concatenate([disc(48, 10), make_layers(2)[0][:, :40].repeat(2, 0)], axis=1)
+    light = linear(frame).astype(np.float32)
+    np.testing.assert_array_equal(run(frame, 0.25, method, light=light, clips=0.98), run(frame, 0.25, method))
 
 
 @pytest.mark.parametrize("scale", [0.25, 0.75, 2.0])

@@ -8,8 +8,9 @@ import signal
 import pytest
 
 from warp_ar.errors import UsageError
-from warp_ar.farm.pool import Teller, cores_of, devices_of, is_from_outside, keeping_to, words_of_exit
+from warp_ar.farm.pool import ProcessPool, Teller, cores_of, devices_of, is_from_outside, keeping_to, words_of_exit
 from warp_ar.farm.ray_pool import _knock
+from warp_ar.farm.records import Context
 
 
 @pytest.mark.parametrize(
@@ -83,3 +84,19 @@ def test_an_address_of_no_cluster_is_told_at_once(address, words):
     with pytest.raises(UsageError) as caught:
         _knock(address)
     assert str(caught.value).startswith(words)
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="needs the masks of processes as Linux tells them")
+def test_workers_see_no_interrupt_even_as_they_begin(tmp_path):
+    """Ctrl-C reaches all processes of a terminal: one that imports would end with a traceback."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [])
+    pool = ProcessPool(Context(None, tmp_path, "cpu"), ["cpu", "cpu"])
+    try:
+        for process, _ in pool._workers:
+            with open(f"/proc/{process.pid}/status", encoding="ascii") as file:
+                held = next(int(line.split()[1], 16) for line in file if line.startswith("SigBlk"))
+            assert held >> (signal.SIGINT - 1) & 1
+            assert not held >> (signal.SIGTERM - 1) & 1
+    finally:
+        pool.close()
+    assert signal.pthread_sigmask(signal.SIG_BLOCK, []) == before

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from warp_ar.input.plate import Plate, codes8
 from warp_ar.input.saturation import FULL, SaturationLevels, ball_codes, ball_discs
 from warp_ar.kernels.color import camera_table, decode_table, is_saturated, saturation_codes
 from warp_ar.scene import Camera, Probe
@@ -15,8 +16,17 @@ from warp_ar.scene.pose import Pose
 DISC = (160.0, 120.0, 90.0)
 
 
+STEP10 = 255.0 / 1023.0
+"""8-bit codes of a step of 10 bits."""
+
+
 def ball_picture(top, *, surface=60.0, noise=1.5, seed=0):
     """A ball that mirrors walls of ``surface``, fading to the rim, and two lamps that drive the camera to ``top``."""
+    return np.clip(np.round(unrounded_ball(top, surface, noise, seed)), 0, 255).astype(np.uint8)
+
+
+def unrounded_ball(top, surface=60.0, noise=1.5, seed=0):
+    """The same before codes are rounded."""
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[:240, :320].astype(float)
     image = np.full((240, 320, 3), 40.0)
@@ -26,7 +36,34 @@ def ball_picture(top, *, surface=60.0, noise=1.5, seed=0):
     for cx, cy, radius in ((120, 90, 24), (200, 110, 12)):
         image[np.hypot(x - cx, y - cy) < radius] = 400.0
     image = cv2.GaussianBlur(image, (0, 0), 1.0)  # the lens
-    return np.clip(np.round(np.minimum(image, top)), 0, 255).astype(np.uint8)
+    return np.minimum(image, top)
+
+
+def plate_of_10_bits(image):
+    """Codes in steps of 8 bits as a sensor of 10 bits has them, widened to 16."""
+    codes = np.clip(np.round(image / STEP10), 0, 1023)
+    return Plate(np.round(codes * (65535.0 / 1023.0)).astype(np.uint16))
+
+
+@pytest.mark.parametrize("step", [950, 951, 953, 990])
+def test_a_plateau_between_two_codes_of_8_bits_is_told_by_deep_frames(step):
+    """Steps of 10 bits that are 236.8, 237.05, 237.55 and 246.8 of 255: rounding to 8 bits misses three of them."""
+    plate = plate_of_10_bits(unrounded_ball(step * STEP10))
+    levels = SaturationLevels()
+    assert levels.observe(codes8(plate, "srgb"), [DISC], plate=plate)
+    np.testing.assert_allclose(levels.levels, step * STEP10, atol=0.51 / 257.0)  # rounding to 16 bits
+    below, _ = plate.clip_levels("srgb", levels.levels)
+    assert (below < decode_table("srgb")[round(step * STEP10)]).all()
+
+
+@pytest.mark.parametrize("top", [255, 247, 238])
+def test_codes_of_8_bits_are_read_alike_from_a_plate(top):
+    plain, deep = SaturationLevels(), SaturationLevels()
+    for seed in range(3):
+        image = ball_picture(top, seed=seed)
+        seen = deep.observe(np.zeros_like(image), [DISC], plate=Plate(image.astype(np.uint16) * 257))
+        assert seen == plain.observe(image, [DISC]) or top == 255
+    np.testing.assert_array_equal(deep.levels, plain.levels)
 
 
 @pytest.mark.parametrize("top", [238, 235, 247])

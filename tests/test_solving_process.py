@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 import itertools
 import pickle
+import subprocess
+import sys
 import threading
 import time
 
@@ -197,3 +199,14 @@ def test_every_thread_solves_with_one_thread_of_blas():
     assert len(seen) == 5
     assert all(entry == [1] * len(before) for entry in seen)
     assert [entry["num_threads"] for entry in threadpool_info() if entry["user_api"] == "blas"] == before
+
+
+def test_a_process_that_is_let_go_closes_what_it_has_opened():
+    command = [sys.executable, "-W", "always::ResourceWarning", "-c"]
+    command.append("from warp_ar.light.solving_process import serve; serve()")
+    streams = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "bufsize": 0}
+    with subprocess.Popen(command, **streams) as process:
+        assert read_message(process.stdout) == "ready"
+        process.stdin.close()
+        assert process.wait(60.0) == 0
+        assert process.stderr.read() == b""

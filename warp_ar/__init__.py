@@ -8,9 +8,11 @@ launchers of single steps are in ``warp_ar.kernels``. Importing this package doe
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING, Any
 
+TYPE_CHECKING = False  # typing's would have to be loaded, and until then no command handles signals
 if TYPE_CHECKING:
+    from typing import Any
+
     from warp_ar.engine.graph import Plan, make_plan
     from warp_ar.engine.pipeline import Pipeline, Result
     from warp_ar.errors import SceneError, SinkError, SourceError, UsageError, WarpArError

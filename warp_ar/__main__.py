@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+if __name__ == "__main__":
+    from warp_ar.begin import begin
+
+    begin("warp_ar.__main__")
+
 import importlib
 import sys
 from collections.abc import Sequence
 
+from warp_ar.begin import importing
 from warp_ar.command_line import EXIT_DONE, run_command
 from warp_ar.errors import UsageError, printable
 from warp_ar.scene.messages import nearest
@@ -37,14 +43,11 @@ def _run(arguments: Sequence[str]) -> int:
     name, *rest = arguments
     if name not in COMMANDS:
         raise UsageError(f"no command {printable(name)}; {nearest(name, COMMANDS)}")
-    module = importlib.import_module("warp_ar.farm.cli" if name == "farm" else f"warp_ar.{name}")
+    with importing():
+        module = importlib.import_module("warp_ar.farm.cli" if name == "farm" else f"warp_ar.{name}")
     return int(module.main(rest))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     return run_command(lambda: _run(sys.argv[1:] if arguments is None else arguments))
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -9,6 +9,11 @@ response  pictures of the card's greys, or of any scene at several exposures, to
 
 from __future__ import annotations
 
+if __name__ == "__main__":
+    from warp_ar.begin import begin
+
+    begin("warp_ar.calibrate")
+
 import argparse
 import dataclasses
 import itertools
@@ -23,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, leave, run_command, say
+from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, run_command, say
 from warp_ar.errors import UsageError
 from warp_ar.input.ball import posed_frames
 from warp_ar.input.ball_measure import measure_ball
@@ -280,7 +285,3 @@ def _run(options: argparse.Namespace) -> int:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     return run_command(lambda: _run(make_parser().parse_args(arguments)))
-
-
-if __name__ == "__main__":
-    leave(main())

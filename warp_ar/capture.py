@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+if __name__ == "__main__":
+    from warp_ar.begin import begin
+
+    begin("warp_ar.capture")
+
 import argparse
 from collections.abc import Sequence
 from fractions import Fraction
@@ -9,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_ar.command_line import EXIT_DONE, Parser, leave, run_command, say
+from warp_ar.command_line import EXIT_DONE, Parser, run_command, say
 from warp_ar.errors import SinkError, UsageError, reason
 from warp_ar.files import write_whole
 from warp_ar.input.ball_finder import BallOutline
@@ -177,7 +182,3 @@ def capture(options: argparse.Namespace) -> int:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     return run_command(lambda: capture(make_parser().parse_args(arguments)), SinkError)
-
-
-if __name__ == "__main__":
-    leave(main())

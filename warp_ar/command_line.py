@@ -19,16 +19,15 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import Any, NoReturn
 
+from warp_ar.begin import EXIT_INTERRUPTED, EXIT_TERMINATED, end_at_once, handling
 from warp_ar.errors import SinkError, UsageError, WarpArError, printable, reason
 from warp_ar.output.sink import close_open_sinks
 
 EXIT_DONE = 0
 EXIT_FAILED = 1
 EXIT_USAGE = 2
-EXIT_INTERRUPTED = 130
 EXIT_PIPE = 141
 """Nobody reads what is printed any more."""
-EXIT_TERMINATED = 143
 
 _LARGEST = 2**31 - 1
 """Largest whole number of an argument: they count frames, samples, pixels, ports."""
@@ -154,12 +153,6 @@ def loading() -> Iterator[Callable[[], None]]:
             gc.enable()
 
 
-def leave(code: int) -> NoReturn:
-    """End the process of a command: Python does not look for garbage in what goes anyway, for half a second."""
-    gc.freeze()
-    sys.exit(code)
-
-
 _TAKES_A_LOCK = frozenset(
     getattr(threading.Condition, name).__code__
     for name in ("__enter__", "__exit__", "_is_owned", "_release_save", "_acquire_restore")
@@ -208,7 +201,7 @@ def ended_by_signals() -> Iterator[None]:
         ending = False
         _send_soon(numbers[-1] if isinstance(dropped.exc_value, Terminated) else signal.SIGINT)
 
-    ctrl_c = ("SIGINT",) if signal.getsignal(signal.SIGINT) is signal.default_int_handler else ()
+    ctrl_c = ("SIGINT",) if signal.getsignal(signal.SIGINT) in (signal.default_int_handler, end_at_once) else ()
     with handling(end, "SIGTERM", "SIGHUP"), handling(interrupt, *ctrl_c):
         sys.unraisablehook = send_again
         try:
@@ -247,19 +240,3 @@ def _send_soon(number: int) -> None:
 
     # Not by the class `Thread`: that takes locks, and this runs wherever a signal has come.
     _thread.start_new_thread(send, ())
-
-
-@contextlib.contextmanager
-def handling(handler: Any, *names: str) -> Iterator[None]:
-    """Handle the signals of these names where there are such; elsewhere than in the main thread nothing is changed."""
-    before = {}
-    if threading.current_thread() is threading.main_thread():
-        for number in (getattr(signal, name) for name in names if hasattr(signal, name)):
-            # Who was started to outlive its terminal (nohup) goes on doing so.
-            if signal.getsignal(number) is not signal.SIG_IGN or number == signal.SIGINT:
-                before[number] = signal.signal(number, handler)
-    try:
-        yield
-    finally:
-        for number, previous in before.items():
-            signal.signal(number, previous)

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+if __name__ == "__main__":
+    from warp_ar.begin import begin
+
+    begin("warp_ar.doctor")
+
 import argparse
 import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, leave, run_command
+from warp_ar.begin import importing
+from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, run_command
 from warp_ar.errors import UsageError, printable
 from warp_ar.input.checkup import FRAMES, check_up, source_of
 from warp_ar.input.finding import Finding, worst_first
@@ -37,10 +43,11 @@ def make_parser() -> argparse.ArgumentParser:
 def check_machine() -> tuple[list[str], list[Finding]]:
     """What this machine has, one line each, and what it lacks."""
     # Here, for it loads Warp.
-    import av
-    import warp as wp
+    with importing():
+        import av
+        import warp as wp
 
-    from warp_ar.device import resolve_device, usable_cores
+        from warp_ar.device import resolve_device, usable_cores
 
     device = resolve_device("auto")
     told = [f"device: {device.name} ({usable_cores()} cores)" if device.is_cpu else f"device: {device.name}"]
@@ -114,7 +121,3 @@ def _run(options: argparse.Namespace) -> int:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     return run_command(lambda: _run(make_parser().parse_args(arguments)))
-
-
-if __name__ == "__main__":
-    leave(main())

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+if __name__ == "__main__":
+    from warp_ar.begin import begin
+
+    begin("warp_ar.environment")
+
 import argparse
 import dataclasses
 import datetime
@@ -12,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, leave, run_command, say
+from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, run_command, say
 from warp_ar.errors import SinkError, UsageError
 from warp_ar.output.color_spaces import COLOR_SPACES, grey_card_scale
 from warp_ar.output.environment_axes import AXES, LAYOUTS
@@ -106,7 +111,3 @@ def _scaled(radiance: Radiance, info: EnvironmentInfo) -> tuple[Radiance, Enviro
         white_luminance=None if luminance is None else luminance / scale,
     )
     return np.ascontiguousarray(radiance * np.float32(scale)), info
-
-
-if __name__ == "__main__":
-    leave(main())

@@ -5,6 +5,11 @@ No frame is run for it.
 
 from __future__ import annotations
 
+if __name__ == "__main__":
+    from warp_ar.begin import begin
+
+    begin("warp_ar.explain")
+
 import argparse
 import sys
 from collections.abc import Sequence
@@ -12,7 +17,7 @@ from collections.abc import Sequence
 from rich.console import Console
 from rich.table import Table
 
-from warp_ar.command_line import EXIT_DONE, Parser, leave, run_command
+from warp_ar.command_line import EXIT_DONE, Parser, run_command
 from warp_ar.engine.graph import make_plan
 from warp_ar.engine.pipeline import resolve_quality
 from warp_ar.input.exposures import plan_bracket
@@ -64,7 +69,3 @@ def print_numerics() -> None:
         rows = " ".join(map(str, numbers.rows))
         table.add_row(stage.name, numbers.precision, numbers.expected, f"{numbers.measured:.1e}", rows)
     Console(width=None if sys.stdout.isatty() else 160).print(table)
-
-
-if __name__ == "__main__":
-    leave(main())

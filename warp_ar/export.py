@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+if __name__ == "__main__":
+    from warp_ar.begin import begin
+
+    begin("warp_ar.export")
+
 import argparse
 import dataclasses
 import itertools
@@ -10,7 +15,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from warp_ar.command_line import EXIT_DONE, Parser, leave, run_command, say
+from warp_ar.begin import importing
+from warp_ar.command_line import EXIT_DONE, Parser, run_command, say
 from warp_ar.errors import SinkError, SourceError, UsageError
 from warp_ar.output.environment_file import write_environment
 from warp_ar.output.gltf_file import GLTF_SUFFIX, write_glb
@@ -101,7 +107,8 @@ def _read_by(scene: Scene, options: argparse.Namespace) -> dict[str, list[Path]]
 
 def _read_shot(options: argparse.Namespace, scene: Any) -> tuple[Shot, Any]:
     """The camera's way, and the environment of the last frame that shows it."""
-    from warp_ar.session import Session  # loads Warp
+    with importing():
+        from warp_ar.session import Session  # loads Warp
 
     light = not options.no_environment and bool(scene.probes or scene.captured)
     light = light and options.output.suffix.lower() != TRACK_SUFFIX
@@ -123,7 +130,3 @@ def _read_shot(options: argparse.Namespace, scene: Any) -> tuple[Shot, Any]:
     path = options.source if options.source is not None else lit.source.path if lit.source is not None else None
     plate = None if path is None else Path(os.path.relpath(path, options.output.parent))
     return Shot(lit, fps, tuple(poses), plate), radiance
-
-
-if __name__ == "__main__":
-    leave(main())

@@ -5,6 +5,11 @@ The folder runs at once with a guessed camera; what is guessed is said whenever 
 
 from __future__ import annotations
 
+if __name__ == "__main__":
+    from warp_ar.begin import begin
+
+    begin("warp_ar.init")
+
 import argparse
 import math
 import shutil
@@ -12,7 +17,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from warp_ar.command_line import EXIT_DONE, Parser, leave, run_command
+from warp_ar.command_line import EXIT_DONE, Parser, run_command
 from warp_ar.errors import SinkError, UsageError, printable, reason
 from warp_ar.input.card import write_card
 from warp_ar.input.sheet import RINGS, SHEET, ball_center
@@ -93,7 +98,3 @@ def _run(options: argparse.Namespace) -> int:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     return run_command(lambda: _run(make_parser().parse_args(arguments)))
-
-
-if __name__ == "__main__":
-    leave(main())

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+if __name__ == "__main__":
+    from warp_ar.begin import begin
+
+    begin("warp_ar.live")
+
 import argparse
-import faulthandler
 from collections.abc import Sequence
 from pathlib import Path
 
-from warp_ar.command_line import EXIT_DONE, Parser, leave, run_command
+from warp_ar.command_line import EXIT_DONE, Parser, run_command
 from warp_ar.errors import UsageError
 from warp_ar.live_clip import RunError, light_clip
 from warp_ar.live_page import DEFAULT_PORT, serve_page
@@ -189,8 +193,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
     0 done, 1 failed while running, 2 bad usage or scene, 130 interrupted, 143 terminated.
     """
     return run_command(lambda: run(make_parser().parse_args(arguments)), RunError)
-
-
-if __name__ == "__main__":
-    faulthandler.enable()  # should native code crash, the report says what it was at
-    leave(main())

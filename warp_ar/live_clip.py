@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-from warp_ar.command_line import EXIT_DONE, EXIT_INTERRUPTED, EXIT_TERMINATED, handling, loading, say
+from warp_ar.begin import EXIT_INTERRUPTED, EXIT_TERMINATED, handling, importing
+from warp_ar.command_line import EXIT_DONE, loading, say
 from warp_ar.errors import UsageError, WarpArError, printable, reason
 from warp_ar.files import write_whole
 from warp_ar.live_start import hurry_compilers, say_quick_check
@@ -260,9 +261,10 @@ def _light_clip(options: argparse.Namespace, loaded: Callable[[], None]) -> int:
     scene = load_scene(options.scene)
     _check_places(options, scene)
     # Here, for they load Warp: the page is to be there before, and what is wrong with a scene is told before.
-    hurry_compilers(options.device)
-    from warp_ar.accuracy.traced_frames import TracedFrames
-    from warp_ar.output.report import RunLog
+    with importing():
+        hurry_compilers(options.device)
+        from warp_ar.accuracy.traced_frames import TracedFrames
+        from warp_ar.output.report import RunLog
 
     side, outputs, replaced = _open_side_files(options)
     stop = _Stop()

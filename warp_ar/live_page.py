@@ -15,7 +15,8 @@ import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from warp_ar.command_line import EXIT_DONE, EXIT_INTERRUPTED, EXIT_TERMINATED, EXIT_USAGE, Terminated, loading, say
+from warp_ar.begin import EXIT_INTERRUPTED, EXIT_TERMINATED, importing
+from warp_ar.command_line import EXIT_DONE, EXIT_USAGE, Terminated, loading, say
 from warp_ar.errors import UsageError, WarpArError, printable
 from warp_ar.live_start import hurry_compilers, say_quick_check
 from warp_ar.scene import Scene, load_scene
@@ -107,8 +108,9 @@ def _say_no_camera(options: argparse.Namespace, text: str) -> None:
 def serve_page(options: argparse.Namespace) -> int:
     """Serve the page until Ctrl-C, or until ``--frames`` have been lit."""
     # Here, for what only writes files should not wait for a web server to load.
-    from warp_ar.viewer.address import LOOPBACK
-    from warp_ar.viewer.server import Server
+    with importing():
+        from warp_ar.viewer.address import LOOPBACK
+        from warp_ar.viewer.server import Server
 
     scene = _page_scene(options)
     address = _page_address(options)

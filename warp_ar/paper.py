@@ -6,9 +6,13 @@ plot, from bundled clips, the preset ``paper`` beside ours and the truth.
 
 from __future__ import annotations
 
+if __name__ == "__main__":
+    from warp_ar.begin import begin
+
+    begin("warp_ar.paper")
+
 import argparse
 import io
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -22,9 +26,9 @@ from warp_ar.accuracy.charts import require_plots, stand_alone
 from warp_ar.accuracy.paper_figures import FIGURES, READING_SCENES, Context, PaperFigure, compare_readings
 from warp_ar.accuracy.progress import WorkProgress
 from warp_ar.accuracy.report import MIN_COLUMNS
-from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, EXIT_USAGE, Parser, leave
+from warp_ar.command_line import EXIT_DONE, Parser, run_command
 from warp_ar.device import resolve_device
-from warp_ar.errors import UsageError, WarpArError
+from warp_ar.errors import SceneError, SinkError, SourceError, UsageError
 from warp_ar.output.own_files import OwnFiles
 from warp_ar.signature import COMMENT, software_exif
 
@@ -153,15 +157,4 @@ def make_all(options: argparse.Namespace) -> int:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code: 0 done, 1 failed while running, 2 bad usage."""
-    try:
-        return make_all(make_parser().parse_args(arguments))
-    except UsageError as error:
-        print(f"warp_ar: {error}", file=sys.stderr)
-        return EXIT_USAGE
-    except WarpArError as error:
-        print(f"warp_ar: {error}", file=sys.stderr)
-        return EXIT_FAILED
-
-
-if __name__ == "__main__":
-    leave(main())
+    return run_command(lambda: make_all(make_parser().parse_args(arguments)), (SceneError, SourceError, SinkError))

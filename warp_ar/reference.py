@@ -6,6 +6,11 @@ until enough are. ``--compare`` shows what the pipeline's own picture of that fr
 
 from __future__ import annotations
 
+if __name__ == "__main__":
+    from warp_ar.begin import begin
+
+    begin("warp_ar.reference")
+
 import argparse
 import dataclasses
 import functools
@@ -22,7 +27,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from warp_ar.accuracy.known_frame import KnownFrame, light_up_to
 from warp_ar.accuracy.path_tracer import DEFAULT_SAMPLES, PathTracer, TracedPicture
-from warp_ar.command_line import EXIT_DONE, Parser, leave, run_command, say
+from warp_ar.command_line import EXIT_DONE, Parser, run_command, say
 from warp_ar.errors import SinkError, SourceError, UsageError, reason
 from warp_ar.exr_file import write_exr
 from warp_ar.files import write_whole
@@ -219,7 +224,3 @@ def _write(path: Path, data: bytes | Callable[[Path], object]) -> None:
         write_whole(path, data)
     except (RuntimeError, OSError) as error:
         raise SinkError(f"{path} cannot be written: {reason(error)}") from error
-
-
-if __name__ == "__main__":
-    leave(main())

@@ -9,6 +9,11 @@ that are busy at the same time then hardly matter.
 
 from __future__ import annotations
 
+if __name__ == "__main__":
+    from warp_ar.begin import begin
+
+    begin("warp_ar.tradeoff")
+
 import argparse
 import json
 import time
@@ -28,7 +33,7 @@ from warp_ar.accuracy.figures import figure_units, make_figures
 from warp_ar.accuracy.progress import Advance, WorkProgress
 from warp_ar.accuracy.report import MIN_COLUMNS, make_cost_table, make_preset_list, print_report, records
 from warp_ar.accuracy.runs import Clock
-from warp_ar.command_line import EXIT_DONE, Parser, leave, run_command
+from warp_ar.command_line import EXIT_DONE, Parser, run_command
 from warp_ar.device import resolve_device
 from warp_ar.errors import SceneError, SinkError, SourceError, UsageError
 from warp_ar.files import parse_json, read_text
@@ -219,7 +224,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code: 0 done, 1 failed while running, 2 bad usage or scene."""
     failures = (SceneError, SourceError, SinkError)
     return run_command(lambda: tradeoff(make_parser().parse_args(arguments)), failures)
-
-
-if __name__ == "__main__":
-    leave(main())

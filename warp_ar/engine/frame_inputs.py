@@ -250,9 +250,9 @@ class FrameInputs:
         for name in dict.fromkeys(touched):
             self._arrays.touch(name)
 
-    def fix_saturation(self, levels: npt.NDArray[np.int64]) -> None:
+    def fix_saturation(self, levels: npt.NDArray[np.float64]) -> None:
         """Take codes at which channels saturate, (3,), as known: frames are no longer asked."""
-        self.saturation.levels = np.asarray(levels)
+        self.saturation.levels = np.asarray(levels, np.float64)
         self._saturation_is_known = True
         self._write_decode()
 
@@ -263,7 +263,7 @@ class FrameInputs:
         if reset:
             self._cover.forget()
         discs = ball_discs(self._probes, self._camera, frame.pose)
-        return self._cover.observe(frame.image, discs, frame.pose, frame.seconds, self.gain)
+        return self._cover.observe(frame.image, discs, frame.pose, frame.seconds, self.gain, frame.plate)
 
     def _note_saturation(self, frame: SeenFrame) -> None:
         """Look where channels saturate, if the frame is on the host and shows a ball."""
@@ -271,9 +271,8 @@ class FrameInputs:
             return
         if frame.index >= WATCHED and frame.index % PERIOD:
             return
-        if self.saturation.observe(
-            frame.image, ball_discs(self._probes, self._camera, frame.pose), float(self.gain.mean())
-        ):
+        discs = ball_discs(self._probes, self._camera, frame.pose)
+        if self.saturation.observe(frame.image, discs, float(self.gain.mean()), frame.plate):
             self._write_decode()
 
     def _place(self, frame: SeenFrame) -> Iterable[str]:

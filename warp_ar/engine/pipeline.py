@@ -269,7 +269,7 @@ class Pipeline(Closing):
         if self._short is not None and other._short is not None:
             self._short.resume(other._short)
 
-    def restart(self, *, saturation: npt.NDArray[np.int64] | None = None) -> None:
+    def restart(self, *, saturation: npt.NDArray[np.float64] | None = None) -> None:
         """Take the next frame for one of a clip that starts at 0 seconds, as if no other had been lit before it.
 
         Pictures of a part of a clip then are those that the whole clip gives, and do not depend on what the pipeline

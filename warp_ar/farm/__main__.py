@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-
-from warp_ar.farm.cli import main
-
 if __name__ == "__main__":
-    sys.exit(main())
+    from warp_ar.begin import begin
+
+    begin("warp_ar.farm.cli")

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from warp_ar.begin import importing
 from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, run_command, say
 from warp_ar.errors import UsageError, printable
 from warp_ar.farm.jobs import parse_jobs, read_jobs
@@ -119,8 +120,9 @@ def resume(options: argparse.Namespace) -> int:
 
 def work(options: argparse.Namespace, folder: Path) -> int:
     """Work through what is open of a run."""
-    from warp_ar.farm.driver import Driver
-    from warp_ar.farm.version import program_version
+    with importing():
+        from warp_ar.farm.driver import Driver
+        from warp_ar.farm.version import program_version
 
     data, version = load_run(folder)
     mine = program_version()
@@ -201,8 +203,9 @@ def plan(options: argparse.Namespace) -> int:
         return _tell_scale(options)
     if options.jobs is None or options.gpus is not None:
         raise UsageError("plan: name a job file, or --figures FILE, with --gpus or without")
-    from warp_ar.farm.plan import make_plan
-    from warp_ar.farm.pool import cores_of, devices_of, keeping_to
+    with importing():
+        from warp_ar.farm.plan import make_plan
+        from warp_ar.farm.pool import cores_of, devices_of, keeping_to
 
     jobs = parse_jobs(read_jobs(options.jobs), str(options.jobs))
     devices = devices_of(options.device, options.workers)

@@ -12,6 +12,7 @@ import dataclasses
 import itertools
 import multiprocessing
 import multiprocessing.connection
+import multiprocessing.resource_tracker
 import os
 import queue
 import signal
@@ -130,7 +131,7 @@ class ProcessPool:
         process = self._spawn.Process(
             target=_serve, args=(theirs, context, *cores), name=f"warp_ar-farm-{worker}", daemon=True
         )
-        with _environment(OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1"):
+        with _environment(OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1"), _interrupts_held():
             process.start()
         theirs.close()
         return process, mine
@@ -188,6 +189,23 @@ def _environment(**values: str) -> Iterator[None]:
                 del os.environ[name]
             else:
                 os.environ[name] = value
+
+
+@contextlib.contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Processes that are started within never see an interrupt of the terminal; one that comes now is told afterwards.
+
+    They ignore it by themselves, but only when they have imported what they need for that.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    multiprocessing.resource_tracker.ensure_running()  # here: its start lets interrupts through again
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _serve(pipe: Any, context: Context, cores: Sequence[int], every: Sequence[int]) -> None:

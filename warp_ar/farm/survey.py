@@ -5,7 +5,7 @@ does not depend on which frames were lit before it. The file is a ZIP of NumPy a
 
 - ``ticks`` (n,) int64 and ``tick`` (2,) int64: time stamps of the frames, and the seconds of a tick as a fraction;
 - ``poses`` (n, 12) float64: ``camera_from_world``, R row by row and t in metres; NaN where the marker was lost;
-- ``saturation`` (3,) int64: codes at which the camera's channels saturate;
+- ``saturation`` (3,) float64: codes at which the camera's channels saturate;
 - ``size`` (2,) int64: width and height of the frames in pixels;
 - ``coding`` str: what a video of the recording's own depth is encoded in;
 - ``keys`` (k,) int64: numbers of the frames from which on each of the k maps holds;
@@ -74,7 +74,7 @@ class Survey:
                 tick = fractions.Fraction(numerator, denominator)
                 self.index = FrameIndex(values["ticks"], tick, bool(values["seekable"]))
                 self.poses: npt.NDArray[np.float64] = values["poses"]
-                self.saturation: npt.NDArray[np.int64] = values["saturation"]
+                self.saturation: npt.NDArray[np.float64] = values["saturation"]
                 self.keys: npt.NDArray[np.int64] = values["keys"]
                 self._places: npt.NDArray[np.int64] = values["places"]
                 width, height = (int(v) for v in values["size"])
@@ -194,7 +194,7 @@ class _Look:
     folder: Path
     poses: npt.NDArray[np.float64]
     keys: list[int] = dataclasses.field(default_factory=list)
-    saturation: npt.NDArray[np.int64] = dataclasses.field(default_factory=lambda: np.full(3, 255))
+    saturation: npt.NDArray[np.float64] = dataclasses.field(default_factory=lambda: np.full(3, 255.0))
     last: Map | None = None
     emitters: npt.NDArray[Any] | None = None
     """Of the last key, as records of ``Emitter``."""

@@ -11,17 +11,22 @@ Points keep their places in the world, the disc's cells their places in the disc
 ball mirrors, but not what planes show. An emitter that changes is seen in the median, or neither beside the ball. What
 stays for longer than ``PATIENCE`` belongs to the scene and is believed. Changes are logarithms per channel, with the
 camera's own gain taken out.
+
+Frames of more than 8 bits are read at their depth: a lamp above white that a white hand covers has changed, though the
+codes of both are 255.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from warp_ar.input.drift import codes_around, still_points
+from warp_ar.input.plate import Plate
 from warp_ar.kernels.color import decode_table
 from warp_ar.scene import Camera, Scene
 from warp_ar.scene.geometry import rotation_matrix
@@ -96,6 +101,7 @@ class BallCover:
         pose: Pose,
         seconds: float,
         gain: Array,
+        plate: Plate | None = None,
     ) -> bool:
         """Look at a frame.
 
@@ -105,17 +111,18 @@ class BallCover:
             pose: ``camera_from_world``.
             seconds: When it was taken.
             gain: Of the camera, RGB.
+            plate: The frame at its full depth, read in the place of ``image`` where there is one.
 
         Returns:
             Whether a ball is covered.
         """
-        own = [self._cells(image, disc, gain) for disc in discs]
+        own = [self._cells(image, disc, gain, plate) for disc in discs]
         known = self._shown is not None and len(own) == len(self._discs)
         rests = known and not self._covered and not any(map(self._has_changed, self._discs, own))
         if rests and abs(seconds - self._looked) < LOOK_SECONDS:
             self._follow_discs(own, seconds)
             return False
-        shown = self._logarithm(codes_around(image, self._camera, pose, self._points), gain)
+        shown = self._logarithm(codes_around(image, self._camera, pose, self._points, plate), gain)
         if not known:
             self._shown, self._discs, self._covered = shown, own, False
             self._last = self._looked = seconds
@@ -171,8 +178,11 @@ class BallCover:
                 return True
         return False
 
-    def _cells(self, image: NDArray[np.uint8], disc: tuple[float, float, float], gain: Array) -> Array:
+    def _cells(
+        self, image: NDArray[np.uint8], disc: tuple[float, float, float], gain: Array, plate: Plate | None = None
+    ) -> Array:
         """Logarithm of what a disc's cells show, four samples of each, NaN beyond the picture, (3, cells)."""
+        picture: NDArray[Any] = image if plate is None else plate.picture
         x, y, radius = disc
         radius = max(radius, 1.0)
         if not (abs(x) < 1e5 and abs(y) < 1e5 and radius < 1e4):
@@ -181,20 +191,26 @@ class BallCover:
         steps = 2.0 * radius / CELLS * _STEPS
         columns = np.round(x - radius + steps).astype(np.int64)
         rows = np.round(y - radius + steps).astype(np.int64)
-        height, width = image.shape[:2]
+        height, width = picture.shape[:2]
         whole = rows[0] >= 0 and columns[0] >= 0 and rows[-1] < height and columns[-1] < width
         if whole:
-            codes = image[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+            shown = picture[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
             rows, columns = rows - rows[0], columns - columns[0]
             seen = None
         else:
             seen = _pairs((rows >= 0) & (rows < height))[self._cell_row]
             seen &= _pairs((columns >= 0) & (columns < width))[self._cell_column]
-            codes, rows, columns = image, rows.clip(0, height - 1), columns.clip(0, width - 1)
-        grid = codes.take(rows, axis=0).take(columns, axis=1).astype(np.int64)
+            shown, rows, columns = picture, rows.clip(0, height - 1), columns.clip(0, width - 1)
+        grid = shown.take(rows, axis=0).take(columns, axis=1)
+        grid = grid.astype(np.float64 if grid.dtype.kind == "f" else np.int64)
         halves = grid[::2] + grid[1::2]
         sums = (halves[:, ::2] + halves[:, 1::2])[self._cell_row, self._cell_column]
-        found = self._table_of_sums(gain)[sums.T + _CHANNELS]
+        if plate is None:
+            found: Array = self._table_of_sums(gain)[sums.T + _CHANNELS]
+        elif picture.dtype == np.uint16:
+            found = self._logarithm(sums / (4.0 * 257.0), gain).T
+        else:
+            found = np.log(np.maximum(0.25 * sums, 0.0) / gain + DARK).T
         if seen is not None:
             found[:, ~seen] = np.nan
         return found

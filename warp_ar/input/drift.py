@@ -104,7 +104,7 @@ class ExposureDrift:
         self._next_looks = FIRST_LOOKS
         self.gain: Array = np.ones(3)
         """What the camera multiplies radiance by, against its first frame, RGB."""
-        self.saturation = np.full(3, 255)
+        self.saturation = np.full(3, 255.0)
         """Code at which each channel saturates, as far as frames have told."""
         self.contrast = 0.0
         """Of the camera's tone curve, as ``without_contrast`` takes it."""

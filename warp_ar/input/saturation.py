@@ -22,15 +22,20 @@ level: a surface would have moved by some ten codes.
 
 A level that was seen holds for all frames after it, for the camera is the same. A frame whose codes heap up at 254 and
 255 anywhere in the picture takes it back for good.
+
+Frames of more than 8 bits are asked in the same way, by their codes rounded to 8. Where the plateau lies between two of
+these is the median of what was rounded to its code: a channel that ends at code 950 of 1023 ends at 236.8 of 255.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from warp_ar.input.plate import Plate
 from warp_ar.scene import Camera, Probe
 from warp_ar.scene.pose import Pose
 
@@ -94,24 +99,35 @@ class SaturationLevels:
 
     def __init__(self) -> None:
         """Take every channel to saturate at 255."""
-        self.levels: NDArray[np.int64] = np.full(3, FULL)
-        """Code at which each channel saturates, (3,)."""
+        self.levels: NDArray[np.float64] = np.full(3, float(FULL))
+        """Code at which each channel saturates, (3,); between two of 8 bits where frames have more."""
         self._is_full = np.zeros(3, bool)
         self._tops: list[tuple[int, float]] = []
         self._stays: int | None = None
 
-    def observe(self, image: NDArray[np.uint8], balls: Sequence[tuple[float, float, float]], gain: float = 1.0) -> bool:
+    def observe(
+        self,
+        image: NDArray[np.uint8],
+        balls: Sequence[tuple[float, float, float]],
+        gain: float = 1.0,
+        plate: Plate | None = None,
+    ) -> bool:
         """Look at one picture; returns whether a level has changed.
 
         Args:
             image: uint8 RGB (height, width, 3).
             balls: Centre x, y and radius of each ball, pixels.
             gain: Of the camera, against its first frame, where that is known to drift.
+            plate: The frame at its full depth, whose codes are read in the place of ``image``'s in balls. Linear light
+                has none.
         """
         if self._is_full.all() and gain == 1.0:
             return False
         before = self.levels.copy()
-        codes = ball_codes(image, balls)
+        exact = None
+        if plate is not None and plate.picture.dtype == np.uint16:
+            exact = ball_codes(plate.picture, balls) / 257.0
+        codes = ball_codes(image, balls) if exact is None else np.rint(exact).astype(np.uint8)
         if self._stays is None:
             self._stays = self._unmoved(codes, gain)
         if self._stays is not None:
@@ -127,8 +143,8 @@ class SaturationLevels:
             level = find_plateau(np.bincount(codes[:, c], minlength=256), STEEP, ABOVE)
             if level is None:
                 level = found
-            if level is not None:
-                self.levels[c] = level
+            if level is not None and level != round(self.levels[c]):
+                self.levels[c] = level if exact is None else _exact_level(exact[:, c], level)
             if self._is_full[c]:
                 self.levels[c] = FULL
         return bool((before != self.levels).any())
@@ -143,6 +159,17 @@ class SaturationLevels:
         if len(level) < MOVED_FRAMES or np.ptp(moved) < MOVED or np.ptp(level) > STILL:
             return None
         return int(np.median(level))
+
+
+def _exact_level(codes: NDArray[np.float64], level: int) -> float:
+    """Where a plateau lies whose 8-bit code is known.
+
+    Args:
+        codes: Of one channel, in steps of 8 bits but not rounded, (n,).
+        level: The rounded code.
+    """
+    on = codes[np.rint(codes) == level]
+    return float(np.median(on)) if len(on) else float(level)
 
 
 def find_plateau(counts: NDArray[np.int64], steep: float, above: float, width: int = WIDTH) -> int | None:
@@ -206,15 +233,15 @@ def luma_top(codes: NDArray[np.uint8]) -> int | None:
     return level if np.median(np.abs(crowd - level), axis=0).max() <= NEUTRAL_WIDE else None
 
 
-def ball_codes(image: NDArray[np.uint8], balls: Sequence[tuple[float, float, float]]) -> NDArray[np.uint8]:
-    """Codes of the pixels inside balls, (n, 3).
+def ball_codes(image: NDArray[Any], balls: Sequence[tuple[float, float, float]]) -> NDArray[Any]:
+    """Codes of the pixels inside balls, (n, 3), of the picture's type.
 
     Args:
-        image: uint8 RGB (height, width, 3).
+        image: uint8 or uint16 RGB (height, width, 3).
         balls: Centre x, y and radius of each, pixels.
     """
     height, width = image.shape[:2]
-    found = [np.zeros((0, 3), np.uint8)]
+    found = [np.zeros((0, 3), image.dtype)]
     for x, y, radius in balls:
         r = INSIDE * radius
         top, bottom = max(int(np.ceil(y - r)), 0), min(int(np.floor(y + r)) + 1, height)

@@ -226,28 +226,34 @@ def solve_by(solver: Solver, sides: tuple[Any, ...], trace: Callable[[Any], Any]
 
 def serve() -> None:
     """What a process does: solve what comes on its standard input until that ends."""
-    source, target = os.fdopen(os.dup(0), "rb", 0), os.fdopen(os.dup(1), "wb", 0)
-    with open(os.devnull, "r+b") as nothing:  # what libraries print is no message
-        os.dup2(nothing.fileno(), 0)
-        os.dup2(nothing.fileno(), 1)
-    import warp_ar.light.recovery  # noqa: F401 - what unpickling needs, loaded before it is asked for
+    with os.fdopen(os.dup(0), "rb", 0) as source, os.fdopen(os.dup(1), "wb", 0) as target:
+        with open(os.devnull, "r+b") as nothing:  # what libraries print is no message
+            os.dup2(nothing.fileno(), 0)
+            os.dup2(nothing.fileno(), 1)
+        import warp_ar.light.recovery  # noqa: F401 - what unpickling needs, loaded before it is asked for
+
+        with contextlib.suppress(EOFError, OSError):
+            _answer(source, target)
+
+
+def _answer(source: Any, target: Any) -> None:
+    """Solve what comes until the stream ends, which is an ``EOFError`` or an ``OSError``."""
 
     def trace(emitters: Any) -> Any:
         write_message(target, ("trace", emitters))
         return read_message(source)
 
-    with contextlib.suppress(EOFError, OSError):
-        write_message(target, "ready")
-        while True:
-            solver, sides, traced = read_message(source)
-            answer: tuple[str, Any]
-            try:
-                answer = "solved", (solver, solve_by(solver, sides, trace if traced else None))
-            except (EOFError, OSError):
-                return
-            except Exception as error:
-                answer = "error", error
-            write_message(target, answer)
+    write_message(target, "ready")
+    while True:
+        solver, sides, traced = read_message(source)
+        answer: tuple[str, Any]
+        try:
+            answer = "solved", (solver, solve_by(solver, sides, trace if traced else None))
+        except (EOFError, OSError):
+            raise
+        except Exception as error:
+            answer = "error", error
+        write_message(target, answer)
 
 
 POOL = SolvingPool(max(1, usable_cores() // CORES_EACH))

@@ -12,7 +12,9 @@ from warp_ar.kernels.codes import by_warps
 from warp_ar.kernels.structs import make_picture
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
+from warp_ar.stages.shared.clipped import box_reads, clipped_evidence
 from warp_ar.stages.shared.layers import composite_config, layers_of
+from warp_ar.stages.shared.picture import frame_reads
 from warp_ar.stages.shared.variants import composite_variant
 
 
@@ -45,11 +47,10 @@ class Expose(Stage):
         scale = features.request.scene.exposure.scale
         if not features.exposed:
             return LeftOut("exposure is 1" if scale == 1.0 else "exposure is auto and no virtual light falls")
-        reads = ["frame", "exposure", *features.layers]
+        reads = [*frame_reads(features), "exposure", *features.layers]
         if scale == "auto":
             reads.append("clock")
-        if features.boxed:
-            reads.append("summed_area")
+        reads += box_reads(features)
         if features.declipped:
             reads.append("declipped")
         return Wiring(tuple(reads), ("image",))
@@ -75,7 +76,7 @@ class Expose(Stage):
         )
         expose.make_expose_kernel(config, by_warps(device, self.request.size[0]))
         params, decode, encode = (arrays[name] for name in ("params", "decode", "encode"))
-        picture = make_picture(arrays["frame"], decode, None)
+        picture = make_picture(arrays["frame"], decode, None, arrays["linear_frame"])
         scale, codes = arrays["expose_scale"], arrays["expose_codes"]
         layers = layers_of(arrays)
         passes: list[Pass] = []
@@ -91,11 +92,7 @@ class Expose(Stage):
             passes.append(Pass(lambda rows: expose.read_scale(params, scale)))
         passes.append(Pass(lambda rows: expose.expose_codes(decode, encode, scale, codes)))
 
-        clipped = expose.make_clipped_evidence(
-            self.request.size[1],
-            arrays["summed_area"] if "summed_area" in self.wiring.reads else None,
-            arrays.get("declipped"),
-        )
+        clipped = clipped_evidence(self.request, self.wiring, arrays)
         exposure = expose.make_exposure(encode, scale, codes)
 
         def launch(rows: Rows | None) -> None:

@@ -7,12 +7,13 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_ar.kernels.expose import ExposeConfig, make_clipped_evidence
+from warp_ar.kernels.expose import ExposeConfig
 from warp_ar.kernels.separate import SeparateLayers, make_separate_layers_kernel, separate_layers
 from warp_ar.kernels.structs import make_picture
 from warp_ar.stages.base import NOT_ASKED, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
 from warp_ar.stages.request import LAYERS, PICTURE_LAYERS
+from warp_ar.stages.shared.clipped import box_reads, clipped_evidence
 from warp_ar.stages.shared.layers import composite_config, layers_of
 from warp_ar.stages.shared.variants import composite_variant
 
@@ -52,7 +53,7 @@ class Separate(Stage):
             reads.append("frame")
             # The guess of clipped pixels depends on the exposure's scale.
             reads += ["image"] if features.exposed else []
-            reads += ["summed_area"] if features.boxed else []
+            reads += box_reads(features)
             reads += ["declipped"] if features.declipped else []
         return Wiring(tuple(reads), tuple(LAYERS[name].resource for name in asked))
 
@@ -82,11 +83,7 @@ class Separate(Stage):
             arrays["params"],
             make_picture(arrays["frame"], arrays["decode"], None),
             layers,
-            make_clipped_evidence(
-                self.request.size[1],
-                arrays["summed_area"] if "summed_area" in reads else None,
-                arrays["declipped"] if "declipped" in reads else None,
-            ),
+            clipped_evidence(self.request, self.wiring, arrays),
             arrays["expose_scale"] if plate and features.exposed else None,
         )
 

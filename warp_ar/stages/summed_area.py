@@ -12,6 +12,7 @@ from warp_ar.kernels import summed_area
 from warp_ar.kernels.summed_area_strips import make_sum_strips_kernel, strip_config, strip_shapes, sum_area_by_strips
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring
 from warp_ar.stages.features import Features
+from warp_ar.stages.shared.clipped import box_reads
 from warp_ar.stages.shared.picture import frame_reads
 from warp_ar.stages.shared.relighting import SUMMED, SUMMED_CUT, relight_reads
 
@@ -32,8 +33,8 @@ class SummedArea(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Reads the frame alone; where relighting wants it deeper than 8 bits, what these cut off has a table too."""
-        if features.lit and SUMMED_CUT in relight_reads(features):
+        """Reads the frame alone; where it is wanted deeper than 8 bits, what these cut off has a table too."""
+        if (features.lit and SUMMED_CUT in relight_reads(features)) or SUMMED_CUT in box_reads(features):
             return Wiring(frame_reads(features), (SUMMED, SUMMED_CUT))
         return Wiring(("frame",), (SUMMED,))
 

@@ -1,0 +1,105 @@
+"""How commands begin: a signal ends them while they import, in one line at most, and slow imports are told."""
+
+from __future__ import annotations
+
+import io
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from warp_ar import begin
+from warp_ar.__main__ import COMMANDS
+
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals as on POSIX")
+
+FIRST = "warp_ar.begin"
+"""The module that commands begin with."""
+
+
+def ended_at(module: str, number: int, *words: str) -> tuple[int, list[str]]:
+    """Exit code of ``python -m ...`` that gets a signal once it has imported this module, and what it said.
+
+    Python's own report of imports tells when that is; the module after the first one comes after its handlers.
+    """
+    command = [sys.executable, "-X", "importtime", "-m", *words]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        lines, seen, sent = [], False, False
+        for line in process.stderr:
+            if not line.startswith("import time:"):
+                lines.append(line)
+            elif seen and not sent:
+                process.send_signal(number)
+                sent = True
+            elif line.split("|")[-1].strip() == module:
+                seen = True
+    assert sent
+    return process.returncode, lines
+
+
+@pytest.mark.parametrize("command", [*(f"warp_ar.{name}" for name in COMMANDS), "warp_ar"])
+def test_an_interrupt_ends_every_command_as_it_begins(command):
+    assert ended_at(FIRST, signal.SIGINT, command) == (130, [])
+
+
+@pytest.mark.parametrize(
+    ("module", "number", "code"),
+    [
+        ("numpy", signal.SIGINT, 130),
+        ("cv2", signal.SIGTERM, 143),
+        ("warp", signal.SIGINT, 130),
+        ("warp_ar.kernels.launch", signal.SIGHUP, 143),
+    ],
+)
+def test_a_signal_ends_a_command_within_any_import(module, number, code):
+    assert ended_at(module, number, "warp_ar", "explain") == (code, [])
+
+
+def test_who_is_started_in_the_background_goes_on():
+    """A shell has what it starts with ``&`` ignore an interrupt that is meant for what is in front."""
+    script = (
+        "import os, signal, sys; signal.signal(signal.SIGINT, signal.SIG_IGN); os.execv(sys.executable, sys.argv[1:])"
+    )
+    words = [sys.executable, "-X", "importtime", "-m", "warp_ar.live", "--list"]
+    with subprocess.Popen(
+        [sys.executable, "-c", script, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stderr is not None
+        assert process.stdout is not None
+        for line in process.stderr:
+            if line.endswith(" warp_ar.errors\n"):
+                process.send_signal(signal.SIGINT)
+        assert "desk" in process.stdout.read()
+    assert process.returncode == 0
+
+
+class Terminal(io.StringIO):
+    """A stream that says it is a terminal, or not."""
+
+    def __init__(self, shown: bool) -> None:
+        super().__init__()
+        self.shown = shown
+
+    def isatty(self) -> bool:
+        return self.shown
+
+
+@pytest.mark.parametrize(
+    ("shown", "slow", "said"), [(True, True, "warp_ar: loading libraries\n"), (True, False, ""), (False, True, "")]
+)
+def test_imports_that_take_long_are_told_on_a_terminal(monkeypatch, shown, slow, said):
+    told = Terminal(shown)
+    monkeypatch.setattr(sys, "stderr", told)
+    monkeypatch.setattr(begin, "PATIENCE", 0.01 if slow else 60.0)
+    before = signal.getsignal(signal.SIGINT)
+    with begin.importing():
+        assert signal.getsignal(signal.SIGINT) is begin.end_at_once
+        until = time.monotonic() + (20.0 if said else 0.1)
+        while not told.getvalue() and time.monotonic() < until:
+            time.sleep(0.005)
+    assert told.getvalue() == said
+    assert signal.getsignal(signal.SIGINT) is before
