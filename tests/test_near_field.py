@@ -12,7 +12,7 @@ from tests.reference import near_field as reference
 from tests.test_environment_shadow import COUNT, SIDE, draw, sky, sphere
 from tests.test_relight import CAMERA, DESK, LOOK_DOWN, POINTS, RAYS, H, W
 from warp_ar.engine.graph import make_plan
-from warp_ar.kernels import near_field, shade
+from warp_ar.kernels import near_field, near_field_rays, shade
 from warp_ar.kernels.lobes import lobe_texels
 from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
 from warp_ar.kernels.structs import (
@@ -257,8 +257,8 @@ def test_width_of_a_ray_is_the_root_of_its_solid_angle(device):
 @wp.kernel(enable_backward=False)
 def _width_kernel(cosine: wp.array[wp.float32], alpha: wp.float32, exponent: wp.float32, out: wp.array2d[wp.float32]):
     i = wp.tid()
-    out[0, i] = near_field.ggx_ray_width(cosine[i], alpha)
-    out[1, i] = near_field.phong_ray_width(cosine[i], exponent, alpha)
+    out[0, i] = near_field_rays.ggx_ray_width(cosine[i], alpha)
+    out[1, i] = near_field_rays.phong_ray_width(cosine[i], exponent, alpha)
 
 
 def test_share_follows_the_light(device):
