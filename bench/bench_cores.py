@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.bench_frame import SIZES, clip
+from bench.bench_frame import SIZES, clip, stream_frames
 from bench.common import commit
 from warp_ar.engine.crew import Crew
 from warp_ar.engine.pipeline import Pipeline
@@ -115,18 +115,12 @@ def run_frames(size: str) -> dict[str, Any]:
     wall, spent = [], []
     with Pipeline(frames.scene, device="cpu") as pipeline:
         watch = Watch(pipeline)
-        before = None
-        for index in range(WARM_UP + FRAMES):
-            if index == WARM_UP:
+        for index, (passed, busy) in enumerate(stream_frames(pipeline, frames, WARM_UP + FRAMES)):
+            if index < WARM_UP:
                 watch.forget()
-            begin, busy = time.perf_counter(), time.process_time()
-            result = pipeline.submit(frames.images[index % len(frames.images)], time_seconds=index / 24.0)
-            if before is not None:
-                _ = before.image
-            before = result
-            if index >= WARM_UP:
-                wall.append((time.perf_counter() - begin) * 1e3)
-                spent.append((time.process_time() - busy) * 1e3)
+                continue
+            wall.append(passed)
+            spent.append(busy)
     return {"ms": statistics.median(wall), "processor_ms": statistics.mean(spent), **watch.means()}
 
 

@@ -283,20 +283,27 @@ def bench_codec(label: str, frames: Clip, device: str) -> None:
         report(f"host {label} encode", [(time.perf_counter() - start) * 1e3 / 24], device)
 
 
+def stream_frames(pipeline: Pipeline, frames: Clip, count: int) -> Iterator[tuple[float, float]]:
+    """Light frames as a live source has it: each is begun before the one ahead of it is read.
+
+    Yields:
+        Milliseconds of a frame, by the clock and of the processor.
+    """
+    before = None
+    for index in range(count):
+        begin, spent = time.perf_counter(), time.process_time()
+        result = pipeline.submit(frames.images[index % len(frames.images)], time_seconds=index / 24.0)
+        if before is not None:
+            _ = before.image
+        before = result
+        yield (time.perf_counter() - begin) * 1e3, (time.process_time() - spent) * 1e3
+
+
 def bench_cpu_frames(label: str, frames: Clip, quality: Quality, count: int) -> None:
     """Frames per second by the clock, tracking included, decoding and encoding not."""
     with Pipeline(frames.scene, device="cpu", quality=quality) as pipeline:
-        wall, cpu = [], []
-        before = None
-        for index in range(WARM_UP + count):
-            begin, spent = time.perf_counter(), time.process_time()
-            result = pipeline.submit(frames.images[index % len(frames.images)], time_seconds=index / 24.0)
-            if before is not None:
-                _ = before.image
-            before = result
-            if index >= WARM_UP:
-                wall.append((time.perf_counter() - begin) * 1e3)
-                cpu.append((time.process_time() - spent) * 1e3)
+        times = list(stream_frames(pipeline, frames, WARM_UP + count))[WARM_UP:]
+    wall, cpu = (list(part) for part in zip(*times, strict=True))
     fps = 1e3 / statistics.median(wall)
     load = round(os.getloadavg()[0], 1)
     report(f"frame {label}", wall, "cpu", fps=round(fps, 1), processor_ms=round(statistics.median(cpu), 2), load=load)

@@ -231,7 +231,7 @@ async def view(growth: Growth, seconds: float, *, reads: bool = True, counts: bo
 
 async def fuzz(url: str, stop: asyncio.Event) -> int:
     """Send bad messages until told to stop, coming back after each, for each costs the connection; returns how many."""
-    from tests.test_viewer import is_refused, mutated
+    from tests.viewer_rig import is_refused, mutated
 
     rng, count = random.Random(0), 0
     async with aiohttp.ClientSession() as session:

@@ -23,13 +23,40 @@ RANKS = 4
 """Surfaces that a pixel keeps."""
 
 
+@wp.func
+def add_to_rank(ranks: vec8, found: wp.int32, share: wp.float32) -> vec8:
+    """Count a share of the pixel for a surface: in its rank, else in the first that is free, else in none."""
+    out = ranks
+    taken = bool(found < 0)
+    for k in range(wp.static(RANKS)):
+        if not taken and (out[2 * k] == wp.float32(found) or out[2 * k] < 0.0):
+            out[2 * k] = wp.float32(found)
+            out[2 * k + 1] = out[2 * k + 1] + share
+            taken = True
+    return out
+
+
+@wp.func
+def sort_ranks(ranks: vec8) -> vec8:
+    """In falling order; few, so the plainest way to sort them. Equal ones keep the order of their samples."""
+    out = ranks
+    for _ in range(wp.static(RANKS - 1)):
+        for k in range(wp.static(RANKS - 1)):
+            if out[2 * k + 3] > out[2 * k + 1]:
+                which = out[2 * k]
+                much = out[2 * k + 1]
+                out[2 * k] = out[2 * k + 2]
+                out[2 * k + 1] = out[2 * k + 3]
+                out[2 * k + 2] = which
+                out[2 * k + 3] = much
+    return out
+
+
 @functools.cache
-def make_count_coverage_kernel(config: TraceConfig, edge_samples: int) -> wp.Kernel:
-    """Kernel of ``count_coverage``, specialised to the kinds of shape that exist and to the samples of a pixel."""
-    check_edge_samples(edge_samples)
+def make_shown(config: TraceConfig) -> wp.Function:
+    """``shown(scene, balls, origin, direction) -> int32``: number of the surface that a ray meets first, or -1."""
     closest_visible = make_primary(config)
     physical_surface = make_physical_surface(config)
-    sample_direction = make_sample_direction(edge_samples)
 
     @wp.func(module="unique")
     def shown(scene: RayScene, balls: wp.array[Probe], origin: wp.vec3, direction: wp.vec3) -> wp.int32:
@@ -39,6 +66,15 @@ def make_count_coverage_kernel(config: TraceConfig, edge_samples: int) -> wp.Ker
             surface = physical_surface(scene, balls, origin, direction)
             found = surface.index
         return found
+
+    return shown
+
+
+@functools.cache
+def make_count_coverage_kernel(config: TraceConfig, edge_samples: int) -> wp.Kernel:
+    """Kernel of ``count_coverage``, specialised to the kinds of shape that exist and to the samples of a pixel."""
+    check_edge_samples(edge_samples)
+    shown, sample_direction = make_shown(config), make_sample_direction(edge_samples)
 
     @wp.kernel(module="unique", enable_backward=False)
     def count_coverage_kernel(
@@ -70,22 +106,8 @@ def make_count_coverage_kernel(config: TraceConfig, edge_samples: int) -> wp.Ker
         else:
             for sample in range(wp.static(edge_samples)):
                 found = shown(scene, balls, params[0].camera_position, sample_direction(params, rays[i, j], sample))
-                taken = bool(found < 0)
-                for k in range(wp.static(RANKS)):
-                    if not taken and (ranks[2 * k] == wp.float32(found) or ranks[2 * k] < 0.0):
-                        ranks[2 * k] = wp.float32(found)
-                        ranks[2 * k + 1] = ranks[2 * k + 1] + wp.static(1.0 / edge_samples)
-                        taken = True
-            # Few ranks, so the plainest way to sort them; equal ones keep the order of their samples.
-            for _ in range(wp.static(RANKS - 1)):
-                for k in range(wp.static(RANKS - 1)):
-                    if ranks[2 * k + 3] > ranks[2 * k + 1]:
-                        which = ranks[2 * k]
-                        much = ranks[2 * k + 1]
-                        ranks[2 * k] = ranks[2 * k + 2]
-                        ranks[2 * k + 1] = ranks[2 * k + 3]
-                        ranks[2 * k + 2] = which
-                        ranks[2 * k + 3] = much
+                ranks = add_to_rank(ranks, found, wp.static(1.0 / edge_samples))
+            ranks = sort_ranks(ranks)
         coverage_out[i, j] = ranks
 
     return count_coverage_kernel

@@ -306,8 +306,8 @@ def make_find_gain(method: str) -> wp.Function:
 
 
 @functools.cache
-def make_expose_kernel(config: ExposeConfig, warps: bool) -> wp.Kernel:
-    """Kernel specialised to ``config``, by warps (see ``codes``) or by runs of pixels; equal ones share one kernel."""
+def make_exposed(config: ExposeConfig) -> wp.Function:
+    """``exposed(code, i, j, params, decode_table, layers, clipped, exposure) -> vec3ub``: a pixel's code."""
     read_layers = make_read_layers(config.layers)
     find_gain = make_find_gain(config.method)
 
@@ -339,6 +339,14 @@ def make_expose_kernel(config: ExposeConfig, warps: bool) -> wp.Kernel:
         if known:
             radiance = picture.linear[i, j]
         return encode(exposure.encode_table, s * compose(radiance, at))
+
+    return exposed
+
+
+@functools.cache
+def make_expose_kernel(config: ExposeConfig, warps: bool) -> wp.Kernel:
+    """Kernel specialised to ``config``, by warps (see ``codes``) or by runs of pixels; equal ones share one kernel."""
+    exposed = make_exposed(config)
 
     @wp.kernel(module="unique", enable_backward=False)
     def expose_kernel(

@@ -277,14 +277,115 @@ def draw_facet(u: wp.vec2, normal: wp.vec3, wo: wp.vec3, alpha: wp.float32) -> F
     return out
 
 
+@wp.struct
+class GlossPoint:
+    """A point of a receiver that mirrors."""
+
+    hit: Hit  # its shape is -1 where a pixel shows none
+    wo: wp.vec3
+    surface: Gloss
+    alpha: wp.float32
+
+
+@functools.cache
+def make_see_receiver(config: GlossConfig) -> wp.Function:
+    """``see_receiver(params, sight, gloss, i, j) -> GlossPoint``: what pixel (i, j) shows of receivers that mirror."""
+    closest_proxy = make_trace(config.trace).closest_proxy
+
+    @wp.func(module="unique")
+    def see_receiver(
+        params: wp.array[FrameParams], sight: Sight, gloss: wp.array[Gloss], i: wp.int32, j: wp.int32
+    ) -> GlossPoint:
+        at = GlossPoint()
+        at.hit.shape = -1
+        origin = params[0].camera_position
+        ray = sight.picture.rays[i, j]
+        seen = params[0].world_from_camera * wp.vec3(ray[0], ray[1], 1.0)
+        hit = closest_proxy(sight.scene, origin, seen, FAR)
+        if hit.shape < 0:
+            return at
+        at.surface = gloss[hit.shape]
+        at.alpha = at.surface.roughness * at.surface.roughness
+        at.wo = -wp.normalize(seen)
+        if wp.max(at.surface.reflectance) <= 0.0 or wp.dot(hit.geometric_normal, at.wo) <= 0.0:
+            return at  # matt, or seen from behind
+        if wp.dot(hit.normal, at.wo) <= 0.0 or meets_probe(sight.probes, origin, seen, hit.t):
+            return at
+        at.hit = hit
+        return at
+
+    return see_receiver
+
+
+@wp.struct
+class GlossRay:
+    """One of the rays that stand for what a point of a receiver reflects."""
+
+    hit: Hit  # that it leaves
+    wi: wp.vec3
+    masking: wp.float32  # share of it that other facets let pass; 0: there is no such ray
+    cos_d: wp.float32  # between the facet's normal and the ray
+    width: wp.float32  # alpha that it stands for
+
+
+@functools.cache
+def make_draw_ray(config: GlossConfig) -> wp.Function:
+    """``draw_ray(params, sight, at, pixel, is_near, shift, sample, count) -> GlossRay``: one of ``count``.
+
+    Where no object is near, into the middle of the lobe; else of a rough receiver by a facet, its place in the sequence
+    moved by ``shift``, and of a mirror from a place of its own in the pixel.
+    """
+    closest_proxy = make_trace(config.trace).closest_proxy
+    sample_direction = make_sample_direction(EDGE_SAMPLES)
+
+    @wp.func(module="unique")
+    def draw_ray(
+        params: wp.array[FrameParams],
+        sight: Sight,
+        at: GlossPoint,
+        pixel: wp.vec2i,
+        is_near: wp.bool,
+        shift: wp.vec2,
+        sample: wp.int32,
+        count: wp.int32,
+    ) -> GlossRay:
+        out = GlossRay()
+        out.hit = at.hit
+        if not is_near:
+            out.wi = reflect(at.wo, at.hit.normal)
+            out.masking = 1.0
+            out.cos_d = wp.dot(at.hit.normal, at.wo)
+            out.width = at.alpha
+        elif at.alpha > MIRROR_ALPHA:
+            u = hammersley(sample, count) + shift
+            drawn = draw_facet(wp.vec2(u[0] - wp.floor(u[0]), u[1] - wp.floor(u[1])), at.hit.normal, at.wo, at.alpha)
+            out.wi = drawn.wi
+            out.masking = drawn.masking  # 0: onto another facet
+            out.cos_d = drawn.cos_d
+            out.width = at.alpha / wp.sqrt(wp.float32(count))
+        else:
+            origin = params[0].camera_position
+            direction = wp.normalize(sample_direction(params, sight.picture.rays[pixel[0], pixel[1]], sample))
+            out.hit = closest_proxy(sight.scene, origin, direction, FAR)
+            if out.hit.shape != at.hit.shape or meets_probe(sight.probes, origin, direction, out.hit.t):
+                return out
+            out.wi = reflect(-direction, out.hit.normal)
+            out.masking = 1.0
+            out.cos_d = -wp.dot(out.hit.normal, direction)
+        if wp.dot(out.wi, out.hit.geometric_normal) <= 0.0:
+            out.masking = 0.0
+        return out
+
+    return draw_ray
+
+
 @functools.cache
 def make_gloss_kernel(config: GlossConfig) -> wp.Kernel:
     """Kernel specialised to ``config``; equal configs share one kernel."""
     closest_proxy = make_trace(config.trace).closest_proxy
     may_mirror = make_may_mirror(config.trace)
-    follow = make_follow(config)
+    see_receiver, draw_ray, follow = make_see_receiver(config), make_draw_ray(config), make_follow(config)
     highlights = make_highlights(config) if config.lights else None
-    sample_direction = make_sample_direction(EDGE_SAMPLES)
 
     @wp.kernel(
         module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS, module_options=QUICK_TO_COMPILE
@@ -306,31 +407,20 @@ def make_gloss_kernel(config: GlossConfig) -> wp.Kernel:
         surface_out[i, j] = -1
         if not inside_rect(i, j, params[0].ball_rect):
             return
-        origin = params[0].camera_position
-        ray = sight.picture.rays[i, j]
-        seen = params[0].world_from_camera * wp.vec3(ray[0], ray[1], 1.0)
-        hit = closest_proxy(sight.scene, origin, seen, FAR)
+        at = see_receiver(params, sight, gloss, i, j)
+        hit = at.hit
         if hit.shape < 0:
             return
-        surface = gloss[hit.shape]
-        wo = -wp.normalize(seen)
-        cos_o = wp.dot(hit.normal, wo)
-        if wp.max(surface.reflectance) <= 0.0 or wp.dot(hit.geometric_normal, wo) <= 0.0 or cos_o <= 0.0:
-            return  # matt, or seen from behind
-        if meets_probe(sight.probes, origin, seen, hit.t):
-            return
-        number = hit.shape
-        alpha = surface.roughness * surface.roughness
         turn = tile_turn(i, j)
         change = wp.vec3(0.0, 0.0, 0.0)
         if wp.static(len(config.lights) > 0):
-            change = highlights(sight, lights, surface, hit, wo, turn)
+            change = highlights(sight, lights, at.surface, hit, at.wo, turn)
         ratio = wp.vec3(1.0, 1.0, 1.0)
         if sight.layers.shadow_ratio.shape[0] > 0 and inside_rect(i, j, params[0].shadow_rect):
             ratio = sight.layers.shadow_ratio[i, j]
         is_shadowed = wp.max(wp.abs(ratio - wp.vec3(1.0, 1.0, 1.0))) > LEAST_SHADOW
-        mirror = reflect(wo, hit.normal)
-        is_near = may_mirror(sight.scene, hit.point, mirror, 2.0 * wp.atan(LOBE_REACH * alpha))
+        mirror = reflect(at.wo, hit.normal)
+        is_near = may_mirror(sight.scene, hit.point, mirror, 2.0 * wp.atan(LOBE_REACH * at.alpha))
         wanted = is_shadowed or is_near
         if wp.static(config.faces):
             if not wanted:
@@ -339,49 +429,27 @@ def make_gloss_kernel(config: GlossConfig) -> wp.Kernel:
         if wanted:
             added = wp.vec3(0.0, 0.0, 0.0)
             before = wp.vec3(0.0, 0.0, 0.0)
-            is_rough = alpha > MIRROR_ALPHA
-            count = wp.where(is_rough, wp.static(config.samples), wp.static(EDGE_SAMPLES))
+            count = wp.where(at.alpha > MIRROR_ALPHA, wp.static(config.samples), wp.static(EDGE_SAMPLES))
             if not is_near:
                 count = 1  # into the middle of the lobe, which the environment is filtered for
             hashes = pcg3d_hash(wp.uint32(i), wp.uint32(j), wp.uint32(0))
             shift = wp.vec2(uniform_from_bits(hashes[0]), uniform_from_bits(hashes[1]))
             for sample in range(count):
-                wi = mirror
-                masking = float(1.0)
-                width = float(0.0)
-                cos_d = cos_o
-                if not is_near:
-                    width = alpha
-                elif is_rough:
-                    u = hammersley(sample, count) + shift
-                    at = wp.vec2(u[0] - wp.floor(u[0]), u[1] - wp.floor(u[1]))
-                    drawn = draw_facet(at, hit.normal, wo, alpha)
-                    if drawn.masking <= 0.0:
-                        continue  # onto another facet
-                    masking = drawn.masking
-                    cos_d = drawn.cos_d
-                    wi = drawn.wi
-                    width = alpha / wp.sqrt(wp.float32(count))
-                else:
-                    direction = wp.normalize(sample_direction(params, ray, sample))
-                    hit = closest_proxy(sight.scene, origin, direction, FAR)
-                    if hit.shape != number or meets_probe(sight.probes, origin, direction, hit.t):
-                        continue
-                    cos_d = -wp.dot(hit.normal, direction)
-                    wi = reflect(-direction, hit.normal)
-                if wp.dot(wi, hit.geometric_normal) <= 0.0:
-                    continue
-                f = surface.reflectance + schlick(cos_d) * (wp.vec3(1.0) - surface.reflectance)
-                one = follow(params[0], sight, lights, hit, wi, masking * f, width, is_shadowed, turn)
-                added += one.change
-                before += one.before
+                ray = draw_ray(params, sight, at, wp.vec2i(i, j), is_near, shift, sample, count)
+                if ray.masking > 0.0:
+                    f = at.surface.reflectance + schlick(ray.cos_d) * (wp.vec3(1.0) - at.surface.reflectance)
+                    one = follow(
+                        params[0], sight, lights, ray.hit, ray.wi, ray.masking * f, ray.width, is_shadowed, turn
+                    )
+                    added += one.change
+                    before += one.before
             share = 1.0 / wp.float32(count)
             shown = shown_radiance(sight.picture, i, j)
             given_back = wp.cw_mul(wp.vec3(1.0, 1.0, 1.0) - ratio, wp.min(share * before, shown))
             change += share * added + wp.where(is_shadowed, 1.0, 0.0) * given_back
         change_out[i, j] = change
-        if alpha > MIRROR_ALPHA:
-            surface_out[i, j] = number
+        if at.alpha > MIRROR_ALPHA:
+            surface_out[i, j] = hit.shape
 
     return gloss_kernel
 

@@ -124,6 +124,37 @@ def emitted_radiance(scene: RayScene, material: Material, point: SurfacePoint) -
     return emission
 
 
+@wp.func
+def mix_metal(
+    surface: Surface,
+    dfg: wp.array2d[wp.vec2],
+    base: wp.vec3,
+    metallic: wp.float32,
+    roughness: wp.float32,
+    cos_o: wp.float32,
+) -> Surface:
+    """A ``METALLIC_ROUGHNESS`` surface seen from the cosine ``cos_o``.
+
+    Metal and dielectric are mixed as they reflect, not as their facets do: each has its own factor for what scatters
+    more than once, or a mixture of two white ones would be darker than either.
+    """
+    out = surface
+    one = wp.vec3(1.0, 1.0, 1.0)
+    scale_bias = sample_dfg(dfg, cos_o, roughness)
+    plastic_gain = energy_compensation(scale_bias, DIELECTRIC_F0 * one)
+    metal_gain = energy_compensation(scale_bias, base)
+    dielectric = (DIELECTRIC_F0 * scale_bias[0] + scale_bias[1]) * plastic_gain
+    out.f0 = DIELECTRIC_F0 * (1.0 - metallic) * plastic_gain + metallic * wp.cw_mul(base, metal_gain)
+    out.f90 = (1.0 - metallic) * plastic_gain + metallic * metal_gain
+    out.reflectance = scale_bias[0] * out.f0 + scale_bias[1] * out.f90
+    steady = scale_bias[0] * (out.f0[0] + out.f0[1] + out.f0[2])
+    reflected = out.reflectance[0] + out.reflectance[1] + out.reflectance[2]
+    out.steady = steady / wp.max(reflected, 1.0e-6)
+    out.diffuse = (1.0 - metallic) * wp.cw_mul(base, one - dielectric)
+    out.roughness = roughness
+    return out
+
+
 @functools.cache
 def make_surface(models: tuple[int, ...], textures: bool) -> wp.Function:
     """``surface_at(scene, dfg, hit, cos_o, spread) -> Surface``; ``dfg`` is a table as ``integrate_dfg`` writes it.
@@ -181,21 +212,7 @@ def make_surface(models: tuple[int, ...], textures: bool) -> wp.Function:
                 surface.reflectance = base
         if wp.static(METALLIC_ROUGHNESS in models):
             if material.model == METALLIC_ROUGHNESS:
-                # Metal and dielectric are mixed as they reflect, not as their facets do: each has its own factor for
-                # what scatters more than once, or a mixture of two white ones would be darker than either.
-                one = wp.vec3(1.0, 1.0, 1.0)
-                scale_bias = sample_dfg(dfg, cos_o, roughness)
-                plastic_gain = energy_compensation(scale_bias, DIELECTRIC_F0 * one)
-                metal_gain = energy_compensation(scale_bias, base)
-                dielectric = (DIELECTRIC_F0 * scale_bias[0] + scale_bias[1]) * plastic_gain
-                surface.f0 = DIELECTRIC_F0 * (1.0 - metallic) * plastic_gain + metallic * wp.cw_mul(base, metal_gain)
-                surface.f90 = (1.0 - metallic) * plastic_gain + metallic * metal_gain
-                surface.reflectance = scale_bias[0] * surface.f0 + scale_bias[1] * surface.f90
-                steady = scale_bias[0] * (surface.f0[0] + surface.f0[1] + surface.f0[2])
-                reflected = surface.reflectance[0] + surface.reflectance[1] + surface.reflectance[2]
-                surface.steady = steady / wp.max(reflected, 1.0e-6)
-                surface.diffuse = (1.0 - metallic) * wp.cw_mul(base, one - dielectric)
-                surface.roughness = roughness
+                surface = mix_metal(surface, dfg, base, metallic, roughness, cos_o)
         if wp.static(textures):
             if material.unlit != 0:
                 surface.emission = base

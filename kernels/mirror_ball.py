@@ -72,12 +72,53 @@ def nearest_ball(probes: wp.array[Probe], origin: wp.vec3, direction: wp.vec3, t
     return nearest
 
 
+@wp.struct
+class BallRay:
+    """A ray from the camera that a mirror ball reflects."""
+
+    ball: wp.int32  # -1: none does
+    origin: wp.vec3  # of the reflected ray
+    wi: wp.vec3
+    width: wp.float32  # of a pixel on the ball, metres
+
+
+@functools.cache
+def make_reflect_at_ball(config: MirrorBallConfig) -> wp.Function:
+    """``reflect_at_ball(scene, probes, origin, direction) -> BallRay``: at the ball that a camera's ray meets first."""
+    occluded_by_proxies = make_trace(config.trace).occluded_by_proxies
+
+    @wp.func(module="unique")
+    def reflect_at_ball(scene: RayScene, probes: wp.array[Probe], origin: wp.vec3, direction: wp.vec3) -> BallRay:
+        out = BallRay()
+        out.ball = -1
+        ball = nearest_ball(probes, origin, direction, FAR)
+        if ball < 0:
+            return out
+        probe = probes[ball]
+        t = intersect_sphere(probe.radius, origin - probe.center, direction, FAR)
+        # Back onto the ball: what a far camera adds to the error of t ends here.
+        normal = wp.normalize(origin - probe.center + t * direction)
+        if wp.dot(normal, direction) >= 0.0:
+            return out  # the camera is inside the ball, or the ray grazes it
+        if occluded_by_proxies(scene, origin, direction, t):
+            return out
+        point = probe.center + probe.radius * normal
+        error = ROUNDING * (8.0 * wp.max(wp.abs(point)) + 32.0 * probe.radius)
+        out.wi = reflect(-wp.normalize(direction), normal)
+        out.origin = offset_origin(point, normal, out.wi, error)
+        out.width = scene.pixel_spread * t / wp.max(-wp.dot(normal, wp.normalize(direction)), 0.1)
+        out.ball = ball
+        return out
+
+    return reflect_at_ball
+
+
 @functools.cache
 def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
     """Kernel specialised to ``config``; equal configs share one kernel."""
     trace = make_trace(config.trace)
     closest_object, closest_proxy = trace.closest_object, trace.closest_proxy
-    occluded_by_proxies = trace.occluded_by_proxies
+    reflect_at_ball = make_reflect_at_ball(config)
     shade_hit = make_shade_hit(config.shade) if config.shade is not None else None
     direct_lighting = make_direct_lighting(config.relight) if config.relight is not None else None
     find_in_frame = make_find_in_frame(config.trace, True)
@@ -110,21 +151,12 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
         count = wp.int32(wp.static(config.samples))  # a variable: the loop stays one
         for sample in range(count):
             direction = sample_direction(params, ray, sample)
-            ball = nearest_ball(receiver.probes, origin, direction, FAR)
-            if ball < 0:
+            seen = reflect_at_ball(scene, receiver.probes, origin, direction)
+            if seen.ball < 0:
                 continue
-            probe = receiver.probes[ball]
-            t = intersect_sphere(probe.radius, origin - probe.center, direction, FAR)
-            # Back onto the ball: what a far camera adds to the error of t ends here.
-            normal = wp.normalize(origin - probe.center + t * direction)
-            if wp.dot(normal, direction) >= 0.0:
-                continue  # the camera is inside the ball, or the ray grazes it
-            if occluded_by_proxies(scene, origin, direction, t):
-                continue
-            point = probe.center + probe.radius * normal
-            wi = reflect(-wp.normalize(direction), normal)
-            error = ROUNDING * (8.0 * wp.max(wp.abs(point)) + 32.0 * probe.radius)
-            start = offset_origin(point, normal, wi, error)
+            start = seen.origin
+            wi = seen.wi
+            probe = receiver.probes[seen.ball]
             surface = closest_proxy(scene, start, wi, FAR)
             reach = surface.t
             if wp.static(config.shade is not None):
@@ -136,8 +168,7 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
             if wp.static(config.shade is not None):
                 if item.shape >= 0:
                     # A pixel's rays leave the ball turned by twice the angle between the normals where they meet it.
-                    width = scene.pixel_spread * t / wp.max(-wp.dot(normal, wp.normalize(direction)), 0.1)
-                    spread = width / wp.max(item.t, 1.0e-6) + 2.0 * width / probe.radius
+                    spread = seen.width / wp.max(item.t, 1.0e-6) + 2.0 * seen.width / probe.radius
                     radiance = shade_hit(scene, lights, distant, item, wi, NearPoint(), tile_turn(i, j), spread)
                     change += wp.cw_mul(rho, radiance) - shown
                     continue

@@ -154,6 +154,49 @@ def light_along(sky: Sky, origin: wp.vec3, direction: wp.vec3, vertex: Vertex, d
     return light
 
 
+@wp.struct
+class SeenProxy:
+    """What the frame tells of a point of a proxy."""
+
+    reflectance: wp.vec3
+    shows: wp.bool  # whether what the camera sees of it is what it sends everywhere
+    radiance: wp.vec3  # that it has without virtual content, if the frame shows it
+    rays: wp.int32  # that were traced for it
+
+
+@functools.cache
+def make_see_proxy(trace: TraceConfig) -> wp.Function:
+    """``see_proxy(params, scene, vertex) -> SeenProxy``."""
+    see_in_frame = make_see_in_frame(trace)
+
+    @wp.func(module="unique")
+    def see_proxy(params: FrameParams, scene: LocalScene, vertex: Vertex) -> SeenProxy:
+        out = SeenProxy()
+        seen = see_in_frame(params, scene, vertex.hit)
+        out.rays = seen.rays
+        out.radiance = seen.radiance
+        out.reflectance = scene.proxy_reflectance[vertex.hit.shape]
+        if seen.known:
+            out.reflectance = seen.reflectance
+            # What a glossy surface sends the camera is not what it sends elsewhere.
+            out.shows = not is_glossy(scene, vertex)
+        return out
+
+    return see_proxy
+
+
+@wp.func
+def white_surface(scene: LocalScene, vertex: Vertex, lobe: wp.bool) -> Surface:
+    """A first surface that tells how much light arrives: white, or the gloss of its proxy alone."""
+    surface = Surface()
+    if lobe:
+        surface = polished(scene, vertex, wp.vec3(0.0, 0.0, 0.0))
+    else:
+        surface.model = wp.static(int(LAMBERT))
+        surface.diffuse = wp.vec3(1.0, 1.0, 1.0)
+    return surface
+
+
 @functools.cache
 def make_sky_light(trace: TraceConfig) -> wp.Function:
     """``sky_light(scene, hit, surface, wo, guided, changes_only, key, k) -> SkyLight``: reflected, of one direction.
@@ -204,7 +247,7 @@ def make_physical_radiance(trace: TraceConfig) -> wp.Function:
     balances with drawing it by its light.
     """
     find_vertex, sky_light = make_find_vertex(trace), make_sky_light(trace)
-    see_in_frame, look_up_material = make_see_in_frame(trace), make_look_up_material()
+    see_proxy, look_up_material = make_see_proxy(trace), make_look_up_material()
 
     @wp.func(module="unique")
     def physical_radiance(
@@ -231,15 +274,12 @@ def make_physical_radiance(trace: TraceConfig) -> wp.Function:
             wo = -toward
             reflectance = wp.vec3(0.0, 0.0, 0.0)
             if vertex.kind == PROXY:
-                seen = see_in_frame(params, scene, vertex.hit)
+                seen = see_proxy(params, scene, vertex)
                 carried.rays += seen.rays
-                # What a glossy surface sends the camera is not what it sends elsewhere.
-                if seen.known and not is_glossy(scene, vertex):
+                if seen.shows:
                     carried.radiance += wp.cw_mul(weight, seen.radiance)
                     return carried
-                reflectance = scene.proxy_reflectance[vertex.hit.shape]
-                if seen.known:
-                    reflectance = seen.reflectance
+                reflectance = seen.reflectance
             vertex = from_viewer(vertex, wo)
             hit = vertex.hit
             surface = look_up_material(scene, vertex, wo, reflectance)
@@ -328,7 +368,7 @@ def make_follow_path(trace: TraceConfig) -> wp.Function:
     nothing else is. ``lobe``: it is not white but the gloss of its proxy alone.
     """
     find_vertex, sky_light = make_find_vertex(trace), make_sky_light(trace)
-    see_in_frame, look_up_material = make_see_in_frame(trace), make_look_up_material()
+    see_proxy, look_up_material = make_see_proxy(trace), make_look_up_material()
     physical_radiance, virtual_light = make_physical_radiance(trace), make_virtual_light(trace)
     occluded_by_objects = make_trace(trace).occluded_by_objects
 
@@ -354,22 +394,17 @@ def make_follow_path(trace: TraceConfig) -> wp.Function:
             is_white = white and k == 0
             reflectance = wp.vec3(1.0, 1.0, 1.0)
             if vertex.kind == PROXY and not is_white:
-                seen = see_in_frame(params, scene, vertex.hit)
+                seen = see_proxy(params, scene, vertex)
                 carried.rays += seen.rays
-                reflectance = scene.proxy_reflectance[vertex.hit.shape]
-                if seen.known:
-                    reflectance = seen.reflectance
-                    if not changes_only and not is_glossy(scene, vertex):
-                        carried.radiance += wp.cw_mul(weight, seen.radiance)
-                        changes_only = True
+                reflectance = seen.reflectance
+                if seen.shows and not changes_only:
+                    carried.radiance += wp.cw_mul(weight, seen.radiance)
+                    changes_only = True
             vertex = from_viewer(vertex, wo)
             hit = vertex.hit
             surface = Surface()
-            if is_white and lobe:
-                surface = polished(scene, vertex, wp.vec3(0.0, 0.0, 0.0))
-            elif is_white:
-                surface.model = wp.static(int(LAMBERT))
-                surface.diffuse = reflectance
+            if is_white:
+                surface = white_surface(scene, vertex, lobe)
             else:
                 surface = look_up_material(scene, vertex, wo, reflectance)
             if not only_light:

@@ -15,7 +15,7 @@ import functools
 import warp as wp
 
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
-from warp_ar.kernels.path_following import Carried, make_follow_path
+from warp_ar.kernels.path_following import make_follow_path
 from warp_ar.kernels.path_picture import Moments, add_sample
 from warp_ar.kernels.path_sampling import NO_DENSITY, PathKey, sky_radiance
 from warp_ar.kernels.path_vertices import (
@@ -24,6 +24,7 @@ from warp_ar.kernels.path_vertices import (
     OBJECT,
     PROXY,
     LocalScene,
+    Vertex,
     is_glossy,
     is_turned,
     make_find_vertex,
@@ -39,10 +40,77 @@ WHOLE, DIFFERENCE, IRRADIANCE = 0, 1, 2
 reflectance known."""
 
 
+@wp.struct
+class PixelSample:
+    """What one path, or those of both lobes of a glossy surface, tell of a pixel; as ``add_sample`` takes it."""
+
+    z: wp.vec3
+    g: wp.vec3
+    e: wp.vec3
+    shows: wp.float32
+    rays: wp.int32  # that were traced for it
+
+
+@functools.cache
+def make_sample_pixel(trace: TraceConfig) -> wp.Function:
+    """``sample_pixel(params, scene, asked, vertex, direction, shown, key) -> PixelSample``.
+
+    ``vertex`` is what the camera's ray meets; ``shown`` what the frame holds there.
+    """
+    follow_path = make_follow_path(trace)
+
+    @wp.func(module="unique")
+    def sample_pixel(
+        params: FrameParams,
+        scene: LocalScene,
+        asked: wp.int32,
+        vertex: Vertex,
+        direction: wp.vec3,
+        shown: wp.vec3,
+        key: PathKey,
+    ) -> PixelSample:
+        out = PixelSample()
+        whole = asked == wp.static(WHOLE)
+        if whole and vertex.kind == NOTHING:
+            out.z = sky_radiance(scene.sky, direction, NO_DENSITY)
+        elif whole or vertex.kind == OBJECT:
+            if asked != wp.static(IRRADIANCE):
+                carried = follow_path(params, scene, vertex, direction, False, False, False, False, key)
+                out.z = carried.radiance
+                out.rays = carried.rays
+        else:
+            out.z = shown
+            # A face that is seen from behind is not the surface that the camera sees.
+            if vertex.kind == PROXY and not is_turned(vertex, direction):
+                only_light = asked == wp.static(IRRADIANCE)
+                lobes = wp.where(is_glossy(scene, vertex), 2, 1)
+                for lobe in range(lobes):
+                    of_lobe = key
+                    if lobe == 1:
+                        of_lobe.seed = ~key.seed
+                    one = follow_path(params, scene, vertex, direction, True, True, lobe == 1, only_light, of_lobe)
+                    out.rays += one.rays
+                    if lobe == 0:
+                        out.g = one.radiance
+                        out.e = one.light
+                    elif only_light:
+                        out.g = one.light  # what the frame shows mirrored
+                    else:
+                        out.z += one.radiance
+                out.shows = 1.0
+            elif vertex.kind == BALL and asked == wp.static(DIFFERENCE):
+                carried = follow_path(params, scene, vertex, direction, True, False, False, False, key)
+                out.z += carried.radiance
+                out.rays = carried.rays
+        return out
+
+    return sample_pixel
+
+
 @functools.cache
 def make_trace_paths_kernel(trace: TraceConfig) -> wp.Kernel:
     """Kernel of ``trace_paths`` for the kinds of shape in ``trace``."""
-    find_vertex, follow_path = make_find_vertex(trace), make_follow_path(trace)
+    find_vertex, sample_pixel = make_find_vertex(trace), make_sample_pixel(trace)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def trace_paths_kernel(
@@ -60,7 +128,6 @@ def make_trace_paths_kernel(trace: TraceConfig) -> wp.Kernel:
     ):
         i, j = wp.tid()
         i += row_start
-        whole = asked == wp.static(WHOLE)
         rays = scene.picture.rays
         key = PathKey()
         key.pixel = wp.uint32(i * rays.shape[1] + j)
@@ -73,48 +140,12 @@ def make_trace_paths_kernel(trace: TraceConfig) -> wp.Kernel:
             y = rays[i, j][1] + (uniform_from_bits(bits[1]) - 0.5) / params[0].focal[1]
             direction = wp.normalize(params[0].world_from_camera * wp.vec3(x, y, 1.0))
             vertex = find_vertex(scene, params[0].camera_position, direction, True)
-            z = wp.vec3(0.0, 0.0, 0.0)
-            g = wp.vec3(0.0, 0.0, 0.0)
-            e = wp.vec3(0.0, 0.0, 0.0)
-            shows = float(0.0)
-            carried = Carried()
-            if whole:
-                if vertex.kind == NOTHING:
-                    z = sky_radiance(scene.sky, direction, NO_DENSITY)
-                else:
-                    carried = follow_path(params[0], scene, vertex, direction, False, False, False, False, key)
-                    z = carried.radiance
-            elif vertex.kind == OBJECT:
-                if asked == wp.static(DIFFERENCE):
-                    carried = follow_path(params[0], scene, vertex, direction, False, False, False, False, key)
-                    z = carried.radiance
-            else:
-                z = scene.radiance[i, j]
-                # A face that is seen from behind is not the surface that the camera sees.
-                if vertex.kind == PROXY and not is_turned(vertex, direction):
-                    only_light = asked == wp.static(IRRADIANCE)
-                    lobes = wp.where(is_glossy(scene, vertex), 2, 1)
-                    for lobe in range(lobes):
-                        of_lobe = key
-                        if lobe == 1:
-                            of_lobe.seed = ~key.seed
-                        one = follow_path(
-                            params[0], scene, vertex, direction, True, True, lobe == 1, only_light, of_lobe
-                        )
-                        carried.rays += one.rays
-                        if lobe == 0:
-                            g = one.radiance
-                            e = one.light
-                        elif only_light:
-                            g = one.light  # what the frame shows mirrored
-                        else:
-                            z += one.radiance
-                    shows = 1.0
-                elif vertex.kind == BALL and asked == wp.static(DIFFERENCE):
-                    carried = follow_path(params[0], scene, vertex, direction, True, False, False, False, key)
-                    z += carried.radiance
-            moments_out.rays[i, j] = moments_out.rays[i, j] + carried.rays + 1
-            add_sample(i, j, wp.float32(done + k + 1), z, g, e, shows, moments_out)
+            shown = wp.vec3(0.0, 0.0, 0.0)
+            if asked != wp.static(WHOLE):
+                shown = scene.radiance[i, j]
+            one = sample_pixel(params[0], scene, asked, vertex, direction, shown, key)
+            moments_out.rays[i, j] = moments_out.rays[i, j] + one.rays + 1
+            add_sample(i, j, wp.float32(done + k + 1), one.z, one.g, one.e, one.shows, moments_out)
 
     return trace_paths_kernel
 

@@ -199,6 +199,16 @@ def make_find_hider(config: CellConfig) -> wp.Function:
     return find_hider
 
 
+@wp.func
+def is_shone_on(lights: wp.array[Light], hit: Hit) -> wp.bool:
+    """Whether a virtual light shines on a point, were nothing in the way."""
+    for index in range(lights.shape[0]):
+        light = sample_light(lights[index], hit.point)
+        if wp.dot(hit.geometric_normal, light.wi) > 0.0 and wp.max(light.irradiance_normal) > 0.0:
+            return True
+    return False
+
+
 @functools.cache
 def make_ambient_visibility_kernel(config: CellConfig) -> wp.Kernel:
     """Kernel of ``estimate_ambient_visibility``."""
@@ -247,10 +257,7 @@ def make_ambient_visibility_kernel(config: CellConfig) -> wp.Kernel:
             sent = look_up_bounced(scene, receiver, hit, i, j)
             needed = sent[0] + sent[1] + sent[2] > 0.0
         else:
-            for index in range(lights.shape[0]):
-                light = sample_light(lights[index], hit.point)
-                if wp.dot(hit.geometric_normal, light.wi) > 0.0 and wp.max(light.irradiance_normal) > 0.0:
-                    needed = True
+            needed = is_shone_on(lights, hit)
         if not needed:
             return
         if partial == 0:

@@ -191,37 +191,19 @@ def make_lit_by_areas(config: ShadeConfig) -> wp.Function:
 
 
 @functools.cache
-def make_shade_hit(config: ShadeConfig) -> wp.Function:
-    """``shade_hit``: radiance that leaves a hit against the ray's ``direction`` (not unit).
+def make_sent_unlit(config: ShadeConfig) -> wp.Function:
+    """``sent_unlit(distant, hit, surface, normal, wo, near) -> vec3``: radiance without virtual lights.
 
-    ``turn`` is for ``visible_share``, ``spread`` the width of the ray at t = 1 in metres.
+    Of what it sends itself and of the environment, as far as ``near`` does not know better.
     """
     forms = config.distant
-    surface_at = make_surface(forms.models, forms.textures)
     glossy = make_reflected_radiance(forms)
     distant_irradiance = make_distant_irradiance(forms)
-    reflect_direct = make_reflect_direct(forms.models)
-    sample_light = make_sample_light(config.lights)
-    is_lit = make_shadow(forms.trace)
-    visible_share = make_visible_share(forms.trace) if config.soft else None
-    lit_by_areas = make_lit_by_areas(config) if config.area_samples > 0 else None
 
     @wp.func(module="unique")
-    def shade_hit(
-        scene: RayScene,
-        lights: wp.array[Light],
-        distant: DistantLight,
-        hit: Hit,
-        direction: wp.vec3,
-        near: NearPoint,
-        turn: wp.float32,
-        spread: wp.float32,
+    def sent_unlit(
+        distant: DistantLight, hit: Hit, surface: Surface, normal: wp.vec3, wo: wp.vec3, near: NearPoint
     ) -> wp.vec3:
-        wo = -wp.normalize(direction)
-        normal, geometric = face_viewer(hit.normal, hit.geometric_normal, wo)
-        cos_o = wp.dot(normal, wo)
-        surface = surface_at(scene, distant.dfg, hit, cos_o, spread)
-
         radiance = wp.vec3(0.0)
         if wp.static(forms.textures):
             radiance = surface.emission
@@ -251,12 +233,47 @@ def make_shade_hit(config: ShadeConfig) -> wp.Function:
                         added = wp.vec3(near.reflected[0], near.reflected[1], near.reflected[2])
                         reflected = (1.0 - near.reflected[3]) * reflected + added
                 if wp.static(forms.textures):
-                    hidden = 1.0 - specular_occlusion(surface.occlusion, cos_o, surface.roughness)
+                    hidden = 1.0 - specular_occlusion(surface.occlusion, wp.dot(normal, wo), surface.roughness)
                     if wp.static(config.near_field):
                         if near.known:
                             hidden = 0.0  # rays know
                     reflected *= 1.0 - hidden
                 radiance += wp.cw_mul(surface.reflectance, reflected)
+        return radiance
+
+    return sent_unlit
+
+
+@functools.cache
+def make_shade_hit(config: ShadeConfig) -> wp.Function:
+    """``shade_hit``: radiance that leaves a hit against the ray's ``direction`` (not unit).
+
+    ``turn`` is for ``visible_share``, ``spread`` the width of the ray at t = 1 in metres.
+    """
+    forms = config.distant
+    surface_at = make_surface(forms.models, forms.textures)
+    sent_unlit = make_sent_unlit(config)
+    reflect_direct = make_reflect_direct(forms.models)
+    sample_light = make_sample_light(config.lights)
+    is_lit = make_shadow(forms.trace)
+    visible_share = make_visible_share(forms.trace) if config.soft else None
+    lit_by_areas = make_lit_by_areas(config) if config.area_samples > 0 else None
+
+    @wp.func(module="unique")
+    def shade_hit(
+        scene: RayScene,
+        lights: wp.array[Light],
+        distant: DistantLight,
+        hit: Hit,
+        direction: wp.vec3,
+        near: NearPoint,
+        turn: wp.float32,
+        spread: wp.float32,
+    ) -> wp.vec3:
+        wo = -wp.normalize(direction)
+        normal, geometric = face_viewer(hit.normal, hit.geometric_normal, wo)
+        surface = surface_at(scene, distant.dfg, hit, wp.dot(normal, wo), spread)
+        radiance = sent_unlit(distant, hit, surface, normal, wo, near)
         if wp.static(len(config.lights) > 0):
             for index in range(lights.shape[0]):
                 light = sample_light(lights[index], hit.point)

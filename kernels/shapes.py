@@ -225,6 +225,22 @@ def box_uv(half: wp.vec3, normal: wp.vec3, point: wp.vec3) -> wp.vec2:
 
 
 @wp.func
+def onto_box(half: wp.vec3, normal: wp.vec3, point: wp.vec3) -> wp.vec3:
+    """A point near a box put onto the face of that normal."""
+    return wp.vec3(
+        wp.where(normal[0] != 0.0, normal[0] * half[0], point[0]),
+        wp.where(normal[1] != 0.0, normal[1] * half[1], point[1]),
+        wp.where(normal[2] != 0.0, normal[2] * half[2], point[2]),
+    )
+
+
+@wp.func
+def plane_uv(half: wp.vec3, point: wp.vec3) -> wp.vec2:
+    """Texture coordinates 0..1 on a plane."""
+    return wp.vec2(0.5 + 0.5 * point[0] / half[0], 0.5 + 0.5 * point[1] / half[1])
+
+
+@wp.func
 def sphere_uv(normal: wp.vec3) -> wp.vec2:
     """Texture coordinates of a sphere: u runs as a latlong map's columns, v from -z to +z."""
     phi = wp.atan2(normal[1], normal[0])

@@ -175,6 +175,25 @@ def is_folded(camera: FrameParams, rays: wp.array2d[wp.vec2], point: wp.vec3, at
     return False
 
 
+@wp.func
+def hidden_by_balls(
+    probes: wp.array[Probe], own: wp.int32, origin: wp.vec3, point: wp.vec3, t_max: wp.float32, pad: wp.float32
+) -> wp.bool:
+    """Whether a ball other than ``own`` comes within ``pad``, in metres, of the ray to a point up to ``t_max``.
+
+    ``point`` is relative to the ray's origin.
+    """
+    reach = wp.length(point)
+    for other in range(probes.shape[0]):
+        if other != own:
+            o = origin - probes[other].center
+            b = -wp.dot(o, point)
+            nearest = o + wp.clamp(b / (reach * reach), 0.0, t_max) * point
+            if wp.length(nearest) < probes[other].radius + pad:
+                return True
+    return False
+
+
 @functools.cache
 def make_project_corners_kernel(config: ProjectConfig) -> wp.Kernel:
     """Kernel specialised to ``config``; equal configs share one kernel."""
@@ -235,13 +254,8 @@ def make_project_corners_kernel(config: ProjectConfig) -> wp.Kernel:
         reach = wp.length(point)
         pad = rim_start * reach / wp.min(camera.focal[0], camera.focal[1])
         t_max = 1.0 - CONTACT * probe.radius / reach
-        for other in range(probes.shape[0]):
-            if other != index:
-                o = camera.camera_position - probes[other].center
-                b = -wp.dot(o, point)
-                nearest = o + wp.clamp(b / (reach * reach), 0.0, t_max) * point
-                if wp.length(nearest) < probes[other].radius + pad:
-                    return
+        if hidden_by_balls(probes, index, camera.camera_position, point, t_max, pad):
+            return
         if wp.static(len(kinds) > 0):
             if hidden_by_proxies(scene, camera.camera_position, point, t_max, pad):
                 return

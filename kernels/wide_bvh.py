@@ -334,6 +334,19 @@ def bound_part(b: Building, start: wp.int32, stop: wp.int32) -> wp.types.matrix(
     return wp.matrix_from_rows(lower, upper)
 
 
+@wp.func
+def write_leaf(b: Building, start: wp.int32, stop: wp.int32, leaf: wp.int32, tree_out: wp.array[wp.float32]):
+    """Write the triangles of a part, as many as a block has lanes at most, and -1 as the number of those that lack."""
+    for lane in range(WIDTH):
+        triangle = wp.int32(-1)
+        if start + lane < stop:
+            triangle = b.order[start + lane]
+            for corner in range(3):
+                for axis in range(3):
+                    tree_out[leaf + 24 * corner + 8 * axis + lane] = b.corners[triangle, corner][axis]
+        tree_out[leaf + 9 * WIDTH + lane] = wp.cast(triangle, wp.float32)
+
+
 @wp.kernel(enable_backward=False)
 def build_wide_bvh_kernel(
     most_depth: wp.int32,
@@ -343,7 +356,7 @@ def build_wide_bvh_kernel(
     tree_out: wp.array[wp.float32],
     blocks_out: wp.array[wp.int32],
 ):
-    """One thread: writes a tree while there is environment, and how many blocks it takes, or more than there are."""
+    """One thread: writes a tree while there is room, and how many blocks it takes, or more than there are."""
     distant = tree_out.shape[0] // BLOCK
     for lane in range(WIDTH):
         tree_out[NODE_BLOCKS * BLOCK + 9 * WIDTH + lane] = wp.cast(wp.int32(-1), wp.float32)
@@ -404,17 +417,8 @@ def build_wide_bvh_kernel(
                         tasks += 1
                     else:
                         tree_out[at + 6 * WIDTH + k] = wp.cast(-1 - blocks, wp.float32)
-                        leaf = blocks * BLOCK
+                        write_leaf(b, starts[k], stops[k], blocks * BLOCK, tree_out)
                         blocks += LEAF_BLOCKS
-                        for lane in range(WIDTH):
-                            triangle = wp.int32(-1)
-                            if starts[k] + lane < stops[k]:
-                                triangle = b.order[starts[k] + lane]
-                                for corner in range(3):
-                                    for axis in range(3):
-                                        place = leaf + 24 * corner + 8 * axis + lane
-                                        tree_out[place] = b.corners[triangle, corner][axis]
-                            tree_out[leaf + 9 * WIDTH + lane] = wp.cast(triangle, wp.float32)
                 for axis in range(3):
                     tree_out[at + WIDTH * axis + k] = lower[axis]
                     tree_out[at + WIDTH * (3 + axis) + k] = upper[axis]

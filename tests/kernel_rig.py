@@ -21,6 +21,16 @@ cy = 23.5
 """
 """Section of a scene file: frames so small that a test lights many."""
 
+SMALL_DESK = f"""schema = 1
+name = "test"
+{SMALL_CAMERA}[marker]
+size = 0.1
+[probe]
+center = [0.1, 0.0, 0.03]
+radius = 0.03
+"""
+"""A scene file with that camera, a marker and a ball."""
+
 TEXTURES = tuple(name for name in Material.vars if name.endswith("_texture"))
 """Fields of a material that are the index of a texture, or -1."""
 
@@ -32,6 +42,15 @@ def records(struct: Any, *values: dict[str, Any], device: Any = None) -> wp.arra
         for key, item in value.items():
             record[key] = item
     return wp.array(out, dtype=struct, device=device)
+
+
+def camera_fields(position: Any, turn: Any, focal: float, size: tuple[int, int]) -> dict[str, Any]:
+    """Fields of ``FrameParams`` of a camera, of which ``turn`` is ``world_from_camera``.
+
+    Its axis meets the middle of a picture of so many rows and columns.
+    """
+    middle = (size[1] - 1) / 2, (size[0] - 1) / 2
+    return {"camera_position": position, "world_from_camera": turn, "focal": (focal, focal), "principal": middle}
 
 
 def shape(kind: int, position: Any, extent: Any, material: int = -1) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.test_path_tracer import ABOVE, RHO, boxes, latlong_sky
-from tests.test_viewer import Running, page_scene
+from tests.viewer_rig import Running, page_scene
 from warp_ar.accuracy.path_tracer import FIRST_LIGHT_SAMPLES, PathTracer
 from warp_ar.viewer.convergence import FULL_SCALE, false_colors
 

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from tests.error_model import check_error
-from tests.kernel_rig import TEXTURES, records, shape, tables
+from tests.kernel_rig import TEXTURES, camera_fields, records, shape, tables
 from tests.reference import environment_shadow as reference
 from tests.test_relight import CAMERA, DESK, LOOK_DOWN, POINTS, RAYS, H, W
 from warp_ar.engine.graph import make_plan
@@ -131,16 +131,8 @@ def run(
     kinds = tuple(tuple(sorted({item["kind"] for item in items})) for items in (objects, proxies))
     forms = DistantLightConfig(TraceConfig(*kinds), (LAMBERT,), False, "sh", False, bool(probes))
     config = EnvironmentShadowConfig(forms, count, side, bounce, secondary, emitters, partials)
-    params = records(
-        FrameParams,
-        {
-            "camera_position": CAMERA,
-            "world_from_camera": LOOK_DOWN,
-            "focal": (60, 60),
-            "principal": ((W - 1) / 2, (H - 1) / 2),
-            "shadow_rect": rect,
-        },
-    )
+    camera = camera_fields(CAMERA, LOOK_DOWN, 60, (H, W))
+    params = records(FrameParams, {**camera, "shadow_rect": rect})
     scene = RayScene()
     objects = [{**item, "material": 0} for item in objects]
     scene.objects, scene.proxies = records(Shape, *objects), records(Shape, *proxies)

@@ -7,7 +7,7 @@ import types
 import numpy as np
 import pytest
 
-from tests.test_recover import DistantLight, lit_environment, scene  # noqa: F401
+from tests.recover_rig import DistantLight, lit_environment, scene  # noqa: F401
 from warp_ar.light.card import check_card
 from warp_ar.light.config import CONFIG, Kind
 from warp_ar.light.evidence import allowed_factor, doubt_of, likely_gain, spread_directions

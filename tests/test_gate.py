@@ -15,7 +15,7 @@ from typing import Any
 import aiohttp
 import pytest
 
-from tests.test_viewer import PATIENCE, Page, run, served
+from tests.viewer_rig import PATIENCE, Page, run, served
 from warp_ar.errors import UsageError
 from warp_ar.viewer.gate import MOST_PER_ADDRESS
 from warp_ar.viewer.server import own_headers

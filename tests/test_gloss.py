@@ -10,7 +10,7 @@ import warp as wp
 
 from tests.error_model import check_error
 from tests.hard_cases.rig import SIZE, look_at, make_quality, make_scene
-from tests.kernel_rig import SMALL_CAMERA, TEXTURES, constant_environment, records, shape, tables
+from tests.kernel_rig import SMALL_CAMERA, TEXTURES, camera_fields, constant_environment, records, shape, tables
 from tests.reference import color as reference_color
 from tests.reference import gloss as reference
 from tests.reference.visibility import Body
@@ -77,17 +77,8 @@ def run(
     forms = DistantLightConfig(trace, (LAMBERT,), False, "sh", True, True)
     config = gloss.GlossConfig(trace, samples, lit, ShadeConfig(forms, lit, 1) if objects else None)
     inverse, whole = pose.inverse(), (0, H, 0, W)
-    params = records(
-        FrameParams,
-        {
-            "camera_position": inverse.translation,
-            "world_from_camera": inverse.rotation,
-            "focal": (FOCAL, FOCAL),
-            "principal": ((W - 1) / 2, (H - 1) / 2),
-            "ball_rect": whole,
-            "shadow_rect": whole,
-        },
-    )
+    camera = camera_fields(inverse.translation, inverse.rotation, FOCAL, (H, W))
+    params = records(FrameParams, {**camera, "ball_rect": whole, "shadow_rect": whole})
     sight = gloss.Sight()
     sight.scene = RayScene()
     sight.scene.objects, sight.scene.proxies = records(Shape, *objects), records(Shape, *proxies)

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from tests.error_model import check_error
-from tests.kernel_rig import SMALL_CAMERA
+from tests.kernel_rig import SMALL_DESK
 from tests.reference import irradiance as reference
 from tests.reference import latlong
 from warp_ar.engine.graph import make_plan
@@ -34,15 +34,7 @@ SH4_ERROR = 0.05
 SIZES = [(64, 128), (16, 32), (7, 13), (1, 9), (9, 1), (1, 1), (5, 10)]
 METHODS = [method for method in Irradiance.methods if method != "sphere_mip"]  # which filters the frame
 
-SCENE = f"""
-schema = 1
-name = "test"
-{SMALL_CAMERA}[marker]
-size = 0.1
-[probe]
-center = [0.1, 0.0, 0.03]
-radius = 0.03
-[[object]]
+SCENE = f"""{SMALL_DESK}[[object]]
 shape = "sphere"
 radius = 0.05
 at = [0.0, 0.0, 0.05]

@@ -11,7 +11,7 @@ import warp as wp
 
 from tests.error_model import check_error
 from tests.hard_cases.rig import look_at
-from tests.kernel_rig import TEXTURES, constant_environment, records, shape, tables
+from tests.kernel_rig import TEXTURES, camera_fields, constant_environment, records, shape, tables
 from tests.reference import color as reference_color
 from tests.reference import mirror_ball as reference
 from tests.reference import relight as reference_relight
@@ -126,16 +126,8 @@ def run(
             trace, samples, shading if objects else None, relighting, ratio is not None
         )
     inverse = pose.inverse()
-    params = records(
-        FrameParams,
-        {
-            "camera_position": inverse.translation,
-            "world_from_camera": inverse.rotation,
-            "focal": (FOCAL, FOCAL),
-            "principal": ((W - 1) / 2, (H - 1) / 2),
-            "ball_rect": rect,
-        },
-    )
+    camera = camera_fields(inverse.translation, inverse.rotation, FOCAL, (H, W))
+    params = records(FrameParams, {**camera, "ball_rect": rect})
     scene = RayScene()
     scene.objects, scene.proxies = records(Shape, *objects), records(Shape, *proxies)
     scene.materials = records(Material, *[{**dict.fromkeys(TEXTURES, -1), **one} for one in materials])

@@ -7,12 +7,12 @@ import trimesh
 import warp as wp
 
 from tests.error_model import check_error
-from tests.kernel_rig import TEXTURES, records, tables
+from tests.kernel_rig import TEXTURES, camera_fields, records, tables
 from tests.reference import near_field as reference
 from tests.test_environment_shadow import COUNT, SIDE, draw, sky, sphere
 from tests.test_relight import CAMERA, DESK, LOOK_DOWN, POINTS, RAYS, H, W
 from warp_ar.engine.graph import make_plan
-from warp_ar.kernels import near_field, shade
+from warp_ar.kernels import near_field, near_field_rays, shade
 from warp_ar.kernels.lobes import lobe_texels
 from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
 from warp_ar.kernels.structs import (
@@ -74,17 +74,8 @@ def run(
     lobes, samples = 4 if PHONG in models else 0, samples if MIRROR in models else 0
     layers = ratio is not None, added is not None
     config = near_field.NearFieldConfig(forms, COUNT, lobes, samples, SIDE, *layers, known)
-    params = records(
-        FrameParams,
-        {
-            "camera_position": CAMERA,
-            "world_from_camera": LOOK_DOWN,
-            "focal": (60, 60),
-            "principal": ((W - 1) / 2, (H - 1) / 2),
-            "object_rect": (0, H, 0, W),
-            "light_rect": (0, H, 0, W),
-        },
-    )
+    camera = camera_fields(CAMERA, LOOK_DOWN, 60, (H, W))
+    params = records(FrameParams, {**camera, "object_rect": (0, H, 0, W), "light_rect": (0, H, 0, W)})
     scene = RayScene()
     scene.objects = records(Shape, *[{**item, "material": k} for k, item in enumerate(objects)])
     scene.proxies = records(Shape, DESK)
@@ -266,8 +257,8 @@ def test_width_of_a_ray_is_the_root_of_its_solid_angle(device):
 @wp.kernel(enable_backward=False)
 def _width_kernel(cosine: wp.array[wp.float32], alpha: wp.float32, exponent: wp.float32, out: wp.array2d[wp.float32]):
     i = wp.tid()
-    out[0, i] = near_field.ggx_ray_width(cosine[i], alpha)
-    out[1, i] = near_field.phong_ray_width(cosine[i], exponent, alpha)
+    out[0, i] = near_field_rays.ggx_ray_width(cosine[i], alpha)
+    out[1, i] = near_field_rays.phong_ray_width(cosine[i], exponent, alpha)
 
 
 def test_share_follows_the_light(device):

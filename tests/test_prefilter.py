@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from tests.error_model import check_error
-from tests.kernel_rig import SMALL_CAMERA
+from tests.kernel_rig import SMALL_DESK
 from tests.reference import latlong
 from tests.reference import prefilter as reference
 from tests.reference import pyramid as reference_pyramid
@@ -54,20 +54,10 @@ MATERIALS = {
     "lambert": 'model = "lambert"',
 }
 
-SCENE = f"""
-schema = 1
-name = "test"
-{SMALL_CAMERA}[marker]
-size = 0.1
-[probe]
-center = [0.1, 0.0, 0.03]
-radius = 0.03
-"""
-
 
 def scene(*materials):
     return loads_scene(
-        SCENE
+        SMALL_DESK
         + "".join(
             f'[[object]]\nshape = "sphere"\nradius = 0.05\n[object.material]\n{MATERIALS[m]}\n' for m in materials
         )

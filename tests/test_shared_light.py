@@ -22,7 +22,7 @@ import pytest
 
 from tests.browser_rig import CHROMIUM
 from tests.reference import color as reference_color
-from tests.test_viewer import PATIENCE, Site, run, served
+from tests.viewer_rig import PATIENCE, Site, run, served
 from warp_ar import live
 from warp_ar.errors import UsageError
 from warp_ar.light.captured import latlong_directions, texel_solid_angles

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tests.test_path_tracer import CAMERA, DOWN, WHITE, desk
-from tests.test_viewer import page_scene
+from tests.viewer_rig import page_scene
 from warp_ar.accuracy.known_frame import exposed_scene, light_of
 from warp_ar.accuracy.path_tracer import PathTracer
 from warp_ar.accuracy.traced_frames import TracedFrames

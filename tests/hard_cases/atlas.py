@@ -141,10 +141,13 @@ ELSEWHERE: dict[str, tuple[tuple[int, str, str], ...]] = {
     "test_recover.py::test_white_furnace_beside_a_perfect_mirror": ((1, "recover", "*"), (18, "recover", "*")),
     "test_recover.py::test_transfer_agrees_with_its_twin": ((1, "recover", "*"),),
     "test_recover.py::test_observation_reads_surfaces_and_nothing_else": ((3, "recover", "*"),),
-    "test_recover.py::test_regions_join_across_seam_and_poles": ((4, "recover", "*"),),
-    "test_recover.py::test_cells_keep_energy_and_recovered_returns_it": ((4, "recover", "*"), (18, "recover", "*")),
-    "test_recover.py::test_estimates_are_reproducible_and_steady": ((7, "recover", "shading"),),
-    "test_recover.py::test_all_that_is_estimated_is_finite_for_absurd_frames": (
+    "test_recover_solution.py::test_regions_join_across_seam_and_poles": ((4, "recover", "*"),),
+    "test_recover_cells.py::test_cells_keep_energy_and_recovered_returns_it": (
+        (4, "recover", "*"),
+        (18, "recover", "*"),
+    ),
+    "test_recover_solution.py::test_estimates_are_reproducible_and_steady": ((7, "recover", "shading"),),
+    "test_recover_solution.py::test_all_that_is_estimated_is_finite_for_absurd_frames": (
         (6, "recover", "*"),
         (12, "recover", "*"),
     ),

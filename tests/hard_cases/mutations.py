@@ -62,8 +62,8 @@ MUTATIONS = (
         1,
         "what leaves the mirror ball starts on it, not off it: at the rim it meets the ball again",
         "kernels/mirror_ball.py",
-        "            start = offset_origin(point, normal, wi, error)\n",
-        "            start = point\n",
+        "        out.origin = offset_origin(point, normal, out.wi, error)\n",
+        "        out.origin = point\n",
         "tests/test_mirror_ball.py::test_grazing_the_silhouette",
     ),
     Mutation(
@@ -106,8 +106,8 @@ MUTATIONS = (
         3,
         "a camera inside the ball sees it mirror the environment",
         "kernels/mirror_ball.py",
-        "            if wp.dot(normal, direction) >= 0.0:\n                continue",
-        "            if wp.dot(normal, direction) >= 0.0:\n                normal = -normal",
+        "        if wp.dot(normal, direction) >= 0.0:\n            return out",
+        "        if wp.dot(normal, direction) >= 0.0:\n            normal = -normal",
         "tests/test_mirror_ball.py::test_a_camera_inside_the_ball_sees_no_mirror",
     ),
     Mutation(
@@ -324,8 +324,8 @@ MUTATIONS = (
         14,
         "a fixed offset of a tenth of a millimetre",
         "kernels/trace.py",
-        "                hit.error = ROUNDING * (8.0 * wp.max(wp.abs(hit.point)) + 32.0 * size)\n",
-        "                hit.error = 1.0e-4\n",
+        "        hit.error = ROUNDING * (8.0 * wp.max(wp.abs(hit.point)) + 32.0 * size)\n",
+        "        hit.error = 1.0e-4\n",
         "tests/test_visibility.py::test_rays_that_leave_do_not_come_back",
     ),
     Mutation(

@@ -28,7 +28,7 @@ from tests.hard_cases.rig import (
     request_for,
     with_sized_lights,
 )
-from tests.test_recover import cells_of, points_of, probes_of, seen, transfer_of
+from tests.recover_rig import cells_of, points_of, probes_of, seen, transfer_of
 from tests.test_visibility import World, shoot
 from warp_ar.errors import SceneError
 from warp_ar.kernels import recover

@@ -166,21 +166,30 @@ def measure_steps(
         most = max(own, key=lambda method: abs(own[method] - own[start]))
         part = times[most].get(setting.name, 0.0) - times[start].get(setting.name, 0.0)
         shares[setting.name] = min(max(part / (own[most] - own[start]), 0.0), 1.0) if own[most] != own[start] else 1.0
-        # What recovery does on its own thread is the same for a map of any size.
-        others = [
-            other.name
-            for other in settings
-            if other.name in setting.stages and other.name not in (setting.name, NOW_AND_THEN)
-        ]
-        if others:
-            scales[setting.name] = {
-                method: {name: stages[name] / base[name] for name in others if base.get(name) and stages.get(name)}
-                for method, stages in times.items()
-            }
+        if others := _scale_others(setting, settings, times, base):
+            scales[setting.name] = others
     for table in scales.values():
         for scale in table.values():
             scale.update({name: 1.0 + shares[name] * (ratio - 1.0) for name, ratio in scale.items()})
     return fill_between(Costs(track + pace * work, methods, scales, track, work))
+
+
+def _scale_others(
+    setting: Setting, settings: Sequence[Setting], times: dict[str, dict[str, float]], base: dict[str, float]
+) -> dict[str, dict[str, float]]:
+    """By how much each method of a setting scales the stages of other settings; empty where it has none of them."""
+    # What recovery does on its own thread is the same for a map of any size.
+    others = [
+        other.name
+        for other in settings
+        if other.name in setting.stages and other.name not in (setting.name, NOW_AND_THEN)
+    ]
+    if not others:
+        return {}
+    return {
+        method: {name: stages[name] / base[name] for name in others if base.get(name) and stages.get(name)}
+        for method, stages in times.items()
+    }
 
 
 def fill_between(costs: Costs) -> Costs:

@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_ar.kernels import near_field
+from warp_ar.kernels.near_field_rays import SHARP_ALPHA
 from warp_ar.scene import MetallicRoughnessMaterial, PhongMaterial
 from warp_ar.scene.mesh_materials import MeshMaterial
 from warp_ar.scene.object_materials import reflects_glossily, scene_materials
@@ -150,7 +151,7 @@ class NearField(Stage):
         rays = RAYS[self.features.near_field]
         materials = scene_materials(self.request.scene)
         widths = [width for item in materials if reflects_glossily(item) for width in lobe_widths(item)]
-        sharp = [width < near_field.SHARP_ALPHA for width in widths]
+        sharp = [width < SHARP_ALPHA for width in widths]
         # The forms themselves stay the scene's: they are what the kernel writes.
         forms, variant = self.features.distant, distant_variant(self.features, device)
         return near_field.NearFieldConfig(

@@ -1,0 +1,243 @@
+"""When light is recovered while frames flow: how often, how late, and what may stand."""
+
+from __future__ import annotations
+
+import collections
+import contextlib
+import itertools
+import time
+
+import numpy as np
+import pytest
+
+from tests.recover_rig import scene  # noqa: F401
+from tests.reference import recover as reference
+from warp_ar.engine.pipeline import Pipeline
+from warp_ar.kernels import recover as kernels
+from warp_ar.kernels.recover_cells import CELL_COLUMNS, CELL_ROWS, Cell
+from warp_ar.light import recovery
+from warp_ar.light import surfaces as light_surfaces
+from warp_ar.light.config import CONFIG
+from warp_ar.scene import Pose, load_scene
+from warp_ar.session import Session
+from warp_ar.stages.quality import PRESETS
+from warp_ar.stages.recover import LATENCY, Recover
+
+
+def test_stage_is_left_out_where_the_quality_says_so(scene):
+    quality = PRESETS["low"].with_methods(recover="clipped")
+    with Pipeline(scene, device="cpu", quality=quality, outputs=("environment",)) as pipeline:
+        assert "recover" in dict(pipeline.plan.left_out)
+        assert "filled_radiance" not in pipeline.arrays
+
+
+@pytest.mark.parametrize(("fps", "expected"), [(12, [0, 1, 2, 5, 8, 11]), (30, [0, 1, 2, 8, 14]), (3, [0, 1, 2, 5, 8])])
+def test_estimates_are_a_few_a_second(scene, monkeypatch, fps, expected):
+    frames, ask = [], Recover._ask
+
+    def counted(self, rows):
+        frames.append(index)
+        ask(self, rows)
+
+    monkeypatch.setattr(Recover, "_ask", counted)
+    rng = np.random.default_rng(5)
+    pose = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
+    quality = PRESETS["low"].with_methods(recover="white_card")
+    with Pipeline(scene, device="cpu", quality=quality, outputs=("environment",)) as pipeline:
+        for index in range(expected[-1] + 1):
+            image = rng.integers(0, 255, (240, 320, 3), np.uint8)
+            pipeline(image, time_seconds=index / fps, pose=pose)
+    assert frames == expected
+
+
+def spied_estimates(monkeypatch, seconds=0.0):
+    """Let a solver's n-th estimate, from 1 on, put n into every cell; it takes ``seconds``."""
+    # By solver: that of a pipeline which is closed already may still be at its last one.
+    numbers = collections.defaultdict(lambda: itertools.count(1))
+
+    def update(self, cells, *_):
+        time.sleep(seconds)
+        return recovery.Estimate(np.full((*cells.shape, 3), next(numbers[self]), np.float32), (False,) * 3)
+
+    monkeypatch.setattr(recovery.Recovery, "update", update)
+
+
+def shown_estimates(scene, device, count, turns=1, estimates="delayed"):
+    """Number of the estimate that each of ``count`` frames, 30 a second, was lit by; pipelines take turns."""
+    pose = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
+    rng = np.random.default_rng(6)
+    shown = []
+    with contextlib.ExitStack() as stack:
+        quality = PRESETS["low"].with_methods(recover="white_card")
+        arguments = {"device": device, "quality": quality, "outputs": ("environment",), "estimates": estimates}
+        pipelines = [stack.enter_context(Pipeline(scene, **arguments)) for _ in range(turns)]
+        for index in range(count):
+            now, before = pipelines[index % turns], pipelines[(index - 1) % turns]
+            if index and turns > 1:
+                now.continue_from(before)
+            now(rng.integers(0, 255, (240, 320, 3), np.uint8), time_seconds=index / 30, pose=pose)
+            shown.append(int(now.arrays["recover_recovered"].numpy()[0, 0, 0]))
+    return shown
+
+
+@pytest.mark.parametrize("turns", [1, 2])
+@pytest.mark.parametrize("seconds", [0.0, 0.05])
+def test_estimates_take_effect_a_fixed_time_later(scene, device, monkeypatch, seconds, turns):
+    """The first frames wait for theirs; however long one takes, and whoever has the frames meanwhile."""
+    spied_estimates(monkeypatch, seconds)
+    # Begun in frames 0, 1, 2, 8 and 14.
+    expected = [1, 2, *[3] * (8 + round(30 * LATENCY) - 2), *[4] * 6, 5, 5]
+    assert shown_estimates(scene, device, len(expected), turns) == expected
+
+
+def test_an_estimate_that_is_waited_for_lights_its_own_frame(scene, device, monkeypatch):
+    spied_estimates(monkeypatch, 0.05)
+    expected = [1, 2, *[3] * 6, *[4] * 6, 5, 5]
+    assert shown_estimates(scene, device, len(expected), estimates="synchronous") == expected
+
+
+def what_is_seen(surroundings=0.4, table=0.3):
+    """Cells and observations of an environment that does not clip."""
+    cells = np.zeros((CELL_ROWS, CELL_COLUMNS), np.dtype(Cell.numpy_dtype()))
+    cells["solid_angle"], cells["radiance"] = (
+        reference.cell_directions(CELL_ROWS, CELL_COLUMNS)[1].reshape(CELL_ROWS, CELL_COLUMNS),
+        surroundings,
+    )
+    observations = np.zeros(40, np.dtype(kernels.Observation.numpy_dtype()))
+    observations["visible"], observations["radiance"] = 1.0, table
+    return cells, observations
+
+
+def settled_solver(scene):
+    """A solver that has made as many estimates as it takes."""
+    solver = recovery.Recovery(light_surfaces.find_surfaces(scene), 0.85, (-0.12, 0.03, 0.035))
+    solver._frames = CONFIG.solver.settled
+    return solver
+
+
+def test_what_still_holds_is_solved_for_now_and_then(scene):
+    solver = settled_solver(scene)
+    rested = [solver.rests(*what_is_seen()) for _ in range(12)]
+    assert rested == [False, *[True] * CONFIG.solver.rest, False, *[True] * CONFIG.solver.rest, False, True]
+
+
+def test_a_new_solver_does_not_rest(scene):
+    solver = settled_solver(scene)
+    solver._frames = CONFIG.solver.settled - 1
+    assert not any(solver.rests(*what_is_seen()) for _ in range(5))
+
+
+@pytest.mark.parametrize(
+    "changed", [{"surroundings": 0.4 * 1.4}, {"table": 0.3 * 0.7}, {"surroundings": 0.25, "table": 0.2}]
+)
+def test_a_switched_emitter_is_solved_for_at_once(scene, changed):
+    solver = settled_solver(scene)
+    assert not solver.rests(*what_is_seen())
+    assert not solver.rests(*what_is_seen(**changed))
+
+
+@pytest.mark.parametrize(
+    "changed", [{"surroundings": 0.4 * 1.05}, {"table": 0.3 * 0.9}, {"surroundings": 0.35, "table": 0.25}]
+)
+def test_other_light_waits_once_at_most(scene, changed):
+    solver = settled_solver(scene)
+    assert not solver.rests(*what_is_seen())
+    assert [solver.rests(*what_is_seen(**changed)) for _ in range(2)] == [True, False]
+    solver = settled_solver(scene)
+    assert [solver.rests(*what_is_seen()) for _ in range(2)] == [False, True]
+    assert not solver.rests(*what_is_seen(**changed))
+
+
+def test_light_that_changes_slowly_is_followed(scene):
+    """What is compared with is what was solved for, not the last frame."""
+    solver = settled_solver(scene)
+    rested = [solver.rests(*what_is_seen(table=0.3 * 1.009**k)) for k in range(12)]
+    assert rested.count(False) >= 4
+
+
+def test_an_emitter_over_a_part_of_the_desk_is_other_light(scene):
+    solver = settled_solver(scene)
+    cells, observations = what_is_seen()
+    assert not solver.rests(cells, observations)
+    observations = observations.copy()
+    observations["radiance"][:10] *= 1.3
+    assert solver.rests(cells, observations)
+    assert not solver.rests(cells, observations)
+
+
+def test_a_dark_environment_rests_until_it_is_lit(scene):
+    solver = settled_solver(scene)
+    assert [solver.rests(*what_is_seen(surroundings=0.0)) for _ in range(2)] == [False, True]
+    assert not solver.rests(*what_is_seen())
+
+
+def test_a_frame_without_surfaces_is_no_proof(scene):
+    solver = settled_solver(scene)
+    cells, observations = what_is_seen()
+    observations["visible"] = 0.0
+    assert not any(solver.rests(cells, observations) for _ in range(3))
+
+
+def test_the_stage_lets_an_estimate_stand(scene, device, monkeypatch):
+    """The same picture for seconds: fewer estimates, the same light, and no work for those who read it."""
+    solved, update = [], recovery.Recovery.update
+
+    def counted(self, *sides):
+        solved.append(index)
+        return update(self, *sides)
+
+    monkeypatch.setattr(recovery.Recovery, "update", counted)
+    image = np.full((240, 320, 3), 90, np.uint8)
+    image[:100] = 255
+    pose = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
+    quality = PRESETS["low"].with_methods(recover="white_card")
+    lit = []
+    with Pipeline(scene, device=device, quality=quality, outputs=("environment",), estimates="synchronous") as pipeline:
+        for index in range(100):
+            result = pipeline(image, time_seconds=index / 30, pose=pose)
+            lit.append(result.environment)
+    asked = [0, 1, 2, *range(8, 100, 6)]
+    rests = [frame for frame in asked[CONFIG.solver.settled :] if frame not in solved]
+    assert solved == [frame for frame in asked if frame not in rests]
+    assert len(rests) >= 4
+    assert all((lit[frame] == lit[frame - 1]).all() for frame in rests)
+
+
+def test_a_failing_estimate_is_reported_with_its_frame(scene, monkeypatch):
+    def update(*_):
+        raise ArithmeticError("no such light")
+
+    monkeypatch.setattr(recovery.Recovery, "update", update)
+    with pytest.raises(ArithmeticError, match="no such light"):
+        shown_estimates(scene, "cpu", 1)
+
+
+CLIPPED_ERROR = 0.4
+"""Of the irradiance that clipping takes at least in the case below."""
+
+SHADING_ERROR = 0.2
+"""What may be left: the first frame alone leaves 0.13."""
+
+
+def test_light_of_a_path_traced_environment_comes_back(shared):
+    case = shared / "truth" / "gold_torus_interior"
+    truth = np.load(case / "env" / "0000.npy").astype(float)
+    d, area = reference.cell_directions(*truth.shape[:2])
+    normals = reference.cell_directions(12, 24)[0]
+    cosine = np.maximum(normals @ d.T, 0.0) * area
+
+    def irradiance(map_):
+        return cosine @ np.asarray(map_, float).reshape(-1, 3)
+
+    errors = {}
+    for method in ("clipped", "white_card", "shading"):
+        quality = PRESETS["medium"].with_methods(recover=method)
+        source = load_scene(case / "scene_object.toml")
+        with Session(source, device="cpu", quality=quality, outputs=("environment",)) as session:
+            _, result = next(iter(session))
+        small = result.environment
+        got = np.repeat(np.repeat(small, truth.shape[0] // len(small), 0), truth.shape[0] // len(small), 1)
+        errors[method] = np.linalg.norm(irradiance(got) - irradiance(truth)) / np.linalg.norm(irradiance(truth))
+    assert errors["clipped"] > CLIPPED_ERROR
+    assert errors["white_card"] < errors["clipped"]
+    assert errors["shading"] < SHADING_ERROR

@@ -1,0 +1,193 @@
+"""The command that serves the page: its address, its arguments, its beginning and its end."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import dataclasses
+import functools
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+import numpy as np
+import pytest
+
+from tests.viewer_rig import PATIENCE, Page, Running, page_scene, run, served
+from warp_ar import live
+from warp_ar.errors import SourceError, UsageError
+from warp_ar.scene import dumps_scene, load_scene
+from warp_ar.viewer.address import Address, own_address
+from warp_ar.viewer.host import Host
+from warp_ar.viewer.server import Server
+
+
+def test_address() -> None:
+    assert Address().url == "http://127.0.0.1:8720/"
+    assert Address("0.0.0.0", 80, "abc").url == "http://localhost:80/?token=abc"
+    assert Address("::1", 80).url == "http://[::1]:80/"
+    assert not Address("0.0.0.0").loopback
+    # What a phone can open is no name of this machine for itself.
+    outside = Address("0.0.0.0", 80, "abc").outside_url
+    if own_address() is None:
+        assert outside is None
+    else:
+        assert outside == f"http://{own_address()}:80/?token=abc"
+        assert not own_address().startswith("127.")
+    assert Address("127.0.0.1").outside_url is None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["--port", "70000"], "--port 70000"),
+        (["--token", "a b"], "--token"),
+        (["--token", ""], "--token"),
+        (["--tls", "/no/such.pem"], "/no/such.pem"),
+        (["--report", "run.json"], "--report needs"),
+        (["--quality", "auto", "--budget-ms", "-5"], "--budget-ms -5"),
+        (["--quality", "auto", "--budget-ms", "inf"], "--budget-ms inf"),
+        (["--budget-ms", "20"], "needs --quality auto"),
+        (["--host", "no.such.host.invalid", "--device", "cpu", "--quality", "low"], "cannot serve"),
+    ],
+)
+def test_bad_usage_of_the_page(
+    arguments: list[str],
+    expected: str,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert live.main(["desk", *arguments]) == 2
+    text = capsys.readouterr().err
+    assert expected in text
+    assert text.count("\n") == 1
+
+
+def test_the_command_serves_until_its_frames_are_lit(capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["desk", "--device", "cpu", "--quality", "low", "--port", "0", "--no-browser", "--frames", "3"]
+    assert live.main(arguments) == 0
+    assert "http://127.0.0.1:" in capsys.readouterr().out
+
+
+def test_without_a_camera_frames_that_are_counted_never_come(capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["desk", "--source", "1023", "--device", "cpu", "--quality", "low", "--port", "0", "--no-browser"]
+    assert live.main([*arguments, "--frames", "1"]) == 2
+    assert "capture device 1023 cannot be opened" in capsys.readouterr().err
+    with pytest.raises(SourceError, match="numbered from 0 to 1023"):
+        Host(page_scene(), source=1024, device="cpu", quality="low")
+
+
+def test_without_a_camera_a_picture_says_so() -> None:
+    with Running(page_scene(), source=1023) as running:
+        missing = running.host.state_message()["missing"]
+        assert missing["name"] == "source.absent"
+        assert "capture device 1023 cannot be opened" in missing["text"]
+        assert "My camera" in missing["remedy"]
+        words = running.next().frame
+        assert np.ptp(words) > 100, "nothing is written there"
+
+
+def test_names_do_not_reach_the_terminal_as_they_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = dataclasses.replace(load_scene("desk"), name="d\x1b]0;owned\x07esk")
+    (tmp_path / "scene.toml").write_text(dumps_scene(scene))
+    arguments = [str(tmp_path / "scene.toml"), "--device", "cpu", "--quality", "low"]
+    assert live.main([*arguments, "--port", "0", "--no-browser", "--frames", "1"]) == 0
+    out = capsys.readouterr().out
+    assert "http://127.0.0.1:" in out
+    assert "\x1b" not in out
+    assert "\x07" not in out
+
+
+# The command, with frames that take ten minutes each.
+ENDLESS = """
+import sys, time
+from warp_ar.engine.pipeline import Pipeline
+def light(self, *arguments, **options):
+    print("lighting", flush=True)
+    time.sleep(600)
+Pipeline.__call__ = light
+from warp_ar.live import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_ctrl_c_does_not_wait_for_the_frame_in_hand() -> None:
+    command = [sys.executable, "-c", ENDLESS, "desk", "--device", "cpu", "--quality", "low", "--port", "0"]
+    with subprocess.Popen(
+        [*command, "--no-browser", "--frames", "1"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert "http://" in process.stdout.readline()
+        assert process.stdout.readline() == "lighting\n"
+        process.send_signal(signal.SIGINT)
+        try:
+            _, errors = process.communicate(timeout=PATIENCE)
+        finally:
+            process.kill()
+    assert process.returncode == 130
+    assert errors == ""
+
+
+@run
+async def test_the_page_is_there_before_anything_is_built() -> None:
+    go_on = threading.Event()
+
+    def make(**callbacks: Any) -> Host:
+        assert go_on.wait(PATIENCE)
+        return Host(page_scene(), device="cpu", quality="low", **callbacks)
+
+    ready: asyncio.Event = asyncio.Event()
+    server = Server(make, Address(port=0))
+    task = asyncio.create_task(server.serve(lambda _: ready.set()))
+    try:
+        await ready.wait()
+        async with aiohttp.ClientSession() as session:
+            for path in ("", "static/app.js"):
+                async with session.get(server.address.url + path) as response:
+                    assert response.status == 200
+            connecting = asyncio.create_task(session.ws_connect(f"{server.address.url}live", max_msg_size=1 << 24))
+            await asyncio.sleep(0.2)
+            go_on.set()
+            async with await connecting as socket:
+                await Page(socket).until("frame")
+    finally:
+        go_on.set()
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+
+
+@run
+async def test_a_viewer_that_is_busy_beyond_the_end_leaves_without_an_error(caplog: pytest.LogCaptureFixture) -> None:
+    ended = asyncio.Event()
+
+    async def busy(viewer: Any) -> None:
+        while not ended.is_set():
+            with contextlib.suppress(asyncio.CancelledError):
+                await ended.wait()
+
+    async with aiohttp.ClientSession() as session:
+        async with served() as site:
+            site.server._receive = busy  # type: ignore[method-assign]
+            before = asyncio.all_tasks()
+            page = await session.ws_connect(f"{site.url}/live")
+            await page.receive()
+            handlers = asyncio.all_tasks() - before
+        ended.set()
+        results = await asyncio.gather(*handlers, return_exceptions=True)
+        await page.close()
+    assert [error for error in results if isinstance(error, Exception)] == []
+    assert [record for record in caplog.records if record.name.startswith("aiohttp")] == []
+
+
+@run
+async def test_a_host_that_cannot_be_built_ends_the_server_with_its_reason() -> None:
+    make = functools.partial(Host, dataclasses.replace(page_scene(), source=None), device="cpu")
+    with pytest.raises(UsageError, match="names no source"):
+        await Server(make, Address(port=0)).serve()

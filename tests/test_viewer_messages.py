@@ -1,0 +1,116 @@
+"""What the page and its server say to each other: what is understood, what is refused and why."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import random
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.viewer_rig import GOOD, jpeg, mutated, picture_message
+from warp_ar.errors import WarpArError
+from warp_ar.viewer import protocol
+from warp_ar.viewer.protocol import Bucket, ProtocolError, parse_picture, parse_text
+
+
+@pytest.mark.parametrize("message", GOOD, ids=lambda m: m["type"])
+def test_what_the_page_says_is_understood(message: dict[str, Any]) -> None:
+    command = parse_text(json.dumps(message))
+
+    def plain(value: Any) -> Any:
+        return tuple(map(plain, value)) if isinstance(value, list) else value
+
+    values = [plain(v) for k, v in message.items() if k != "type"]
+    assert list(vars(command).values()) == values
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("", "no JSON"),
+        ("{", "no JSON"),
+        ("[" * 4000, "no JSON"),
+        ("[]", "no known type"),
+        ('{"type": ["ack"]}', "no known type"),
+        ('{"type": "exec", "code": 1}', "no known type"),
+        ('{"type": "ack"}', "ack takes id"),
+        ('{"type": "ack", "id": 1, "more": 1}', "ack takes id"),
+        ('{"type": "ack", "id": true}', "ack: id"),
+        ('{"type": "ack", "id": -1}', "ack: id"),
+        ('{"type": "ack", "id": 1e3}', "ack: id"),
+        ('{"type": "ping", "sent": NaN}', "NaN is no number"),
+        ('{"type": "ping", "sent": 1e999}', "ping: sent"),
+        ('{"type": "budget", "ms": 0}', "budget: ms"),
+        ('{"type": "set", "part": "camera", "index": 0, "key": "fx", "value": 1}', "set: part"),
+        ('{"type": "set", "part": "light", "index": 64, "key": "at", "value": [0, 0, 0]}', "set: index"),
+        ('{"type": "set", "part": "light", "index": 0, "key": "at", "value": [1, 2, 3, 4]}', "set: value"),
+        ('{"type": "set", "part": "light", "index": 0, "key": "at", "value": [1, 2, "x"]}', "set: value"),
+        ('{"type": "set", "part": "light", "index": 0, "key": "at", "value": {"a": 1}}', "set: value"),
+        ('{"type": "add", "part": "object", "kind": "mesh"}', "add: kind"),
+        ('{"type": "add", "part": "object", "kind": "spot"}', "add: kind"),
+        ('{"type": "add", "part": "proxy", "kind": "mesh"}', "add: kind"),
+        ('{"type": "outline", "kind": "door", "points": [[0, 0], [1, 0], [1, 1], [0, 1]]}', "outline: kind"),
+        ('{"type": "outline", "kind": "wall", "points": [[0, 0], [1, 0], [1, 1]]}', "outline: points"),
+        ('{"type": "outline", "kind": "wall", "points": [[0, 0], [1, 0], [1, 1], [0, "x"]]}', "outline: points"),
+        ('{"type": "card", "radius": "large", "ruler": 0.1}', "card: radius"),
+        ('{"type": "setup", "step": "all"}', "setup: step"),
+        ('{"type": "camera", "width": 100000, "height": 480}', "camera: width"),
+        ('{"type": "quality", "name": "' + "x" * 65 + '"}', "quality: name"),
+        ('{"type": "quality", "name": "' + "x" * 5000 + '"}', "4096 at most"),
+    ],
+)
+def test_what_no_page_says_is_refused_with_a_reason(text: str, reason: str) -> None:
+    with pytest.raises(ProtocolError, match=reason):
+        parse_text(text)
+
+
+def test_pictures_are_measured_before_they_are_decoded() -> None:
+    assert protocol.jpeg_size(jpeg()) == (64, 48)
+    progressive = cv2.imencode(".jpg", np.zeros((48, 64, 3), np.uint8), (cv2.IMWRITE_JPEG_PROGRESSIVE, 1))[1].tobytes()
+    assert protocol.jpeg_size(progressive) == (64, 48)
+    picture = parse_picture(picture_message(jpeg(), 7.5, 3), (64, 48))
+    assert (picture.taken, picture.id, picture.jpeg) == (7.5, 3, jpeg())
+    bomb = bytearray(jpeg())
+    start = bomb.index(b"\xff\xc0")
+    bomb[start + 5 : start + 9] = b"\xff\xff\xff\xff"  # 65535 x 65535: 12 GB
+    for data, reason in [
+        (picture_message(bytes(bomb)), "65535x65535"),
+        (picture_message(jpeg(32, 48)), "32x48"),
+        (picture_message(b"\x89PNG"), "no JPEG"),
+        (picture_message(jpeg()[:20]), "no JPEG"),
+        (picture_message(jpeg(), math.nan), "no sensible time"),
+        (picture_message(jpeg(), -1.0), "no sensible time"),
+        (b"12", "holds no picture"),
+        (b"\0" * (protocol.MAX_PICTURE + 1), "at most"),
+    ]:
+        with pytest.raises(ProtocolError, match=reason):
+            parse_picture(data, (64, 48))
+
+
+def test_rate_is_bounded_and_comes_back() -> None:
+    bucket = Bucket(rate=10.0, burst=20.0)
+    assert sum(bucket.take(1.0, 100.0) for _ in range(100)) == 20
+    assert sum(bucket.take(1.0, 100.5) for _ in range(100)) == 5
+    assert not bucket.take(21.0, 1e9)
+
+
+def test_ten_thousand_random_messages_are_understood_or_refused() -> None:
+    rng = random.Random(0)
+    understood = 0
+    for _ in range(10_000):
+        message = mutated(rng)
+        with contextlib.suppress(ProtocolError):
+            if isinstance(message, str):
+                understood += parse_text(message) is not None
+            else:
+                parse_picture(message, (64, 48))
+    assert 1000 < understood < 9000  # else the fuzz tries only one of the two
+
+
+def test_errors_are_one_of_ours() -> None:
+    assert issubclass(ProtocolError, WarpArError)
