@@ -66,7 +66,7 @@ def make_environment_shadow_kernel(config: EnvironmentShadowConfig) -> wp.Kernel
     closest_object, occluded_by_objects = trace.closest_object, trace.occluded_by_objects
     mask_objects, mask_physical = make_masks(config, min(config.count, CHUNK))
     visible_proxy = make_visible_proxy(config.distant.trace, config.distant.probes)
-    aim, find_sender = make_aim(config.emitters), make_find_sender(config)
+    aim, find_sender = make_aim(config.emitters, config.distant.several), make_find_sender(config)
     traced = config.bounce == "traced"
     look_before = None if traced else make_look_before(config.distant)
     reflect_back = make_reflect_back(config.distant, traced)
@@ -125,7 +125,7 @@ def make_environment_shadow_kernel(config: EnvironmentShadowConfig) -> wp.Kernel
             bit = wp.uint64(1)
             size = wp.int32(wp.static(chunk))  # a variable: unrolled, the kernel would hold its rays many times over
             for k in range(size):
-                ray = aim(sets, at + k, hit)
+                ray = aim(sets, distant.others.places, at + k, hit)
                 if ray.cosine > 0.0:
                     if (met & bit) == wp.uint64(0):
                         without += ray.cosine * ray.grown * sets.flux[at + k]
@@ -159,7 +159,7 @@ def make_environment_shadow_kernel(config: EnvironmentShadowConfig) -> wp.Kernel
                                 if wp.static(traced):
                                     seed = pcg3d_hash(wp.uint32(at + k), wp.uint32(row), wp.uint32(column))
                                 elif before.up == wp.vec3(0.0, 0.0, 0.0):
-                                    before = look_before(distant, hit.geometric_normal, ray.direction)
+                                    before = look_before(distant, hit.point, hit.geometric_normal, ray.direction)
                                 reflected = reflect_back(
                                     params[0], picture, scene, distant, meeting, before, seed, reflected
                                 )

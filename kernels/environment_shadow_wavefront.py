@@ -71,7 +71,7 @@ def make_find_occluded_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
     secondary_count = config.secondary_count
     side = config.side
     mask_objects, mask_physical = make_masks(config, size)
-    aim, trace = make_aim(config.emitters), make_trace(config.distant.trace)
+    aim, trace = make_aim(config.emitters, config.distant.several), make_trace(config.distant.trace)
     closest_proxy, occluded_by_objects = trace.closest_proxy, trace.occluded_by_objects
     visible_proxy = make_visible_proxy(config.distant.trace, config.distant.probes)
 
@@ -114,7 +114,7 @@ def make_find_occluded_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
                         bit = wp.uint64(1) << wp.uint64(k - begin)
                         if (virtual_mask & bit) == wp.uint64(0):
                             continue
-                        ray = aim(sets, at + k - begin, hit)
+                        ray = aim(sets, distant.others.places, at + k - begin, hit)
                         if ray.cosine <= 0.0:
                             continue
                         ray.origin = offset_origin(hit.point, hit.geometric_normal, ray.direction, hit.error)
@@ -162,7 +162,7 @@ def make_sum_light_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
     side = config.side
     _, mask_physical = make_masks(config, size)
     visible_proxy = make_visible_proxy(config.distant.trace, config.distant.probes)
-    aim, find_sender = make_aim(config.emitters), make_find_sender(config)
+    aim, find_sender = make_aim(config.emitters, config.distant.several), make_find_sender(config)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def sum_light_kernel(
@@ -193,7 +193,7 @@ def make_sum_light_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
         hidden = wp.vec3(0.0)
         for k in range(at, at + size):
             bit = wp.uint64(1) << wp.uint64(k - at)
-            ray = aim(sets, k, hit)
+            ray = aim(sets, distant.others.places, k, hit)
             if ray.cosine > 0.0:
                 light = ray.cosine * ray.grown * sets.flux[k]
                 if (met & bit) != wp.uint64(0):
@@ -216,7 +216,7 @@ def make_trace_secondary_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
     """Kernel of the third pass: what objects send along the queued rays."""
     secondary_count = config.secondary_count
     side = config.side
-    aim = make_aim(config.emitters)
+    aim = make_aim(config.emitters, config.distant.several)
     closest_object = make_trace(config.distant.trace).closest_object
     visible_proxy = make_visible_proxy(config.distant.trace, config.distant.probes)
     traced = config.bounce == "traced"
@@ -247,7 +247,7 @@ def make_trace_secondary_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
             row = cell_pixel(i, stride, rays.shape[0])
             column = cell_pixel(j, stride, rays.shape[1])
             hit = visible_proxy(params[0], rays[row, column], scene, distant.probes)
-            ray = aim(sets, index, hit)
+            ray = aim(sets, distant.others.places, index, hit)
             ray.origin = offset_origin(hit.point, hit.geometric_normal, ray.direction, hit.error)
             reflected = ReflectedLight()
             # What is nearer than all that is physical is nearest.
@@ -264,7 +264,7 @@ def make_trace_secondary_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
                 if wp.static(traced):
                     seed = pcg3d_hash(wp.uint32(index), wp.uint32(row), wp.uint32(column))
                 else:
-                    before = look_before(distant, hit.geometric_normal, ray.direction)
+                    before = look_before(distant, hit.point, hit.geometric_normal, ray.direction)
                 reflected = reflect_back(params[0], picture, scene, distant, meeting, before, seed, reflected)
             wave_out.reflected[0, place] = reflected.sent
             if wp.static(not traced):

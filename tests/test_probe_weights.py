@@ -8,6 +8,7 @@ import warp as wp
 
 from tests.reference import probe_weights as reference
 from warp_ar.kernels import probe_weights, structs
+from warp_ar.kernels.interpolated_irradiance import OtherBalls
 from warp_ar.kernels.lobes import lobe_texels
 from warp_ar.kernels.probe_weights import probe_weight
 from warp_ar.kernels.reflect import (
@@ -140,17 +141,19 @@ def look(radiances, points, *, form="map", places=THREE, several=True):
     distant, first, others = DistantLight(), radiances[0], np.float32(radiances[1:])
     levels = np.full((lobe_texels(LEVEL_HEIGHT), 3), first, np.float32)
     distant.levels, distant.level_height = wp.array(levels, wp.vec3), LEVEL_HEIGHT
-    distant.others_levels = wp.array(others[:, None, None] * np.ones_like(levels), wp.vec3)
+    balls = OtherBalls()
+    balls.levels = wp.array(others[:, None, None] * np.ones_like(levels), wp.vec3)
     sh = np.zeros((9, 3), np.float32)
     sh[0] = np.pi / 0.28209479
-    distant.irradiance_sh, distant.others_sh = (
+    distant.irradiance_sh, balls.irradiance_sh = (
         wp.array(first * sh, wp.vec3),
         wp.array(others[:, None, None] * sh, wp.vec3),
     )
     flat = np.full((4, 8, 3), np.pi, np.float32)
     distant.irradiance_map = wp.array(first * flat, wp.vec3)
-    distant.others_map = wp.array(others[:, None, None, None] * flat, wp.vec3)
-    distant.places = wp.array(np.float32(places), wp.vec4)
+    balls.irradiance_map = wp.array(others[:, None, None, None] * flat, wp.vec3)
+    balls.places = wp.array(np.float32(places), wp.vec4)
+    distant.others = balls
     out = wp.zeros((len(points), 2), wp.vec3)
     wp.launch(
         make_environment_kernel(form, several), len(points), [distant, wp.array(np.float32(points), wp.vec3)], [out]
