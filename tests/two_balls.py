@@ -6,6 +6,7 @@ import functools
 from collections.abc import Sequence
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -78,11 +79,13 @@ def shares(probes: tuple[Probe, ...], points: Array, trusts: tuple[float, ...] =
 
 
 def shown_of(pipeline: Pipeline, index: int, right: float = 0.0, detail: int = 1) -> tuple[Array, NDArray[np.bool_]]:
-    """Radiance of an object's pixels (n, 3), and which of them it covers whole (n,)."""
-    virtual = pipeline.arrays["virtual"].numpy().astype(np.float64)[hits(index, right, detail)[0]]
-    whole = virtual[:, 3] == 1.0
+    """Radiance of an object's pixels (n, 3), and which of them are one sample: it covers them and all beside them."""
+    virtual = pipeline.arrays["virtual"].numpy().astype(np.float64)
+    inside = cv2.erode((virtual[..., 3] == 1.0).astype(np.uint8), np.ones((3, 3), np.uint8))
+    shown = hits(index, right, detail)[0]
+    whole = inside[shown] == 1
     assert whole.sum() > 50
-    return virtual[:, :3], whole
+    return virtual[shown][:, :3], whole
 
 
 def rms(values: Array) -> float:
