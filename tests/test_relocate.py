@@ -1,11 +1,11 @@
 """What was recovered in one ball's map, as another ball sees it."""
 
 import numpy as np
-import pytest
 import warp as wp
 
 from tests.reference import latlong
-from warp_ar.kernels.relocate import move_emitters, relocate
+from warp_ar.kernels.recover_cells import Cell
+from warp_ar.kernels.relocate import move_emitters, relocate, share_radiance
 from warp_ar.kernels.structs import Emitter
 
 HEIGHT = 64
@@ -79,18 +79,73 @@ def test_a_near_lamp_stands_where_the_other_ball_sees_it_with_its_energy_there(d
     np.testing.assert_allclose((excess * area).sum((0, 1)), gain * before, rtol=ENERGY)
 
 
-@pytest.mark.parametrize("known", [False, True])
-def test_what_has_no_place_stays_in_its_direction(device, known):
-    """To the bit where nothing is turned; what the other ball captured stays as it was."""
+CELLS = (16, 32)
+
+
+def shared(*, clips, lamps, hidden=(), emitters=None, excess=None):
+    """A black map in which directions clip, given the radiance of ``lamps``: (cell, share, radiance) of the first."""
+    cells, recovered = np.zeros(CELLS, np.dtype(Cell.numpy_dtype())), np.zeros((*CELLS, 3), np.float32)
+    cells["solid_angle"] = latlong.solid_angles(*CELLS)
+    cells["direction"] = latlong.directions(*CELLS)
+    for at, share, radiance in lamps:
+        cells["missing"][at], recovered[at] = share, radiance
+    for at in hidden:
+        cells["hidden"][at] = 1.0
+    shape = HEIGHT, 2 * HEIGHT
+    share, confidence = np.zeros((*shape, 3), np.float32), np.ones(shape, np.float32)
+    for at, value in clips:
+        share[at] = value
+    first = np.zeros((*shape, 3), np.float32) if excess is None else np.float32(excess)
+    other = wp.zeros(shape, wp.vec3), wp.array(share, wp.vec3), wp.array(confidence, wp.float32)
+    out = wp.full(shape, wp.vec3(-1.0), dtype=wp.vec3)
+    maps = wp.array(first, wp.vec3), wp.zeros(shape, wp.vec3)
+    given = wp.array(cells, dtype=Cell), wp.array(recovered, wp.vec3)
+    share_radiance(other, *maps, emitters, *given, out)
+    return out.numpy()
+
+
+def test_one_lamp_has_its_radiance_wherever_the_other_ball_sees_it(device):
+    """By the share that lacks light, each channel by its own."""
+    found = shared(clips=[((40, 10), (1.0, 0.5, 0.0))], lamps=[((3, 20), (0.2, 0.2, 0.2), (30.0, 20.0, 10.0))])
+    # A sum of one term over that term.
+    np.testing.assert_allclose(found[40, 10], [30.0, 10.0, 0.0], rtol=1e-6)
+    found[40, 10] = 0.0
+    assert not found.any()
+
+
+def test_of_two_lamps_the_nearer_counts_most(device):
+    lamps = [((3, 20), 0.2, 30.0), ((9, 2), 0.8, 5.0)]
+    directions, area = latlong.directions(*CELLS), latlong.solid_angles(*CELLS)
+    at = (14, 84)  # the middle of the first lamp's cell is two texels from here
+    toward = latlong.directions(HEIGHT, 2 * HEIGHT)[at]
+    weights = [area[cell] * share / (((toward - directions[cell]) ** 2).sum() + 0.04) ** 2 for cell, share, _ in lamps]
+    expected = np.average([radiance for *_, radiance in lamps], weights=weights)
+    assert expected > 29.0
+    found = shared(clips=[(at, 1.0)], lamps=lamps)
+    np.testing.assert_allclose(found[at], expected, rtol=1e-5)
+
+
+def test_what_the_first_ball_does_not_see_is_far(device):
+    """Light that was found where it sees nothing stays in its direction."""
+    excess = np.zeros((HEIGHT, 2 * HEIGHT, 3))
+    excess[12:16, 80:84] = 7.0
+    excess[40, 40] = 3.0  # which clips there, and not here
+    found = shared(clips=[], lamps=[], hidden=[(3, 20)], excess=excess)
+    np.testing.assert_array_equal(found[12:16, 80:84], 7.0)
+    assert found.sum() == found[12:16, 80:84].sum()
+
+
+def test_where_an_emitter_has_a_place_its_light_is_turned_and_else_nothing_is(device):
+    """Of two passes over one map exactly one writes."""
+    far = emitter_records({"origin": HERE, "direction": (0.0, 0.6, 0.8), "distance": np.inf, "power": (1.0,) * 3})
     _, captured, environment = maps(np.array([0.0, -0.6, 0.8]))
-    filled = np.random.default_rng(2).uniform(0.0, 1.0, captured.shape).astype(np.float32)
-    found = moved(environment, captured, filled, emitter_records() if known else None)
-    # A place in a map of 128 columns is known to 8e-6 of a texel, over which this lamp changes by 6.5.
-    np.testing.assert_allclose(found, filled + (environment - captured), atol=6e-5 if known else 0.0)
+    for emitters, near in ((emitter_records(lamp()), True), (far, False), (emitter_records(), False)):
+        assert (shared(clips=[], lamps=[], emitters=emitters) == -1.0).all() == near
+        assert (moved(environment, captured, captured, emitters) == 0.0).all() != near
 
 
 def test_nothing_is_taken_away(device):
     """A map that is darker than what was captured, as where it has just moved on, gives no negative light."""
     _, captured, environment = maps(np.array([0.0, -0.6, 0.8]))
-    found = moved(captured, environment, captured, None)
+    found = moved(captured, environment, captured, emitter_records(lamp()))
     np.testing.assert_array_equal(found, captured)

@@ -99,6 +99,7 @@ class TwoBalls:
     def __init__(self, desk: Desk, detail: int = 1) -> None:
         """Pictures have ``detail`` times ``SIZE`` pixels along each side."""
         self.desk, self.detail = desk, detail
+        self._truth: dict[tuple[int, bool], Array] = {}
 
     def photograph(self, right: float = 0.0) -> NDArray[np.uint8]:
         """The desk and its balls."""
@@ -159,10 +160,14 @@ class TwoBalls:
 
     def truth(self, index: int, mirror: bool = False) -> Array:
         """Radiance of an object's pixels, (n, 3)."""
-        _, points, normals, toward = hits(index, 0.0, self.detail)
-        if mirror:
-            return radiance(self.desk, points, toward)
-        return ALBEDO / np.pi * irradiance(self.desk, points, normals, 512)
+        if (index, mirror) not in self._truth:
+            _, points, normals, toward = hits(index, 0.0, self.detail)
+            if mirror:
+                true = radiance(self.desk, points, toward)
+            else:
+                true = ALBEDO / np.pi * irradiance(self.desk, points, normals, 512)
+            self._truth[index, mirror] = true
+        return self._truth[index, mirror]
 
     def lit(self, probes: tuple[Probe, ...], quality: Quality, device: str, frames: int = 3) -> list[Array]:
         """Radiance of matt objects' pixels after some frames; NaN in those that an object does not cover whole."""
