@@ -8,14 +8,16 @@ known by their places, it is turned (``relocate``):
 
 with ``correct_parallax`` for the turn and ``solid_angle_gain`` for g.
 
-Where none is, the other ball tells itself where its light clips, and a lamp has one radiance wherever it is seen from
-(``share_radiance``): with s'(d) the share of a texel that lacks light, and the cells k of the first ball's map, each of
-solid angle a, share s and radiance R that what clips lacks,
+Where none is, the other ball tells itself in which directions its light clips, and what it lacks is taken to be as much
+as the first one does, as of light far away (``share_excess``). With a' the solid angle and s' the share of its texels
+that lack light, and e_k what was found in cell k of the first ball's map, radiance times solid angle,
 
-    M'(d) = F'(d) + s'(d) sum w a s R / sum w a s,    w = 1 / (|d - d_k|^2 + NEARBY^2)^2.
+    M'(d) = F'(d) + s'(d) sum over k of w_k(d) e_k / sum over d of a' s' w_k,
+    w_k(d) = 1 / (|d - d_k|^2 + NEARBY^2)^2:
 
-Of one lamp this is its R, however far apart the two balls see it; of several, those in like directions count most.
-What the first ball cannot see, and light was found in, is as far as the environment.
+of one lamp all goes where the other ball sees it, of several each to the nearest. What nothing in the other map clips
+for, and what was found where the first ball sees nothing, stays in its direction. Shares are no measure of how large a
+lamp is: one of a pixel or two has another share in every picture.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ from __future__ import annotations
 import warp as wp
 
 from warp_ar.kernels.emitters import MAX_DISTANCE, correct_parallax, seen_from, solid_angle_gain
-from warp_ar.kernels.latlong import direction_from_latlong, sample_latlong
+from warp_ar.kernels.latlong import direction_from_latlong, sample_latlong, texel_solid_angle
 from warp_ar.kernels.launch import Rows, launch, launch_rows
 from warp_ar.kernels.recover_cells import Cell, trust
 from warp_ar.kernels.structs import Emitter
@@ -72,24 +74,52 @@ def relocate_kernel(
 
 
 @wp.func
-def missing_radiance(cells: wp.array2d[Cell], recovered: wp.array2d[wp.vec3], direction: wp.vec3) -> wp.vec3:
-    """Radiance that what clips in a direction lacks, by the first ball's cells, the nearer the more."""
-    total = wp.vec3(0.0)
-    whole = wp.vec3(0.0)
-    for row in range(cells.shape[0]):
-        for column in range(cells.shape[1]):
-            share = cells[row, column].missing
-            if wp.max(share) > 0.0:
-                away = direction - cells[row, column].direction
-                near = wp.dot(away, away) + NEARBY * NEARBY
-                weight = cells[row, column].solid_angle / (near * near)
-                total += weight * wp.cw_mul(share, recovered[row, column])
-                whole += weight * share
-    return wp.cw_div(total, wp.max(whole, wp.vec3(1.0e-12)))
+def nearness(a: wp.vec3, b: wp.vec3) -> wp.float32:
+    """Weight of a unit direction for another."""
+    away = a - b
+    near = wp.dot(away, away) + NEARBY * NEARBY
+    return 1.0 / (near * near)
 
 
 @wp.kernel(enable_backward=False)
-def share_radiance_kernel(
+def send_excess_kernel(
+    # In:
+    row_start: wp.int32,
+    share: wp.array2d[wp.vec3],
+    confidence: wp.array2d[wp.float32],
+    cells: wp.array2d[Cell],
+    recovered: wp.array2d[wp.vec3],
+    # Out:
+    sent_out: wp.array2d[wp.vec3],
+):
+    """A cell's e over the sum that it is shared by; -1 where it stays in its direction."""
+    i, j = wp.tid()
+    i += row_start
+    cell = cells[i, j]
+    sent_out[i, j] = wp.vec3(0.0)
+    excess = cell.solid_angle * wp.cw_mul(cell.missing, recovered[i, j])
+    if not wp.max(excess) > 0.0:
+        return
+    whole = wp.vec3(0.0)
+    if cell.hidden == 0.0:
+        height = share.shape[0]
+        width = share.shape[1]
+        for row in range(height):
+            area = texel_solid_angle(row, height, width)
+            for column in range(width):
+                lost = trust(confidence[row, column]) * share[row, column]
+                if wp.max(lost) > 0.0:
+                    toward = direction_from_latlong(wp.float32(row) + 0.5, wp.float32(column) + 0.5, height, width)
+                    whole += area * nearness(toward, cell.direction) * lost
+    sent = wp.vec3(-1.0)
+    for channel in range(3):
+        if whole[channel] > 0.0:
+            sent[channel] = excess[channel] / whole[channel]
+    sent_out[i, j] = sent
+
+
+@wp.kernel(enable_backward=False)
+def share_excess_kernel(
     # In:
     row_start: wp.int32,
     filled: wp.array2d[wp.vec3],
@@ -99,7 +129,7 @@ def share_radiance_kernel(
     captured: wp.array2d[wp.vec3],
     emitters: wp.array[Emitter],
     cells: wp.array2d[Cell],
-    recovered: wp.array2d[wp.vec3],
+    sent: wp.array2d[wp.vec3],
     # Out:
     environment_out: wp.array2d[wp.vec3],
 ):
@@ -113,10 +143,16 @@ def share_radiance_kernel(
     light = filled[i, j]
     lost = trust(confidence[i, j]) * share[i, j]
     if wp.max(lost) > 0.0:
-        direction = direction_from_latlong(wp.float32(i) + 0.5, wp.float32(j) + 0.5, height, width)
-        light += wp.cw_mul(lost, missing_radiance(cells, recovered, direction))
-    if cells[i * cells.shape[0] / height, j * cells.shape[1] / width].hidden > 0.0:
-        light += wp.max(environment[i, j] - captured[i, j], wp.vec3(0.0))
+        toward = direction_from_latlong(wp.float32(i) + 0.5, wp.float32(j) + 0.5, height, width)
+        for row in range(cells.shape[0]):
+            for column in range(cells.shape[1]):
+                arriving = wp.max(sent[row, column], wp.vec3(0.0))
+                if wp.max(arriving) > 0.0:
+                    light += nearness(toward, cells[row, column].direction) * wp.cw_mul(lost, arriving)
+    stays = sent[i * cells.shape[0] / height, j * cells.shape[1] / width]
+    for channel in range(3):
+        if stays[channel] < 0.0:
+            light[channel] += wp.max(environment[i, j][channel] - captured[i, j][channel], 0.0)
     environment_out[i, j] = light
 
 
@@ -168,34 +204,57 @@ def relocate(
     )
 
 
-def share_radiance(
+def send_excess(
+    share: wp.array,
+    confidence: wp.array,
+    cells: wp.array,
+    recovered: wp.array,
+    sent_out: wp.array,
+    *,
+    rows: Rows | None = None,
+) -> None:
+    """What each cell of the first ball's map sends to a unit of what clips in another's.
+
+    Args:
+        share: (h, w) what clips in the other map, of ``weigh_boundaries``.
+        confidence: (h, w) how well each of its texels was seen.
+        cells: ``Cell`` of the first ball's map when light was recovered in it.
+        recovered: Radiance that a wholly clipped texel of a cell lacks, as many.
+        sent_out: ``wp.vec3``, as many.
+        rows: Band of rows of cells, None for all.
+    """
+    inputs = [share, confidence, cells, recovered]
+    launch_rows(send_excess_kernel, sent_out.shape, inputs, [sent_out], rows=rows, device=sent_out.device)
+
+
+def share_excess(
     other: tuple[wp.array, wp.array, wp.array],
     environment: wp.array,
     captured: wp.array,
     emitters: wp.array | None,
     cells: wp.array,
-    recovered: wp.array,
+    sent: wp.array,
     environment_out: wp.array,
     *,
     rows: Rows | None = None,
 ) -> None:
-    """Give what clips in another ball's map the radiance of what clips in the first's; not if an emitter has a place.
+    """Add what was recovered in the first ball's map where another's clips; not if an emitter has a place.
 
     Args:
-        other: (h, w) the other ball's light as captured and completed, its share that clips, of ``weigh_boundaries``,
-            and how well each texel was seen.
+        other: (h, w) the other ball's light as captured and completed, and its share and confidence as for
+            ``send_excess``.
         environment: (h, w) the first ball's, with what was recovered.
         captured: (h, w) the first ball's without.
         emitters: Of the first ball's map; None: the method knows none.
-        cells: ``Cell`` of when that was recovered.
-        recovered: Radiance that a wholly clipped texel of a cell lacks, as many.
+        cells: As for ``send_excess``.
+        sent: From there.
         environment_out: (h, w) ``wp.vec3``.
         rows: Band of rows, None for all.
     """
     device = environment.device
     emitters = wp.empty(0, dtype=Emitter, device=device) if emitters is None else emitters
-    inputs = [*other, environment, captured, emitters, cells, recovered]
-    launch_rows(share_radiance_kernel, environment.shape, inputs, [environment_out], rows=rows, device=device)
+    inputs = [*other, environment, captured, emitters, cells, sent]
+    launch_rows(share_excess_kernel, environment.shape, inputs, [environment_out], rows=rows, device=device)
 
 
 def move_emitters(emitters: wp.array, places: wp.array, emitters_out: wp.array, *, ball: int) -> None:

@@ -134,9 +134,10 @@ class Recover(Stage):
         others = self.features.others
         types: dict[str, tuple[tuple[int, ...], Any]] = {"others_environment": (shape, wp.vec3)}
         types["others_emitters"] = (CONFIG.search.most,), Emitter
-        missing = {"recover_others_missing": ArraySpec((others, *shape), wp.vec3)} if others else {}
+        # Balls take turns with these.
+        missing = {"recover_others_missing": ArraySpec(shape, wp.vec3), "recover_sent": ArraySpec(cells, wp.vec3)}
         return {
-            **missing,
+            **(missing if others else {}),
             **{
                 name: ArraySpec((others, *types[name][0]), types[name][1])
                 for name in self.wiring.writes
@@ -203,13 +204,15 @@ class Recover(Stage):
         arrays, places, height = self._arrays, self._arrays["probe_places"], self.request.quality.environment_height
         emitters = arrays["emitters"] if self.features.emitters else None
         first, out = (arrays["environment"], arrays["filled_radiance"]), arrays["others_environment"][ball]
-        filled, missing = arrays["others_filled"][ball], arrays["recover_others_missing"][ball]
+        filled, missing, sent = arrays["others_filled"][ball], arrays["recover_others_missing"], arrays["recover_sent"]
         clipped, confidence = (arrays[f"{KEPT}_{part}"][ball] for part in ("clipped", "confidence"))
         own = arrays["params"], arrays["probes"][ball + 1 : ball + 2], missing
         found = arrays["recover_cells"], arrays["recover_recovered"]
-        share = functools.partial(relocate.share_radiance, (filled, missing, confidence), *first, emitters, *found, out)
+        other, cells = (filled, missing, confidence), found[0]
+        share = functools.partial(relocate.share_excess, other, *first, emitters, cells, sent, out)
         passes = [
             Pass(lambda rows: weigh_boundaries(clipped, *own, rows=rows), rows=height),
+            Pass(lambda rows: relocate.send_excess(missing, confidence, *found, sent, rows=rows), rows=cells.shape[0]),
             Pass(lambda rows: share(rows=rows), rows=height),
         ]
         if emitters is not None:
