@@ -357,10 +357,10 @@ def make_pick_ray(config: NearFieldConfig) -> wp.Function:
                 # it is a smaller set.
                 stride = samples.shape[0] / wp.static(side * side)
                 share = wp.float32(stride * side * side) / wp.static(float(config.count))
-                index = at.place * stride + n
+                chosen = at.place * stride + n
                 if wp.static(config.distant.several):
-                    share *= probe_share(places, ball_of_sample(index, places.shape[0]), at.hit.point)
-                ray = make_sample_ray(samples[index], at, share)
+                    share *= probe_share(places, ball_of_sample(chosen, places.shape[0]), at.hit.point)
+                ray = make_sample_ray(samples[chosen], at, share)
         if wp.static(config.distant.specular):
             if n >= diffuse:
                 k = n - diffuse
