@@ -415,7 +415,7 @@ def make_gather_light_kernel(config: CellConfig) -> wp.Kernel:
                 if here > 0.0 and there > 0.0:
                     squared = wp.dot(way, way)
                     total += here * there / (squared * (squared + patch.area / wp.pi)) * patch.flux
-        distant = wp.pi * mean_facing(receiver, hit.normal)
+        distant = wp.pi * mean_facing(receiver, hit.point, hit.normal)
         matters = bool(False)
         for channel in range(3):
             if total[channel] > NEGLIGIBLE * distant[channel]:
