@@ -102,9 +102,15 @@ def options() -> list[str]:
 
 
 @pytest.fixture
-def url(scene_file: Path, cache: Path, options: list[str]) -> Iterator[str]:
+def says() -> list[str] | None:
+    """What the command says on its standard error; None: nothing."""
+    return None
+
+
+@pytest.fixture
+def url(scene_file: Path, cache: Path, options: list[str], says: list[str] | None) -> Iterator[str]:
     """The page of a server of its own."""
-    with served([str(scene_file), *options], cache) as address:
+    with served([str(scene_file), *options], cache, says=says) as address:
         yield address
 
 
@@ -315,6 +321,7 @@ def test_opening_light_and_a_mesh(open_tab: Callable[..., Tab], tmp_path: Path) 
     tab.errors = [error for error in tab.errors if "422" not in error]  # the refused one, which was asked for
 
 
+@pytest.mark.parametrize("says", [["slide.glb: not shown: animations"]], ids=["none is played at first"])
 def test_an_animation_is_chosen_held_and_looped(open_tab: Callable[..., Tab], tmp_path: Path, artefacts: Path) -> None:
     """By the panel's own controls, of a file that was dropped; what they show is what the server plays."""
     gltf = Gltf()
