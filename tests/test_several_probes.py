@@ -103,6 +103,30 @@ def test_a_ball_that_leaves_the_picture_goes_out_smoothly(device: str) -> None:
     assert trust < 1e-4
 
 
+def test_light_that_clips_is_put_back_where_each_ball_sees_it(device: str) -> None:
+    """A lamp between the balls, 25 times as bright as the camera shows: what the one tells, the other tells mirrored.
+
+    By the card alone, which knows no place of the lamp: its light was found in the first ball's map. The picture is
+    symmetric but for the card's print, which is a hundredth of what a ball mirrors.
+    """
+    balls = tuple((ball.center, ball.radius, ball.reflectance[0]) for ball in BALLS)
+    desk = Desk(lamp_at=(0.0, -0.15, 0.4), lamp_radius=0.025, lamp=27.5, card=0.08, balls=balls)
+    world = TwoBalls(desk, detail=2)
+    ends = 0, len(PLACES) - 1
+    captured, recovered = (
+        [light for index, light in enumerate(world.lit(BALLS, quality, device, frames=1)) if index in ends]
+        for quality in (QUALITY, PRESETS["low"])
+    )
+    means = np.array([[np.nanmean(light, axis=0) for light in found] for found in (captured, recovered)])
+    expected = [world.foreseen(BALLS, index)[0] for index in ends]
+    whole = [np.isfinite(light[:, 0]) for light in captured]
+    foreseen = np.array([light[inside].mean(0) for light, inside in zip(expected, whole, strict=True)])
+    print(means / foreseen)
+    np.testing.assert_allclose(means[:, 1], means[:, 0], rtol=0.01)
+    # Off by a quarter of what clipping took, or less.
+    assert (np.abs(means[1] - foreseen) < 0.25 * np.abs(means[0] - foreseen)).all()
+
+
 def test_what_frames_leave_out_changes_no_bit(device: str) -> None:
     """Frames in which no object is to be seen: light is gathered meanwhile."""
     scene = make_scene(BALLS, material(False))
