@@ -14,6 +14,11 @@ Points. The first two dimensions of Sobol's sequence are a (0, 2)-sequence in ba
 consecutive points, and all blocks together, have one point in each elementary interval of their size. A block is a set:
 pixels of a tile take one set each, their mean has the error of all sets together [KH01].
 
+Several balls. Where the light is interpolated between the environments of several mirror balls, each has samples of its
+own, in turn: of every ``slots`` samples, the least power of two that is no less than the number of balls, each ball has
+one or two. So the first part of a set, and all sets together, hold aligned blocks of every ball's sequence. A ball's
+samples sum to its own irradiance; ``probe_weights`` says what it counts at a point.
+
 Near emitters. A sample carries the distance at which its light starts; infinity for an environment. An emitter at a
 known distance is thereby an emitter at its place: see ``sample_toward``.
 
@@ -45,6 +50,8 @@ EMITTER_COSINE = wp.constant(wp.float32(math.cos(math.radians(12.0))))
 """Cosine of the largest angle between an emitter's direction and light that belongs to it."""
 MIN_EMITTER_DISTANCE = wp.constant(wp.float32(0.05))
 """Metres from the ball within which no emitter is taken to be."""
+ONE_BALL = 0, 1
+"""Turn of the only ball: all samples are of its environment."""
 # Typed: literals above 2^31 in a kernel make the compiler warn.
 TOP_BIT = wp.constant(wp.uint32(0x80000000))
 
@@ -92,6 +99,27 @@ def sample_toward(sample: EnvironmentSample, point: wp.vec3) -> Incidence:
         result.distance = distance
         result.measure = sample.measure * sample.distance * sample.distance / (distance * distance)
     return result
+
+
+@wp.func
+def slots_of(balls: wp.int32) -> wp.int32:
+    """Samples after which it is the first ball's turn again."""
+    slots = wp.int32(1)
+    while slots < balls:
+        slots *= 2
+    return slots
+
+
+@wp.func
+def ball_of_sample(index: wp.int32, balls: wp.int32) -> wp.int32:
+    """Whose environment a sample is of."""
+    return (index % slots_of(balls)) % balls
+
+
+@wp.func
+def turns_of(ball: wp.int32, balls: wp.int32) -> wp.int32:
+    """Samples of ``slots_of`` that are a ball's."""
+    return 1 + (slots_of(balls) - 1 - ball) / balls
 
 
 @wp.func
@@ -199,22 +227,28 @@ def draw_samples_kernel(
     cumulative: wp.array2d[wp.float32],
     rows: wp.array[wp.vec2],
     origin: wp.vec3,
-    count: wp.int32,
+    turn: wp.vec2i,
     # Out:
     directions_out: wp.array[wp.vec3],
     flux_out: wp.array[wp.vec3],
     samples_out: wp.array[EnvironmentSample],
 ):
-    """Invert the cumulative sums of the mixture for one point."""
+    """Invert the cumulative sums of the mixture for one point, if it is this ball's turn."""
     index = wp.tid() + row_start
+    if ball_of_sample(index, turn[1]) != turn[0]:
+        return
+    slots = slots_of(turn[1])
+    turns = turns_of(turn[0], turn[1])
+    count = samples_out.shape[0] / slots * turns
+    number = wp.uint32(index / slots * turns + index % slots / turn[1])
     height = environment.shape[0]
     width = environment.shape[1]
     total = rows[height - 1]
     # Each kind of density gives half; a black environment gives all to the weight alone.
     bright_share = wp.where(total[0] > 0.0, 0.5 / wp.max(total[0], 1.0e-37), 0.0)
     even_share = wp.where(total[0] > 0.0, 0.5, 1.0) / total[1]
-    u = radical_inverse(wp.uint32(index)) + 0.5 / wp.float32(count)
-    v = wp.min(sobol_second(wp.uint32(index)) + 0.5 / wp.float32(count), BELOW_ONE)
+    u = radical_inverse(number) + 0.5 / wp.float32(count)
+    v = wp.min(sobol_second(number) + 0.5 / wp.float32(count), BELOW_ONE)
 
     low = wp.int32(0)
     high = wp.int32(height - 1)
@@ -273,12 +307,13 @@ def list_texels_kernel(
     row_start: wp.int32,
     environment: wp.array2d[wp.vec3],
     origin: wp.vec3,
+    turn: wp.vec2i,
     # Out:
     directions_out: wp.array[wp.vec3],
     flux_out: wp.array[wp.vec3],
     samples_out: wp.array[EnvironmentSample],
 ):
-    """Every texel of a map as a sample at its centre."""
+    """Every texel of a map as a sample at its centre, as often as it is this ball's turn."""
     i, j = wp.tid()
     i += row_start
     height = environment.shape[0]
@@ -291,12 +326,15 @@ def list_texels_kernel(
     sample = EnvironmentSample()
     sample.direction = wp.vec3(sine * wp.cos(phi), sine * wp.sin(phi), z)
     sample.radiance = safe_radiance(environment[i, j])
-    sample.measure = (top - bottom) * 2.0 * PI / wp.float32(width)
+    slots = slots_of(turn[1])
+    sample.measure = (top - bottom) * 2.0 * PI / wp.float32(width * turns_of(turn[0], turn[1]))
     sample.distance = FAR_AWAY
     sample.origin = origin
-    directions_out[i * width + j] = sample.direction
-    flux_out[i * width + j] = sample.measure * sample.radiance
-    samples_out[i * width + j] = sample
+    for slot in range(turn[0], slots, turn[1]):
+        index = (i * width + j) * slots + slot
+        directions_out[index] = sample.direction
+        flux_out[index] = sample.measure * sample.radiance
+        samples_out[index] = sample
 
 
 @wp.kernel(enable_backward=False)
@@ -304,11 +342,14 @@ def place_emitters_kernel(
     # In:
     row_start: wp.int32,
     emitters: wp.array[Emitter],
+    turn: wp.vec2i,
     # Out:
     samples_out: wp.array[EnvironmentSample],
 ):
     """Give the samples that show an emitter the distance of the emitter that they are nearest to."""
     index = wp.tid() + row_start
+    if ball_of_sample(index, turn[1]) != turn[0]:
+        return
     sample = samples_out[index]
     if wp.max(sample.radiance) < 1.0:
         return
@@ -323,7 +364,11 @@ def place_emitters_kernel(
 
 
 def place_emitters(
-    emitters: wp.array[Emitter], samples_out: wp.array[EnvironmentSample], *, rows: Rows | None = None
+    emitters: wp.array[Emitter],
+    samples_out: wp.array[EnvironmentSample],
+    *,
+    turn: tuple[int, int] = ONE_BALL,
+    rows: Rows | None = None,
 ) -> None:
     """Turn the samples of near emitters from directions into places.
 
@@ -332,10 +377,12 @@ def place_emitters(
     Args:
         emitters: (k,) emitters; those without direction are none, those at infinity stay directions.
         samples_out: (n,) samples, drawn from an environment captured where the emitters' distances are from.
+        turn: As for ``draw_samples``.
         rows: Range of samples; None means all.
     """
     device = samples_out.device
-    launch_rows(place_emitters_kernel, samples_out.shape, [emitters], [samples_out], rows=rows, device=device)
+    given = [emitters, wp.vec2i(*turn)]
+    launch_rows(place_emitters_kernel, samples_out.shape, given, [samples_out], rows=rows, device=device)
 
 
 def sum_environment(
@@ -372,6 +419,7 @@ def draw_samples(
     flux_out: wp.array[wp.vec3],
     samples_out: wp.array[EnvironmentSample],
     *,
+    turn: tuple[int, int] = ONE_BALL,
     rows: Rows | None = None,
 ) -> None:
     """Draw as many samples as ``samples_out`` holds, the same for the same environment.
@@ -384,12 +432,13 @@ def draw_samples(
         directions_out: (n,) unit directions of the samples, by themselves for culling.
         flux_out: (n,) their radiance times solid angle, likewise.
         samples_out: (n,), n a power of two.
+        turn: Number of the ball that the environment is of, and how many balls share the samples.
         rows: Range of samples; None means all.
     """
     launch_rows(
         draw_samples_kernel,
         samples_out.shape,
-        [environment, cumulative, rows_sums, origin, samples_out.shape[0]],
+        [environment, cumulative, rows_sums, origin, wp.vec2i(*turn)],
         [directions_out, flux_out, samples_out],
         rows=rows,
         device=environment.device,
@@ -403,6 +452,7 @@ def list_texels(
     flux_out: wp.array[wp.vec3],
     samples_out: wp.array[EnvironmentSample],
     *,
+    turn: tuple[int, int] = ONE_BALL,
     rows: Rows | None = None,
 ) -> None:
     """Write every texel of a map as a sample: the reference.
@@ -410,15 +460,16 @@ def list_texels(
     Args:
         environment: (h, w) radiance.
         origin: Where the environment was captured, world.
-        directions_out: (h * w,) directions of the samples.
-        flux_out: (h * w,) their radiance times solid angle.
-        samples_out: (h * w,).
+        directions_out: (h * w * slots,) directions of the samples.
+        flux_out: As many, their radiance times solid angle.
+        samples_out: As many.
+        turn: As for ``draw_samples``.
         rows: Band of the map's rows; None means all.
     """
     launch_rows(
         list_texels_kernel,
         environment.shape,
-        [environment, origin],
+        [environment, origin, wp.vec2i(*turn)],
         [directions_out, flux_out, samples_out],
         rows=rows,
         device=environment.device,

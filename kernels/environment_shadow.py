@@ -117,7 +117,7 @@ def make_meet_objects(config: EnvironmentShadowConfig) -> wp.Function:
             if wp.static(traced):
                 seed = pcg3d_hash(key[0], key[1], key[2])
             elif out.before.up == wp.vec3(0.0, 0.0, 0.0):
-                out.before = look_before(distant, hit.geometric_normal, ray.direction)
+                out.before = look_before(distant, hit.point, hit.geometric_normal, ray.direction)
             out.reflected = reflect_back(params[0], picture, scene, distant, meeting, out.before, seed, out.reflected)
         return out
 
@@ -130,7 +130,11 @@ def make_environment_shadow_kernel(config: EnvironmentShadowConfig) -> wp.Kernel
     side = config.side
     chunk = min(config.count, CHUNK)
     mask_objects, mask_physical = make_masks(config, chunk)
-    see_cell, aim, find_sender = make_see_cell(config), make_aim(config.emitters), make_find_sender(config)
+    see_cell, aim, find_sender = (
+        make_see_cell(config),
+        make_aim(config.emitters, config.distant.several),
+        make_find_sender(config),
+    )
     meet_objects = make_meet_objects(config)
     secondary_count = config.secondary_count
     all_ask = secondary_count == config.count
@@ -177,7 +181,7 @@ def make_environment_shadow_kernel(config: EnvironmentShadowConfig) -> wp.Kernel
             bit = wp.uint64(1)
             size = wp.int32(wp.static(chunk))  # a variable: unrolled, the kernel would hold its rays many times over
             for k in range(size):
-                ray = aim(sets, at + k, hit)
+                ray = aim(sets, distant.others.places, at + k, hit)
                 if ray.cosine > 0.0:
                     if (met & bit) == wp.uint64(0):
                         sums.without += ray.cosine * ray.grown * sets.flux[at + k]

@@ -19,13 +19,12 @@ h) leave it as it is, black ones give 1 - h, and where nothing but the ground is
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 
 import warp as wp
 
-from warp_ar.kernels.irradiance import sh_irradiance
-from warp_ar.kernels.latlong import sample_latlong
-from warp_ar.kernels.lobes import level_from_alpha, sample_levels
+from warp_ar.kernels.lobes import level_from_alpha
 from warp_ar.kernels.materials import Surface, lobe_axis, make_surface, reflect
 from warp_ar.kernels.reflect import (
     RAY_SPREAD,
@@ -34,8 +33,10 @@ from warp_ar.kernels.reflect import (
     knows_irradiance,
     knows_levels,
     look_up,
+    make_captured_along,
     make_distant_irradiance,
     make_find_in_frame,
+    make_radiance_along,
     make_reflected_radiance,
     make_shade_unoccluded,
 )
@@ -88,21 +89,23 @@ class Sent:
 
 @functools.cache
 def make_look_wide(config: DistantLightConfig) -> wp.Function:
-    """``look_wide(environment, direction) -> vec3``: the environment around a direction, as few rays carry it."""
+    """``look_wide(environment, point, direction) -> vec3``: the environment around a direction, as few rays carry it.
+
+    Emitters are where the balls saw them.
+    """
+    unplaced = dataclasses.replace(config, emitters=False)
+    distant_irradiance, radiance_along = make_distant_irradiance(unplaced), make_radiance_along(unplaced)
 
     @wp.func(module="unique")
-    def look_wide(distant: DistantLight, direction: wp.vec3) -> wp.vec3:
+    def look_wide(distant: DistantLight, point: wp.vec3, direction: wp.vec3) -> wp.vec3:
         radiance = wp.vec3(0.0)
         if wp.static(config.diffuse != "none"):
             if knows_irradiance(distant) and not knows_levels(distant):
-                if wp.static(config.diffuse == "sh"):
-                    radiance = sh_irradiance(distant.irradiance_sh, direction) / wp.pi
-                if wp.static(config.diffuse == "map"):
-                    radiance = sample_latlong(distant.irradiance_map, direction) / wp.pi
+                radiance = distant_irradiance(distant, point, direction) / wp.pi
         if wp.static(config.specular):
             if knows_levels(distant):
                 level = level_from_alpha(CAUSTIC_ALPHA, distant.level_height)
-                radiance = sample_levels(distant.levels, direction, level, distant.level_height)
+                radiance = radiance_along(distant, point, direction, level)
         return radiance
 
     return look_wide
@@ -219,7 +222,7 @@ def make_bounced(config: DistantLightConfig) -> wp.Function:
     find_in_frame = make_find_in_frame(config.trace, config.probes)
     shade_unoccluded = make_shade_unoccluded(config)
     reflected_radiance = make_reflected_radiance(config)
-    distant_irradiance = make_distant_irradiance(config)
+    distant_irradiance, captured_along = make_distant_irradiance(config), make_captured_along(config)
 
     @wp.func(module="unique")
     def bounced(
@@ -263,7 +266,7 @@ def make_bounced(config: DistantLightConfig) -> wp.Function:
             if at[0] >= 0.0:  # noqa: SIM108  (a conditional expression computes both)
                 received = look_up(picture, at[0], at[1])
             else:
-                received = sample_latlong(distant.environment, wi)
+                received = captured_along(distant, proxy.point, wi)
             if lobe.is_rough:
                 if wp.static(config.diffuse != "none"):  # what is rough here has an irradiance
                     received = distant_irradiance(distant, hit.point, normal) / wp.pi
@@ -297,25 +300,22 @@ class Before:
 
 @functools.cache
 def make_look_before(config: DistantLightConfig) -> wp.Function:
-    """``look_before(environment, normal, direction) -> Before``: of a surface that ``direction`` leaves."""
+    """``look_before(environment, point, normal, direction) -> Before``: of a surface that ``direction`` leaves."""
     look_wide = make_look_wide(config)
+    distant_irradiance = make_distant_irradiance(dataclasses.replace(config, emitters=False))
 
     @wp.func(module="unique")
-    def look_before(distant: DistantLight, normal: wp.vec3, direction: wp.vec3) -> Before:
+    def look_before(distant: DistantLight, point: wp.vec3, normal: wp.vec3, direction: wp.vec3) -> Before:
         before = Before()
         before.up = normal
         if wp.dot(normal, direction) < 0.0:
             before.up = -normal
-        before.brightest = MAX_BRIGHTNESS * wp.max(look_wide(distant, before.up))
+        before.brightest = MAX_BRIGHTNESS * wp.max(look_wide(distant, point, before.up))
         if wp.static(config.diffuse != "none"):
             if knows_irradiance(distant):
-                if wp.static(config.diffuse == "sh"):
-                    before.from_receiver = sh_irradiance(distant.irradiance_sh, -before.up)
-                    before.brightest = MAX_BRIGHTNESS * wp.max(sh_irradiance(distant.irradiance_sh, before.up)) / wp.pi
-                if wp.static(config.diffuse == "map"):
-                    before.from_receiver = sample_latlong(distant.irradiance_map, -before.up)
-                    upward = sample_latlong(distant.irradiance_map, before.up)
-                    before.brightest = MAX_BRIGHTNESS * wp.max(upward) / wp.pi
+                before.from_receiver = distant_irradiance(distant, point, -before.up)
+                upward = distant_irradiance(distant, point, before.up)
+                before.brightest = MAX_BRIGHTNESS * wp.max(upward) / wp.pi
         return before
 
     return look_before

@@ -14,11 +14,12 @@ import functools
 import warp as wp
 
 from warp_ar.kernels.cells import cell_pixel
-from warp_ar.kernels.environment_samples import SampleSets, sample_toward
+from warp_ar.kernels.environment_samples import SampleSets, ball_of_sample, sample_toward
 from warp_ar.kernels.environment_shadow_bounce import bounding_radius, make_look_wide
 from warp_ar.kernels.environment_shadow_cells import EnvironmentShadowConfig, can_matter
 from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.kernels.materials import reflect
+from warp_ar.kernels.probe_weights import probe_share
 from warp_ar.kernels.reflect import DistantLight, look_up, make_find_in_frame
 from warp_ar.kernels.shapes import FAR, intersect_sphere
 from warp_ar.kernels.structs import BOX, PLANE, FrameParams, Hit, Picture, Probe, RayScene
@@ -152,17 +153,20 @@ class SampleRay:
     origin: wp.vec3  # set where the ray is traced
     direction: wp.vec3
     distance: wp.float32  # of the sample, metres
-    grown: wp.float32  # the sample's measure as the point sees it, over that from the ball
+    grown: wp.float32  # the sample's measure as the point sees it, over that from the ball, and what the ball counts
     cosine: wp.float32  # at the receiver; the point sees the sample if it is above 0
     weight: wp.float32  # of radiance along it; set where the ray is traced
 
 
 @functools.cache
-def make_aim(emitters: bool) -> wp.Function:
-    """``aim(sets, index, hit) -> SampleRay``: less what is set where it is traced."""
+def make_aim(emitters: bool, several: bool = False) -> wp.Function:
+    """``aim(sets, places, index, hit) -> SampleRay``: less what is set where it is traced.
+
+    ``places`` are those of the balls, if ``several``.
+    """
 
     @wp.func(module="unique")
-    def aim(sets: SampleSets, index: wp.int32, hit: Hit) -> SampleRay:
+    def aim(sets: SampleSets, places: wp.array[wp.vec4], index: wp.int32, hit: Hit) -> SampleRay:
         ray = SampleRay()
         ray.direction = sets.directions[index]
         ray.distance = FAR
@@ -172,6 +176,8 @@ def make_aim(emitters: bool) -> wp.Function:
             ray.direction = toward.direction
             ray.distance = toward.distance
             ray.grown = toward.measure / sets.samples[index].measure
+        if wp.static(several):
+            ray.grown *= probe_share(places, ball_of_sample(index, places.shape[0]), hit.point)
         ray.cosine = wp.min(wp.dot(hit.normal, ray.direction), wp.dot(hit.geometric_normal, ray.direction))
         return ray
 
@@ -251,7 +257,16 @@ def make_find_sender(config: EnvironmentShadowConfig) -> wp.Function:
                     sender.radiance = look_up(picture, at[0], at[1])
                 else:
                     # Where the ball saw it; an emitter right beside it is not its light.
-                    from_ball = sample_latlong(distant.environment, proxy.point - sets.samples[index].origin)
+                    toward = proxy.point - sets.samples[index].origin
+                    from_ball = wp.vec3(0.0)
+                    if wp.static(config.distant.several):
+                        ball = ball_of_sample(index, distant.others.places.shape[0])
+                        if ball == 0:
+                            from_ball = sample_latlong(distant.environment, toward)
+                        else:
+                            from_ball = sample_latlong(distant.others.environment[ball - 1], toward)
+                    else:
+                        from_ball = sample_latlong(distant.environment, toward)
                     sender.radiance = wp.min(from_ball, wp.vec3(1.0, 1.0, 1.0))
         if wp.static(config.distant.probes):
             if by_ball:
@@ -262,7 +277,7 @@ def make_find_sender(config: EnvironmentShadowConfig) -> wp.Function:
                         sender.distance = t
                         normal = (ray.origin + t * ray.direction - probe.center) / probe.radius
                         wi = reflect(-ray.direction, normal)
-                        sender.radiance = wp.cw_mul(probe.reflectance, look_wide(distant, wi))
+                        sender.radiance = wp.cw_mul(probe.reflectance, look_wide(distant, probe.center, wi))
         return sender
 
     return find_sender

@@ -69,7 +69,7 @@ def make_find_occluded_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
     secondary_count = config.secondary_count
     side = config.side
     mask_objects, mask_physical = make_masks(config, size)
-    aim, reach, see_cell = make_aim(config.emitters), make_reach(config), make_see_cell(config)
+    aim, reach, see_cell = make_aim(config.emitters, config.distant.several), make_reach(config), make_see_cell(config)
     occluded_by_objects = make_trace(config.distant.trace).occluded_by_objects
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
@@ -106,7 +106,7 @@ def make_find_occluded_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
                     bit = wp.uint64(1) << wp.uint64(k - begin)
                     if (virtual_mask & bit) == wp.uint64(0):
                         continue
-                    ray = aim(sets, at + k - begin, hit)
+                    ray = aim(sets, distant.others.places, at + k - begin, hit)
                     if ray.cosine <= 0.0:
                         continue
                     ray.origin = offset_origin(hit.point, hit.geometric_normal, ray.direction, hit.error)
@@ -147,7 +147,7 @@ def make_sum_light_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
     side = config.side
     _, mask_physical = make_masks(config, size)
     visible_proxy = make_visible_proxy(config.distant.trace, config.distant.probes)
-    aim, find_sender = make_aim(config.emitters), make_find_sender(config)
+    aim, find_sender = make_aim(config.emitters, config.distant.several), make_find_sender(config)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def sum_light_kernel(
@@ -178,7 +178,7 @@ def make_sum_light_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
         hidden = wp.vec3(0.0)
         for k in range(at, at + size):
             bit = wp.uint64(1) << wp.uint64(k - at)
-            ray = aim(sets, k, hit)
+            ray = aim(sets, distant.others.places, k, hit)
             if ray.cosine > 0.0:
                 light = ray.cosine * ray.grown * sets.flux[k]
                 if (met & bit) != wp.uint64(0):
@@ -201,7 +201,7 @@ def make_trace_secondary_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
     """Kernel of the third pass: what objects send along the queued rays."""
     secondary_count = config.secondary_count
     side = config.side
-    aim = make_aim(config.emitters)
+    aim = make_aim(config.emitters, config.distant.several)
     closest_object = make_trace(config.distant.trace).closest_object
     visible_proxy = make_visible_proxy(config.distant.trace, config.distant.probes)
     traced = config.bounce == "traced"
@@ -232,7 +232,7 @@ def make_trace_secondary_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
             row = cell_pixel(i, stride, rays.shape[0])
             column = cell_pixel(j, stride, rays.shape[1])
             hit = visible_proxy(params[0], rays[row, column], scene, distant.probes)
-            ray = aim(sets, index, hit)
+            ray = aim(sets, distant.others.places, index, hit)
             ray.origin = offset_origin(hit.point, hit.geometric_normal, ray.direction, hit.error)
             reflected = ReflectedLight()
             # What is nearer than all that is physical is nearest.
@@ -246,7 +246,7 @@ def make_trace_secondary_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
                 if wp.static(traced):
                     seed = pcg3d_hash(wp.uint32(index), wp.uint32(row), wp.uint32(column))
                 else:
-                    before = look_before(distant, hit.geometric_normal, ray.direction)
+                    before = look_before(distant, hit.point, hit.geometric_normal, ray.direction)
                 reflected = reflect_back(params[0], picture, scene, distant, meeting, before, seed, reflected)
             wave_out.reflected[0, place] = reflected.sent
             if wp.static(not traced):

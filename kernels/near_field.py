@@ -137,7 +137,7 @@ def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
         transmitted = wp.vec4(0.0)
         leaving = float(0.0)  # rays; those into the surface are part of its reflectance
         for n in range(diffuse + rays[1]):
-            ray = pick_ray(params, scene, samples, at, n, diffuse)
+            ray = pick_ray(params, scene, samples, distant.others.places, at, n, diffuse)
             near = wp.vec4(0.0)
             if ray.leaves:
                 near = look_near(

@@ -20,9 +20,10 @@ import math
 
 import warp as wp
 
-from warp_ar.kernels.environment_samples import EnvironmentSample, sample_toward, sobol_second
+from warp_ar.kernels.environment_samples import EnvironmentSample, ball_of_sample, sample_toward, sobol_second
 from warp_ar.kernels.lobes import level_from_alpha
 from warp_ar.kernels.materials import Surface, make_surface, reflect
+from warp_ar.kernels.probe_weights import probe_share
 from warp_ar.kernels.reflect import (
     RAY_SPREAD,
     DistantLight,
@@ -287,9 +288,10 @@ def make_mirror_ray(config: NearFieldConfig) -> wp.Function:
 
 @functools.cache
 def make_pick_ray(config: NearFieldConfig) -> wp.Function:
-    """``pick_ray(params, scene, samples, at, n, diffuse) -> NearRay``: ray number ``n`` of a pixel.
+    """``pick_ray(params, scene, samples, places, at, n, diffuse) -> NearRay``: ray number ``n`` of a pixel.
 
-    The first ``diffuse`` go toward samples of the environment, the others into the lobe.
+    The first ``diffuse`` go toward samples of the environment, of several balls at ``places``, the others into the
+    lobe.
     """
     mirror_ray = make_mirror_ray(config) if config.mirror_samples > 0 else None
     side, lobes = config.side, config.lobe_count
@@ -300,6 +302,7 @@ def make_pick_ray(config: NearFieldConfig) -> wp.Function:
         params: wp.array[FrameParams],
         scene: RayScene,
         samples: wp.array[EnvironmentSample],
+        places: wp.array[wp.vec4],
         at: SeenPoint,
         n: wp.int32,
         diffuse: wp.int32,
@@ -311,7 +314,10 @@ def make_pick_ray(config: NearFieldConfig) -> wp.Function:
                 # it is a smaller set.
                 stride = samples.shape[0] / wp.static(side * side)
                 share = wp.float32(stride * side * side) / wp.static(float(config.count))
-                ray = make_sample_ray(samples[at.place * stride + n], at, share)
+                chosen = at.place * stride + n
+                if wp.static(config.distant.several):
+                    share *= probe_share(places, ball_of_sample(chosen, places.shape[0]), at.hit.point)
+                ray = make_sample_ray(samples[chosen], at, share)
         if wp.static(config.distant.specular):
             if n >= diffuse:
                 k = n - diffuse

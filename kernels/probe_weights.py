@@ -61,6 +61,17 @@ def probe_weight(places: wp.array[wp.vec4], ball: wp.int32, point: wp.vec3) -> w
     return place[3] * least
 
 
+@wp.func
+def probe_share(places: wp.array[wp.vec4], ball: wp.int32, point: wp.vec3) -> wp.float32:
+    """Weight of a ball at a point, of all balls' together; the first one's where none was ever seen."""
+    total = float(0.0)
+    for index in range(places.shape[0]):
+        total += probe_weight(places, index, point)
+    if total <= 0.0:
+        return wp.where(ball == 0, 1.0, 0.0)
+    return probe_weight(places, ball, point) / total
+
+
 @wp.kernel(enable_backward=False)
 def measure_seen_kernel(
     # In:

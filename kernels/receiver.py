@@ -36,9 +36,7 @@ import warp as wp
 
 from warp_ar.kernels.cells import look_up_cells
 from warp_ar.kernels.color import luminance
-from warp_ar.kernels.emitters import add_emitters
-from warp_ar.kernels.irradiance import sh_irradiance
-from warp_ar.kernels.latlong import sample_latlong
+from warp_ar.kernels.interpolated_irradiance import OtherBalls, make_irradiance_at
 from warp_ar.kernels.pixels import cut_luma, shown_radiance
 from warp_ar.kernels.shapes import surface_key
 from warp_ar.kernels.structs import Emitter, Hit, KeyLight, Picture, Probe, RayScene
@@ -109,6 +107,8 @@ class RelightConfig:
     """Whether light that lit proxies send to each other is known."""
     edge_samples: int = 1
     """Samples per pixel along the edges of shadows and of proxies: a square number; 1 leaves edges hard."""
+    several: bool = False
+    """Whether the light of several mirror balls is interpolated."""
     area_samples: int = 0
     """Samples of what emits, per point; ``area_lights.POINT_SAMPLES``: as lights at points; 0: nothing emits."""
 
@@ -242,6 +242,7 @@ class Receiver:
     irradiance_sh: wp.array[wp.vec3]
     irradiance_map: wp.array2d[wp.vec3]
     emitters: wp.array[Emitter]
+    others: OtherBalls
     cells: ReceiverCells
 
 
@@ -277,6 +278,7 @@ class Matter:
 def make_find_matter(config: RelightConfig) -> wp.Function:
     """``find_matter(scene, receiver, hit, row, col, mirror) -> Matter``; arguments as those of ``direct_lighting``."""
     method, reading = config.method, READINGS.get(config.method)
+    irradiance_at = make_irradiance_at(config.irradiance, config.emitters, config.several)
 
     @wp.func(module="unique")
     def find_matter(
@@ -312,12 +314,14 @@ def make_find_matter(config: RelightConfig) -> wp.Function:
                 hue = radiance + wp.vec3(_HUE_FLOOR, _HUE_FLOOR, _HUE_FLOOR)
                 matter.kd = wp.min(around / luminance(hue) * hue, wp.vec3(1.0, 1.0, 1.0))
             else:
-                if wp.static(config.irradiance == "sh"):
-                    distant = sh_irradiance(receiver.irradiance_sh, hit.normal)
-                else:
-                    distant = sample_latlong(receiver.irradiance_map, hit.normal)
-                if wp.static(config.emitters):
-                    distant = add_emitters(distant, receiver.emitters, hit.point, hit.normal)
+                distant = irradiance_at(
+                    receiver.irradiance_sh,
+                    receiver.irradiance_map,
+                    receiver.emitters,
+                    receiver.others,
+                    hit.point,
+                    hit.normal,
+                )
                 if wp.static(config.ambient_visibility):
                     if not is_mirrored:
                         left = look_up_ambient(scene, receiver, hit, row, col)
@@ -377,6 +381,7 @@ def make_receiver(
     key_lights: wp.array | None = None,
     irradiance: wp.array | None = None,
     emitters: wp.array | None = None,
+    others: OtherBalls | None = None,
     cells: ReceiverCells | None = None,
 ) -> Receiver:
     """What kernels read of the receiver; what the method leaves out may be None.
@@ -391,13 +396,14 @@ def make_receiver(
         irradiance: Irradiance of the environment, nine coefficients or a latlong map as ``config.irradiance`` says;
             needed by ``reflectance``.
         emitters: (q,) Emitter, seen from the first probe; needed if ``config.emitters``.
+        others: The balls after the first; needed if ``config.several``.
         cells: From ``receiver_cells``; needed if ``config.ambient_visibility`` or ``config.bounced``.
     """
     receiver = Receiver()
     receiver.picture, receiver.box = picture, surroundings_size(picture.rays.shape[0])
     form = f"irradiance_{config.irradiance}"
     optional = {"table": table, "cut_table": cut_table, "probes": probes, "key_lights": key_lights, form: irradiance}
-    for name, value in {**optional, "emitters": emitters, "cells": cells}.items():
+    for name, value in {**optional, "emitters": emitters, "others": others, "cells": cells}.items():
         if value is not None:
             setattr(receiver, name, value)
     return receiver

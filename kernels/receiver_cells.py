@@ -33,10 +33,10 @@ import functools
 import warp as wp
 
 from warp_ar.kernels.cells import cell_pixel
-from warp_ar.kernels.environment_samples import EnvironmentSample, Incidence, sample_toward
-from warp_ar.kernels.irradiance import sh_irradiance
-from warp_ar.kernels.latlong import sample_latlong
+from warp_ar.kernels.environment_samples import EnvironmentSample, Incidence, ball_of_sample, sample_toward
+from warp_ar.kernels.interpolated_irradiance import make_irradiance_at
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch, launch_rows
+from warp_ar.kernels.probe_weights import probe_share
 from warp_ar.kernels.receiver import DEFAULT_REFLECTANCE, Receiver, ReceiverCells, RelightConfig, look_up_bounced
 from warp_ar.kernels.relight import make_direct_lighting
 from warp_ar.kernels.shadow import sample_light, tile_turn
@@ -120,15 +120,18 @@ def in_lit_cells(cell_row: wp.int32, cell_col: wp.int32, stride: wp.int32, rect:
 
 @functools.cache
 def make_mean_facing(config: CellConfig) -> wp.Function:
-    """``mean_facing(receiver, normal) -> vec3``: mean radiance, by the cosine, of the environment before a surface."""
-    form = config.relight.irradiance
+    """``mean_facing(receiver, point, normal) -> vec3``: mean radiance, by the cosine, of what lies before a surface.
+
+    Of the environment, emitters where the balls saw them.
+    """
+    irradiance_at = make_irradiance_at(config.relight.irradiance, False, config.relight.several)
 
     @wp.func(module="unique")
-    def mean_facing(receiver: Receiver, normal: wp.vec3) -> wp.vec3:
-        if wp.static(form == "sh"):
-            mean = sh_irradiance(receiver.irradiance_sh, normal) / wp.pi
-        else:
-            mean = sample_latlong(receiver.irradiance_map, normal) / wp.pi
+    def mean_facing(receiver: Receiver, point: wp.vec3, normal: wp.vec3) -> wp.vec3:
+        received = irradiance_at(
+            receiver.irradiance_sh, receiver.irradiance_map, receiver.emitters, receiver.others, point, normal
+        )
+        mean = received / wp.pi
         # A series may ring below zero, which no light does.
         return wp.max(mean, wp.vec3(0.0, 0.0, 0.0))
 
@@ -181,7 +184,7 @@ def make_find_hider(config: CellConfig) -> wp.Function:
                     nearest = t
                     found.hides = True
                     normal = (t * toward.direction - away) / probe.radius
-                    found.radiance = wp.cw_mul(probe.reflectance, mean_facing(receiver, normal))
+                    found.radiance = wp.cw_mul(probe.reflectance, mean_facing(receiver, probe.center, normal))
         if wp.static(not only_planes):
             # Most samples pass by the ball around all proxies.
             if meets_ball(wp.vec3(solids[0], solids[1], solids[2]) - hit.point, solids[3], toward.direction):
@@ -193,7 +196,7 @@ def make_find_hider(config: CellConfig) -> wp.Function:
                         if wp.dot(facing, toward.direction) > 0.0:
                             facing = -facing
                         found.hides = True
-                        found.radiance = DEFAULT_REFLECTANCE * mean_facing(receiver, facing)
+                        found.radiance = DEFAULT_REFLECTANCE * mean_facing(receiver, hidden.point, facing)
         return found
 
     return find_hider
@@ -271,6 +274,9 @@ def make_ambient_visibility_kernel(config: CellConfig) -> wp.Kernel:
             toward = sample_toward(sample, hit.point)
             cosine = wp.dot(hit.normal, toward.direction)
             if cosine > 0.0:
+                if wp.static(config.relight.several):
+                    places = receiver.others.places
+                    toward.measure *= probe_share(places, ball_of_sample(k, places.shape[0]), hit.point)
                 flux = cosine * toward.measure * sample.radiance
                 whole += flux
                 hider = find_hider(scene, receiver, hit, toward, solids)
@@ -416,7 +422,7 @@ def make_gather_light_kernel(config: CellConfig) -> wp.Kernel:
                 if here > 0.0 and there > 0.0:
                     squared = wp.dot(way, way)
                     total += here * there / (squared * (squared + patch.area / wp.pi)) * patch.flux
-        distant = wp.pi * mean_facing(receiver, hit.normal)
+        distant = wp.pi * mean_facing(receiver, hit.point, hit.normal)
         matters = bool(False)
         for channel in range(3):
             if total[channel] > NEGLIGIBLE * distant[channel]:

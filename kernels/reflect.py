@@ -17,8 +17,8 @@ from typing import Literal
 import warp as wp
 
 from warp_ar.kernels.camera import project
-from warp_ar.kernels.emitters import add_emitters, correct_parallax
-from warp_ar.kernels.irradiance import sh_irradiance
+from warp_ar.kernels.emitters import correct_parallax
+from warp_ar.kernels.interpolated_irradiance import OtherBalls, make_irradiance_at
 from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.kernels.lobes import level_from_roughness, level_from_shininess, sample_levels
 from warp_ar.kernels.materials import lobe_axis, make_surface, reflect, specular_occlusion
@@ -99,12 +99,7 @@ class DistantLight:
     dfg: wp.array2d[wp.vec2]  # of ``integrate_dfg``, for METALLIC_ROUGHNESS
     probes: wp.array[Probe]
     emitters: wp.array[Emitter]
-    # The light at the balls after the first, one of each after another; places are those of all.
-    places: wp.array[wp.vec4]
-    others_sh: wp.array2d[wp.vec3]
-    others_map: wp.array3d[wp.vec3]
-    others_levels: wp.array2d[wp.vec3]
-    others_emitters: wp.array2d[Emitter]
+    others: OtherBalls
 
 
 @wp.func
@@ -214,32 +209,22 @@ def make_shade_unoccluded(config: DistantLightConfig) -> wp.Function:
 @functools.cache
 def make_distant_irradiance(config: DistantLightConfig) -> wp.Function:
     """``distant_irradiance(distant, point, normal) -> vec3``: under the environment; 0 if none is known."""
+    form: Literal["sh", "map"] = "sh" if config.diffuse == "sh" else "map"
+    irradiance_at = make_irradiance_at(form, config.emitters, config.several)
 
     @wp.func(module="unique")
     def distant_irradiance(distant: DistantLight, point: wp.vec3, normal: wp.vec3) -> wp.vec3:
         irradiance = wp.vec3(0.0)
         if wp.static(config.diffuse != "none"):
             if knows_irradiance(distant):
-                if wp.static(config.diffuse == "sh"):
-                    irradiance = sh_irradiance(distant.irradiance_sh, normal)
-                if wp.static(config.diffuse == "map"):
-                    irradiance = sample_latlong(distant.irradiance_map, normal)
-                if wp.static(config.emitters):
-                    irradiance = add_emitters(irradiance, distant.emitters, point, normal)
-                if wp.static(config.several):
-                    total = probe_weight(distant.places, 0, point)
-                    for ball in range(1, distant.places.shape[0]):
-                        weight = probe_weight(distant.places, ball, point)
-                        if weight > 0.0:
-                            total += weight
-                            other = wp.vec3(0.0)
-                            if wp.static(config.diffuse == "sh"):
-                                other = sh_irradiance(distant.others_sh[ball - 1], normal)
-                            if wp.static(config.diffuse == "map"):
-                                other = sample_latlong(distant.others_map[ball - 1], normal)
-                            if wp.static(config.emitters):
-                                other = add_emitters(other, distant.others_emitters[ball - 1], point, normal)
-                            irradiance += (weight / total) * (other - irradiance)
+                irradiance = irradiance_at(
+                    distant.irradiance_sh,
+                    distant.irradiance_map,
+                    distant.emitters,
+                    distant.others,
+                    point,
+                    normal,
+                )
         return irradiance
 
     return distant_irradiance
@@ -256,19 +241,40 @@ def make_radiance_along(config: DistantLightConfig) -> wp.Function:
             toward = correct_parallax(distant.emitters, point, direction)
         radiance = sample_levels(distant.levels, toward, level, distant.level_height)
         if wp.static(config.several):
-            total = probe_weight(distant.places, 0, point)
-            for ball in range(1, distant.places.shape[0]):
-                weight = probe_weight(distant.places, ball, point)
+            balls = distant.others
+            total = probe_weight(balls.places, 0, point)
+            for ball in range(1, balls.places.shape[0]):
+                weight = probe_weight(balls.places, ball, point)
                 if weight > 0.0:
                     total += weight
                     toward = direction
                     if wp.static(config.emitters):
-                        toward = correct_parallax(distant.others_emitters[ball - 1], point, direction)
-                    other = sample_levels(distant.others_levels[ball - 1], toward, level, distant.level_height)
+                        toward = correct_parallax(balls.emitters[ball - 1], point, direction)
+                    other = sample_levels(balls.levels[ball - 1], toward, level, distant.level_height)
                     radiance += (weight / total) * (other - radiance)
         return radiance
 
     return radiance_along
+
+
+@functools.cache
+def make_captured_along(config: DistantLightConfig) -> wp.Function:
+    """``captured_along(distant, point, direction) -> vec3``: the environment, unfiltered, as it was captured."""
+
+    @wp.func(module="unique")
+    def captured_along(distant: DistantLight, point: wp.vec3, direction: wp.vec3) -> wp.vec3:
+        radiance = sample_latlong(distant.environment, direction)
+        if wp.static(config.several):
+            balls = distant.others
+            total = probe_weight(balls.places, 0, point)
+            for ball in range(1, balls.places.shape[0]):
+                weight = probe_weight(balls.places, ball, point)
+                if weight > 0.0:
+                    total += weight
+                    radiance += (weight / total) * (sample_latlong(balls.environment[ball - 1], direction) - radiance)
+        return radiance
+
+    return captured_along
 
 
 @functools.cache

@@ -1,15 +1,17 @@
 """A desk with mirror balls under a lamp nearby, rendered in float64, and the light anywhere on it.
 
 The lamp is a ball of one radiance above the desk's left half, the room behind it nearly dark: what a mirror ball shows
-depends on where it stands. The desk is matt. Balls throw no shadows and are not mirrored in each other, here as in what
-is taken to be true.
+depends on where it stands. The desk is matt, and a printed card may lie at the origin. Balls are not mirrored in each
+other, here as in what is taken to be true, and throw the lamp's shadow only where a desk is told of them.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,6 +29,59 @@ class Desk:
     lamp: float = 1.1
     albedo: tuple[float, float, float] = (0.5, 0.4, 0.3)
     room: tuple[float, float, float] = (0.04, 0.05, 0.07)
+    card: float = 0.0
+    """Side of the black square of marker 0 of DICT_4X4_50; 0: there is no card."""
+    white: float = 0.85
+    ink: float = 0.04
+    balls: tuple[Ball, ...] = ()
+    """What stands between lamp and desk."""
+
+
+SHADOW = 64
+"""Points of the lamp that a shadow is found by: a share of it is known to a hundredth."""
+PAPER = 1.5
+"""Side of the card's paper, over that of its black square."""
+
+
+@functools.cache
+def _print() -> NDArray[np.uint8]:
+    pattern = cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), 0, 120)
+    return np.pad(np.asarray(pattern, np.uint8), 30, constant_values=255)
+
+
+def _albedo(desk: Desk, points: Array) -> Array:
+    """Of the desk and the card on it, (n, 3)."""
+    out = np.broadcast_to(np.array(desk.albedo), points.shape).copy()
+    half = 0.5 * PAPER * desk.card
+    on = np.abs(points[:, :2]).max(-1) < half
+    cells = len(_print())
+    j, i = ((0.5 * (s * points[on, k] / max(half, 1e-9) + 1.0) * cells).astype(int) for k, s in ((0, 1), (1, -1)))
+    out[on] = np.where(_print()[np.minimum(i, cells - 1), np.minimum(j, cells - 1)] > 0, desk.white, desk.ink)[:, None]
+    return out
+
+
+def _lit_share(desk: Desk, points: Array) -> Array:
+    """Share of the lamp that points of the desk see past the balls, (n,)."""
+    seen = np.ones((len(points), SHADOW), bool)
+    k = np.arange(SHADOW) + 0.5
+    ring, turn = np.sqrt(k / SHADOW), k * math.pi * (3.0 - math.sqrt(5.0))
+    # The disk that the lamp is from below; from the side it is a little too narrow.
+    lamp = np.array(desk.lamp_at) + desk.lamp_radius * np.column_stack(
+        [ring * np.cos(turn), ring * np.sin(turn), 0 * k]
+    )
+    for center, radius, _ in desk.balls:
+        # Only what lies near the line from the lamp through the ball.
+        away, toward = points - np.array(desk.lamp_at), np.array(center) - np.array(desk.lamp_at)
+        along = away @ toward / (toward @ toward)
+        near = np.flatnonzero(
+            np.linalg.norm(away - along[:, None] * toward, axis=-1) < (radius + desk.lamp_radius) * (1.0 + 2.0 * along)
+        )
+        d = lamp - points[near, None]
+        d /= np.linalg.norm(d, axis=-1, keepdims=True)
+        b = ((np.array(center) - points[near, None]) * d).sum(-1)
+        square = ((np.array(center) - points[near]) ** 2).sum(-1)[:, None]
+        seen[near] &= (b < 0.0) | (square - b * b > radius**2)
+    return np.asarray(seen.mean(-1), float)
 
 
 def _lamp_irradiance(desk: Desk, points: Array, normals: Array) -> Array:
@@ -46,8 +101,8 @@ def radiance(desk: Desk, origins: Array, directions: Array) -> Array:
     down = (d[:, 2] < 0.0) & (t > 0.0)
     points = o[down] + t[down, None] * d[down]
     up = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
-    received = _lamp_irradiance(desk, points, up)[:, None] + math.pi * np.array(desk.room)
-    out[down] = np.array(desk.albedo) / math.pi * received
+    direct = _lamp_irradiance(desk, points, up) * _lit_share(desk, points)
+    out[down] = _albedo(desk, points) / math.pi * (direct[:, None] + math.pi * np.array(desk.room))
     off = o - np.array(desk.lamp_at)
     along = (off * d).sum(-1)
     seen = (along < 0.0) & (along**2 - (off * off).sum(-1) + desk.lamp_radius**2 > 0.0)

@@ -127,9 +127,11 @@ def run(
     emitters=False,
     partials=1,
     as_wavefront=False,
+    others=None,
 ):
     kinds = tuple(tuple(sorted({item["kind"] for item in items})) for items in (objects, proxies))
-    forms = DistantLightConfig(TraceConfig(*kinds), (LAMBERT,), False, "sh", False, bool(probes))
+    several = others is not None
+    forms = DistantLightConfig(TraceConfig(*kinds), (LAMBERT,), False, "sh", False, bool(probes), several=several)
     config = EnvironmentShadowConfig(forms, count, side, bounce, secondary, emitters, partials)
     camera = camera_fields(CAMERA, LOOK_DOWN, 60, (H, W))
     params = records(FrameParams, {**camera, "shadow_rect": rect})
@@ -143,6 +145,8 @@ def run(
     coefficients = np.zeros((9, 3), np.float32)
     coefficients[0] = np.pi / 0.28209479
     surroundings.irradiance_sh = wp.array(coefficients, dtype=wp.vec3)
+    if several:
+        surroundings.others = others
     frame = wp.full((H, W), wp.vec3ub(255, 255, 255), dtype=wp.vec3ub)
     shape = -(-H // stride), -(-W // stride)
     cells = shadow_cells(shape, stride)

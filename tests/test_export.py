@@ -52,6 +52,29 @@ def test_a_shot_is_written_with_its_light(clip: pathlib.Path, tmp_path: pathlib.
     assert "is replaced: this program wrote it before" in capsys.readouterr().err
 
 
+def test_every_balls_light_is_written(clip: pathlib.Path, tmp_path: pathlib.Path, capsys) -> None:
+    """In files of their own, which say where the ball stands; a program that knows one light takes the first."""
+    more = "\n[[probe]]\ncenter = [0.1, 0.03, 0.03]\nradius = 0.03\n"
+    clip.write_text(clip.read_text().replace("[probe]", "[[probe]]") + more)
+    assert run(clip, "--output", tmp_path / "shot.glb", "--frames", 1) == 0
+    printed = capsys.readouterr().out.splitlines()
+    maps = [tmp_path / f"shot_{name}.exr" for name in ("environment", "environment_1")]
+    assert [str(path) for path in maps] == [line for line in printed if line.endswith(".exr")]
+    first, second = map(read_environment, maps)
+    assert np.abs(first - second).max() > 0.0
+    data = (tmp_path / "shot.glb").read_bytes()
+    extras = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])["asset"]["extras"]
+    assert extras["environment"] == "shot_environment.exr"
+    assert extras["other_environments"] == [{"file": "shot_environment_1.exr", "at": [0.1, 0.03, 0.03]}]
+    usd = pytest.importorskip("pxr.Usd", reason="needs usd-core, of the extra exchange")
+    assert run(clip, "--output", tmp_path / "shot.usda", "--frames", 1) == 0
+    stage = usd.Stage.Open(str(tmp_path / "shot.usda"))
+    other = stage.GetPrimAtPath("/shot/lights/environment_1")
+    assert stage.GetPrimAtPath("/shot/lights/environment").IsActive()
+    assert not other.IsActive()
+    assert tuple(other.GetCustomDataByKey("at")) == (0.1, 0.03, 0.03)
+
+
 def test_a_way_comes_back_as_poses(clip: pathlib.Path, tmp_path: pathlib.Path) -> None:
     assert run(clip, "--output", tmp_path / "way.jsonl", "--frames", 2) == 0
     assert not (tmp_path / "way_environment.exr").exists()

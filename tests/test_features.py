@@ -138,8 +138,9 @@ def test_only_several_balls_call_for_interpolation() -> None:
     [
         ("medium", 0, (), {}, ""),
         ("medium", 1, (), {}, ""),
-        ("medium", 2, (), {"objects": ()}, ""),
-        ("medium", 3, (), {}, "objects are lit by what is interpolated between 3 mirror balls"),
+        ("medium", 2, (), {"objects": ()}, "receivers are lit by what is interpolated between 2 mirror balls"),
+        ("medium", 2, (), {"objects": (), "lights": ()}, ""),
+        ("medium", 3, (), {}, "objects and receivers are lit by what is interpolated between 3 mirror balls"),
         ("medium", 2, (1.0, 0.1), {}, "of several exposures 2 mirror balls make one map"),
         ("paper", 2, (), {}, "sphere map is a texture of one mirror ball, the first"),
     ],

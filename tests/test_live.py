@@ -83,6 +83,17 @@ def message(capsys: pytest.CaptureFixture[str]) -> str:
     return text
 
 
+def test_every_balls_environment_is_kept(tmp_path: Path) -> None:
+    """The first one's where one ball's would lie, each other one's in a folder below."""
+    two = PROBE.replace("[probe]", "[[probe]]") + "[[probe]]\ncenter = [0.1, 0.03, 0.03]\nradius = 0.03\n"
+    scene, light = write_scene(tmp_path, body=two + OBJECT), tmp_path / "light"
+    assert run(scene, "--headless", "--frames", 2, "--save-environment", light) == 0
+    names = ("0000.exr", "0001.exr")
+    assert sorted(path.name for path in light.iterdir()) == [*names, "ball_1"]
+    assert sorted(path.name for path in (light / "ball_1").iterdir()) == [*names]
+    assert (read_environment(light / "0001.exr") != read_environment(light / "ball_1" / "0001.exr")).any()
+
+
 def test_folder_report_and_environment(tmp_path: Path) -> None:
     scene = write_scene(tmp_path)
     out, light, report = tmp_path / "out", tmp_path / "light", tmp_path / "reports" / "run.json"

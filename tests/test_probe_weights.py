@@ -8,6 +8,7 @@ import warp as wp
 
 from tests.reference import probe_weights as reference
 from warp_ar.kernels import probe_weights, structs
+from warp_ar.kernels.interpolated_irradiance import OtherBalls
 from warp_ar.kernels.lobes import lobe_texels
 from warp_ar.kernels.probe_weights import probe_weight
 from warp_ar.kernels.reflect import (
@@ -69,8 +70,8 @@ def test_a_ball_goes_out_without_a_jump(device):
         places[1, 3] = trust
         steps.append(weigh(places, at))
     steps = np.array(steps)
-    # The steepest of weights: their sum falls to a third of the largest, so they change three times as fast as trust.
-    assert np.abs(np.diff(steps, axis=0)).max() < 3.0 / 40.0
+    # Steepest at the ball's own place: of two others 1 - T is left, so it has T / (2 - T), whose slope is 2 at T = 1.
+    assert np.abs(np.diff(steps, axis=0)).max() < 2.0 / 40.0
     np.testing.assert_allclose(steps[-1][:, [0, 2]], weigh(np.array(THREE)[[0, 2]], at), atol=ROUNDING)
     assert (np.diff(steps[:, :, 1], axis=0) <= ROUNDING).all()
 
@@ -93,26 +94,27 @@ def follow(shares, centers, *, seconds=0.1):
         given = wp.array(balls, dtype=structs.Probe), wp.array(params, dtype=structs.FrameParams)
         probe_weights.update_places(seen, *given, places)
         twin = reference.update_places(twin, share, center, seconds)
-        np.testing.assert_allclose(places.numpy(), twin, atol=10 * ROUNDING)
+        np.testing.assert_allclose(places.numpy(), twin, atol=ROUNDING)
         history.append(places.numpy().copy())
     return np.array(history)
 
 
 def test_trust_follows_what_is_seen(device):
-    """From the first frame on; then no step is larger than its time constant allows, and the lost keep their places."""
+    """From the first frame on; then as an exponential of 0.4 s, down and up; and the lost keep their places."""
     here, away = [(0.1, 0, 0), (0.4, 0, 0)], [(0.1, 0, 0), (9.0, 9.0, 9.0)]
     history = follow([(0.9, 0.8), *[(0.9, 0.0)] * 30, *[(0.9, 0.9)] * 30], [here, *[away] * 30, *[here] * 30])
     np.testing.assert_allclose(history[0, :, 3], 1.0)
-    assert history[30, 1, 3] < 1e-2
-    assert history[60, 1, 3] > 0.99
-    assert np.abs(np.diff(history[:, 1, 3])).max() < 0.1 / 0.4
+    down = np.exp(-0.1 / 0.4 * np.arange(31))
+    expected = np.concatenate([down, 1.0 - (1.0 - down[-1]) * down[1:]])
+    np.testing.assert_allclose(history[:, 1, 3], expected, rtol=ROUNDING)
     np.testing.assert_allclose(history[:, 1, :3], np.tile((0.4, 0.0, 0.0), (61, 1)), atol=1e-6)
 
 
 def test_while_no_ball_is_seen_all_stays(device):
     centers = [[(0.1, 0, 0), (0.4, 0, 0)]] * 2001
     history = follow([(0.9, 0.2), *[(0.0, 0.0)] * 2000], centers)
-    np.testing.assert_allclose(history[-1], history[0], rtol=1e-3)
+    # Two roundings a frame: fading, and the greatest put back to 1.
+    np.testing.assert_allclose(history[-1], history[0], rtol=2000 * 1.2e-7)
 
 
 def test_a_ball_that_was_never_seen_says_nothing(device):
@@ -140,17 +142,19 @@ def look(radiances, points, *, form="map", places=THREE, several=True):
     distant, first, others = DistantLight(), radiances[0], np.float32(radiances[1:])
     levels = np.full((lobe_texels(LEVEL_HEIGHT), 3), first, np.float32)
     distant.levels, distant.level_height = wp.array(levels, wp.vec3), LEVEL_HEIGHT
-    distant.others_levels = wp.array(others[:, None, None] * np.ones_like(levels), wp.vec3)
+    balls = OtherBalls()
+    balls.levels = wp.array(others[:, None, None] * np.ones_like(levels), wp.vec3)
     sh = np.zeros((9, 3), np.float32)
     sh[0] = np.pi / 0.28209479
-    distant.irradiance_sh, distant.others_sh = (
+    distant.irradiance_sh, balls.irradiance_sh = (
         wp.array(first * sh, wp.vec3),
         wp.array(others[:, None, None] * sh, wp.vec3),
     )
     flat = np.full((4, 8, 3), np.pi, np.float32)
     distant.irradiance_map = wp.array(first * flat, wp.vec3)
-    distant.others_map = wp.array(others[:, None, None, None] * flat, wp.vec3)
-    distant.places = wp.array(np.float32(places), wp.vec4)
+    balls.irradiance_map = wp.array(others[:, None, None, None] * flat, wp.vec3)
+    balls.places = wp.array(np.float32(places), wp.vec4)
+    distant.others = balls
     out = wp.zeros((len(points), 2), wp.vec3)
     wp.launch(
         make_environment_kernel(form, several), len(points), [distant, wp.array(np.float32(points), wp.vec3)], [out]

@@ -85,8 +85,11 @@ class View:
         turn=LOOK_DOWN,
         irradiance=None,
         scene=None,
+        others=None,
         **forms,
     ):
+        forms = {**forms, "several": others is not None}
+        self.others = others
         kinds = tuple(sorted({int(proxy["kind"]) for proxy in proxies}))
         trace = TraceConfig((), kinds if scene is None else (BOX, PLANE, MESH))
         self.relight = RelightConfig("reflectance", trace, "sh" if irradiance is None else "map", bool(probes), **forms)
@@ -124,6 +127,7 @@ class View:
             probes=self.probes,
             key_lights=self.keys,
             irradiance=self.surroundings,
+            others=self.others,
             cells=cells,
         )
 

@@ -79,6 +79,7 @@ def run(
     out=None,
     rows=None,
     linear=None,
+    others=None,
 ):
     frame = np.full((H, W, 3), 128, np.uint8) if frame is None else frame
     config = RelightConfig(
@@ -86,6 +87,7 @@ def run(
         TraceConfig(tuple(sorted({o["kind"] for o in objects})), tuple(sorted({p["kind"] for p in proxies}))),
         "sh" if irradiance_map is None else "map",
         bool(probes),
+        several=others is not None,
     )
     params = records(FrameParams, {"camera_position": CAMERA, "world_from_camera": LOOK_DOWN, "light_rect": rect})
     scene = RayScene()
@@ -109,6 +111,7 @@ def run(
         probes=records(Probe, *probes),
         key_lights=keys,
         irradiance=surroundings,
+        others=others,
     )
     relight.relight(config, params, scene, records(Light, *lights), receiver, out, rows=rows)
     return out.numpy()

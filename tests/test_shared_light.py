@@ -30,7 +30,7 @@ from warp_ar.output.environment_axes import AXES, to_cube
 from warp_ar.output.environment_harmonics import basis
 from warp_ar.scene import Pose
 from warp_ar.viewer import shared_light
-from warp_ar.viewer.light_record import LightState, describe, key_light
+from warp_ar.viewer.light_record import LightState, describe, encode_picture, key_light
 from warp_ar.viewer.shared_light import FACES, MOST_LISTENERS, check_origin
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -89,6 +89,26 @@ def test_what_is_told_beside_it() -> None:
     assert bare["interval"] is None
     assert bare["pose"] is None
     json.dumps(told, allow_nan=False)
+
+
+def test_the_light_at_every_ball_is_told() -> None:
+    first, _ = room()
+    second, places = np.roll(first, 32, axis=1), ((0.1, 0.2, 0.3), (-0.4, 0.5, 0.6))
+    state = LightState(first, 1.0, {}, (second,), places)
+    for axes in AXES:
+        told = describe(state, None, axes)
+        turn = np.reshape(told["world_from_marker"], (3, 3))
+        alone = [describe(LightState(one, 1.0, {}), None, axes) for one in (first, second)]
+        assert [ball["key"] for ball in told["balls"]] == [one["key"] for one in alone]
+        assert [ball["irradiance"] for ball in told["balls"]] == [one["irradiance"] for one in alone]
+        np.testing.assert_allclose([ball["at"] for ball in told["balls"]], np.array(places) @ turn.T)
+        assert {key: told[key] for key in alone[0]} == alone[0], "the first one's, as where it is alone"
+        assert "balls" not in alone[0]
+    found = read_exr(encode_picture(state, "exr", "z-up", "latlong", None, 1))
+    np.testing.assert_array_equal(found, second)
+    np.testing.assert_array_equal(read_exr(encode_picture(state, "exr", "z-up", "latlong", None)), first)
+    with pytest.raises(UsageError, match="ball = 2: 2 have a light, counted from 0"):
+        encode_picture(state, "exr", "z-up", "latlong", None, 2)
 
 
 async def known_light(site: Site, query: str = "", **options: Any) -> dict[str, Any]:

@@ -5,6 +5,7 @@ Screenshots are kept in the folder that WARP_AR_ARTEFACTS names, else in pytest'
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import dataclasses
 import os
@@ -18,6 +19,7 @@ import numpy as np
 import pytest
 
 from tests.browser_rig import CHROMIUM, SMALL, Tab, axe_core, chromium, serious_findings, served, write_camera_file
+from tests.gltf_files import Gltf
 from tests.test_budget import even_costs
 from warp_ar.accuracy.cost_table import relevant_settings
 from warp_ar.accuracy.costs import cost_key, write_costs
@@ -100,9 +102,15 @@ def options() -> list[str]:
 
 
 @pytest.fixture
-def url(scene_file: Path, cache: Path, options: list[str]) -> Iterator[str]:
+def says() -> list[str] | None:
+    """What the command says on its standard error; None: nothing."""
+    return None
+
+
+@pytest.fixture
+def url(scene_file: Path, cache: Path, options: list[str], says: list[str] | None) -> Iterator[str]:
     """The page of a server of its own."""
-    with served([str(scene_file), *options], cache) as address:
+    with served([str(scene_file), *options], cache, says=says) as address:
         yield address
 
 
@@ -364,6 +372,56 @@ def test_opening_light_and_a_mesh(open_tab: Callable[..., Tab], tmp_path: Path) 
     page.evaluate(drop.replace("corner.off", "corner.exe"), mesh)
     tab.until("document.getElementById('notices').textContent.includes('corner.exe: expected a file that ends in')")
     tab.errors = [error for error in tab.errors if "422" not in error]  # the refused one, which was asked for
+
+
+@pytest.mark.parametrize("says", [["slide.glb: not shown: animations"]], ids=["none is played at first"])
+def test_an_animation_is_chosen_held_and_looped(open_tab: Callable[..., Tab], tmp_path: Path, artefacts: Path) -> None:
+    """By the panel's own controls, of a file that was dropped; what they show is what the server plays."""
+    gltf = Gltf()
+    node = gltf.node(gltf.square(), scale=[0.03] * 3, translation=[0.0, 0.03, 0.0])
+    times = gltf.array(np.float32([0.0, 2.0]), min=[0.0], max=[2.0])
+    places = gltf.array(np.float32([[-0.05, 0.03, 0.0], [0.05, 0.03, 0.0]]))
+    channel = {"sampler": 0, "target": {"node": node, "path": "translation"}}
+    gltf.tree["animations"] = [
+        {"name": "Slide", "samplers": [{"input": times, "output": places}], "channels": [channel]}
+    ]
+    coded = base64.b64encode(gltf.save(tmp_path / "slide.glb").read_bytes()).decode()
+    tab = open_tab()
+    page = tab.page
+    number = page.evaluate("warpAr.scene.objects.length")
+    page.evaluate(
+        """coded => {
+          const dataTransfer = new DataTransfer();
+          const bytes = Uint8Array.from(atob(coded), (letter) => letter.charCodeAt(0));
+          dataTransfer.items.add(new File([bytes], "slide.glb"));
+          const event = new DragEvent("drop", { dataTransfer, bubbles: true, cancelable: true });
+          document.getElementById("figure").dispatchEvent(event);
+        }""",
+        coded,
+    )
+    item = f"warpAr.scene.objects[{number}]"
+    tab.until(f"warpAr.scene.objects.length === {number + 1}", "the mesh")
+    page.click(f'[data-key="object {number}"] .pick')
+    choice = page.get_by_label("Animation", exact=True)
+    assert choice.locator("option").all_text_contents() == ["None", "Slide"]
+    pause, loop = page.locator("#animation-pause"), page.locator("#animation-loop")
+    assert pause.is_disabled(), "nothing is played"
+    choice.select_option(label="Slide")
+    tab.until(f"{item}.animation === 0 && !{item}.paused")
+    assert pause.text_content() == "Pause"
+    pause.click()
+    tab.until(f"{item}.paused")
+    assert pause.text_content() == "Play"
+    loop.click()
+    tab.until(f"{item}.loop === false")
+    assert loop.get_attribute("aria-checked") == "false"
+    tab.shown()
+    page.screenshot(path=artefacts / "animation.png")
+    pause.click()
+    tab.until(f"!{item}.paused")
+    page.click("#undo")
+    tab.until(f"{item}.paused")
+    tab.until("document.getElementById('animation-pause').textContent === 'Play'", "what the undone edit says")
 
 
 def test_the_browsers_camera_is_lit(open_tab: Callable[..., Tab], artefacts: Path) -> None:

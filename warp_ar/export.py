@@ -67,9 +67,10 @@ def export(options: argparse.Namespace) -> int:
     if output.suffix.lower() in USD_SUFFIXES:
         load_usd()
     scene = load_scene(options.scene)
-    beside = {name: output.with_name(f"{output.stem}_{name}.exr") for name in ("environment", "undistort", "distort")}
+    maps = environment_names(scene)
+    beside = {name: output.with_name(f"{output.stem}_{name}.exr") for name in (*maps, "undistort", "distort")}
     if options.no_environment or output.suffix.lower() == TRACK_SUFFIX:
-        del beside["environment"]
+        beside = {name: path for name, path in beside.items() if name not in maps}
     if not options.stmaps:
         del beside["undistort"], beside["distort"]
     textures = texture_files(scene, output) if output.suffix.lower() in USD_SUFFIXES else {}
@@ -79,12 +80,15 @@ def export(options: argparse.Namespace) -> int:
         if words := check_replaceable(path, overwrite=options.overwrite):
             say(words)
     make_folder(output.parent)
-    shot, radiance = _read_shot(options, scene)
-    if radiance is None:
-        beside.pop("environment", None)
-    else:
-        write_environment(beside["environment"], radiance, overwrite=True, axes="y-up")
-        shot = dataclasses.replace(shot, environment=beside["environment"], radiance=radiance)
+    shot, light = _read_shot(options, scene)
+    beside = {name: path for name, path in beside.items() if name not in maps[len(light) :]}
+    for name, radiance in zip(maps, light, strict=False):
+        write_environment(beside[name], radiance, overwrite=True, axes="y-up")
+    if light:
+        others = tuple(
+            (beside[name], scene.probes[ball].center) for ball, name in enumerate(maps[: len(light)]) if ball
+        )
+        shot = dataclasses.replace(shot, environment=beside[maps[0]], radiance=light[0], others=others)
     for name, make in (("undistort", undistort_map), ("distort", distort_map)):
         if name in beside:
             write_stmap(beside[name], make(shot.camera))
@@ -97,6 +101,11 @@ def export(options: argparse.Namespace) -> int:
     return EXIT_DONE
 
 
+def environment_names(scene: Scene) -> tuple[str, ...]:
+    """What the environments' files are named by: of the first mirror ball, and of each other one in turn."""
+    return ("environment", *(f"environment_{ball}" for ball in range(1, len(scene.probes))))
+
+
 def _read_by(scene: Scene, options: argparse.Namespace) -> dict[str, list[Path]]:
     """Files and folders that the run reads, by what they are."""
     named = {"--source": options.source, "--calibration": options.calibration}
@@ -105,15 +114,16 @@ def _read_by(scene: Scene, options: argparse.Namespace) -> dict[str, list[Path]]
     return {**reads, "what the scene names,": [path for path in files_of(scene) if path != scene.path]}
 
 
-def _read_shot(options: argparse.Namespace, scene: Any) -> tuple[Shot, Any]:
-    """The camera's way, and the environment of the last frame that shows it."""
+def _read_shot(options: argparse.Namespace, scene: Any) -> tuple[Shot, tuple[Any, ...]]:
+    """The camera's way, and the environments of the last frame that shows them."""
     with importing():
         from warp_ar.session import Session  # loads Warp
 
     light = not options.no_environment and bool(scene.probes or scene.captured)
     light = light and options.output.suffix.lower() != TRACK_SUFFIX
     outputs = ("pose", "environment") if light else ("pose",)
-    poses, radiance = [], None
+    poses: list[Any] = []
+    captured: tuple[Any, ...] = ()
     with Session(
         scene, source=options.source, calibration=options.calibration, device=options.device, outputs=outputs
     ) as session:
@@ -122,11 +132,11 @@ def _read_shot(options: argparse.Namespace, scene: Any) -> tuple[Shot, Any]:
             raise UsageError("a camera's frames have no end to export; record them first, and name the file")
         for _, result in itertools.islice(session, options.frames):
             poses.append(result.pose)
-            radiance = result.environment if light and result.environment is not None else radiance
+            captured = (light and result.environments) or captured
         camera = session.scene.camera.scaled_to(*session.source.size)
         lit = dataclasses.replace(session.scene, camera=camera)
     if all(pose is None for pose in poses):
         raise SourceError("no frame shows the marker, so the camera has no way; see python -m warp_ar.doctor")
     path = options.source if options.source is not None else lit.source.path if lit.source is not None else None
     plate = None if path is None else Path(os.path.relpath(path, options.output.parent))
-    return Shot(lit, fps, tuple(poses), plate), radiance
+    return Shot(lit, fps, tuple(poses), plate), captured

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +17,8 @@ from warp_ar.input.sources import Source, open_source
 from warp_ar.light.captured import CapturedEmitter, Light, texel_solid_angles
 from warp_ar.scene import Exposure, Pose, Scene
 from warp_ar.stages.quality import Quality
+
+_LOG = logging.getLogger(__name__)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,6 +39,8 @@ class KnownFrame:
     """Since the first frame."""
     milliseconds: float
     """That its stages took."""
+    balls: int = 1
+    """Mirror balls between which the pipeline interpolates its light; ``light`` is that of the first alone."""
 
     def tracer(
         self,
@@ -45,6 +51,8 @@ class KnownFrame:
         light_samples: int = LIGHT_SAMPLES,
     ) -> PathTracer:
         """A path tracer of this frame; arguments as those of ``PathTracer``."""
+        if self.balls > 1:
+            _tell_first(self.scene.name, self.balls)
         return PathTracer(
             self.scene,
             self.light,
@@ -56,6 +64,17 @@ class KnownFrame:
             seed=seed,
             light_samples=light_samples,
         )
+
+
+@functools.cache
+def _tell_first(scene: str, balls: int) -> None:
+    """Say once that a reference does not know what the other balls show."""
+    _LOG.warning(
+        "%s: the path tracer's light is that of the first of %d mirror balls, everywhere; the pipeline's is "
+        "interpolated between them, so the two differ away from the first",
+        scene,
+        balls,
+    )
 
 
 def open_scene_source(scene: Scene, source: str | int | Path | None = None) -> Source:
@@ -130,7 +149,14 @@ def light_up_to(
             milliseconds = sum(timing.milliseconds for timing in result.stages.values())
             light, seconds = light_of(pipeline), frame.time - first
             return KnownFrame(
-                exposed_scene(pipeline), frame.image.copy(), result.image, result.pose, light, seconds, milliseconds
+                exposed_scene(pipeline),
+                frame.image.copy(),
+                result.image,
+                result.pose,
+                light,
+                seconds,
+                milliseconds,
+                pipeline.plan.features.others + 1,
             )
     raise SourceError(f"{frames.description} has no frame {number}; it ends before")
 

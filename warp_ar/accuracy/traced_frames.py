@@ -52,6 +52,7 @@ class TracedFrames:
             light_of(self.pipeline),
             frame.time - self.first,
             0.0,
+            self.pipeline.plan.features.others + 1,
         )
         tracer = known.tracer(device=str(self.pipeline.device))
         for picture in tracer.render(self.samples, error=self.error):

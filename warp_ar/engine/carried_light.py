@@ -35,6 +35,11 @@ class CarriedLight:
         """The environment as an output: None where it was not asked for or not seen yet."""
         return self._arrays["environment"] if self.known and self._wanted else None
 
+    @property
+    def others(self) -> Any:
+        """Those of the mirror balls after the first, (P - 1, rows, columns); None where one map is all."""
+        return self._arrays.get("others_environment") if self.environment is not None else None
+
     def scale(self, ratio: npt.NDArray[np.float64]) -> None:
         """Turn remembered radiance into the camera values of a camera whose gain has changed.
 

@@ -471,8 +471,8 @@ class Pipeline(Closing):
             return dataclasses.replace(rendered, image=lit)
         if self.inputs.transfers is not None:
             return dataclasses.replace(rendered, image=self.inputs.transfers.download(lit))
-        kept = None if light is None else np.array(light.numpy())
-        return dataclasses.replace(rendered, image=np.array(lit.numpy()), environment=kept)
+        kept, others = (None if one is None else np.array(one.numpy()) for one in (light, rendered.others_array))
+        return dataclasses.replace(rendered, image=np.array(lit.numpy()), environment=kept, others=others)
 
     def _track(
         self, image: Any, now: float, pose: Pose | None, timings: dict[str, StageTiming]
@@ -534,7 +534,9 @@ class Pipeline(Closing):
         if layers is not None and frame.plate is not None:
             clip = frame.plate.clip_levels(str(self.camera.transfer), self.inputs.saturation.levels)[0]
             layers = layers.with_plate(self.inputs.radiance(frame.plate), clip)
-        return Rendered(self._shown, self._light.environment, timings, (time.perf_counter() - start) * 1e3, layers)
+        milliseconds = (time.perf_counter() - start) * 1e3
+        light = self._light
+        return Rendered(self._shown, light.environment, timings, milliseconds, layers, others_array=light.others)
 
     def _layers_of(self, unlit: Any = None) -> LayerArrays | None:
         """The layers that were asked for; those of a frame that passes as it came are neutral."""
@@ -564,5 +566,6 @@ class Pipeline(Closing):
         self._last_time = now
         shown = bright if self._shown is None else self._shown
         layers = self._layers_of(bright if self._shown is None else None)
-        rendered = self._keep(Rendered(shown, self._light.environment, timings, layers=layers))
+        light = self._light
+        rendered = self._keep(Rendered(shown, light.environment, timings, layers=layers, others_array=light.others))
         return Result(pose, state, rendered.at_once(), shown=False)

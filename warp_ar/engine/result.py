@@ -41,6 +41,10 @@ class Rendered:
     """The picture, or that it is on its way to the host, where it was sent ahead."""
     environment: npt.NDArray[np.float32] | None = None
     """The environment where it was kept."""
+    others_array: Any = None
+    """Those of the mirror balls after the first, where the light is interpolated."""
+    others: npt.NDArray[np.float32] | None = None
+    """The same where they were kept."""
 
     def at_once(self) -> Future[Rendered]:
         """The same as something that nobody needs to wait for."""
@@ -103,12 +107,25 @@ class Result:
 
     @functools.cached_property
     def environment(self) -> npt.NDArray[np.float32] | None:
-        """The environment as a NumPy array of its own, float32 RGB (rows, columns, 3)."""
+        """The environment as a NumPy array of its own, float32 RGB (rows, columns, 3); of several balls the first's."""
         rendered = self._rendered.result()
         if rendered.environment is not None or rendered.environment_array is None:
             return rendered.environment
         with exclusive(rendered.environment_array.device):
             return np.array(rendered.environment_array.numpy())
+
+    @functools.cached_property
+    def environments(self) -> tuple[npt.NDArray[np.float32], ...]:
+        """The environment at every mirror ball whose light is interpolated, as ``environment``, which is the first.
+
+        One where there is one map, none where it was not asked for or not seen yet.
+        """
+        rendered = self._rendered.result()
+        others = rendered.others
+        if others is None and rendered.others_array is not None:
+            with exclusive(rendered.others_array.device):
+                others = np.array(rendered.others_array.numpy())
+        return () if self.environment is None else (self.environment, *(() if others is None else others))
 
     @property
     def layer_arrays(self) -> Mapping[str, Any]:

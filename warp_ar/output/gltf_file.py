@@ -89,9 +89,11 @@ class _Builder:
     def __init__(self, shot: Shot) -> None:
         self._shot = shot
         self._bytes = bytearray()
-        extras = {"plate": None if shot.plate is None else shot.plate.as_posix(), "fps": shot.fps}
+        extras: dict[str, Any] = {"plate": None if shot.plate is None else shot.plate.as_posix(), "fps": shot.fps}
         if shot.environment is not None:
             extras["environment"] = shot.environment.name
+        if shot.others:
+            extras["other_environments"] = [{"file": file.name, "at": list(at)} for file, at in shot.others]
         self._tree: dict[str, Any] = {
             "asset": {"version": "2.0", "generator": PROGRAM, "extras": extras},
             "scene": 0,

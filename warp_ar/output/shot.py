@@ -97,6 +97,9 @@ class Shot:
     """Latlong OpenEXR in the axes ``y-up``."""
     radiance: npt.NDArray[np.float32] | None = None
     """The same, (height, 2 height, 3), z-up, for files that hold it themselves."""
+    others: tuple[tuple[Path, tuple[float, float, float]], ...] = ()
+    """Of each mirror ball after the first whose light is interpolated: its environment, as ``environment``, and where
+    it stands, metres."""
 
     @property
     def camera(self) -> Camera:

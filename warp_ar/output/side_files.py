@@ -52,7 +52,9 @@ class SideFiles:
         """Open the folders.
 
         Args:
-            environment: Folder for the captured light of every frame; None: it is not written.
+            environment: Folder for the captured light of every frame; None: it is not written. Of several mirror balls
+                whose light is interpolated, the first one's lies in it, those of the others in folders ``ball_1`` and
+                so on below it.
             layers: Folder for layers; None: they are not written.
             names: Which layers.
             pictures: Whether layers that PNG can hold are written as PNG besides.
@@ -66,6 +68,8 @@ class SideFiles:
         """What the pipeline's results must hold for it."""
         self.lights: EnvironmentSink | None = None
         """Takes the captured light."""
+        self._other_lights: list[EnvironmentSink] = []
+        self._environment, self._overwrite = environment, overwrite
         self._layers: LayerSink | None = None
         with contextlib.ExitStack() as stack:
             if environment is not None:
@@ -86,6 +90,8 @@ class SideFiles:
     def written(self) -> str:
         """How much of them is stored, in words that begin with a comma; empty where nothing is asked for."""
         lights = "" if self.lights is None else f", and {self.lights.written} environments"
+        if self._other_lights:
+            lights += f" of each of {len(self._other_lights) + 1} mirror balls"
         return lights if self._layers is None else f"{lights}, and layers of {self._layers.written}"
 
     def write(self, frame: npt.NDArray[np.uint8], result: Result, scene: Scene) -> None:
@@ -101,8 +107,18 @@ class SideFiles:
         """
         if self.lights is not None and result.environment is not None:
             self.lights.write(result.environment)
+            for ball, radiance in enumerate(result.environments[1:], 1):
+                self._lights_of(ball).write(radiance)
         if self._layers is not None:
             self._layers.write(layer_frame(frame, result, scene))
+
+    def _lights_of(self, ball: int) -> EnvironmentSink:
+        """Takes the captured light of a mirror ball after the first; opened where there is some."""
+        if ball > len(self._other_lights):
+            assert self._environment is not None
+            sink = EnvironmentSink(self._environment / f"ball_{ball}", overwrite=self._overwrite)
+            self._other_lights.append(self._stack.enter_context(sink))
+        return self._other_lights[ball - 1]
 
     def __enter__(self) -> Self:
         return self

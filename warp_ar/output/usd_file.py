@@ -79,17 +79,28 @@ def write_usd(path: Path, shot: Shot) -> list[Path]:
     for index, light in enumerate(shot.scene.lights):
         _write_light(pxr, stage, f"/shot/lights/light_{index}", light, shot)
     if shot.environment is not None:
-        dome = pxr.UsdLux.DomeLight.Define(stage, "/shot/lights/environment")
-        dome.CreateIntensityAttr(1.0)
-        dome.CreateTextureFileAttr(f"./{shot.environment.name}")
-        dome.CreateTextureFormatAttr(pxr.UsdLux.Tokens.latlong)
-        # A dome's pole is its own y.
-        dome.AddRotateXOp().Set(90.0)
+        _write_dome(pxr, stage, "/shot/lights/environment", shot.environment)
+    for ball, (file, at) in enumerate(shot.others, 1):
+        # The light of another place: a program that interpolates or chooses finds it, none adds it to the first.
+        prim = _write_dome(pxr, stage, f"/shot/lights/environment_{ball}", file)
+        prim.SetCustomDataByKey("at", pxr.Gf.Vec3d(*at))
+        prim.SetActive(False)
     try:
         write_whole(path, lambda part: _export(stage, part, path.suffix))
     except OSError as error:
         raise SinkError(f"{path} cannot be written: {reason(error)}") from error
     return written
+
+
+def _write_dome(pxr: Any, stage: Any, path: str, file: Path) -> Any:
+    """The light of an environment; returns its prim."""
+    dome = pxr.UsdLux.DomeLight.Define(stage, path)
+    dome.CreateIntensityAttr(1.0)
+    dome.CreateTextureFileAttr(f"./{file.name}")
+    dome.CreateTextureFormatAttr(pxr.UsdLux.Tokens.latlong)
+    # A dome's pole is its own y.
+    dome.AddRotateXOp().Set(90.0)
+    return dome.GetPrim()
 
 
 def _export(stage: Any, part: Path, suffix: str) -> None:

@@ -11,7 +11,13 @@ from warp_ar.kernels import environment_samples, pyramid
 from warp_ar.kernels.environment_samples import EnvironmentSample
 from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
-from warp_ar.stages.shared.environment_sets import REFERENCE_SIZE, SAMPLES, lists_texels, sample_names
+from warp_ar.stages.shared.environment_sets import (
+    REFERENCE_SIZE,
+    SAMPLES,
+    lists_texels,
+    sample_names,
+    sample_slots,
+)
 from warp_ar.stages.shared.settled import settled_environment
 
 
@@ -36,7 +42,9 @@ class EnvironmentSamples(Stage):
         if not features.environment:
             return LeftOut(NO_BALL)
         emitters = ("emitters",) if features.emitters else ()
-        return Wiring(("environment", *emitters), ("environment_samples",))
+        others = ("others_environment",) if features.others else ()
+        placed = ("others_emitters",) if features.others and features.emitters else ()
+        return Wiring(("environment", *emitters, *others, *placed), ("environment_samples",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The samples, and the sums that are inverted to draw them; for the reference a small map's texels as well."""
@@ -50,7 +58,8 @@ class EnvironmentSamples(Stage):
         }
         if not lists_texels(self.features):
             return specs
-        texels = REFERENCE_SIZE[0] * REFERENCE_SIZE[1]  # a smaller environment leaves the rest without measure
+        # A smaller environment leaves the rest without measure.
+        texels = REFERENCE_SIZE[0] * REFERENCE_SIZE[1] * sample_slots(self.features)
         return {
             **specs,
             "environment_samples_map": ArraySpec(
@@ -62,29 +71,39 @@ class EnvironmentSamples(Stage):
         }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """Sum, then invert; and list the texels of a small map."""
-        environment, samples = settled_environment(arrays, device), arrays["environment_samples"]
+        """Sum, then invert; and list the texels of a small map. Of several balls one after the other."""
+        emitters = arrays["emitters"] if self.features.emitters else None
+        passes = self._draw(arrays, 0, settled_environment(arrays, device), emitters)
+        for ball in range(self.features.others):
+            emitters = arrays["others_emitters"][ball] if self.features.emitters else None
+            passes += self._draw(arrays, ball + 1, arrays["others_environment"][ball], emitters)
+        return passes
+
+    def _draw(self, arrays: Arrays, ball: int, environment: Any, emitters: Any) -> list[Pass]:
+        """Passes from one map of the environment to its samples; maps take turns with the sums."""
+        samples = arrays["environment_samples"]
         cumulative, sums = arrays["environment_samples_cumulative"], arrays["environment_samples_rows"]
         out = arrays["environment_samples_directions"], arrays["environment_samples_flux"], samples
-        probes = self.request.scene.probes
-        origin = wp.vec3(*probes[0].center) if probes else wp.vec3()
+        probes, turn = self.request.scene.probes, (ball, self.features.others + 1)
+        origin = wp.vec3(*probes[ball].center) if probes else wp.vec3()
+        known = environment, cumulative, sums, origin
         passes = [
             Pass(lambda rows: environment_samples.sum_environment(environment, cumulative, sums)),
-            Pass(lambda rows: environment_samples.draw_samples(environment, cumulative, sums, origin, *out)),
+            Pass(lambda rows: environment_samples.draw_samples(*known, *out, turn=turn)),
         ]
         found = [samples]
         if lists_texels(self.features):
             small, texels = arrays["environment_samples_map"], [arrays[name] for name in sample_names(self.features)]
             passes += [
                 Pass(lambda rows: pyramid.reduce_latlong(environment, small)),
-                Pass(lambda rows: environment_samples.list_texels(small, origin, *texels)),
+                Pass(lambda rows: environment_samples.list_texels(small, origin, *texels, turn=turn)),
             ]
             found.append(texels[-1])
-        if self.features.emitters:
+        if emitters is not None:
 
             def place(rows: Rows | None) -> None:
                 for one in found:
-                    environment_samples.place_emitters(arrays["emitters"], one)
+                    environment_samples.place_emitters(emitters, one, turn=turn)
 
             passes.append(Pass(place))
         return passes

@@ -29,8 +29,13 @@ from warp_ar.stages.base import (
     Wiring,
 )
 from warp_ar.stages.features import Features
-from warp_ar.stages.shared.distant_light import distant_light_arrays, distant_light_reads, make_distant_light
-from warp_ar.stages.shared.environment_sets import REFERENCE_SIZE, sample_names
+from warp_ar.stages.shared.distant_light import (
+    distant_light_arrays,
+    distant_light_reads,
+    make_distant_light,
+    make_other_balls,
+)
+from warp_ar.stages.shared.environment_sets import REFERENCE_SIZE, lists_texels, sample_names, sample_slots
 from warp_ar.stages.shared.picture import find_picture, frame_reads
 from warp_ar.stages.shared.rows import GrowingRows
 from warp_ar.stages.shared.variants import distant_variant
@@ -116,6 +121,8 @@ class EnvironmentShadow(Stage):
             "environment",
             *distant_light_reads(features),
         ]
+        if features.others:
+            reads += [name for name in ("others_environment", "probe_places") if name not in reads]
         if METHODS[quality.method(cls.name)].bounce == "traced":
             reads += frame_reads(features)
         return Wiring(tuple(reads), ("shadow_ratio",))
@@ -149,6 +156,8 @@ class EnvironmentShadow(Stage):
         filters.make_spread_ratio_kernel(config.distant)
         distant = make_distant_light(self.features, arrays, self.name)
         distant.environment = arrays["environment"]
+        if self.features.others:
+            distant.others = make_other_balls(self.features, arrays, self.wiring.reads)
         params, scene, cells = arrays["params"], arrays["ray_scene"], self._cells(arrays)
         picture = find_picture(arrays, frame=config.bounce == "traced")
         sets = SampleSets()
@@ -186,7 +195,7 @@ class EnvironmentShadow(Stage):
         partials = 1 if device.is_cpu else count_partials(*arrays["environment_shadow_ratio"].shape)
         return EnvironmentShadowConfig(
             distant_variant(self.features, device),
-            method.count,
+            method.count * (sample_slots(self.features) if lists_texels(self.features) else 1),
             method.side,
             method.bounce,
             method.secondary,

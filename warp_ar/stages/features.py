@@ -25,6 +25,8 @@ FLAT = "flat"
 """Method of ``relight`` that needs nothing of the environment."""
 NEAR = ("few_rays", "one_bounce")
 """Methods of ``shade`` that know what surrounds objects at close range."""
+MEASURED = ("reflectance", "bounce", "brute_force")
+"""Methods of ``relight`` that take the receiver's reflectance from the environment's irradiance."""
 LOCAL = ("bounce", "brute_force")
 """Methods of ``relight`` that know which part of the environment reaches a point, and what lit surfaces send on."""
 
@@ -73,7 +75,8 @@ class Features:
     area_samples: int
     """Samples of objects that emit, per point that they light; 0: none does."""
     others: int
-    """Mirror balls after the first whose light is interpolated with the first one's on objects; 0: one map is all."""
+    """Mirror balls after the first whose light is interpolated with the first one's, on objects and on the receiver;
+    0: one map is all."""
     near_field: str
     """Method of ``shade`` by which objects show what surrounds them at close range, themselves included; empty: none.
 
@@ -90,13 +93,31 @@ class Features:
         """Which of several mirror balls light objects, in words; empty where there is one or none."""
         scene = self.request.scene
         count = len(scene.probes)
-        if count < 2 or not self.observed or not scene.objects:
+        if count < 2 or not self.observed or not (scene.objects or self.others):
             return ""
         if self.others:
-            return f"objects are lit by what is interpolated between {count} mirror balls, receivers by the first one"
+            lit = "objects and receivers are" if scene.objects else "receivers are"
+            first = f"by the first one alone are found {self._first_alone}"
+            return f"{lit} lit by what is interpolated between {count} mirror balls; {first}"
         if self.merged:
             return f"of several exposures {count} mirror balls make one map, which lights all objects"
         return "the quality's sphere map is a texture of one mirror ball, the first, whose light is that of all objects"
+
+    @property
+    def _first_alone(self) -> str:
+        """What is made from the first ball's light only, in words."""
+        names = ["the light of a path-traced reference"]
+        if self.lit and self.relight_method != FLAT:
+            names.append("the key light of receivers")
+        if self.declipped_by_ball:
+            names.append("the radiance above clipping that a shorter exposure shows")
+        return ", ".join(names)
+
+    @property
+    def others_with_irradiance(self) -> int:
+        """Balls after the first whose irradiance is asked for."""
+        measured = self.lit and self.relight_method in MEASURED
+        return self.others if self.distant.diffuse != "none" or measured else 0
 
     @property
     def shadowed(self) -> bool:
@@ -184,13 +205,14 @@ def has_environment(scene: Scene) -> bool:
 
 
 def interpolates(scene: Scene, quality: Quality) -> bool:
-    """Whether the light of several balls is interpolated: there are objects between them, and no sphere map's method.
+    """Whether the light of several balls is interpolated: something is lit by it, by no sphere map's method.
 
-    A sphere map is a texture of one ball.
+    That are objects, and receivers whose reflectance is measured by it. A sphere map is a texture of one ball.
     """
+    measured = bool(scene.proxies) and sheds_light(scene) and quality.method("relight") in MEASURED
     ways = ((stage, quality.method(stage)) for stage in ("unwrap", "irradiance", "prefilter"))
     textures = any(method in ("sphere_map", "sphere_mip") for _, method in ways)
-    return len(scene.probes) > 1 and bool(scene.objects) and not textures
+    return len(scene.probes) > 1 and (bool(scene.objects) or measured) and not textures
 
 
 def sheds_light(scene: Scene) -> bool:

@@ -57,17 +57,13 @@ class Irradiance(Stage):
             return LeftOut(NO_BALL)
         by_texture = cls.method_for(features) == "sphere_mip"
         reads = ("sphere_map", "pose") if by_texture else ("environment",)
-        if cls._others(features):
+        if features.others_with_irradiance:
             return Wiring((*reads, "others_environment"), (features.irradiance, "others_irradiance"))
         return Wiring(reads, (features.irradiance,))
 
-    @staticmethod
-    def _others(features: Features) -> int:
-        return features.others if features.distant.diffuse != "none" else 0
-
     def arrays(self) -> Mapping[str, ArraySpec]:
         """Irradiance, and sums on the way to it."""
-        specs, others = self._first(), self._others(self.features)
+        specs, others = self._first(), self.features.others_with_irradiance
         if others:
             form = specs[self.features.irradiance]
             specs["others_irradiance"] = ArraySpec((others, *form.shape), form.dtype)
@@ -109,7 +105,7 @@ class Irradiance(Stage):
                 Pass(lambda rows: sphere_map.look_up_level(*known, out, scale=math.pi, rows=rows), rows=MAP_SIZE[0])
             ]
         passes = self._filter(arrays, settled_environment(arrays, device), arrays[self.features.irradiance])
-        for ball in range(self._others(self.features)):
+        for ball in range(self.features.others_with_irradiance):
             passes += self._filter(arrays, arrays["others_environment"][ball], arrays["others_irradiance"][ball])
         return passes
 

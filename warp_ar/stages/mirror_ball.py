@@ -14,7 +14,12 @@ from warp_ar.kernels.reflect import DistantLight
 from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
-from warp_ar.stages.shared.distant_light import distant_light_arrays, distant_light_reads, make_distant_light
+from warp_ar.stages.shared.distant_light import (
+    distant_light_arrays,
+    distant_light_reads,
+    make_distant_light,
+    make_other_balls,
+)
 from warp_ar.stages.shared.picture import find_picture, frame_reads
 from warp_ar.stages.shared.relighting import SUMMED, SUMMED_CUT, relight_config, relight_reads
 from warp_ar.stages.shared.rows import GrowingRows
@@ -143,6 +148,7 @@ class MirrorBall(Stage):
             key_lights=arrays["key_lights"] if "key_lights" in reads else None,
             irradiance=arrays[irradiance] if lit and irradiance in reads else None,
             emitters=arrays["emitters"] if "emitters" in reads else None,
+            others=make_other_balls(self.features, arrays, reads),
         )
         shading = config.shade
         distant = DistantLight() if shading is None else make_distant_light(self.features, arrays, self.name)

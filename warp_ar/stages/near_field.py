@@ -95,6 +95,7 @@ class NearField(Stage):
         reads = [*frame_reads(features), "pose", "objects", "hit_object", "hits", *distant_light_reads(features)]
         if features.distant.diffuse != "none":
             reads.append("environment_samples")
+            reads += [name for name in ("probe_places",) if features.others and name not in reads]
         reads += [name for name in features.layers if name not in ("virtual", "mirror_ball", "reflected")]
         return Wiring(tuple(reads), features.near_names)
 
@@ -162,6 +163,6 @@ class NearField(Stage):
             SIDE,
             "shadow_ratio" in layers,
             "added_light" in layers,
-            # Samples are of the first ball's environment: they can only say what differs.
+            # Of several balls each has a part of the samples only: they say what differs.
             rays.known or self.features.others > 0,
         )

@@ -26,6 +26,7 @@ from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring, unobserved
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.host_copies import HostCopies
+from warp_ar.stages.shared.probe_maps import KEPT
 from warp_ar.stages.shared.variants import trace_variant
 
 EVERY_FRAME = 3
@@ -120,7 +121,8 @@ class Recover(Stage):
         if not features.others:
             return Wiring(reads, writes)
         others = ("others_environment", "others_emitters") if features.emitters else ("others_environment",)
-        return Wiring((*reads, "others_filled", "probe_places"), (*writes, *others))
+        kept = [f"{KEPT}_{part}" for part in ("confidence", "clipped")]
+        return Wiring((*reads, "others_filled", *kept, "probe_places"), (*writes, *others))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The map, the two sides of the equations, and what readers have seen."""
@@ -132,7 +134,10 @@ class Recover(Stage):
         others = self.features.others
         types: dict[str, tuple[tuple[int, ...], Any]] = {"others_environment": (shape, wp.vec3)}
         types["others_emitters"] = (CONFIG.search.most,), Emitter
+        # Balls take turns with these.
+        missing = {"recover_others_missing": ArraySpec(shape, wp.vec3), "recover_sent": ArraySpec(cells, wp.vec3)}
         return {
+            **(missing if others else {}),
             **{
                 name: ArraySpec((others, *types[name][0]), types[name][1])
                 for name in self.wiring.writes
@@ -196,14 +201,24 @@ class Recover(Stage):
 
     def _relocate(self, ball: int) -> list[Pass]:
         """What was recovered in the first ball's map, put into that of another as it sees it."""
-        arrays, places = self._arrays, self._arrays["probe_places"]
+        arrays, places, height = self._arrays, self._arrays["probe_places"], self.request.quality.environment_height
         emitters = arrays["emitters"] if self.features.emitters else None
-        first = arrays["environment"], arrays["filled_radiance"]
-        known = arrays["others_filled"][ball], *first, emitters, places, arrays["others_environment"][ball]
-        put = functools.partial(relocate.relocate, *known, ball=ball + 1)
-        passes = [Pass(lambda rows: put(rows=rows), rows=self.request.quality.environment_height)]
+        first, out = (arrays["environment"], arrays["filled_radiance"]), arrays["others_environment"][ball]
+        filled, missing, sent = arrays["others_filled"][ball], arrays["recover_others_missing"], arrays["recover_sent"]
+        clipped, confidence = (arrays[f"{KEPT}_{part}"][ball] for part in ("clipped", "confidence"))
+        own = arrays["params"], arrays["probes"][ball + 1 : ball + 2], missing
+        found = arrays["recover_cells"], arrays["recover_recovered"]
+        other, cells = (filled, missing, confidence), found[0]
+        share = functools.partial(relocate.share_excess, other, *first, emitters, cells, sent, out)
+        passes = [
+            Pass(lambda rows: weigh_boundaries(clipped, *own, rows=rows), rows=height),
+            Pass(lambda rows: relocate.send_excess(missing, confidence, *found, sent, rows=rows), rows=cells.shape[0]),
+            Pass(lambda rows: share(rows=rows), rows=height),
+        ]
         if emitters is not None:
             moved = arrays["others_emitters"][ball]
+            put = functools.partial(relocate.relocate, filled, *first, emitters, places, out, ball=ball + 1)
+            passes.append(Pass(lambda rows: put(rows=rows), rows=height))
             passes.append(Pass(lambda rows: relocate.move_emitters(emitters, places, moved, ball=ball + 1)))
         return passes
 

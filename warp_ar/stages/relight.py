@@ -19,6 +19,7 @@ from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring
 from warp_ar.stages.features import Features, sheds_light
 from warp_ar.stages.request import Request
+from warp_ar.stages.shared.distant_light import make_other_balls
 from warp_ar.stages.shared.edge_lists import edge_arrays, make_edge_lists
 from warp_ar.stages.shared.environment_sets import SAMPLES
 from warp_ar.stages.shared.picture import find_picture
@@ -157,7 +158,8 @@ class Relight(Stage):
         }
         known = {word: arrays[name] for word, name in names.items() if name in self.wiring.reads}
         cells = make_cells(self.features, arrays)
-        return make_receiver(config, find_picture(arrays), probes=arrays["probes"], cells=cells, **known)
+        others = make_other_balls(self.features, arrays, self.wiring.reads)
+        return make_receiver(config, find_picture(arrays), probes=arrays["probes"], others=others, cells=cells, **known)
 
     def _cell_passes(
         self, config: RelightConfig, inputs: tuple[Any, Any, Any, Receiver], arrays: Arrays, device: Any

@@ -80,7 +80,9 @@ class Convergence:
         self.drop()
         with exclusive(pipeline.device):
             light, scene = light_of(pipeline), exposed_scene(pipeline)
-        known = KnownFrame(scene, frame.copy(), result.image, result.pose, light, seconds, 0.0)
+        known = KnownFrame(
+            scene, frame.copy(), result.image, result.pose, light, seconds, 0.0, pipeline.plan.features.others + 1
+        )
         self._key, self._lit = key, result.image
 
         def make() -> PathTracer:

@@ -333,13 +333,16 @@ class FrameLoop:
             return
         with exclusive(pipeline.device):
             values = np.array(light.numpy())
+            others = pipeline.arrays.get("others_environment")
+            others = () if others is None else tuple(np.array(others.numpy()))
             scale = pipeline.arrays.get("expose_scale")
             exposure = 1.0 if scale is None else float(scale.numpy()[0])
         status = pipeline.arrays.get("recover_status")
         # Black until the ball has been seen once.
         self.light = values if values.any() else None
         known = {} if status is None else status()
-        self.light_state = None if self.light is None else LightState(values, exposure, known)
+        places = tuple(probe.center for probe in pipeline.scene.probes[: len(others) + 1])
+        self.light_state = None if self.light is None else LightState(values, exposure, known, others, places)
 
     def _watch_cost(self, pipeline: Pipeline, frame: Frame, result: Result, light_ms: float) -> None:
         """Learn what the preset costs; under a budget, choose the methods that it asks for."""

@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from warp_ar.errors import UsageError
 from warp_ar.kernels.irradiance import cosine_lobe
 from warp_ar.light.captured import find_emitters, latlong_directions, texel_solid_angles
 from warp_ar.output.environment_axes import CUBES, check_axes, to_cube, world_from_marker
@@ -21,6 +22,7 @@ from warp_ar.viewer.calibration import written
 from warp_ar.viewer.shared_light import FACES
 
 _DEGREES: Final = (0, 1, 1, 1, 2, 2, 2, 2, 2)
+_LOBE: Final = np.array([cosine_lobe(degree) for degree in _DEGREES])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,6 +35,10 @@ class LightState:
     """Factor on the picture's radiance."""
     recovery: Mapping[str, Any]
     """What recovered light rests on, of ``recover``; empty where it does not run."""
+    others: tuple[npt.NDArray[np.float32], ...] = ()
+    """The same light at each mirror ball after the first, where it is interpolated."""
+    places: tuple[tuple[float, float, float], ...] = ()
+    """Where all those balls stand, the first one too, metres in the marker's frame."""
 
 
 def describe(state: LightState, pose: Pose | None, axes: str) -> dict[str, Any]:
@@ -49,7 +55,7 @@ def describe(state: LightState, pose: Pose | None, axes: str) -> dict[str, Any]:
     check_axes(axes)
     turn = world_from_marker(axes)
     coefficients = project_radiance(state.radiance, axes)
-    lobe = np.array([cosine_lobe(degree) for degree in _DEGREES])
+    several = {"balls": _balls(state, turn, axes)} if state.others else {}
     return {
         "program": PROGRAM,
         "type": "light",
@@ -57,13 +63,30 @@ def describe(state: LightState, pose: Pose | None, axes: str) -> dict[str, Any]:
         "world_from_marker": turn.ravel().tolist(),
         "basis": list(BASIS),
         "radiance": coefficients.tolist(),
-        "irradiance": (coefficients * lobe[:, None]).tolist(),
+        "irradiance": (coefficients * _LOBE[:, None]).tolist(),
         "key": key_light(state.radiance, turn),
+        **several,
         "interval": _interval(state.recovery),
         "exposure": state.exposure,
         "whiteLevel": 1.0,
         "pose": None if pose is None else {"R": pose.rotation.ravel().tolist(), "t": pose.translation.tolist()},
     }
+
+
+def _balls(state: LightState, turn: npt.NDArray[np.float64], axes: str) -> list[dict[str, Any]]:
+    """The light at every mirror ball, the first one's too, and where it stands."""
+    told = []
+    for place, radiance in zip(state.places, (state.radiance, *state.others), strict=True):
+        coefficients = project_radiance(radiance, axes)
+        told.append(
+            {
+                "at": (turn @ np.array(place)).tolist(),
+                "radiance": coefficients.tolist(),
+                "irradiance": (coefficients * _LOBE[:, None]).tolist(),
+                "key": key_light(radiance, turn),
+            }
+        )
+    return told
 
 
 def key_light(radiance: npt.NDArray[np.float32], turn: npt.NDArray[np.float64]) -> dict[str, Any] | None:
@@ -97,17 +120,23 @@ def _interval(recovery: Mapping[str, Any]) -> dict[str, Any] | None:
     return {"of": "irradiance of surfaces that face +x -x +y -y +z -z of the marker", **values}
 
 
-def encode_picture(state: LightState, kind: str, axes: str, layout: str, size: int | None) -> bytes:
-    """The environment as an ``exr`` or ``hdr``; arguments and errors as those of `write_environment`."""
-    return written(
-        f"light.{kind}", lambda path: write_environment(path, state.radiance, axes=axes, layout=layout, size=size)
-    )
+def encode_picture(state: LightState, kind: str, axes: str, layout: str, size: int | None, ball: int = 0) -> bytes:
+    """The environment at a ball as an ``exr`` or ``hdr``; arguments and errors as those of `write_environment`."""
+    radiance = _at_ball(state, ball)
+    return written(f"light.{kind}", lambda path: write_environment(path, radiance, axes=axes, layout=layout, size=size))
 
 
-def encode_face(state: LightState, axes: str, size: int | None, face: str) -> bytes:
+def _at_ball(state: LightState, ball: int) -> npt.NDArray[np.float32]:
+    count = 1 + len(state.others)
+    if not 0 <= ball < count:
+        raise UsageError(f"ball = {ball}: {count} {'has' if count == 1 else 'have'} a light, counted from 0")
+    return (state.radiance, *state.others)[ball]
+
+
+def encode_face(state: LightState, axes: str, size: int | None, face: str, ball: int = 0) -> bytes:
     """One face of the cube, of ``FACES``, as HDR; arguments and errors as those of `to_cube`."""
     check_axes(axes, "cube")
-    column = to_cube(state.radiance, axes, size)
+    column = to_cube(_at_ball(state, ball), axes, size)
     edge, number = column.shape[1], FACES.index(face)
     picture = np.ascontiguousarray(column[number * edge : (number + 1) * edge])
     return encode_hdr(picture, CUBES[axes])

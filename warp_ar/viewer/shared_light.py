@@ -1,7 +1,7 @@
 """The light as other programs take it from the page's server: ``/light.json``, pictures, and a channel of changes.
 
     GET /light.json                 harmonics, key light, interval, exposure, pose
-    GET /light.exr, /light.hdr      the environment: ``?axes=``, ``?layout=cube``, ``?size=``
+    GET /light.exr, /light.hdr      the environment: ``?axes=``, ``?layout=cube``, ``?size=``, ``?ball=``
     GET /light/px.hdr ... nz.hdr    one face of the cube
     WS  /light                      the same JSON, when it has changed; text, no answer expected
 
@@ -92,7 +92,7 @@ class SharedLight:
         return web.json_response(await self._made(describe, state, pose, axes))
 
     async def _picture(self, request: web.Request) -> web.Response:
-        layout, size = request.query.get("layout", "latlong"), _size(request)
+        layout, size, ball = request.query.get("layout", "latlong"), _size(request), _ball(request)
         axes, kind = _axes(request), request.path.rpartition(".")[2]
         if layout not in LAYOUTS:
             raise web.HTTPBadRequest(text=f"layout = {layout!r}: expected {' or '.join(LAYOUTS)}\n")
@@ -100,15 +100,15 @@ class SharedLight:
 
         from warp_ar.viewer.light_record import encode_picture
 
-        return self._answer(await self._made(encode_picture, state, kind, axes, layout, size), kind)
+        return self._answer(await self._made(encode_picture, state, kind, axes, layout, size, ball), kind)
 
     async def _face(self, request: web.Request) -> web.Response:
-        axes, size = _axes(request), _size(request)
+        axes, size, ball = _axes(request), _size(request), _ball(request)
         state = await self._state()
         from warp_ar.viewer.light_record import encode_face
 
         face = request.path.rpartition("/")[2].removesuffix(".hdr")
-        return self._answer(await self._made(encode_face, state, axes, size, face), "hdr")
+        return self._answer(await self._made(encode_face, state, axes, size, face, ball), "hdr")
 
     async def _made(self, make: Callable[..., Any], *arguments: Any) -> Any:
         """What a function makes beside the loop; what it refuses is the request's fault."""
@@ -179,6 +179,13 @@ def _size(request: web.Request) -> int | None:
         return None
     if not (text.isascii() and text.isdigit() and len(text) < 6 and 1 <= int(text) <= LARGEST_FACE):
         raise web.HTTPBadRequest(text=f"size = {text[:40]!r}: expected 1 to {LARGEST_FACE} texels\n")
+    return int(text)
+
+
+def _ball(request: web.Request) -> int:
+    text = request.query.get("ball", "0")
+    if not (text.isascii() and text.isdigit() and len(text) < 4):
+        raise web.HTTPBadRequest(text=f"ball = {text[:40]!r}: expected the number of a mirror ball, counted from 0\n")
     return int(text)
 
 

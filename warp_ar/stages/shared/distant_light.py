@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import warp as wp
 
+from warp_ar.kernels.interpolated_irradiance import OtherBalls
 from warp_ar.kernels.reflect import DistantLight
 from warp_ar.kernels.split_sum import integrate_dfg
 from warp_ar.kernels.structs import METALLIC_ROUGHNESS
@@ -62,10 +63,22 @@ def make_distant_light(features: Features, arrays: Arrays, stage: str) -> Distan
     distant.probes = arrays["probes"]
     if config.emitters:
         distant.emitters = arrays["emitters"]
-    fields = {
-        "others_irradiance": f"others_{config.diffuse}",
-        "probe_places": "places",
-    }
-    for name in _other_reads(features):
-        setattr(distant, fields.get(name, name), arrays[name])
+    if names := _other_reads(features):
+        distant.others = make_other_balls(features, arrays, names)
     return distant
+
+
+def make_other_balls(features: Features, arrays: Arrays, names: Iterable[str]) -> OtherBalls:
+    """The light at the balls after the first, as far as these resources hold it."""
+    fields = {
+        "probe_places": "places",
+        "others_irradiance": features.irradiance,
+        "others_levels": "levels",
+        "others_environment": "environment",
+        "others_emitters": "emitters",
+    }
+    others = OtherBalls()
+    for name in names:
+        if name in fields:
+            setattr(others, fields[name], arrays[name])
+    return others

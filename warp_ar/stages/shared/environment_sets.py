@@ -15,6 +15,11 @@ def lists_texels(features: Features) -> bool:
     return features.request.quality.method("environment_shadow") == "brute_force"
 
 
+def sample_slots(features: Features) -> int:
+    """Samples of which each of the balls whose light is interpolated has one or two."""
+    return 1 << features.others.bit_length()
+
+
 def sample_names(features: Features) -> tuple[str, str, str]:
     """Arrays that shadows read: directions, flux, samples."""
     listed = "environment_samples_texel_directions", "environment_samples_texel_flux", "environment_samples_texels"

@@ -24,6 +24,8 @@ def relight_reads(features: Features) -> tuple[str, ...]:
     if method in ("reflectance", *LOCAL):
         reads.append(features.irradiance)
         reads += ["emitters"] * features.emitters
+        if features.others:
+            reads += ["others_irradiance", "probe_places", *(["others_emitters"] * features.emitters)]
     if features.ambient_visibility:
         reads.append("environment_samples")
     return tuple(reads)
@@ -42,5 +44,6 @@ def relight_config(features: Features) -> RelightConfig:
         features.ambient_visibility,
         features.bounced,
         features.request.quality.edge_samples,
-        features.area_samples,
+        several=method in ("reflectance", *LOCAL) and features.others > 0,
+        area_samples=features.area_samples,
     )
