@@ -66,13 +66,14 @@ def test_light_of_unknown_direction_is_best_met_by_three_eighths():
     assert (given @ others / (given @ given)).mean() == pytest.approx(ELSEWHERE, abs=2e-3)
 
 
-def plane_in_the_sun(shown_shadow, level=1.0, texture=0.1):
+def plane_in_the_sun(shown_shadow, level=1.0, texture=0.1, both_sides=True):
     """Equations of a plane around a ball of five centimetres. The estimate has two thirds of the light come from +x.
 
     Args:
         shown_shadow: Where rays toward this direction meet the ball the plane is dark.
         level: What is added, beside the ball and elsewhere where its rays pass within 2.5 radii, over what is said.
         texture: Standard deviation of the logarithm of its reflectance.
+        both_sides: Of the ball's shadow, or of one alone.
     """
     rng = np.random.default_rng(7)
     points = np.column_stack([rng.uniform(-0.5, 0.5, (1500, 2)), np.zeros(1500)])
@@ -99,7 +100,8 @@ def plane_in_the_sun(shown_shadow, level=1.0, texture=0.1):
     problem.added_irradiance = lambda unknowns: added * unknowns.mean()
     problem.distant_radiance = lambda unknowns: unknowns
     problem.near_emitters = lambda unknowns: []
-    true = 2.0 * np.where(passes(sun, 2.5), level, 1.0) * ~passes(shown_shadow, 1.0)
+    hidden = passes(sun, 2.5) & (points[:, 1] > (-1.0 if both_sides else 0.0))
+    true = 2.0 * np.where(hidden, level, 1.0) * ~passes(shown_shadow, 1.0)
     problem.light = 0.3 * (1.0 + true[:, None]) * np.exp(texture * rng.standard_normal((1500, 1))) * np.ones(3)
     return problem, ball
 
@@ -121,6 +123,11 @@ def test_planes_tell_what_reaches_the_ball(shown_shadow, level, least, most):
     # Nothing is asked of an estimate that adds nothing, nor of points that clip.
     assert reaching_factor(problem, np.zeros((1, 3)), ball) == 1.0
     problem.exact[:] = False
+    assert reaching_factor(problem, np.ones((1, 3)), ball) == 1.0
+
+
+def test_a_shadow_whose_edge_passes_by_the_ball_says_nothing():
+    problem, ball = plane_in_the_sun(np.array([0.8, 0.0, 0.6]), 0.0, both_sides=False)
     assert reaching_factor(problem, np.ones((1, 3)), ball) == 1.0
 
 
@@ -170,17 +177,22 @@ def test_rays_that_pass_closely_are_found_for_distant_and_near_light():
     problem.distant_radiance = lambda unknowns: unknowns
     problem.near_emitters = lambda unknowns: []
     away = np.linalg.norm(points[:, :2], axis=1)
-    shares = passing_shares(problem, np.ones((1, 3)), ball, (2.0, 3.5))
+    shares = passing_shares(problem, np.ones((1, 3)), ball, (2.0, 3.5))[0]
     assert np.array_equal(shares, [away < 0.2, away < 0.35])
     # A lamp at the height h above the table, straight above a ball at the height 0.1: a ray to the point at the
     # distance x passes the ball's middle at x (h - 0.1) / sqrt(x^2 + h^2).
     problem.distant_radiance = lambda unknowns: 0.0 * unknowns
     problem.near_emitters = lambda unknowns: [(np.array([0.0, 0.0, 0.5]), np.ones(3))]
-    shares = passing_shares(problem, np.ones((1, 3)), ball, (2.0,))
+    shares = passing_shares(problem, np.ones((1, 3)), ball, (2.0,))[0]
     assert np.array_equal(shares[0], away * 0.4 / np.hypot(away, 0.5) < 0.2)
     # Below the ball's middle a lamp lights nothing past it.
     problem.near_emitters = lambda unknowns: [(np.array([0.0, 0.0, 0.05]), np.ones(3))]
-    assert not passing_shares(problem, np.ones((1, 3)), ball, (0.4,)).any()
+    assert not passing_shares(problem, np.ones((1, 3)), ball, (0.4,))[0].any()
+    # Light from +x: points at +y have the ball on their right.
+    problem.direction, problem.near_emitters = np.array([[0.8, 0.0, 0.6]]), lambda unknowns: []
+    problem.distant_radiance = lambda unknowns: unknowns
+    shares, side = passing_shares(problem, np.ones((1, 3)), ball, (2.0,))
+    assert np.array_equal(np.sign(side), np.sign(points[:, 1]) * (shares[0] > 0.0))
 
 
 @pytest.mark.parametrize("true", [0.0, 0.4, 1.0])
@@ -190,7 +202,7 @@ def test_the_share_of_light_that_arrives_is_told(true, known):
     rng = np.random.default_rng(6)
     added = np.repeat([0.0, 2.0], 40)
     light = np.exp(-1.0) * (1.0 + true * added) * np.exp(0.05 * rng.standard_normal(80))
-    cost = costs(light, np.ones(80), added, np.full(80, 2.0), 0.05, -1.0, known)
+    cost = costs(np.stack([light, np.ones(80), added, np.full(80, 2.0)]), 0.05, -1.0, known)
     # Twenty equations of 5 % on either side, the logarithm of 1 + 2 f.
     assert SHARES[cost.argmin()] == pytest.approx(true, abs=0.1)
     assert share_told(cost) == pytest.approx(true, abs=0.1)

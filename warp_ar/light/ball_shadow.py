@@ -11,7 +11,8 @@ plane shows
 Two groups of points tell f, each against all points of its plane to which hardly any of a passes by the ball:
 
 - **Beside the shadow**, within two radii of the ball: the level is that of the plane elsewhere, where f = 1. They say
-  whether the light is there at all. What hides it does so for the ball as well, and f is taken.
+  whether the light is there at all. What hides it on both sides of the shadow hides it from the ball between them, and
+  f is taken. Where one side alone is dark, a shadow's edge passes, and the ball may lie in the light.
 - **Across the shadow**, within 3.5 radii: the level is free. They say whether the ball throws the shadow that the
   estimate says. If it does not, the light comes from elsewhere; the card says that it is there. Light from a
   direction b in place of a, over all normals, is best met by the factor (irradiances max(n . a, 0), max(n . b, 0))
@@ -53,8 +54,11 @@ class Ball:
     """Metres; 0: a point, which throws no shadow."""
 
 
-def passing_shares(problem: Problem, unknowns: Array, ball: Ball, reach: tuple[float, ...]) -> Array:
+def passing_shares(problem: Problem, unknowns: Array, ball: Ball, reach: tuple[float, ...]) -> tuple[Array, Array]:
     """Share of what an estimate adds at each point that passes the ball closely or is stopped by it, (reaches, n).
+
+    And on which side of the ball it passes within the first reach: above 0 where a point that looks toward the light
+    has the ball on its right, (n,).
 
     Args:
         problem: The equations.
@@ -65,7 +69,8 @@ def passing_shares(problem: Problem, unknowns: Array, ball: Ball, reach: tuple[f
     distant, near = problem.distant_radiance(unknowns), problem.near_emitters(unknowns)
     power = (distant * problem.missing).sum(axis=1) * problem.solid_angle
     to_ball = ball.center - problem.points
-    close, total = np.zeros((len(reach), len(to_ball))), np.zeros(len(to_ball))
+    close, total, side = np.zeros((len(reach), len(to_ball))), np.zeros(len(to_ball)), np.zeros(len(to_ball))
+    across = np.cross(problem.normals, to_ball)
 
     def add(direction: Array, weight: Array, length: Array | float) -> None:
         """Rays (n or 1, k, 3) of a weight (n, k) and a length."""
@@ -75,6 +80,8 @@ def passing_shares(problem: Problem, unknowns: Array, ball: Ball, reach: tuple[f
         ahead = (along > 0.0) & (along < length)
         for k, radii in enumerate(reach):
             close[k] += (weight * (ahead & (off < radii**2))).sum(axis=1)
+        sign = np.sign((across[:, None] * direction).sum(axis=2))
+        side[:] += (weight * sign * (ahead & (off < reach[0] ** 2))).sum(axis=1)
         total[:] += weight.sum(axis=1)
 
     cells = np.flatnonzero(power > 0.0)
@@ -86,23 +93,20 @@ def passing_shares(problem: Problem, unknowns: Array, ball: Ball, reach: tuple[f
         away = np.linalg.norm(ray, axis=1, keepdims=True)
         cosine = np.maximum((ray * problem.normals).sum(axis=1, keepdims=True) / away, 0.0)
         add((ray / away)[:, None], cosine * float(intensity.sum()) / away**2, away)
-    return np.asarray(close / np.maximum(total, 1e-12), np.float64)
+    return close / np.maximum(total, 1e-12), side
 
 
-def costs(
-    shown: Array, captured: Array, added: Array, shared: Array, scatter: float, level: float, known: float | None
-) -> Array:
+def costs(given: Array, scatter: float, level: float, known: float | None) -> Array:
     """Twice the negative log likelihood of each of ``SHARES``, (shares,).
 
     Args:
-        shown: Light that points show, (n,).
-        captured: Irradiance as captured, (n,).
-        added: Irradiance that the estimate adds, (n,).
-        shared: Points that share one error, (n,).
+        given: Of points: light that they show, irradiance as captured, irradiance that the estimate adds, and how many
+            share one error, (4, n).
         scatter: Standard deviation of the logarithm of one point.
         level: Logarithm of light over irradiance, of the plane elsewhere.
         known: Standard deviation of that level here; None: it is free.
     """
+    shown, captured, added, shared = given
     logs = np.log(shown) - level - np.log(np.maximum(captured + SHARES[:, None] * added, 1e-9))
     trusted = np.ones_like(logs)
     prior = 1e-9 if known is None else (scatter / known) ** 2
@@ -115,9 +119,16 @@ def costs(
     return np.asarray(cost + prior * (offset[:, 0] / scatter) ** 2, np.float64)
 
 
-def share_told(cost: Array) -> float:
-    """What nearly all of the likelihood has f above, and 1 where the evidence is not worth listening to."""
+def share_told(cost: Array, sides: Array | None = None) -> float:
+    """What nearly all of the likelihood has f above, and 1 where the evidence is not worth listening to.
+
+    Args:
+        cost: From ``costs``, (shares,).
+        sides: The same of points on either side of the shadow, each of which must say half of it, (2, shares).
+    """
     if cost[-1] - cost.min() < CONFIG.search.evidence:
+        return 1.0
+    if sides is not None and (sides[:, -1] - sides.min(axis=1)).min() < 0.5 * CONFIG.search.evidence:
         return 1.0
     likelihood = np.cumsum(np.exp(-0.5 * (cost - cost.min())))
     return float(SHARES[np.searchsorted(likelihood, CONFIG.evidence.share * likelihood[-1])])
@@ -140,21 +151,27 @@ def reaching_factor(problem: Problem, unknowns: Array, ball: Ball) -> float:
         return 1.0
     shown, captured = problem.light.sum(axis=1), problem.captured.sum(axis=1)
     ratio = np.log(shown) - np.log(np.maximum(captured + added, 1e-9))
-    beside, across = np.zeros(len(SHARES)), np.zeros(len(SHARES))
-    passing = passing_shares(problem, unknowns, ball, (config.beside, config.across))
+    given = np.stack([shown, captured, added, problem.shared])
+    beside, across, sides = np.zeros(len(SHARES)), np.zeros(len(SHARES)), np.zeros((2, len(SHARES)))
+    passing, side = passing_shares(problem, unknowns, ball, (config.beside, config.across))
     for surface in np.unique(problem.surface[usable]):
         own = usable & (problem.surface == surface)
-        for cost, close, least, is_known in (
-            (beside, passing[0], config.beside_share, True),
-            (across, passing[1], config.elsewhere, False),
-        ):
-            elsewhere, here = own & (close < config.elsewhere), own & (close > least)
-            if min(elsewhere.sum(), here.sum()) < config.points:
-                continue
-            level = float(np.median(ratio[elsewhere]))
-            scatter = 1.4826 * float(np.median(np.abs(ratio[elsewhere] - level)))
-            known = float(np.hypot(scatter, config.level)) if is_known else None
-            given = (shown[here], captured[here], added[here], problem.shared[here])
-            cost += costs(*given, max(scatter, config.scatter), level, known)
+        elsewhere, here = own & (passing[0] < config.elsewhere), own & (passing[0] > config.beside_share)
+        if min(elsewhere.sum(), here.sum()) >= config.points:
+            level, scatter = _level(ratio[elsewhere])
+            known = float(np.hypot(scatter, config.level))
+            told = [costs(given[:, one], scatter, level, known) for one in (here, here & (side < 0), here & (side > 0))]
+            beside += told[0]
+            sides += told[1:]
+        elsewhere, here = own & (passing[1] < config.elsewhere), own & (passing[1] > config.elsewhere)
+        if min(elsewhere.sum(), here.sum()) >= config.points:
+            level, scatter = _level(ratio[elsewhere])
+            across += costs(given[:, here], scatter, level, None)
     directed = share_told(across)
-    return min(share_told(beside), directed + ELSEWHERE * (1.0 - directed))
+    return min(share_told(beside, sides), directed + ELSEWHERE * (1.0 - directed))
+
+
+def _level(ratio: Array) -> tuple[float, float]:
+    """Median and standard deviation of logarithms of light over irradiance, (n,)."""
+    level = float(np.median(ratio))
+    return level, max(1.4826 * float(np.median(np.abs(ratio - level))), CONFIG.shadow.scatter)
