@@ -126,6 +126,7 @@ class Problem:
         self.index = np.flatnonzero(seen)
         shown = observations[seen]
         self.points = surfaces.points["position"][seen].astype(float)
+        self.normals = surfaces.points["normal"][seen].astype(float)
         self.surface = surfaces.surface[seen]
         self.kinds, self.groups, self.white = surfaces.kinds, surfaces.groups, white
         self.kind = self.kinds[self.surface]
@@ -274,6 +275,31 @@ class Problem:
         near[cell] = True
         total = self.solid_angle[near] @ self.missing[near]
         return np.asarray(near[:, None] / np.maximum(total, 1e-6), np.float64)
+
+    def distant_radiance(self, unknowns: Array) -> Array:
+        """Radiance that cells lack by parts and candidates at infinity, (m, 3).
+
+        Args:
+            unknowns: Radiance of parts, then power of candidates, (parts + candidates, 3).
+        """
+        radiance = self.member @ unknowns[: self.parts]
+        for candidate, power in zip(self.candidates, unknowns[self.parts :], strict=True):
+            if not np.isfinite(candidate.distance):
+                radiance += self.patch(candidate.cell) * power
+        return radiance
+
+    def near_emitters(self, unknowns: Array) -> list[tuple[Array, Array]]:
+        """Places of candidates that are not at infinity, metres (3,), and their intensities, (3,)."""
+        return [
+            (self.origin[one.cell] + one.distance * self.direction[one.cell], power * one.distance**2)
+            for one, power in zip(self.candidates, unknowns[self.parts :], strict=True)
+            if np.isfinite(one.distance)
+        ]
+
+    def added_irradiance(self, unknowns: Array) -> Array:
+        """Irradiance of points by parts and candidates, each candidate where it stands, (points, 3)."""
+        columns = np.concatenate([self.columns, self.candidate_columns], axis=2)
+        return np.asarray(np.einsum("cnk,kc->nc", columns, unknowns), np.float64)
 
     def push(self, candidate: Candidate) -> None:
         """Add a candidate to the unknowns."""

@@ -48,6 +48,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from warp_ar.light.ball_shadow import Ball, reaching_factor
 from warp_ar.light.card import NO_CARD, CardCheck, check_card
 from warp_ar.light.config import CONFIG
 from warp_ar.light.emitters import EmitterSearch
@@ -191,7 +192,8 @@ class Recovery:
         self._solved += 1
         self._unseen = 0
         means, bounds = problem.card_means()
-        by_card = problem.member @ (problem.expected[problem.component][:, None] * means)
+        radiance_by_card = problem.expected[problem.component][:, None] * means
+        by_card = problem.member @ radiance_by_card
         if self.method == "white_card" or not (problem.parts or problem.may_hold_candidate.any()):
             factor = problem.card_factor(bounds, doubt_of(card.contrast))
             self._held = self._estimate(problem, by_card, bounds, "white_card", factor, card)
@@ -219,9 +221,11 @@ class Recovery:
         if is_turn or self._evidence is None:
             c = _told_channel(problem)
             start = fit_channel(problem, c, problem.start(means[c]), CONFIG.solver.iterations).z
-            self._evidence = _weigh(
-                problem, c, start, bounds, (recovered, by_card), self._blocks, doubt_of(card.contrast)
-            )
+            evidence = _weigh(problem, c, start, bounds, (recovered, by_card), self._blocks, doubt_of(card.contrast))
+            if evidence.method == "white_card":
+                solution = np.concatenate([radiance_by_card, np.zeros((len(powers), 3))])
+            reaching = reaching_factor(problem, solution, Ball(self._center, self._radius))
+            self._evidence = dataclasses.replace(evidence, factor=min(evidence.factor, reaching))
         evidence = self._evidence
         if evidence.method == "shading":
             self._held = self._estimate(problem, recovered, bounds, *evidence.parts, card, tuple(emitters))

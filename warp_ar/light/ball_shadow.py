@@ -1,0 +1,177 @@
+"""Whether recovered light reaches the ball, as the surface around the ball's own shadow shows it.
+
+The card says how much light is missing, and shading where it comes from; but what lights them need not light the ball:
+clutter that nobody modelled may hide it there, and what clips in the ball may not be what lights the card. Light that
+passes close to the ball falls on the planes beside its shadow, and what is hidden from the ball is hidden there too.
+With e the irradiance as captured, a what an estimate adds and f the share of a that reaches the ball, a point of a
+plane shows
+
+    log L = level + log(e + f a) + texture.
+
+Two groups of points tell f, each against all points of its plane to which hardly any of a passes by the ball:
+
+- **Beside the shadow**, within two radii of the ball: the level is that of the plane elsewhere, where f = 1. They say
+  whether the light is there at all. What hides it on both sides of the shadow hides it from the ball between them, and
+  f is taken. Where one side alone is dark, a shadow's edge passes, and the ball may lie in the light.
+- **Across the shadow**, within 3.5 radii: the level is free. They say whether the ball throws the shadow that the
+  estimate says. If it does not, the light comes from elsewhere; the card says that it is there. Light from a
+  direction b in place of a, over all normals, is best met by the factor (irradiances max(n . a, 0), max(n . b, 0))
+
+        mean over b of X . D / |X|^2 = (1 / 4)^2 / (1 / 6) = 3 / 8,
+
+  so that f + 3/8 (1 - f) is taken.
+
+Either is listened to only where the cost, twice a negative log likelihood, falls from f = 1 by as much as is asked of a
+new emitter: where the evidence is good, nothing is lost, and where there is none, nothing changes. Emitters stand where
+they were found, near or far; a near one lights a plane unevenly, which is no shadow.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from warp_ar.light.config import CONFIG, Kind
+from warp_ar.light.problem import Problem
+
+Array = NDArray[np.float64]
+
+ELSEWHERE = 3.0 / 8.0
+"""Factor that light of unknown direction is best met by."""
+SHARES = np.linspace(0.0, 1.0, 41)
+"""Values of f that are tried."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Ball:
+    """Where light is looked for."""
+
+    center: Array
+    """Metres, (3,)."""
+    radius: float
+    """Metres; 0: a point, which throws no shadow."""
+
+
+def passing_shares(problem: Problem, unknowns: Array, ball: Ball, reach: tuple[float, ...]) -> tuple[Array, Array]:
+    """Share of what an estimate adds at each point that passes the ball closely or is stopped by it, (reaches, n).
+
+    And on which side of the ball it passes within the first reach: above 0 where a point that looks toward the light
+    has the ball on its right, (n,).
+
+    Args:
+        problem: The equations.
+        unknowns: Radiance of parts, then power of candidates, (parts + candidates, 3).
+        ball: The ball.
+        reach: Radii from the ball's middle within which a ray passes closely.
+    """
+    distant, near = problem.distant_radiance(unknowns), problem.near_emitters(unknowns)
+    power = (distant * problem.missing).sum(axis=1) * problem.solid_angle
+    to_ball = ball.center - problem.points
+    close, total, side = np.zeros((len(reach), len(to_ball))), np.zeros(len(to_ball)), np.zeros(len(to_ball))
+    across = np.cross(problem.normals, to_ball)
+
+    def add(direction: Array, weight: Array, length: Array | float) -> None:
+        """Rays (n or 1, k, 3) of a weight (n, k) and a length."""
+        along = (to_ball[:, None] * direction).sum(axis=2)
+        # Squared distance of the ball's middle from the ray, in radii.
+        off = ((to_ball**2).sum(axis=1)[:, None] - along**2) / ball.radius**2
+        ahead = (along > 0.0) & (along < length)
+        for k, radii in enumerate(reach):
+            close[k] += (weight * (ahead & (off < radii**2))).sum(axis=1)
+        sign = np.sign((across[:, None] * direction).sum(axis=2))
+        side[:] += (weight * sign * (ahead & (off < reach[0] ** 2))).sum(axis=1)
+        total[:] += weight.sum(axis=1)
+
+    cells = np.flatnonzero(power > 0.0)
+    if len(cells):
+        toward = problem.direction[cells]
+        add(toward[None], np.maximum(problem.normals @ toward.T, 0.0) * power[cells], np.inf)
+    for place, intensity in near:
+        ray = place - problem.points
+        away = np.linalg.norm(ray, axis=1, keepdims=True)
+        cosine = np.maximum((ray * problem.normals).sum(axis=1, keepdims=True) / away, 0.0)
+        add((ray / away)[:, None], cosine * float(intensity.sum()) / away**2, away)
+    return close / np.maximum(total, 1e-12), side
+
+
+def costs(given: Array, scatter: float, level: float, known: float | None) -> Array:
+    """Twice the negative log likelihood of each of ``SHARES``, (shares,).
+
+    Args:
+        given: Of points: light that they show, irradiance as captured, irradiance that the estimate adds, and how many
+            share one error, (4, n).
+        scatter: Standard deviation of the logarithm of one point.
+        level: Logarithm of light over irradiance, of the plane elsewhere.
+        known: Standard deviation of that level here; None: it is free.
+    """
+    shown, captured, added, shared = given
+    logs = np.log(shown) - level - np.log(np.maximum(captured + SHARES[:, None] * added, 1e-9))
+    trusted = np.ones_like(logs)
+    prior = 1e-9 if known is None else (scatter / known) ** 2
+    for _ in range(CONFIG.shadow.iterations):
+        weights = trusted / shared
+        offset = (weights * logs).sum(axis=1, keepdims=True) / (weights.sum(axis=1, keepdims=True) + prior)
+        squared = ((logs - offset) / scatter) ** 2
+        trusted = 1.0 / (1.0 + 0.25 * squared)
+    cost = (4.0 * np.log1p(0.25 * squared) / shared).sum(axis=1)
+    return np.asarray(cost + prior * (offset[:, 0] / scatter) ** 2, np.float64)
+
+
+def share_told(cost: Array, sides: Array | None = None) -> float:
+    """What nearly all of the likelihood has f above, and 1 where the evidence is not worth listening to.
+
+    Args:
+        cost: From ``costs``, (shares,).
+        sides: The same of points on either side of the shadow, each of which must say half of it, (2, shares).
+    """
+    if cost[-1] - cost.min() < CONFIG.search.evidence:
+        return 1.0
+    if sides is not None and (sides[:, -1] - sides.min(axis=1)).min() < 0.5 * CONFIG.search.evidence:
+        return 1.0
+    likelihood = np.cumsum(np.exp(-0.5 * (cost - cost.min())))
+    return float(SHARES[np.searchsorted(likelihood, CONFIG.evidence.share * likelihood[-1])])
+
+
+def reaching_factor(problem: Problem, unknowns: Array, ball: Ball) -> float:
+    """What an estimate is to be multiplied by, 0 to 1, for what the planes around the ball show of it.
+
+    Args:
+        problem: The equations.
+        unknowns: Radiance of parts, then power of candidates, (parts + candidates, 3).
+        ball: The ball.
+    """
+    added = problem.added_irradiance(unknowns).sum(axis=1)
+    if ball.radius <= 0.0 or not added.any():
+        return 1.0
+    config = CONFIG.shadow
+    usable = (problem.kind == Kind.PLANE) & problem.exact.all(axis=1)
+    if not usable.any():
+        return 1.0
+    shown, captured = problem.light.sum(axis=1), problem.captured.sum(axis=1)
+    ratio = np.log(shown) - np.log(np.maximum(captured + added, 1e-9))
+    given = np.stack([shown, captured, added, problem.shared])
+    beside, across, sides = np.zeros(len(SHARES)), np.zeros(len(SHARES)), np.zeros((2, len(SHARES)))
+    passing, side = passing_shares(problem, unknowns, ball, (config.beside, config.across))
+    for surface in np.unique(problem.surface[usable]):
+        own = usable & (problem.surface == surface)
+        elsewhere, here = own & (passing[0] < config.elsewhere), own & (passing[0] > config.beside_share)
+        if min(elsewhere.sum(), here.sum()) >= config.points:
+            level, scatter = _level(ratio[elsewhere])
+            known = float(np.hypot(scatter, config.level))
+            told = [costs(given[:, one], scatter, level, known) for one in (here, here & (side < 0), here & (side > 0))]
+            beside += told[0]
+            sides += told[1:]
+        elsewhere, here = own & (passing[1] < config.elsewhere), own & (passing[1] > config.elsewhere)
+        if min(elsewhere.sum(), here.sum()) >= config.points:
+            level, scatter = _level(ratio[elsewhere])
+            across += costs(given[:, here], scatter, level, None)
+    directed = share_told(across)
+    return min(share_told(beside, sides), directed + ELSEWHERE * (1.0 - directed))
+
+
+def _level(ratio: Array) -> tuple[float, float]:
+    """Median and standard deviation of logarithms of light over irradiance, (n,)."""
+    level = float(np.median(ratio))
+    return level, max(1.4826 * float(np.median(np.abs(ratio - level))), CONFIG.shadow.scatter)
