@@ -11,6 +11,7 @@ import shutil
 import subprocess
 import tempfile
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -301,6 +302,16 @@ class _Quiet(http.server.SimpleHTTPRequestHandler):
         pass
 
 
+MIDDLE = """() => {
+  const canvas = document.getElementById("view");
+  const copy = document.createElement("canvas");
+  [copy.width, copy.height] = [canvas.width, canvas.height];
+  const context = copy.getContext("2d");
+  context.drawImage(canvas, 0, 0);
+  return Array.from(context.getImageData(159, 119, 2, 2).data);
+}"""
+
+
 @pytest.mark.skipif(CHROMIUM is None, reason="needs a browser: apt-get install chromium")
 def test_three_js_shows_a_ball_as_the_light_says(three: Path) -> None:
     """The example page, from another origin, in a real browser: the ball's middle has albedo / pi times E(+z)."""
@@ -330,16 +341,10 @@ def test_three_js_shows_a_ball_as_the_light_says(three: Path) -> None:
             page.on("pageerror", lambda error: problems.append(str(error)))
             page.goto(f"{origin}/live-light.html?desk={address[0].replace('?', '%3F')}")
             page.wait_for_function("window.shown !== undefined", timeout=1e3 * PATIENCE)
-            told, pixels = page.evaluate(
-                """() => {
-                    const canvas = document.getElementById("view");
-                    const copy = document.createElement("canvas");
-                    [copy.width, copy.height] = [canvas.width, canvas.height];
-                    const context = copy.getContext("2d");
-                    context.drawImage(canvas, 0, 0);
-                    return [window.shown, Array.from(context.getImageData(159, 119, 2, 2).data)];
-                }"""
-            )
+            deadline = time.monotonic() + PATIENCE
+            while not any((pixels := page.evaluate(MIDDLE))[:3]) and time.monotonic() < deadline:
+                page.wait_for_timeout(100)  # drawn in the next frame, as soon as there is a GPU or what stands for it
+            told = page.evaluate("window.shown")
             browser.close()
         assert not problems
         middle = np.array(pixels, float).reshape(4, 4)[:, :3].mean(0)
