@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from tests import test_near_field as near_field
 from tests.kernel_rig import constant_environment
 from tests.reference.probe_weights import weights
 from tests.test_environment_shadow import SUM_ERROR, sky, sphere
@@ -109,6 +110,23 @@ def test_a_shadow_beside_a_ball_is_that_of_its_light_alone(device):
     found, surface = run_shadow(drawn, item, count=4096, side=1, filtered=False, others=others)
     alone, _ = run_shadow(sample_all(environments[1:], texels=True), item, count=2048, side=1, filtered=False)
     np.testing.assert_allclose(found[surface >= 0], alone[surface >= 0], atol=SUM_ERROR)
+
+
+def test_objects_near_the_desk_take_each_sample_by_its_balls_weight(device):
+    """Of light that is summed by samples: beyond the second ball as if the first one's samples had no light."""
+    environments = skies(2)
+    drawn, alone = (sample_all(environments, texels=False) for _ in range(2))
+    values = alone[2].numpy()
+    values["measure"][::2] = 0.0
+    alone[2].assign(values)
+    beside = others_of([0.0], environments[1:], [(x, 0.0, 0.0, 1.0) for x in (-0.9, -0.5)])
+    item = [sphere(near_field.BALL, near_field.RADIUS)], [near_field.CHALK]
+    expected, _, found, _, _ = near_field.run(*item, drawn=alone)
+    several, *_ = near_field.run(*item, drawn=drawn, others=beside)
+    # The same sums of the same terms, and zeros.
+    np.testing.assert_allclose(several[found >= 0], expected[found >= 0], rtol=1e-6)
+    one, *_ = near_field.run(*item, drawn=drawn)
+    assert np.abs(one / np.maximum(expected, 1e-6) - 1.0)[found >= 0].max() > 0.1, "the other ball's light is another"
 
 
 def test_reflectance_is_by_the_irradiance_that_is_interpolated(device):

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from warp_ar.accuracy import known_frame
 from warp_ar.accuracy.known_frame import KnownFrame, light_of, light_up_to
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SourceError, UsageError
 from warp_ar.input.sources import open_source
 from warp_ar.kernels.structs import Emitter
-from warp_ar.scene import Scene, load_scene
+from warp_ar.light.captured import Light
+from warp_ar.scene import Pose, Scene, load_scene
 
 
 @pytest.fixture(scope="module")
@@ -79,3 +82,17 @@ def test_frames_that_cannot_be_judged_are_named(tmp_path: Path) -> None:
     nowhere = Scene(scene.camera)
     with pytest.raises(UsageError, match="names no source"):
         light_up_to(nowhere, 0, quality="low", device="cpu")
+
+
+def test_what_a_reference_lacks_of_several_balls_is_said_once(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(known_frame, "PathTracer", lambda *given, **more: None)
+    black = np.zeros((2, 4, 3), np.float32)
+    light, pose = Light(black, black[..., 0]), Pose(np.eye(3), np.zeros(3))
+    for balls, said in ((1, 0), (2, 1), (2, 1)):
+        scene = dataclasses.replace(load_scene("torus"), name="two balls of this test")
+        image = np.zeros((2, 4, 3), np.uint8)
+        KnownFrame(scene, image, image, pose, light, 0.0, 0.0, balls).tracer()
+        assert len(caplog.records) == said
+    assert "the path tracer's light is that of the first of 2 mirror balls" in caplog.records[0].getMessage()

@@ -60,6 +60,8 @@ def run(
     samples=1,
     environment_shows=1.0,
     known=False,
+    drawn=None,
+    others=None,
 ):
     models = tuple(sorted({m["model"] for m in materials}))
     forms = DistantLightConfig(
@@ -69,6 +71,7 @@ def run(
         "sh" if set(models) - {MIRROR} else "none",
         bool(set(models) - {LAMBERT}),
         False,
+        several=others is not None,
     )
     # As the stage has it: what no material needs is not compiled.
     lobes, samples = 4 if PHONG in models else 0, samples if MIRROR in models else 0
@@ -92,7 +95,9 @@ def run(
     hit_object, hits = wp.zeros((H, W), wp.int32), wp.zeros((H, W), Hit)
     visible = make_visible(hit_object, hits)
     trace_pixels(forms.trace, params, rays, scene, visible)
-    drawn = draw(environment)
+    drawn = draw(environment) if drawn is None else drawn
+    if others is not None:
+        surroundings.others = others
     frame = wp.full((H, W), wp.vec3ub(code, code, code), dtype=wp.vec3ub)
     near, layers = near_light((H, W)), near_field.ReceiverLayers()
     if ratio is not None:
