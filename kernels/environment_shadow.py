@@ -28,10 +28,11 @@ from warp_ar.kernels.cells import cell_pixel
 from warp_ar.kernels.environment_samples import SampleSets
 from warp_ar.kernels.environment_shadow_bounce import (
     Before,
+    Meeting,
     ReflectedLight,
+    caustic_alpha,
     make_look_before,
     make_reflect_back,
-    meet,
 )
 from warp_ar.kernels.environment_shadow_cells import (
     CHUNK,
@@ -40,18 +41,12 @@ from warp_ar.kernels.environment_shadow_cells import (
     EnvironmentShadowConfig,
     ShadowCells,
     bounced_of,
+    can_matter,
     cell_column,
     first_of_set,
     ratio_of,
 )
-from warp_ar.kernels.environment_shadow_rays import (
-    SampleRay,
-    Sender,
-    make_aim,
-    make_find_sender,
-    make_masks,
-    make_see_cell,
-)
+from warp_ar.kernels.environment_shadow_rays import make_aim, make_find_sender, make_masks
 from warp_ar.kernels.environment_shadow_wavefront import Wavefront, shade_wavefront
 from warp_ar.kernels.launch import Rows, launch_rows, slow_to_compile
 from warp_ar.kernels.reflect import DistantLight
@@ -59,85 +54,25 @@ from warp_ar.kernels.sampling import pcg3d_hash
 from warp_ar.kernels.shapes import surface_key
 from warp_ar.kernels.structs import FrameParams, Hit, Picture, RayScene
 from warp_ar.kernels.trace import make_trace, offset_origin
+from warp_ar.kernels.visibility import make_visible_proxy
 
 wp.set_module_options({"enable_backward": False})
-
-
-@wp.struct
-class CellSums:
-    """What the samples of a cell have brought so far."""
-
-    without: wp.vec3  # irradiance without virtual objects
-    hidden: wp.vec3  # of it what objects hide
-    reflected: ReflectedLight
-    before: Before  # the cell's surface, once an object was asked what it sends without a ray; up is 0 until then
-
-
-@functools.cache
-def make_meet_objects(config: EnvironmentShadowConfig) -> wp.Function:
-    """``meet_objects(params, picture, scene, distant, hit, ray, sender, key, asks, sums) -> CellSums``.
-
-    What objects hide of the ``sender`` along a ray from the cell's ``hit``, and, if the ray ``asks``, what they send
-    instead. ``key`` is for the random numbers of this ray.
-    """
-    trace = make_trace(config.distant.trace)
-    closest_object, occluded_by_objects = trace.closest_object, trace.occluded_by_objects
-    traced = config.bounce == "traced"
-    look_before = None if traced else make_look_before(config.distant)
-    reflect_back = make_reflect_back(config.distant, traced)
-
-    @wp.func(module="unique")
-    def meet_objects(
-        params: wp.array[FrameParams],
-        picture: Picture,
-        scene: RayScene,
-        distant: DistantLight,
-        hit: Hit,
-        ray: SampleRay,
-        sender: Sender,
-        key: wp.vec3ui,
-        asks: wp.bool,
-        sums: CellSums,
-    ) -> CellSums:
-        out = sums
-        other = Hit()
-        other.shape = -1
-        hides = wp.bool(False)
-        if asks:
-            other = closest_object(scene, ray.origin, ray.direction, sender.distance)
-            hides = other.shape >= 0
-        else:
-            hides = occluded_by_objects(scene, ray.origin, ray.direction, sender.distance)
-        if hides:
-            out.hidden += ray.weight * sender.radiance
-        if other.shape >= 0:
-            stands_for = ray.weight * wp.static(config.count / config.secondary_count)
-            meeting = meet(scene, other, ray.direction, hit.point, stands_for)
-            seed = wp.vec3ui()
-            if wp.static(traced):
-                seed = pcg3d_hash(key[0], key[1], key[2])
-            elif out.before.up == wp.vec3(0.0, 0.0, 0.0):
-                out.before = look_before(distant, hit.point, hit.geometric_normal, ray.direction)
-            out.reflected = reflect_back(params[0], picture, scene, distant, meeting, out.before, seed, out.reflected)
-        return out
-
-    return meet_objects
 
 
 @functools.cache
 def make_environment_shadow_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
     """Kernel specialised to ``config``; equal configs share one kernel."""
+    trace = make_trace(config.distant.trace)
+    closest_object, occluded_by_objects = trace.closest_object, trace.occluded_by_objects
+    mask_objects, mask_physical = make_masks(config, min(config.count, CHUNK))
+    visible_proxy = make_visible_proxy(config.distant.trace, config.distant.probes)
+    aim, find_sender = make_aim(config.emitters, config.distant.several), make_find_sender(config)
+    traced = config.bounce == "traced"
+    look_before = None if traced else make_look_before(config.distant)
+    reflect_back = make_reflect_back(config.distant, traced)
     side = config.side
     chunk = min(config.count, CHUNK)
-    mask_objects, mask_physical = make_masks(config, chunk)
-    see_cell, aim, find_sender = (
-        make_see_cell(config),
-        make_aim(config.emitters, config.distant.several),
-        make_find_sender(config),
-    )
-    meet_objects = make_meet_objects(config)
     secondary_count = config.secondary_count
-    all_ask = secondary_count == config.count
 
     @slow_to_compile
     @wp.kernel(module="unique", enable_backward=False)
@@ -155,27 +90,36 @@ def make_environment_shadow_kernel(config: EnvironmentShadowConfig) -> wp.Kernel
     ):
         i, j = wp.tid()
         i += row_start
+        rays = picture.rays
+        stride = cells_out.stride
         j = cell_column(j, cells_out.surface.shape[1], side, lanes)
+        row = cell_pixel(i, stride, rays.shape[0])
+        column = cell_pixel(j, stride, rays.shape[1])
         cells_out.surface[i, j] = -1
-        hit = see_cell(params, picture.rays, scene, distant.probes, cells_out.stride, i, j)
+        if not can_matter(row, column, stride * side, params[0].shadow_rect):
+            return
+        hit = visible_proxy(params[0], rays[row, column], scene, distant.probes)
         if hit.shape < 0:
             return
         cells_out.surface[i, j] = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
         cells_out.ratio[i, j] = wp.vec4(1.0, 1.0, 1.0, hit.t)
         cells_out.bounced[i, j] = wp.vec3(0.0)
 
-        row = cell_pixel(i, cells_out.stride, picture.rays.shape[0])
-        column = cell_pixel(j, cells_out.stride, picture.rays.shape[1])
-        sums = CellSums()
+        point = hit.point
+        own = hit.shape
+        without = wp.vec3(0.0)
+        hidden = wp.vec3(0.0)
+        reflected = ReflectedLight()
+        before = Before()
         # A set is in the order of its sequence: any first part of it is a smaller set.
         first = first_of_set(i, j, side, sets.samples.shape[0])
         for block in range(wp.static(config.count // chunk)):
             at = first + block * wp.static(chunk)
-            virtual_mask = mask_objects(scene, sets, at, hit.point)
+            virtual_mask = mask_objects(scene, sets, at, point)
             if wp.static(config.count == chunk):
                 if virtual_mask == wp.uint64(0):
                     return
-            physical = mask_physical(scene, distant, sets, at, hit.point, hit.shape)
+            physical = mask_physical(scene, distant, sets, at, point, own)
             # Most samples meet nothing: they are but a sum.
             met = virtual_mask | physical.proxies | physical.balls
             bit = wp.uint64(1)
@@ -184,24 +128,47 @@ def make_environment_shadow_kernel(config: EnvironmentShadowConfig) -> wp.Kernel
                 ray = aim(sets, distant.others.places, at + k, hit)
                 if ray.cosine > 0.0:
                     if (met & bit) == wp.uint64(0):
-                        sums.without += ray.cosine * ray.grown * sets.flux[at + k]
+                        without += ray.cosine * ray.grown * sets.flux[at + k]
                     else:
-                        ray.weight = ray.cosine * ray.grown * sets.samples[at + k].measure
-                        ray.origin = offset_origin(hit.point, hit.geometric_normal, ray.direction, hit.error)
+                        measure = sets.samples[at + k].measure
+                        weight = ray.cosine * ray.grown * measure
+                        ray.origin = offset_origin(point, hit.geometric_normal, ray.direction, hit.error)
                         by_proxy = (physical.proxies & bit) != wp.uint64(0)
                         by_ball = (physical.balls & bit) != wp.uint64(0)
                         sender = find_sender(params, picture, scene, distant, sets, at + k, ray, by_proxy, by_ball)
-                        sums.without += ray.weight * sender.radiance
+                        radiance = sender.radiance
+                        without += weight * radiance
                         if (virtual_mask & bit) != wp.uint64(0):
-                            key = wp.vec3ui(wp.uint32(at + k), wp.uint32(row), wp.uint32(column))
-                            asks = wp.static(all_ask) or block * wp.static(chunk) + k < wp.static(secondary_count)
-                            sums = meet_objects(params, picture, scene, distant, hit, ray, sender, key, asks, sums)
+                            other = Hit()
+                            other.shape = -1
+                            if wp.static(secondary_count == config.count) or block * wp.static(chunk) + k < wp.static(
+                                secondary_count
+                            ):
+                                other = closest_object(scene, ray.origin, ray.direction, sender.distance)
+                                if other.shape >= 0:
+                                    hidden += weight * radiance
+                            elif occluded_by_objects(scene, ray.origin, ray.direction, sender.distance):
+                                hidden += weight * radiance
+                            if other.shape >= 0:
+                                meeting = Meeting()
+                                meeting.hit = other
+                                meeting.direction = ray.direction
+                                meeting.alpha = caustic_alpha(scene.objects[other.shape], point)
+                                meeting.stands_for = weight * wp.static(config.count / secondary_count)
+                                seed = wp.vec3ui()
+                                if wp.static(traced):
+                                    seed = pcg3d_hash(wp.uint32(at + k), wp.uint32(row), wp.uint32(column))
+                                elif before.up == wp.vec3(0.0, 0.0, 0.0):
+                                    before = look_before(distant, hit.point, hit.geometric_normal, ray.direction)
+                                reflected = reflect_back(
+                                    params[0], picture, scene, distant, meeting, before, seed, reflected
+                                )
                 bit = bit << wp.uint64(1)
-        unchanged = sums.hidden + sums.reflected.sent == wp.vec3(0.0, 0.0, 0.0)
+        unchanged = hidden + reflected.sent == wp.vec3(0.0, 0.0, 0.0)
         if cells_out.shaded.shape[0] > 0 and not unchanged:
             cells_out.shaded[i / SHADED_TILE, j / SHADED_TILE] = params[0].frame_index
-        cells_out.ratio[i, j] = ratio_of(sums.without, sums.hidden, hit.t)
-        cells_out.bounced[i, j] = bounced_of(sums.without, sums.hidden, sums.reflected.sent, sums.reflected.returned)
+        cells_out.ratio[i, j] = ratio_of(without, hidden, hit.t)
+        cells_out.bounced[i, j] = bounced_of(without, hidden, reflected.sent, reflected.returned)
 
     return environment_shadow_kernel
 

@@ -25,7 +25,7 @@ import functools
 import warp as wp
 
 from warp_ar.kernels.lobes import level_from_alpha
-from warp_ar.kernels.materials import Surface, lobe_axis, make_surface, reflect
+from warp_ar.kernels.materials import lobe_axis, make_surface, reflect
 from warp_ar.kernels.reflect import (
     RAY_SPREAD,
     DistantLight,
@@ -166,48 +166,6 @@ def make_estimated(config: DistantLightConfig) -> wp.Function:
     return estimated
 
 
-@wp.struct
-class Lobe:
-    """The one of its lobes into which an object's point sends a ray."""
-
-    weight: wp.vec3  # of what arrives along it; 0: there is no such ray
-    wi: wp.vec3
-    is_rough: wp.bool
-
-
-@functools.cache
-def make_pick_lobe(config: DistantLightConfig) -> wp.Function:
-    """``pick_lobe(distant, surface, normal, geometric, wo, seed) -> Lobe``: by the reflectance of both."""
-
-    @wp.func(module="unique")
-    def pick_lobe(
-        distant: DistantLight, surface: Surface, normal: wp.vec3, geometric: wp.vec3, wo: wp.vec3, seed: wp.vec3ui
-    ) -> Lobe:
-        lobe = Lobe()
-        rough = surface.diffuse[0] + surface.diffuse[1] + surface.diffuse[2]
-        glossy = surface.reflectance[0] + surface.reflectance[1] + surface.reflectance[2]
-        if wp.static(config.diffuse == "none") or not knows_irradiance(distant):
-            rough = float(0.0)
-        if wp.static(not config.specular) or not knows_levels(distant):
-            glossy = float(0.0)
-        if rough + glossy <= 0.0:
-            return lobe
-        rough_share = rough / (rough + glossy)
-        lobe.is_rough = uniform_from_bits(seed[2]) < rough_share
-        if lobe.is_rough:
-            u = wp.vec2(uniform_from_bits(seed[0]), uniform_from_bits(seed[1]))
-            lobe.wi = frame_from_normal(normal) * sample_cosine_hemisphere(u)
-        else:
-            lobe.wi = reflect(wo, normal)
-        if wp.dot(lobe.wi, geometric) > 0.0:
-            lobe.weight = surface.reflectance / wp.max(1.0 - rough_share, 1.0e-6)
-            if lobe.is_rough:
-                lobe.weight = surface.diffuse / rough_share
-        return lobe
-
-    return pick_lobe
-
-
 @functools.cache
 def make_bounced(config: DistantLightConfig) -> wp.Function:
     """``bounced(params, picture, scene, environment, hit, direction, alpha, seed) -> vec3``.
@@ -216,9 +174,12 @@ def make_bounced(config: DistantLightConfig) -> wp.Function:
     more, one ray; a Monte-Carlo estimate.
     """
     trace = make_trace(config.trace)
-    closest_object, closest_proxy = trace.closest_object, trace.closest_proxy
-    occluded_by_objects = trace.occluded_by_objects
-    surface_at, pick_lobe = make_surface(config.models, config.textures), make_pick_lobe(config)
+    closest_object, closest_proxy, occluded_by_objects = (
+        trace.closest_object,
+        trace.closest_proxy,
+        trace.occluded_by_objects,
+    )
+    surface_at = make_surface(config.models, config.textures)
     find_in_frame = make_find_in_frame(config.trace, config.probes)
     shade_unoccluded = make_shade_unoccluded(config)
     reflected_radiance = make_reflected_radiance(config)
@@ -245,12 +206,26 @@ def make_bounced(config: DistantLightConfig) -> wp.Function:
         emitted = wp.vec3(0.0)
         if wp.static(config.textures and config.gathered):
             emitted = surface.emission
-        lobe = pick_lobe(distant, surface, normal, geometric, wo, seed)
-        if wp.max(lobe.weight) <= 0.0:
+        rough = surface.diffuse[0] + surface.diffuse[1] + surface.diffuse[2]
+        glossy = surface.reflectance[0] + surface.reflectance[1] + surface.reflectance[2]
+        if wp.static(config.diffuse == "none") or not knows_irradiance(distant):
+            rough = float(0.0)
+        if wp.static(not config.specular) or not knows_levels(distant):
+            glossy = float(0.0)
+        if rough + glossy <= 0.0:
+            return emitted
+        rough_share = rough / (rough + glossy)
+        u = wp.vec2(uniform_from_bits(seed[0]), uniform_from_bits(seed[1]))
+        is_rough = uniform_from_bits(seed[2]) < rough_share
+        weight = surface.reflectance / wp.max(1.0 - rough_share, 1.0e-6)
+        wi = reflect(wo, normal)
+        if is_rough:
+            weight = surface.diffuse / rough_share
+            wi = frame_from_normal(normal) * sample_cosine_hemisphere(u)
+        if wp.dot(wi, geometric) <= 0.0:
             return emitted
 
         received = wp.vec3(0.0)
-        wi = lobe.wi
         origin = offset_origin(hit.point, geometric, wi, hit.error)
         other = closest_object(scene, origin, wi, FAR)
         proxy = closest_proxy(scene, origin, wi, other.t)
@@ -259,22 +234,21 @@ def make_bounced(config: DistantLightConfig) -> wp.Function:
             up = proxy.geometric_normal
             if wp.dot(up, wi) > 0.0:
                 up = -up
-            u = wp.vec2(uniform_from_bits(seed[1]), uniform_from_bits(seed[0]))
-            leaving = frame_from_normal(up) * sample_cosine_hemisphere(u)
+            leaving = frame_from_normal(up) * sample_cosine_hemisphere(wp.vec2(u[1], u[0]))
             start = offset_origin(proxy.point, up, leaving, proxy.error)
             at = find_in_frame(params, picture, scene, distant.probes, proxy)
             if at[0] >= 0.0:  # noqa: SIM108  (a conditional expression computes both)
                 received = look_up(picture, at[0], at[1])
             else:
                 received = captured_along(distant, proxy.point, wi)
-            if lobe.is_rough:
+            if is_rough:
                 if wp.static(config.diffuse != "none"):  # what is rough here has an irradiance
                     received = distant_irradiance(distant, hit.point, normal) / wp.pi
             if occluded_by_objects(scene, start, leaving, FAR):
                 received = wp.cw_mul(received, FURTHER * (surface.diffuse + surface.reflectance))
         elif other.shape >= 0:
             received = shade_unoccluded(scene, distant, other, wi, RAY_SPREAD)
-        elif lobe.is_rough:
+        elif is_rough:
             received = distant_irradiance(distant, hit.point, normal) / wp.pi
         else:
             if wp.static(config.specular):
@@ -283,8 +257,8 @@ def make_bounced(config: DistantLightConfig) -> wp.Function:
                     distant, surface.model, surface.roughness, surface.shininess, hit.point, wi, floor
                 )
         if wp.static(config.textures):
-            return wp.cw_mul(lobe.weight, received) + emitted
-        return wp.cw_mul(lobe.weight, received)
+            return wp.cw_mul(weight, received) + emitted
+        return wp.cw_mul(weight, received)
 
     return bounced
 
@@ -329,17 +303,6 @@ class Meeting:
     direction: wp.vec3
     alpha: wp.float32  # least width of the object's lobe
     stands_for: wp.float32  # weight of its radiance, which is that of several samples where one ray stands for them
-
-
-@wp.func
-def meet(scene: RayScene, hit: Hit, direction: wp.vec3, point: wp.vec3, stands_for: wp.float32) -> Meeting:
-    """What a ray from a point of the receiver met of an object."""
-    meeting = Meeting()
-    meeting.hit = hit
-    meeting.direction = direction
-    meeting.alpha = caustic_alpha(scene.objects[hit.shape], point)
-    meeting.stands_for = stands_for
-    return meeting
 
 
 @wp.struct

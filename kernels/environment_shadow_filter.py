@@ -53,47 +53,11 @@ def window_weight(offset: wp.int32, reach: wp.int32) -> wp.float32:
     return 0.0
 
 
-@wp.struct
-class Means:
-    """What a filter sums over the neighbours of a cell; fourth components sum the weights."""
-
-    far_left: wp.vec4  # of all neighbours: what is not hidden
-    far_sent: wp.vec3  # what objects send
-    near_left: wp.vec4  # the same of the nearer ones
-    near_sent: wp.vec3
-    squares: wp.vec4  # of the nearer ones' near_left
-
-
-@functools.cache
-def make_choose_mean(has_near: bool) -> wp.Function:
-    """``choose_mean(means) -> vec3``: the mean of all neighbours, or of the nearer ones where that differs."""
-
-    @wp.func(module="unique")
-    def choose_mean(means: Means) -> wp.vec3:
-        all = means.far_left
-        left = wp.vec3(all[0], all[1], all[2]) / all[3]
-        mean = left + means.far_sent / all[3]
-        if wp.static(has_near):
-            near = means.near_left
-            squares = means.squares
-            count = near[3]
-            sharp = wp.vec3(near[0], near[1], near[2]) / count
-            # Cells that differ among themselves are noise, or the middle of an edge, where both means agree.
-            spread = wp.vec3(squares[0], squares[1], squares[2]) / count - wp.cw_mul(sharp, sharp)
-            error = wp.sqrt(wp.max(wp.max(spread), 0.0) / count)
-            share = wp.clamp(wp.max(wp.abs(sharp - left)) / wp.max(CONTRAST, NOISE * error) - 0.5, 0.0, 1.0)
-            mean += share * (sharp + means.near_sent / count - mean)
-        return mean
-
-    return choose_mean
-
-
 @functools.cache
 def make_filter_ratio_kernel(side: int) -> wp.Kernel:
     """Kernel of ``filter_ratio`` for tiles of so many cells along."""
     wide, narrow = side // 2, side // 4
     width = 2 * wide + 1
-    choose_mean = make_choose_mean(wide > 1)
 
     # The loops stay loops: written out, with weights that are known, they take compilers seconds and gain nothing.
     @wp.kernel(module="unique", enable_backward=False, module_options={"max_unroll": 1})
@@ -123,7 +87,12 @@ def make_filter_ratio_kernel(side: int) -> wp.Kernel:
                 cells_out.filtered[i, j] = wp.vec3(1.0, 1.0, 1.0)
                 return
         depth = ratio[i, j][3]
-        means = Means()
+        # Means of all neighbours, and of the nearer ones; the fourth component sums the weights.
+        far_left = wp.vec4(0.0)
+        near_left = wp.vec4(0.0)
+        squares = wp.vec4(0.0)
+        far_sent = wp.vec3(0.0)
+        near_sent = wp.vec3(0.0)
         for a in range(wp.static(width)):
             ni = i + a - wp.static(wide)
             wide_row = window_weight(ni - i, wp.static(wide))
@@ -139,13 +108,22 @@ def make_filter_ratio_kernel(side: int) -> wp.Kernel:
                             weight = wide_row * window_weight(nj - j, wp.static(wide))
                             near = narrow_row * window_weight(nj - j, wp.static(narrow))
                             sent = bounced[ni, nj]
-                            means.far_left += weight * value
-                            means.far_sent += weight * sent
+                            far_left += weight * value
+                            far_sent += weight * sent
                             if near > 0.0:
-                                means.near_left += near * value
-                                means.squares += near * wp.cw_mul(value, value)
-                                means.near_sent += near * sent
-        mean = choose_mean(means)
+                                near_left += near * value
+                                squares += near * wp.cw_mul(value, value)
+                                near_sent += near * sent
+        left = wp.vec3(far_left[0], far_left[1], far_left[2]) / far_left[3]
+        mean = left + far_sent / far_left[3]
+        if wp.static(wide > 1):
+            sharp = wp.vec3(near_left[0], near_left[1], near_left[2]) / near_left[3]
+            # Cells that differ among themselves are noise, or the middle of an edge, where both means agree.
+            count = near_left[3]
+            spread = wp.vec3(squares[0], squares[1], squares[2]) / count - wp.cw_mul(sharp, sharp)
+            error = wp.sqrt(wp.max(wp.max(spread), 0.0) / count)
+            share = wp.clamp(wp.max(wp.abs(sharp - left)) / wp.max(CONTRAST, NOISE * error) - 0.5, 0.0, 1.0)
+            mean += share * (sharp + near_sent / near_left[3] - mean)
         if wp.max(wp.abs(mean - wp.vec3(1.0, 1.0, 1.0))) < NEGLIGIBLE:
             mean = wp.vec3(1.0, 1.0, 1.0)
         elif cells_out.changed.shape[0] > 0:
@@ -153,47 +131,6 @@ def make_filter_ratio_kernel(side: int) -> wp.Kernel:
         cells_out.filtered[i, j] = mean
 
     return filter_ratio_kernel
-
-
-@wp.func
-def differ_around(surface: wp.array2d[wp.int32], row: wp.int32, column: wp.int32) -> wp.bool:
-    """Whether the four cells around a pixel, the first at (row, column), show several surfaces."""
-    key = surface[wp.clamp(row, 0, surface.shape[0] - 1), wp.clamp(column, 0, surface.shape[1] - 1)]
-    mixed = wp.bool(False)
-    for corner in range(1, 4):
-        ni = wp.clamp(row + corner / 2, 0, surface.shape[0] - 1)
-        nj = wp.clamp(column + corner % 2, 0, surface.shape[1] - 1)
-        mixed = mixed or surface[ni, nj] != key
-    return mixed
-
-
-@wp.func
-def mean_around(cells: ShadowCells, key: wp.int32, y: wp.float32, x: wp.float32) -> wp.vec3:
-    """Bilinear among the four cells around a place in units of cells, of those on a surface; 1 where none near is."""
-    surface = cells.surface
-    filtered = cells.filtered
-    row = wp.int32(wp.floor(y))
-    column = wp.int32(wp.floor(x))
-    total = wp.vec3(0.0)
-    weights = float(0.0)
-    for corner in range(4):
-        ni = wp.clamp(row + corner / 2, 0, surface.shape[0] - 1)
-        nj = wp.clamp(column + corner % 2, 0, surface.shape[1] - 1)
-        weight = 1.0 - wp.abs(y - wp.float32(row + corner / 2))
-        weight *= 1.0 - wp.abs(x - wp.float32(column + corner % 2))
-        if weight > 0.0 and surface[ni, nj] == key:
-            total += weight * filtered[ni, nj]
-            weights += weight
-    if weights == 0.0:
-        # None of the four is on this surface: those around them.
-        for a in range(wp.max(row - 1, 0), wp.min(row + 3, surface.shape[0])):
-            for b in range(wp.max(column - 1, 0), wp.min(column + 3, surface.shape[1])):
-                if surface[a, b] == key:
-                    total += filtered[a, b]
-                    weights += 1.0
-    if weights > 0.0:
-        return total / weights
-    return wp.vec3(1.0, 1.0, 1.0)
 
 
 @functools.cache
@@ -219,6 +156,7 @@ def make_spread_ratio_kernel(config: DistantLightConfig) -> wp.Kernel:
         """From cells to pixels: bilinear among the cells on the pixel's surface."""
         i, place = wp.tid()
         i += row_start
+        filtered = cells.filtered
         surface = cells.surface
         changed = cells.changed
         stride = cells.stride
@@ -239,13 +177,36 @@ def make_spread_ratio_kernel(config: DistantLightConfig) -> wp.Kernel:
                 x = wp.float32(j - stride / 2) / wp.float32(stride)
                 column = wp.int32(wp.floor(x))
                 key = surface[wp.clamp(row, 0, surface.shape[0] - 1), wp.clamp(column, 0, surface.shape[1] - 1)]
-                if differ_around(surface, row, column):
+                mixed = wp.bool(False)
+                for corner in range(1, 4):
+                    ni = wp.clamp(row + corner / 2, 0, surface.shape[0] - 1)
+                    nj = wp.clamp(column + corner % 2, 0, surface.shape[1] - 1)
+                    mixed = mixed or surface[ni, nj] != key
+                if mixed:
                     hit = visible_proxy(params[0], rays[i, j], scene, probes)
                     key = wp.int32(-1)
                     if hit.shape >= 0:
                         key = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
                 if key >= 0:
-                    value = mean_around(cells, key, y, x)
+                    total = wp.vec3(0.0)
+                    weights = float(0.0)
+                    for corner in range(4):
+                        ni = wp.clamp(row + corner / 2, 0, surface.shape[0] - 1)
+                        nj = wp.clamp(column + corner % 2, 0, surface.shape[1] - 1)
+                        weight = 1.0 - wp.abs(y - wp.float32(row + corner / 2))
+                        weight *= 1.0 - wp.abs(x - wp.float32(column + corner % 2))
+                        if weight > 0.0 and surface[ni, nj] == key:
+                            total += weight * filtered[ni, nj]
+                            weights += weight
+                    if weights == 0.0:
+                        # None of the four is on this surface: those around them.
+                        for a in range(wp.max(row - 1, 0), wp.min(row + 3, surface.shape[0])):
+                            for b in range(wp.max(column - 1, 0), wp.min(column + 3, surface.shape[1])):
+                                if surface[a, b] == key:
+                                    total += filtered[a, b]
+                                    weights += 1.0
+                    if weights > 0.0:
+                        value = total / weights
             shadow_ratio_out[i, j] = value
 
     return spread_ratio_kernel

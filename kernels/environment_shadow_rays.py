@@ -13,50 +13,18 @@ import functools
 
 import warp as wp
 
-from warp_ar.kernels.cells import cell_pixel
 from warp_ar.kernels.environment_samples import SampleSets, ball_of_sample, sample_toward
 from warp_ar.kernels.environment_shadow_bounce import bounding_radius, make_look_wide
-from warp_ar.kernels.environment_shadow_cells import EnvironmentShadowConfig, can_matter
+from warp_ar.kernels.environment_shadow_cells import EnvironmentShadowConfig
 from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.kernels.materials import reflect
 from warp_ar.kernels.probe_weights import probe_share
 from warp_ar.kernels.reflect import DistantLight, look_up, make_find_in_frame
 from warp_ar.kernels.shapes import FAR, intersect_sphere
-from warp_ar.kernels.structs import BOX, PLANE, FrameParams, Hit, Picture, Probe, RayScene
+from warp_ar.kernels.structs import BOX, PLANE, FrameParams, Hit, Picture, RayScene
 from warp_ar.kernels.trace import make_trace
-from warp_ar.kernels.visibility import make_visible_proxy
 
 wp.set_module_options({"enable_backward": False})
-
-
-@functools.cache
-def make_see_cell(config: EnvironmentShadowConfig) -> wp.Function:
-    """``see_cell(params, rays, scene, probes, stride, i, j) -> Hit``: the proxy that cell (i, j) shows.
-
-    Its shape is -1 where there is none, or where no filter reads the cell.
-    """
-    visible_proxy = make_visible_proxy(config.distant.trace, config.distant.probes)
-    side = config.side
-
-    @wp.func(module="unique")
-    def see_cell(
-        params: wp.array[FrameParams],
-        rays: wp.array2d[wp.vec2],
-        scene: RayScene,
-        probes: wp.array[Probe],
-        stride: wp.int32,
-        i: wp.int32,
-        j: wp.int32,
-    ) -> Hit:
-        row = cell_pixel(i, stride, rays.shape[0])
-        column = cell_pixel(j, stride, rays.shape[1])
-        hit = Hit()
-        hit.shape = -1
-        if can_matter(row, column, stride * side, params[0].shadow_rect):
-            hit = visible_proxy(params[0], rays[row, column], scene, probes)
-        return hit
-
-    return see_cell
 
 
 @wp.func
@@ -155,15 +123,11 @@ class SampleRay:
     distance: wp.float32  # of the sample, metres
     grown: wp.float32  # the sample's measure as the point sees it, over that from the ball, and what the ball counts
     cosine: wp.float32  # at the receiver; the point sees the sample if it is above 0
-    weight: wp.float32  # of radiance along it; set where the ray is traced
 
 
 @functools.cache
 def make_aim(emitters: bool, several: bool = False) -> wp.Function:
-    """``aim(sets, places, index, hit) -> SampleRay``: less what is set where it is traced.
-
-    ``places`` are those of the balls, if ``several``.
-    """
+    """``aim(sets, places, index, hit) -> SampleRay``: less its origin; ``places`` of the balls, if ``several``."""
 
     @wp.func(module="unique")
     def aim(sets: SampleSets, places: wp.array[wp.vec4], index: wp.int32, hit: Hit) -> SampleRay:
@@ -182,33 +146,6 @@ def make_aim(emitters: bool, several: bool = False) -> wp.Function:
         return ray
 
     return aim
-
-
-@functools.cache
-def make_reach(config: EnvironmentShadowConfig) -> wp.Function:
-    """``reach(scene, probes, ray, by_proxy, by_ball) -> float32``: how far a ray gets before it meets the physical.
-
-    A proxy if ``by_proxy``, a mirror ball if ``by_ball``; those that the ray cannot meet need not be asked.
-    """
-    closest_proxy = make_trace(config.distant.trace).closest_proxy
-
-    @wp.func(module="unique")
-    def reach(
-        scene: RayScene, probes: wp.array[Probe], ray: SampleRay, by_proxy: wp.bool, by_ball: wp.bool
-    ) -> wp.float32:
-        distance = ray.distance
-        if by_proxy:
-            proxy = closest_proxy(scene, ray.origin, ray.direction, distance)
-            distance = wp.min(distance, proxy.t)
-        if wp.static(config.distant.probes):
-            if by_ball:
-                for index in range(probes.shape[0]):
-                    probe = probes[index]
-                    t = intersect_sphere(probe.radius, ray.origin - probe.center, ray.direction, distance)
-                    distance = wp.min(distance, t)
-        return distance
-
-    return reach
 
 
 @wp.struct

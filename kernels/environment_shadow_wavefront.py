@@ -15,10 +15,11 @@ from warp_ar.kernels.cells import cell_pixel
 from warp_ar.kernels.environment_samples import SampleSets
 from warp_ar.kernels.environment_shadow_bounce import (
     Before,
+    Meeting,
     ReflectedLight,
+    caustic_alpha,
     make_look_before,
     make_reflect_back,
-    meet,
 )
 from warp_ar.kernels.environment_shadow_cells import (
     CHUNK,
@@ -27,15 +28,16 @@ from warp_ar.kernels.environment_shadow_cells import (
     EnvironmentShadowConfig,
     ShadowCells,
     bounced_of,
+    can_matter,
     cell_column,
     first_of_set,
     ratio_of,
 )
-from warp_ar.kernels.environment_shadow_rays import make_aim, make_find_sender, make_masks, make_reach, make_see_cell
+from warp_ar.kernels.environment_shadow_rays import make_aim, make_find_sender, make_masks
 from warp_ar.kernels.launch import MOST_REGISTERS, launch
 from warp_ar.kernels.reflect import DistantLight
 from warp_ar.kernels.sampling import pcg3d_hash
-from warp_ar.kernels.shapes import FAR, surface_key
+from warp_ar.kernels.shapes import FAR, intersect_sphere, surface_key
 from warp_ar.kernels.structs import FrameParams, Picture, RayScene
 from warp_ar.kernels.trace import make_trace, offset_origin
 from warp_ar.kernels.visibility import make_visible_proxy
@@ -69,8 +71,9 @@ def make_find_occluded_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
     secondary_count = config.secondary_count
     side = config.side
     mask_objects, mask_physical = make_masks(config, size)
-    aim, reach, see_cell = make_aim(config.emitters, config.distant.several), make_reach(config), make_see_cell(config)
-    occluded_by_objects = make_trace(config.distant.trace).occluded_by_objects
+    aim, trace = make_aim(config.emitters, config.distant.several), make_trace(config.distant.trace)
+    closest_proxy, occluded_by_objects = trace.closest_proxy, trace.occluded_by_objects
+    visible_proxy = make_visible_proxy(config.distant.trace, config.distant.probes)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def find_occluded_kernel(
@@ -85,45 +88,57 @@ def make_find_occluded_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
         wave_out: Wavefront,
     ):
         partial, i, thread = wp.tid()
+        rays = picture.rays
+        stride = cells_out.stride
         columns = cells_out.surface.shape[1]
         j = cell_column(thread, columns, side, WARP_LANES)
+        row = cell_pixel(i, stride, rays.shape[0])
+        column = cell_pixel(j, stride, rays.shape[1])
         key = wp.int32(-1)
         found = wp.uint32(0)
-        hit = see_cell(params, picture.rays, scene, distant.probes, cells_out.stride, i, j)
-        if hit.shape >= 0:
-            key = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
-            if partial == 0:
-                cells_out.ratio[i, j] = wp.vec4(1.0, 1.0, 1.0, hit.t)
-                cells_out.bounced[i, j] = wp.vec3(0.0)
-            begin = partial * size
-            at = first_of_set(i, j, side, sets.samples.shape[0]) + begin
-            virtual_mask = mask_objects(scene, sets, at, hit.point)
-            if virtual_mask != wp.uint64(0):
-                physical = mask_physical(scene, distant, sets, at, hit.point, hit.shape)
-                count = wp.int32(0)
-                # Its end is no constant: unrolled, the kernel would hold its rays many times over.
-                for k in range(begin, begin + size):
-                    bit = wp.uint64(1) << wp.uint64(k - begin)
-                    if (virtual_mask & bit) == wp.uint64(0):
-                        continue
-                    ray = aim(sets, distant.others.places, at + k - begin, hit)
-                    if ray.cosine <= 0.0:
-                        continue
-                    ray.origin = offset_origin(hit.point, hit.geometric_normal, ray.direction, hit.error)
-                    by_proxy = (physical.proxies & bit) != wp.uint64(0)
-                    by_ball = (physical.balls & bit) != wp.uint64(0)
-                    free = reach(scene, distant.probes, ray, by_proxy, by_ball)
-                    if occluded_by_objects(scene, ray.origin, ray.direction, free):
-                        found = found | (wp.uint32(1) << wp.uint32(k - begin))
-                        if k < secondary_count:
-                            count += 1
-                if count > 0:
-                    start = wp.atomic_add(wave_out.queue_length, 0, count)
-                    wave_out.queue_starts[partial, i, j] = start
-                    for k in range(begin, wp.min(begin + size, secondary_count)):
-                        if (found & (wp.uint32(1) << wp.uint32(k - begin))) != wp.uint32(0):
-                            wave_out.queue[start] = (i * columns + j) * CHUNK + k
-                            start += 1
+        if can_matter(row, column, stride * side, params[0].shadow_rect):
+            hit = visible_proxy(params[0], rays[row, column], scene, distant.probes)
+            if hit.shape >= 0:
+                key = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
+                if partial == 0:
+                    cells_out.ratio[i, j] = wp.vec4(1.0, 1.0, 1.0, hit.t)
+                    cells_out.bounced[i, j] = wp.vec3(0.0)
+                begin = partial * size
+                at = first_of_set(i, j, side, sets.samples.shape[0]) + begin
+                virtual_mask = mask_objects(scene, sets, at, hit.point)
+                if virtual_mask != wp.uint64(0):
+                    physical = mask_physical(scene, distant, sets, at, hit.point, hit.shape)
+                    count = wp.int32(0)
+                    # Its end is no constant: unrolled, the kernel would hold its rays many times over.
+                    for k in range(begin, begin + size):
+                        bit = wp.uint64(1) << wp.uint64(k - begin)
+                        if (virtual_mask & bit) == wp.uint64(0):
+                            continue
+                        ray = aim(sets, distant.others.places, at + k - begin, hit)
+                        if ray.cosine <= 0.0:
+                            continue
+                        ray.origin = offset_origin(hit.point, hit.geometric_normal, ray.direction, hit.error)
+                        if (physical.proxies & bit) != wp.uint64(0):
+                            proxy = closest_proxy(scene, ray.origin, ray.direction, ray.distance)
+                            ray.distance = wp.min(ray.distance, proxy.t)
+                        if wp.static(config.distant.probes):
+                            if (physical.balls & bit) != wp.uint64(0):
+                                for index in range(distant.probes.shape[0]):
+                                    probe = distant.probes[index]
+                                    from_ball = ray.origin - probe.center
+                                    t = intersect_sphere(probe.radius, from_ball, ray.direction, ray.distance)
+                                    ray.distance = wp.min(ray.distance, t)
+                        if occluded_by_objects(scene, ray.origin, ray.direction, ray.distance):
+                            found = found | (wp.uint32(1) << wp.uint32(k - begin))
+                            if k < secondary_count:
+                                count += 1
+                    if count > 0:
+                        start = wp.atomic_add(wave_out.queue_length, 0, count)
+                        wave_out.queue_starts[partial, i, j] = start
+                        for k in range(begin, wp.min(begin + size, secondary_count)):
+                            if (found & (wp.uint32(1) << wp.uint32(k - begin))) != wp.uint32(0):
+                                wave_out.queue[start] = (i * columns + j) * CHUNK + k
+                                start += 1
         if partial == 0:
             cells_out.surface[i, j] = key
         wave_out.occluded[partial, i, j] = found
@@ -238,9 +253,12 @@ def make_trace_secondary_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
             # What is nearer than all that is physical is nearest.
             other = closest_object(scene, ray.origin, ray.direction, FAR)
             if other.shape >= 0:
-                ray.weight = ray.cosine * ray.grown * sets.samples[index].measure
-                stands_for = ray.weight * wp.static(config.count / secondary_count)
-                meeting = meet(scene, other, ray.direction, hit.point, stands_for)
+                weight = ray.cosine * ray.grown * sets.samples[index].measure
+                meeting = Meeting()
+                meeting.hit = other
+                meeting.direction = ray.direction
+                meeting.alpha = caustic_alpha(scene.objects[other.shape], hit.point)
+                meeting.stands_for = weight * wp.static(config.count / secondary_count)
                 seed = wp.vec3ui()
                 before = Before()
                 if wp.static(traced):

@@ -125,116 +125,11 @@ def _label(kinds: tuple[int, ...], detail: bool, stretched: bool) -> str:
 
 
 @functools.cache
-def _make_touch(kinds: tuple[int, ...], detail: bool) -> wp.Function:
-    """Where a ray, in a shape's coordinates, meets that shape, which is of one of the given kinds."""
-
-    @wp.func(name=f"touch_{_label(kinds, detail, False)}", module="unique")
-    def touch(scene: RayScene, shape: Shape, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> Contact:
-        contact = Contact()
-        contact.t = FAR
-        if wp.static(SPHERE in kinds):
-            if shape.kind == SPHERE:
-                contact.t = intersect_sphere(shape.extent[0], origin, direction, t_max)
-        if wp.static(BOX in kinds):
-            if shape.kind == BOX:
-                contact.t = intersect_box(shape.extent, origin, direction, t_max)
-        if wp.static(PLANE in kinds):
-            if shape.kind == PLANE:
-                contact.t = intersect_plane(shape.extent, origin, direction, t_max)
-        if wp.static(MESH in kinds):
-            if shape.kind == MESH:
-                if wp.static(detail):
-                    if shape.holed != 0:
-                        return intersect_solid(scene, shape, origin, direction, t_max, True)
-                return intersect_mesh(shape, origin, direction, t_max)
-        return contact
-
-    return touch
-
-
-@wp.func
-def smooth_normal(scene: RayScene, corner: wp.int32, contact: Contact, flat: wp.vec3) -> wp.vec3:
-    """Between the normals of a triangle's corners; ``flat`` where they cancel, for zero is no direction."""
-    normals = scene.vertex_normals
-    w = 1.0 - contact.u - contact.v
-    normal = wp.normalize(contact.u * normals[corner] + contact.v * normals[corner + 1] + w * normals[corner + 2])
-    if wp.dot(normal, normal) < 0.5:
-        return flat
-    return normal
-
-
-@wp.func
-def mesh_uv(scene: RayScene, corner: wp.int32, contact: Contact) -> wp.vec2:
-    """Texture coordinates between those of a triangle's corners."""
-    uvs = scene.vertex_uvs
-    w = 1.0 - contact.u - contact.v
-    return contact.u * uvs[corner] + contact.v * uvs[corner + 1] + w * uvs[corner + 2]
-
-
-@functools.cache
-def _make_describe(kinds: tuple[int, ...], detail: bool, stretched: bool) -> wp.Function:
-    """The point of a shape that a ray has met, given ``t``, shape and contact."""
-    local_point, local_vector, world_normal = _ways(stretched)
-
-    @wp.func(name=f"describe_{_label(kinds, detail, stretched)}", module="unique")
-    def describe(
-        scene: RayScene, shape: Shape, origin: wp.vec3, direction: wp.vec3, found: Hit, contact: Contact
-    ) -> Hit:
-        hit = found
-        p = local_point(shape, origin) + hit.t * local_vector(shape, direction)
-        geometric = wp.vec3(0.0, 0.0, 1.0)
-        normal = wp.vec3(0.0, 0.0, 1.0)
-        # Each kind puts the point back onto its surface: the error of t, large for a far origin, ends here.
-        if wp.static(SPHERE in kinds):
-            if shape.kind == SPHERE:
-                geometric = wp.normalize(p)
-                p = shape.extent[0] * geometric
-                normal = geometric
-                hit.uv = sphere_uv(geometric)
-        if wp.static(BOX in kinds):
-            if shape.kind == BOX:
-                geometric = box_normal(shape.extent, p)
-                p = onto_box(shape.extent, geometric, p)
-                normal = geometric
-                hit.uv = box_uv(shape.extent, geometric, p)
-        if wp.static(PLANE in kinds):
-            if shape.kind == PLANE:
-                p = wp.vec3(p[0], p[1], 0.0)
-                hit.uv = plane_uv(shape.extent, p)
-        if wp.static(MESH in kinds):
-            if shape.kind == MESH:
-                p = wp.mesh_eval_position(shape.mesh, contact.face, contact.u, contact.v)
-                geometric = wp.mesh_eval_face_normal(shape.mesh, contact.face)
-                hit.corner = shape.first_vertex + 3 * contact.face
-                hit.weights = wp.vec2(contact.u, contact.v)
-                hit.uv = mesh_uv(scene, hit.corner, contact)
-                normal = geometric
-                if shape.smooth != 0:
-                    normal = smooth_normal(scene, hit.corner, contact, geometric)
-                if wp.static(detail):
-                    normal = bumped(scene, shape, hit, normal, local_vector(shape, direction))
-        arm = shape.rotation * (shape.scale * p)
-        hit.point = arm + shape.position
-        hit.normal = world_normal(shape, normal)
-        hit.geometric_normal = world_normal(shape, geometric)
-        # World coordinates are rounded once on the way out and twice on the way back into the shape; within the shape,
-        # rotating there and back, placing the point and testing the surface again take some 20 roundings of its size.
-        size = shape.scale * wp.length(shape.extent)
-        if wp.static(stretched):
-            if shape.stretch != 0.0:
-                size *= shape.stretch  # what is rounded along the shortest way counts along the longest
-        hit.error = ROUNDING * (8.0 * wp.max(wp.abs(hit.point)) + 32.0 * size)
-        return hit
-
-    return describe
-
-
-@functools.cache
 def _make_closest(kinds: tuple[int, ...], detail: bool, stretched: bool) -> wp.Function:
     """Closest hit among shapes of the given kinds."""
-    local_point, local_vector, _ = _ways(stretched)
-    touch, describe = _make_touch(kinds, detail), _make_describe(kinds, detail, stretched)
+    local_point, local_vector, world_normal = _ways(stretched)
 
+    # One function, long as it is: what it is handed on a CPU is copied for every function that it calls.
     @wp.func(name=f"closest_hit_{_label(kinds, detail, stretched)}", module="unique")
     def closest_hit(
         scene: RayScene,
@@ -243,6 +138,8 @@ def _make_closest(kinds: tuple[int, ...], detail: bool, stretched: bool) -> wp.F
         direction: wp.vec3,
         t_max: wp.float32,
     ) -> Hit:
+        vertex_normals = scene.vertex_normals
+        vertex_uvs = scene.vertex_uvs
         hit = Hit()
         hit.shape = -1
         hit.corner = -1
@@ -251,13 +148,91 @@ def _make_closest(kinds: tuple[int, ...], detail: bool, stretched: bool) -> wp.F
             contact = Contact()
             for index in range(shapes.shape[0]):
                 shape = shapes[index]
-                met = touch(scene, shape, local_point(shape, origin), local_vector(shape, direction), hit.t)
-                if met.t < hit.t:
-                    contact = met
-                    hit.t = met.t
+                o = local_point(shape, origin)
+                d = local_vector(shape, direction)
+                t = FAR
+                if wp.static(SPHERE in kinds):
+                    if shape.kind == SPHERE:
+                        t = intersect_sphere(shape.extent[0], o, d, hit.t)
+                if wp.static(BOX in kinds):
+                    if shape.kind == BOX:
+                        t = intersect_box(shape.extent, o, d, hit.t)
+                if wp.static(PLANE in kinds):
+                    if shape.kind == PLANE:
+                        t = intersect_plane(shape.extent, o, d, hit.t)
+                if wp.static(MESH in kinds):
+                    if shape.kind == MESH:
+                        met = Contact()
+                        if wp.static(detail):
+                            if shape.holed != 0:
+                                met = intersect_solid(scene, shape, o, d, hit.t, True)
+                            else:
+                                met = intersect_mesh(shape, o, d, hit.t)
+                        else:
+                            met = intersect_mesh(shape, o, d, hit.t)
+                        t = met.t
+                        if t < hit.t:
+                            contact = met
+                if t < hit.t:
+                    hit.t = t
                     hit.shape = index
+
             if hit.shape >= 0:
-                hit = describe(scene, shapes[hit.shape], origin, direction, hit, contact)
+                shape = shapes[hit.shape]
+                p = local_point(shape, origin) + hit.t * local_vector(shape, direction)
+                geometric = wp.vec3(0.0, 0.0, 1.0)
+                normal = wp.vec3(0.0, 0.0, 1.0)
+                # Each kind puts the point back onto its surface: the error of t, large for a far origin, ends here.
+                if wp.static(SPHERE in kinds):
+                    if shape.kind == SPHERE:
+                        geometric = wp.normalize(p)
+                        p = shape.extent[0] * geometric
+                        normal = geometric
+                        hit.uv = sphere_uv(geometric)
+                if wp.static(BOX in kinds):
+                    if shape.kind == BOX:
+                        geometric = box_normal(shape.extent, p)
+                        p = onto_box(shape.extent, geometric, p)
+                        normal = geometric
+                        hit.uv = box_uv(shape.extent, geometric, p)
+                if wp.static(PLANE in kinds):
+                    if shape.kind == PLANE:
+                        p = wp.vec3(p[0], p[1], 0.0)
+                        hit.uv = plane_uv(shape.extent, p)
+                if wp.static(MESH in kinds):
+                    if shape.kind == MESH:
+                        p = wp.mesh_eval_position(shape.mesh, contact.face, contact.u, contact.v)
+                        geometric = wp.mesh_eval_face_normal(shape.mesh, contact.face)
+                        w = 1.0 - contact.u - contact.v
+                        corner = shape.first_vertex + 3 * contact.face
+                        normal = geometric
+                        if shape.smooth != 0:
+                            normal = wp.normalize(
+                                contact.u * vertex_normals[corner]
+                                + contact.v * vertex_normals[corner + 1]
+                                + w * vertex_normals[corner + 2]
+                            )
+                            # Opposed corner normals can cancel; zero is no direction.
+                            if wp.dot(normal, normal) < 0.5:
+                                normal = geometric
+                        hit.uv = contact.u * vertex_uvs[corner] + contact.v * vertex_uvs[corner + 1]
+                        hit.uv += w * vertex_uvs[corner + 2]
+                        hit.corner = corner
+                        hit.weights = wp.vec2(contact.u, contact.v)
+                        if wp.static(detail):
+                            normal = bumped(scene, shape, hit, normal, local_vector(shape, direction))
+                arm = shape.rotation * (shape.scale * p)
+                hit.point = arm + shape.position
+                hit.normal = world_normal(shape, normal)
+                hit.geometric_normal = world_normal(shape, geometric)
+                # World coordinates are rounded once on the way out and twice on the way back into the shape; within the
+                # shape, rotating there and back, placing the point and testing the surface again take some 20 roundings
+                # of its size.
+                size = shape.scale * wp.length(shape.extent)
+                if wp.static(stretched):
+                    if shape.stretch != 0.0:
+                        size *= shape.stretch  # what is rounded along the shortest way counts along the longest
+                hit.error = ROUNDING * (8.0 * wp.max(wp.abs(hit.point)) + 32.0 * size)
         return hit
 
     return closest_hit

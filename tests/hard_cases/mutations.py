@@ -324,8 +324,8 @@ MUTATIONS = (
         14,
         "a fixed offset of a tenth of a millimetre",
         "kernels/trace.py",
-        "        hit.error = ROUNDING * (8.0 * wp.max(wp.abs(hit.point)) + 32.0 * size)\n",
-        "        hit.error = 1.0e-4\n",
+        "                hit.error = ROUNDING * (8.0 * wp.max(wp.abs(hit.point)) + 32.0 * size)\n",
+        "                hit.error = 1.0e-4\n",
         "tests/test_visibility.py::test_rays_that_leave_do_not_come_back",
     ),
     Mutation(
