@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import pytest
@@ -20,6 +21,20 @@ FIRST = "warp_ar.begin"
 """The module that commands begin with."""
 
 
+PATIENCE = 60.0
+"""Seconds after which a command that goes on is killed."""
+
+
+@pytest.fixture(autouse=True)
+def heeded():
+    """Commands inherit what the suite ignores: an interrupt, where it was started in the background itself."""
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in numbers}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler if handler is not None else signal.SIG_DFL)
+
+
 def ended_at(module: str, number: int, *words: str) -> tuple[int, list[str]]:
     """Exit code of ``python -m ...`` that gets a signal once it has imported this module, and what it said.
 
@@ -28,6 +43,8 @@ def ended_at(module: str, number: int, *words: str) -> tuple[int, list[str]]:
     command = [sys.executable, "-X", "importtime", "-m", *words]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
+        late = threading.Timer(PATIENCE, process.kill)
+        late.start()
         lines, seen, sent = [], False, False
         for line in process.stderr:
             if not line.startswith("import time:"):
@@ -37,6 +54,7 @@ def ended_at(module: str, number: int, *words: str) -> tuple[int, list[str]]:
                 sent = True
             elif line.split("|")[-1].strip() == module:
                 seen = True
+        late.cancel()
     assert sent
     return process.returncode, lines
 
