@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import pathlib
+import signal
 from collections.abc import Iterator
 
 import hypothesis
@@ -33,7 +34,13 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Name the marker by which tests say what they cover."""
+    """Name the marker by which tests say what they cover; heed interrupts wherever the suite was started from.
+
+    A shell has what it starts in the background ignore them, and commands that tests start would inherit that.
+    """
+    for number in (signal.SIGINT, getattr(signal, "SIGHUP", signal.SIGINT)):
+        if signal.getsignal(number) is signal.SIG_IGN:
+            signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
     config.addinivalue_line("markers", "atlas(row, stage, method): hard case that a test covers; see hard_cases")
 
 

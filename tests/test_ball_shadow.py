@@ -7,7 +7,7 @@ import types
 import numpy as np
 import pytest
 
-from tests.test_recover import DistantLight, lit_environment, scene  # noqa: F401
+from tests.recover_rig import DistantLight, lit_environment, scene  # noqa: F401
 from warp_ar.light.ball_shadow import ELSEWHERE, SHARES, Ball, costs, passing_shares, reaching_factor, share_told
 from warp_ar.light.config import CONFIG, Kind
 from warp_ar.light.evidence import spread_directions

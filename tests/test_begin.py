@@ -25,16 +25,6 @@ PATIENCE = 60.0
 """Seconds after which a command that goes on is killed."""
 
 
-@pytest.fixture(autouse=True)
-def heeded():
-    """Commands inherit what the suite ignores: an interrupt, where it was started in the background itself."""
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    before = {number: signal.signal(number, signal.SIG_DFL) for number in numbers}
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler if handler is not None else signal.SIG_DFL)
-
-
 def ended_at(module: str, number: int, *words: str) -> tuple[int, list[str]]:
     """Exit code of ``python -m ...`` that gets a signal once it has imported this module, and what it said.
 

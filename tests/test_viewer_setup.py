@@ -122,8 +122,15 @@ class Hands:
 
 @pytest.mark.parametrize("size", [(1280, 800), (390, 844)], ids=["desktop", "phone"])
 def test_from_the_card_to_a_lit_object(
-    size: tuple[int, int], desk: RandomDesk, views: list[np.ndarray], browser: Any, tmp_path: Path
+    size: tuple[int, int],
+    desk: RandomDesk,
+    views: list[np.ndarray],
+    browser: Any,
+    tmp_path: Path,
+    request: pytest.FixtureRequest,
 ) -> None:
+    if size[0] < 800 and not request.config.getoption("--long"):
+        pytest.skip("three minutes, as the desktop's: --long")
     folder = Path(os.environ.get("WARP_AR_ARTEFACTS") or tmp_path)
     folder.mkdir(parents=True, exist_ok=True)
     phone = size[0] < 800
