@@ -253,7 +253,7 @@ def test_no_setting_moves_twice_in_half_a_second_or_by_two_methods(seed):
             moved[setting] = now
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("budget", [12.0, 33.0, 60.0, 400.0])
 def test_ten_thousand_noisy_frames_bring_no_flicker(budget, seed):
     """Frames whose times scatter by a fifth, every fiftieth five times too long; costs that are a fifth off."""

@@ -25,15 +25,15 @@ def test_frames_are_those_of_the_path_tracer() -> None:
     """In the light, pose and time of each frame, not of the one after it."""
     with Session(page_scene(), device="cpu", quality="low") as session:
         session.ahead = False
-        traced = TracedFrames(session.pipeline, 2)  # type: ignore[arg-type]
+        traced = TracedFrames(session.pipeline, 1)  # type: ignore[arg-type]
         first = None
-        for frame, result in itertools.islice(session, 3):
+        for frame, result in itertools.islice(session, 2):
             image = traced(frame, result)
             first = frame.time if first is None else first
             light = light_of(session.pipeline)  # type: ignore[arg-type]
             scene = exposed_scene(session.pipeline)  # type: ignore[arg-type]
             tracer = PathTracer(scene, light, frame.image, result.pose, device="cpu", seconds=frame.time - first)
-            tracer.sample(2)
+            tracer.sample(1)
             np.testing.assert_array_equal(image, tracer.picture().image)
             assert (image != frame.image).any()
             assert (image != result.image).any()
