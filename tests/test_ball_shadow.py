@@ -203,7 +203,8 @@ def test_the_share_of_light_that_arrives_is_told(true, known):
     added = np.repeat([0.0, 2.0], 40)
     light = np.exp(-1.0) * (1.0 + true * added) * np.exp(0.05 * rng.standard_normal(80))
     cost = costs(np.stack([light, np.ones(80), added, np.full(80, 2.0)]), 0.05, -1.0, known)
-    # Twenty equations of 5 % on either side, the logarithm of 1 + 2 f.
+    # Twenty equations of 5 % on either side, the logarithm of 1 + 2 f: where f is 1, four standard deviations of it are
+    # 4 * 1.5 * 0.05 * sqrt(2 / 20) = 0.095.
     assert SHARES[cost.argmin()] == pytest.approx(true, abs=0.1)
     assert share_told(cost) == pytest.approx(true, abs=0.1)
 
