@@ -137,7 +137,7 @@ def triangle_cases(frames: Clip, folder: Path, triangles: int, side: int) -> dic
         "textured": write_torus(folder / "textured.glb", grid, color, make_pictures(side, 0)),
     }
     return {
-        name: with_objects(frames, (Object("mesh", file=path, at=(0.15, 0.055, 0.03), scale=1.8),))
+        name: with_objects(frames, (Object("mesh", file=path, at=(0.1, 0.05, 0.04), scale=5.0),))
         for name, path in files.items()
     }
 
