@@ -2,7 +2,8 @@
 
 The lamp is a ball of one radiance above the desk's left half, the room behind it nearly dark: what a mirror ball shows
 depends on where it stands. The desk is matt, and a printed card may lie at the origin. Balls are not mirrored in each
-other, here as in what is taken to be true, and throw the lamp's shadow only where a desk is told of them.
+other, here as in what is taken to be true, and throw the lamp's shadow and mirror the lamp onto the desk only where a
+desk is told of them.
 """
 
 from __future__ import annotations
@@ -92,6 +93,54 @@ def _lamp_irradiance(desk: Desk, points: Array, normals: Array) -> Array:
     return np.asarray(math.pi * desk.lamp * desk.lamp_radius**2 / squared * np.maximum(cosine, 0.0), float)
 
 
+def mirrored_irradiance(desk: Desk, points: Array) -> Array:
+    """Of the desk at points (n, 3) by the lamp's light that balls mirror, the lamp small: a point, (n,).
+
+    In the plane through lamp L, ball C and point, angles at C from CL: a ray leaves L at alpha(phi), meets the ball of
+    radius R at phi, its angle of incidence i = phi + alpha, and goes on toward psi = 2 phi + alpha. It passes the point
+    (rho, theta), where rho sin(psi - theta) = R sin i. With s from ball to point the flux of a tube of rays is spread
+    over rho sin(theta) (R cos(i) + s (2 + alpha')) dphi, where alpha' = R (D cos(phi) - R) / (D^2 + R^2 - 2 D R
+    cos(phi)) is dalpha/dphi and D = |CL|: irradiance of a surface that faces the ray is
+
+        I sin(alpha) alpha' / (rho sin(theta) (R cos(i) + s (2 + alpha'))).
+    """
+    out = np.zeros(len(points))
+    for center, radius, reflectance in desk.balls:
+        to_lamp, to_point = np.array(desk.lamp_at) - np.array(center), points - np.array(center)
+        far, rho = float(np.linalg.norm(to_lamp)), np.linalg.norm(to_point, axis=-1)
+        axis = to_lamp / far
+        across = to_point - np.outer(to_point @ axis, axis)
+        theta = np.arctan2(np.maximum(np.linalg.norm(across, axis=-1), 1e-9 * radius), to_point @ axis)
+        across /= np.linalg.norm(across, axis=-1, keepdims=True) + 1e-30
+
+        def leaving(phi: Array, far: float = far, radius: float = radius) -> Array:
+            """Angle alpha."""
+            return np.arctan2(radius * np.sin(phi), far - radius * np.cos(phi))
+
+        grazing = math.acos(radius / far)
+        low, high = np.zeros(len(points)), np.minimum(theta, grazing)
+        for _ in range(50):  # psi grows with phi; the mirrored ray of phi = 0 passes on the axis' side
+            middle = 0.5 * (low + high)
+            incidence = middle + leaving(middle)
+            inside = rho * np.sin(np.minimum(theta - incidence - middle, 0.5 * math.pi)) > -radius * np.sin(incidence)
+            low, high = np.where(inside, middle, low), np.where(inside, high, middle)
+        phi = 0.5 * (low + high)
+        alpha = leaving(phi)
+        incidence = phi + alpha
+        place = radius * (np.cos(phi)[:, None] * axis + np.sin(phi)[:, None] * across)
+        ray = to_point - place
+        s = np.linalg.norm(ray, axis=-1)
+        turned = radius * (far * np.cos(phi) - radius) / (far**2 + radius**2 - 2.0 * far * radius * np.cos(phi))
+        width = rho * np.sin(theta) * (radius * np.cos(incidence) + s * (2.0 + turned))
+        intensity = reflectance * desk.lamp * math.pi * desk.lamp_radius**2
+        shown = (rho > radius) & (phi < grazing - 1e-6)
+        # The other root of the equation, behind the ball, is no ray.
+        shown &= (ray * place).sum(-1) > 0.0
+        given = intensity * np.sin(alpha) * turned / width * np.maximum(-ray[:, 2] / s, 0.0)
+        out[shown] += given[shown]
+    return out
+
+
 def radiance(desk: Desk, origins: Array, directions: Array) -> Array:
     """Linear RGB along rays (n, 3) of unit direction, balls left out."""
     o, d = np.broadcast_arrays(origins, directions)
@@ -101,7 +150,7 @@ def radiance(desk: Desk, origins: Array, directions: Array) -> Array:
     down = (d[:, 2] < 0.0) & (t > 0.0)
     points = o[down] + t[down, None] * d[down]
     up = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
-    direct = _lamp_irradiance(desk, points, up) * _lit_share(desk, points)
+    direct = _lamp_irradiance(desk, points, up) * _lit_share(desk, points) + mirrored_irradiance(desk, points)
     out[down] = _albedo(desk, points) / math.pi * (direct[:, None] + math.pi * np.array(desk.room))
     off = o - np.array(desk.lamp_at)
     along = (off * d).sum(-1)

@@ -73,6 +73,16 @@ def test_every_balls_light_is_written(clip: pathlib.Path, tmp_path: pathlib.Path
     assert stage.GetPrimAtPath("/shot/lights/environment").IsActive()
     assert not other.IsActive()
     assert tuple(other.GetCustomDataByKey("at")) == (0.1, 0.03, 0.03)
+    # With one ball less nothing of the other's light stays; what is somebody else's does.
+    theirs = tmp_path / "shot_environment_7.exr"
+    theirs.write_bytes(b"somebody's")
+    clip.write_text(clip.read_text().replace(more, ""))
+    capsys.readouterr()
+    assert run(clip, "--output", tmp_path / "shot.glb", "--frames", 1) == 0
+    assert "shot_environment_1.exr: of an earlier export" in capsys.readouterr().err
+    assert maps[0].exists()
+    assert not maps[1].exists()
+    assert theirs.exists()
 
 
 def test_a_way_comes_back_as_poses(clip: pathlib.Path, tmp_path: pathlib.Path) -> None:

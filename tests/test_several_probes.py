@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.reference import latlong
-from tests.rendered_lamp import Array, Desk
+from tests.rendered_lamp import Array, Desk, mirrored_irradiance
 from tests.two_balls import ALBEDO, BALLS, PLACES, TwoBalls, hits, make_scene, material, pose, rms, shares, shown_of
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.scene import LambertMaterial, dumps_scene, loads_scene
@@ -173,3 +173,34 @@ def test_scene_files_say_several_balls() -> None:
     header = dumps_scene(dataclasses.replace(scene, probes=()))
     assert len(loads_scene(header + single).probes) == 1
     assert len(loads_scene(header + 3 * single.replace("[probe]", "[[probe]]")).probes) == 3
+
+
+def test_the_true_desk_has_the_light_that_balls_mirror_onto_it() -> None:
+    """Against rays from the lamp by way of a ball, counted in squares of the desk."""
+    ball = ((-0.2, 0.0, 0.04), 0.04, 0.85)
+    desk = Desk(lamp_at=(-0.1, -0.15, 0.34), lamp_radius=0.02, lamp=27.5, balls=(ball,))
+    lamp, center, radius = np.array(desk.lamp_at), np.array(ball[0]), ball[1]
+    away = float(np.linalg.norm(lamp - center))
+    widest = math.sqrt(1.0 - (radius / away) ** 2)
+    rng, count, half = np.random.default_rng(0), 600_000, 0.01
+    cosine, turn = 1.0 - (1.0 - widest) * rng.random(count), 2.0 * np.pi * rng.random(count)
+    z = (center - lamp) / away
+    x = np.cross(z, [1.0, 0.0, 0.0])
+    x /= np.linalg.norm(x)
+    sine = np.sqrt(1.0 - cosine**2)
+    rays = np.column_stack([sine * np.cos(turn), sine * np.sin(turn), cosine]) @ np.stack([x, np.cross(z, x), z])
+    along = rays @ (lamp - center)
+    points = lamp + (-along - np.sqrt(along**2 - away**2 + radius**2))[:, None] * rays
+    normals = (points - center) / radius
+    gone = rays - 2.0 * (rays * normals).sum(1, keepdims=True) * normals
+    down = gone[:, 2] < 0.0
+    points, gone = points[down], gone[down]
+    landed = points - (points[:, 2] / gone[:, 2])[:, None] * gone
+    flux = ball[2] * desk.lamp * np.pi * desk.lamp_radius**2 * 2.0 * np.pi * (1.0 - widest) / count
+    side = (np.arange(24) + 0.5) / 12.0 * half - half
+    square = np.stack(np.meshgrid(side, side, [0.0]), -1).reshape(-1, 3)
+    for at in ((-0.1, -0.05), (-0.3, 0.0), (-0.2, -0.08), (-0.15, 0.02)):
+        inside = (np.abs(landed[:, :2] - at) < half).all(axis=1).sum()
+        assert inside > 500
+        expected = mirrored_irradiance(desk, square + np.array([*at, 0.0])).mean() * (2.0 * half) ** 2 / flux
+        assert abs(inside - expected) < 5.0 * math.sqrt(expected)

@@ -663,6 +663,23 @@ def test_environment_sink_numbers_its_files(tmp_path: pathlib.Path) -> None:
         assert np.array_equal(read_environment(tmp_path / "env" / f"{index:04d}.exr"), radiance() + np.float32(index))
 
 
+def test_light_of_balls_of_an_earlier_run_goes(tmp_path: pathlib.Path) -> None:
+    for folder in (tmp_path, tmp_path / "ball_1", tmp_path / "ball_2", tmp_path / "ball_room"):
+        with EnvironmentSink(folder) as sink:
+            sink.write(radiance())
+            sink.write(radiance())
+    theirs = tmp_path / "ball_2" / "0007.exr"
+    theirs.write_bytes(b"somebody's")
+    with EnvironmentSink(tmp_path) as sink:
+        assert (tmp_path / "ball_1" / "0001.exr").exists(), "nothing goes before there is a frame"
+        assert sink.replaced.endswith("ball_*: 4 environments of an earlier run are removed")
+        sink.write(radiance())
+    assert not (tmp_path / "ball_1").exists()
+    assert list((tmp_path / "ball_2").iterdir()) == [theirs]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["0000.exr", "ball_2", "ball_room"]
+    assert len(list((tmp_path / "ball_room").iterdir())) == 2
+
+
 def test_shared_environments_load(shared: pathlib.Path) -> None:
     paths = sorted((shared / "hdri").glob("*.exr"))
     assert paths

@@ -9,6 +9,7 @@ if __name__ == "__main__":
 
 import argparse
 import dataclasses
+import glob
 import itertools
 import os
 from collections.abc import Sequence
@@ -27,6 +28,7 @@ from warp_ar.output.stmap import distort_map, undistort_map, write_stmap
 from warp_ar.output.track_file import TRACK_SUFFIX, write_track
 from warp_ar.output.usd_file import USD_SUFFIXES, load_usd, write_usd
 from warp_ar.scene import Scene, load_scene
+from warp_ar.signature import is_signed
 
 SUFFIXES = (*USD_SUFFIXES, GLTF_SUFFIX, TRACK_SUFFIX)
 
@@ -85,6 +87,7 @@ def export(options: argparse.Namespace) -> int:
     for name, radiance in zip(maps, light, strict=False):
         write_environment(beside[name], radiance, overwrite=True, axes="y-up")
     if light:
+        _clear_stale(output, len(light))
         others = tuple(
             (beside[name], scene.probes[ball].center) for ball, name in enumerate(maps[: len(light)]) if ball
         )
@@ -104,6 +107,15 @@ def export(options: argparse.Namespace) -> int:
 def environment_names(scene: Scene) -> tuple[str, ...]:
     """What the environments' files are named by: of the first mirror ball, and of each other one in turn."""
     return ("environment", *(f"environment_{ball}" for ball in range(1, len(scene.probes))))
+
+
+def _clear_stale(output: Path, balls: int) -> None:
+    """Remove what an earlier export of more mirror balls wrote of those that this one does not have."""
+    for path in output.parent.glob(f"{glob.escape(output.stem)}_environment_[1-9]*.exr"):
+        number = path.stem.removeprefix(f"{output.stem}_environment_")
+        if number.isdecimal() and int(number) >= balls and is_signed(path):
+            path.unlink(missing_ok=True)
+            say(f"{path}: of an earlier export, of a mirror ball that this one does not have; removed")
 
 
 def _read_by(scene: Scene, options: argparse.Namespace) -> dict[str, list[Path]]:

@@ -11,6 +11,7 @@ the poles and edges: half a texel at most.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import datetime
 import functools
@@ -28,9 +29,9 @@ from warp_ar.files import is_file, limits, too_much, write_whole
 from warp_ar.output.color_spaces import COLOR_SPACES, convert_light, find_color_space
 from warp_ar.output.environment_axes import CUBES, DESCRIPTIONS, check_axes, from_axes, to_axes, to_cube
 from warp_ar.output.folder_sink import FolderSink
-from warp_ar.output.places import check_replaceable
+from warp_ar.output.places import check_replaceable, earlier_frames
 from warp_ar.output.radiance_hdr import encode_hdr
-from warp_ar.signature import PROGRAM
+from warp_ar.signature import PROGRAM, is_signed
 
 ENVIRONMENT_SUFFIXES = (".exr", ".hdr", ".json")
 
@@ -77,12 +78,40 @@ class EnvironmentInfo:
 
 
 class EnvironmentSink(FolderSink):
-    """A folder of ``NNNN.exr``, numbered from 0, each as `write_environment` writes it."""
+    """A folder of ``NNNN.exr``, numbered from 0, each as `write_environment` writes it.
+
+    The first one also clears away what this program left in folders ``ball_1``, ``ball_2``, ... below: light of an
+    earlier run, of mirror balls that this one may not have.
+    """
 
     _suffix = ".exr"
 
+    def __init__(self, path: str | pathlib.Path, *, overwrite: bool = False) -> None:
+        super().__init__(path, overwrite=overwrite)
+        self._stale: list[pathlib.Path] = []
+        for folder in self._path.glob("ball_[1-9]*"):
+            if folder.name.removeprefix("ball_").isdecimal() and folder.is_dir():
+                self._stale += [one for one in earlier_frames(folder, self._suffix, overwrite=True) if is_signed(one)]
+        if self._stale:
+            say = f"{self.replaced}; " if self.replaced else ""
+            self.replaced = f"{say}{self._path}/ball_*: {len(self._stale)} environments of an earlier run are removed"
+
     def _check(self, image: npt.NDArray[Any]) -> None:
         _check_environment(image)
+
+    def write(self, image: npt.NDArray[Any]) -> None:
+        """Take the next map; the first one clears away those of an earlier run."""
+        self._check(image)
+        stale, self._stale = self._stale, []
+        try:
+            for path in reversed(stale):
+                path.unlink(missing_ok=True)
+        except OSError as error:
+            raise SinkError(f"{self._path}: light of an earlier run cannot be removed: {reason(error)}") from error
+        for folder in {path.parent for path in stale}:
+            with contextlib.suppress(OSError):  # it holds something else: that stays, and so does the folder
+                folder.rmdir()
+        super().write(image)
 
     def _store(self, index: int, image: npt.NDArray[Any]) -> None:
         write_environment(self._path / f"{index:04d}.exr", image, overwrite=True)
