@@ -88,30 +88,25 @@ class EnvironmentSink(FolderSink):
 
     def __init__(self, path: str | pathlib.Path, *, overwrite: bool = False) -> None:
         super().__init__(path, overwrite=overwrite)
-        self._stale: list[pathlib.Path] = []
+        stale: list[pathlib.Path] = []
         for folder in self._path.glob("ball_[1-9]*"):
             if folder.name.removeprefix("ball_").isdecimal() and folder.is_dir():
-                self._stale += [one for one in earlier_frames(folder, self._suffix, overwrite=True) if is_signed(one)]
-        if self._stale:
+                stale += [one for one in earlier_frames(folder, self._suffix, overwrite=True) if is_signed(one)]
+        if stale:
+            self._earlier += stale
             say = f"{self.replaced}; " if self.replaced else ""
-            self.replaced = f"{say}{self._path}/ball_*: {len(self._stale)} environments of an earlier run are removed"
+            self.replaced = f"{say}{self._path}/ball_*: {len(stale)} environments of an earlier run are removed"
 
     def _check(self, image: npt.NDArray[Any]) -> None:
         _check_environment(image)
 
     def write(self, image: npt.NDArray[Any]) -> None:
-        """Take the next map; the first one clears away those of an earlier run."""
-        self._check(image)
-        stale, self._stale = self._stale, []
-        try:
-            for path in reversed(stale):
-                path.unlink(missing_ok=True)
-        except OSError as error:
-            raise SinkError(f"{self._path}: light of an earlier run cannot be removed: {reason(error)}") from error
-        for folder in {path.parent for path in stale}:
+        """Take the next map; the first one clears away those of an earlier run, and folders that are empty then."""
+        emptied = {path.parent for path in self._earlier} - {self._path}
+        super().write(image)
+        for folder in emptied:
             with contextlib.suppress(OSError):  # it holds something else: that stays, and so does the folder
                 folder.rmdir()
-        super().write(image)
 
     def _store(self, index: int, image: npt.NDArray[Any]) -> None:
         write_environment(self._path / f"{index:04d}.exr", image, overwrite=True)
