@@ -16,6 +16,7 @@ from tests.reference import color as reference_color
 from tests.reference import mirror_ball as reference
 from tests.reference import relight as reference_relight
 from tests.reference.visibility import Body
+from warp_ar.engine import scheduler
 from warp_ar.engine.graph import make_plan
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.kernels import color, mirror_ball
@@ -647,6 +648,32 @@ def test_stage_runs_where_a_ball_has_something_to_show():
     }
     for reason, plan in left_out.items():
         assert reason in dict(plan.left_out)["mirror_ball"]
+
+
+class _Listed(Exception):
+    """The kernels of a plan are known."""
+
+
+def test_each_method_has_its_rays_and_all_share_a_kernel(monkeypatch):
+    launch, seen, found = mirror_ball.mirror_ball, [], set()
+
+    def noted(*arguments, samples, **others):
+        seen.append(samples)
+        launch(*arguments, samples=samples, **others)
+
+    def listed(kernels, *_, **__):
+        found.update(kernel for kernel in kernels if "mirror_ball_kernel" in kernel.key)
+        raise _Listed
+
+    monkeypatch.setattr(mirror_ball, "mirror_ball", noted)
+    monkeypatch.setattr(scheduler, "load_modules", listed)
+    for method, samples in SAMPLES.items():
+        quality = PRESETS["medium"].with_methods(mirror_ball=method)
+        with Pipeline("desk", device="cpu", quality=quality) as pipeline, pytest.raises(_Listed):
+            pipeline.warm_up()
+        assert set(seen) == {samples}
+        seen.clear()
+    assert len(found) == 1
 
 
 def test_config_holds_what_the_scene_calls_for():
