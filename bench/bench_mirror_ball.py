@@ -79,7 +79,6 @@ def main(device: str) -> None:
             relighting = RelightConfig("reflectance", trace, "sh", True)
             config = mirror_ball.MirrorBallConfig(
                 trace,
-                samples,
                 ShadeConfig(forms, (DIRECTIONAL,), 1) if objects else None,
                 relighting if lit else None,
                 shaded,
@@ -90,9 +89,11 @@ def main(device: str) -> None:
             picture = make_picture(frame, decode, rays)
             receiver = make_receiver(relighting, picture, probes=probes, key_lights=keys, irradiance=irradiance)
 
-            def call(config: mirror_ball.MirrorBallConfig = config, receiver: Receiver = receiver) -> None:
+            def call(
+                config: mirror_ball.MirrorBallConfig = config, receiver: Receiver = receiver, samples: int = samples
+            ) -> None:
                 inputs = (params, scene, lights, surroundings, receiver, ratio)
-                mirror_ball.mirror_ball(config, *inputs, out)
+                mirror_ball.mirror_ball(config, *inputs, out, samples=samples)
 
             call()
             found = out.numpy()

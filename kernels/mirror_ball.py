@@ -31,7 +31,7 @@ from warp_ar.kernels.shadow import tile_turn
 from warp_ar.kernels.shapes import FAR, ROUNDING, intersect_sphere
 from warp_ar.kernels.structs import FrameParams, Light, Probe, RayScene
 from warp_ar.kernels.trace import TraceConfig, make_trace, offset_origin
-from warp_ar.kernels.visibility import inside_rect, make_sample_direction
+from warp_ar.kernels.visibility import inside_rect, look_within_pixel
 
 wp.set_module_options({"enable_backward": False})
 
@@ -45,18 +45,12 @@ class MirrorBallConfig:
 
     trace: TraceConfig
     """Kinds of shape in the scene."""
-    samples: int = 1
-    """Rays per pixel, spread as ``shade``'s along edges: a square number."""
     shade: ShadeConfig | None = None
     """How virtual objects look; None: there are none."""
     relight: RelightConfig | None = None
     """How the receiver responds to virtual light; None: there is no virtual light, or no proxy for it."""
     ratio: bool = False
     """Whether virtual objects shade the receiver under the environment."""
-
-    def __post_init__(self) -> None:
-        if self.samples < 1 or math.isqrt(self.samples) ** 2 != self.samples:
-            raise ValueError(f"samples is {self.samples}; expected a square number such as 1 or 4")
 
 
 @wp.func
@@ -122,7 +116,6 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
     shade_hit = make_shade_hit(config.shade) if config.shade is not None else None
     direct_lighting = make_direct_lighting(config.relight) if config.relight is not None else None
     find_in_frame = make_find_in_frame(config.trace, True)
-    sample_direction = make_sample_direction(config.samples)
 
     @wp.kernel(
         module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS, module_options=QUICK_TO_COMPILE
@@ -136,6 +129,7 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
         distant: DistantLight,
         receiver: Receiver,
         shadow_ratio: wp.array2d[wp.vec3],
+        side: wp.int32,
         # Out:
         mirrored_out: wp.array2d[wp.vec3],
     ):
@@ -148,9 +142,8 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
         ray = receiver.picture.rays[i, j]
         shown = shown_radiance(receiver.picture, i, j)
         change = wp.vec3(0.0, 0.0, 0.0)
-        count = wp.int32(wp.static(config.samples))  # a variable: the loop stays one
-        for sample in range(count):
-            direction = sample_direction(params, ray, sample)
+        for sample in range(side * side):
+            direction = look_within_pixel(params, ray, sample, side)
             seen = reflect_at_ball(scene, receiver.probes, origin, direction)
             if seen.ball < 0:
                 continue
@@ -182,7 +175,7 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
             if wp.static(config.relight is not None):
                 lit = direct_lighting(scene, lights, receiver, surface, i, j, rho, tile_turn(i, j))
                 change += wp.cw_mul(rho, lit.added)
-        mirrored_out[i, j] = change / wp.static(float(config.samples))
+        mirrored_out[i, j] = change / wp.float32(side * side)
 
     return mirror_ball_kernel
 
@@ -197,6 +190,7 @@ def mirror_ball(
     shadow_ratio: wp.array | None,
     mirrored_out: wp.array,
     *,
+    samples: int = 1,
     rows: Rows | None = None,
 ) -> None:
     """Write what virtual objects change in the picture of mirror balls; zero outside ``params[0].ball_rect``.
@@ -210,13 +204,20 @@ def mirror_ball(
         receiver: From ``make_receiver``; picture and probes are always needed.
         shadow_ratio: (H, W) vec3 of ``environment_shadow``; needed if ``config.ratio``.
         mirrored_out: (H, W) vec3, change of linear radiance in camera values.
+        samples: Rays per pixel, spread as ``shade``'s along edges: a square number. A number, not a kernel of its own.
         rows: Band of rows; None means all.
+
+    Raises:
+        ValueError: ``samples`` is no square number.
     """
+    side = math.isqrt(max(samples, 0))
+    if samples < 1 or side**2 != samples:
+        raise ValueError(f"samples is {samples}; expected a square number such as 1 or 4")
     rays = receiver.picture.rays
     launch_rows(
         make_mirror_ball_kernel(config),
         rays.shape,
-        [params, scene, lights, distant, receiver, shadow_ratio],
+        [params, scene, lights, distant, receiver, shadow_ratio, side],
         [mirrored_out],
         rows=rows,
         device=rays.device,

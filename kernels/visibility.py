@@ -85,6 +85,19 @@ def check_edge_samples(count: int) -> None:
         raise ValueError(f"edge_samples is {count}; expected a square number such as 1, 4 or 16")
 
 
+@wp.func
+def look_within_pixel(params: wp.array[FrameParams], ray: wp.vec2, sample: wp.int32, side: wp.int32) -> wp.vec3:
+    """Where one of a pixel's ``side**2`` samples looks in the world, not unit; a single one through its centre."""
+    inner = wp.vec3(ray[0], ray[1], 1.0)
+    if side > 1:
+        step = 1.0 / wp.float32(side)
+        a = wp.float32(sample % side)
+        b = wp.float32(sample / side)
+        inner[0] += ((a + (b + 0.5) * step) * step - 0.5) / params[0].focal[0]
+        inner[1] += ((b + 1.0 - (a + 0.5) * step) * step - 0.5) / params[0].focal[1]
+    return params[0].world_from_camera * inner
+
+
 @functools.cache
 def make_sample_direction(count: int) -> wp.Function:
     """``sample_direction(params, ray, sample) -> vec3``: where a pixel's sample looks in the world, not unit.
@@ -96,14 +109,7 @@ def make_sample_direction(count: int) -> wp.Function:
 
     @wp.func(module="unique")
     def sample_direction(params: wp.array[FrameParams], ray: wp.vec2, sample: wp.int32) -> wp.vec3:
-        inner = wp.vec3(ray[0], ray[1], 1.0)
-        if wp.static(side > 1):
-            n = wp.static(float(side))
-            a = wp.float32(sample % wp.static(side))
-            b = wp.float32(sample / wp.static(side))
-            inner[0] += ((a + (b + 0.5) / n) / n - 0.5) / params[0].focal[0]
-            inner[1] += ((b + (n - 0.5 - a) / n) / n - 0.5) / params[0].focal[1]
-        return params[0].world_from_camera * inner
+        return look_within_pixel(params, ray, sample, wp.static(side))
 
     return sample_direction
 

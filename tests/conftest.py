@@ -12,9 +12,14 @@ import hypothesis
 import pytest
 import warp as wp
 
+from warp_ar.engine import tiers
+
 wp.config.log_level = wp.LOG_WARNING
 # A test runs its kernels once or twice: compiled quickly they give the same bits (tests/test_tiers.py).
 os.environ.setdefault("WARP_AR_TIERS", "quick")
+# So are those that a test launches by itself: the same kernel is then compiled once for tests, pipelines and commands.
+_WARP_FLAGS = wp.config.cpu_compiler_flags
+wp.config.cpu_compiler_flags = tiers.QUICK_FLAGS
 
 MOST_PROCESSES = 4
 """Processes that a run of a folder is spread over at most: each takes 1 to 3 GB."""
@@ -104,6 +109,13 @@ def device(request: pytest.FixtureRequest) -> Iterator[str]:
     """Run the test on the CPU and, where there is one, on the first CUDA device."""
     with wp.ScopedDevice(request.param):
         yield request.param
+
+
+@pytest.fixture
+def warp_flags(monkeypatch: pytest.MonkeyPatch) -> str:
+    """Warp's own flags of Clang, in force as they are outside of tests."""
+    monkeypatch.setattr(wp.config, "cpu_compiler_flags", _WARP_FLAGS)
+    return str(_WARP_FLAGS)
 
 
 @pytest.fixture(scope="session")

@@ -16,6 +16,7 @@ from tests.reference import color as reference_color
 from tests.reference import mirror_ball as reference
 from tests.reference import relight as reference_relight
 from tests.reference.visibility import Body
+from warp_ar.engine import scheduler
 from warp_ar.engine.graph import make_plan
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.kernels import color, mirror_ball
@@ -122,9 +123,7 @@ def run(
         forms = DistantLightConfig(trace, models, False, "sh" if lit else "none", lit, True)
         shading = ShadeConfig(forms, kinds(lights), 1)
         relighting = RelightConfig(method, trace, "sh", True) if lights and proxies else None
-        config = mirror_ball.MirrorBallConfig(
-            trace, samples, shading if objects else None, relighting, ratio is not None
-        )
+        config = mirror_ball.MirrorBallConfig(trace, shading if objects else None, relighting, ratio is not None)
     inverse = pose.inverse()
     camera = camera_fields(inverse.translation, inverse.rotation, FOCAL, (H, W))
     params = records(FrameParams, {**camera, "ball_rect": rect})
@@ -154,6 +153,7 @@ def run(
         receiver,
         None if ratio is None else wp.array(ratio.astype(np.float32), dtype=wp.vec3),
         out,
+        samples=samples,
         rows=rows,
     )
     return out.numpy()
@@ -515,10 +515,10 @@ def test_more_rays_converge(device):
     assert errors[0] > 1.5 * errors[1] > 1.5**2 * errors[2]
 
 
-def test_samples_that_are_no_square_are_refused():
+def test_samples_that_are_no_square_are_refused(device):
     for samples in (0, 2, 8, -4):
         with pytest.raises(ValueError, match=f"samples is {samples}; expected a square number"):
-            mirror_ball.MirrorBallConfig(TraceConfig((), ()), samples)
+            run(samples=samples)
 
 
 def test_specialised_is_the_general_kernel(device):
@@ -527,7 +527,7 @@ def test_specialised_is_the_general_kernel(device):
     models = (LAMBERT, PHONG, METALLIC_ROUGHNESS, MIRROR)
     shading = ShadeConfig(DistantLightConfig(trace, models, True, "sh", True, True), (POINT, SPOT, DIRECTIONAL), 1)
     relighting = RelightConfig("reflectance", trace, "sh", True)
-    general = mirror_ball.MirrorBallConfig(trace, 4, shading, relighting, True)
+    general = mirror_ball.MirrorBallConfig(trace, shading, relighting, True)
     scene = {**BUSY, "irradiance": ENVIRONMENT, "method": "reflectance", "samples": 4}
     frame = noise_frame()
     np.testing.assert_allclose(run(frame, **scene, config=general), run(frame, **scene), atol=1e-6)
@@ -650,6 +650,32 @@ def test_stage_runs_where_a_ball_has_something_to_show():
         assert reason in dict(plan.left_out)["mirror_ball"]
 
 
+class _Listed(Exception):
+    """The kernels of a plan are known."""
+
+
+def test_each_method_has_its_rays_and_all_share_a_kernel(monkeypatch):
+    launch, seen, found = mirror_ball.mirror_ball, [], set()
+
+    def noted(*arguments, samples, **others):
+        seen.append(samples)
+        launch(*arguments, samples=samples, **others)
+
+    def listed(kernels, *_, **__):
+        found.update(kernel for kernel in kernels if "mirror_ball_kernel" in kernel.key)
+        raise _Listed
+
+    monkeypatch.setattr(mirror_ball, "mirror_ball", noted)
+    monkeypatch.setattr(scheduler, "load_modules", listed)
+    for method, samples in SAMPLES.items():
+        quality = PRESETS["medium"].with_methods(mirror_ball=method)
+        with Pipeline("desk", device="cpu", quality=quality) as pipeline, pytest.raises(_Listed):
+            pipeline.warm_up()
+        assert set(seen) == {samples}
+        seen.clear()
+    assert len(found) == 1
+
+
 def test_config_holds_what_the_scene_calls_for():
     desk = load_scene("desk")
     size = desk.camera.width, desk.camera.height
@@ -658,7 +684,6 @@ def test_config_holds_what_the_scene_calls_for():
         return mirror_config(find_features(Request(scene, PRESETS["high"].with_methods(**methods), size)))
 
     whole = config(desk, mirror_ball="smooth")
-    assert whole.samples == 4
     assert whole.ratio
     assert whole.relight is not None
     assert whole.shade is not None

@@ -109,8 +109,8 @@ def test_headers_serve_flags_that_differ_in_those_of_llvm(monkeypatch, tmp_path)
     assert values.numpy() == 2.0
 
 
-def test_flags_of_clang_part_headers() -> None:
-    usual, quick = str(wp.config.cpu_compiler_flags), QUICK_TO_COMPILE["cpu_compiler_flags"]
+def test_flags_of_clang_part_headers(warp_flags) -> None:
+    usual, quick = warp_flags, QUICK_TO_COMPILE["cpu_compiler_flags"]
     assert modules._clang_flags(usual) == modules._clang_flags(quick) == ["-march=native"]
     assert modules._clang_flags("-mavx2 -mllvm=-x=1") == ["-mavx2"]
 

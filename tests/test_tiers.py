@@ -200,7 +200,9 @@ def last_chosen_kernel(values_out: wp.array[wp.int32]):
     values_out[wp.tid()] = 7
 
 
-def test_kernels_that_gain_most_are_compiled_better_first_and_each_by_its_own_flags(monkeypatch, tmp_path) -> None:
+def test_kernels_that_gain_most_are_compiled_better_first_and_each_by_its_own_flags(
+    monkeypatch, tmp_path, warp_flags
+) -> None:
     monkeypatch.setattr(tiers, "_BESIDE", tiers._Beside())
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
     monkeypatch.setenv(tiers.VARIABLE, "two")
@@ -209,7 +211,7 @@ def test_kernels_that_gain_most_are_compiled_better_first_and_each_by_its_own_fl
     tiers.choose([last_chosen_kernel, last_marked_kernel], resolve_device("cpu"))
     wanted = [(module, arguments["extra_flags"]) for module, _, _, arguments in tiers._BESIDE.wanted]
     assert wanted == [
-        (last_marked_kernel.module, wp.config.cpu_compiler_flags),
+        (last_marked_kernel.module, warp_flags),
         (last_chosen_kernel.module, QUICK_TO_COMPILE["cpu_compiler_flags"]),
     ]
 

@@ -37,7 +37,6 @@ def mirror_config(features: Features) -> mirror_ball.MirrorBallConfig:
     lit = "added_light" in layers
     return mirror_ball.MirrorBallConfig(
         trace_config(features.request.scene),
-        SAMPLES[features.request.quality.method("mirror_ball")],
         shading,
         mirrored_relighting(features) if lit else None,
         "shadow_ratio" in layers,
@@ -50,7 +49,6 @@ def mirror_variant(features: Features, device: Any) -> mirror_ball.MirrorBallCon
         return mirror_config(features)
     return mirror_ball.MirrorBallConfig(
         trace_variant(trace_config(features.request.scene), device),
-        SAMPLES[features.request.quality.method("mirror_ball")],
         shade_variant(mirrored_shading(features), features, device),
         relight_variant(mirrored_relighting(features), features, device),
         ratio=True,
@@ -141,6 +139,7 @@ class MirrorBall(Stage):
         relighting = mirrored_relighting(self.features)
         irradiance = self.features.irradiance
         lit = config.relight is not None
+        samples = SAMPLES[self.request.quality.method(self.name)]
         receiver = make_receiver(
             relighting,
             find_picture(arrays),
@@ -162,6 +161,6 @@ class MirrorBall(Stage):
         )
 
         def launch(rows: Rows | None) -> None:
-            mirror_ball.mirror_ball(variant, *inputs, arrays["mirror_ball"], rows=rows)
+            mirror_ball.mirror_ball(variant, *inputs, arrays["mirror_ball"], samples=samples, rows=rows)
 
         return [Pass(launch, rows=self.request.size[1], extent=GrowingRows(arrays["ball_rows"]))]
