@@ -2,7 +2,7 @@
 
 A curved mirror shows many pixels of the frame in one of its own. Were each of its few rays to read one place, fine
 texture of the receiver would become moiré, and flicker as anything moves. So a ray carries how its origin and its
-direction change over the part of the pixel that it stands for [Ige99]: where it meets a plane of normal n at distance t,
+direction change over the part of the pixel that it stands for [Ige99]. On a surface of normal n at distance t
 
     dP = dO + t dD + dt D,    dt = -(dO + t dD).n / D.n,
 
@@ -10,8 +10,8 @@ is what it covers along each of two axes, and the camera's projection turns that
 ellipse A A' + B B' the frame is read at up to ``MOST_TAPS`` places along the longer axis, each as wide as the shorter
 one or as the part of the longer one that it stands for, from the two levels nearest to that width.
 
-Level l has a texel for each 2^l x 2^l pixels, rows and columns rounded up: the mean of those that there are. It holds the
-picture as mirrors show it, with the shadows and the light that are virtual.
+Level l has a texel for each 2^l x 2^l pixels, rows and columns rounded up: the mean of those that there are. It holds
+the picture as mirrors show it, with the shadows and the light that are virtual.
 
 References:
     [Ige99] Igehy 1999, Tracing Ray Differentials.
@@ -87,7 +87,9 @@ def start_of(height: wp.int32, width: wp.int32, level: wp.int32) -> wp.int32:
 
 
 @wp.func
-def composed_radiance(params: FrameParams, picture: Picture, layers: ReceiverLayers, i: wp.int32, j: wp.int32) -> wp.vec3:
+def composed_radiance(
+    params: FrameParams, picture: Picture, layers: ReceiverLayers, i: wp.int32, j: wp.int32
+) -> wp.vec3:
     """A pixel with the shadows and the light that are virtual."""
     radiance = shown_radiance(picture, i, j)
     if layers.shadow_ratio.shape[0] > 0:
@@ -179,9 +181,7 @@ def shrink_frame(
     launch_rows(shrink_frame_kernel, size, [params, picture, layers], [levels_out], rows=rows, device=levels_out.device)
 
 
-def shrink_level(
-    height: int, width: int, level: int, levels_out: wp.array, *, rows: Rows | None = None
-) -> None:
+def shrink_level(height: int, width: int, level: int, levels_out: wp.array, *, rows: Rows | None = None) -> None:
     """Write one of the levels 3 to ``LAST_LEVEL`` from the one below.
 
     Args:
@@ -240,9 +240,7 @@ def look_up_level(
 
 
 @wp.func
-def covered_on(
-    origin: wp.vec3, turn: wp.vec3, t: wp.float32, direction: wp.vec3, normal: wp.vec3
-) -> wp.vec3:
+def covered_on(origin: wp.vec3, turn: wp.vec3, t: wp.float32, direction: wp.vec3, normal: wp.vec3) -> wp.vec3:
     """What a ray covers of a surface that it meets at t, along one axis, as derived above."""
     moved = origin + t * turn
     cosine = wp.dot(direction, normal)

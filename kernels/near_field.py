@@ -10,10 +10,10 @@ only what those change that meet something. Where nothing is near that has no no
 
 *Mirrored*, radiance of what is near and a share; ``shade`` adds (1 - share) of the prefiltered environment. A mirror
 sends rays from places all over the pixel, for what a curved one shows in neighbouring pixels may lie far apart; each
-reads what it meets as wide as its part of the pixel is there, the environment as well, and the share is 1. A glossy lobe sends a few, another few from each pixel of a tile. What
-is near hides part of the lobe, and what it hides may be much darker than the rest: at the rim of a window that a
-receiver cuts off, half of the rays meet the receiver and hardly any of the light is gone. So every ray reads the
-environment as well. With the means over the rays
+reads what it meets as wide as its part of the pixel is there, the environment as well, and the share is 1. A glossy
+lobe sends a few, another few from each pixel of a tile. What is near hides part of the lobe, and what it hides may be
+much darker than the rest: at the rim of a window that a receiver cuts off, half of the rays meet the receiver and
+hardly any of the light is gone. So every ray reads the environment as well. With the means over the rays
 
     s  share of the rays that meet something near,      N  their radiance, 0 for the others,
     B  the environment along all rays,                  M  the environment along those that meet nothing,

@@ -57,7 +57,7 @@ SHARP = wp.constant(wp.float32(SHARP_ALPHA))
 RAY_WIDTH = 2.0
 """Width of one ray of many, over the width that its share of the lobe has."""
 LOBE_ANGLE = 2.0
-"""Angle that such a ray covers, over its width: that is one of half vectors, and what is mirrored turns twice as far."""
+"""Angle that such a ray covers, over its width: that is of half vectors, and what is mirrored turns twice as far."""
 SAME_SURFACE = wp.constant(wp.float32(0.5))
 """Cosine between the normals of neighbours up to which they say how a mirror bends."""
 
