@@ -56,8 +56,9 @@ SHARP_ALPHA = 0.02
 SHARP = wp.constant(wp.float32(SHARP_ALPHA))
 RAY_WIDTH = 2.0
 """Width of one ray of many, over the width that its share of the lobe has."""
-LOBE_ANGLE = 2.0
-"""Angle that such a ray covers, over its width: that is of half vectors, and what is mirrored turns twice as far."""
+LOBE_ANGLE = 1.0
+"""Side of what such a ray covers in the frame, as an angle, over its width. A ray's share is a square of 1.77;
+what is less is left to the rays beside it, for a wide square also reaches over the edges of what it lies on."""
 SAME_SURFACE = wp.constant(wp.float32(0.5))
 """Cosine between the normals of neighbours up to which they say how a mirror bends."""
 

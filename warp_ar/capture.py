@@ -30,6 +30,7 @@ from warp_ar.scene import (
     Object,
     PoseSpec,
     Proxy,
+    ProxyMaterial,
     Scene,
     SourceSpec,
     dumps_scene,
@@ -131,11 +132,14 @@ def make_scene(found: Capture, light: Path, ball_radius: float | None) -> Scene:
     )
     chalk = Object("sphere", radius=unit, at=(x - 3.0 * unit, y, unit), material=LambertMaterial((0.8, 0.8, 0.8)))
     a, b, c = (float(v) for v in pose.translation)
+    material = None
+    if found.gloss is not None and (reflectance := found.gloss.reflectance) is not None:
+        material = ProxyMaterial(round(found.gloss.roughness, 2), (round(reflectance, 3),) * 3)
     return Scene(
         camera=found.camera,
         name=light.stem,
         source=SourceSpec(path=found.shown.resolve()),
-        proxies=(Proxy("plane", at=(x, y, 0.0), size=(40.0 * unit, 40.0 * unit)),),
+        proxies=(Proxy("plane", at=(x, y, 0.0), size=(40.0 * unit, 40.0 * unit), material=material),),
         objects=(beside, chalk),
         captured=CapturedLight(light.resolve()),
         pose=PoseSpec(((tuple(map(float, pose.rotation.reshape(-1))), (a, b, c)),)),

@@ -20,6 +20,7 @@ from warp_ar.input.photographs import Photograph, exposures_by_exif, exposures_b
 from warp_ar.input.response import write_response
 from warp_ar.input.support import Support
 from warp_ar.light.captured import Light, find_emitters, texel_solid_angles
+from warp_ar.light.receiver_gloss import FoundGloss, Surroundings, View, estimate_gloss
 from warp_ar.scene import Camera, Pose, Probe, Scene
 from warp_ar.scene.pose_file import pose_of_position
 from warp_ar.stages.quality import PRESETS
@@ -33,6 +34,8 @@ WINDOW = 1.25
 """Half side, in radii, of the part of a photograph that is unwrapped."""
 LARGEST = 560.0
 """Pixels of a ball's radius beyond which photographs are reduced: the map has no use for more."""
+MOST_LOOKED_AT = 1000
+"""Pixels of the longer side of a photograph of which the plane's gloss is told."""
 BRACKET_ERROR = 0.05
 """Relative error of merged radiance: what a response that was estimated or assumed leaves."""
 
@@ -51,6 +54,8 @@ class Capture:
     """Of that photograph."""
     support: Support | None
     """The plane that the ball stands on, where it was asked for."""
+    gloss: FoundGloss | None
+    """How that plane mirrors, or why that is not told; None where focal length or plane are not known."""
     notes: tuple[str, ...]
     """What a user should know, a line each."""
 
@@ -96,6 +101,7 @@ def capture_light(
         raise UsageError(f"shown = {shown}: expected the number of a photograph, 0 to {len(photos) - 1}")
     reference = photos[shown] if shown is not None else photos[_best_exposed(photos)]
     camera, notes = _camera_of(reference, transfer, focal_35mm)
+    has_focal = not notes
     outline = find_ball(reference.image, camera, ball)
     bracket = _merge_plan(photos, reference, outline, transfer, exposures)
     notes += [*bracket.notes, _describe_outline(outline)]
@@ -106,9 +112,46 @@ def capture_light(
     if found is not None:
         turn = found.pose.rotation
         notes.append(f"the support's normal is known within {found.tilt_deviation:.1f} degrees")
-    light, more = _unwrap(bracket, reference, camera, outline, turn, reflectance, device, height)
-    light = dataclasses.replace(light, exposure=reference.info.exposure)
-    return Capture(light, outline, reference.path, camera, found, (*notes, *more))
+    map_ = _unwrap(bracket, reference, camera, outline, turn, reflectance, device, height)
+    light = dataclasses.replace(map_.light, exposure=reference.info.exposure)
+    gloss = None
+    if found is not None and has_focal:
+        view = view_plane(reference.image, map_.decode, camera, outline, found, reflectance)
+        gloss = estimate_gloss(view, Surroundings(light.radiance, map_.clipped, light.confidence))
+        notes.append(gloss.words)
+    return Capture(light, outline, reference.path, camera, found, gloss, (*notes, *map_.notes))
+
+
+def view_plane(
+    image: Image, decode: Array, camera: Camera, outline: BallOutline, support: Support, reflectance: float
+) -> View:
+    """What a photograph shows of the plane under the ball, in the plane's axes.
+
+    Args:
+        image: uint8 RGB (height, width, 3).
+        decode: (256, 3) linear value of each code.
+        camera: Of the photograph.
+        outline: The ball in it.
+        support: The plane that the ball stands on.
+        reflectance: Of the ball.
+    """
+    h, w = image.shape[:2]
+    shrink = max(1, math.ceil(max(h, w) / MOST_LOOKED_AT))
+    height, width = h // shrink, w // shrink
+    linear = np.stack([decode[image[: height * shrink, : width * shrink, k], k] for k in range(3)], -1)
+    radiance = linear.reshape(height, shrink, width, shrink, 3).mean((1, 3)).astype(np.float32)
+    x = (np.arange(width) + 0.5) * shrink - 0.5
+    y = (np.arange(height) + 0.5) * shrink - 0.5
+    across, down = np.meshgrid((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy)
+    rays = np.stack([across, down, np.ones_like(across)], -1)
+    turn, shift = support.pose.rotation, support.pose.translation
+    rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True) @ turn
+    eye = -turn.T @ shift
+    toward = turn.T @ np.array(outline.sphere)
+    # The ball rests on the plane: the height of its centre is its radius, which gives the radius where none is known.
+    radius = -float(eye[2]) / (float(toward[2]) - 1.0)
+    usable = np.ones((height, width), bool)
+    return View(radiance, usable, rays, eye, eye + radius * toward, radius, reflectance)
 
 
 def _best_exposed(photos: Sequence[Photograph]) -> int:
@@ -223,6 +266,18 @@ def _shift_notes(photos: Sequence[Photograph], aligned: Aligned, circle: Circle)
     return [f"photographs lie up to {most:.1f} pixels apart at the ball; they were aligned"] if most > 0.5 else []
 
 
+@dataclasses.dataclass(frozen=True)
+class _Map:
+    """Merged light, and what it came from."""
+
+    light: Light
+    clipped: NDArray[np.float32]
+    """(h, 2 h) share of each texel that clips in every exposure."""
+    decode: Array
+    """(256, 3) linear value of each code of the shown photograph."""
+    notes: tuple[str, ...]
+
+
 def _unwrap(
     bracket: _Bracket,
     reference: Photograph,
@@ -232,7 +287,7 @@ def _unwrap(
     reflectance: float,
     device: str,
     height: int,
-) -> tuple[Light, list[str]]:
+) -> _Map:
     """The merged map of all photographs, by the pipeline that lights frames."""
     index = bracket.photos.index(reference)
     own = bracket.circles[index]
@@ -273,13 +328,15 @@ def _unwrap(
         confidence = np.array(pipeline.arrays["environment_confidence"].numpy())
         clipped = np.array(pipeline.arrays["environment_clipped"].numpy())
         left_out = pipeline.bracket.notes
+        decode = np.array(pipeline.arrays["decode"].numpy(), float)
     area = texel_solid_angles(height)
     share = float((radiance * clipped * area[..., None]).sum() / max(float((radiance * area[..., None]).sum()), 1e-12))
     notes = list(left_out)
     if share > 0.0:
         what = "the shortest exposure" if len(times) > 1 else "the photograph"
         notes.append(f"{what} still clips: {share:.1%} of the light is a lower bound")
-    return Light(radiance, confidence, find_emitters(radiance, clipped, BRACKET_ERROR), 1.0, None, share), notes
+    light = Light(radiance, confidence, find_emitters(radiance, clipped, BRACKET_ERROR), 1.0, None, share)
+    return _Map(light, clipped.max(-1), decode, tuple(notes))
 
 
 def _place(
