@@ -82,6 +82,11 @@ def make_parser() -> argparse.ArgumentParser:
     support.add_argument("--contact", type=float, nargs=2, metavar=("X", "Y"), help="pixel where the ball touches it")
     support.add_argument("--ball-radius", type=float, metavar="M", help="of the ball, metres; else lengths are radii")
     support.add_argument(
+        "--gloss",
+        action="store_true",
+        help="also tell how it mirrors, which takes some seconds; the scene has it where it is told",
+    )
+    support.add_argument(
         "--scene",
         type=Path,
         metavar="FILE.toml",
@@ -104,6 +109,8 @@ def _check(options: argparse.Namespace) -> None:
         raise UsageError("--rectangle and --contact both tell the plane; give one of the two")
     if options.scene is not None and options.rectangle is None and options.contact is None:
         raise UsageError("--scene needs the plane: give --rectangle and --rectangle-size, or --contact")
+    if options.gloss and options.rectangle is None and options.contact is None:
+        raise UsageError("--gloss needs the plane: give --rectangle and --rectangle-size, or --contact")
     if options.shown is not None and options.shown not in options.photos:
         raise UsageError(f"--shown {options.shown}: expected one of the photographs")
     if not 0.01 <= options.reflectance <= 1.0:
@@ -161,6 +168,7 @@ def capture(options: argparse.Namespace) -> int:
         support=(lambda outline, camera: _support_of(options, outline, camera)) if wanted else None,
         reflectance=options.reflectance,
         device=options.device,
+        gloss=options.gloss,
     )
     for note in found.notes:
         say(note)

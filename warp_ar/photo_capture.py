@@ -20,7 +20,7 @@ from warp_ar.input.photographs import Photograph, exposures_by_exif, exposures_b
 from warp_ar.input.response import write_response
 from warp_ar.input.support import Support
 from warp_ar.light.captured import Light, find_emitters, texel_solid_angles
-from warp_ar.light.receiver_gloss import FoundGloss, Surroundings, View, estimate_gloss
+from warp_ar.light.receiver_gloss import FoundGloss, Surroundings, View, estimate_gloss, shown_well
 from warp_ar.scene import Camera, Pose, Probe, Scene
 from warp_ar.scene.pose_file import pose_of_position
 from warp_ar.stages.quality import PRESETS
@@ -55,7 +55,7 @@ class Capture:
     support: Support | None
     """The plane that the ball stands on, where it was asked for."""
     gloss: FoundGloss | None
-    """How that plane mirrors, or why that is not told; None where focal length or plane are not known."""
+    """How that plane mirrors, or why that is not told; None: not asked for, or focal length or plane are not known."""
     notes: tuple[str, ...]
     """What a user should know, a line each."""
 
@@ -72,6 +72,7 @@ def capture_light(
     reflectance: float = 0.85,
     device: str = "auto",
     height: int = HEIGHT,
+    gloss: bool = False,
 ) -> Capture:
     """Capture the light that a mirror ball shows in one photograph or a bracket of them.
 
@@ -87,6 +88,7 @@ def capture_light(
         reflectance: Of the ball.
         device: ``auto``, ``cpu`` or ``cuda:N``.
         height: Rows of the map.
+        gloss: Whether to find out how that plane mirrors, which takes some seconds.
 
     Raises:
         SourceError: A photograph cannot be read.
@@ -114,12 +116,13 @@ def capture_light(
         notes.append(f"the support's normal is known within {found.tilt_deviation:.1f} degrees")
     map_ = _unwrap(bracket, reference, camera, outline, turn, reflectance, device, height)
     light = dataclasses.replace(map_.light, exposure=reference.info.exposure)
-    gloss = None
-    if found is not None and has_focal:
+    mirrors = None
+    if gloss and found is not None and has_focal:
         view = view_plane(reference.image, map_.decode, camera, outline, found, reflectance)
-        gloss = estimate_gloss(view, Surroundings(light.radiance, map_.clipped, light.confidence))
-        notes.append(gloss.words)
-    return Capture(light, outline, reference.path, camera, found, gloss, (*notes, *map_.notes))
+        known = shown_well(view, light.confidence)
+        mirrors = estimate_gloss(view, Surroundings(light.radiance, map_.clipped, known))
+        notes.append(mirrors.words)
+    return Capture(light, outline, reference.path, camera, found, mirrors, (*notes, *map_.notes))
 
 
 def view_plane(
