@@ -56,6 +56,11 @@ LEAST_SIGNIFICANCE = 3.0
 """Standard deviations that F0 must be from 0."""
 NEARLY = 0.7
 """Of what the best fit explains, from which on another width's or distance's F0 belongs to the interval."""
+DILUTION = 1.5
+"""Upper end of the interval over what the fits say: places and radiance that are not quite true let a reflection look
+weaker, not stronger."""
+WIDEST = 0.05
+"""Width of a lobe from which on shading and texture take part of what is mirrored for theirs: of roughness 0.22."""
 PARTS = 12
 """Sectors around the middle of what is seen that are left out in turn."""
 LEAST_CELLS = 200
@@ -372,12 +377,14 @@ def _judge(
         )
     if f0 < LEAST_SIGNIFICANCE * deviation:
         return _nothing(f"its parts disagree (reflectance {f0:.3f} +/- {deviation:.3f})", advantage)
+    if alpha > WIDEST:
+        return _nothing("what it mirrors is too blurred to be told from its shading", advantage)
     alike = [one.f0 for one in fits if one.gain >= NEARLY * gain and one.f0 > 0.0]
     span = 2.0 * deviation
-    least, most = max(min(alike) - span, 0.0), max(alike) + span
+    least, most = max(min(alike) - span, 0.0), DILUTION * (max(alike) + span)
     at = ALPHAS.index(alpha)
-    low = math.sqrt(min(min(alphas), ALPHAS[max(at - 1, 0)]))
-    high = math.sqrt(max(max(alphas), ALPHAS[min(at + 1, len(ALPHAS) - 1)]))
+    low = math.sqrt(min(min(alphas), ALPHAS[max(at - 2, 0)]))
+    high = math.sqrt(max(max(alphas), ALPHAS[min(at + 2, len(ALPHAS) - 1)]))
     roughness = math.sqrt(alpha)
     words = (
         f"the plane mirrors: reflectance {f0:.3f} ({least:.3f} to {most:.3f}), "
