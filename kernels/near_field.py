@@ -9,11 +9,11 @@ empty receiver. Few samples are a bad sum: there it is the environment's irradia
 only what those change that meet something. Where nothing is near that has no noise.
 
 *Mirrored*, radiance of what is near and a share; ``shade`` adds (1 - share) of the prefiltered environment. A mirror
-sends rays from places all over the pixel, for what a curved one shows in neighbouring pixels may lie far apart; they
-read the environment as well, and the share is 1. A glossy lobe sends a few, another few from each pixel of a tile. What
-is near hides part of the lobe, and what it hides may be much darker than the rest: at the rim of a window that a
-receiver cuts off, half of the rays meet the receiver and hardly any of the light is gone. So every ray reads the
-environment as well. With the means over the rays
+sends rays from places all over the pixel, for what a curved one shows in neighbouring pixels may lie far apart; each
+reads what it meets as wide as its part of the pixel is there, the environment as well, and the share is 1. A glossy
+lobe sends a few, another few from each pixel of a tile. What is near hides part of the lobe, and what it hides may be
+much darker than the rest: at the rim of a window that a receiver cuts off, half of the rays meet the receiver and
+hardly any of the light is gone. So every ray reads the environment as well. With the means over the rays
 
     s  share of the rays that meet something near,      N  their radiance, 0 for the others,
     B  the environment along all rays,                  M  the environment along those that meet nothing,
@@ -49,6 +49,7 @@ from warp_ar.kernels.near_field_rays import (
     make_look_near,
     make_pick_ray,
     make_see_point,
+    mirrored_level,
 )
 from warp_ar.kernels.reflect import DistantLight, make_distant_irradiance, make_reflected_radiance
 from warp_ar.kernels.structs import FrameParams, Hit, Picture, RayScene
@@ -127,7 +128,7 @@ def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
             return
         if visible.objects[i, j] < 0:
             return
-        at = see_point(params, picture, scene, distant.dfg, visible.hits[i, j], i, j)
+        at = see_point(params, picture, scene, distant.dfg, visible, i, j)
         surface = at.surface
         alpha = at.alpha
         rays = count_rays(at)
@@ -140,9 +141,7 @@ def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
             ray = pick_ray(params, scene, samples, distant.others.places, at, n, diffuse)
             near = wp.vec4(0.0)
             if ray.leaves:
-                near = look_near(
-                    params[0], picture, layers, scene, distant, ray.origin, ray.direction, ray.reach, ray.spread
-                )
+                near = look_near(params[0], picture, layers, scene, distant, ray)
             if wp.static(config.distant.diffuse != "none"):
                 if n < diffuse:
                     radiance = ray.radiance
@@ -164,7 +163,7 @@ def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
                                 surface.shininess,
                                 ray.point,
                                 ray.direction,
-                                0.0,
+                                mirrored_level(ray, distant.level_height),
                             )
                             near = wp.vec4(beyond[0], beyond[1], beyond[2], 1.0)
                     reflected += near

@@ -10,6 +10,10 @@ angle between h and n, which is 1 / alpha at the peak, where a lobe's n-th has t
     | width = 2 / (k sqrt n) |,    Phong: 2 alpha / sqrt(n cos^e), e its exponent.
 
 With one width for all, the few rays in the long tails of GGX would show emitters as squares of a tile's size.
+
+A mirror's rays stand for the parts of its pixel, and spread as its neighbours say: how origin and direction of the
+mirrored ray differ from pixel to pixel, whatever the shape. The picture of the receiver is read as wide as a ray of a
+mirror or a lobe is there (``frame_levels``), and so are the environment and the textures of other objects.
 """
 
 from __future__ import annotations
@@ -21,6 +25,7 @@ import math
 import warp as wp
 
 from warp_ar.kernels.environment_samples import EnvironmentSample, ball_of_sample, sample_toward, sobol_second
+from warp_ar.kernels.frame_levels import Footprint, ReceiverLayers, covered_on, look_up_covered, shown_as
 from warp_ar.kernels.lobes import level_from_alpha
 from warp_ar.kernels.materials import Surface, make_surface, reflect
 from warp_ar.kernels.probe_weights import probe_share
@@ -42,7 +47,7 @@ from warp_ar.kernels.sampling import (
 from warp_ar.kernels.shapes import FAR
 from warp_ar.kernels.structs import METALLIC_ROUGHNESS, PHONG, FrameParams, Hit, Picture, RayScene
 from warp_ar.kernels.trace import make_trace, offset_origin
-from warp_ar.kernels.visibility import inside_rect, make_primary, make_sample_direction
+from warp_ar.kernels.visibility import VisibleObjects, inside_rect, make_primary, make_sample_direction
 
 wp.set_module_options({"enable_backward": False})
 
@@ -51,6 +56,11 @@ SHARP_ALPHA = 0.02
 SHARP = wp.constant(wp.float32(SHARP_ALPHA))
 RAY_WIDTH = 2.0
 """Width of one ray of many, over the width that its share of the lobe has."""
+LOBE_ANGLE = 1.0
+"""Side of what such a ray covers in the frame, as an angle, over its width. A ray's share is a square of 1.77;
+what is less is left to the rays beside it, for a wide square also reaches over the edges of what it lies on."""
+SAME_SURFACE = wp.constant(wp.float32(0.5))
+"""Cosine between the normals of neighbours up to which they say how a mirror bends."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,14 +86,6 @@ class NearFieldConfig:
     else the sum of all samples."""
 
 
-@wp.struct
-class ReceiverLayers:
-    """What virtual objects and lights change in the picture of the receiver; empty where nothing does."""
-
-    shadow_ratio: wp.array2d[wp.vec3]  # factor on the frame
-    added: wp.array2d[wp.vec3]  # radiance of virtual light
-
-
 @wp.func
 def lobe_alpha(model: wp.int32, roughness: wp.float32, shininess: wp.float32) -> wp.float32:
     """Width of a surface's lobe; 0 for a mirror."""
@@ -107,6 +109,56 @@ def phong_ray_width(cos_theta: wp.float32, exponent: wp.float32, alpha: wp.float
     return wp.min(alpha * wp.exp(-0.5 * exponent * wp.log(wp.max(cos_theta, 1.0e-3))), 1.0)
 
 
+@wp.struct
+class NearRay:
+    """A ray that leaves a pixel of an object, and what stands behind the near field on its way."""
+
+    origin: wp.vec3
+    direction: wp.vec3
+    reach: wp.float32  # metres
+    spread: wp.float32  # width over length
+    point: wp.vec3  # that it leaves, without offset
+    radiance: wp.vec3  # a sample's of the environment
+    weight: wp.float32  # that sample's cosine and measure, times its share
+    leaves: wp.bool  # into the open; else into the surface
+    covers: wp.bool  # a part of what a pixel mirrors: what it meets is read as wide as that
+    footprint: Footprint
+
+
+@wp.func
+def look_up_proxy(
+    params: FrameParams, picture: Picture, layers: ReceiverLayers, ray: NearRay, proxy: Hit, at: wp.vec2
+) -> wp.vec3:
+    """The picture of a proxy, shown at ``at``, as wide as the ray is that meets it."""
+    fp = ray.footprint
+    normal = proxy.geometric_normal
+    across = covered_on(fp.origin_x, fp.turn_x, proxy.t, ray.direction, normal)
+    along = covered_on(fp.origin_y, fp.turn_y, proxy.t, ray.direction, normal)
+    from_camera = proxy.point - params.camera_position
+    a = shown_as(params, from_camera, across)
+    b = shown_as(params, from_camera, along)
+    return look_up_covered(params, picture, layers, at, a, b)
+
+
+@wp.func
+def spread_at(ray: NearRay, t: wp.float32) -> wp.float32:
+    """Width over length that a ray has when it has come so far: the side of a square of the area that it covers."""
+    fp = ray.footprint
+    area = wp.length(wp.cross(fp.origin_x + t * fp.turn_x, fp.origin_y + t * fp.turn_y))
+    return wp.sqrt(area) / wp.max(t, 1.0e-6)
+
+
+@wp.func
+def mirrored_level(ray: NearRay, height: wp.int32) -> wp.float32:
+    """Level of the environment for what a mirror's ray covers beyond a texel, which level 0 shows by itself.
+
+    A GGX lobe of width alpha has the peak density of a solid angle of 4 pi alpha^2.
+    """
+    covered = wp.length(wp.cross(ray.footprint.turn_x, ray.footprint.turn_y))
+    texel = wp.pi / wp.float32(wp.max(height, 1))
+    return level_from_alpha(wp.sqrt(wp.max(covered - texel * texel, 0.0) / (4.0 * wp.pi)), height)
+
+
 @functools.cache
 def make_look_near(config: NearFieldConfig) -> wp.Function:
     """``look_near(...) -> vec4``: radiance of what is near along a ray, and 1; zero where only the environment is.
@@ -125,17 +177,17 @@ def make_look_near(config: NearFieldConfig) -> wp.Function:
         layers: ReceiverLayers,
         scene: RayScene,
         distant: DistantLight,
-        origin: wp.vec3,
-        direction: wp.vec3,
-        t_max: wp.float32,
-        spread: wp.float32,
+        ray: NearRay,
     ) -> wp.vec4:
-        other = closest_object(scene, origin, direction, t_max)
-        proxy = closest_proxy(scene, origin, direction, other.t)
+        other = closest_object(scene, ray.origin, ray.direction, ray.reach)
+        proxy = closest_proxy(scene, ray.origin, ray.direction, other.t)
         if proxy.shape >= 0:
             at = find_in_frame(params, picture, scene, distant.probes, proxy)
             if at[0] < 0.0:
                 return wp.vec4(0.0)
+            if ray.covers and layers.levels.shape[0] > 0:
+                wide = look_up_proxy(params, picture, layers, ray, proxy, at)
+                return wp.vec4(wide[0], wide[1], wide[2], 1.0)
             radiance = look_up(picture, at[0], at[1])
             row = wp.int32(at[1] + 0.5)
             column = wp.int32(at[0] + 0.5)
@@ -146,25 +198,14 @@ def make_look_near(config: NearFieldConfig) -> wp.Function:
                     radiance += layers.added[row, column]
             return wp.vec4(radiance[0], radiance[1], radiance[2], 1.0)
         if other.shape >= 0:
-            radiance = shade_unoccluded(scene, distant, other, direction, spread)
+            spread = ray.spread
+            if ray.covers:
+                spread = wp.max(spread, spread_at(ray, other.t))
+            radiance = shade_unoccluded(scene, distant, other, ray.direction, spread)
             return wp.vec4(radiance[0], radiance[1], radiance[2], 1.0)
         return wp.vec4(0.0)
 
     return look_near
-
-
-@wp.struct
-class NearRay:
-    """A ray that leaves a pixel of an object, and what stands behind the near field on its way."""
-
-    origin: wp.vec3
-    direction: wp.vec3
-    reach: wp.float32  # metres
-    spread: wp.float32  # width over length
-    point: wp.vec3  # that it leaves, without offset
-    radiance: wp.vec3  # a sample's of the environment
-    weight: wp.float32  # that sample's cosine and measure, times its share
-    leaves: wp.bool  # into the open; else into the surface
 
 
 @wp.struct
@@ -179,11 +220,90 @@ class SeenPoint:
     alpha: wp.float32  # width of its lobe; 0 for a mirror
     pixel: wp.vec2  # undistorted (x / z, y / z)
     place: wp.int32  # of the pixel in its tile
+    footprint: Footprint  # of a mirror's whole pixel
+
+
+@wp.struct
+class Step:
+    """How a mirrored ray differs from that of a pixel's neighbour."""
+
+    found: wp.bool
+    origin: wp.vec3
+    turn: wp.vec3
+
+
+@wp.func
+def step_to(
+    params: FrameParams, picture: Picture, visible: VisibleObjects, at: SeenPoint, i: wp.int32, j: wp.int32
+) -> Step:
+    """To pixel (i, j), where it shows the same object with no crease between."""
+    out = Step()
+    if not inside_rect(i, j, params.object_rect):
+        return out
+    if visible.objects[i, j] != at.hit.shape:
+        return out
+    ray = picture.rays[i, j]
+    wo = -wp.normalize(params.world_from_camera * wp.vec3(ray[0], ray[1], 1.0))
+    beside = visible.hits[i, j]
+    normal = wp.where(wp.dot(beside.geometric_normal, wo) < 0.0, -beside.normal, beside.normal)
+    if wp.dot(normal, at.normal) < SAME_SURFACE:
+        return out
+    out.found = True
+    out.origin = beside.point - at.hit.point
+    out.turn = reflect(wo, normal) - reflect(at.wo, at.normal)
+    return out
+
+
+@wp.func
+def shorter_step(first: Step, second: Step, axis: wp.vec3, distance: wp.float32, angle: wp.float32) -> Step:
+    """Of two neighbours the one that lies more on the same surface; without any, a pixel of a plane mirror."""
+    out = first
+    if second.found and (not first.found or wp.length_sq(second.turn) < wp.length_sq(first.turn)):
+        out = second
+    if not out.found:
+        out.origin = (distance * angle) * axis
+        out.turn = angle * axis
+    return out
+
+
+@wp.func
+def pixel_footprint(
+    params: FrameParams,
+    picture: Picture,
+    visible: VisibleObjects,
+    scene: RayScene,
+    at: SeenPoint,
+    i: wp.int32,
+    j: wp.int32,
+) -> Footprint:
+    """How the mirrored ray changes over a pixel, by its neighbours."""
+    axes = frame_from_normal(reflect(at.wo, at.normal))
+    distance = wp.length(at.hit.point - params.camera_position)
+    x = shorter_step(
+        step_to(params, picture, visible, at, i, j - 1),
+        step_to(params, picture, visible, at, i, j + 1),
+        wp.vec3(axes[0, 0], axes[1, 0], axes[2, 0]),
+        distance,
+        scene.pixel_spread,
+    )
+    y = shorter_step(
+        step_to(params, picture, visible, at, i - 1, j),
+        step_to(params, picture, visible, at, i + 1, j),
+        wp.vec3(axes[0, 1], axes[1, 1], axes[2, 1]),
+        distance,
+        scene.pixel_spread,
+    )
+    out = Footprint()
+    out.origin_x = x.origin
+    out.origin_y = y.origin
+    out.turn_x = x.turn
+    out.turn_y = y.turn
+    return out
 
 
 @functools.cache
 def make_see_point(config: NearFieldConfig) -> wp.Function:
-    """``see_point(params, picture, scene, dfg, hit, i, j) -> SeenPoint``: what pixel (i, j) shows of an object."""
+    """``see_point(params, picture, scene, dfg, visible, i, j) -> SeenPoint``: what pixel (i, j) shows of an object."""
     surface_at = make_surface(config.distant.models, config.distant.textures)
     side = config.side
 
@@ -193,11 +313,12 @@ def make_see_point(config: NearFieldConfig) -> wp.Function:
         picture: Picture,
         scene: RayScene,
         dfg: wp.array2d[wp.vec2],
-        hit: Hit,
+        visible: VisibleObjects,
         i: wp.int32,
         j: wp.int32,
     ) -> SeenPoint:
         at = SeenPoint()
+        hit = visible.hits[i, j]
         at.hit = hit
         at.pixel = picture.rays[i, j]
         at.place = (i % side) * side + j % side
@@ -210,6 +331,9 @@ def make_see_point(config: NearFieldConfig) -> wp.Function:
         cos_o = wp.max(wp.dot(at.normal, at.wo), 1.0e-3)
         at.surface = surface_at(scene, dfg, hit, cos_o, scene.pixel_spread)
         at.alpha = lobe_alpha(at.surface.model, at.surface.roughness, at.surface.shininess)
+        if wp.static(config.distant.specular and config.mirror_samples > 0):
+            if at.alpha < SHARP:
+                at.footprint = pixel_footprint(params[0], picture, visible, scene, at, i, j)
         return at
 
     return see_point
@@ -234,8 +358,8 @@ def make_sample_ray(sample: EnvironmentSample, at: SeenPoint, share: wp.float32)
 
 
 @wp.func
-def make_lobe_ray(u: wp.vec2, at: SeenPoint) -> NearRay:
-    """Into the lobe of a glossy surface, by two numbers of [0, 1)."""
+def make_lobe_ray(u: wp.vec2, at: SeenPoint, share: wp.float32) -> NearRay:
+    """Into the lobe of a glossy surface, by two numbers of [0, 1); it covers ``share`` times its width, as an angle."""
     out = NearRay()
     if at.surface.model == PHONG:
         center = reflect(at.wo, at.normal)
@@ -253,23 +377,26 @@ def make_lobe_ray(u: wp.vec2, at: SeenPoint) -> NearRay:
         out.reach = FAR
         out.spread = width
         out.point = at.hit.point
+        out.covers = True
+        axes = frame_from_normal(wi)
+        out.footprint.turn_x = (share * width) * wp.vec3(axes[0, 0], axes[1, 0], axes[2, 0])
+        out.footprint.turn_y = (share * width) * wp.vec3(axes[0, 1], axes[1, 1], axes[2, 1])
     return out
 
 
 @functools.cache
 def make_mirror_ray(config: NearFieldConfig) -> wp.Function:
-    """``mirror_ray(params, scene, shape, ray, k) -> NearRay``: from what a pixel's sample ``k`` shows of a mirror."""
+    """``mirror_ray(params, scene, at, k) -> NearRay``: from what a pixel's sample ``k`` shows of a mirror."""
     closest_visible = make_primary(config.distant.trace)
     sample_direction = make_sample_direction(config.mirror_samples)
+    part = 1.0 / math.sqrt(config.mirror_samples)
 
     @wp.func(module="unique")
-    def mirror_ray(
-        params: wp.array[FrameParams], scene: RayScene, shape: wp.int32, ray: wp.vec2, k: wp.int32
-    ) -> NearRay:
+    def mirror_ray(params: wp.array[FrameParams], scene: RayScene, at: SeenPoint, k: wp.int32) -> NearRay:
         out = NearRay()
-        direction = wp.normalize(sample_direction(params, ray, k))
+        direction = wp.normalize(sample_direction(params, at.pixel, k))
         seen = closest_visible(scene, params[0].camera_position, direction)
-        if seen.shape == shape:
+        if seen.shape == at.hit.shape:
             geometric = seen.geometric_normal
             if wp.dot(geometric, direction) > 0.0:
                 geometric = -geometric
@@ -281,9 +408,19 @@ def make_mirror_ray(config: NearFieldConfig) -> wp.Function:
                 out.reach = FAR
                 out.spread = scene.pixel_spread
                 out.point = seen.point
+                out.covers = True
+                out.footprint.origin_x = part * at.footprint.origin_x
+                out.footprint.origin_y = part * at.footprint.origin_y
+                out.footprint.turn_x = part * at.footprint.turn_x
+                out.footprint.turn_y = part * at.footprint.turn_y
         return out
 
     return mirror_ray
+
+
+def ray_width(config: NearFieldConfig) -> float:
+    """Width of a ray of a tile's lobes, over ``NearRay.spread``."""
+    return RAY_WIDTH / (math.sqrt(max(config.lobe_count, 1)) * config.side)
 
 
 @functools.cache
@@ -296,6 +433,7 @@ def make_pick_ray(config: NearFieldConfig) -> wp.Function:
     mirror_ray = make_mirror_ray(config) if config.mirror_samples > 0 else None
     side, lobes = config.side, config.lobe_count
     shift = 0.5 / (max(lobes, 1) * side * side)
+    share_covered = LOBE_ANGLE * ray_width(config)
 
     @wp.func(module="unique")
     def pick_ray(
@@ -323,12 +461,12 @@ def make_pick_ray(config: NearFieldConfig) -> wp.Function:
                 k = n - diffuse
                 if wp.static(config.mirror_samples > 0):
                     if at.alpha < SHARP:
-                        ray = mirror_ray(params, scene, at.hit.shape, at.pixel, k)
+                        ray = mirror_ray(params, scene, at, k)
                 if wp.static(lobes > 0):
                     if at.alpha >= SHARP:
                         index = wp.uint32(at.place * wp.static(lobes) + k)
                         u = wp.vec2(radical_inverse(index) + wp.static(shift), sobol_second(index) + wp.static(shift))
-                        ray = make_lobe_ray(u, at)
+                        ray = make_lobe_ray(u, at, wp.static(share_covered))
         return ray
 
     return pick_ray
@@ -338,11 +476,11 @@ def make_pick_ray(config: NearFieldConfig) -> wp.Function:
 def make_look_beyond(config: NearFieldConfig) -> wp.Function:
     """``look_beyond(distant, ray) -> vec3``: the environment along a lobe's ray, as wide as the ray."""
     radiance_along = make_radiance_along(config.distant)
-    ray_width = RAY_WIDTH / (math.sqrt(max(config.lobe_count, 1)) * config.side)
+    width = ray_width(config)
 
     @wp.func(module="unique")
     def look_beyond(distant: DistantLight, ray: NearRay) -> wp.vec3:
-        level = level_from_alpha(wp.static(ray_width) * ray.spread, distant.level_height)
+        level = level_from_alpha(wp.static(width) * ray.spread, distant.level_height)
         return radiance_along(distant, ray.point, ray.direction, level)
 
     return look_beyond

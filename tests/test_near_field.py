@@ -1,6 +1,7 @@
 import dataclasses
 import warnings
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -12,7 +13,7 @@ from tests.reference import near_field as reference
 from tests.test_environment_shadow import COUNT, SIDE, draw, sky, sphere
 from tests.test_relight import CAMERA, DESK, LOOK_DOWN, POINTS, RAYS, H, W
 from warp_ar.engine.graph import make_plan
-from warp_ar.kernels import near_field, near_field_rays, shade
+from warp_ar.kernels import frame_levels, near_field, near_field_rays, shade
 from warp_ar.kernels.lobes import lobe_texels
 from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
 from warp_ar.kernels.structs import (
@@ -62,6 +63,8 @@ def run(
     known=False,
     drawn=None,
     others=None,
+    shown=None,
+    wide=True,
 ):
     models = tuple(sorted({m["model"] for m in materials}))
     forms = DistantLightConfig(
@@ -98,13 +101,16 @@ def run(
     drawn = draw(environment) if drawn is None else drawn
     if others is not None:
         surroundings.others = others
-    frame = wp.full((H, W), wp.vec3ub(code, code, code), dtype=wp.vec3ub)
+    shown = np.full((H, W), code) if shown is None else shown
+    frame = wp.array(np.repeat(shown[..., None], 3, -1).astype(np.uint8), dtype=wp.vec3ub)
     near, layers = near_light((H, W)), near_field.ReceiverLayers()
     if ratio is not None:
         layers.shadow_ratio = wp.array(ratio, dtype=wp.vec3)
     if added is not None:
         layers.added = wp.array(added, dtype=wp.vec3)
     picture = make_picture(frame, tables()[0], rays)
+    if wide and forms.specular:
+        layers.levels = make_levels(params, picture, layers)
     near_field.estimate_near_field(
         config, params, picture, layers, scene, surroundings, drawn[2], visible, near, rows=rows
     )
@@ -112,6 +118,15 @@ def run(
         raw, near = near, near_light((H, W))
         near_field.filter_near_field(config, params, scene, visible, raw, near)
     return near.irradiance.numpy(), near.reflected.numpy(), hit_object.numpy(), hits.numpy(), drawn
+
+
+def make_levels(params, picture, layers):
+    """All levels of a picture."""
+    levels = wp.zeros(frame_levels.level_texels(H, W), wp.vec3)
+    frame_levels.shrink_frame(params, picture, layers, levels)
+    for level in range(3, frame_levels.LAST_LEVEL + 1):
+        frame_levels.shrink_level(H, W, level, levels)
+    return levels
 
 
 CHALK = {"model": LAMBERT, "base_color": (1, 1, 1)}
@@ -195,31 +210,44 @@ def test_mirror_shows_the_picture_of_the_desk(device):
     assert POINTS[chalk][:, 0].mean() > 0
 
 
-def shown_by_a_mirror(offset):
-    """What a mirror ball in a black environment shows of a white desk from one place of each pixel; NaN beside the
-    ball."""
+def shown_by_a_mirror(offset, shown=None, center=BALL):
+    """What a mirror ball in a black environment shows of a desk from one place of each pixel; NaN beside the ball.
+
+    ``shown`` is the desk's picture, by default all white.
+    """
     rays = np.stack([*(RAYS + np.array(offset) / 60).transpose(2, 0, 1), np.ones((H, W))], -1) @ LOOK_DOWN.T
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-    to_ball = CAMERA - np.array(BALL)
+    to_ball = CAMERA - np.array(center)
     along = rays @ to_ball
     within = along**2 - to_ball @ to_ball + RADIUS**2
     points = CAMERA - (along + np.sqrt(np.maximum(within, 0)))[..., None] * rays
-    normals = (points - np.array(BALL)) / RADIUS
+    normals = (points - np.array(center)) / RADIUS
     mirrored = rays - 2 * (rays * normals).sum(-1, keepdims=True) * normals
     with np.errstate(divide="ignore", invalid="ignore"):
         desk = points + (-points[..., 2] / mirrored[..., 2])[..., None] * mirrored
     reach = CAMERA[2] * np.array([RAYS[..., 0].max(), RAYS[..., 1].max()])
     # From above, the ball hides no desk that it mirrors: objects are not in the picture.
     seen = (mirrored[..., 2] < 0) & (np.abs(desk[..., :2]) < reach).all(-1)
+    if shown is not None:
+        at = np.where(seen[..., None], desk[..., :2] / CAMERA[2], 0)
+        columns, rows = 60 * at[..., 0] + (W - 1) / 2, (H - 1) / 2 - 60 * at[..., 1]
+        seen = np.where(seen, cv2.remap(shown, np.float32(columns), np.float32(rows), cv2.INTER_LINEAR), 0)
     return np.where(within > 0, seen, np.nan)
+
+
+PLACES = (np.arange(10) + 0.5) / 10 - 0.5
+
+
+def mean_of_a_mirror(shown=None, center=BALL):
+    """Mean of ``shown_by_a_mirror`` over a hundred places of each pixel, the ball's own only."""
+    with np.errstate(invalid="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        return np.nanmean([shown_by_a_mirror((x, y), shown, center) for x in PLACES for y in PLACES], axis=0)
 
 
 def test_mirror_is_the_mean_over_its_pixel(device):
     """A hundred places of each pixel, the ball's own only: near its rim neighbouring pixels have nothing in common."""
-    places = (np.arange(10) + 0.5) / 10 - 0.5
-    with np.errstate(invalid="ignore"), warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)
-        expected = np.nanmean([shown_by_a_mirror((x, y)) for x in places for y in places], axis=0)
+    expected = mean_of_a_mirror()
     errors = {}
     for samples in (1, 16):
         _, mirrored, found, _, _ = run([sphere(BALL, RADIUS)], [CHROME], samples=samples, environment_shows=0.0)
@@ -228,6 +256,62 @@ def test_mirror_is_the_mean_over_its_pixel(device):
     # A place of sixteen or two on the wrong side of the desk's picture.
     assert errors[16].max() < 0.2
     assert errors[16].mean() < 0.25 * errors[1].mean()
+
+
+def test_fine_texture_in_a_mirror_is_neither_moire_nor_flicker(device):
+    """A checkerboard of single pixels, of which each pixel of the ball shows many; the ball moves by tenths of a pixel.
+
+    Against a hundred places of each pixel, with one ray: read as wide as it is, and at a single place.
+    """
+    rows, columns = np.mgrid[:H, :W]
+    board = np.where((rows + columns) % 2, 255, 0)
+    shown = np.float32(board / 255)
+    centers = [(0.001 * step, 0.0, 0.06) for step in range(4)]
+    expected = [mean_of_a_mirror(shown, center) for center in centers]
+    white = [mean_of_a_mirror(None, center) for center in centers]
+    error, flicker = {}, {}
+    for wide in (False, True):
+        mirrored = [
+            run([sphere(center, RADIUS)], [CHROME], environment_shows=0.0, shown=board, wide=wide) for center in centers
+        ]
+        # Where the desk's picture is shown: its border is the rays' matter.
+        inside = [(one[2] == 0) & (all_white > 0.9) for one, all_white in zip(mirrored, white, strict=True)]
+        off = [one[1][..., 0] - truth for one, truth in zip(mirrored, expected, strict=True)]
+        error[wide] = np.sqrt(np.mean(np.concatenate([a[b] for a, b in zip(off, inside, strict=True)]) ** 2))
+        both = np.array(inside)[1:] & np.array(inside)[:-1]
+        assert both.sum() > 30
+        flicker[wide] = np.sqrt(np.mean(np.diff(off, axis=0)[both] ** 2))
+    assert error[True] < 0.5 * error[False], error
+    assert flicker[True] < 0.5 * flicker[False], flicker
+
+
+def test_levels_are_means_of_the_picture_with_what_is_virtual(device):
+    """Rows and columns that are no powers of two; shadows everywhere, light within its rectangle."""
+    rng = np.random.default_rng(3)
+    height, width = 23, 45
+    shown, ratio = rng.uniform(0, 2, (height, width, 3)), rng.uniform(0, 1, (height, width, 3))
+    added, rect = rng.uniform(0, 1, (height, width, 3)), (4, 20, 7, 31)
+    picture = make_picture(
+        wp.zeros((height, width), wp.vec3ub), tables()[0], wp.zeros((height, width), wp.vec2), wp.array(shown, wp.vec3)
+    )
+    layers = frame_levels.ReceiverLayers()
+    layers.shadow_ratio, layers.added = wp.array(ratio, dtype=wp.vec3), wp.array(added, dtype=wp.vec3)
+    levels = wp.zeros(frame_levels.level_texels(height, width), wp.vec3)
+    frame_levels.shrink_frame(records(FrameParams, {"light_rect": rect}), picture, layers, levels)
+    for level in range(3, frame_levels.LAST_LEVEL + 1):
+        frame_levels.shrink_level(height, width, level, levels)
+    composed = shown * ratio
+    composed[4:20, 7:31] += added[4:20, 7:31]
+    for level in range(1, frame_levels.LAST_LEVEL + 1):
+        side, (rows, columns) = 2**level, frame_levels.level_size(height, width, level)
+        assert (rows, columns) == (-(-height // side), -(-width // side))
+        start = frame_levels.level_offset(height, width, level)
+        found = levels.numpy()[start : start + rows * columns].reshape(rows, columns, 3)
+        expected = [
+            [composed[i : i + side, j : j + side].mean((0, 1)) for j in range(0, width, side)]
+            for i in range(0, height, side)
+        ]
+        np.testing.assert_allclose(found, expected, rtol=2e-6)
 
 
 def test_glossy_share_is_between(device):

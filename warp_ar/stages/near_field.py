@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -10,7 +11,7 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_ar.kernels import near_field
+from warp_ar.kernels import frame_levels, near_field
 from warp_ar.kernels.near_field_rays import SHARP_ALPHA
 from warp_ar.scene import MetallicRoughnessMaterial, PhongMaterial
 from warp_ar.scene.mesh_materials import MeshMaterial
@@ -113,6 +114,7 @@ class NearField(Stage):
         if config.specular:
             specs["near_reflected"] = specs["near_field_reflected"] = ArraySpec((height, width), wp.vec4)
             specs["near_field_transmitted"] = ArraySpec((height, width), wp.vec4)
+            specs["near_field_levels"] = ArraySpec((frame_levels.level_texels(height, width),), wp.vec3)
         return {**specs, **distant_light_arrays(self.features, self.name)}
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
@@ -126,6 +128,8 @@ class NearField(Stage):
             layers.shadow_ratio = arrays["shadow_ratio"]
         if config.added:
             layers.added = arrays["added_light"]
+        if self.features.distant.specular:
+            layers.levels = arrays["near_field_levels"]
         distant = make_distant_light(self.features, arrays, self.name)
         samples = arrays["environment_samples"] if config.distant.diffuse != "none" else None
         raw, near = near_field.NearLight(), near_field.NearLight()
@@ -144,7 +148,24 @@ class NearField(Stage):
 
         height = self.request.size[1]
         extent = arrays["object_rows"]
-        return [Pass(estimate, rows=height, extent=extent), Pass(average, rows=height, extent=extent)]
+        passes = [Pass(estimate, rows=height, extent=extent), Pass(average, rows=height, extent=extent)]
+        return [*self._shrink(params, picture, layers), *passes]
+
+    def _shrink(self, params: Any, picture: Any, layers: Any) -> list[Pass]:
+        """Levels of the frame, where an object mirrors it."""
+        if not self.features.distant.specular:
+            return []
+        width, height = self.request.size
+        levels = layers.levels
+
+        def shrink(rows: Rows | None) -> None:
+            frame_levels.shrink_frame(params, picture, layers, levels, rows=rows)
+
+        def shrink_further(rows: Rows | None, level: int) -> None:
+            frame_levels.shrink_level(height, width, level, levels, rows=rows)
+
+        further = [functools.partial(shrink_further, level=level) for level in range(3, frame_levels.LAST_LEVEL + 1)]
+        return [Pass(shrink, rows=frame_levels.level_size(height, width, 2)[0]), *(Pass(one) for one in further)]
 
     def _config(self, device: Any) -> near_field.NearFieldConfig:
         """What the kernels are compiled for."""
