@@ -66,9 +66,9 @@ def test_gradients_are_radial_inside_the_rim_alone(picture):
     slopes = gradients(picture)
     points, normals = silhouette(camera, sphere())
     _, _, r = ellipse(camera, sphere())
-    at_rim = radial_compression(slopes, points, normals, r)
-    inside = radial_compression(slopes, points - 0.2 * r * normals, normals, 0.8 * r)
-    outside = radial_compression(slopes, points + 0.3 * r * normals, normals, 1.3 * r)
+    outlines = np.stack([points, points - 0.2 * r * normals, points + 0.3 * r * normals])
+    radii = r * np.array([1.0, 0.8, 1.3])
+    at_rim, inside, outside = radial_compression(slopes, outlines, np.broadcast_to(normals, outlines.shape), radii)
     assert at_rim > 1.0
     assert max(inside, outside) < 0.5 * at_rim
 
