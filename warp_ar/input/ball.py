@@ -79,6 +79,8 @@ MOST_DEVIATION = 6e-4
 MOST_ERROR = 0.36
 """Mean cost up to which the frames are explained: 0.1 to 0.2 on path-traced desks, 0.3 where a small ball is seen
 through a video codec, 0.3 to 0.6 in wrong places."""
+HOPELESS = 0.6
+"""Mean cost beyond which the last stage does not make a good fit of a place."""
 RIVAL_DISTANCE = 4e-3
 RIVAL_SHARE = 0.75
 """Four millimetres away, metres, the cost must be so much higher: a wrong place is not that much better than others."""
@@ -332,7 +334,9 @@ class _Task:
         for view in self.views:
             seen = self.samples(view, center)
             e, told = self.residuals(view, center, seen)
-            columns = []
+            # Only samples that have a prediction here and to all sides have a say: the others are not asked again.
+            seen, e = _Samples(seen.directions[told], seen.values[told]), e[told]
+            columns, told = [], np.ones(len(e), bool)
             for axis in np.eye(3):
                 ahead, told_ahead = self.residuals(view, center + DIFFERENCE * axis, seen)
                 behind, told_behind = self.residuals(view, center - DIFFERENCE * axis, seen)
@@ -409,7 +413,8 @@ def fit_ball(
         if any(np.linalg.norm(center - other) < SAME for other in led):
             continue
         led.append(center)
-        for scale in SCALES[1:]:
+        hopeless = fine.cost(center, SCALES[-1])[0] > HOPELESS
+        for scale in () if hopeless else SCALES[1:]:
             center = fine.descend(center, scale)
         found.append((*fine.cost(center, SCALES[-1]), center))
     error, samples, center = min(found, key=lambda one: one[0])
