@@ -250,7 +250,7 @@ def radial_compression(slopes: NDArray[np.float32], points: Array, normals: Arra
     pieces = shape[1] // 8
 
     def energy(v: Array) -> Array:
-        return (v * v)[:, : 8 * pieces].reshape(shape[0], pieces, 8, -1).mean(2) + FLAT
+        return np.asarray((v * v)[:, : 8 * pieces].reshape(shape[0], pieces, 8, -1).mean(2) + FLAT)
 
     radial, tangential = energy(dx * nx + dy * ny), energy(dy * nx - dx * ny)
     ratio = np.clip(np.log(radial / tangential), -3.0, 3.0).mean(1)
