@@ -13,6 +13,7 @@ from tests.rendered_room import look_at
 from warp_ar.errors import UsageError
 from warp_ar.input import ball_measure, check_ball
 from warp_ar.input.ball_measure import measure_ball
+from warp_ar.input.ball_solve import BallSolution
 from warp_ar.input.check_ball import check_balls
 from warp_ar.input.check_pictures import take_look
 from warp_ar.input.ground_seen import ground_correlations, ground_is_seen
@@ -79,6 +80,21 @@ def test_nothing_is_searched_where_the_card_is_seen(bare, monkeypatch):
         measure_ball(bare, CAMERA, PROBE, (TABLE,))
     with pytest.raises(AssertionError, match="looked for"):
         measure_ball(with_ball(bare), CAMERA, PROBE, (TABLE,))
+
+
+@pytest.mark.parametrize(("share", "is_kept"), [(0.6, False), (0.75, True), (1.25, True), (1.4, False)])
+def test_a_ball_of_quite_another_size_is_not_believed(bare, share, is_kept, monkeypatch):
+    """From one side alone the card's rings made one of 18 mm where 30 were typed."""
+    solution = BallSolution(PROBE.center, share * PROBE.radius, (1e-4,) * 3, 1e-4, False, ())
+    monkeypatch.setattr(ball_measure, "agreeing_outlines", lambda *arguments: [None])
+    monkeypatch.setattr(ball_measure, "solve_ball", lambda *arguments: solution)
+    monkeypatch.setattr(ball_measure, "mirrored_radius", lambda *arguments: None)
+    monkeypatch.setattr(ball_measure, "fit_ball", lambda *arguments, **options: None)
+    if is_kept:
+        assert measure_ball(bare[:1], CAMERA, PROBE, (TABLE,)).radius == solution.radius
+    else:
+        with pytest.raises(UsageError, match="no mirror ball is seen"):
+            measure_ball(bare[:1], CAMERA, PROBE, (TABLE,))
 
 
 def test_a_balls_place_that_shows_the_desk_is_a_finding(monkeypatch):

@@ -37,6 +37,8 @@ MOST = 0.1
 """Share of the radius that its interval may have, and half of what the centre's may, for a ball to be used."""
 DOUBT = 0.025
 """Share of the radius by which outlines may differ from what was typed before the mirrored receiver is asked."""
+STRAY = 1.0 / 3.0
+"""Share of the given radius beyond which outlines are no longer those that were looked for, but of rings on the card."""
 LEAST_CONTRAST = 0.15
 """Contrast across an outline below which there is none: the bundled clips have 0.32 to 0.55, a bare card 0.08."""
 SEARCH_DEVIATION = 0.0015
@@ -105,6 +107,8 @@ def measure_ball(
             report.center, SEARCH_DEVIATION, probe.radius, None, "by its rim's contrast, height as given"
         )
     solution = solve_ball(outlines, camera, probe, ground)
+    if abs(solution.radius - probe.radius) > STRAY * probe.radius:
+        raise UsageError(_not_seen(probe))
     assumed = keep_radius or solution.radius_assumed
     radius = probe.radius if assumed else solution.radius
     deviation = ASSUMED * radius if assumed else solution.radius_deviation
