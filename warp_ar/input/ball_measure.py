@@ -38,7 +38,7 @@ MOST = 0.1
 DOUBT = 0.025
 """Share of the radius by which outlines may differ from what was typed before the mirrored receiver is asked."""
 STRAY = 1.0 / 3.0
-"""Share of the given radius beyond which outlines are no longer those that were looked for, but of rings on the card."""
+"""Share of the given radius beyond which outlines are not those that were looked for, but of rings on the card."""
 LEAST_CONTRAST = 0.15
 """Contrast across an outline below which there is none: the bundled clips have 0.32 to 0.55, a bare card 0.08."""
 SEARCH_DEVIATION = 0.0015
