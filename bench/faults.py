@@ -60,6 +60,12 @@ def _over_ball(image: Any, paint: Callable[[Any], Any], share: float = 1.0) -> A
     return np.where(mask[..., None] > 0, paint(image), image)
 
 
+def smoothstep() -> Any:
+    """The code that an S-shaped tone curve makes of each, (256,)."""
+    x = np.arange(256) / 255.0
+    return np.rint(255.0 * x * x * (3.0 - 2.0 * x)).astype(np.uint8)
+
+
 SCENES: dict[str, tuple[str, Callable[[Scene], Scene]]] = {
     "units.ball": ("a radius of 35 m", lambda s: _ball(s, radius=35.0)),
     "units.card": ("a marker of 80 m", lambda s: _marker(s, size=80.0)),
@@ -89,6 +95,7 @@ PICTURES: dict[str, tuple[str, Callable[[Any, int], Any]]] = {
     "ball.clipped": ("exposed 2.5 times as long", _scaled(1.7)),
     "card.dark": ("a thirtieth of the light", _scaled(0.2)),
     "card.contrast": ("haze of a third of clipping", lambda image, _: np.maximum(image // 2 + 110, image)),
+    "camera.response": ("an S-shaped tone curve", lambda image, _: smoothstep()[image]),
     "camera.drift": ("30 % of exposure", lambda image, k: _scaled(1 - 0.025 * k)(image, k)),
     "camera.balance": ("15 % of red", lambda image, k: _scaled([1 - 0.013 * k, 1, 1])(image, k)),
     "picture.blurred": ("by 4 pixels", lambda image, _: cv2.GaussianBlur(image, (0, 0), 4.0)),

@@ -1,5 +1,7 @@
 """The ball's outline in a photograph."""
 
+import dataclasses
+
 import cv2
 import numpy as np
 import pytest
@@ -7,7 +9,7 @@ import pytest
 from tests.photo_room import exposed, photograph, sphere
 from tests.rendered_room import Room, look_at, render
 from warp_ar.errors import UsageError
-from warp_ar.input.ball_finder import far_camera, find_ball, silhouette, sphere_of_circle
+from warp_ar.input.ball_finder import far_camera, find_ball, silhouette, silhouettes, sphere_of_circle
 from warp_ar.input.ball_rim import gradients, radial_compression
 from warp_ar.scene import Camera
 
@@ -66,9 +68,9 @@ def test_gradients_are_radial_inside_the_rim_alone(picture):
     slopes = gradients(picture)
     points, normals = silhouette(camera, sphere())
     _, _, r = ellipse(camera, sphere())
-    at_rim = radial_compression(slopes, points, normals, r)
-    inside = radial_compression(slopes, points - 0.2 * r * normals, normals, 0.8 * r)
-    outside = radial_compression(slopes, points + 0.3 * r * normals, normals, 1.3 * r)
+    outlines = np.stack([points, points - 0.2 * r * normals, points + 0.3 * r * normals])
+    radii = r * np.array([1.0, 0.8, 1.3])
+    at_rim, inside, outside = radial_compression(slopes, outlines, np.broadcast_to(normals, outlines.shape), radii)
     assert at_rim > 1.0
     assert max(inside, outside) < 0.5 * at_rim
 
@@ -79,6 +81,30 @@ def test_spheres_and_circles_agree():
     points, normals = silhouette(camera, center)
     assert np.linalg.norm(points - (120.0, 90.0), axis=1) == pytest.approx(50.0, rel=1e-3)
     assert (normals * (points - (120.0, 90.0))).sum(1).min() > 0
+
+
+def test_outlines_together_are_those_of_each_alone(picture):
+    camera = dataclasses.replace(photograph()[1], distortion=(-0.1, 0.03, 0.001, -0.002, 0.01))
+    spheres = sphere() + np.random.default_rng(0).normal(0.0, 0.1, (5, 3))
+    spheres[1] = (0.0, -9.9, 1.2)  # beyond 0.9 of the way to y, another axis spans its rim
+    points, normals = silhouettes(camera, spheres, 40)
+    slopes, radii = gradients(picture), np.linspace(30.0, 50.0, 5)
+    together = radial_compression(slopes, points, normals, radii)
+    for k, each in enumerate(spheres):
+        rim, out = silhouette(camera, each, 40)
+        # Rays to the rim touch the ball: they pass its centre at the radius.
+        flat = cv2.undistortPoints(
+            rim[:, None], camera.matrix(), np.array(camera.distortion), criteria=(3, 100, 1e-12)
+        )[:, 0]
+        rays = np.column_stack([flat, np.ones(len(flat))])
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        if k != 1:  # whose rays are too oblique for the lens's inverse
+            assert np.linalg.norm(np.cross(rays, each), axis=1) == pytest.approx(1.0, abs=1e-6)
+        np.testing.assert_allclose(points[k], rim, atol=1e-9)
+        np.testing.assert_allclose(normals[k], out, atol=1e-9)
+        alone = radial_compression(slopes, rim[None], out[None], radii[k : k + 1])
+        assert together[k] == pytest.approx(float(alone[0]), abs=1e-9)
+    assert len(silhouette(camera, np.array([0.0, 0.0, 0.9]))[0]) == 0
 
 
 def test_bad_circles_and_pictures_without_a_ball():

@@ -176,7 +176,12 @@ def test_a_box_beside_its_edges_is_seen(looks):
         assert right == pytest.approx(scene.proxies[box].at, abs=0.003)
 
 
+CODES = np.arange(256) / 255.0
 PICTURES = {
+    "an S-shaped tone curve": (
+        "camera.response",
+        lambda image, _: np.rint(255 * CODES**2 * (3 - 2 * CODES)).astype(np.uint8)[image],
+    ),
     "overexposed": ("card.clipped", gain(2.2)),
     "underexposed": ("card.dark", gain(0.2)),
     "haze": ("card.contrast", lambda image, _: (170 + image // 4).astype(np.uint8)),
@@ -325,6 +330,9 @@ def test_costs_are_measured_and_order_the_findings():
     findings = [Finding("ball.place", "", ""), Finding("marker.unseen", "", "")]
     assert [finding.name for finding in worst_first(findings)] == ["marker.unseen", "ball.place"]
     assert "FLIP" in findings[0].cost
+    assert errors["camera.response"]["error"] > errors["camera.focal"]["error"]
+    remedy = Finding("camera.response", "", "python -m warp_ar.calibrate response PICTURES").remedy_for("my_desk")
+    assert remedy.endswith("PICTURES --write my_desk")
 
 
 @pytest.fixture(autouse=True)

@@ -58,6 +58,8 @@ STEPS = 8
 """Most Gauss-Newton steps of one stage."""
 DONE = 2e-5
 """Metres: a shorter step ends a stage."""
+SAME = 1e-4
+"""Metres: starts that lead closer together lead to one place."""
 LONGEST = 4e-3
 """Metres: no step is longer, for the edges are thinner."""
 DIFFERENCE = 2e-4
@@ -77,6 +79,8 @@ MOST_DEVIATION = 6e-4
 MOST_ERROR = 0.36
 """Mean cost up to which the frames are explained: 0.1 to 0.2 on path-traced desks, 0.3 where a small ball is seen
 through a video codec, 0.3 to 0.6 in wrong places."""
+HOPELESS = 0.6
+"""Mean cost beyond which the last stage does not make a good fit of a place."""
 RIVAL_DISTANCE = 4e-3
 RIVAL_SHARE = 0.75
 """Four millimetres away, metres, the cost must be so much higher: a wrong place is not that much better than others."""
@@ -165,11 +169,9 @@ class BallView:
         local = self.pose.apply(points)
         front = local[:, 2] > 1e-3
         local[~front] = (0.0, 0.0, 1.0)
-        pixels = local[:, :2] / local[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
-        if any(camera.distortion):
-            origin = np.zeros(3)
-            pixels = cv2.projectPoints(local, origin, origin, camera.matrix(), np.array(camera.distortion))[0][:, 0]
-        return np.asarray(pixels, np.float64), front & _within(pixels, 2.0, (camera.width - 3, camera.height - 3))
+        flat = _distorted(local[:, 0] / local[:, 2], local[:, 1] / local[:, 2], camera.distortion)
+        pixels = np.column_stack([camera.fx * flat[0] + camera.cx, camera.fy * flat[1] + camera.cy])
+        return pixels, front & _within(pixels, 2.0, (camera.width - 3, camera.height - 3))
 
     def disc(self, center: Array, radius: float, across: int) -> Array:
         """Pixels of samples on a ball, (n, 2)."""
@@ -195,6 +197,19 @@ def _within(pixels: Array, low: float, high: tuple[float, float]) -> NDArray[np.
     return np.asarray((x > low) & (x < high[0]) & (y > low) & (y < high[1]))
 
 
+def _distorted(x: Array, y: Array, coefficients: Sequence[float]) -> tuple[Array, Array]:
+    """Points at depth 1 as the lens shows them, by OpenCV's model; its own takes four times as long."""
+    if not any(coefficients):
+        return x, y
+    k1, k2, p1, p2, k3, k4, k5, k6 = (*coefficients, 0.0, 0.0, 0.0, 0.0)[:8]
+    xx, yy, xy = x * x, y * y, x * y
+    rr = xx + yy
+    radial = 1.0 + rr * (k1 + rr * (k2 + rr * k3))
+    if k4 or k5 or k6:
+        radial /= 1.0 + rr * (k4 + rr * (k5 + rr * k6))
+    return x * radial + 2.0 * p1 * xy + p2 * (rr + 2.0 * xx), y * radial + p1 * (rr + 2.0 * yy) + 2.0 * p2 * xy
+
+
 def _dot(a: Array, b: Array) -> Array:
     """Scalar products of rows, (n,)."""
     return np.asarray(a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2])
@@ -210,6 +225,8 @@ class _Receiver:
             for p in (known or [DESK])
         ]
         self._others = [(np.array(probe.center), probe.radius) for probe in others]
+        self.hides = len(self._shapes) > 1 or bool(self._others) or any(half[2] > 0.0 for _, _, half in self._shapes)
+        """Whether something can lie before what a ray meets; one plane alone hides nothing."""
 
     def trace(self, origin: Array, direction: Array) -> Array:
         """Distance to the nearest plane or box, (n,), infinite where there is none or another ball is before it."""
@@ -288,7 +305,8 @@ class _Task:
         origin = np.broadcast_to(eye, away.shape)
         # The ball with a margin: it bleeds into what is blurred.
         shown = _meet_ball(center, 1.1 * radius, origin, away) > distance
-        shown &= self.receiver.trace(origin, away) > distance * (1.0 - _BOUND) - _BOUND
+        if self.receiver.hides:
+            shown &= self.receiver.trace(origin, away) > distance * (1.0 - _BOUND) - _BOUND
         _, picture = view.coarse if self.is_coarse else view.fine
         wanted = view.sample(picture, places)
         shown &= wanted[:, 3] < 0.1
@@ -316,7 +334,9 @@ class _Task:
         for view in self.views:
             seen = self.samples(view, center)
             e, told = self.residuals(view, center, seen)
-            columns = []
+            # Only samples that have a prediction here and to all sides have a say: the others are not asked again.
+            seen, e = _Samples(seen.directions[told], seen.values[told]), e[told]
+            columns, told = [], np.ones(len(e), bool)
             for axis in np.eye(3):
                 ahead, told_ahead = self.residuals(view, center + DIFFERENCE * axis, seen)
                 behind, told_behind = self.residuals(view, center - DIFFERENCE * axis, seen)
@@ -387,9 +407,14 @@ def fit_ball(
     places = start + SEARCH_STEP * np.stack(np.meshgrid(steps, steps, heights), -1).reshape(-1, 3)
     ranked = places[np.argsort([coarse.cost(place, SCALES[0])[0] for place in places])]
     found: list[tuple[float, int, Array]] = []
+    led: list[Array] = []
     for place in [start, *ranked[: STARTS - 1]]:
-        center = place if place is start else coarse.descend(place, SCALES[0])
-        for scale in SCALES:
+        center = fine.descend(place if place is start else coarse.descend(place, SCALES[0]), SCALES[0])
+        if any(np.linalg.norm(center - other) < SAME for other in led):
+            continue
+        led.append(center)
+        hopeless = fine.cost(center, SCALES[-1])[0] > HOPELESS
+        for scale in () if hopeless else SCALES[1:]:
             center = fine.descend(center, scale)
         found.append((*fine.cost(center, SCALES[-1]), center))
     error, samples, center = min(found, key=lambda one: one[0])

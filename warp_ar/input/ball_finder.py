@@ -54,6 +54,10 @@ PIECES = 240
 """Pieces that a rim is cut into."""
 COMPRESSION = 1.0
 """Weight of the radial compression inside a rim against the steps across it."""
+BEHIND = -4.0
+"""Compression of a ball that is not wholly before the camera: less than any that is."""
+TOGETHER = 64
+"""Outlines whose compression is looked at together: more do not stay in a core's cache."""
 SECTORS = 12
 """Sectors of the rim that are left out in turn."""
 LEAST_SUPPORT = 0.2
@@ -96,33 +100,43 @@ def far_camera(width: int, height: int) -> Camera:
     return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
 
-def _cross(a: Array, b: Array) -> Array:
-    """Cross product of two vectors; NumPy's takes ten times as long, and a search asks for thousands."""
-    (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
-    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
-
-
 def silhouette(camera: Camera, sphere: Array, count: int = PIECES) -> tuple[Array, Array]:
     """Outline (count, 2) in pixels and outward unit normals of a ball at ``sphere`` (centre over radius)."""
-    d = float(np.linalg.norm(sphere))
-    if d <= 1.0 or sphere[2] <= 1.0:
+    if not _is_before(sphere[None])[0]:
         return np.zeros((0, 2)), np.zeros((0, 2))
-    n = sphere / d
-    u = _cross(n, np.array([0.0, 1.0, 0.0] if abs(n[1]) < 0.9 else [1.0, 0.0, 0.0]))
-    u /= np.linalg.norm(u)
-    angle = 2 * np.pi * np.arange(count) / count
-    spokes = np.outer(np.cos(angle), u) + np.outer(np.sin(angle), _cross(n, u))
+    pixels, normals = silhouettes(camera, sphere[None], count)
+    return pixels[0], normals[0]
+
+
+def _is_before(spheres: Array) -> NDArray[np.bool_]:
+    """Which spheres (m, 3) are wholly before the camera."""
+    return np.asarray((np.linalg.norm(spheres, axis=1) > 1.0) & (spheres[:, 2] > 1.0))
+
+
+def silhouettes(camera: Camera, spheres: Array, count: int = PIECES) -> tuple[Array, Array]:
+    """Outlines (m, count, 2) in pixels and outward unit normals of balls (m, 3), all wholly before the camera.
+
+    Together, for a search asks for thousands, and NumPy takes as long for a few numbers as for hundreds.
+    """
+    d = np.linalg.norm(spheres, axis=1, keepdims=True)
+    n = spheres / d
+    u = np.cross(n, np.where(np.abs(n[:, 1:2]) < 0.9, (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)))
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    angle = 2 * np.pi * np.arange(count)[:, None] / count
+    spokes = np.cos(angle) * u[:, None] + np.sin(angle) * np.cross(n, u)[:, None]
     # Rays that touch the ball touch it on a circle: centre c - n / d, radius sqrt(1 - 1 / d^2).
-    rim = sphere - n / d + math.sqrt(1.0 - 1.0 / (d * d)) * spokes
+    rim = (spheres - n / d)[:, None] + np.sqrt(1.0 - 1.0 / (d * d))[:, None] * spokes
     zero = np.zeros(3)
-    pixels = cv2.projectPoints(rim, zero, zero, camera.matrix(), np.array(camera.distortion))[0].reshape(-1, 2)
+    flat = cv2.projectPoints(rim.reshape(-1, 3), zero, zero, camera.matrix(), np.array(camera.distortion))[0]
+    pixels = flat.reshape(len(spheres), count, 2)
     tangent = np.empty_like(pixels)
-    tangent[1:-1] = pixels[2:] - pixels[:-2]
-    tangent[0], tangent[-1] = pixels[1] - pixels[-1], pixels[0] - pixels[-2]
-    normal = np.stack([tangent[:, 1], -tangent[:, 0]], 1)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-9)[:, None]
-    sign = np.sign(((pixels - pixels.mean(0)) * normal).sum(1))
-    return pixels, normal * sign[:, None]
+    tangent[:, 1:-1] = pixels[:, 2:] - pixels[:, :-2]
+    tangent[:, 0], tangent[:, -1] = pixels[:, 1] - pixels[:, -1], pixels[:, 0] - pixels[:, -2]
+    normal = np.stack([tangent[..., 1], -tangent[..., 0]], -1)
+    normal /= np.maximum(np.hypot(normal[..., 0], normal[..., 1]), 1e-9)[..., None]
+    out = pixels - pixels.mean(1, keepdims=True)
+    sign = np.sign(out[..., 0] * normal[..., 0] + out[..., 1] * normal[..., 1])
+    return pixels, normal * sign[..., None]
 
 
 def sphere_of_circle(camera: Camera, x: float, y: float, radius: float) -> Array:
@@ -167,14 +181,20 @@ class _Fit:
         else:
             self.evidence = gather_evidence(image, self.points, self.normals, self.radius, shift=shift, blur=blur)
 
-    def shifts(self, move: Array) -> Array:
-        """Along the normals, pixels, when the outline moves by (right, down, outward)."""
-        return np.asarray(self.normals @ move[:2] + move[2])
+    def shifts(self, moves: Array) -> Array:
+        """Along the normals, pixels (m, n), when the outline moves by (right, down, outward), (m, 3)."""
+        return np.asarray(moves[:, :2] @ self.normals.T + moves[:, 2:])
 
-    def cost(self, move: Array, evidence: RimEvidence | None = None) -> float:
-        return (evidence or self.evidence).total(self.shifts(move))
+    def costs(self, moves: Array, evidence: RimEvidence | None = None) -> Array:
+        """Costs (m,) of moves (m, 3)."""
+        return (evidence or self.evidence).totals(self.shifts(moves))
+
+    def spheres(self, moves: Array) -> Array:
+        """Spheres (m, 3) of moves (m, 3)."""
+        return np.asarray(self.base + moves @ self.steps.T)
 
     def sphere(self, move: Array) -> Array:
+        """The sphere of one move (3,)."""
         return np.asarray(self.base + self.steps @ move)
 
 
@@ -196,19 +216,22 @@ def _search(image: Image, camera: Camera, sphere: Array, shift: float, step: flo
     """The sphere with the most rim among all whose outline is within ``shift`` pixels in every unknown."""
     slopes, fit = gradients(image), _Fit(image, camera, sphere, math.ceil(2.0 * shift))
 
-    def compression(move: Array) -> float:
-        points, normals = silhouette(camera, fit.sphere(move), PIECES // 3)
-        if len(points) == 0:
-            return -4.0
-        return radial_compression(slopes, points, normals, fit.radius + move[2])
+    def compressions(moves: Array) -> Array:
+        spheres = fit.spheres(moves)
+        found, before = np.full(len(moves), BEHIND), _is_before(spheres)
+        if before.any():
+            points, normals = silhouettes(camera, spheres[before], PIECES // 3)
+            found[before] = radial_compression(slopes, points, normals, fit.radius + moves[before, 2])
+        return found
 
-    def cost(move: Array) -> float:
-        return fit.cost(move) - COMPRESSION * compression(move)
+    def costs(moves: Array) -> Array:
+        parts = (moves[k : k + TOGETHER] for k in range(0, len(moves), TOGETHER))
+        return np.concatenate([fit.costs(part) - COMPRESSION * compressions(part) for part in parts])
 
     grid = np.arange(-math.ceil(shift / step), math.ceil(shift / step) + 1.0) * step
     moves = np.stack(np.meshgrid(grid, grid, grid), -1).reshape(-1, 3)
-    costs = np.array([cost(move) for move in moves])
-    found = [descend(cost, moves[k], 0.5 * step, 0.2) for k in _apart(moves, costs, 2.5 * step)]
+    chosen = _apart(moves, costs(moves), 2.5 * step)
+    found = [descend(costs, moves[k], 0.5 * step, 0.2) for k in chosen]
     return fit.sphere(min(found, key=lambda item: item[1])[0])
 
 
@@ -251,20 +274,20 @@ def refine_outline(image: Image, camera: Camera, sphere: Array) -> BallOutline:
     tried = []
     for blur in BLURS:
         fit = _Fit(picture, view, sphere, 1.5, blur)
-        move, value = descend(fit.cost, np.zeros(3), 0.4, 0.02)
-        tried.append((value + fit.evidence.least, fit.shifts(move), fit.sphere(move), blur))
+        move, value = descend(fit.costs, np.zeros(3), 0.4, 0.02)
+        tried.append((value + fit.evidence.least, fit.shifts(move[None])[0], fit.sphere(move), blur))
     least = min(item[0] for item in tried)
     likely = [item for item in tried if item[0] < least + ALIKE]
     unsure = np.std([item[1].mean() for item in likely])
     # Once more about what was found, so that normals and window are those of the outline itself.
     middle = likely[(len(likely) - 1) // 2]
     fit = _Fit(picture, view, middle[2], 1.5, middle[3])
-    move, _ = descend(fit.cost, np.zeros(3), 0.2, 0.01)
+    move, _ = descend(fit.costs, np.zeros(3), 0.2, 0.01)
     sector = np.arange(PIECES) * SECTORS // PIECES
 
     def without(k: int) -> Array:
         evidence = fit.evidence.without(sector == k)
-        return descend(lambda m: fit.cost(m, evidence), move, 0.1, 0.01)[0]
+        return descend(lambda moves: fit.costs(moves, evidence), move, 0.1, 0.01)[0]
 
     left = np.stack([without(k) for k in range(SECTORS)])
     spread = np.sqrt((SECTORS - 1) / SECTORS * ((left - left.mean(0)) ** 2).sum(0)) + LEAST_DEVIATION
@@ -387,6 +410,7 @@ def _strength(image: Image, camera: Camera, sphere: Array) -> float:
     fit = _Fit(small, view, sphere, 1.0)
     if not fit.evidence.known.any():
         return -math.inf
-    compression = radial_compression(gradients(small), fit.points, fit.normals, fit.radius)
-    seen = MOST_COST - fit.cost(np.zeros(3)) + COMPRESSION * compression
+    outline = (fit.points[None], fit.normals[None], np.array([fit.radius]))
+    compression = float(radial_compression(gradients(small), *outline)[0])
+    seen = MOST_COST - float(fit.costs(np.zeros((1, 3)))[0]) + COMPRESSION * compression
     return seen * float(fit.evidence.known.mean()) * math.log(max(radius, 4.0))

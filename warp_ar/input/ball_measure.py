@@ -20,6 +20,7 @@ from warp_ar.input.ball_outline import outline_search
 from warp_ar.input.ball_radius import DEVIATION, mirrored_radius
 from warp_ar.input.ball_solve import BallSolution, ground_below, solve_ball
 from warp_ar.input.ball_views import agreeing_outlines
+from warp_ar.input.ground_seen import ground_is_seen
 from warp_ar.scene import Camera, Pose, Probe, Proxy
 
 Image = NDArray[np.uint8]
@@ -36,6 +37,8 @@ MOST = 0.1
 """Share of the radius that its interval may have, and half of what the centre's may, for a ball to be used."""
 DOUBT = 0.025
 """Share of the radius by which outlines may differ from what was typed before the mirrored receiver is asked."""
+STRAY = 1.0 / 3.0
+"""Share of the given radius beyond which outlines are not those that were looked for, but of rings on the card."""
 LEAST_CONTRAST = 0.15
 """Contrast across an outline below which there is none: the bundled clips have 0.32 to 0.55, a bare card 0.08."""
 SEARCH_DEVIATION = 0.0015
@@ -85,26 +88,27 @@ def measure_ball(
         tell: Takes what is being looked at, in words, whenever that changes: all of it takes some seconds.
 
     Raises:
-        UsageError: The ball is in too few frames.
+        UsageError: The ball is in too few frames, or they show what it should stand on instead.
     """
     few = views[:: -(-len(views) // OUTLINES)]
     ground = ground_below(probe, proxies)
     standing = ground is not None and probe.center[2] - probe.radius - ground < 0.3 * probe.radius
     ground = ground if standing else None
+    if ground is not None and ground_is_seen(few, camera, probe, ground):
+        raise UsageError(_not_seen(probe))
     how = "by {} outlines"
     tell("the ball's outlines")
     outlines = agreeing_outlines(few, camera, probe, ground)
     if not outlines:
         report = outline_search(views, camera, probe.center, probe.radius)
         if report.contrast < LEAST_CONTRAST:
-            raise UsageError(
-                f"no mirror ball is seen where [probe] center = {[round(x, 4) for x in probe.center]} has it; stand it "
-                "on the card's cross, have all of it in the picture, and check [probe]"
-            )
+            raise UsageError(_not_seen(probe))
         return BallMeasurement(
             report.center, SEARCH_DEVIATION, probe.radius, None, "by its rim's contrast, height as given"
         )
     solution = solve_ball(outlines, camera, probe, ground)
+    if abs(solution.radius - probe.radius) > STRAY * probe.radius:
+        raise UsageError(_not_seen(probe))
     assumed = keep_radius or solution.radius_assumed
     radius = probe.radius if assumed else solution.radius
     deviation = ASSUMED * radius if assumed else solution.radius_deviation
@@ -132,6 +136,13 @@ def measure_ball(
         if math.dist(center, solution.center) < 3 * math.hypot(spread, own) and spread < own:
             return BallMeasurement((center[0], center[1], center[2]), spread, radius, told, "by the desk in it")
     return BallMeasurement(solution.center, own, radius, told, how.format(len(outlines)))
+
+
+def _not_seen(probe: Probe) -> str:
+    return (
+        f"no mirror ball is seen where [probe] center = {[round(x, 4) for x in probe.center]} has it; stand it on the "
+        "card's cross, have all of it in the picture, and check [probe]"
+    )
 
 
 def _is_doubtful(solution: BallSolution, probe: Probe, frames: int) -> bool:

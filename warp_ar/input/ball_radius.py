@@ -32,6 +32,9 @@ DISTINCT: Final = 0.9
 """The least cost over those ``ASIDE``, below which the radius is told: 0.6 to 0.87 on rendered desks."""
 EXPLAINED: Final = 0.42
 """Mean cost up to which a ball explains what is mirrored: 0.2 to 0.39 on rendered desks, else 0.5 and more."""
+HOPELESS: Final = 0.6
+"""Mean cost of a few radii beyond which no other explains the frames: 0.25 to 0.45 on rendered desks up to six steps
+beside the right one, 0.7 and more without a ball."""
 VIEWS: Final = 3
 """Frames that are compared: each costs a second."""
 DEVIATION: Final = 0.01
@@ -67,10 +70,15 @@ def mirrored_radius(
             x, y, z = (float(value) for value in found[1])
             costs[k], balls[k] = found[0], dataclasses.replace(ball, center=(x, y, z))
 
-    for k in range(-steps, steps + 1, 2):
+    # One of the first few is within four steps of the right radius, and explains more than nothing.
+    first = [k for k in range(-steps, steps + 1) if k % 4 == 3 and abs(k) < steps]
+    for k in first:
         attempt(k, probe.center)
-    if not costs:
+    if not costs or min(costs.values()) > HOPELESS:
         return None
+    for k in range(-steps, steps + 1, 2):
+        if k not in first:
+            attempt(k, probe.center)
     # From the best one outward, each from its neighbour's place.
     best = min(costs, key=lambda k: costs[k])
     for way in (1, -1):

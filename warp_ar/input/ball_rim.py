@@ -97,23 +97,24 @@ class RimEvidence:
     least: float = 0.0
     """Mean of the pieces' best costs, by which blurs are compared."""
 
-    def total(self, shift: Array) -> float:
-        """Mean cost of the pieces shifted by ``shift`` (n,) pixels; outside the window a piece costs the most."""
-        return float(self._each(shift).mean()) if self.known.any() else MOST_COST
+    def totals(self, shifts: Array) -> Array:
+        """Mean costs (m,) of the pieces shifted by ``shifts`` (m, n) pixels; outside the window a piece costs most."""
+        return self._each(shifts).mean(1) if self.known.any() else np.full(len(shifts), MOST_COST)
 
-    def _each(self, shift: Array) -> Array:
-        step = self.shifts[1] - self.shifts[0]
-        at = (shift - self.shifts[0]) / step
-        low = np.clip(np.floor(at).astype(int), 0, len(self.shifts) - 2)
+    def _each(self, shifts: Array) -> Array:
+        """Costs of the pieces that are known, (m, known)."""
+        last = len(self.shifts) - 1
+        at = (shifts[:, self.known] - self.shifts[0]) / (self.shifts[1] - self.shifts[0])
+        low = np.clip(at.astype(int), 0, last - 1)
         share = np.clip(at - low, 0.0, 1.0)
-        rows = np.arange(len(low))
-        cost = (1.0 - share) * self.costs[rows, low] + share * self.costs[rows, low + 1]
-        outside = (at < 0) | (at > len(self.shifts) - 1)
-        return np.where(outside & self.known, MOST_COST, cost)[self.known]
+        costs = self.costs[self.known].ravel()
+        place = low + np.arange(at.shape[1]) * (last + 1)
+        cost = (1.0 - share) * costs[place] + share * costs[place + 1]
+        return np.where((at < 0) | (at > last), MOST_COST, cost)
 
     def support(self, shift: Array) -> float:
         """Share of the pieces in view that speak for the outline; of evidence from ``gather_steps``."""
-        return float((self._each(shift) < 0.5 * MOST_COST).mean()) if self.known.any() else 0.0
+        return float((self._each(shift[None]) < 0.5 * MOST_COST).mean()) if self.known.any() else 0.0
 
     def without(self, gone: NDArray[np.bool_]) -> RimEvidence:
         """The same but for some pieces."""
@@ -220,43 +221,61 @@ def gradients(image: Image) -> NDArray[np.float32]:
     return np.dstack([cv2.Sobel(gray, cv2.CV_32F, *way, scale=1 / 8) for way in ((1, 0), (0, 1))])
 
 
-def radial_compression(slopes: NDArray[np.float32], points: Array, normals: Array, radius: float) -> float:
-    """How much more radial gradients are just inside an outline than just outside.
+def radial_compression(slopes: NDArray[np.float32], points: Array, normals: Array, radii: Array) -> Array:
+    """How much more radial gradients are just inside outlines than just outside.
 
     A ball squeezes what it mirrors toward its rim along the radius, not along the rim: there q'(t) grows beyond bounds.
     So inside the rim gradients point along the radius, and outside it they know nothing of the ball. An edge that is
     mirrored concentrically, such as a table's, has radial gradients on both sides, and is no rim.
 
+    Args:
+        slopes: Of ``gradients``.
+        points: Outlines (m, n, 2), pixels.
+        normals: Outward unit normals (m, n, 2).
+        radii: Of the balls in pixels, (m,).
+
     Returns:
-        Mean logarithm of radial over tangential energy inside, less that outside: 2 to 3 at a rim, below 0 inside it.
+        Mean logarithm of radial over tangential energy inside, less that outside, (m,): 2 to 3 at a rim, below 0
+        inside it.
     """
-    bands = [np.linspace(low, high, 6) * radius for low, high in (INNER_BAND, OUTER_BAND)]
-    at = points[:, None] + np.concatenate(bands)[None, :, None] * normals[:, None]
-    x, y = np.moveaxis(at.astype(np.float32), 2, 0)
+    bands = np.concatenate([np.linspace(low, high, 6) for low, high in (INNER_BAND, OUTER_BAND)])
+    reach = (radii[:, None] * bands)[:, None]
+    nx, ny = normals[..., 0, None], normals[..., 1, None]
+    shape = (len(points), points.shape[1], len(bands))
+    x, y = (
+        (points[..., k, None] + reach * n).astype(np.float32).reshape(-1, len(bands)) for k, n in ((0, nx), (1, ny))
+    )
     slope = cv2.remap(slopes, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    along = slope[..., 0] * normals[:, None, 0] + slope[..., 1] * normals[:, None, 1]
-    across = slope[..., 1] * normals[:, None, 0] - slope[..., 0] * normals[:, None, 1]
-    pieces = len(points) // 8
-    radial, tangential = ((v * v)[: 8 * pieces].reshape(pieces, 8, -1).mean(1) + FLAT for v in (along, across))
-    ratio = np.clip(np.log(radial / tangential), -3.0, 3.0).mean(0)
-    return float(ratio[:6].mean() - ratio[6:].mean())
+    dx, dy = slope[..., 0].reshape(shape), slope[..., 1].reshape(shape)
+    pieces = shape[1] // 8
+
+    def energy(v: Array) -> Array:
+        return np.asarray((v * v)[:, : 8 * pieces].reshape(shape[0], pieces, 8, -1).mean(2) + FLAT)
+
+    radial, tangential = energy(dx * nx + dy * ny), energy(dy * nx - dx * ny)
+    ratio = np.clip(np.log(radial / tangential), -3.0, 3.0).mean(1)
+    return np.asarray(ratio[:, :6].mean(1) - ratio[:, 6:].mean(1))
 
 
-def descend(
-    cost: Callable[[Array], float], start: Array, step: float, least: float, widths: Array | None = None
-) -> tuple[Array, float]:
-    """Minimum of a function of few unknowns by a pattern search: it needs no derivatives of interpolated costs."""
-    best, value = start.copy(), cost(start)
+def descend(costs: Callable[[Array], Array], start: Array, step: float, least: float) -> tuple[Array, float]:
+    """Minimum of a function of few unknowns by a pattern search: it needs no derivatives of interpolated costs.
+
+    Args:
+        costs: Takes places (m, n), returns costs (m,).
+        start: Where to begin, (n,).
+        step: The first step.
+        least: The last one.
+    """
+    best, value = start.copy(), float(costs(start[None])[0])
     size = len(start)
-    widths = np.ones(size) if widths is None else widths
     # Along each axis, and along the diagonals of all: a circle's place and radius trade off against each other.
-    moves = [sign * axis for axis in np.eye(size) for sign in (1.0, -1.0)]
-    moves += list(np.stack(np.meshgrid(*[(-1.0, 1.0)] * size), -1).reshape(-1, size))
+    axes = [sign * axis for axis in np.eye(size) for sign in (1.0, -1.0)]
+    moves = np.array([*axes, *np.stack(np.meshgrid(*[(-1.0, 1.0)] * size), -1).reshape(-1, size)])
     while step >= least:
-        values = [cost(best + step * widths * move) for move in moves]
+        values = costs(best + step * moves)
         k = int(np.argmin(values))
         if values[k] < value - 1e-12:
-            best, value = best + step * widths * moves[k], values[k]
+            best, value = best + step * moves[k], float(values[k])
         else:
             step *= 0.5
     return best, value

@@ -16,6 +16,7 @@ from warp_ar.input.ball_solve import BallSolution, ground_below, rough_circle, s
 from warp_ar.input.ball_views import agreeing_outlines
 from warp_ar.input.check_pictures import Look
 from warp_ar.input.finding import Finding
+from warp_ar.input.ground_seen import ground_is_seen
 from warp_ar.scene import Camera, Pose, Probe, Scene
 
 Array = NDArray[np.float64]
@@ -37,6 +38,8 @@ SEEN: Final = 0.46
 A ball in the open, whose rim here and there looks like what is behind it, shows 0.50 to 0.97; half hidden it shows
 0.44.
 """
+SIDES: Final = 6
+"""Frames in which what the ball stands on is looked for in its place."""
 LOST: Final = 0.35
 """Share of the outline below which there is none."""
 
@@ -79,9 +82,12 @@ def _check_ball(
         text = f"{label}: the ball is outside the picture"
         return [Finding("ball.outside", text, "move camera or ball until all of it is in view; check center")]
     ground = _ground(scene, probe)
-    outlines = [pair for pair in agreeing_outlines(views, look.camera, probe, ground) if pair[0].support > LOST]
     insides = [_inside_of(image, circle) for image, circle in seen]
     contrast = float(np.median([_contrast(part) for part in insides]))
+    spread = look.views[:: -(-len(look.views) // SIDES)]
+    if ground is not None and ground_is_seen(spread, look.camera, probe, ground):
+        return [_why_lost(look, views, label, contrast)]
+    outlines = [pair for pair in agreeing_outlines(views, look.camera, probe, ground) if pair[0].support > LOST]
     if len(outlines) < max(1, len(seen) // 2):
         return [_why_lost(look, views, label, contrast)]
     found = []

@@ -38,6 +38,9 @@ DARK: Final = 0.04
 """Linear camera value below which white paper is too dark: its noise is that of the whole picture."""
 CONTRAST: Final = 0.5
 """Black ink over white paper, linear, above which it is haze, gloss, or another transfer curve."""
+STEEPEST: Final = 45.0
+"""White paper over black ink, linear, above which no print is: that of laser printers is 20 to 30, the bundled clips'
+is 21. An S-shaped curve, as cameras lay over what they show, makes it 40 to 100."""
 SHADOW: Final = 0.45
 """Logarithm of light across the card that a smooth fall does not explain."""
 BLURRED: Final = 6.0
@@ -310,6 +313,13 @@ def _check_light(marker: Marker, look: Look, views: Sequence[tuple[Image, Pose]]
         found.append(
             Finding("card.contrast", text, "turn the card out of the lamp's reflection; check [camera] transfer")
         )
+    elif (steep := 1.0 / max(float(np.median(ratios)), 1e-3)) > STEEPEST:
+        text = (
+            f"the card's white is {steep:.0f} times as bright as its black, and no print is: the camera lays a tone "
+            "curve over [camera] transfer"
+        )
+        remedy = "turn its contrast and HDR modes off, or python -m warp_ar.calibrate response PICTURES"
+        found.append(Finding("camera.response", text, remedy))
     if np.median(uneven) > SHADOW:
         text = (
             f"a shadow lies across the card: its white differs by a factor of {math.exp(float(np.median(uneven))):.1f}"

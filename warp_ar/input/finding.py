@@ -25,6 +25,7 @@ class Finding:
         if scene is None:
             return self.remedy
         named = self.remedy.replace("calibrate camera PICTURES", f"calibrate camera PICTURES --write {scene}")
+        named = named.replace("calibrate response PICTURES", f"calibrate response PICTURES --write {scene}")
         return named.replace("calibrate ball SCENE", f"calibrate ball {scene}")
 
     @property

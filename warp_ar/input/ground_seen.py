@@ -1,0 +1,92 @@
+"""Whether a receiver is seen where a mirror ball should stand: cheap evidence that there is none.
+
+What lies flat looks the same from every side once it is turned into the receiver's plane. A ball does not: where it
+hides the receiver, its mirror image is seen, at another height, and moves against the receiver with the eye. So the
+points of the receiver that the ball would hide are looked up in frames from different sides; where they correlate
+the receiver itself is seen, and no ball. Where it has no texture, or all frames are from one side, that says nothing.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from warp_ar.scene import Camera, Pose, Probe
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+View = tuple[Image, Pose]
+
+ACROSS: Final = 41
+"""Points along each side of the part of the receiver that is looked up."""
+APART: Final = math.radians(12.0)
+"""Angle between two eyes, seen from the ball, from which a mirror image has moved by a sixth of its radius."""
+PAIRS: Final = 6
+"""Pairs of frames that are compared, those furthest apart first."""
+LEAST_POINTS: Final = 200
+"""Points that the ball would hide from both eyes."""
+TEXTURE: Final = 0.01
+"""Standard deviation over mean of codes below which nothing is told; the card's thin rings have 0.02 to 0.03."""
+ALIKE: Final = 0.8
+"""Median correlation of the pairs from which the receiver is seen: bare cards have 0.91 to 0.97, balls -0.4 to 0."""
+
+
+def ground_is_seen(views: Sequence[View], camera: Camera, probe: Probe, ground: float) -> bool:
+    """Whether frames show the receiver where a ball would hide it; False where they do not tell.
+
+    Args:
+        views: RGB uint8 frames with ``camera_from_world``.
+        camera: The camera.
+        probe: The ball, where it should stand.
+        ground: Height in metres of the level plane that it stands on.
+    """
+    correlations = ground_correlations(views, camera, probe, ground)
+    return bool(correlations) and float(np.median(correlations)) > ALIKE
+
+
+def ground_correlations(views: Sequence[View], camera: Camera, probe: Probe, ground: float) -> list[float]:
+    """Correlations of the receiver that a ball would hide between frames from different sides, -1 to 1."""
+    line = np.linspace(-1.2, 1.2, ACROSS) * probe.radius
+    x, y = (value.ravel() for value in np.meshgrid(line, line))
+    points = np.array([probe.center[0], probe.center[1], ground]) + np.column_stack([x, y, np.zeros_like(x)])
+    seen = [_look_up(view, camera, points, probe) for view in views]
+    eyes = [pose.inverse().translation - np.array(probe.center) for _, pose in views]
+    eyes = [eye / np.linalg.norm(eye) for eye in eyes]
+    pairs = sorted(itertools.combinations(range(len(views)), 2), key=lambda pair: float(eyes[pair[0]] @ eyes[pair[1]]))
+    found = []
+    for a, b in pairs[:PAIRS]:
+        both = seen[a][1] & seen[b][1]
+        if eyes[a] @ eyes[b] > math.cos(APART) or both.sum() < LEAST_POINTS:
+            continue
+        one, other = seen[a][0][both], seen[b][0][both]
+        if min(one.std() / max(one.mean(), 1.0), other.std() / max(other.mean(), 1.0)) > TEXTURE:
+            found.append(float(np.corrcoef(one, other)[0, 1]))
+    return found
+
+
+def _look_up(view: View, camera: Camera, points: Array, probe: Probe) -> tuple[Array, NDArray[np.bool_]]:
+    """Codes of points (n, 3) in a frame, (n,), and which of them are in it and behind the ball."""
+    image, pose = view
+    local = pose.apply(points)
+    eye = pose.inverse().translation
+    away = points - eye
+    distance = np.linalg.norm(away, axis=1)
+    away /= distance[:, None]
+    from_ball = eye - np.array(probe.center)
+    along = away @ from_ball
+    gap = np.sqrt(np.maximum(from_ball @ from_ball - along**2, 0.0))
+    hidden = (gap < 0.9 * probe.radius) & (-along < distance) & (local[:, 2] > 1e-3)
+    local[local[:, 2] <= 1e-3] = (0.0, 0.0, 1.0)
+    zero = np.zeros(3)
+    pixels = cv2.projectPoints(local, zero, zero, camera.matrix(), np.array(camera.distortion))[0].reshape(-1, 2)
+    inside = ((pixels >= 1) & (pixels <= (camera.width - 2, camera.height - 2))).all(1)
+    gray = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (0, 0), 1.0)
+    at = np.where(inside[:, None], pixels, 0.0).astype(np.float32)
+    codes = cv2.remap(gray, at[None, :, 0], at[None, :, 1], cv2.INTER_LINEAR)[0]
+    return np.asarray(codes, np.float64), hidden & inside
