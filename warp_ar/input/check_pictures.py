@@ -39,8 +39,8 @@ DARK: Final = 0.04
 CONTRAST: Final = 0.5
 """Black ink over white paper, linear, above which it is haze, gloss, or another transfer curve."""
 STEEPEST: Final = 45.0
-"""White paper over black ink, linear, above which no print is: that of laser printers is 20 to 30, the bundled clips'
-is 21. An S-shaped curve, as cameras lay over what they show, makes it 40 to 100."""
+"""White paper over black ink, linear, above which a print on plain paper is not: that of laser printers is 20 to 30, the
+bundled clips' is 21. An S-shaped curve, as cameras lay over what they show, makes it 40 to 100."""
 SHADOW: Final = 0.45
 """Logarithm of light across the card that a smooth fall does not explain."""
 BLURRED: Final = 6.0
@@ -315,8 +315,8 @@ def _check_light(marker: Marker, look: Look, views: Sequence[tuple[Image, Pose]]
         )
     elif (steep := 1.0 / max(float(np.median(ratios)), 1e-3)) > STEEPEST:
         text = (
-            f"the card's white is {steep:.0f} times as bright as its black, and no print is: the camera lays a tone "
-            "curve over [camera] transfer"
+            f"the card's white is {steep:.0f} times as bright as its black; on plain paper it is 20 to 30 times: the "
+            "camera lays a tone curve over [camera] transfer, or the print is on glossy photo paper"
         )
         remedy = "turn its contrast and HDR modes off, or python -m warp_ar.calibrate response PICTURES"
         found.append(Finding("camera.response", text, remedy))
