@@ -39,7 +39,7 @@ DARK: Final = 0.04
 CONTRAST: Final = 0.5
 """Black ink over white paper, linear, above which it is haze, gloss, or another transfer curve."""
 STEEPEST: Final = 45.0
-"""White paper over black ink, linear, above which a print on plain paper is not: that of laser printers is 20 to 30, the
+"""White paper over black ink, linear, above which no print on plain paper is: that of laser printers is 20 to 30, the
 bundled clips' is 21. An S-shaped curve, as cameras lay over what they show, makes it 40 to 100."""
 SHADOW: Final = 0.45
 """Logarithm of light across the card that a smooth fall does not explain."""
