@@ -30,6 +30,7 @@ from warp_ar.output.sinks import open_sink
 from warp_ar.scene import Pose
 from warp_ar.session import Session
 from warp_ar.signals import REC_709, REC_2020, hlg_of_light, light_of_hlg, light_of_pq, pq_of_light, rgb_from_rgb
+from warp_ar.stages.quality import PRESETS
 
 SIZE = (64, 48)
 STEP16 = 1.0 / 65535.0
@@ -227,7 +228,7 @@ def first() -> Any:
 OUTPUTS = ("image", "radiance", "environment")
 
 
-def lit(frame: Any, pose: Any = None, quality: str = "medium", scene: str = "desk", **more: Any) -> Any:
+def lit(frame: Any, pose: Any = None, quality: Any = "medium", scene: str = "desk", **more: Any) -> Any:
     with warp_ar.Pipeline(
         scene, device="cpu", quality=quality, size=(160, 120), outputs=OUTPUTS, estimates="synchronous", **more
     ) as pipeline:
@@ -338,12 +339,15 @@ def test_what_a_ball_shows_of_an_object_hides_light_above_white(first: np.ndarra
     """Where a virtual object stands before what the ball shows, none of the light behind it is left in the picture."""
     with warp_ar.Pipeline("desk", device="cpu", size=(160, 120), outputs=("pose",)) as pipeline:
         pose = pipeline(first).pose
-    _, dim, _, few = lit(np.full((120, 160, 3), 0.25, np.float32), linear=True, pose=pose)
-    _, bright, _, many = lit(np.full((120, 160, 3), 4.0, np.float32), linear=True, pose=pose)
+    # Environment shadows take what no frame shows for white at most, so that bounced light does not grow alike.
+    quality = PRESETS["medium"].with_methods(environment_shadow="none")
+    _, dim, _, few = lit(np.full((120, 160, 3), 0.25, np.float32), pose, quality, linear=True)
+    _, bright, _, many = lit(np.full((120, 160, 3), 4.0, np.float32), pose, quality, linear=True)
     ball = (few["mirror_ball"] != 0.0).any(-1) & (few["objects"][..., 3] == 0.0)
-    assert ball.sum() > 20
-    # Radiance and all that it lights grow alike; were the plate taken for 1, three of its four parts would stay.
-    assert (np.abs(bright[ball]) < 16.5 * np.abs(dim[ball]) + 0.05).all()
+    assert ball.sum() >= 5
+    # 16 times the environment's part, and no more of a virtual light's. Were the plate taken for 1, three of its four
+    # parts would stay.
+    assert (np.abs(bright[ball]) < 16.0 * np.abs(dim[ball]) + 1e-3).all()
     assert many["mirror_ball"].min() < -1.5
 
 
