@@ -108,7 +108,10 @@ def measure_ball(
         )
     solution = solve_ball(outlines, camera, probe, ground)
     if abs(solution.radius - probe.radius) > STRAY * probe.radius:
-        raise UsageError(_not_seen(probe))
+        raise UsageError(
+            f"what is round where the ball should be has a radius of {solution.radius:.3f} m, but [probe] radius = "
+            f"{probe.radius:g}: a ring on the card, or a wrong radius; stand the ball on the cross, and measure it"
+        )
     assumed = keep_radius or solution.radius_assumed
     radius = probe.radius if assumed else solution.radius
     deviation = ASSUMED * radius if assumed else solution.radius_deviation
