@@ -93,7 +93,7 @@ def test_a_ball_of_quite_another_size_is_not_believed(bare, share, is_kept, monk
     if is_kept:
         assert measure_ball(bare[:1], CAMERA, PROBE, (TABLE,)).radius == solution.radius
     else:
-        with pytest.raises(UsageError, match=rf"has a radius of {solution.radius:.3f} m, but \[probe\] radius = 0.03: "):
+        with pytest.raises(UsageError, match=rf"has a radius of {solution.radius:.3f} m, but \[probe\] radius = 0.03"):
             measure_ball(bare[:1], CAMERA, PROBE, (TABLE,))
 
 
