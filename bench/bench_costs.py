@@ -35,20 +35,24 @@ def main(device: str) -> None:
     by_work = os.environ.get("WARP_AR_CLOCK") == "processor"
     clock = WORK if by_work else time.perf_counter
     more = {"clock": "processor" if by_work else "wall", "load": round(os.getloadavg()[0], 1)}
-    desk = open_scene("desk", FRAMES)
-    darken = open_scene("darken", FRAMES)
-    lamp, screen = sized_light(desk), open_scene("screen", FRAMES)
-    shows = {"light_shadow": lamp, "area_light": screen}
-    for setting in (*settings_of(lamp), *(setting for setting in settings_of(screen) if setting.name == "area_light")):
-        method_cost(shows.get(setting.name, desk), setting, device, clock, more)
-    method_cost(
-        darken, next(setting for setting in settings_of(darken) if setting.name == "expose"), device, clock, more
-    )
+    if os.environ.get("WARP_AR_BENCH") != "presets":
+        method_costs(device, clock, more)
     for scene in bundled_scenes():
-        case = {"desk": desk, "darken": darken}.get(scene) or open_scene(scene, FRAMES)
+        case = open_scene(scene, FRAMES)
         times, _ = run_in_turn(case, {name: PRESETS[name] for name in RUNS}, device, clock)
         for name in RUNS:
             report(f"preset {scene} {name}", times[name], device, scene=scene, preset=name, **more)
+
+
+def method_costs(device: str, clock: Any, more: dict[str, Any]) -> None:
+    """One line per method of every setting."""
+    desk, darken, screen = (open_scene(name, FRAMES) for name in ("desk", "darken", "screen"))
+    lamp = sized_light(desk)
+    shows = {"light_shadow": lamp, "area_light": screen}
+    for setting in (*settings_of(lamp), *(setting for setting in settings_of(screen) if setting.name == "area_light")):
+        method_cost(shows.get(setting.name, desk), setting, device, clock, more)
+    expose = next(setting for setting in settings_of(darken) if setting.name == "expose")
+    method_cost(darken, expose, device, clock, more)
 
 
 def settings_of(case: Case) -> tuple[Setting, ...]:

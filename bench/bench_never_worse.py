@@ -22,6 +22,7 @@ from bench.random_tables import Setup, make_setup
 from bench.table_world import latlong_directions
 from warp_ar import PRESETS, Pipeline, Pose
 from warp_ar.scene import loads_scene
+from warp_ar.stages.quality import DEFAULT_PRESET
 
 NO_WORSE = 1.02
 """Ratio of errors up to which recovered light counts as no worse."""
@@ -53,9 +54,9 @@ def irradiance(environment: NDArray[Any], normals: NDArray[np.float64]) -> NDArr
     return np.asarray(np.maximum(normals @ d.reshape(-1, 3).T, 0.0) @ (small.reshape(-1, 3) * area.reshape(-1, 1)))
 
 
-def evaluate(setup: Setup, *, device: str = "cpu") -> Outcome:
-    """Run the program's default on one picture."""
-    pipeline = Pipeline(loads_scene(setup.scene), device=device, quality=PRESETS["medium"], outputs=("environment",))
+def evaluate(setup: Setup, *, device: str = "cpu", quality: str = DEFAULT_PRESET) -> Outcome:
+    """Run a preset on one picture."""
+    pipeline = Pipeline(loads_scene(setup.scene), device=device, quality=PRESETS[quality], outputs=("environment",))
     try:
         result = pipeline(setup.image, time_seconds=0.0, pose=Pose(setup.rotation, setup.translation))
         recovered = result.environment
@@ -90,18 +91,22 @@ def summarise(outcomes: list[Outcome]) -> dict[str, float]:
     }
 
 
-def main(device: str, first: int = 0, count: int = 20) -> None:
+def main(device: str, first: int = 0, count: int = 20, quality: str = DEFAULT_PRESET) -> None:
     """Evaluate set-ups and print figures, by kind of card and in all."""
     outcomes: dict[str, list[Outcome]] = {}
     for seed in range(first, first + count):
         setup = make_setup(seed)
-        outcome = evaluate(setup, device=device)
+        outcome = evaluate(setup, device=device, quality=quality)
         outcomes.setdefault(setup.about["card"], []).append(outcome)
         if outcome.ratio > NO_WORSE:
             print(f"worse: {outcome.clipped:.3f} -> {outcome.recovered:.3f} {outcome.method} {setup.about}", flush=True)
     for card, own in outcomes.items():
         print(card, {key: round(value, 3) for key, value in summarise(own).items()})
-    print(json.dumps({"bench": "never_worse", **summarise([one for own in outcomes.values() for one in own])}))
+    print(
+        json.dumps(
+            {"bench": "never_worse", "quality": quality, **summarise([one for own in outcomes.values() for one in own])}
+        )
+    )
 
 
 if __name__ == "__main__":
@@ -109,5 +114,6 @@ if __name__ == "__main__":
     parser.add_argument("--count", type=int, default=300, help="set-ups")
     parser.add_argument("--first", type=int, default=0, help="number of the first")
     parser.add_argument("--device", default="cpu")
+    parser.add_argument("--quality", choices=PRESETS, default=DEFAULT_PRESET, help="preset (default: %(default)s)")
     arguments = parser.parse_args()
-    main(arguments.device, arguments.first, arguments.count)
+    main(arguments.device, arguments.first, arguments.count, arguments.quality)

@@ -18,6 +18,7 @@ import numpy as np
 import warp as wp
 
 from warp_ar.device import capturing
+from warp_ar.kernels.launch import noting
 
 WARM_UP = 3
 RUNS = 30
@@ -50,6 +51,27 @@ def commit() -> str:
     return out.stdout.strip()
 
 
+def time_thread(function: Callable[[], object], device: Any) -> float:
+    """Milliseconds of one call by this thread's processor time, which other programs hardly disturb; CPU only."""
+    start = time.thread_time()
+    function()
+    return (time.thread_time() - start) * 1e3
+
+
+def recorded(function: Callable[[], object]) -> Callable[[], object]:
+    """What launches of ``function`` do, recorded once, as frames have it done: packing arguments does not count."""
+    with noting() as notes:
+        function()
+    launches = [note.record() for note in notes if note.record is not None]
+    assert len(launches) == len(notes) > 0
+
+    def replay(notes: Any = notes) -> None:  # notes hold the arrays
+        for each in launches:
+            each.launch()
+
+    return replay
+
+
 def time_once(function: Callable[[], object], device: Any) -> float:
     """Milliseconds of one call, until the device has finished."""
     wp.synchronize_device(device)
@@ -59,16 +81,18 @@ def time_once(function: Callable[[], object], device: Any) -> float:
     return (time.perf_counter() - start) * 1e3
 
 
-def measure(functions: Mapping[str, Callable[[], object]], device: Any, runs: int = RUNS) -> dict[str, list[float]]:
+def measure(
+    functions: Mapping[str, Callable[[], object]], device: Any, runs: int = RUNS, *, one_thread: bool = False
+) -> dict[str, list[float]]:
     """Time contenders in turn, A B A B ..., after a warm-up; milliseconds of every run.
 
     On CUDA each function is captured in a graph and the replay is timed with events: launching from Python does not
-    count.
+    count. On CPU functions that work on the caller's thread alone may be timed by that thread's processor time.
     """
     device = wp.get_device(device)
     if device.is_cuda:
         functions = {name: _captured(function, device) for name, function in functions.items()}
-    timer = _time_with_events if device.is_cuda else time_once
+    timer = _time_with_events if device.is_cuda else time_thread if one_thread else time_once
     for _ in range(WARM_UP):
         for function in functions.values():
             function()
@@ -104,7 +128,7 @@ def paired_ratio(times: Mapping[str, list[float]], over: str, under: str) -> flo
 def copy_bandwidth(device: str, size: int = 1 << 26) -> float:
     """Measured bytes per second of a plain copy (read plus written) on ``device``."""
     source, target = wp.zeros(size, dtype=wp.uint8, device=device), wp.empty(size, dtype=wp.uint8, device=device)
-    times = measure({"copy": lambda: wp.copy(target, source)}, device)["copy"]
+    times = measure({"copy": lambda: wp.copy(target, source)}, device, one_thread=True)["copy"]
     return 2.0 * size / (statistics.median(times) * 1e-3)
 
 

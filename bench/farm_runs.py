@@ -143,25 +143,7 @@ def work(
         steady: The same, counted from when as many jobs as there are workers have been done; None: to its end.
         meddle: Called five times a second with the driver's process number.
     """
-    path = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
-    environment = dict(os.environ, PYTHONPATH=path)
-    if gpus and device != "cpu":
-        environment["CUDA_VISIBLE_DEVICES"] = ",".join(map(str, gpus))
-    command = [sys.executable, "-m", "warp_ar.farm", "resume", str(folder), "--workers", str(workers)]
-    before = os.sched_getaffinity(0)
-    if cores:
-        os.sched_setaffinity(0, cores)
-    try:
-        process = subprocess.Popen(
-            [*command, "--device", device],
-            cwd=ROOT,
-            env=environment,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-    finally:
-        os.sched_setaffinity(0, before)
+    process = _start(folder, workers, device, gpus, cores)
     seen, start = Watched(), time.monotonic()
     ended = threading.Event()
     watcher = threading.Thread(target=_watch, args=(process.pid, folder, seen, say, ended), daemon=True)
@@ -187,6 +169,29 @@ def work(
     ended.set()
     watcher.join()
     return seen
+
+
+def _start(folder: Path, workers: int, device: str, gpus: Sequence[int], cores: Sequence[int]) -> subprocess.Popen[str]:
+    """The command that works a run through, on the GPUs and cores that it may use."""
+    path = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
+    environment = dict(os.environ, PYTHONPATH=path)
+    if gpus and device != "cpu":
+        environment["CUDA_VISIBLE_DEVICES"] = ",".join(map(str, gpus))
+    command = [sys.executable, "-m", "warp_ar.farm", "resume", str(folder), "--workers", str(workers)]
+    before = os.sched_getaffinity(0)
+    if cores:
+        os.sched_setaffinity(0, cores)
+    try:
+        return subprocess.Popen(
+            [*command, "--device", device],
+            cwd=ROOT,
+            env=environment,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+    finally:
+        os.sched_setaffinity(0, before)
 
 
 def _segments_done(folder: Path) -> int:

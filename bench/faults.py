@@ -96,6 +96,7 @@ PICTURES: dict[str, tuple[str, Callable[[Any, int], Any]]] = {
     "card.dark": ("a thirtieth of the light", _scaled(0.2)),
     "card.contrast": ("haze of a third of clipping", lambda image, _: np.maximum(image // 2 + 110, image)),
     "camera.response": ("an S-shaped tone curve", lambda image, _: smoothstep()[image]),
+    "camera.saturation": ("codes that end at 238", lambda image, _: np.minimum(image, 238)),
     "camera.drift": ("30 % of exposure", lambda image, k: _scaled(1 - 0.025 * k)(image, k)),
     "camera.balance": ("15 % of red", lambda image, k: _scaled([1 - 0.013 * k, 1, 1])(image, k)),
     "picture.blurred": ("by 4 pixels", lambda image, _: cv2.GaussianBlur(image, (0, 0), 4.0)),

@@ -28,7 +28,9 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+from bench.common import commit
 from warp_ar.scene import bundled_scenes
+from warp_ar.stages.quality import PRESETS
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "bench" / "results"
@@ -48,10 +50,10 @@ def tradeoff(options: Sequence[str], scene: str, folder: Path) -> dict[str, str]
     return {path.name: path.read_text(encoding="utf-8") for path in out.iterdir() if path.suffix != ".html"}
 
 
-def every_scene(options: Sequence[str]) -> list[dict[str, str]]:
-    """The same for every bundled scene, as many at a time as there are cores."""
+def every_scene(options: Sequence[str], scenes: Sequence[str] = ()) -> list[dict[str, str]]:
+    """The same for every bundled scene, or for these, as many at a time as there are cores."""
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(os.cpu_count() or 1) as workers:
-        return list(workers.map(lambda scene: tradeoff(options, scene, Path(folder)), bundled_scenes()))
+        return list(workers.map(lambda scene: tradeoff(options, scene, Path(folder)), scenes or bundled_scenes()))
 
 
 def merge_errors(tables: Sequence[dict[str, Any]], lines: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -96,13 +98,31 @@ def make_errors() -> None:
     path.write_text(json.dumps(merged, indent=1) + "\n", encoding="utf-8")
 
 
-def make_presets() -> None:
-    """Errors of presets."""
-    lists = [json.loads(files["presets.json"]) for files in every_scene(PRESET_OPTIONS)]
+def make_presets(only: str | None, scenes: Sequence[str]) -> None:
+    """Errors of presets; where only some or some scenes are asked for, the others' stay as they are.
+
+    Args:
+        only: Presets, separated by commas.
+        scenes: Names of bundled scenes.
+    """
+    options = (*PRESET_OPTIONS, *(("--only", only) if only else ()))
+    lists = [json.loads(files["presets.json"]) for files in every_scene(options, scenes)]
     errors = {scene: own for listed in lists for scene, own in listed["errors"].items()}
-    made = {**lists[0]["made"], "by": f"python -m warp_ar.tradeoff {' '.join(errors)} {' '.join(PRESET_OPTIONS)}"}
-    merged = {**lists[0], "made": made, "errors": errors}
-    (RESULTS / "presets.json").write_text(json.dumps(merged, indent=1) + "\n", encoding="utf-8")
+    by = f"python -m warp_ar.tradeoff {' '.join(errors)} {' '.join(options)}"
+    merged = {**lists[0], "made": {**lists[0]["made"], "by": by, "commit": commit()}, "errors": errors}
+    path = RESULTS / "presets.json"
+    if only or scenes:
+        merged = merge_presets(json.loads(path.read_text(encoding="utf-8")), merged)
+    path.write_text(json.dumps(merged, indent=1) + "\n", encoding="utf-8")
+
+
+def merge_presets(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any]:
+    """A list of presets' errors with those of another one in it; it tells how both were made."""
+    both = {
+        scene: old["errors"].get(scene, {}) | new["errors"].get(scene, {}) for scene in old["errors"] | new["errors"]
+    }
+    errors = {scene: {name: own[name] for name in PRESETS if name in own} for scene, own in both.items()}
+    return {**old, "renewed": [*old.get("renewed", []), new["made"]], "errors": dict(sorted(errors.items()))}
 
 
 def make_costs(*, processor_time: bool) -> None:
@@ -117,6 +137,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m bench.make_cost_tables", description="All cost tables anew.")
     steps_text = ",".join(STEPS)
     parser.add_argument("--only", default=steps_text, help=f"steps, separated by commas (default: {steps_text})")
+    parser.add_argument("--presets", metavar="A,B", help="errors of these presets only; those of others stay")
+    parser.add_argument(
+        "--scenes", default=(), type=lambda text: text.split(","), metavar="A,B", help="the same for scenes"
+    )
     parser.add_argument("--processor-time", action="store_true", help="count the work of one thread")
     options = parser.parse_args()
     asked = options.only.split(",")
@@ -124,7 +148,7 @@ def main() -> int:
         parser.error(f"--only {options.only}: expected some of {', '.join(STEPS)}")
     steps: dict[str, Callable[[], object]] = {
         "errors": make_errors,
-        "presets": make_presets,
+        "presets": lambda: make_presets(options.presets, options.scenes),
         "costs": lambda: make_costs(processor_time=options.processor_time),
         "budget": lambda: subprocess.run([sys.executable, "-m", "bench.record_costs"], cwd=ROOT, check=True),
         "tables": lambda: subprocess.run([sys.executable, "-m", "bench.write_cost_tables"], cwd=ROOT, check=True),

@@ -60,6 +60,21 @@ def add_emitters(irradiance: wp.vec3, emitters: wp.array[Emitter], point: wp.vec
 
 
 @wp.func
+def emitter_weight(away: wp.float32, off: wp.float32) -> wp.float32:
+    """Weight of an emitter for a direction ``away`` from it, as derived above; both are lengths between unit vectors.
+
+    Args:
+        away: From where the emitter is seen from the point.
+        off: From there to where the environment shows it.
+    """
+    s = away / wp.max(REACH, 2.5 * off)
+    if s >= 1.0:
+        return 0.0
+    s4 = s * s * s * s
+    return (1.0 - s4) * (1.0 - s4) / wp.max(s4 * (2.0 - s4), NEARLY_ALL)
+
+
+@wp.func
 def correct_parallax(emitters: wp.array[Emitter], point: wp.vec3, direction: wp.vec3) -> wp.vec3:
     """Unit direction in which the environment shows what is seen from a point along a unit direction."""
     spin = wp.vec3(0.0)
@@ -69,10 +84,8 @@ def correct_parallax(emitters: wp.array[Emitter], point: wp.vec3, direction: wp.
         if emitter.distance > 0.0 and emitter.distance < MAX_DISTANCE:
             to_emitter = wp.normalize(emitter.origin + emitter.distance * emitter.direction - point)
             off = wp.length(emitter.direction - to_emitter)
-            s = wp.length(direction - to_emitter) / wp.max(REACH, 2.5 * off)
-            if s < 1.0:
-                s4 = s * s * s * s
-                weight = (1.0 - s4) * (1.0 - s4) / wp.max(s4 * (2.0 - s4), NEARLY_ALL)
+            weight = emitter_weight(wp.length(direction - to_emitter), off)
+            if weight > 0.0:
                 weights += weight
                 if off > LEAST_TURN:
                     axis = wp.normalize(wp.cross(to_emitter, emitter.direction))
@@ -116,10 +129,8 @@ def solid_angle_gain(emitters: wp.array[Emitter], point: wp.vec3, direction: wp.
             away = wp.max(wp.length(offset), 1.0e-4)
             to_emitter = offset / away
             off = wp.length(emitter.direction - to_emitter)
-            s = wp.length(direction - to_emitter) / wp.max(REACH, 2.5 * off)
-            if s < 1.0:
-                s4 = s * s * s * s
-                weight = (1.0 - s4) * (1.0 - s4) / wp.max(s4 * (2.0 - s4), NEARLY_ALL)
+            weight = emitter_weight(wp.length(direction - to_emitter), off)
+            if weight > 0.0:
                 weights += weight
                 near = emitter.distance / away
                 gain += weight * wp.min(near * near, MAX_GAIN)

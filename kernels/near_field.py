@@ -45,6 +45,7 @@ from warp_ar.kernels.near_field_rays import (
     ReceiverLayers,
     SeenPoint,
     lobe_alpha,
+    make_footprint_of,
     make_look_beyond,
     make_look_near,
     make_pick_ray,
@@ -102,6 +103,7 @@ def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
     """
     see_point, count_rays = make_see_point(config), make_count_rays(config)
     pick_ray, look_near = make_pick_ray(config), make_look_near(config)
+    footprint_of = make_footprint_of(config)
     look_beyond = make_look_beyond(config) if config.lobe_count > 0 else None
     reflected_radiance = make_reflected_radiance(config.distant) if config.mirror_samples > 0 else None
     distant_irradiance = make_distant_irradiance(config.distant)
@@ -141,7 +143,7 @@ def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
             ray = pick_ray(params, scene, samples, distant.others.places, at, n, diffuse)
             near = wp.vec4(0.0)
             if ray.leaves:
-                near = look_near(params[0], picture, layers, scene, distant, ray)
+                near = look_near(params[0], picture, layers, scene, distant, at, ray)
             if wp.static(config.distant.diffuse != "none"):
                 if n < diffuse:
                     radiance = ray.radiance
@@ -163,7 +165,7 @@ def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
                                 surface.shininess,
                                 ray.point,
                                 ray.direction,
-                                mirrored_level(ray, distant.level_height),
+                                mirrored_level(footprint_of(at, ray), distant.level_height),
                             )
                             near = wp.vec4(beyond[0], beyond[1], beyond[2], 1.0)
                     reflected += near

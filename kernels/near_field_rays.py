@@ -122,90 +122,6 @@ class NearRay:
     weight: wp.float32  # that sample's cosine and measure, times its share
     leaves: wp.bool  # into the open; else into the surface
     covers: wp.bool  # a part of what a pixel mirrors: what it meets is read as wide as that
-    footprint: Footprint
-
-
-@wp.func
-def look_up_proxy(
-    params: FrameParams, picture: Picture, layers: ReceiverLayers, ray: NearRay, proxy: Hit, at: wp.vec2
-) -> wp.vec3:
-    """The picture of a proxy, shown at ``at``, as wide as the ray is that meets it."""
-    fp = ray.footprint
-    normal = proxy.geometric_normal
-    across = covered_on(fp.origin_x, fp.turn_x, proxy.t, ray.direction, normal)
-    along = covered_on(fp.origin_y, fp.turn_y, proxy.t, ray.direction, normal)
-    from_camera = proxy.point - params.camera_position
-    a = shown_as(params, from_camera, across)
-    b = shown_as(params, from_camera, along)
-    return look_up_covered(params, picture, layers, at, a, b)
-
-
-@wp.func
-def spread_at(ray: NearRay, t: wp.float32) -> wp.float32:
-    """Width over length that a ray has when it has come so far: the side of a square of the area that it covers."""
-    fp = ray.footprint
-    area = wp.length(wp.cross(fp.origin_x + t * fp.turn_x, fp.origin_y + t * fp.turn_y))
-    return wp.sqrt(area) / wp.max(t, 1.0e-6)
-
-
-@wp.func
-def mirrored_level(ray: NearRay, height: wp.int32) -> wp.float32:
-    """Level of the environment for what a mirror's ray covers beyond a texel, which level 0 shows by itself.
-
-    A GGX lobe of width alpha has the peak density of a solid angle of 4 pi alpha^2.
-    """
-    covered = wp.length(wp.cross(ray.footprint.turn_x, ray.footprint.turn_y))
-    texel = wp.pi / wp.float32(wp.max(height, 1))
-    return level_from_alpha(wp.sqrt(wp.max(covered - texel * texel, 0.0) / (4.0 * wp.pi)), height)
-
-
-@functools.cache
-def make_look_near(config: NearFieldConfig) -> wp.Function:
-    """``look_near(...) -> vec4``: radiance of what is near along a ray, and 1; zero where only the environment is.
-
-    The receiver's radiance is that of the picture so far: its shadows and its virtual light included.
-    """
-    trace = make_trace(config.distant.trace)
-    closest_object, closest_proxy = trace.closest_object, trace.closest_proxy
-    find_in_frame = make_find_in_frame(config.distant.trace, config.distant.probes)
-    shade_unoccluded = make_shade_unoccluded(config.distant)
-
-    @wp.func(module="unique")
-    def look_near(
-        params: FrameParams,
-        picture: Picture,
-        layers: ReceiverLayers,
-        scene: RayScene,
-        distant: DistantLight,
-        ray: NearRay,
-    ) -> wp.vec4:
-        other = closest_object(scene, ray.origin, ray.direction, ray.reach)
-        proxy = closest_proxy(scene, ray.origin, ray.direction, other.t)
-        if proxy.shape >= 0:
-            at = find_in_frame(params, picture, scene, distant.probes, proxy)
-            if at[0] < 0.0:
-                return wp.vec4(0.0)
-            if ray.covers and layers.levels.shape[0] > 0:
-                wide = look_up_proxy(params, picture, layers, ray, proxy, at)
-                return wp.vec4(wide[0], wide[1], wide[2], 1.0)
-            radiance = look_up(picture, at[0], at[1])
-            row = wp.int32(at[1] + 0.5)
-            column = wp.int32(at[0] + 0.5)
-            if wp.static(config.ratio):
-                radiance = wp.cw_mul(radiance, layers.shadow_ratio[row, column])
-            if wp.static(config.added):
-                if inside_rect(row, column, params.light_rect):
-                    radiance += layers.added[row, column]
-            return wp.vec4(radiance[0], radiance[1], radiance[2], 1.0)
-        if other.shape >= 0:
-            spread = ray.spread
-            if ray.covers:
-                spread = wp.max(spread, spread_at(ray, other.t))
-            radiance = shade_unoccluded(scene, distant, other, ray.direction, spread)
-            return wp.vec4(radiance[0], radiance[1], radiance[2], 1.0)
-        return wp.vec4(0.0)
-
-    return look_near
 
 
 @wp.struct
@@ -221,6 +137,131 @@ class SeenPoint:
     pixel: wp.vec2  # undistorted (x / z, y / z)
     place: wp.int32  # of the pixel in its tile
     footprint: Footprint  # of a mirror's whole pixel
+
+
+def ray_width(config: NearFieldConfig) -> float:
+    """Width of a ray of a tile's lobes, over ``NearRay.spread``."""
+    return RAY_WIDTH / (math.sqrt(max(config.lobe_count, 1)) * config.side)
+
+
+@functools.cache
+def make_footprint_of(config: NearFieldConfig) -> wp.Function:
+    """``footprint_of(at, ray) -> Footprint``: of a ray that covers a part of what a pixel mirrors.
+
+    A mirror's is its part of the pixel, a lobe's a square around its direction.
+    """
+    part = 1.0 / math.sqrt(max(config.mirror_samples, 1))
+    share = LOBE_ANGLE * ray_width(config)
+
+    @wp.func(module="unique")
+    def footprint_of(at: SeenPoint, ray: NearRay) -> Footprint:
+        out = Footprint()
+        if wp.static(config.mirror_samples > 0):
+            if at.alpha < SHARP:
+                out.origin_x = part * at.footprint.origin_x
+                out.origin_y = part * at.footprint.origin_y
+                out.turn_x = part * at.footprint.turn_x
+                out.turn_y = part * at.footprint.turn_y
+        if wp.static(config.lobe_count > 0):
+            if at.alpha >= SHARP:
+                axes = frame_from_normal(ray.direction)
+                angle = wp.static(share) * ray.spread
+                out.turn_x = angle * wp.vec3(axes[0, 0], axes[1, 0], axes[2, 0])
+                out.turn_y = angle * wp.vec3(axes[0, 1], axes[1, 1], axes[2, 1])
+        return out
+
+    return footprint_of
+
+
+@wp.func
+def look_up_proxy(
+    params: FrameParams,
+    picture: Picture,
+    layers: ReceiverLayers,
+    ray: NearRay,
+    fp: Footprint,
+    proxy: Hit,
+    at: wp.vec2,
+) -> wp.vec3:
+    """The picture of a proxy, shown at ``at``, as wide as the ray is that meets it."""
+    normal = proxy.geometric_normal
+    across = covered_on(fp.origin_x, fp.turn_x, proxy.t, ray.direction, normal)
+    along = covered_on(fp.origin_y, fp.turn_y, proxy.t, ray.direction, normal)
+    from_camera = proxy.point - params.camera_position
+    a = shown_as(params, from_camera, across)
+    b = shown_as(params, from_camera, along)
+    return look_up_covered(params, picture, layers, at, a, b)
+
+
+@wp.func
+def spread_at(fp: Footprint, t: wp.float32) -> wp.float32:
+    """Width over length that a ray has when it has come so far: the side of a square of the area that it covers."""
+    area = wp.length(wp.cross(fp.origin_x + t * fp.turn_x, fp.origin_y + t * fp.turn_y))
+    return wp.sqrt(area) / wp.max(t, 1.0e-6)
+
+
+@wp.func
+def mirrored_level(fp: Footprint, height: wp.int32) -> wp.float32:
+    """Level of the environment for what a mirror's ray covers beyond a texel, which level 0 shows by itself.
+
+    A GGX lobe of width alpha has the peak density of a solid angle of 4 pi alpha^2.
+    """
+    covered = wp.length(wp.cross(fp.turn_x, fp.turn_y))
+    texel = wp.pi / wp.float32(wp.max(height, 1))
+    return level_from_alpha(wp.sqrt(wp.max(covered - texel * texel, 0.0) / (4.0 * wp.pi)), height)
+
+
+@functools.cache
+def make_look_near(config: NearFieldConfig) -> wp.Function:
+    """``look_near(...) -> vec4``: radiance of what is near along a ray, and 1; zero where only the environment is.
+
+    The receiver's radiance is that of the picture so far: its shadows and its virtual light included.
+    """
+    footprint_of = make_footprint_of(config)
+    trace = make_trace(config.distant.trace)
+    closest_object, closest_proxy = trace.closest_object, trace.closest_proxy
+    find_in_frame = make_find_in_frame(config.distant.trace, config.distant.probes)
+    shade_unoccluded = make_shade_unoccluded(config.distant)
+
+    @wp.func(module="unique")
+    def look_near(
+        params: FrameParams,
+        picture: Picture,
+        layers: ReceiverLayers,
+        scene: RayScene,
+        distant: DistantLight,
+        at: SeenPoint,
+        ray: NearRay,
+    ) -> wp.vec4:
+        other = closest_object(scene, ray.origin, ray.direction, ray.reach)
+        proxy = closest_proxy(scene, ray.origin, ray.direction, other.t)
+        if proxy.shape >= 0:
+            shown = find_in_frame(params, picture, scene, distant.probes, proxy)
+            if shown[0] < 0.0:
+                return wp.vec4(0.0)
+            if wp.static(config.distant.specular):
+                if ray.covers:
+                    wide = look_up_proxy(params, picture, layers, ray, footprint_of(at, ray), proxy, shown)
+                    return wp.vec4(wide[0], wide[1], wide[2], 1.0)
+            radiance = look_up(picture, shown[0], shown[1])
+            row = wp.int32(shown[1] + 0.5)
+            column = wp.int32(shown[0] + 0.5)
+            if wp.static(config.ratio):
+                radiance = wp.cw_mul(radiance, layers.shadow_ratio[row, column])
+            if wp.static(config.added):
+                if inside_rect(row, column, params.light_rect):
+                    radiance += layers.added[row, column]
+            return wp.vec4(radiance[0], radiance[1], radiance[2], 1.0)
+        if other.shape >= 0:
+            spread = ray.spread
+            if wp.static(config.distant.specular):
+                if ray.covers:
+                    spread = wp.max(spread, spread_at(footprint_of(at, ray), other.t))
+            radiance = shade_unoccluded(scene, distant, other, ray.direction, spread)
+            return wp.vec4(radiance[0], radiance[1], radiance[2], 1.0)
+        return wp.vec4(0.0)
+
+    return look_near
 
 
 @wp.struct
@@ -358,8 +399,8 @@ def make_sample_ray(sample: EnvironmentSample, at: SeenPoint, share: wp.float32)
 
 
 @wp.func
-def make_lobe_ray(u: wp.vec2, at: SeenPoint, share: wp.float32) -> NearRay:
-    """Into the lobe of a glossy surface, by two numbers of [0, 1); it covers ``share`` times its width, as an angle."""
+def make_lobe_ray(u: wp.vec2, at: SeenPoint) -> NearRay:
+    """Into the lobe of a glossy surface, by two numbers of [0, 1)."""
     out = NearRay()
     if at.surface.model == PHONG:
         center = reflect(at.wo, at.normal)
@@ -378,9 +419,6 @@ def make_lobe_ray(u: wp.vec2, at: SeenPoint, share: wp.float32) -> NearRay:
         out.spread = width
         out.point = at.hit.point
         out.covers = True
-        axes = frame_from_normal(wi)
-        out.footprint.turn_x = (share * width) * wp.vec3(axes[0, 0], axes[1, 0], axes[2, 0])
-        out.footprint.turn_y = (share * width) * wp.vec3(axes[0, 1], axes[1, 1], axes[2, 1])
     return out
 
 
@@ -389,7 +427,6 @@ def make_mirror_ray(config: NearFieldConfig) -> wp.Function:
     """``mirror_ray(params, scene, at, k) -> NearRay``: from what a pixel's sample ``k`` shows of a mirror."""
     closest_visible = make_primary(config.distant.trace)
     sample_direction = make_sample_direction(config.mirror_samples)
-    part = 1.0 / math.sqrt(config.mirror_samples)
 
     @wp.func(module="unique")
     def mirror_ray(params: wp.array[FrameParams], scene: RayScene, at: SeenPoint, k: wp.int32) -> NearRay:
@@ -409,18 +446,9 @@ def make_mirror_ray(config: NearFieldConfig) -> wp.Function:
                 out.spread = scene.pixel_spread
                 out.point = seen.point
                 out.covers = True
-                out.footprint.origin_x = part * at.footprint.origin_x
-                out.footprint.origin_y = part * at.footprint.origin_y
-                out.footprint.turn_x = part * at.footprint.turn_x
-                out.footprint.turn_y = part * at.footprint.turn_y
         return out
 
     return mirror_ray
-
-
-def ray_width(config: NearFieldConfig) -> float:
-    """Width of a ray of a tile's lobes, over ``NearRay.spread``."""
-    return RAY_WIDTH / (math.sqrt(max(config.lobe_count, 1)) * config.side)
 
 
 @functools.cache
@@ -433,7 +461,6 @@ def make_pick_ray(config: NearFieldConfig) -> wp.Function:
     mirror_ray = make_mirror_ray(config) if config.mirror_samples > 0 else None
     side, lobes = config.side, config.lobe_count
     shift = 0.5 / (max(lobes, 1) * side * side)
-    share_covered = LOBE_ANGLE * ray_width(config)
 
     @wp.func(module="unique")
     def pick_ray(
@@ -466,7 +493,7 @@ def make_pick_ray(config: NearFieldConfig) -> wp.Function:
                     if at.alpha >= SHARP:
                         index = wp.uint32(at.place * wp.static(lobes) + k)
                         u = wp.vec2(radical_inverse(index) + wp.static(shift), sobol_second(index) + wp.static(shift))
-                        ray = make_lobe_ray(u, at, wp.static(share_covered))
+                        ray = make_lobe_ray(u, at)
         return ray
 
     return pick_ray

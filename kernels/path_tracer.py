@@ -167,11 +167,21 @@ def make_find_shown_kernel(trace: TraceConfig) -> wp.Kernel:
         i, j = wp.tid()
         i += row_start
         ray = scene.picture.rays[i, j]
-        direction = wp.normalize(params[0].world_from_camera * wp.vec3(ray[0], ray[1], 1.0))
-        vertex = find_vertex(scene, params[0].camera_position, direction, False)
         shown = wp.int32(-1)
-        if vertex.kind == PROXY and not is_turned(vertex, direction):
-            shown = vertex.hit.shape
+        for k in range(5):
+            # The middle, then the corners: a pixel of two surfaces has the radiance of neither.
+            x = wp.where(k == 0, 0.0, wp.where(k % 2 == 0, 0.5, -0.5))
+            y = wp.where(k == 0, 0.0, wp.where(k < 3, -0.5, 0.5))
+            toward = wp.vec3(ray[0] + x / params[0].focal[0], ray[1] + y / params[0].focal[1], 1.0)
+            direction = wp.normalize(params[0].world_from_camera * toward)
+            vertex = find_vertex(scene, params[0].camera_position, direction, False)
+            seen = wp.int32(-1)
+            if vertex.kind == PROXY and not is_turned(vertex, direction):
+                seen = vertex.hit.shape
+            if k == 0:
+                shown = seen
+            elif seen != shown:
+                shown = -1
         shown_out[i, j] = shown
 
     return find_shown_kernel
@@ -217,6 +227,6 @@ def find_shown(
     *,
     rows: Rows | None = None,
 ) -> None:
-    """Write which proxy the frame shows in the middle of every pixel, -1 for none; (H, W)."""
+    """Write which proxy alone the frame shows in every pixel, -1 for none or several surfaces; (H, W)."""
     shape, device = shown_out.shape, shown_out.device
     launch_rows(make_find_shown_kernel(trace), shape, [params, scene], [shown_out], rows=rows, device=device)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import warp as wp
 
 from warp_ar.kernels import color
 from warp_ar.kernels.structs import Material
+from warp_ar.stages.base import Pass
 
 SMALL_CAMERA = """[camera]
 width = 64
@@ -72,3 +74,13 @@ def constant_environment(radiance: Any) -> npt.NDArray[np.float32]:
     sh = np.zeros((9, 3), np.float32)
     sh[0] = np.pi * np.asarray(radiance) / 0.28209479
     return sh
+
+
+def launch_passes(passes: Sequence[Pass], bands: int) -> None:
+    """A stage's passes one after another; those over rows in so many bands."""
+    for step in passes:
+        if bands == 1 or step.rows is None:
+            step.launch(None)
+        else:
+            for band in range(bands):
+                step.launch((step.rows * band // bands, step.rows * (band + 1) // bands))

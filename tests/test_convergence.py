@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+import time
+from typing import Any
+
 import numpy as np
 import pytest
 
 from tests.test_path_tracer import ABOVE, RHO, boxes, latlong_sky
 from tests.viewer_rig import Running, page_scene
 from warp_ar.accuracy.path_tracer import FIRST_LIGHT_SAMPLES, PathTracer
+from warp_ar.errors import UsageError
+from warp_ar.scene import Scene
+from warp_ar.viewer import convergence, frames
 from warp_ar.viewer.convergence import FULL_SCALE, false_colors
+from warp_ar.viewer.frames import Lit
+
+COARSE_GOAL = 0.3  # relative standard error that a few samples reach
 
 
 @pytest.mark.parametrize("known", [False, True], ids=["whole", "difference"])
@@ -97,3 +106,90 @@ def test_frames_stay_short_while_it_converges() -> None:
     tracer.sample_for(0.0)
     ended = [tracer.sample_for(0.0) for _ in range(4)]
     assert not any(ended), "a slice of no time traced the whole picture"
+
+
+EDITS = [
+    {"type": "set", "part": "object", "index": 0, "key": "at", "value": [0.0, -0.08, 0.03]},
+    {"type": "set", "part": "exposure", "index": 0, "key": "scale", "value": 0.5},
+    {"type": "undo"},
+]
+
+
+def few_samples(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a held frame be done after few samples, whose error is still told."""
+    monkeypatch.setattr(convergence, "LEAST_SAMPLES", 2)
+    monkeypatch.setattr(convergence, "GOAL", COARSE_GOAL)
+    monkeypatch.setattr(convergence, "LIGHT_SAMPLES", FIRST_LIGHT_SAMPLES + 1)
+
+
+def done(running: Running) -> dict[str, float] | None:
+    """What is told of a reference that is done."""
+    told = running.host.state_message()["convergence"]
+    return told if told is not None and told["done"] else None
+
+
+def shows_difference(lit: Lit, reference: np.ndarray) -> bool:
+    """Whether a frame stands beside its own difference to a reference."""
+    return lit.other is not None and np.array_equal(lit.other, false_colors(lit.image, reference))
+
+
+def test_every_hold_and_every_edit_converges_to_the_goal(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The reference begins anew, of what is shown then, and ends at the error that is stated."""
+    few_samples(monkeypatch)
+    with Running(page_scene()) as running:
+        running.edit(type="compare", other="difference")
+        begun: list[tuple[float, float]] = []
+        make = PathTracer.__init__
+
+        def noted(self: PathTracer, scene: Scene, *arguments: Any, **options: Any) -> None:
+            make(self, scene, *arguments, **options)
+            begun.append((options["seconds"], self.exposure))
+
+        monkeypatch.setattr(PathTracer, "__init__", noted)
+        for step, edit in enumerate([{"type": "play", "on": False}, *EDITS, {"type": "play", "on": True}]):
+            running.edit(**edit)
+            if edit == {"type": "play", "on": True}:
+                running.next()
+                running.edit(type="play", on=False)
+            running.until(lambda step=step: len(begun) > step)
+            told = running.until(lambda: done(running))
+            assert told["error"] <= told["goal"] == 100.0 * COARSE_GOAL
+            # The last picture comes a moment after what is told of it.
+            reference = running.host._loop.convergence._picture.image
+            running.until(lambda reference=reference: shows_difference(running.frames[-1], reference))
+        assert begun[-1][0] > begun[0][0], "another frame is held in the end"
+        assert begun[1][1] != begun[2][1], "the exposure was edited"
+
+
+def test_at_rest_the_picture_stays_that_of_its_reference(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing lights it anew, by light that came in since; another way to look at it is shown all the same."""
+    few_samples(monkeypatch)
+    with Running(page_scene()) as running:
+        running.edit(type="compare", other="traced")
+        running.edit(type="play", on=False)
+        running.until(lambda: done(running))
+        rest, count = running.frames[-1], len(running.frames)
+        time.sleep(4.0 * frames._STILL_SECONDS)
+        assert len(running.frames) == count, "lit anew at rest"
+        running.edit(type="compare", other="difference")
+        running.until(lambda: len(running.frames) > count)
+        np.testing.assert_array_equal(running.frames[-1].image, rest.image)
+        np.testing.assert_array_equal(running.frames[-1].other, false_colors(rest.image, rest.other))
+
+
+def test_what_cannot_be_traced_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A reference that fails is a notice, and the picture goes on; the next edit tries again."""
+
+    def fail(*_: Any, **__: Any) -> None:
+        raise UsageError("the file of a mesh is gone")
+
+    few_samples(monkeypatch)
+    with Running(page_scene()) as running:
+        with monkeypatch.context() as broken:
+            broken.setattr(PathTracer, "__init__", fail)
+            running.edit(type="compare", other="difference")
+            running.edit(type="play", on=False)
+            running.until(lambda: any("mesh is gone" in str(message) for message in running.messages))
+            assert running.next().other is None
+        running.edit(**EDITS[0])
+        running.until(lambda: done(running))

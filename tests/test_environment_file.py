@@ -1,4 +1,4 @@
-"""What an environment's file says of itself, and other readers of it. The pixels alone: `test_sinks`."""
+"""What an environment's file says of itself, and other readers of it. The pixels alone: `test_environment_sink`."""
 
 from __future__ import annotations
 

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from tests.error_model import check_error
-from tests.kernel_rig import TEXTURES, camera_fields, records, shape, tables
+from tests.kernel_rig import TEXTURES, camera_fields, constant_environment, records, shape, tables
 from tests.reference import environment_shadow as reference
 from tests.test_relight import CAMERA, DESK, LOOK_DOWN, POINTS, RAYS, H, W
 from warp_ar.engine.graph import make_plan
@@ -142,9 +142,7 @@ def run(
     surroundings = DistantLight()
     surroundings.environment = wp.array(sky(), dtype=wp.vec3)
     surroundings.probes = records(Probe, *probes)
-    coefficients = np.zeros((9, 3), np.float32)
-    coefficients[0] = np.pi / 0.28209479
-    surroundings.irradiance_sh = wp.array(coefficients, dtype=wp.vec3)
+    surroundings.irradiance_sh = wp.array(constant_environment(1.0), dtype=wp.vec3)
     if several:
         surroundings.others = others
     frame = wp.full((H, W), wp.vec3ub(255, 255, 255), dtype=wp.vec3ub)

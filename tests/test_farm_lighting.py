@@ -76,7 +76,7 @@ def test_segments_are_bit_equal_to_one_run_where_light_is_given(folder, light):
     assert np.abs(whole[0].astype(int) - whole[-1]).max() > 20, "the clip must show something that changes"
 
 
-@pytest.mark.parametrize("quality", ["low", "medium"])  # medium knows emitters by their places
+@pytest.mark.parametrize("quality", ["low", "medium"])
 def test_a_surveyed_clip_is_lit_as_a_live_one(folder, quality):
     jobs, run = surveyed(folder, quality=quality)
     whole = lit_whole(jobs, run)
@@ -139,8 +139,11 @@ def test_a_survey_holds_light_until_it_moves(folder):
     assert survey.key_of(int(survey.keys[-1])) == len(survey.keys) - 1
     radiance, emitters = survey.light(0)
     assert radiance.shape == (64, 128, 3)
-    assert emitters is None, "quality low finds no places of emitters"
+    assert emitters is not None, "quality low finds places of emitters"
     assert survey.pose(0) is not None
+    jobs, run = surveyed(folder, quality="paper")
+    _, emitters = Survey(run / Job("survey").place(jobs)).light(0)
+    assert emitters is None, "quality paper does not"
 
 
 def test_a_clock_is_started_before_the_first_frame():

@@ -407,7 +407,7 @@ def test_missing_files(tmp_path: pathlib.Path) -> None:
             load_texture(tmp_path / "words.png")
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
 @given(suffix=st.sampled_from([".ply", ".obj", ".glb", ".stl", ".off"]), data=st.data())
 @pytest.mark.filterwarnings("ignore")  # what a reader mumbles about damage is its own affair
 def test_flipped_and_cut_bytes_never_raise_anything_else(

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from tests.error_model import check_error
-from tests.kernel_rig import SMALL_DESK
+from tests.kernel_rig import SMALL_DESK, launch_passes
 from tests.reference import irradiance as reference
 from tests.reference import latlong
 from warp_ar.engine.graph import make_plan
@@ -106,12 +106,7 @@ def run_method(radiance, method, normals, bands=1):
     for name, spec in stage.arrays().items():
         arrays.add(name, wp.full(spec.shape, spec.fill, dtype=spec.dtype))
     assert set(stage.wiring.writes) <= set(arrays)
-    for step in stage.build(arrays, environment.device):
-        if bands == 1 or step.rows is None:
-            step.launch(None)
-        else:
-            for band in range(bands):
-                step.launch((step.rows * band // bands, step.rows * (band + 1) // bands))
+    launch_passes(stage.build(arrays, environment.device), bands)
     output = arrays[features.irradiance]
     return evaluate(evaluate_sh_kernel if output.ndim == 1 else evaluate_map_kernel, output, normals)
 

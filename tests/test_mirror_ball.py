@@ -96,6 +96,16 @@ def kinds(shapes):
     return tuple(sorted({one["kind"] for one in shapes}))
 
 
+def even_light(light):
+    """An environment of the same radiance everywhere."""
+    surroundings = DistantLight()
+    surroundings.irradiance_sh = wp.array(constant_environment(light), dtype=wp.vec3)
+    surroundings.levels = wp.full(4096, wp.vec3(*map(float, light)), dtype=wp.vec3)
+    surroundings.level_height = 8
+    surroundings.dfg = wp.full((8, 8), wp.vec2(0.9, 0.05), dtype=wp.vec2)
+    return surroundings
+
+
 def run(
     frame=None,
     objects=(),
@@ -139,17 +149,12 @@ def run(
     )
     out = wp.full((H, W), wp.vec3(9.0, 9.0, 9.0), dtype=wp.vec3) if out is None else out
     light = np.ones(3) if irradiance is None else irradiance
-    surroundings = DistantLight()
-    surroundings.irradiance_sh = wp.array(constant_environment(light), dtype=wp.vec3)
-    surroundings.levels = wp.full(4096, wp.vec3(*map(float, light)), dtype=wp.vec3)
-    surroundings.level_height = 8
-    surroundings.dfg = wp.full((8, 8), wp.vec2(0.9, 0.05), dtype=wp.vec2)
     mirror_ball.mirror_ball(
         config,
         params,
         scene,
         records(Light, *lights),
-        surroundings,
+        even_light(light),
         receiver,
         None if ratio is None else wp.array(ratio.astype(np.float32), dtype=wp.vec3),
         out,

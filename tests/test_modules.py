@@ -112,6 +112,7 @@ def test_headers_serve_flags_that_differ_in_those_of_llvm(monkeypatch, tmp_path)
 def test_flags_of_clang_part_headers(warp_flags) -> None:
     usual, quick = warp_flags, QUICK_TO_COMPILE["cpu_compiler_flags"]
     assert modules._clang_flags(usual) == modules._clang_flags(quick) == ["-march=native"]
+    assert modules._clang_flags(modules._header_flags()) == ["-march=native"]
     assert modules._clang_flags("-mavx2 -mllvm=-x=1") == ["-mavx2"]
 
 
@@ -226,3 +227,52 @@ def test_remembered_references_name_the_same_kernels(tmp_path: Path) -> None:
     assert len(usual) > 20
     assert remembered == usual
     assert once < 0.5 * often
+
+
+ADJOINTS = """
+import sys
+from pathlib import Path
+import warp as wp
+from warp_ar.device import start_warp
+from warp_ar.engine import modules
+
+start_warp()
+
+@wp.struct
+class Pair:
+    first: wp.float32
+    second: wp.vec3
+
+@wp.kernel(module="unique", enable_backward=False)
+def pair_kernel(pairs: wp.array[Pair], sums_out: wp.array[wp.float32]):
+    pair = pairs[0]
+    sums_out[0] = pair.first + pair.second[1]
+
+if sys.argv[1] == "dropped":
+    modules.drop_unused_adjoints()
+    modules.drop_unused_adjoints()  # again changes nothing
+pair = Pair()
+pair.first, pair.second = 1.0, wp.vec3(0.0, 2.0, 0.0)
+pairs, sums = wp.array([pair], dtype=Pair, device="cpu"), wp.zeros(1, dtype=wp.float32, device="cpu")
+wp.launch(pair_kernel, 1, [pairs], [sums], device="cpu")
+(binary,) = Path(wp.config.kernel_cache_dir).glob("wp_pair_kernel*/*.o")
+print(sums.numpy()[0], binary.parent.name, b"adj_atomic_add" in binary.read_bytes())
+"""
+
+
+def test_sums_and_adjoints_of_structs_that_nothing_calls_are_not_compiled(tmp_path: Path) -> None:
+    """The kernel computes the same, and has the same name in the cache."""
+    script = tmp_path / "script.py"
+    script.write_text(ADJOINTS)
+
+    def run(how: str) -> list[str]:
+        environment = {**os.environ, "WARP_CACHE_PATH": str(tmp_path / how)}
+        environment["PYTHONPATH"] = str(Path(__file__).parents[1])
+        command = [sys.executable, str(script), how]
+        lines = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout.splitlines()
+        return lines[-1].split()
+
+    usual, dropped = run("usual"), run("dropped")
+    assert usual[2] == "True"
+    assert dropped == [*usual[:2], "False"]
+    assert usual[0] == "3.0"

@@ -273,6 +273,19 @@ def latlong_sky(height: int = 64) -> npt.NDArray[np.float32]:
     return sky(np.stack(parts, -1))
 
 
+def test_a_pixel_shows_what_fills_it(device: str) -> None:
+    """No part of a pixel that shows a proxy shows another one; of both the frame has a mean."""
+    frame, parts = np.full((160, 240, 3), 0.5, np.float32), 5
+    coarse = PathTracer(boxes(False), latlong_sky(), frame, ABOVE, device=device, light_samples=5).shown()
+    size = (48 * parts, 32 * parts)
+    fine = PathTracer(boxes(False), latlong_sky(), frame, ABOVE, device=device, size=size, light_samples=5).shown()
+    within = fine.reshape(32, parts, 48, parts).transpose(0, 2, 1, 3).reshape(32, 48, -1)
+    for proxy in (0, 1):
+        seen = within[coarse == proxy]
+        assert len(seen) > 60
+        assert not (seen == 1 - proxy).any(), "a pixel of two proxies shows one"
+
+
 def test_the_same_seed_gives_the_same_bits(device: str) -> None:
     """However many samples are added at a time; another seed gives others."""
     frame = np.full((32, 48, 3), 0.5, np.float32)

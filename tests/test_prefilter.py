@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from tests.error_model import check_error
-from tests.kernel_rig import SMALL_DESK
+from tests.kernel_rig import SMALL_DESK, launch_passes
 from tests.reference import latlong
 from tests.reference import prefilter as reference
 from tests.reference import pyramid as reference_pyramid
@@ -102,12 +102,7 @@ def run(radiance, method, lobe="ggx", bands=1):
     arrays.add("environment", environment)
     for name, spec in stage.arrays().items():
         arrays.add(name, wp.full(spec.shape, spec.fill, dtype=spec.dtype))
-    for step in stage.build(arrays, environment.device):
-        if bands == 1 or step.rows is None:
-            step.launch(None)
-        else:
-            for band in range(bands):
-                step.launch((step.rows * band // bands, step.rows * (band + 1) // bands))
+    launch_passes(stage.build(arrays, environment.device), bands)
     return arrays["prefilter_levels"]
 
 

@@ -115,7 +115,7 @@ def test_light_that_clips_is_put_back_where_each_ball_sees_it(device: str) -> No
     ends = 0, len(PLACES) - 1
     captured, recovered = (
         [light for index, light in enumerate(world.lit(BALLS, quality, device, frames=1)) if index in ends]
-        for quality in (QUALITY, PRESETS["low"])
+        for quality in (QUALITY, QUALITY.with_methods(recover="white_card"))
     )
     means = np.array([[np.nanmean(light, axis=0) for light in found] for found in (captured, recovered)])
     expected = [world.foreseen(BALLS, index)[0] for index in ends]

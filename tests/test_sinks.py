@@ -15,14 +15,12 @@ from typing import Any
 import av
 import cv2
 import numpy as np
-import OpenEXR
 import pytest
 
 from warp_ar.command_line import Terminated, ended_by_signals
 from warp_ar.errors import SinkError, UsageError
 from warp_ar.input.sources import open_source
 from warp_ar.output.folder_sink import FolderSink
-from warp_ar.output.layer_file import LayerFrame, LayerSink
 from warp_ar.output.sink import FRAMES_WAITING, ThreadedSink
 from warp_ar.output.sinks import (
     EnvironmentSink,
@@ -59,6 +57,13 @@ def patches() -> np.ndarray:
     colors = [(255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 0), (0, 255, 255), (255, 0, 255)]
     colors += [(0, 0, 0), (255, 255, 255), (128, 128, 128), (200, 120, 60), (20, 40, 90), (90, 160, 70)]
     return np.concatenate([np.full((32, 32, 3), color, np.uint8) for color in colors], axis=1)
+
+
+def radiance() -> np.ndarray:
+    rng = np.random.default_rng(0)
+    image = rng.exponential(1.0, (8, 16, 3)).astype(np.float32)
+    image[0, 0] = (1e6, 1e-30, -0.5)
+    return image
 
 
 def levels(path: pathlib.Path) -> list[float]:
@@ -340,186 +345,6 @@ def test_no_frame_leaves_no_file_and_no_loss(tmp_path: pathlib.Path) -> None:
     assert (tmp_path / "old.mp4").read_text() == "old"
 
 
-@pytest.fixture
-def disk(tmp_path: pathlib.Path) -> Iterator[pathlib.Path]:
-    """A disk of 400 kB."""
-    place = tmp_path / "disk"
-    place.mkdir()
-    mounted = (
-        sys.platform == "linux"
-        and not subprocess.run(
-            ["mount", "-t", "tmpfs", "-o", "size=400k", "tmpfs", str(place)], check=False, capture_output=True
-        ).returncode
-    )
-    if not mounted:
-        pytest.skip("no small disk can be mounted here")
-    yield place
-    subprocess.run(["umount", str(place)], check=True)
-
-
-# What is on the disk beside: every fragment, and the end of the file, is cut off somewhere.
-@pytest.mark.parametrize("taken", [0, 130, 200, 270, 330, 390])
-@pytest.mark.parametrize("name", [*VIDEOS, "frames", "light"])
-def test_full_disk_leaves_whole_files_and_true_counts(disk: pathlib.Path, name: str, taken: int) -> None:
-    (disk / "other").write_bytes(bytes(1000 * taken))
-    before = threading.active_count()
-    rng = np.random.default_rng(0)
-    sink = EnvironmentSink(disk / name) if name == "light" else open_sink(disk / name, fps=24)
-
-    def fill() -> None:
-        with sink:
-            for _ in range(260):
-                image = rng.integers(0, 256, (48, 64, 3), dtype=np.uint8)
-                sink.write(image.astype(np.float32) if name == "light" else image)
-
-    with pytest.raises(SinkError, match="No space left"):
-        fill()
-    if name == "light":
-        assert [read_environment(path).shape for path in (disk / name).iterdir()] == [(48, 64, 3)] * sink.written
-    elif name == "frames":
-        assert len(list((disk / name).iterdir())) == sink.written
-        assert sink.written == 0 or len(levels(disk / name)) == sink.written
-    elif (disk / name).exists():
-        assert len(levels(disk / name)) == sink.written
-    assert not list(disk.rglob(".*"))
-    assert threading.active_count() <= before
-
-
-@pytest.mark.parametrize("name", VIDEOS)
-def test_an_end_that_does_not_fit_leaves_the_fragments(disk: pathlib.Path, name: str) -> None:
-    # 60 frames take 110 to 124 kB: the last fragments fit or not, and so does what makes an ordinary file of them.
-    outcomes = set()
-    for free in range(96, 136, 4):
-        (disk / name).unlink(missing_ok=True)
-        (disk / "other").write_bytes(bytes((400 - free) * 1024))
-        rng, told = np.random.default_rng(0), ""
-        try:
-            with open_sink(disk / name, fps=24) as sink:
-                for _ in range(60):
-                    sink.write(rng.integers(0, 256, (48, 64, 3), dtype=np.uint8))
-        except SinkError as error:
-            told = str(error)
-        assert len(levels(disk / name)) == sink.written
-        assert (sink.written == 60) == (told == "") or "finished" in told
-        outcomes.add(sink.written)
-    assert 60 in outcomes
-    assert len(outcomes) > 1
-
-
-@pytest.mark.parametrize("name", VIDEOS)
-def test_full_disk_at_the_start_leaves_what_stood_there(disk: pathlib.Path, name: str) -> None:
-    with open_sink(disk / name, fps=24) as sink:
-        for level in range(20):
-            sink.write(flat(level))
-    before = (disk / name).read_bytes()
-    free = shutil.disk_usage(disk).free
-    (disk / "other").write_bytes(bytes(max(free - 8192, 0)))
-    rng = np.random.default_rng(0)
-
-    def fill() -> None:
-        with open_sink(disk / name, fps=24) as sink:
-            for _ in range(60):
-                sink.write(rng.integers(0, 256, (480, 640, 3), dtype=np.uint8))
-
-    with pytest.raises(SinkError, match="No space left"):
-        fill()
-    assert (disk / name).read_bytes() == before
-
-
-@contextlib.contextmanager
-def file_limit(size: int) -> Iterator[None]:
-    """Let no file of this process grow beyond so many bytes: a quota where no disk can be mounted.
-
-    Python ignores SIGXFSZ, so that a write beyond the limit fails with EFBIG, as one onto a full disk does with ENOSPC.
-    """
-    import resource
-
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="no limit of a file's size")
-@pytest.mark.parametrize("limit", [0, 2_000, 30_000, 70_000, 150_000])
-@pytest.mark.parametrize("name", VIDEOS)
-def test_a_limit_of_files_leaves_whole_videos_and_true_counts(tmp_path: pathlib.Path, name: str, limit: int) -> None:
-    rng = np.random.default_rng(0)
-    sink = open_sink(tmp_path / name, fps=24)
-
-    def fill() -> None:
-        with sink:
-            for _ in range(200):
-                sink.write(rng.integers(0, 256, (48, 320, 3), dtype=np.uint8))
-
-    with file_limit(limit), pytest.raises(SinkError, match="File too large"):
-        fill()
-    if (tmp_path / name).exists():
-        assert len(levels(tmp_path / name)) == sink.written > 0
-    else:
-        assert sink.written == 0
-    assert limit < 150_000 or sink.written > 0
-    assert not list(tmp_path.rglob(".*"))
-
-
-FOLDERS = {
-    "frames": (lambda path: FolderSink(path), lambda image: image, lambda path: cv2.imread(str(path))),
-    "light": (lambda path: EnvironmentSink(path), lambda image: image.astype(np.float32), read_environment),
-    "layers": (
-        lambda path: LayerSink(path, pictures=("plate",)),
-        lambda image: LayerFrame({"plate": image.astype(np.float32)}, image, ()),
-        lambda path: OpenEXR.File(str(path)).parts[0].channels["plate"].pixels,
-    ),
-}
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="no limit of a file's size")
-@pytest.mark.parametrize("limit", [0, 700, 2_000, 2_500, 30_000])
-@pytest.mark.parametrize("name", FOLDERS)
-def test_a_limit_of_files_leaves_whole_frames_and_true_counts(tmp_path: pathlib.Path, name: str, limit: int) -> None:
-    """Three flat frames fit or not; the fourth, of noise, does not."""
-    opened, prepared, read = FOLDERS[name]
-    noise = np.random.default_rng(0).integers(0, 256, (240, 320, 3), dtype=np.uint8)
-    sink = opened(tmp_path / name)
-
-    def fill() -> None:
-        with sink:
-            for image in [*(np.full_like(noise, level) for level in (1, 2, 3)), noise]:
-                sink.write(prepared(image))
-
-    with file_limit(limit), pytest.raises(SinkError, match="File too large"):
-        fill()
-    paths = sorted(path for path in (tmp_path / name).iterdir() if path.is_file())
-    assert [read(path).shape for path in paths] == [(240, 320, 3)] * len(paths)
-    # Layers count where their pictures are there, too.
-    assert sink.written <= len(paths) if name == "layers" else sink.written == len(paths)
-    assert sink.written == 3 or limit < 30_000
-    assert sink.written == 0 or limit > 0
-    assert not list(tmp_path.rglob(".*"))
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="no limit of a file's size")
-@pytest.mark.parametrize("name", VIDEOS)
-def test_a_limit_at_the_start_leaves_what_stood_there(tmp_path: pathlib.Path, name: str) -> None:
-    with open_sink(tmp_path / name, fps=24) as sink:
-        for level in range(20):
-            sink.write(flat(level))
-    before = (tmp_path / name).read_bytes()
-    rng = np.random.default_rng(0)
-
-    def fill() -> None:
-        with open_sink(tmp_path / name, fps=24) as sink:
-            for _ in range(20):
-                sink.write(rng.integers(0, 256, (240, 320, 3), dtype=np.uint8))
-
-    with file_limit(4096), pytest.raises(SinkError, match="File too large"):
-        fill()
-    assert (tmp_path / name).read_bytes() == before
-    assert [path.name for path in tmp_path.iterdir()] == [name]
-
-
 # --------------------------------------------------------------------------------------------------------------- errors
 
 
@@ -598,92 +423,6 @@ def test_tee_writes_and_closes_all(tmp_path: pathlib.Path) -> None:
     assert null.count == 3
     assert levels(tmp_path / "frames") == [0, 1, 2]
     assert len(levels(tmp_path / "a.mkv")) == 3
-
-
-# ---------------------------------------------------------------------------------------------------------- environment
-
-
-def radiance() -> np.ndarray:
-    rng = np.random.default_rng(0)
-    image = rng.exponential(1.0, (8, 16, 3)).astype(np.float32)
-    image[0, 0] = (1e6, 1e-30, -0.5)
-    return image
-
-
-def test_environment_round_trip_is_exact(tmp_path: pathlib.Path) -> None:
-    path = tmp_path / "new" / "0000.exr"
-    write_environment(path, radiance())
-    assert np.array_equal(read_environment(path), radiance())
-    with OpenEXR.File(str(path)) as file:
-        assert file.header()["compression"] == OpenEXR.ZIP_COMPRESSION
-        assert file.channels()["RGB"].pixels.dtype == np.float32
-        assert np.array_equal(file.channels()["RGB"].pixels, radiance())
-
-
-def test_environment_of_a_view_is_the_view(tmp_path: pathlib.Path) -> None:
-    write_environment(tmp_path / "e.exr", radiance()[::-1, ::2])
-    assert np.array_equal(read_environment(tmp_path / "e.exr"), radiance()[::-1, ::2])
-
-
-def test_environment_from_separate_channels_and_half(tmp_path: pathlib.Path) -> None:
-    small = np.clip(radiance(), 0, 100).astype(np.float16)
-    channels = {name: np.ascontiguousarray(small[..., index]) for index, name in enumerate("RGB")}
-    channels["Z"] = channels["R"]
-    OpenEXR.File({"type": OpenEXR.scanlineimage}, channels).write(str(tmp_path / "e.exr"))
-    assert np.array_equal(read_environment(tmp_path / "e.exr"), small.astype(np.float32))
-    OpenEXR.File({"type": OpenEXR.scanlineimage}, {"Z": channels["R"]}).write(str(tmp_path / "z.exr"))
-    with pytest.raises(SinkError, match="R, G and B"):
-        read_environment(tmp_path / "z.exr")
-
-
-def test_environment_errors(tmp_path: pathlib.Path, capfd: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "folder.exr").mkdir()
-    (tmp_path / "file").write_text("")
-    (tmp_path / "bad.exr").write_bytes(b"no picture")
-    with pytest.raises(SinkError, match="float32"):
-        write_environment(tmp_path / "e.exr", radiance().astype(np.float64))
-    with pytest.raises(SinkError, match="is a folder"):
-        write_environment(tmp_path / "folder.exr", radiance())
-    with pytest.raises(SinkError, match="cannot be written"):
-        write_environment(tmp_path / "file" / "e.exr", radiance())
-    with pytest.raises(SinkError, match="there is no file"):
-        read_environment(tmp_path / "none.exr")
-    with pytest.raises(SinkError, match="cannot be read"):
-        read_environment(tmp_path / "bad.exr")
-    capfd.readouterr()
-
-
-def test_environment_sink_numbers_its_files(tmp_path: pathlib.Path) -> None:
-    with EnvironmentSink(tmp_path / "env") as sink:
-        for index in range(6):
-            sink.write(radiance() + np.float32(index))
-        with pytest.raises(SinkError, match="float32"):
-            sink.write(flat(0))
-    for index in range(6):
-        assert np.array_equal(read_environment(tmp_path / "env" / f"{index:04d}.exr"), radiance() + np.float32(index))
-
-
-def test_light_of_balls_of_an_earlier_run_goes(tmp_path: pathlib.Path) -> None:
-    for folder in (tmp_path, tmp_path / "ball_1", tmp_path / "ball_2", tmp_path / "ball_room"):
-        with EnvironmentSink(folder) as sink:
-            sink.write(radiance())
-            sink.write(radiance())
-    theirs = tmp_path / "ball_2" / "0007.exr"
-    theirs.write_bytes(b"somebody's")
-    with EnvironmentSink(tmp_path) as sink:
-        assert (tmp_path / "ball_1" / "0001.exr").exists(), "nothing goes before there is a frame"
-        assert sink.replaced.endswith("ball_*: 4 environments of an earlier run are removed")
-        sink.write(radiance())
-    assert not (tmp_path / "ball_1").exists()
-    assert list((tmp_path / "ball_2").iterdir()) == [theirs]
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["0000.exr", "ball_2", "ball_room"]
-    assert len(list((tmp_path / "ball_room").iterdir())) == 2
-
-
-def test_shared_environments_load(shared: pathlib.Path) -> None:
-    paths = sorted((shared / "hdri").glob("*.exr"))
-    assert paths
-    assert read_environment(paths[0]).shape == (512, 1024, 3)
 
 
 # -------------------------------------------------------------------------------------------------------------- signals

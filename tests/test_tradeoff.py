@@ -68,9 +68,8 @@ def test_extra_lines_are_read_before_anything_is_measured(tmp_path, monkeypatch,
     assert "is the same as --extra" in capsys.readouterr().err
 
 
-def test_presets_alone(tmp_path, monkeypatch, device):
-    monkeypatch.setattr(case_report, "RUNS", ("paper", "low"))
-    arguments = ["darken", "--presets", "--frames", "2", "--shrink", "4", "--device", device]
+def test_presets_alone(tmp_path, device):
+    arguments = ["darken", "--presets", "--only", "paper,low", "--frames", "2", "--shrink", "4", "--device", device]
     assert tradeoff.main([*arguments, "--out", str(tmp_path)]) == EXIT_DONE
     assert {path.name for path in tmp_path.iterdir()} == {"presets.json", "tradeoff.jsonl"}
     listed = json.loads((tmp_path / "presets.json").read_text())
@@ -84,6 +83,8 @@ def test_presets_alone(tmp_path, monkeypatch, device):
     ("arguments", "message"),
     [
         (["desk", "--presets", "--stage", "irradiance"], "--presets --stage irradiance: expected one of both"),
+        (["desk", "--only", "low"], "--only low: expected --presets beside it"),
+        (["desk", "--presets", "--only", "low,best"], "--only best: expected presets of paper, low, medium"),
         (["desk", "--frames", "0"], "--frames 0: expected 1 or more"),
         (["desk", "--shrink", "0"], "--shrink 0: expected 1 or more"),
         (["desk", "--stage", "colour", "--frames", "1"], "--stage colour: expected one of environment_height"),

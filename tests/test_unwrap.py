@@ -3,6 +3,7 @@ import json
 import cv2
 import numpy as np
 import pytest
+import trimesh
 import warp as wp
 
 from tests.error_model import check_error
@@ -376,46 +377,9 @@ def test_hidden_by_a_proxy(device, kind):
     half, at, turn = np.array(shape["extent"]), np.array(shape["position"]), np.array(shape.get("rotation", np.eye(3)))
     mesh = None
     if kind == "mesh":
-        signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-        faces = [
-            0,
-            1,
-            3,
-            0,
-            3,
-            2,
-            4,
-            6,
-            7,
-            4,
-            7,
-            5,
-            0,
-            4,
-            5,
-            0,
-            5,
-            1,
-            2,
-            3,
-            7,
-            2,
-            7,
-            6,
-            0,
-            2,
-            6,
-            0,
-            6,
-            4,
-            1,
-            5,
-            7,
-            1,
-            7,
-            3,
-        ]
-        mesh = wp.Mesh(wp.array((signs * half).astype(np.float32), dtype=wp.vec3), wp.array(faces, dtype=wp.int32))
+        box = trimesh.creation.box(2 * half)
+        vertices, faces = np.float32(box.vertices), np.int32(box.faces).ravel()
+        mesh = wp.Mesh(wp.array(vertices, dtype=wp.vec3), wp.array(faces, dtype=wp.int32))
         shape |= {"kind": MESH, "mesh": mesh.id}
     frame = encode(
         reference.render(view, [BALL], lambda d: np.full_like(d, 0.5) / REFLECTANCE, lambda d: np.full_like(d, 0.5))
@@ -467,13 +431,19 @@ def test_hidden_ball_leaves_the_word_to_the_other(device):
     assert (radiance[confidence > 0] == decode_table("srgb")[128]).all()
 
 
-def test_balls_vote_by_their_pixels(device):
-    """Of two balls that disagree, the one with 16 times the pixels has 16 votes to 1, whatever their order."""
+def two_balls_that_disagree():
+    """The larger one shows white, the smaller one black."""
     large, small = ((0.0, -0.1, 0.0), 0.06, (1.0, 1.0, 1.0)), ((0.0, 0.1, 0.0), 0.015, (1.0, 1.0, 1.0))
     view = reference.View((1.0, 0.0, 0.0), (0.0, 0.0, 0.0), focal=900.0)
     frame = constant_frame(view, 0)
     frame[:, : view.width // 2] = 255 if view.project([large[0]])[0][0, 0] < view.width / 2 else 0
     frame[:, view.width // 2 :] = 255 - frame[:, :1]
+    return view, frame, large, small
+
+
+def test_balls_vote_by_their_pixels(device):
+    """Of two balls that disagree, the one with 16 times the pixels has 16 votes to 1, whatever their order."""
+    view, frame, large, small = two_balls_that_disagree()
     for balls in ([large, small], [small, large]):
         radiance, confidence, _ = unwrapped(view, frame, balls, transfer="linear")
         sure = confidence > 0.98
@@ -485,11 +455,7 @@ def test_balls_vote_by_their_pixels(device):
 
 def test_in_a_balls_own_map_others_tell_of_what_it_does_not_see(device):
     """Its light wherever it has a say, whatever the other one's pixels; the other's in its blind cone."""
-    large, small = ((0.0, -0.1, 0.0), 0.06, (1.0, 1.0, 1.0)), ((0.0, 0.1, 0.0), 0.015, (1.0, 1.0, 1.0))
-    view = reference.View((1.0, 0.0, 0.0), (0.0, 0.0, 0.0), focal=900.0)
-    frame = constant_frame(view, 0)
-    frame[:, : view.width // 2] = 255 if view.project([large[0]])[0][0, 0] < view.width / 2 else 0
-    frame[:, view.width // 2 :] = 255 - frame[:, :1]
+    view, frame, large, small = two_balls_that_disagree()
     alone = {ball: unwrapped(view, frame, [ball], transfer="linear") for ball in (large, small)}
     for balls, own, light in (([large, small], 1, 0.0), ([small, large], 0, 0.0), ([small, large], 1, 1.0)):
         radiance, confidence, _ = unwrapped(view, frame, balls, transfer="linear", own=own)

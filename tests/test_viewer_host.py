@@ -25,7 +25,7 @@ from warp_ar.output.sinks import read_environment
 from warp_ar.scene import Animation, Camera, loads_scene
 from warp_ar.viewer import protocol
 from warp_ar.viewer.encoding import encode_jpeg
-from warp_ar.viewer.lighting import Lighting, make_target
+from warp_ar.viewer.lighting import FIRST, Lighting, make_target
 from warp_ar.viewer.protocol import ProtocolError
 
 # JPEG at quality 85 against the picture, mean absolute difference of a synthetic desk in levels; measured 1.4.
@@ -157,7 +157,7 @@ def test_without_viewers_nothing_is_lit() -> None:
 def test_the_camera_is_shown_until_something_is_built_and_the_cheapest_plan_comes_first(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    go_on = {"low": threading.Event(), "medium": threading.Event()}
+    go_on = {FIRST.name: threading.Event(), "medium": threading.Event()}
     loaded = Lighting._warm_up
 
     def wait(self: Lighting, pipeline: Pipeline) -> None:
@@ -172,18 +172,18 @@ def test_the_camera_is_shown_until_something_is_built_and_the_cheapest_plan_come
         plain = running.next()
         assert plain.plan == 0
         assert plain.image is plain.frame, "somebody pretends to have lit it"
-        assert running.host.state_message()["building"]["quality"] == "low"
+        assert running.host.state_message()["building"]["quality"] == FIRST.name
         assert running.host.plan_message()["run"] == []
-        go_on["low"].set()
+        go_on[FIRST.name].set()
         running.until(lambda: running.frames[-1].plan == 1)
-        assert running.host.plan_message()["quality"] == "low"
+        assert running.host.plan_message()["quality"] == FIRST.name
         running.next()
         assert not running.settled, "it says that it is done"
         assert running.host.state_message()["building"]["quality"] == "medium"
         go_on["medium"].set()
         running.until(lambda: running.settled)
         assert running.host.plan_message()["quality"] == "medium"
-        assert [m["quality"] for m in running.messages if m["type"] == "plan"] == ["low", "medium"]
+        assert [m["quality"] for m in running.messages if m["type"] == "plan"] == [FIRST.name, "medium"]
     finally:
         for event in go_on.values():
             event.set()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import struct
+from collections.abc import Iterator
 from typing import Any
 
 import cv2
@@ -121,23 +122,32 @@ def _png(data: bytes) -> Size:
     return width, height
 
 
-def _jpeg(data: bytes) -> Size | None:
+def jpeg_segments(data: bytes) -> Iterator[tuple[int, int]]:
+    """Marker and place of each segment of a JPEG that has a length, up to its pixels, or to what is no segment."""
     at = 2
-    while at + 9 <= len(data):
-        if data[at] != 0xFF:
-            return None
+    while at + 4 <= len(data) and data[at] == 0xFF:
         marker = data[at + 1]
         if marker == 0xFF:  # filling
             at += 1
         elif marker == 0x01 or 0xD0 <= marker <= 0xD8:  # without a length
             at += 2
-        elif 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+        elif marker in (0xD9, 0xDA):  # the end, or pixels
+            return
+        else:
+            yield marker, at
+            length = struct.unpack_from(">H", data, at + 2)[0]
+            if length < 2:
+                return
+            at += 2 + length
+
+
+def _jpeg(data: bytes) -> Size | None:
+    for marker, at in jpeg_segments(data):
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            if at + 9 > len(data):
+                return None
             height, width = struct.unpack_from(">HH", data, at + 5)
             return width, height
-        elif marker in (0xD9, 0xDA):  # the end, or pixels before a header
-            return None
-        else:
-            at += 2 + struct.unpack_from(">H", data, at + 2)[0]
     return None
 
 

@@ -24,7 +24,7 @@ from typing import Any
 from rich.console import Console
 
 from warp_ar.accuracy import tradeoff_page
-from warp_ar.accuracy.case_report import CaseReport, measure_case, settings_of, work_units
+from warp_ar.accuracy.case_report import RUNS, CaseReport, measure_case, settings_of, work_units
 from warp_ar.accuracy.cases import SIZED, VERSIONS, Case, open_cases
 from warp_ar.accuracy.charts import require_plots
 from warp_ar.accuracy.cost_table import SETTINGS, Setting
@@ -38,6 +38,7 @@ from warp_ar.device import resolve_device
 from warp_ar.errors import SceneError, SinkError, SourceError, UsageError
 from warp_ar.files import parse_json, read_text
 from warp_ar.output.own_files import OwnFiles
+from warp_ar.stages.quality import PRESETS
 
 DEFAULT_FRAMES = 12
 
@@ -56,6 +57,12 @@ def make_parser() -> argparse.ArgumentParser:
     )
     add("--stage", metavar="NAME", help=f"turn only this: {', '.join(setting.name for setting in SETTINGS)}")
     add("--presets", action="store_true", help="turn nothing: run whole presets only, and write presets.json")
+    add(
+        "--only",
+        type=lambda text: text.split(","),
+        metavar="A,B",
+        help=f"with --presets: these instead of {','.join(RUNS)}",
+    )
     add("--truth", type=Path, metavar="DIR", help="a case with pictures of the truth, or a folder of cases")
     add(
         "--versions",
@@ -90,6 +97,11 @@ def check(options: argparse.Namespace) -> None:
         raise UsageError(f"--frames {options.frames}: expected 1 or more")
     if options.presets and options.stage is not None:
         raise UsageError(f"--presets --stage {options.stage}: expected one of both")
+    if options.only is not None and not options.presets:
+        raise UsageError(f"--only {','.join(options.only)}: expected --presets beside it")
+    for name in options.only or ():
+        if name not in PRESETS:
+            raise UsageError(f"--only {name}: expected presets of {', '.join(PRESETS)}, separated by commas")
     if options.shrink < 1:
         raise UsageError(f"--shrink {options.shrink}: expected 1 or more")
     if options.stage is not None and options.stage not in {setting.name for setting in SETTINGS}:
@@ -134,7 +146,7 @@ def asked_cases(options: argparse.Namespace, console: Console) -> Asked:
 
 def units_of(options: argparse.Namespace, asked: Asked) -> float:
     """Units of all work: of measuring, and of figures and the page where they are written."""
-    units = sum(work_units(case, settings, quick=options.quick) for case, settings in asked)
+    units = sum(work_units(case, settings, quick=options.quick, presets=options.only) for case, settings in asked)
     if options.out is None or options.presets:
         return units
     units += tradeoff_page.page_units(len(settings) for _, settings in asked)
@@ -147,7 +159,8 @@ def measure(
     """Measure every case, and print its tables."""
     reports = []
     for case, settings in asked:
-        reports.append(measure_case(case, device, settings, advance, quick=options.quick, clock=clock))
+        report = measure_case(case, device, settings, advance, quick=options.quick, clock=clock, presets=options.only)
+        reports.append(report)
         print_report(reports[-1], console)
     return reports
 

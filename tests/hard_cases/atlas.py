@@ -221,7 +221,7 @@ ELSEWHERE: dict[str, tuple[tuple[int, str, str], ...]] = {
     "test_sources.py::test_size_that_changes_is_named": ((16, SOURCE, "*"),),
     "test_sources.py::test_empty_and_foreign_files": ((16, SOURCE, "*"),),
     "test_sources.py::test_truncated_video_gives_what_is_whole_and_names_the_frame": ((16, SOURCE, "*"),),
-    "test_sources.py::test_device_drops_to_the_newest_and_reports_being_unplugged": ((16, SOURCE, "*"),),
+    "test_capture_device.py::test_device_drops_to_the_newest_and_reports_being_unplugged": ((16, SOURCE, "*"),),
     "test_pipeline.py::test_wrong_frames_are_refused_and_the_next_one_works": ((16, PIPELINE, "*"),),
     "test_receiver_cells.py::test_garbage_in_the_environment": (
         (6, "relight", "bounce"),

@@ -89,13 +89,15 @@ def settings_of(case: Case) -> tuple[Setting, ...]:
     return relevant_settings(case.scene, (case.scene.camera.width, case.scene.camera.height))
 
 
-def work_units(case: Case, settings: Sequence[Setting], *, quick: bool = False) -> float:
+def work_units(
+    case: Case, settings: Sequence[Setting], *, quick: bool = False, presets: Sequence[str] | None = None
+) -> float:
     """Units of work that ``measure_case`` will report as done: runs of the case's frames, at most."""
     methods = [setting.measured if quick else setting.methods for setting in settings]
     units = sum(run_units(method) for own in methods for method in own)
     if case.name.endswith(SIZED):
         return units
-    units += len(RUNS) + (0.0 if case.truth else BRUTE_FORCE_UNITS)
+    units += len(presets or RUNS) + (0.0 if case.truth else BRUTE_FORCE_UNITS)
     tries = QUICK_TRIES if quick else TRIES
     return units + (COST_UNITS + 3.0 * (tries + 1) if is_complete(case, settings) else 0.0)
 
@@ -108,6 +110,7 @@ def measure_case(
     *,
     quick: bool = False,
     clock: Clock = time.perf_counter,
+    presets: Sequence[str] | None = None,
 ) -> CaseReport:
     """Sweep every setting, then run presets and the best choices.
 
@@ -118,6 +121,7 @@ def measure_case(
         advance: Told of what is done, ``work_units`` in all.
         quick: Leave brute force out, and what lies between two other methods; time fewer frames, and search less.
         clock: Seconds, on CPU.
+        presets: Those to run as a whole; None means ``RUNS``.
     """
     rows: list[Row] = []
     pictures: dict[tuple[str, str], Image] = {}
@@ -140,11 +144,11 @@ def measure_case(
         region = region_of(case, case.shown[-1], last)
         return CaseReport(case, {case.shown[-1]: last}, tuple(rows), pictures, (), region)
     reference = case.truth or _best_images(case, device, advance, quick=quick)
-    qualities = {name: PRESETS[name] for name in RUNS}
+    qualities = {name: PRESETS[name] for name in presets or RUNS}
     if is_complete(case, settings) and "paper" in qualities:
         qualities |= _find_equals(case, device, settings, rows, reference, clock, advance, quick=quick)
     times, images = run_in_turn(case, qualities, device, clock)
-    advance(f"{case.name}: presets", len(RUNS))
+    advance(f"{case.name}: presets", len(presets or RUNS))
     wholes = tuple(
         Whole(
             label,

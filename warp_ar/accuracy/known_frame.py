@@ -12,8 +12,9 @@ import numpy.typing as npt
 
 from warp_ar.accuracy.path_tracer import LIGHT_SAMPLES, Image, PathTracer
 from warp_ar.engine.pipeline import Pipeline
+from warp_ar.engine.result import Result
 from warp_ar.errors import SourceError, UsageError
-from warp_ar.input.sources import Source, open_source
+from warp_ar.input.sources import Frame, Source, open_source
 from warp_ar.light.captured import CapturedEmitter, Light, texel_solid_angles
 from warp_ar.scene import Exposure, Pose, Scene
 from warp_ar.stages.quality import Quality
@@ -142,23 +143,30 @@ def light_up_to(
             if frame.index < number:
                 continue
             where = f"frame {number} of {frames.description}"
-            if not result.shown:
-                raise SourceError(f"{where} has another exposure than the frames that are shown; name one of those")
-            if result.pose is None:
-                raise SourceError(f"{where} shows no marker, so where things are is not known; name another frame")
-            milliseconds = sum(timing.milliseconds for timing in result.stages.values())
-            light, seconds = light_of(pipeline), frame.time - first
-            return KnownFrame(
-                exposed_scene(pipeline),
-                frame.image.copy(),
-                result.image,
-                result.pose,
-                light,
-                seconds,
-                milliseconds,
-                pipeline.plan.features.others + 1,
-            )
+            return _known_frame(pipeline, frame, result, frame.time - first, where)
     raise SourceError(f"{frames.description} has no frame {number}; it ends before")
+
+
+def _known_frame(pipeline: Pipeline, frame: Frame, result: Result, seconds: float, where: str) -> KnownFrame:
+    """What is known of the frame that a pipeline lit last, ``seconds`` after the first.
+
+    Raises:
+        SourceError: It is not shown, or shows no marker; ``where`` names it.
+    """
+    if not result.shown:
+        raise SourceError(f"{where} has another exposure than the frames that are shown; name one of those")
+    if result.pose is None:
+        raise SourceError(f"{where} shows no marker, so where things are is not known; name another frame")
+    return KnownFrame(
+        exposed_scene(pipeline),
+        frame.image.copy(),
+        result.image,
+        result.pose,
+        light_of(pipeline),
+        seconds,
+        sum(timing.milliseconds for timing in result.stages.values()),
+        pipeline.plan.features.others + 1,
+    )
 
 
 def exposed_scene(pipeline: Pipeline) -> Scene:

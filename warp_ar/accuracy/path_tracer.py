@@ -362,7 +362,7 @@ class PathTracer:
         return TracedPicture(radiance, error, image, self.samples, self._seconds, relative)
 
     def shown(self) -> npt.NDArray[np.int32]:
-        """Index of the proxy that the frame shows in the middle of every pixel, -1 for none, (H, W)."""
+        """Index of the proxy that alone the frame shows in every pixel, -1 for none or several surfaces, (H, W)."""
         self.prepare()
         with exclusive(self.device):
             return np.array(self._local.shown.numpy())

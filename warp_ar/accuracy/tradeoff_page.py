@@ -348,6 +348,34 @@ def page_units(settings: Iterable[int]) -> float:
     return SECTION_UNITS * sum(count + 2 for count in settings)
 
 
+def _is_by_clock(made: Mapping[str, Any]) -> bool:
+    """Whether milliseconds are those of the clock, not of processors."""
+    return bool(made.get("clock", "time") == "time")
+
+
+def _introduction(made: Mapping[str, Any]) -> str:
+    """The page's head, and how it is read."""
+    by_clock = _is_by_clock(made)
+    counted = "" if by_clock else " Milliseconds are processor time: the work of one thread that does it all."
+    ramp = error_colors(np.linspace(0.0, 1.0, 128)[None].repeat(4, 0) ** 2)
+    # The ramp's colours go with the root of the error.
+    marks = "".join(f"<span>{mark * mark:.2g}</span>" for mark in np.linspace(0.1, 0.9, 5))
+    return (
+        f'<!doctype html>{COMMENT}<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width,initial-scale=1"><title>What accuracy costs</title>'
+        f"<style>{_STYLE}</style></head><body><main><h1>What accuracy costs</h1>"
+        '<p class="lead">Every stage has methods, from the paper\'s way to brute force. Here is what each takes and '
+        "what it errs: lower is truer, further left is faster.</p>"
+        f'<p class="soft">Measured on {html.escape(str(made["device"]))} with Warp {html.escape(str(made["warp"]))}, '
+        f"marker tracking left out.{counted} Filled points are the Pareto front; of hollow grey ones "
+        "another costs less and errs less. <b>Equal time</b> is sought as the choice that errs least by the cost table "
+        "and takes no longer than the paper's way (the cheapest, where all take longer), <b>equal error</b> as the "
+        "cheapest that errs no more; what they took and erred when all ran in turn is stated for each scene.</p>"
+        f'<p class="soft">Error maps show FLIP: <span class="scale"><img alt="black to yellow" src="{data_uri(ramp)}">'
+        f"{marks}</span></p>"
+    )
+
+
 def render(
     reports: Sequence[CaseReport],
     figures: Sequence[Figure],
@@ -371,26 +399,11 @@ def render(
 
     anchors = [(f"case{index}", report) for index, report in enumerate(reports)]
     whole = [(anchor, report) for anchor, report in anchors if report.wholes]
-    by_clock = made.get("clock", "time") == "time"
-    limit = REAL_TIME if by_clock else None
-    counted = "" if by_clock else " Milliseconds are processor time: the work of one thread that does it all."
-    ramp = error_colors(np.linspace(0.0, 1.0, 128)[None].repeat(4, 0) ** 2)
-    # The ramp's colours go with the root of the error.
-    marks = "".join(f"<span>{mark * mark:.2g}</span>" for mark in np.linspace(0.1, 0.9, 5))
+    limit = REAL_TIME if _is_by_clock(made) else None
     lines = [line for line in extra if str(line.get("case", "")).startswith("precision")]
     parts = [
-        f'<!doctype html>{COMMENT}<html lang="en"><head><meta charset="utf-8">',
-        '<meta name="viewport" content="width=device-width,initial-scale=1"><title>What accuracy costs</title>',
-        f"<style>{_STYLE}</style></head><body><main><h1>What accuracy costs</h1>",
-        '<p class="lead">Every stage has methods, from the paper\'s way to brute force. Here is what each takes and '
-        "what it errs: lower is truer, further left is faster.</p>",
-        f'<p class="soft">Measured on {html.escape(str(made["device"]))} with Warp {html.escape(str(made["warp"]))}, '
-        f"marker tracking left out.{counted} Filled points are the Pareto front; of hollow grey ones "
-        "another costs less and errs less. <b>Equal time</b> is sought as the choice that errs least by the cost table "
-        "and takes no longer than the paper's way (the cheapest, where all take longer), <b>equal error</b> as the "
-        "cheapest that errs no more; what they took and erred when all ran in turn is stated for each scene.</p>",
-        f'<p class="soft">Error maps show FLIP: <span class="scale"><img alt="black to yellow" src="{data_uri(ramp)}">'
-        f"{marks}</span></p><nav>",
+        _introduction(made),
+        "<nav>",
         *(f'<a href="#{anchor}">{html.escape(report.case.name)}</a>' for anchor, report in anchors),
         '<a href="#figures">The paper\'s figures</a>' if figures else "",
         '<a href="#list">The cost table</a>',

@@ -2,8 +2,9 @@
 
 Warp translates Python to C++ in one thread at a time and leaves its compilers, which take most of the time, to run
 beside it. Each thread of a process has Clang parse Warp's headers anew, for 1.5 s, before it compiles its first module;
-here they are parsed once and kept beside the compiled kernels. Modules of the same flags follow each other: Clang's
-options belong to the process, so that compilers with other flags would wait for each other.
+here they are parsed once, with the templates that they call for, and kept beside the compiled kernels. Modules of the
+same flags follow each other: Clang's options belong to the process, so that compilers with other flags would wait for
+each other.
 """
 
 from __future__ import annotations
@@ -27,12 +28,16 @@ import warp as wp
 
 from warp_ar.device import compiling, exclusive, usable_cores
 from warp_ar.engine.tiers import QUICK_FLAGS, choose, compile_better, digest
+from warp_ar.kernels.launch import UNCHECKED
 
 Progress = Callable[[int, int], None]
 """Told how many of how many modules are compiled, first with 0; not called where all were compiled before."""
 
 _AHEAD: list[threading.Thread] = []
 """Threads that parse headers before there is anything to compile."""
+_INSTANTIATE = "-fpch-instantiate-templates"
+"""Clang's flag with which headers are parsed: what they call for of their own templates is made once, with them, not in
+every module. Modules that are compiled without it take such headers, and give the same binary to the byte."""
 _HEADER_WAIT = 10.0
 """Seconds that a thread waits for another's headers before it parses them itself."""
 
@@ -125,6 +130,21 @@ def remember_references() -> None:
     adjoint.get_references = get_references
 
 
+def drop_unused_adjoints() -> None:
+    """Have Warp write the sums and adjoints of structs so that Clang leaves out those that a module does not call.
+
+    As Warp writes them, other modules could call them, though none does: for each struct of each module Clang makes an
+    atomic sum of all its fields, though no kernel here has an adjoint. For commands alone: it changes Warp's own text,
+    not what modules are named by, and where this Warp writes structs otherwise nothing changes.
+    """
+    codegen: Any = getattr(getattr(wp, "_src", None), "codegen", None)
+    template = getattr(codegen, "struct_template", None)
+    if isinstance(template, str):
+        for function in ("{name} add(", "void adj_atomic_add("):
+            template = template.replace(f"\nCUDA_CALLABLE {function}", f"\ninline CUDA_CALLABLE {function}")
+        codegen.struct_template = template
+
+
 def _is_own(module: Any) -> bool:
     return str(module.__name__).startswith("warp_ar.")
 
@@ -132,6 +152,8 @@ def _is_own(module: Any) -> bool:
 def _compile(variants: list[tuple[Any, int | None]], device: Any, progress: Progress | None) -> None:
     """Compile modules, each for a size of block; None means the usual one."""
     cores = usable_cores()
+    if device.is_cpu:
+        parse_headers_ahead()  # the first module would have to wait for them, too
     while _AHEAD:
         _AHEAD.pop().join()
     headers = _Headers({_flags(module) for module, _ in variants}) if device.is_cpu else None
@@ -204,7 +226,7 @@ class _Headers:
         Args:
             flags: Of the modules that will be compiled.
         """
-        self._flags = {*flags, str(wp.config.cpu_compiler_flags)}
+        self._flags = {*flags, str(wp.config.cpu_compiler_flags), _header_flags()}
         self._folder_of_thread = (
             getattr(_runtime(), "get_clang_pch_dir", None) if wp.config.use_precompiled_headers else None
         )
@@ -218,7 +240,7 @@ class _Headers:
             self._folder_of_thread = None
             return
         stat = builtin.stat()
-        key = f"{wp.__version__} {builtin} {stat.st_mtime_ns} {stat.st_size} {wp.config.cpu_compiler_flags}"
+        key = f"{wp.__version__} {builtin} {stat.st_mtime_ns} {stat.st_size} {_header_flags()}"
         self._store = Path(wp.config.kernel_cache_dir) / f"headers_{hashlib.sha256(key.encode()).hexdigest()[:16]}"
         folders = getattr(_runtime(), "_pch_dirs", None)
         parsed = folders.get(threading.get_ident()) if isinstance(folders, dict) else None
@@ -241,7 +263,7 @@ class _Headers:
         Args:
             build: Warp's function that compiles a file of C++.
         """
-        flags = str(wp.config.cpu_compiler_flags)
+        flags = _header_flags()
         with self.shared(flags), tempfile.TemporaryDirectory() as folder:
             source = Path(folder) / "headers.cpp"
             source.write_text('#include "builtin.h"\n', encoding="utf-8")
@@ -337,9 +359,16 @@ def _runtime() -> Any:
     return getattr(getattr(getattr(wp, "_src", None), "context", None), "runtime", None)
 
 
+def _header_flags() -> str:
+    """What Clang is called with for headers."""
+    return f"{wp.config.cpu_compiler_flags} {_INSTANTIATE}"
+
+
 def _clang_flags(flags: str) -> list[str]:
-    """Flags without those of LLVM and of its passes."""
-    return [word for word in flags.split() if not word.startswith("-mllvm=") and not word.endswith("vectorize")]
+    """Flags without those of LLVM and of its passes, and without those that fit any headers."""
+    apart = {_INSTANTIATE, *UNCHECKED.split()}
+    words = [word for word in flags.split() if not word.startswith("-mllvm=") and word not in apart]
+    return [word for word in words if not word.endswith("vectorize")]
 
 
 def _headers_in(folder: Path) -> list[Path]:

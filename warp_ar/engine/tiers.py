@@ -24,7 +24,7 @@ import warp as wp
 
 from warp_ar.engine.better_kernels import work_at_once, work_folder
 from warp_ar.errors import UsageError
-from warp_ar.kernels.launch import is_slow_to_compile
+from warp_ar.kernels.launch import UNCHECKED, is_slow_to_compile
 
 VARIABLE: Final = "WARP_AR_TIERS"
 """Environment variable: ``one``, kernels as good as they get before the first frame, which is the rule; ``two``, as
@@ -32,7 +32,7 @@ commands do; ``quick``, the quick ones and no others, for measuring."""
 LEVEL_VARIABLE: Final = "WARP_AR_CUDA_LEVEL"
 """Environment variable, for measuring: NVRTC's level of optimisation, 1 to 3, of all kernels (``2``) or of those whose
 names hold one of several words (``2:near_field,mirror_ball``)."""
-QUICK_FLAGS: Final = "-march=native -mllvm=-inline-threshold=225 -fno-slp-vectorize"
+QUICK_FLAGS: Final = f"-march=native -mllvm=-inline-threshold=225 -fno-slp-vectorize {UNCHECKED}"
 """Of the first way: LLVM's own bound of inlining instead of Warp's 9,000, no vectors of straight code."""
 
 _MODES: Final = ("one", "two", "quick")

@@ -100,12 +100,7 @@ def measure_ball(
     tell("the ball's outlines")
     outlines = agreeing_outlines(few, camera, probe, ground)
     if not outlines:
-        report = outline_search(views, camera, probe.center, probe.radius)
-        if report.contrast < LEAST_CONTRAST:
-            raise UsageError(_not_seen(probe))
-        return BallMeasurement(
-            report.center, SEARCH_DEVIATION, probe.radius, None, "by its rim's contrast, height as given"
-        )
+        return _measure_by_contrast(views, camera, probe)
     solution = solve_ball(outlines, camera, probe, ground)
     if abs(solution.radius - probe.radius) > STRAY * probe.radius:
         raise UsageError(
@@ -124,21 +119,46 @@ def measure_ball(
             own = SLOPE * deviation
             solution = dataclasses.replace(solution, center=mirrored.center)
             how = "by the desk in it"
-    better = None
     tell("its place, by what it mirrors")
-    try:
-        found = dataclasses.replace(probe, center=solution.center, radius=radius)
-        better = fit_ball(few, camera, found, proxies, others, search=SEARCH)
-    except UsageError:
-        pass
     told = None if assumed else deviation
-    if better is not None and better.is_good:
-        spread = math.hypot(better.deviation, SLOPE * deviation)
-        center = tuple(float(value) for value in better.center)
-        # Both are right within their intervals, or the mirrored receiver has been confused with another part of it.
-        if math.dist(center, solution.center) < 3 * math.hypot(spread, own) and spread < own:
-            return BallMeasurement((center[0], center[1], center[2]), spread, radius, told, "by the desk in it")
-    return BallMeasurement(solution.center, own, radius, told, how.format(len(outlines)))
+    by_outlines = BallMeasurement(solution.center, own, radius, told, how.format(len(outlines)))
+    found = dataclasses.replace(probe, center=solution.center, radius=radius)
+    return _refine_center(by_outlines, few, camera, found, proxies, others, SLOPE * deviation)
+
+
+def _measure_by_contrast(views: Sequence[tuple[Image, Pose]], camera: Camera, probe: Probe) -> BallMeasurement:
+    """Where no outline is found: the place at which the contrast across one is largest."""
+    report = outline_search(views, camera, probe.center, probe.radius)
+    if report.contrast < LEAST_CONTRAST:
+        raise UsageError(_not_seen(probe))
+    return BallMeasurement(
+        report.center, SEARCH_DEVIATION, probe.radius, None, "by its rim's contrast, height as given"
+    )
+
+
+def _refine_center(
+    measured: BallMeasurement,
+    views: Sequence[tuple[Image, Pose]],
+    camera: Camera,
+    probe: Probe,
+    proxies: Sequence[Proxy],
+    others: Sequence[Probe],
+    by_radius: float,
+) -> BallMeasurement:
+    """With the centre that the mirrored receiver tells, where that is surer; ``by_radius``: what its radius adds."""
+    try:
+        better = fit_ball(views, camera, probe, proxies, others, search=SEARCH)
+    except UsageError:
+        return measured
+    if better is None or not better.is_good:
+        return measured
+    spread = math.hypot(better.deviation, by_radius)
+    x, y, z = (float(value) for value in better.center)
+    # Both are right within their intervals, or the mirrored receiver has been confused with another part of it.
+    apart = math.dist((x, y, z), measured.center)
+    if apart < 3 * math.hypot(spread, measured.deviation) and spread < measured.deviation:
+        return dataclasses.replace(measured, center=(x, y, z), deviation=spread, how="by the desk in it")
+    return measured
 
 
 def _not_seen(probe: Probe) -> str:

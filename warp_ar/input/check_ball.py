@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from warp_ar.errors import UsageError
 from warp_ar.input.ball_finder import find_ball
 from warp_ar.input.ball_radius import explains_better
+from warp_ar.input.ball_reflectance import measure_reflectance
 from warp_ar.input.ball_solve import BallSolution, ground_below, rough_circle, solve_ball
 from warp_ar.input.ball_views import agreeing_outlines
 from warp_ar.input.check_pictures import Look
@@ -37,6 +38,10 @@ SEEN: Final = 0.46
 
 A ball in the open, whose rim here and there looks like what is behind it, shows 0.50 to 0.97; half hidden it shows
 0.44.
+"""
+REFLECTANCE: Final = 0.12
+"""Logarithm by which a ball may reflect more or less than the scene says: another response than the camera's, or a
+radius that is 5 % off, moves what is measured by up to 0.09.
 """
 SIDES: Final = 6
 """Frames in which what the ball stands on is looked for in its place."""
@@ -113,7 +118,27 @@ def _check_ball(
     # A ball that explains what is mirrored is right, and the outlines are edges beside its rim.
     if off and explains_better(views, look.camera, probe, seen_ball, scene.proxies, others):
         off = []
-    return [*found, *off]
+    return [*found, *(off or _check_reflectance(scene, look, views, probe, label))]
+
+
+def _check_reflectance(
+    scene: Scene, look: Look, views: Sequence[tuple[Image, Pose]], probe: Probe, label: str
+) -> list[Finding]:
+    """The finding that what the ball mirrors is too bright or too dark there for its reflectance."""
+    measured = [measure_reflectance(scene, look.camera, probe, view, look.table) for view in views]
+    told = [one for one in measured if one is not None]
+    if not told or 2 * len(told) < len(views):
+        return []
+    found = np.median([one.reflectance for one in told], axis=0)
+    if abs(float(np.log(found / np.array(probe.reflectance)).mean())) < REFLECTANCE:
+        return []
+    red, green, blue = np.minimum(found, 1.0)
+    text = (
+        f"{label} reflectance = {float(np.mean(probe.reflectance)):.2g}: what stands beside the ball is "
+        f"{float(found.mean()):.2f} times as bright mirrored in it as seen directly"
+    )
+    remedy = f"write reflectance = [{red:.2f}, {green:.2f}, {blue:.2f}], or wipe the ball"
+    return [Finding("ball.reflectance", text, remedy)]
 
 
 def _ground(scene: Scene, probe: Probe) -> float | None:

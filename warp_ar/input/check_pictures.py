@@ -38,9 +38,10 @@ DARK: Final = 0.04
 """Linear camera value below which white paper is too dark: its noise is that of the whole picture."""
 CONTRAST: Final = 0.5
 """Black ink over white paper, linear, above which it is haze, gloss, or another transfer curve."""
-STEEPEST: Final = 45.0
-"""White paper over black ink, linear, above which no print on plain paper is: that of laser printers is 20 to 30, the
-bundled clips' is 21. An S-shaped curve, as cameras lay over what they show, makes it 40 to 100."""
+STEEPEST: Final = 33.0
+"""White paper over black ink, linear, above which no print on plain paper is: that of laser printers is 20 to 30, and
+is read within a tenth (the bundled clips' is 21, read as 19 to 23 in right set-ups). An S-shaped curve, as cameras lay
+over what they show, makes it 35 to 43 by half of smoothstep, and 84 to 103 by all of it."""
 SHADOW: Final = 0.45
 """Logarithm of light across the card that a smooth fall does not explain."""
 BLURRED: Final = 6.0

@@ -32,7 +32,8 @@ def _sections(source: str | int, marker: Marker, center: Sequence[float], radius
         ("[source]", "", [("source", "camera" if isinstance(source, int) else "path", json.dumps(source))]),
         (
             "[marker]",
-            "The printed card. If its ruler is not 100 mm, scale both lengths of the board by what it is.",
+            "The printed card. If its rulers are not 100 mm long, multiply both lengths of the board by their length "
+            "over 100 mm.",
             [("marker", "dictionary", json.dumps(marker.dictionary)), ("marker", "board", json.dumps(board))],
         ),
         (

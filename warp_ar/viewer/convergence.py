@@ -30,10 +30,10 @@ LIGHT_SAMPLES: Final = 8
 """Per pixel, by which the reflectance of proxies is found; fewer than offline, for somebody waits."""
 LEAST_SAMPLES: Final = 16
 """Per pixel, before which an error is not believed."""
+GOAL: Final = 0.002
+"""Relative standard error at which a picture rests."""
 MOST_SAMPLES: Final = 4096
-"""Per pixel, after which a picture rests."""
-LEAST_ERROR: Final = 0.002
-"""Relative standard error at which it does, too."""
+"""Per pixel, after which it does, too."""
 
 
 def false_colors(image: Image, reference: Image) -> Image:
@@ -42,6 +42,13 @@ def false_colors(image: Image, reference: Image) -> Image:
     share = np.clip(off / (255.0 * FULL_SCALE), 0.0, 1.0)
     colors = cv2.applyColorMap(np.round(255.0 * share).astype(np.uint8), cv2.COLORMAP_INFERNO)
     return np.ascontiguousarray(colors[..., ::-1])
+
+
+def _is_done(picture: TracedPicture) -> bool:
+    """Whether no more samples are added."""
+    if picture.samples < LEAST_SAMPLES:
+        return False
+    return picture.samples >= MOST_SAMPLES or picture.relative_error <= GOAL
 
 
 class Convergence:
@@ -107,12 +114,18 @@ class Convergence:
         if key != self._key or self._made is None:
             return False
         picture = self._picture
-        if picture is None or picture.samples < LEAST_SAMPLES:
-            return True
-        return picture.samples < MOST_SAMPLES and picture.relative_error > LEAST_ERROR
+        return picture is None or not _is_done(picture)
+
+    def rests(self, key: Any) -> bool:
+        """Whether the picture of ``key`` is as good as it gets."""
+        return key == self._key and self._picture is not None and _is_done(self._picture)
 
     def step(self) -> bool:
-        """Add a slice of samples; whether there is a new picture to show."""
+        """Add a slice of samples; whether there is a new picture to show.
+
+        Raises:
+            WarpArError: The frame cannot be traced, such as where a mesh's file is gone; it is not tried again.
+        """
         made = self._made
         if made is None or not made.done():
             time.sleep(0.5 * SLICE_SECONDS)
@@ -120,8 +133,8 @@ class Convergence:
         try:
             tracer = made.result()
         except WarpArError:
-            self._made = None  # such as a mesh that is gone: the picture goes on without a reference
-            return False
+            self._made = None  # the picture goes on without a reference
+            raise
         tracer.sample_for(SLICE_SECONDS)
         now = time.monotonic()
         if tracer.samples < 1 or now - self._shown < SHOWN_SECONDS:
@@ -140,11 +153,13 @@ class Convergence:
         return picture.image if compare == TRACED else false_colors(lit, picture.image)
 
     def _told(self, picture: TracedPicture, lit: Image) -> dict[str, float]:
-        """Samples, relative standard error and mean difference of the picture; the latter two in per cent."""
+        """Samples, relative standard error and mean difference of the picture; all but the first in per cent."""
         off = float(cv2.norm(lit, picture.image, cv2.NORM_L1)) / lit.size
         return {
             "samples": picture.samples,
             "error": round(100.0 * picture.relative_error, 2),
+            "goal": 100.0 * GOAL,
+            "done": _is_done(picture),
             "difference": round(100.0 * off / 255.0, 3),
             "scale": 100.0 * FULL_SCALE,
         }

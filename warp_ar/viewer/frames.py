@@ -118,6 +118,7 @@ class FrameLoop:
         """Of the newest frame that was lit, since the first: the time of animations."""
         self._times: collections.deque[float] = collections.deque(maxlen=60)
         self._at = 0.0
+        self._compared = ""
         self.convergence = Convergence()
         """The reference of a held frame."""
         self.latest: Lit | None = None
@@ -219,23 +220,44 @@ class FrameLoop:
         """What a held picture is of, the frame's own time among it; another one is dropped."""
         return self._controls.wanted, self._plan, self._at
 
-    def _converges(self) -> bool:
-        """Whether samples are to be added to the reference of the held frame, which nothing has changed."""
+    def _asks_reference(self) -> bool:
+        """Whether a held frame is compared with its reference, and nothing changes how it is lit."""
         controls, latest = self._controls, self.latest
         asked = controls.compare in CONVERGING and not controls.playing and latest is not None and latest.plan != 0
-        return asked and not self._helpers.lighting.changing and self.convergence.wants(self._held())
+        return asked and not self._helpers.lighting.changing
+
+    def _converges(self) -> bool:
+        """Whether samples are to be added to the reference of the held frame, which nothing has changed."""
+        return self._asks_reference() and self.convergence.wants(self._held())
 
     def _converge(self) -> bool:
-        """Add a slice of samples, and hand out what they show; False where the frame is to be lit instead."""
-        latest = self.latest
-        if not self._converges() or latest is None:
+        """Add a slice of samples, and hand out what they show; False where the frame is to be lit instead.
+
+        At rest the picture stays that of the reference: lit again, it would have light that came in meanwhile.
+        """
+        latest, compare = self.latest, self._controls.compare
+        if latest is None or not self._asks_reference():
             return False
-        if self.convergence.step():
+        if self.convergence.rests(self._held()) and self._helpers.recorder.count is None:
+            shows = compare != self._compared
+        elif self.convergence.wants(self._held()):
+            shows = self._step()
+        else:
+            return False
+        if shows:
             self._id += 1
-            other = self.convergence.other(self._held(), self._controls.compare)
+            other, self._compared = self.convergence.other(self._held(), compare), compare
             self.latest = dataclasses.replace(latest, id=self._id, taken=time.monotonic(), stamp=None, other=other)
             self._publish(self.latest)
         return True
+
+    def _step(self) -> bool:
+        """Add a slice of samples; whether there is a new picture to show. What cannot be traced is told."""
+        try:
+            return self.convergence.step()
+        except WarpArError as error:
+            self._notify(messages.notice(error))
+            return False
 
     def _beside(self, pipeline: Pipeline, frame: Frame, result: Result, now: float) -> Image | None:
         """What the picture is compared with."""
@@ -246,6 +268,7 @@ class FrameLoop:
             return lighting.other(frame, now)
         if not controls.playing and not lighting.changing:
             self.convergence.begin(self._held(), pipeline, frame.image, result, now, lighting.builder)
+        self._compared = controls.compare
         return self.convergence.other(self._held(), controls.compare)
 
     def _light_frame(self, frame: Frame, now: float) -> bool:

@@ -18,6 +18,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final, TypeAlias
 
 from warp_ar.errors import WarpArError
+from warp_ar.pictures import jpeg_segments
 
 SCHEMA: Final = 3
 """Number of what both sides may say, told in ``hello``; it grows when keys change."""
@@ -428,24 +429,13 @@ def jpeg_size(data: bytes) -> tuple[int, int] | None:
     """Width and height that a JPEG of three 8-bit components says it has, before decoding; None if it is none."""
     if data[:2] != b"\xff\xd8":
         return None
-    place = 2
-    while place + 4 <= len(data):
-        if data[place] != 0xFF:
-            return None
-        marker = data[place + 1]
-        if marker == 0xFF:  # padding
-            place += 1
-            continue
-        length = int.from_bytes(data[place + 2 : place + 4], "big")
+    for marker, at in jpeg_segments(data):
         # Start of frame: baseline, extended and progressive Huffman; the other kinds no browser writes.
         if marker in (0xC0, 0xC1, 0xC2):
-            if place + 10 > len(data) or data[place + 4] != 8 or data[place + 9] != 3:
+            if at + 10 > len(data) or data[at + 4] != 8 or data[at + 9] != 3:
                 return None
-            height, width = struct.unpack_from(">HH", data, place + 5)
+            height, width = struct.unpack_from(">HH", data, at + 5)
             return (width, height) if width and height else None
-        if marker in (0xD9, 0xDA) or length < 2:
-            return None
-        place += 2 + length
     return None
 
 

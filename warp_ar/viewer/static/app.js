@@ -221,7 +221,8 @@ function rightTag() {
   const name = compare === "traced" ? "path tracing" : "difference to path tracing";
   if (state.playing) return `${name}: hold the frame`;
   if (!convergence) return `${name} …`;
-  return `${name}: ${convergence.samples} samples, error ${convergence.error.toFixed(1)} %, differs by ${convergence.difference.toFixed(2)} %`;
+  const { samples, error, goal, done, difference } = convergence;
+  return `${name}: ${samples} samples, error ${error.toFixed(1)} % (${done ? "done" : `until ${goal.toFixed(1)} %`}), differs by ${difference.toFixed(2)} %`;
 }
 
 function showSplit() {

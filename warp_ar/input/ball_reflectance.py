@@ -1,0 +1,186 @@
+"""How much of the light a mirror ball reflects, told by what is seen twice: directly, and mirrored in the ball.
+
+A matt surface has one radiance wherever it is seen from. So where the ball mirrors a point of a modelled plane that the
+camera sees beside the ball as well, the ball's pixel over that point's own is the ball's reflectance:
+
+    reflectance = median over pixels of L(pixel of the ball) / L(projection of the mirrored point).
+
+Neither card nor light must be known, and shadows do no harm: they lie on the point, whichever way it is looked at. What
+does is a response that is not the camera's (a ratio r becomes r^g with the wrong exponent g: 7 % at most for gammas of
+1.8 to 2.6 taken for sRGB), a surface that shines, and a ball elsewhere than the scene has it: the two pictures then
+differ in their course, which their correlation tells.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from warp_ar.scene import Camera, Pose, Probe, Proxy, Scene
+from warp_ar.scene.geometry import rotation_matrix
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+FACING: Final = 0.35
+"""Least cosine at which the ball is met: nearer to its rim a pixel mirrors a wide patch."""
+GRAZING: Final = 0.25
+"""Least cosine at which a plane is looked at, by the camera and by way of the ball: beyond it even paper shines."""
+BESIDE: Final = 1.15
+"""Radii from the ball's middle in the picture from which on a point is not the ball's own."""
+CODES: Final = (12, 200)
+"""Codes that are neither quantised nor near a shoulder."""
+BLUR: Final = 1.5
+"""Pixels of blur of what is seen directly: its texture is mirrored smaller than it is seen."""
+FEWEST: Final = 200
+"""Pixels that must tell."""
+SCATTER: Final = 0.2
+"""Greatest standard deviation of one pixel's logarithm: with more, the two do not show the same."""
+ALIKE: Final = 0.6
+"""Least correlation of both pictures' logarithms."""
+NEAR: Final = 1e-4
+"""Metres from which on a ray may meet something."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Reflected:
+    """What one picture says of a ball."""
+
+    reflectance: tuple[float, float, float]
+    """RGB."""
+    pixels: int
+    """Pixels that say so."""
+
+
+def measure_reflectance(
+    scene: Scene, camera: Camera, probe: Probe, view: tuple[Image, Pose], table: NDArray[np.float32]
+) -> Reflected | None:
+    """The reflectance of a ball by one picture.
+
+    Args:
+        scene: What stands around the ball.
+        camera: Of the picture's size.
+        probe: The ball, where it is seen.
+        view: RGB picture (h, w, 3) and ``camera_from_world``.
+        table: Linear value of each code, (256, 3).
+
+    Returns:
+        None where the ball mirrors too little of what the camera sees as well, or both do not show the same.
+    """
+    image, pose = view
+    mirrored, points = _mirrored_points(scene, camera, probe, pose)
+    if len(points) < FEWEST:
+        return None
+    linear = np.stack([table[image[..., k], k] for k in range(3)], -1)
+    direct = _pixels_of(camera, pose, points)
+    x, y = direct.astype(np.float32).T
+    blurred = cv2.GaussianBlur(linear, (0, 0), BLUR)
+    beside = cv2.remap(blurred, x[:, None], y[:, None], cv2.INTER_LINEAR)[:, 0].astype(float)
+    column, row = np.round(direct).astype(int).T
+    own, other = image[mirrored[:, 1], mirrored[:, 0]], image[row, column]
+    tells = ((own > CODES[0]) & (own < CODES[1]) & (other > CODES[0]) & (other < CODES[1])).all(axis=1)
+    if tells.sum() < FEWEST:
+        return None
+    logs = np.log(linear[mirrored[tells, 1], mirrored[tells, 0]].astype(float)), np.log(beside[tells])
+    ratio = logs[0] - logs[1]
+    both = [part.mean(axis=1) for part in logs]
+    off = np.abs(both[0] - both[1] - np.median(both[0] - both[1]))
+    correlation = float(np.corrcoef(*both)[0, 1]) if min(np.ptp(part) for part in both) > 0.0 else 0.0
+    if 1.4826 * float(np.median(off)) > SCATTER or correlation < ALIKE:
+        return None
+    red, green, blue = (float(value) for value in np.exp(np.median(ratio, axis=0)))
+    return Reflected((red, green, blue), int(tells.sum()))
+
+
+def _mirrored_points(scene: Scene, camera: Camera, probe: Probe, pose: Pose) -> tuple[NDArray[np.int64], Array]:
+    """Pixels of the ball (n, 2) and the points of matt planes that they mirror and the camera sees, (n, 3)."""
+    center, radius = np.array(probe.center, float), probe.radius
+    eye = -pose.rotation.T @ pose.translation
+    nothing = np.zeros((0, 2), np.int64), np.zeros((0, 3))
+    depth = float((pose.rotation @ center + pose.translation)[2])
+    if depth <= radius:
+        return nothing
+    middle = _pixels_of(camera, pose, center[None])[0]
+    reach = camera.fx * radius / (depth - radius)
+    low = np.maximum(np.floor(middle - reach), 0).astype(int)
+    high = np.minimum(np.ceil(middle + reach) + 1, (camera.width, camera.height)).astype(int)
+    if (low >= high).any():
+        return nothing
+    pixels = np.stack(np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1])), -1).reshape(-1, 2)
+    local = cv2.undistortPoints(
+        pixels[:, None].astype(float), camera.matrix(), np.asarray(camera.distortion, float)
+    ).reshape(-1, 2)
+    rays = _unit(np.column_stack([local, np.ones(len(local))]) @ pose.rotation)
+    along = rays @ (eye - center)
+    within = along**2 - float((eye - center) @ (eye - center)) + radius**2
+    hit = eye + (-along - np.sqrt(np.maximum(within, 0.0)))[:, None] * rays
+    normal = (hit - center) / radius
+    facing = -(normal * rays).sum(axis=1)
+    met = (within > 0.0) & (facing > FACING)
+    pixels, hit = pixels[met], hit[met]
+    outward = rays[met] + 2.0 * facing[met, None] * normal[met]
+    distance, is_matt = _nearest(scene.proxies, hit, outward)
+    points = hit + np.where(is_matt, distance, 0.0)[:, None] * outward
+    seen = is_matt & _are_seen(scene, camera, probe, pose, points)
+    return pixels[seen], points[seen]
+
+
+def _are_seen(scene: Scene, camera: Camera, probe: Probe, pose: Pose, points: Array) -> NDArray[np.bool_]:
+    """Whether the camera sees points of planes beside the ball, (n,)."""
+    eye = -pose.rotation.T @ pose.translation
+    ahead = (points @ pose.rotation.T + pose.translation)[:, 2] > NEAR
+    at = _pixels_of(camera, pose, np.where(ahead[:, None], points, np.array(probe.center, float)))
+    seen = ahead & (at > 1.0).all(axis=1) & (at < (camera.width - 2, camera.height - 2)).all(axis=1)
+    ray = points - eye
+    away = np.linalg.norm(ray, axis=1)
+    distance, is_matt = _nearest(scene.proxies, np.broadcast_to(eye, points.shape), _unit(ray))
+    seen &= is_matt & (np.abs(distance - away) < 0.01 * away)
+    for ball in scene.probes:
+        offset = np.array(ball.center, float) - eye
+        along = _unit(ray) @ offset
+        beside = np.sqrt(np.maximum(float(offset @ offset) - along**2, 0.0))
+        seen &= (beside > BESIDE * ball.radius) | (along > away)
+    return np.asarray(seen, np.bool_)
+
+
+def _nearest(proxies: tuple[Proxy, ...], origin: Array, rays: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Distance to what rays meet first, and whether that is a matt plane that is not met at a grazing angle, (n,).
+
+    Meshes are left out: what they hide scatters.
+    """
+    nearest, is_matt = np.full(len(rays), np.inf), np.zeros(len(rays), bool)
+    for proxy in proxies:
+        if proxy.shape == "mesh" or proxy.marker is not None:
+            continue
+        rotation = rotation_matrix(proxy.rotate)
+        start, ray = (origin - np.array(proxy.at)) @ rotation, rays @ rotation
+        inverse = 1.0 / np.where(np.abs(ray) < 1e-9, 1e-9, ray)
+        half = 0.5 * np.array(proxy.size, float)
+        if proxy.shape == "plane":
+            distance = -start[:, 2] * inverse[:, 2]
+            place = start[:, :2] + distance[:, None] * ray[:, :2]
+            met = (distance > NEAR) & (np.abs(place) < half).all(axis=1)
+            matt = (ray[:, 2] < -GRAZING) & (proxy.material is None)
+        else:
+            ends = (-half - start) * inverse, (half - start) * inverse
+            distance = np.minimum(*ends).max(axis=1)
+            met = (distance > NEAR) & (distance < np.maximum(*ends).min(axis=1))
+            matt = np.zeros(len(rays), bool)
+        closer = met & (distance < nearest)
+        nearest[closer], is_matt[closer] = distance[closer], matt[closer]
+    return nearest, is_matt
+
+
+def _pixels_of(camera: Camera, pose: Pose, points: Array) -> Array:
+    """Where points (n, 3) are in the picture, (n, 2)."""
+    zero: Any = np.zeros(3)
+    pixels, _ = cv2.projectPoints(pose.apply(points), zero, zero, camera.matrix(), np.array(camera.distortion))
+    return np.asarray(pixels.reshape(-1, 2), float)
+
+
+def _unit(vectors: Array) -> Array:
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12), float)
