@@ -126,6 +126,20 @@ def test_planes_tell_what_reaches_the_ball(shown_shadow, level, least, most):
     assert reaching_factor(problem, np.ones((1, 3)), ball) == 1.0
 
 
+def test_points_that_are_black_take_no_part():
+    """What shows no light at all is not exact: it changes nothing, and nothing is said of its logarithm."""
+    problem, ball = plane_in_the_sun(np.array([0.8, 0.0, 0.6]), 0.5)
+    told = reaching_factor(problem, np.ones((1, 3)), ball)
+    for name in ("points", "normals", "kind", "surface", "exact", "shared", "captured", "light"):
+        value = getattr(problem, name)
+        setattr(problem, name, np.concatenate([value, value[:100]]))
+    problem.exact[-100:], problem.light[-100:] = False, 0.0
+    added = problem.added_irradiance
+    problem.added_irradiance = lambda unknowns: np.concatenate([added(unknowns), added(unknowns)[:100]])
+    with np.errstate(all="raise"):
+        assert reaching_factor(problem, np.ones((1, 3)), ball) == told
+
+
 def test_a_shadow_whose_edge_passes_by_the_ball_says_nothing():
     problem, ball = plane_in_the_sun(np.array([0.8, 0.0, 0.6]), 0.0, both_sides=False)
     assert reaching_factor(problem, np.ones((1, 3)), ball) == 1.0

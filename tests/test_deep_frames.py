@@ -344,7 +344,7 @@ def test_what_a_ball_shows_of_an_object_hides_light_above_white(first: np.ndarra
     _, dim, _, few = lit(np.full((120, 160, 3), 0.25, np.float32), pose, quality, linear=True)
     _, bright, _, many = lit(np.full((120, 160, 3), 4.0, np.float32), pose, quality, linear=True)
     ball = (few["mirror_ball"] != 0.0).any(-1) & (few["objects"][..., 3] == 0.0)
-    assert ball.sum() >= 5
+    assert ball.any()
     # 16 times the environment's part, and no more of a virtual light's. Were the plate taken for 1, three of its four
     # parts would stay.
     assert (np.abs(bright[ball]) < 16.0 * np.abs(dim[ball]) + 1e-3).all()

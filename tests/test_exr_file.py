@@ -10,7 +10,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from tests.test_sinks import file_limit
+from tests.test_full_disk import file_limit
 from warp_ar.accuracy.path_tracer import TracedPicture
 from warp_ar.errors import SinkError
 from warp_ar.exr_file import check_whole_exr, write_exr

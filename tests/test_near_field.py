@@ -485,7 +485,8 @@ def test_models_of_files_shade_themselves_where_the_environment_casts_shadows(tm
     for preset, scene, expected in (
         ("medium", colored, "few_rays"),
         ("medium", plain, ""),
-        ("low", colored, ""),
+        ("low", colored, "few_rays"),
+        ("paper", colored, ""),
         ("high", colored, "one_bounce"),
     ):
         request = Request(scene, PRESETS[preset], (scene.camera.width, scene.camera.height))

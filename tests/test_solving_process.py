@@ -15,6 +15,7 @@ import pytest
 from threadpoolctl import threadpool_info
 
 from warp_ar import Pipeline
+from warp_ar.engine.switcher import let_go
 from warp_ar.input.sources import open_source
 from warp_ar.light.solver import ONE_BLAS_THREAD
 from warp_ar.light.solving_process import SolvingPool, SolvingProcess, read_message, solve_by, write_message
@@ -176,6 +177,39 @@ def test_frames_in_real_time_begin_alike_and_take_what_is_there(monkeypatch):
         live(frames[-1].image, time_seconds=frames[-1].time + 0.05)
         assert stage._progress.pending is None or stage._progress.pending is not pending
         assert stage._progress.took > 0.0
+
+
+def test_an_estimate_outlives_the_pipeline_that_began_it(monkeypatch):
+    """Another pipeline goes on with it: what it traces with goes no sooner than it is done."""
+    scene = load_scene("desk")
+    with open_source(scene.source.path) as source:
+        frames = list(itertools.islice(source, 12))
+    held = threading.Event()
+
+    def slow(solver, sides, trace):
+        assert held.wait(60.0)
+        trace(np.array([[0.1, 0.1, 0.5, 1.0]], np.float32))
+        return solver, solve_by(solver, sides, trace)
+
+    monkeypatch.setattr(recover.POOL, "solve", slow)
+    monkeypatch.setattr(recover, "REST", -1.0)  # however long the first ones took
+    before = Pipeline(scene, device="cpu", quality="low", estimates="real_time")
+    for frame in frames:
+        before(frame.image, time_seconds=frame.time)
+    pending = before.scheduler.stage("recover")._progress.pending
+    assert pending is not None
+    with Pipeline(scene, device="cpu", quality="low", estimates="real_time") as after:
+        after.continue_from(before)
+        assert after.scheduler.stage("recover")._progress.pending is pending
+        going = threading.Thread(target=let_go, args=(before,))
+        going.start()
+        going.join(0.5)
+        held.set()
+        going.join(60.0)
+        assert not going.is_alive()
+        assert pending.exception(60.0) is None
+        after(frames[-1].image, time_seconds=frames[-1].time + 0.2)
+        assert after.scheduler.stage("recover")._progress.pending is not pending
 
 
 def test_every_thread_solves_with_one_thread_of_blas():

@@ -150,7 +150,9 @@ def reaching_factor(problem: Problem, unknowns: Array, ball: Ball) -> float:
     if not usable.any():
         return 1.0
     shown, captured = problem.light.sum(axis=1), problem.captured.sum(axis=1)
-    ratio = np.log(shown) - np.log(np.maximum(captured + added, 1e-9))
+    # Where a plane shows nothing exactly, its points have no logarithm and no part in what follows.
+    ratio = np.full(len(shown), np.nan)
+    ratio[usable] = np.log(shown[usable]) - np.log(np.maximum((captured + added)[usable], 1e-9))
     given = np.stack([shown, captured, added, problem.shared])
     beside, across, sides = np.zeros(len(SHARES)), np.zeros(len(SHARES)), np.zeros((2, len(SHARES)))
     passing, side = passing_shares(problem, unknowns, ball, (config.beside, config.across))

@@ -407,9 +407,9 @@ class Recover(Stage):
         self._effects.send(values, self._frames_stream)
 
     def close(self) -> None:
-        """Let the worker end when it has solved what it is at."""
+        """See the worker end: what it solves, the arrays that go now are its, and another stage may wait for it."""
         if self._worker is not None:
-            self._worker.shutdown(wait=False)
+            self._worker.shutdown()
 
     def resume(self, other: Stage) -> None:
         """Keep the emitters that were found, and when; on another method, or on another receiver, look anew."""
