@@ -153,7 +153,7 @@ def rule_table(cpu: list[dict[str, Any]]) -> str:
             f"{name}: {milliseconds_:.1f} of {budget:.0f} ms, error {error:.4f}; the best errs {best.error:.4f} in "
             f"{(base + best.milliseconds) / scale + TRACKING_MS:.1f} ms with {other or 'the same methods'}"
         )
-    return table(["preset", "budget, ms", "expected ms", "expected error", "the budget's least"], rows, 1)
+    return table(["preset", "budget, ms", "expected ms", "expected error", "least error within the budget"], rows, 1)
 
 
 def replace(path: Path, name: str, text: str) -> None:
