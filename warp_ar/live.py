@@ -41,7 +41,8 @@ def make_parser() -> argparse.ArgumentParser:
     add(
         "--source",
         metavar="PATH|INDEX",
-        help="frames from this folder, video file or capture device, not the scene's own",
+        help="frames from this folder, picture, video file, capture device or stream (rtsp://..., http://...), "
+        "not the scene's own",
     )
     add(
         "--calibration",

@@ -116,7 +116,8 @@ class Session(Closing):
 
         Args:
             scene: A scene, a scene file or a bundled scene's name.
-            source: Frames instead of the scene's own: a folder, a video file, or a capture device's index.
+            source: Frames instead of the scene's own: a folder, a picture, a video file, a capture device's index, or
+                the URL of a camera's stream.
             calibration: OpenCV calibration file instead of the scene's camera numbers, or ``exif``: by the EXIF of the
                 first picture.
             light: Captured light instead of what a mirror ball shows: an OpenEXR.

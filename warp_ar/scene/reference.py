@@ -235,7 +235,7 @@ _MEANINGS: Final[dict[tuple[str, str], str]] = {
     ("pose", "quaternion"): "Rotation of camera_from_world as COLMAP has it: w, x, y, z.",
     ("pose", "position"): "Where the camera stands, instead of camera_from_world.",
     ("pose", "rotate"): "About the fixed x, then y, then z axis, from a level camera that looks along +y.",
-    ("pose", "file"): "A pose for every frame: COLMAP's images.txt in order of name, or a JSON list of R and t.",
+    ("pose", "file"): "A pose for every frame: COLMAP's images.txt or .bin, JSON of R and t, OpenTrackIO, or USD.",
     ("object.material", "model"): "The reflection model; each has keys of its own.",
 }
 
