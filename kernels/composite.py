@@ -344,7 +344,14 @@ def make_layers(
     shadow_ratio: wp.array | None = None,
     mirror_ball: wp.array | None = None,
 ) -> Layers:
-    """Layers as kernels read them; None leaves one empty."""
+    """Layers as kernels read them; None leaves one empty.
+
+    Args:
+        virtual: (H, W) vec4, premultiplied radiance of virtual objects and their coverage.
+        added_light: (H, W) vec3, radiance that virtual lights add to what is physical.
+        shadow_ratio: (H, W) vec3, factor on the frame's radiance.
+        mirror_ball: (H, W) vec3, change of the frame's radiance in the mirror balls.
+    """
     layers = Layers()
     given = {"objects": virtual, "added": added_light, "ratio": shadow_ratio, "mirror_ball": mirror_ball}
     for name, array in given.items():

@@ -404,7 +404,15 @@ def make_clipped_evidence(
     cut_table: wp.array | None = None,
     levels: wp.array | None = None,
 ) -> ClippedEvidence:
-    """What is known of the clipped pixels of a frame of ``height`` rows; None for what the method does not read."""
+    """What is known of the clipped pixels of a frame; None for what the method does not read.
+
+    Args:
+        height: Rows of the frame.
+        summed_area: (H, W) uint32, of ``summed_area.sum_area``.
+        declipped: (H, W) vec3, linear radiance with clipped pixels estimated.
+        cut_table: (H, W) uint32, the table of what 8 bits cut off; None for frames of 8 bits.
+        levels: (2,) vec3, radiance from which channels of a linear frame clip; None for frames of 8 bits.
+    """
     evidence = ClippedEvidence()
     evidence.max_box = largest_box(height)
     arrays = {"summed_area": summed_area, "declipped": declipped, "cut_table": cut_table, "levels": levels}
@@ -415,7 +423,13 @@ def make_clipped_evidence(
 
 
 def make_exposure(encode_table: wp.array, scale: wp.array, codes: wp.array) -> Exposure:
-    """The arrays of an exposure together."""
+    """The arrays of an exposure together.
+
+    Args:
+        encode_table: Of ``color.encode_table``.
+        scale: (1,) float32, not negative.
+        codes: (256,) vec3ub, as ``expose_codes`` writes for this scale.
+    """
     exposure = Exposure()
     exposure.encode_table, exposure.scale, exposure.codes = encode_table, scale, codes
     return exposure

@@ -496,7 +496,7 @@ def project_irradiance_sh(
 
 
 def window_sh(irradiance_sh_out: wp.array[wp.vec3]) -> None:
-    """Window nine coefficients in place, as little as keeps irradiance from being negative anywhere."""
+    """Window nine coefficients, (9,), in place, as little as keeps irradiance from being negative anywhere."""
     launch(window_sh_kernel, dim=1, outputs=[irradiance_sh_out], device=irradiance_sh_out.device)
 
 

@@ -288,7 +288,14 @@ def make_lobe_samples(height: int, lobe: Lobe, count: int, device: wp.DeviceLike
 
 
 def box_weights(height: int) -> np.ndarray:
-    """Weights for ``mix_mips`` that make level l of the pyramid level l of the reflections: the paper's filter."""
+    """Weights for ``mix_mips`` that make level l of the pyramid level l of the reflections: method ``box_mip``.
+
+    Args:
+        height: Rows of the environment.
+
+    Returns:
+        (levels, mips).
+    """
     weights = np.zeros((lobe_count(height), level_count(height, 2 * height)))
     for level in range(weights.shape[0]):
         weights[level, min(level, weights.shape[1] - 1)] = 1.0

@@ -284,7 +284,7 @@ def mix_mips(
 
     Args:
         pyramid: Pyramid of the (height, 2 height) environment, see ``pyramid.build_pyramid``.
-        weights: (levels, mips): ``box_weights`` for the paper's filter, ``mip_weights`` for the fitted one.
+        weights: (levels, mips): ``box_weights`` for ``box_mip``, ``mip_weights`` for ``energy_mip``.
         height: Rows of the environment.
         levels_out: (lobe_texels(height),).
         smooth: Read mips through quadratic B-splines, as the fitted weights expect; else bilinearly, as the paper does.

@@ -112,7 +112,13 @@ class ObjectLight:
 def make_object_light(
     distant: DistantLight, lights: wp.array | None = None, near: NearLight | None = None
 ) -> ObjectLight:
-    """The environment, virtual lights and what is near together; None for what there is not."""
+    """The environment, virtual lights and what is near together.
+
+    Args:
+        distant: Of the environment, see ``reflect.DistantLight``.
+        lights: (n,) Light; None without virtual lights.
+        near: (H, W) each, as ``near_field.filter_near_field`` writes; None where objects show the environment alone.
+    """
     light = ObjectLight()
     light.distant = distant
     if lights is not None:

@@ -80,8 +80,8 @@ class Features:
     near_field: str
     """Method of ``shade`` by which objects show what surrounds them at close range, themselves included; empty: none.
 
-    Models with materials of their files have parts that shade each other: wherever the environment casts shadows they
-    do so by few rays at least.
+    Meshes with materials of their files have parts that shade each other: wherever the environment casts shadows, in
+    all presets but ``paper``, they do so by ``few_rays`` at least.
     """
     irradiance: Literal["irradiance_sh", "irradiance_map"]
     """Resource that holds the environment's irradiance."""
