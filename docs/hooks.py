@@ -90,6 +90,29 @@ def stages() -> str:
     return "\n".join(rows)
 
 
+def presets() -> str:
+    """What each preset chooses."""
+    from warp_ar.stages.quality import PRESETS
+
+    rows = ["| | " + " | ".join(f"`{name}`" for name in PRESETS) + " |", "| --- |" + " --- |" * len(PRESETS)]
+    for size in ("environment_height", "edge_samples"):
+        cells = [str(getattr(quality, size)) for quality in PRESETS.values()]
+        rows.append(f"| {size.replace('_', ' ')} | " + " | ".join(cells) + " |")
+    for stage in dict.fromkeys(stage for quality in PRESETS.values() for stage, _ in quality.methods):
+        cells = [chosen(stage, quality) for quality in PRESETS.values()]
+        rows.append(f"| {stage.replace('_', ' ')} | " + " | ".join(f"`{cell}`" for cell in cells) + " |")
+    return "\n".join(rows)
+
+
+def chosen(stage: str, quality: Any) -> str:
+    """The method of a quality for a stage; the last one where the quality names none."""
+    from warp_ar.stages import STAGES
+
+    method = str(quality.method(stage))
+    methods = next((list(one.methods) for one in STAGES if one.name == stage), [method])
+    return methods[-1] if method == "default" else method
+
+
 def example(name: str) -> str:
     """A worked example as the changes that it makes."""
     text = (pathlib.Path(__file__).parent / "examples" / f"{name}.diff").read_text(encoding="utf-8")
@@ -101,9 +124,13 @@ def example(name: str) -> str:
     return "\n".join(shown)
 
 
-PARTS = {"scene-keys": scene_keys, "command-line": command_line, "stages": stages, "paper-figures": paper_figures} | {
-    f"example-{name}": functools.partial(example, name) for name in ("stage", "method", "scene-key", "source")
-}
+PARTS = {
+    "scene-keys": scene_keys,
+    "command-line": command_line,
+    "stages": stages,
+    "presets": presets,
+    "paper-figures": paper_figures,
+} | {f"example-{name}": functools.partial(example, name) for name in ("stage", "method", "scene-key", "source")}
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
