@@ -236,6 +236,30 @@ def test_a_camera_can_be_left_where_the_scene_has_no_source() -> None:
 
 
 @run
+async def test_who_goes_in_the_midst_of_a_file_is_no_fault_of_the_program(caplog: pytest.LogCaptureFixture) -> None:
+    """Nothing is said of it, and another file is taken."""
+    async with served() as site:
+        await site.server._started()
+        place = site.url.removeprefix("http://")
+        _, writer = await asyncio.open_connection(*place.split(":"))
+        head = f"POST /drop/scene.toml HTTP/1.1\r\nHost: {place}\r\nContent-Length: 100000\r\n\r\n"
+        writer.write(head.encode() + b"#" * 5000)
+        await writer.drain()
+
+        async def until(status: int) -> None:
+            while True:
+                async with site.session.post(f"{site.url}/drop/scene.toml", data=b"x") as response:
+                    if response.status == status:
+                        return
+                await asyncio.sleep(0.02)
+
+        await asyncio.wait_for(until(429), PATIENCE)  # the first one is on its way
+        writer.transport.abort()
+        await asyncio.wait_for(until(422), PATIENCE)  # this one is read, and refused
+    assert not caplog.records
+
+
+@run
 async def test_a_camera_is_left_whatever_becomes_of_its_viewer() -> None:
     """What is sent to it fails in a way that nobody has thought of, and it goes: the camera is free."""
 
