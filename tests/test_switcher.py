@@ -138,6 +138,25 @@ def test_what_cannot_be_built_is_not_laid_to_what_is_wanted_by_then() -> None:
     switcher.close()
 
 
+def test_a_pipeline_that_cannot_go_on_is_not_said_to_be_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Going over waits for the frames that were submitted, and raises what one of them did."""
+
+    def fail(pipeline: Pipeline, other: Pipeline) -> None:
+        raise UsageError("a frame could not be rendered")
+
+    switcher = PipelineSwitcher(device="cpu")
+    now, wanted = target(), target(PAPER)
+    first = switcher.open(now)
+    with monkeypatch.context() as patch:
+        patch.setattr(Pipeline, "continue_from", fail)
+        with pytest.raises(UsageError, match="could not be rendered"):
+            switcher.follow(wanted, wait=True)
+    assert switcher.pipeline is first
+    assert switcher.shows(now)
+    assert switcher.follow(wanted, wait=True) is not first
+    switcher.close()
+
+
 def test_what_is_no_longer_built_is_no_error(caplog: pytest.LogCaptureFixture) -> None:
     """A builder that ends takes nothing more: the pipeline that was to come is given up without a word."""
     busy = threading.Event()

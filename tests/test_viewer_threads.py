@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+import errno
 import json
 import math
 import threading
@@ -345,6 +346,18 @@ def test_a_recording_that_cannot_be_finished_keeps_nothing_open(monkeypatch: pyt
     assert not folder.exists()
     with pytest.raises(SourceError, match="closed"):
         iter(host._controls.feed.source)
+
+
+def test_a_file_that_is_still_being_written_does_not_hinder_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    host = Host(page_scene(), device="cpu", quality="low")
+    cleanup = host._folder.cleanup
+
+    def fail() -> None:
+        cleanup()
+        raise OSError(errno.ENOTEMPTY, "Directory not empty", host._folder.name)
+
+    monkeypatch.setattr(host._folder, "cleanup", fail)
+    assert host.close()
 
 
 # ---------------------------------------------------------------------------------------------- work beside the frames

@@ -205,12 +205,12 @@ class PipelineSwitcher:
             ) from error
 
     def _go_over(self, pipeline: Pipeline) -> None:
-        self._shown = self._wanted
         before = self.pipeline
+        if before is not None and pipeline is not before:
+            pipeline.continue_from(before)  # first: it tells of a frame that failed, and the one before then stays
+        self._shown = self._wanted
         if pipeline is before:
             return
-        if before is not None:
-            pipeline.continue_from(before)
         if pipeline in self._kept:
             self._kept.remove(pipeline)
         self.pipeline = pipeline

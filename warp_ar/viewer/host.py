@@ -431,5 +431,6 @@ class Host:
         self._controls.close()
         ended = frames_ended and self._lighting.close(wait_seconds)
         self._looker.shutdown(wait=ended)
-        self._folder.cleanup()
+        with contextlib.suppress(OSError):  # a thread that has not ended may still write into it
+            self._folder.cleanup()
         return ended
