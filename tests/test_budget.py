@@ -315,7 +315,7 @@ def light(pipeline: AutoPipeline, image: np.ndarray, count: int = 0) -> None:
         # As in ``show_again``: stages rest where nothing changes, and their times with them.
         pipeline(image - (shown % 2) * (image // 8), time_seconds=shown / FPS)
         if pipeline._switcher.busy:
-            pipeline._switcher._building.result()
+            pipeline._switcher._building.exception()  # the next frame tells it
         if not count and pipeline.status()["changes"]:
             return
 
@@ -376,6 +376,29 @@ def test_what_takes_too_long_alone_is_never_shown(frames: Frames, tmp_path, monk
     assert status["rejected"][0]["settings"] == tried[0]
     assert status["settings"] == status["changes"][0]["settings"] == tried[-1]
     assert status["settings"]["irradiance"] != "clusters"
+
+
+def test_what_cannot_be_built_is_told_and_never_shown(frames: Frames, tmp_path, monkeypatch, capsys) -> None:
+    """A device without room for what the budget would allow: the run goes on by other methods."""
+    scene = make_scene()
+    settings = relevant_settings(scene, (320, 240))
+
+    def trial(pipeline, image, pose, costs, settings):
+        if settings["irradiance"] == "clusters":
+            raise RuntimeError("Failed to allocate 12 bytes on device 'cuda:0'")
+        return costs.base
+
+    monkeypatch.setattr(auto_quality, "time_alone", trial)
+    costs = dataclasses.replace(even_costs(settings, base=20.0, step=0.1), work=20.0)
+    with AutoPipeline(scene, device="cpu", budget_ms=1e4, costs=costs, folder=tmp_path) as pipeline:
+        light(pipeline, frames[0])
+        light(pipeline, frames[0], 2)
+        status = pipeline.status()
+        assert pipeline.quality.method("irradiance") != "clusters"
+    assert status["rejected"][0]["settings"]["irradiance"] == "clusters"
+    assert status["changes"]
+    assert status["settings"]["irradiance"] != "clusters"
+    assert capsys.readouterr().err.count("Failed to allocate 12 bytes") == len(status["rejected"])
 
 
 def test_says_once_that_nothing_fits(frames: Frames, tmp_path, capsys) -> None:

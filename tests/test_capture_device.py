@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 
 from tests.test_sources import PATIENCE, error_of, grey, no_thread_left, take_until_error  # noqa: F401  (a fixture)
 from warp_ar.errors import SourceError, UsageError
+from warp_ar.input import capture_device
 from warp_ar.input.sources import CaptureDevice
 
 
@@ -85,6 +87,52 @@ def test_device_is_not_released_while_it_is_read() -> None:
     source.close()
     assert threading.active_count() == before - 1
     source.close()
+
+
+def test_a_driver_that_hangs_does_not_hold_up_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is left to its thread, and not released under it."""
+    monkeypatch.setattr(capture_device, "CLOSE_SECONDS", 0.2)
+    hangs = threading.Event()
+
+    class Hanging(FakeCapture):
+        def read(self) -> tuple[bool, np.ndarray | None]:
+            if not self.gate.is_set():
+                hangs.set()
+            return super().read()
+
+    capture = Hanging(10**9)
+    source = CaptureDevice(0, opener=lambda _: capture)
+    capture.gate.clear()
+    assert hangs.wait(PATIENCE)
+    closing = threading.Thread(target=source.close)
+    closing.start()
+    closing.join(0.5 * PATIENCE)
+    ended, released = not closing.is_alive(), capture.released
+    capture.gate.set()
+    closing.join()
+    source._thread.join()
+    assert ended, "it waits for the driver"
+    assert not released
+    source.close()
+    assert capture.released
+
+
+def test_a_reader_that_fails_is_told() -> None:
+    """Whatever has happened to it: who waits for a frame would wait for ever."""
+
+    class Broken(FakeCapture):
+        def read(self) -> tuple[bool, np.ndarray | None]:
+            if self.given == 2:
+                raise MemoryError("no room for a picture")
+            return super().read()
+
+    source = CaptureDevice(0, opener=lambda _: Broken(1000))
+    with ThreadPoolExecutor(1) as reader:
+        reading = reader.submit(take_until_error, source)
+        try:
+            assert "no room for a picture" in reading.result(0.5 * PATIENCE)[1]
+        finally:
+            source.close()
 
 
 def test_device_that_changes_size() -> None:

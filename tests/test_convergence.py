@@ -177,11 +177,12 @@ def test_at_rest_the_picture_stays_that_of_its_reference(monkeypatch: pytest.Mon
         np.testing.assert_array_equal(running.frames[-1].other, false_colors(rest.image, rest.other))
 
 
-def test_what_cannot_be_traced_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("fault", [UsageError("the file of a mesh is gone"), RuntimeError("no memory: a mesh is gone")])
+def test_what_cannot_be_traced_is_said(monkeypatch: pytest.MonkeyPatch, fault: Exception) -> None:
     """A reference that fails is a notice, and the picture goes on; the next edit tries again."""
 
     def fail(*_: Any, **__: Any) -> None:
-        raise UsageError("the file of a mesh is gone")
+        raise fault
 
     few_samples(monkeypatch)
     with Running(page_scene()) as running:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import warp as wp
@@ -118,6 +120,27 @@ def test_flags_of_clang_part_headers(warp_flags) -> None:
 
 class _Listed(Exception):
     """The kernels of a plan are known."""
+
+
+def test_who_interrupts_compiling_does_not_wait_for_all_of_it(monkeypatch) -> None:
+    """Kernels whose turn has not come are left out; what is at work ends."""
+    compiled, interrupted = [], threading.Event()
+
+    def compile_module(module, device):
+        assert module.number == 0 or interrupted.wait(60.0)
+        compiled.append(module.number)
+
+    def progress(done, total):
+        if done:
+            threading.Timer(0.2, interrupted.set).start()
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(modules.wp, "compile_aot_module", compile_module)
+    monkeypatch.setattr(modules, "usable_cores", lambda: 1)
+    variants = [(SimpleNamespace(number=number, options={}), None) for number in range(20)]
+    with pytest.raises(KeyboardInterrupt):
+        modules._compile(variants, SimpleNamespace(is_cpu=False), progress)
+    assert len(compiled) <= 2
 
 
 @pytest.mark.parametrize("quality", ["low", "medium", "high"])

@@ -142,6 +142,27 @@ def test_a_size_that_changes_ends_it() -> None:
         camera.close()
 
 
+def test_a_reader_that_fails_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever has happened to it: who opens the stream would wait for ever."""
+
+    def fail(self: NetworkStream) -> Iterator[np.ndarray]:
+        raise MemoryError("no room for a picture")
+
+    monkeypatch.setattr(NetworkStream, "_pictures", fail)
+    opened: list[Any] = []
+
+    def open_stream() -> None:
+        try:
+            NetworkStream("http://127.0.0.1:9/video")
+        except SourceError as error:
+            opened.append(str(error))
+
+    thread = threading.Thread(target=open_stream, daemon=True)
+    thread.start()
+    thread.join(0.5 * PATIENCE)
+    assert opened == ["http://127.0.0.1:9/video: MemoryError: no room for a picture"]
+
+
 def test_no_thread_is_left(camera: Camera) -> None:
     before = {thread for thread in threading.enumerate() if thread.name == "warp-ar-stream"}
     with open_source(camera.url) as source:

@@ -10,7 +10,7 @@ import pytest
 from tests.test_pipeline import make_scene
 from warp_ar import session as session_module
 from warp_ar.engine.pipeline import Pipeline
-from warp_ar.errors import SceneError, UsageError
+from warp_ar.errors import SceneError, SourceError, UsageError
 from warp_ar.scene import Camera, Light, SourceSpec
 from warp_ar.session import Session
 from warp_ar.stages.quality import PRESETS
@@ -90,3 +90,16 @@ def test_no_frame_of_a_camera_waits_for_an_estimate(
     monkeypatch.setattr(session_module, "_open_source", opened)
     with Session(scene(), device="cpu", quality=quality) as session:
         assert session.pipeline.plan.request.estimates == expected
+
+
+def test_threads_end_though_the_source_cannot_be_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail() -> None:
+        raise SourceError("the device has gone")
+
+    session = Session(scene(), device="cpu", quality="low")
+    pipeline = session.pipeline
+    monkeypatch.setattr(session.source, "close", fail)
+    with pytest.raises(SourceError):
+        session.close()
+    with pytest.raises(UsageError, match="closed"):
+        pipeline.warm_up()

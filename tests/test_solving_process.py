@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import itertools
 import pickle
@@ -9,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from threadpoolctl import threadpool_info
 from warp_ar import Pipeline
 from warp_ar.engine.switcher import let_go
 from warp_ar.input.sources import open_source
+from warp_ar.light import solving_process
 from warp_ar.light.solver import ONE_BLAS_THREAD
 from warp_ar.light.solving_process import SolvingPool, SolvingProcess, read_message, solve_by, write_message
 from warp_ar.scene import load_scene
@@ -108,6 +111,99 @@ def test_pool_solves_here_until_a_process_is_ready_and_when_it_dies():
     finally:
         pool.close()
     assert pool.solve(Doubler(), sides(), trace)[1][1] == 1
+
+
+def test_all_who_wait_for_a_process_that_dies_solve_for_themselves(monkeypatch):
+    """Three estimates, one process: two wait for it, and neither is left waiting when it has gone."""
+    dies = threading.Event()
+
+    class Dying:
+        ready = True
+
+        def solve(self, *_):
+            assert dies.wait(60.0)
+            raise EOFError
+
+        def close(self):
+            pass
+
+    monkeypatch.setattr(solving_process, "SolvingProcess", Dying)
+    pool = SolvingPool(1)
+    solved = []
+    threads = [
+        threading.Thread(target=lambda: solved.append(pool.solve(Doubler(), sides(), trace)), daemon=True)
+        for _ in range(3)
+    ]
+    for thread in threads:
+        thread.start()
+    deadline = time.monotonic() + 60.0
+    while len(pool._changed._waiters) < 2 and time.monotonic() < deadline:
+        time.sleep(0.01)
+    dies.set()
+    for thread in threads:
+        thread.join(30.0)
+    assert len(solved) == 3, "one waits for ever"
+
+
+def test_a_pool_that_is_closed_leaves_who_solves_to_himself(process):
+    """In the midst of a trace: the answer has nowhere to go, and the estimate is made here."""
+    pool = SolvingPool(1)
+    pool._all, pool._idle = [process], [process]
+    tracing, closed = threading.Event(), threading.Event()
+
+    def held(emitters):
+        tracing.set()
+        assert closed.wait(60.0)
+        return trace(emitters)
+
+    solver = Doubler()
+    with ThreadPoolExecutor(1) as other:
+        solving = other.submit(pool.solve, solver, sides(), held)
+        assert tracing.wait(60.0)
+        pool.close()
+        closed.set()
+        here, (_, count) = solving.result(60.0)
+    assert here is solver
+    assert count == 1
+    assert process._process.stdin.closed
+    assert process._process.stdout.closed
+
+
+@pytest.mark.parametrize("fault", ["singular", "not finite"])
+@pytest.mark.parametrize("estimates", ["synchronous", "real_time"])
+def test_an_estimate_that_fails_leaves_the_light_and_the_next_one_is_made(monkeypatch, fault, estimates):
+    """Frames go on, the reason is in the report, and what failed is forgotten by the solver."""
+    scene = load_scene("desk")
+    with open_source(scene.source.path) as source:
+        frames = list(itertools.islice(source, 3))
+    failing, solvers = [False], []
+
+    def faulty(solver, sides, trace):
+        found = solve_by(solver, sides, trace)
+        solvers.append(solver)
+        if not failing[0]:
+            return found
+        if fault == "singular":
+            raise np.linalg.LinAlgError("Singular matrix")
+        assert found is not None
+        return dataclasses.replace(found, recovered=np.full_like(found.recovered, np.nan))
+
+    monkeypatch.setattr(recover, "solve_by", faulty)
+    with Pipeline(scene, device="cpu", quality="low", estimates=estimates) as pipeline:
+        status = pipeline.arrays["recover_status"]
+        pipeline(frames[0].image, time_seconds=frames[0].time)
+        recovered = pipeline.arrays["recover_recovered"].numpy().copy()
+        assert recovered.any()
+        failing[0] = True
+        pipeline(frames[1].image, time_seconds=frames[1].time)
+        assert "ingular" in status()["failed"] or "not finite" in status()["failed"]
+        assert status()["factor"] > 0.0, "the last estimate holds"
+        np.testing.assert_array_equal(pipeline.arrays["recover_recovered"].numpy(), recovered)
+        failing[0] = False
+        pipeline(frames[2].image, time_seconds=frames[2].time)
+        assert "failed" not in status()
+        assert np.isfinite(pipeline.arrays["environment"].numpy()).all()
+    assert solvers[2] is not solvers[1]
 
 
 def test_estimates_of_a_process_are_those_made_here(process, monkeypatch):

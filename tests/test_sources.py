@@ -7,8 +7,10 @@ import math
 import pathlib
 import struct
 import threading
+import time
 import wave
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import av
@@ -20,7 +22,7 @@ from av.video.reformatter import ColorRange, Colorspace
 from warp_ar.errors import SourceError, UsageError
 from warp_ar.input import live_source
 from warp_ar.input.source import FRAMES_AHEAD
-from warp_ar.input.sources import FrameFolder, QueueSource, Source, Synthetic, VideoFile, open_source
+from warp_ar.input.sources import Frame, FrameFolder, QueueSource, Source, Synthetic, VideoFile, open_source
 
 # 4:2:0 at limited range keeps 219 of 255 levels, and the codec adds its own rounding.
 VIDEO_LEVELS = 3
@@ -152,6 +154,31 @@ def test_close_ends_a_reading_in_progress(tmp_path: pathlib.Path) -> None:
     next(frames)
     source.close()
     assert list(frames) == []
+
+
+def test_a_source_is_closed_while_another_thread_waits_for_its_frame(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Who closes it is not held up and sees no error; who reads gets the end."""
+    source = open_source(write_folder(tmp_path, 3), loop=True)
+    decode, waiting, go_on = source._decode, threading.Event(), threading.Event()
+
+    def slow() -> Iterator[Frame]:
+        for frame in decode():
+            waiting.set()
+            assert go_on.wait(PATIENCE)
+            yield frame
+
+    monkeypatch.setattr(source, "_decode", slow)
+    with ThreadPoolExecutor(1) as reader:
+        frames = iter(source)
+        reading = reader.submit(lambda: list(frames))
+        assert waiting.wait(PATIENCE)
+        while not frames.gi_running:
+            time.sleep(0.001)
+        source.close()
+        go_on.set()
+        assert reading.result(PATIENCE) == []
 
 
 def test_loop_goes_on_counting(tmp_path: pathlib.Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import threading
 import weakref
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -113,6 +114,60 @@ def test_what_cannot_be_built_is_told_once_and_changes_nothing(monkeypatch: pyte
         assert switcher.follow(wanted) is first
         assert not switcher.busy
     switcher.close()
+
+
+def test_what_cannot_be_built_is_not_laid_to_what_is_wanted_by_then() -> None:
+    """An edit that fails to build while another one is made: that one is built, and nothing is told of the first."""
+    go_on = threading.Event()
+
+    def fail(pipeline: Pipeline) -> None:
+        assert go_on.wait(60.0)
+        raise RuntimeError("Failed to allocate 12 bytes")
+
+    switcher = PipelineSwitcher(device="cpu")
+    switcher.open(target())
+    switcher.want(target(PAPER), fail)
+    last = target(PRESETS["low"].with_methods(relight="flat"))
+    switcher.want(last)
+    go_on.set()
+    settle(switcher)
+    switcher.take()
+    settle(switcher)
+    switcher.take()
+    assert switcher.shows(last)
+    switcher.close()
+
+
+def test_a_pipeline_that_cannot_go_on_is_not_said_to_be_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Going over waits for the frames that were submitted, and raises what one of them did."""
+
+    def fail(pipeline: Pipeline, other: Pipeline) -> None:
+        raise UsageError("a frame could not be rendered")
+
+    switcher = PipelineSwitcher(device="cpu")
+    now, wanted = target(), target(PAPER)
+    first = switcher.open(now)
+    with monkeypatch.context() as patch:
+        patch.setattr(Pipeline, "continue_from", fail)
+        with pytest.raises(UsageError, match="could not be rendered"):
+            switcher.follow(wanted, wait=True)
+    assert switcher.pipeline is first
+    assert switcher.shows(now)
+    assert switcher.follow(wanted, wait=True) is not first
+    switcher.close()
+
+
+def test_what_is_no_longer_built_is_no_error(caplog: pytest.LogCaptureFixture) -> None:
+    """A builder that ends takes nothing more: the pipeline that was to come is given up without a word."""
+    busy = threading.Event()
+    with ThreadPoolExecutor(1) as builder:
+        builder.submit(busy.wait, 60.0)
+        switcher = PipelineSwitcher(device="cpu", builder=builder)
+        switcher.want(target())
+        switcher.close(wait=False)
+        builder.shutdown(wait=False, cancel_futures=True)
+        busy.set()
+    assert not caplog.records
 
 
 def test_pipelines_that_are_kept_come_back_at_once() -> None:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import warp as wp
 
+from warp_ar.engine import transfer
 from warp_ar.engine.transfer import COPY_BYTES, COPY_THREADS, KEPT, Transfers, split_rows
 
 
@@ -38,3 +41,14 @@ def test_pictures_come_back_as_they_went(device: str, size: tuple[int, int]) -> 
         assert all(milliseconds > 0.0 for milliseconds in picture.steps().values())
         assert set(picture.steps()) == {"upload", "kernels", "download"}
     transfers.close()
+
+
+def test_what_is_on_its_way_arrives_before_its_memory_goes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pipeline may be let go while its last pictures are copied from slots that go with it."""
+    waited: list[str] = []
+    monkeypatch.setattr(transfer, "wait_for", waited.append)
+    transfers = Transfers.__new__(Transfers)
+    transfers._pool = None
+    transfers._slots = [SimpleNamespace(downloaded=event) for event in ("first", "second", None)]
+    transfers.close()
+    assert waited == ["first", "second"]

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import dataclasses
 import functools
+import os
 import signal
 import subprocess
 import sys
@@ -104,11 +105,13 @@ def test_names_do_not_reach_the_terminal_as_they_are(tmp_path: Path, capsys: pyt
     assert "\x07" not in out
 
 
-# The command, with frames that take ten minutes each.
+# The command, with frames that take ten minutes each, in a thread that has compiled.
 ENDLESS = """
 import sys, time
+from warp._src import context
 from warp_ar.engine.pipeline import Pipeline
 def light(self, *arguments, **options):
+    context.runtime.get_clang_pch_dir()
     print("lighting", flush=True)
     time.sleep(600)
 Pipeline.__call__ = light
@@ -117,10 +120,16 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
-def test_ctrl_c_does_not_wait_for_the_frame_in_hand() -> None:
+def test_ctrl_c_does_not_wait_for_the_frame_in_hand(tmp_path: Path) -> None:
+    """Nor does it leave a folder behind, the compiler's among them."""
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
     command = [sys.executable, "-c", ENDLESS, "desk", "--device", "cpu", "--quality", "low", "--port", "0"]
     with subprocess.Popen(
-        [*command, "--no-browser", "--frames", "1"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [*command, "--no-browser", "--frames", "1"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
     ) as process:
         assert process.stdout is not None
         assert "http://" in process.stdout.readline()
@@ -132,6 +141,7 @@ def test_ctrl_c_does_not_wait_for_the_frame_in_hand() -> None:
             process.kill()
     assert process.returncode == 130
     assert errors == ""
+    assert not list(tmp_path.iterdir())
 
 
 @run

@@ -181,7 +181,7 @@ def test_edits_are_undone_and_done_again() -> None:
     # An edit that cannot be built is none.
     good = controls.wanted
     edit(type="add", part="object", kind="box")
-    controls.give_back(good)
+    controls.give_back(good, controls.wanted)
     controls.undo()
     assert controls.wanted == dataclasses.replace(seen[-3], quality=PRESETS["high"])
     controls.close()

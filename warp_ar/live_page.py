@@ -142,7 +142,10 @@ def serve_page(options: argparse.Namespace) -> int:
     if not server.ended or code in (EXIT_INTERRUPTED, EXIT_TERMINATED):
         # A frame of the reference, or a kernel that is compiled, takes many seconds and cannot be stopped, and Python
         # would wait for its thread, or end it within native code, which aborts. All files are closed and temporary
-        # folders gone by now.
+        # folders gone by now, but for a compiler's.
+        modules = sys.modules.get("warp_ar.engine.modules")
+        if modules is not None and hasattr(modules, "remove_header_folders"):  # else it is still being imported
+            modules.remove_header_folders()
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)

@@ -177,11 +177,13 @@ class Session(Closing):
 
     def close(self) -> None:
         """Let the source and the pipeline's threads go."""
-        self.source.close()
-        if self._switcher is None:
-            self.pipeline.close()
-        else:
-            self._switcher.close()
+        try:
+            self.source.close()
+        finally:
+            if self._switcher is None:
+                self.pipeline.close()
+            else:
+                self._switcher.close()
 
     def change(self, *, scene: Scene | None = None, quality: str | Quality | None = None) -> None:
         """Light the frames to come with another scene or quality; source, light and clock go on.

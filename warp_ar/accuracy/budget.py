@@ -43,12 +43,14 @@ from warp_ar.closing import Closing
 from warp_ar.engine.modules import Progress
 from warp_ar.engine.pipeline import Pipeline, Result
 from warp_ar.engine.switcher import PipelineSwitcher, Target
-from warp_ar.errors import UsageError
+from warp_ar.errors import UsageError, WarpArError
 from warp_ar.scene import Pose, Scene
 from warp_ar.stages.quality import DEFAULT_BUDGET_MS, Quality
 from warp_ar.stages.request import Estimates
 
 _KEPT_PIPELINES = 6
+_NEVER_MS = 1e9
+"""What methods are taken to need that cannot be built here."""
 
 T = TypeVar("T")
 
@@ -218,10 +220,15 @@ class AutoPipeline(Closing):
         return admitted
 
     def _swap(self) -> None:
-        """Go over to the wanted pipeline if it is ready."""
+        """Go over to the wanted pipeline if it is ready; one that cannot be built is told, and not wanted again."""
         if self._controller is None:
             return
-        latest = self._switcher.take(self._admit)
+        try:
+            latest = self._switcher.take(self._admit)
+        except WarpArError as error:
+            print(f"warp_ar: {error}; others are used", file=sys.stderr)
+            self._admit(self.pipeline, _NEVER_MS)
+            return
         assert latest is not None
         if latest is not self.pipeline:
             self.pipeline = latest

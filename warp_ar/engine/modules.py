@@ -173,10 +173,14 @@ def _compile(variants: list[tuple[Any, int | None]], device: Any, progress: Prog
         progress(0, len(variants))
     try:
         with ThreadPoolExecutor(min(cores, len(variants)), "warp_ar-compile") as pool:
-            for done, job in enumerate(as_completed([pool.submit(work, *variant) for variant in variants]), 1):
-                job.result()
-                if progress is not None:
-                    progress(done, len(variants))
+            try:
+                for done, job in enumerate(as_completed([pool.submit(work, *variant) for variant in variants]), 1):
+                    job.result()
+                    if progress is not None:
+                        progress(done, len(variants))
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)  # who interrupts this does not wait for all the others
+                raise
     finally:
         if headers is not None:
             headers.close()

@@ -64,6 +64,7 @@ class PipelineSwitcher:
         self._refused: Target | None = None
         self._prepare: Prepare = Pipeline.warm_up
         self._building: Future[tuple[Pipeline, Any]] | None = None
+        self._built_for: Target | None = None
         self.pipeline: Pipeline | None = None
         """What lights the next frame; None until something was taken."""
         self.swaps = 0
@@ -106,17 +107,14 @@ class PipelineSwitcher:
         if self._building is not None and self._building.done():
             building, self._building = self._building, None
             try:
-                pipeline, prepared = building.result()
+                built = building.result()
             except WarpArError:
-                self._refused, self._wanted = self._wanted, self._shown
-                raise
-            if self._wanted is None or not _fits(pipeline, self._wanted):
-                self._dispose(pipeline)  # something else is wanted by now
-            elif admit is not None and not admit(pipeline, prepared):
-                self._dispose(pipeline)
-                self._refused, self._wanted = self._wanted, self._shown
+                if self._built_for is self._wanted:
+                    self._refused, self._wanted = self._wanted, self._shown
+                    raise
+                # Something else is wanted by now, of which that says nothing.
             else:
-                self._go_over(pipeline)
+                self._take_built(*built, admit)
         if self._wanted is not self._shown and self._building is None:
             ready = self._ready()
             if ready is None:
@@ -124,6 +122,16 @@ class PipelineSwitcher:
             else:
                 self._go_over(ready)
         return self.pipeline
+
+    def _take_built(self, pipeline: Pipeline, prepared: Any, admit: Admit | None) -> None:
+        """Go over to a pipeline that was just built, or let it go."""
+        if self._wanted is None or not _fits(pipeline, self._wanted):
+            self._dispose(pipeline)  # something else is wanted by now
+        elif admit is not None and not admit(pipeline, prepared):
+            self._dispose(pipeline)
+            self._refused, self._wanted = self._wanted, self._shown
+        else:
+            self._go_over(pipeline)
 
     def shows(self, target: Target) -> bool:
         """Whether the next frame is lit as a target asks for."""
@@ -169,6 +177,7 @@ class PipelineSwitcher:
     def _start(self) -> None:
         assert self._builder is not None
         assert self._wanted is not None
+        self._built_for = self._wanted
         self._building = self._builder.submit(self._build, self._wanted, self._prepare)
 
     def _build(self, target: Target, prepare: Prepare) -> tuple[Pipeline, Any]:
@@ -196,12 +205,12 @@ class PipelineSwitcher:
             ) from error
 
     def _go_over(self, pipeline: Pipeline) -> None:
-        self._shown = self._wanted
         before = self.pipeline
+        if before is not None and pipeline is not before:
+            pipeline.continue_from(before)  # first: it tells of a frame that failed, and the one before then stays
+        self._shown = self._wanted
         if pipeline is before:
             return
-        if before is not None:
-            pipeline.continue_from(before)
         if pipeline in self._kept:
             self._kept.remove(pipeline)
         self.pipeline = pipeline
@@ -268,5 +277,5 @@ def let_go(pipeline: Pipeline) -> None:
 
 
 def _close_built(building: Future[tuple[Pipeline, Any]]) -> None:
-    if building.exception() is None:
+    if not building.cancelled() and building.exception() is None:
         let_go(building.result()[0])

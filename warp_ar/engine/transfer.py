@@ -105,9 +105,12 @@ class Transfers:
         self._buffers = SLOTS
 
     def close(self) -> None:
-        """Stop the copying threads."""
+        """Stop the copying threads; what is on its way to the host arrives before the slots that it lies in go."""
         if self._pool is not None:
             self._pool.shutdown()
+        for slot in self._slots:
+            if slot.downloaded is not None:
+                wait_for(slot.downloaded)
 
     def _copy(self, target: Image, source: Image) -> None:
         if self._pool is None:

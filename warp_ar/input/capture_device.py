@@ -33,6 +33,9 @@ SETTLE_FRAMES = 5
 MOST_WAIT = 12
 """Frames within which a device must have taken on another."""
 
+CLOSE_SECONDS = 3.0
+"""How long closing waits for a picture that is being read: a driver may hang."""
+
 MOST_MISSES = 3
 """Times in a row that it may fail to."""
 
@@ -240,15 +243,17 @@ class CaptureDevice(LiveSource):
             except SourceError as problem:
                 error = problem
                 break
-            except cv2.error as problem:
+            except Exception as problem:  # whatever it is, who waits for a picture is told
                 error = SourceError(f"{self._name}: {reason(problem)}")
+                error.__cause__ = problem
                 break
             self._newest.put(image, now, exposure)
         self._newest.close(error)
 
     def close(self) -> None:
-        """End the reader and release the device."""
+        """End the reader and release the device; one whose driver hangs is left to it."""
         self._stop.set()
         super().close()
-        self._thread.join()
-        self._capture.release()
+        self._thread.join(CLOSE_SECONDS)
+        if not self._thread.is_alive():
+            self._capture.release()

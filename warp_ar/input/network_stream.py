@@ -109,6 +109,11 @@ class NetworkStream(LiveSource):
                 # What FFmpeg calls a wait that was cut short depends on where it was.
                 silent = time.monotonic() - heard > 0.9 * OPEN_SECONDS
                 self._problem = f"no picture came for {OPEN_SECONDS:g} s" if silent else reason(error)
+            except Exception as error:  # whatever it is, who waits for a picture is told
+                failed = SourceError(f"{self._name}: {type(error).__name__}: {reason(error)}")
+                failed.__cause__ = error
+                self._end(failed)
+                return
             if self._stop.is_set():
                 break
             first = not self._ready.is_set()

@@ -131,13 +131,17 @@ class RecordedSource(Source):
         """End every iteration and its thread."""
         self._closed = True
         for frames in list(self._running):
-            frames.close()
+            # One whose next frame another thread is waiting for cannot be closed by this one: it ends with that frame.
+            with contextlib.suppress(ValueError):
+                frames.close()
 
     def _passes(self) -> Generator[Frame, None, None]:
         index, start, last = 0, 0.0, 0.0
         while True:
             with contextlib.closing(self._decode()) as frames:
                 for frame in frames:
+                    if self._closed:
+                        return
                     last = start + frame.time
                     exposure = self._cycle[frame.index % len(self._cycle)] if self._cycle else frame.exposure_time
                     yield dataclasses.replace(frame, index=index, time=last, exposure_time=exposure)

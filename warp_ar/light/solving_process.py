@@ -122,14 +122,19 @@ class SolvingProcess:
             else:
                 return value  # type: ignore[no-any-return]
 
+    def end(self) -> None:
+        """End it, and see it gone; a thread that is solving by it is told by its next read or write."""
+        self._process.kill()
+        self._process.wait()
+
     def close(self) -> None:
-        """Let it go, and see it gone."""
+        """End it and close the streams to it, which no thread may be reading any more."""
+        self.end()
+        self._greeting.join()
         for stream in (self._process.stdin, self._process.stdout):
             assert stream is not None
             with contextlib.suppress(OSError):
                 stream.close()
-        self._process.kill()
-        self._process.wait()
 
 
 class SolvingPool:
@@ -182,8 +187,12 @@ class SolvingPool:
             self._drop(process)  # where the trace failed, it waits for an answer that will not come
             raise
         with self._changed:
-            self._idle.append(process)
-            self._changed.notify()
+            closed = self._closed
+            if not closed:
+                self._idle.append(process)
+                self._changed.notify()
+        if closed:
+            process.close()
         return solved
 
     def _take(self) -> SolvingProcess | None:
@@ -203,17 +212,21 @@ class SolvingPool:
         with self._changed:
             if process in self._all:
                 self._all.remove(process)
-            self._changed.notify()
+            self._changed.notify_all()  # without a process left, all who wait for one solve for themselves
         process.close()
 
     def close(self) -> None:
         """End the processes; what is still asked for is solved for here."""
         with self._changed:
             self._closed = True
-            processes, self._all, self._idle = self._all, [], []
+            processes, self._all, idle, self._idle = self._all, [], self._idle, []
             self._changed.notify_all()
         for process in processes:
-            process.close()
+            # The streams of one that is at work are its caller's, who drops it.
+            if process in idle:
+                process.close()
+            else:
+                process.end()
 
 
 def solve_by(solver: Solver, sides: tuple[Any, ...], trace: Callable[[Any], Any] | None) -> Any:

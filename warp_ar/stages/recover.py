@@ -59,6 +59,8 @@ class _Progress:
     """Frames since the last estimate was begun."""
     last: float = 0.0
     """When that was, seconds."""
+    failed: str = ""
+    """Why the last one could not be solved for; empty where it could."""
     rested: bool = False
     """Whether nothing has read the environment since."""
     gain: npt.NDArray[np.float64] = dataclasses.field(default_factory=lambda: np.ones(3))
@@ -162,15 +164,10 @@ class Recover(Stage):
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Both sides of the equations on the device, their solution on the host beside it, its effect on the map."""
-        scene = self.request.scene
-        self._proxies = trace_variant(trace_config(scene), device).proxies
+        self._proxies = trace_variant(trace_config(self.request.scene), device).proxies
         self._arrays, self._device = arrays, device
         arrays["recover_points"].assign(self._surfaces.points)
-        ball = scene.probes[0]
-        solver = recovery.Recovery(
-            self._surfaces, scene.marker.white, ball.center, radius=ball.radius, method=self.method
-        )
-        self._progress = _Progress(solver)
+        self._progress = _Progress(self._new_solver())
         self._asks = self._arrives = self._news = False
         self._worker: ThreadPoolExecutor | None = None
         points = len(self._surfaces.points)
@@ -198,6 +195,14 @@ class Recover(Stage):
         if device.is_cpu:
             passes.append(Pass(self._measure, rows=self.request.quality.environment_height))
         return passes
+
+    def _new_solver(self) -> recovery.Recovery:
+        """One that has learnt nothing yet."""
+        scene = self.request.scene
+        ball = scene.probes[0]
+        return recovery.Recovery(
+            self._surfaces, scene.marker.white, ball.center, radius=ball.radius, method=self.method
+        )
 
     def _relocate(self, ball: int) -> list[Pass]:
         """What was recovered in the first ball's map, put into that of another as it sees it."""
@@ -344,6 +349,10 @@ class Recover(Stage):
         """In the worker, or, if ``aside``, in a process beside it.
 
         Nothing writes the equations before this is done: it takes effect before the next begins.
+
+        Raises:
+            LinAlgError: The equations have no solution.
+            FloatingPointError: It is not finite.
         """
         begin, sides = time.perf_counter(), self._equations.fetched()
         cells = sides["recover_cells_now"]
@@ -358,6 +367,8 @@ class Recover(Stage):
             solver, estimate = POOL.solve(solver, given, self._trace)
         else:
             estimate = solve_by(solver, given, self._trace)
+        if estimate is not None and not _is_finite(estimate):
+            raise FloatingPointError("the solution is not finite")
         solution = None if estimate is None else _Solution(estimate, cells)
         return _Solved(solution, solver, time.perf_counter() - begin)
 
@@ -384,10 +395,15 @@ class Recover(Stage):
         return np.array(flat.reshape(points, count), np.float64)
 
     def _take(self, rows: Rows | None) -> None:
-        """Let what was solved for take effect."""
-        now = self._progress
+        """Let what was solved for take effect; where that has failed, the light stays, and the solver begins anew."""
+        now, self._news = self._progress, False
         assert now.pending is not None
-        solved, now.pending = now.pending.result(), None
+        pending, now.pending, now.failed = now.pending, None, ""
+        try:
+            solved = pending.result()
+        except (np.linalg.LinAlgError, FloatingPointError) as error:
+            now.solver, now.failed = self._new_solver(), str(error)
+            return
         now.solver, now.took = solved.solver, solved.seconds
         solution = solved.solution
         self._news = solution is not None
@@ -433,10 +449,11 @@ class Recover(Stage):
         return True
 
     def status(self) -> Mapping[str, Any]:
-        """What the last estimate rests on, for reports."""
-        estimate = self._progress.estimate
+        """What the last estimate rests on, for reports, and why none was made since; see ``_take``."""
+        estimate, failed = self._progress.estimate, self._progress.failed
+        reason = {"failed": failed} if failed else {}
         if estimate is None:
-            return {}
+            return reason
         emitters = [
             {
                 "direction": [round(float(x), 4) for x in emitter.direction],
@@ -456,4 +473,10 @@ class Recover(Stage):
             for name in ("low", "value", "high"):
                 axes = getattr(estimate.irradiance, name)
                 report[f"irradiance_{name}"] = [[round(float(x), 4) for x in axis] for axis in axes]
-        return report
+        return report | reason
+
+
+def _is_finite(estimate: recovery.Estimate) -> bool:
+    """Whether all that an estimate puts into the map is a number."""
+    powers = all(bool(np.isfinite(emitter.power).all()) for emitter in estimate.emitters)
+    return powers and bool(np.isfinite(estimate.recovered).all())

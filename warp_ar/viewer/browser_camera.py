@@ -5,6 +5,7 @@ from __future__ import annotations
 import collections
 import dataclasses
 import math
+import threading
 import time
 from typing import Final
 
@@ -13,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_ar.errors import UsageError
-from warp_ar.input.sources import QueueSource
+from warp_ar.input.sources import QueueSource, Source
 from warp_ar.pictures import decode_picture
 from warp_ar.viewer import protocol
 from warp_ar.viewer.controls import Controls, Feed, Notify
@@ -48,6 +49,8 @@ class BrowserCamera:
 
     def __init__(self, controls: Controls, notify: Notify) -> None:
         self._controls, self._notify = controls, notify
+        self._choosing = threading.Lock()
+        """Held by who makes a camera the source: of two viewers who ask at once one is refused."""
         self._estimator: FocalEstimator | None = None
         self._estimated: float | None = None
         self._estimate_until = 0.0
@@ -71,17 +74,18 @@ class BrowserCamera:
             UsageError: Another viewer's camera is.
         """
         controls = self._controls
-        feed = controls.newest_feed
-        if feed.is_browser and feed.owner is not owner:
-            raise UsageError("another viewer's camera is the source; it must be switched off there first")
-        self._estimator = self._estimated = None
-        known = controls.wanted.camera_of((width, height))
-        marker = controls.wanted.scene.marker
-        if known is None and marker.board is None:
-            self._estimator = FocalEstimator(marker, width, height)
-            self._estimate_until = time.monotonic() + _ESTIMATE_SECONDS
-        source = QueueSource((width, height), description="the browser's camera")
-        controls.switch(Feed(source, guessed_camera(width, height), owner=owner))
+        with self._choosing:
+            feed = controls.newest_feed
+            if feed.is_browser and feed.owner is not owner:
+                raise UsageError("another viewer's camera is the source; it must be switched off there first")
+            self._estimator = self._estimated = None
+            known = controls.wanted.camera_of((width, height))
+            marker = controls.wanted.scene.marker
+            if known is None and marker.board is None:
+                self._estimator = FocalEstimator(marker, width, height)
+                self._estimate_until = time.monotonic() + _ESTIMATE_SECONDS
+            source = QueueSource((width, height), description="the browser's camera")
+            controls.switch(Feed(source, guessed_camera(width, height), owner=owner))
 
     def is_of(self, owner: object) -> bool:
         """Whether ``owner``'s camera is the source."""
@@ -114,7 +118,7 @@ class BrowserCamera:
         now = time.monotonic()
         self._pushed.append(Pushed(picture, taken.id, now, taken.taken))
         feed.source.push(picture, now)
-        self._estimate(picture, now)
+        self._estimate(picture, now, feed.source)
 
     def begin(self, image: Image, busy_ms: float) -> Pushed | None:
         """Say that a frame is about to be lit; what is known of it if it was pushed.
@@ -130,17 +134,20 @@ class BrowserCamera:
             self._notify({"type": "taken", "id": pushed.id, "wait": round(wait, 1)})
         return pushed
 
-    def _estimate(self, picture: Image, now: float) -> None:
+    def _estimate(self, picture: Image, now: float, source: Source) -> None:
+        """Learn the focal length from a picture of ``source``; what comes after that was left says nothing."""
         estimator = self._estimator
         if estimator is None or now < self._looked + _LOOK_SECONDS:
             return
         self._looked = now
         found = estimator.estimate() if estimator.look(picture) and estimator.ripe else None
         if found is not None and abs(found.focal / (self._estimated or math.inf) - 1.0) > _FOCAL_STEP:
+            camera = guessed_camera(picture.shape[1], picture.shape[0], focal=found.focal)
+            if self._estimator is not estimator or not self._controls.use_camera(camera, source):
+                return
             self._estimated = found.focal
-            self._controls.use_camera(guessed_camera(picture.shape[1], picture.shape[0], focal=found.focal))
             self._notify({"type": "intrinsics", "focal": found.focal, "spread": found.spread, "views": found.views})
-        if estimator.full or now > self._estimate_until:
+        if self._estimator is estimator and (estimator.full or now > self._estimate_until):
             self._estimator = None
             if self._estimated is None:
                 self._notify({"type": "intrinsics", "focal": None, "spread": None, "views": 0})

@@ -24,9 +24,10 @@ from warp_ar.accuracy.costs import BASE, Costs, cost_key, measure_steps, read_co
 from warp_ar.cache_folder import cache_folder
 from warp_ar.engine.graph import make_plan
 from warp_ar.engine.pipeline import Pipeline
-from warp_ar.errors import WarpArError
+from warp_ar.errors import WarpArError, reason
 from warp_ar.scene import Pose
 from warp_ar.stages.quality import AUTO, DEFAULT_BUDGET_MS, PRESETS, Quality
+from warp_ar.viewer.beside import begin
 from warp_ar.viewer.controls import Notify
 
 _COST_FRAMES: Final = 30
@@ -117,7 +118,7 @@ class BudgetSetting:
             self._progress, self._began = 0.0, time.monotonic()
             self._notify(self.record())
             steps = measure_steps(scene, image.copy(), pose, str(pipeline.device), size, self._settings)
-            helper.submit(self._step, helper, steps, key)
+            begin(helper, self._notify, self._step, helper, steps, key)
 
     def _step(self, helper: Executor, steps: Generator[float, None, Costs], key: str) -> None:
         progress = None
@@ -127,14 +128,19 @@ class BudgetSetting:
         except StopIteration as end:
             write_costs(self._folder, self._cache_key, end.value)
             self._adopt(end.value)
-        except WarpArError as error:
+        except (WarpArError, RuntimeError, MemoryError) as error:
+            # Such as a device whose memory is full.
             self._failed = key
-            self._notify({"type": "notice", "text": f"What methods cost cannot be measured: {error}", "bad": True})
+            text = f"What methods cost cannot be measured: {reason(error)}"
+            self._notify({"type": "notice", "text": text, "bad": True})
+        except BaseException:
+            self._failed = key  # else they would be measured again and again
+            raise
         finally:
             self._progress = progress
         self._notify(self.record())
         if progress is not None and not self._stopped:
-            helper.submit(self._step, helper, steps, key)
+            begin(helper, self._notify, self._step, helper, steps, key)
 
     def _adopt(self, costs: Costs | None) -> None:
         self._costs = costs

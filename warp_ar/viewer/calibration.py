@@ -18,6 +18,7 @@ from warp_ar.input.camera_calibration import GOOD_VIEWS, BoardViews, CameraRepor
 from warp_ar.input.card import write_card
 from warp_ar.input.sheet import SHEET
 from warp_ar.scene import Camera
+from warp_ar.viewer.beside import begin
 from warp_ar.viewer.controls import Notify
 
 _LOOK_SECONDS: Final = 0.4
@@ -48,9 +49,10 @@ class CalibrationSession:
             WarpArError: There is nothing to finish, or what was seen tells too little: looking goes on.
         """
         if name == "finish":
-            if self._views is None:
+            seen = self._views  # once: another viewer may finish or stop it meanwhile
+            if seen is None:
                 raise UsageError("nothing was looked at yet: start the calibration first")
-            report = self._views.solve()
+            report = seen.solve()
             if report.doubt:
                 # The views stay, for more of them to be added.
                 views = len(report.view_errors)
@@ -68,13 +70,15 @@ class CalibrationSession:
         if self._looking is not None and not self._looking.done():
             return
         self._looked = now
-        self._looking = self._helper.submit(self._add, views, image)
+        self._looking = begin(self._helper, self._notify, self._add, views, image)
 
     def _add(self, views: BoardViews, image: npt.NDArray[np.uint8]) -> None:
         try:
             new = views.add(image)
         except UsageError as error:  # the source has changed
-            self._views, new = None, True
+            new = True
+            if self._views is views:
+                self._views = None
             self._notify({"type": "notice", "text": str(error), "bad": True})
         if new:
             self._notify(self.message())

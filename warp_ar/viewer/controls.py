@@ -124,7 +124,7 @@ class Controls:
             if label is not None and self.wanted != before:
                 self._history.note(label, before, time.monotonic())
             self._touch()
-        self._notify(self.scene_message())
+            self._tell()
 
     def undo(self) -> None:
         """Take the last edit back; without one nothing happens."""
@@ -140,15 +140,17 @@ class Controls:
             if wanted is not None:
                 self.wanted = wanted
                 self._touch()
-        self._notify(self.scene_message())
+            self._tell()
 
-    def give_back(self, good: Wanted) -> None:
-        """Want again what was wanted before an edit that could not be built."""
+    def give_back(self, good: Wanted, refused: Wanted) -> None:
+        """Want again what was wanted before an edit that could not be built, unless something else is wanted by now."""
         with self.changed:
+            if self.wanted is not refused:
+                return
             self.wanted = good
             self._history.drop(good)
             self._touch()
-        self._notify(self.scene_message())
+            self._tell()
 
     def start_anew(self, wanted: Wanted) -> None:
         """Want another scene; edits of the one before are forgotten."""
@@ -156,7 +158,7 @@ class Controls:
             self.wanted = wanted
             self._history.clear()
             self._touch()
-        self._notify(self.scene_message())
+            self._tell()
 
     def scene_message(self) -> dict[str, Any]:
         """The scene as it is edited, and what can be undone."""
@@ -171,6 +173,10 @@ class Controls:
     def _touch(self) -> None:
         self.edits += 1
         self.changed.notify_all()
+
+    def _tell(self) -> None:
+        """Tell viewers the scene; to be called with the lock held, so that what they hear last is what is."""
+        self._notify(self.scene_message())
 
     def set_compare(self, other: str) -> None:
         """Choose what stands beside the picture.
@@ -227,14 +233,20 @@ class Controls:
                 self.wanted = self.feed.wanted
                 self._history.clear()
             self._touch()
-        self._notify(self.scene_message())
+            self._tell()
         return True
 
-    def use_camera(self, camera: Camera) -> None:
-        """Say what camera took the present source's frames."""
+    def use_camera(self, camera: Camera, source: Source) -> bool:
+        """Say what camera takes a source's frames; False if the source has been left."""
         with self.changed:
-            self.feed = dataclasses.replace(self.feed, camera=camera)
+            if self._next is not None and self._next.source is source:
+                self._next = dataclasses.replace(self._next, camera=camera)
+            elif self._next is None and self.feed.source is source:
+                self.feed = dataclasses.replace(self.feed, camera=camera)
+            else:
+                return False
             self._touch()
+        return True
 
     def close(self) -> None:
         """Let the sources go."""

@@ -17,7 +17,7 @@ from warp_ar.accuracy.known_frame import KnownFrame, exposed_scene, light_of
 from warp_ar.accuracy.path_tracer import Image, PathTracer, TracedPicture
 from warp_ar.device import exclusive
 from warp_ar.engine.pipeline import Pipeline, Result
-from warp_ar.errors import WarpArError
+from warp_ar.errors import UsageError, WarpArError, reason
 from warp_ar.viewer.controls import TRACED
 
 FULL_SCALE: Final = 0.2
@@ -132,10 +132,13 @@ class Convergence:
             return False
         try:
             tracer = made.result()
-        except WarpArError:
+            tracer.sample_for(SLICE_SECONDS)
+        except (WarpArError, RuntimeError, MemoryError) as error:
             self._made = None  # the picture goes on without a reference
-            raise
-        tracer.sample_for(SLICE_SECONDS)
+            if isinstance(error, WarpArError):
+                raise
+            # Such as a device whose memory is full.
+            raise UsageError(f"the reference cannot be traced here: {reason(error)}") from error
         now = time.monotonic()
         if tracer.samples < 1 or now - self._shown < SHOWN_SECONDS:
             return False

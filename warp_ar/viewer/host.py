@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import tempfile
 import threading
@@ -15,17 +16,17 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_ar.engine.pipeline import resolve_quality
-from warp_ar.errors import UsageError
+from warp_ar.errors import SourceError, UsageError, WarpArError
 from warp_ar.input.outline_fit import fit_outline
 from warp_ar.output.sinks import write_environment
 from warp_ar.scene import Scene, bundled_scenes, dumps_scene, load_scene
 from warp_ar.stages.quality import AUTO, DEFAULT_PRESET, PRESETS, Quality
-from warp_ar.viewer import calibration, edits, protocol
+from warp_ar.viewer import calibration, edits, messages, protocol
 from warp_ar.viewer.browser_camera import BrowserCamera
 from warp_ar.viewer.budget import BudgetSetting
 from warp_ar.viewer.bundle import pack_scene
 from warp_ar.viewer.calibration import CalibrationSession
-from warp_ar.viewer.controls import Controls, Notify, open_feed
+from warp_ar.viewer.controls import Controls, Feed, Notify, open_feed
 from warp_ar.viewer.dropped import DroppedFiles
 from warp_ar.viewer.edits import Wanted
 from warp_ar.viewer.frames import FrameLoop, Helpers, Lit
@@ -185,13 +186,14 @@ class Host:
 
     def _set_budget(self, budget: float | None, preset: str) -> None:
         """Keep to a budget, or with None show a preset."""
-        if budget is None:
-            quality = self._preset = resolve_quality(preset)
-        else:
-            running = self._controls.wanted.quality
-            quality = running if self._budget.rules(running) else self._budget.start_quality()
-        self._budget.switch(budget)
-        self._controls.change(lambda w: dataclasses.replace(w, quality=quality))
+        with self._controls.changed:  # of two viewers who ask at once, both parts are those of one
+            if budget is None:
+                quality = self._preset = resolve_quality(preset)
+            else:
+                running = self._controls.wanted.quality
+                quality = running if self._budget.rules(running) else self._budget.start_quality()
+            self._budget.switch(budget)
+            self._controls.change(lambda w: dataclasses.replace(w, quality=quality))
         self._notify(self.state_message())
 
     def _point_out(self, kind: str, points: tuple[tuple[float, float], ...]) -> None:
@@ -226,8 +228,17 @@ class Host:
 
     def leave_camera(self, owner: object) -> None:
         """Back to the scene's own source, if ``owner``'s camera is the source."""
-        if self._camera.is_of(owner):
-            self._camera.leave(open_feed(self._controls.wanted.scene, self._given_source))
+        if not self._camera.is_of(owner):
+            return
+        scene = self._controls.wanted.scene
+        try:
+            feed = open_feed(scene, self._given_source)
+        except WarpArError as error:
+            # Such as a scene without a source, or one whose file has gone: others may bring a camera.
+            self._notify(messages.notice(error))
+            absent = error if isinstance(error, SourceError) else SourceError(str(error))
+            feed = Feed(NoCamera((scene.camera.width, scene.camera.height), absent))
+        self._camera.leave(feed)
 
     def camera_size(self, owner: object) -> tuple[int, int] | None:
         """Size of the pictures that ``owner`` may push now; None if it is not the source."""
@@ -386,7 +397,8 @@ class Host:
 
     def _missing(self) -> dict[str, str] | None:
         """Why there are no frames, or why the marker is not seen in them."""
-        missing = self._setup.missing if self.no_camera is None else self.no_camera.finding
+        absent = self.no_camera  # once: another source may come meanwhile
+        missing = self._setup.missing if absent is None else absent.finding
         return None if missing is None else {"name": missing.name, "text": missing.text, "remedy": missing.remedy}
 
     def _lens(self) -> str:
@@ -414,9 +426,11 @@ class Host:
             Whether all threads have ended; those that have not end with what they are at.
         """
         self._budget.stop()
-        self._recorder.stop()
+        with contextlib.suppress(WarpArError):  # a recording that cannot be finished goes with its folder
+            self._recorder.stop()
         self._controls.close()
         ended = frames_ended and self._lighting.close(wait_seconds)
         self._looker.shutdown(wait=ended)
-        self._folder.cleanup()
+        with contextlib.suppress(OSError):  # a thread that has not ended may still write into it
+            self._folder.cleanup()
         return ended

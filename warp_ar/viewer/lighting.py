@@ -106,7 +106,8 @@ class Lighting:
         """What is being built, for a line on the page; None while nothing is."""
         if not self.busy:
             return None
-        target = self._then if self._then is not None and not self.changing else self._first or self._now
+        then = self._then  # once: the thread of the frames sets it
+        target = then if then is not None and not self.changing else self._first or self._now
         name, done, count = self._progress or (target.quality.name, 0, 0)
         return {"quality": name, "done": done, "count": count}
 
@@ -139,7 +140,7 @@ class Lighting:
                 self._settled = True
                 self._notify(messages.notice(error))
                 self._give_up()
-                controls.give_back(self._good)
+                controls.give_back(self._good, wanted)
         if self._main.swaps != before:
             assert self._main.pipeline is not None
             self.plan = self._main.pipeline.plan
@@ -149,8 +150,10 @@ class Lighting:
             if self._second.pipeline is not None or self._second.busy:
                 self._second.close(wait=False)
         elif not self.changing:
-            with contextlib.suppress(WarpArError):
+            try:
                 self._second.follow(self._then, prepare=self._warm_up)
+            except WarpArError as error:
+                self._notify(messages.notice(error))
         return self._main.pipeline if self._place == _place(self._now) else None
 
     def _tell_bracket(self, notes: tuple[str, ...]) -> None:

@@ -101,6 +101,10 @@ class PageFiles:
             words = await self._server._aside(host.drop, name, b"".join(parts))
         except TimeoutError:
             return web.Response(status=408, text="the file took too long\n")
+        except ConnectionError:
+            return web.Response(
+                status=400, text="the file did not come whole\n"
+            )  # nobody hears it: the sender has gone
         except WarpArError as error:
             return web.Response(status=422, text=f"{error}\n")
         finally:

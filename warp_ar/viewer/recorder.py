@@ -78,6 +78,7 @@ class Recorder:
         Raises:
             UsageError: There is none.
         """
-        if self._sink is not None or not self._path.is_file():
-            raise UsageError("nothing was recorded, or it has not ended")
-        return self._path.read_bytes()
+        with self._lock:  # a file that is being finished is not whole yet
+            if self._sink is not None or not self._path.is_file():
+                raise UsageError("nothing was recorded, or it has not ended")
+            return self._path.read_bytes()

@@ -88,6 +88,8 @@ class _Viewer:
         self.messages = protocol.Bucket(MESSAGES_PER_SECOND, 2 * MESSAGES_PER_SECOND)
         self.bytes = protocol.Bucket(BYTES_PER_SECOND, 2 * BYTES_PER_SECOND)
         self.picture: asyncio.Task[None] | None = None
+        self.early: list[str | bytes] | None = []
+        """What all were told while its greetings were made, which may be older; None once it has those."""
 
     def tell(self, message: str | bytes) -> None:
         """Send a message when there is room for it; a viewer that lets 64 pile up misses some."""
@@ -184,8 +186,9 @@ class Server:
 
     def _publish(self, lit: Lit) -> None:
         """On the host's thread."""
-        if self._loop is not None:
-            self._loop.call_soon_threadsafe(self._arrived, lit)
+        loop = self._loop
+        if loop is not None:
+            loop.call_soon_threadsafe(self._arrived, lit)
 
     def _arrived(self, lit: Lit) -> None:
         self._latest = lit
@@ -196,12 +199,13 @@ class Server:
 
     def _notify(self, message: dict[str, Any]) -> None:
         """On any thread."""
-        if self._loop is not None:
-            self._loop.call_soon_threadsafe(self._tell_all, json.dumps(message))
+        loop = self._loop
+        if loop is not None:
+            loop.call_soon_threadsafe(self._tell_all, json.dumps(message))
 
     def _tell_all(self, message: str | bytes) -> None:
         for viewer in self._viewers:
-            viewer.tell(message)
+            viewer.tell(message) if viewer.early is None else viewer.early.append(message)
 
     async def _jpeg(self, lit: Lit, which: str) -> bytes:
         """A picture of a frame, encoded when first asked for."""
@@ -308,17 +312,22 @@ class Server:
             for message in await self._aside(host.greetings):
                 viewer.tell(json.dumps(message))
             viewer.tell(await self._light_message(host.light()))
+            early, viewer.early = viewer.early or [], None
+            for told in early:
+                viewer.tell(told)
             await self._receive(viewer)
         finally:
             self._viewers.discard(viewer)
             host.watch(-1)
             sender.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await sender
             if viewer.picture is not None:
                 viewer.picture.cancel()
-            if not self._ending:  # else the host gives up its camera by itself
-                await self._aside(host.leave_camera, viewer)
+            try:
+                with contextlib.suppress(asyncio.CancelledError):
+                    await sender
+            finally:
+                if not self._ending:  # else the host gives up its camera by itself
+                    await self._aside(host.leave_camera, viewer)
         return socket
 
     def _aside(

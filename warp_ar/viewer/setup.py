@@ -22,6 +22,7 @@ from warp_ar.input.grey_response import MOST_DEVIATION, measure_grey_response
 from warp_ar.input.response import write_response
 from warp_ar.input.tracking import TrackState
 from warp_ar.scene import Camera, Probe, Scene
+from warp_ar.viewer.beside import begin
 from warp_ar.viewer.controls import Controls, Notify
 
 Image = npt.NDArray[np.uint8]
@@ -107,7 +108,7 @@ class SetupChecks:
         due = doubtful or now - self._seen > LOST_SECONDS
         if due and now - self._looked > AGAIN_SECONDS and not self._is_busy:
             self._looked = now
-            self._busy = self._helper.submit(self._say_why, doubtful)
+            self._busy = begin(self._helper, self._notify, self._say_why, doubtful)
 
     @property
     def _is_busy(self) -> bool:
@@ -151,7 +152,7 @@ class SetupChecks:
         """Do what was asked for, if there are enough frames."""
         if self._waits and self._step is not None and len(self._frames) >= FEWEST:
             self._waits = False
-            self._busy = self._helper.submit(self._run, self._step)
+            self._busy = begin(self._helper, self._notify, self._run, self._step)
 
     def _run(self, step: str) -> None:
         try:
@@ -178,7 +179,8 @@ class SetupChecks:
             now = _state_of(self._shown()[0])
         except WarpArError:
             return frozenset()  # the source has changed meanwhile
-        return frozenset(step for step, made in self._made.items() if now[step] == made)
+        # A copy: the helper adds to it.
+        return frozenset(step for step, made in list(self._made.items()) if now[step] == made)
 
     def _ball(self, scene: Scene, look: Look) -> None:
         """Measure the first mirror ball and put it where it stands."""
@@ -254,7 +256,7 @@ class SetupChecks:
             "findings": findings,
             "outdated": self._findings is not None and findings is None,
             "frames": len(self._frames),
-            "measured": {step: words for step, words in self._measured.items() if step in valid},
+            "measured": {step: words for step, words in list(self._measured.items()) if step in valid},
             "failed": dict(self._failed),
         }
 
