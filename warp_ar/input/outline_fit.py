@@ -262,7 +262,7 @@ def refit_outline(image: NDArray[np.uint8], camera: Camera, pose: Pose, proxy: P
             if moved is None:
                 break
             shape = moved
-    if not _is_sound(kind, shape):
+    if not _is_sound(shape):
         shape = start
     off = float(np.linalg.norm(view.pixels(_corners(kind, shape)) - seen, axis=1).max())
     return OutlineRefit(_proxy(kind, shape), _met(kind, shape, view, picture)[0], before, off)
@@ -395,7 +395,7 @@ def _start_box(view: _View, points: Array) -> Array:
     return np.array([*middle, math.atan2(along[1], along[0]), width, abs(depth), height])
 
 
-def _is_sound(kind: str, shape: Array) -> bool:
+def _is_sound(shape: Array) -> bool:
     return bool(
         np.isfinite(shape).all()
         and (shape[3:] >= SMALLEST).all()
@@ -405,7 +405,7 @@ def _is_sound(kind: str, shape: Array) -> bool:
 
 
 def _check(kind: str, shape: Array) -> None:
-    if _is_sound(kind, shape):
+    if _is_sound(shape):
         return
     order = {
         "plane": "its four corners, around it",
@@ -488,7 +488,7 @@ def _settled(kind: str, shape: Array, view: _View, anchors: tuple[list[int], Arr
         if not np.isfinite(jacobian).all():
             return shape
         moved = shape + np.linalg.lstsq(jacobian, pointed.ravel() - now, rcond=None)[0]
-        if not _is_sound(kind, moved):
+        if not _is_sound(moved):
             return shape
         shape = moved
     return shape
@@ -527,7 +527,7 @@ def _improve(
     step, *_ = np.linalg.lstsq(jacobian[good] * root[good, None], target[good] * root[good], rcond=None)
     moved = shape.copy()
     moved[:free] += step
-    return moved if _is_sound(kind, moved) else None
+    return moved if _is_sound(moved) else None
 
 
 def _met(kind: str, shape: Array, view: _View, picture: _Picture) -> tuple[float, float]:

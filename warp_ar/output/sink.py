@@ -24,8 +24,6 @@ from warp_ar.closing import Closing
 from warp_ar.errors import SinkError, reason
 from warp_ar.files import kind_of
 
-Image = npt.NDArray[np.uint8]
-
 FRAMES_WAITING = 4
 """How many frames may wait to be encoded before `Sink.write` waits."""
 
