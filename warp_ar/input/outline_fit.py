@@ -6,7 +6,7 @@ picture is searched along the edge's normal for the strongest step in colour, an
 its edges meet the steps. The points themselves hold it weakly, so that a shape without edges stays where it was pointed
 out. A box may be as bright as the wood behind it, so that steps are told in RGB.
 
-Steps of other things (a print on the box, its shadow, the desk's grain) make wrong shapes that fit as well. So the fit
+Other steps (a print on the box, its shadow, the desk's grain) make wrong shapes that fit as well. So the fit
 starts from several sizes, and a shape counts as fitted only if no other one, more than ``TRUSTED`` away, fits nearly as
 well, and if the edges that were met tell its corners within ``TRUSTED``. For that each edge has an offset of its own of
 ``EDGE`` pixels (its bevel, the card's pose, the lens) beside the scatter s of its n samples, so that it tells no more
