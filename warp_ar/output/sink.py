@@ -102,7 +102,12 @@ class ThreadedSink(Sink):
         """Encode and write one frame; runs on a thread, and raises SinkError."""
 
     def write(self, image: Any) -> None:
-        """Take the next frame, an array or whatever else has a shape and copies itself; it is stored on a thread."""
+        """Take the next frame, an array or whatever else has a shape and copies itself; it is stored on a thread.
+
+        Raises:
+            SinkError: The sink is closed, the frame has another size or kind than those before it, or an earlier one
+                could not be stored.
+        """
         if self._closed:
             raise SinkError(f"{self.description} is closed; open another one to write to")
         self._check(image)
