@@ -17,8 +17,8 @@ import numpy.typing as npt
 from bench.mitsuba_scene import environment, rgb, sensor
 from warp_ar.kernels.color import decode_table
 from warp_ar.scene import Camera, Pose
-from warp_ar.scene.description import MetallicRoughnessMaterial
 from warp_ar.scene.geometry import Mesh
+from warp_ar.scene.materials import MetallicRoughnessMaterial
 from warp_ar.scene.mesh_materials import MeshMaterial, TextureUse
 from warp_ar.scene.object_materials import is_closed
 

@@ -1,7 +1,7 @@
 """The budget's controller on pretended machines: time over the budget, error, changes, by kind of load.
 
 Then where it settles: with the costs that ``RECORDED`` holds of ``desk`` (``python -m bench.record_costs``), each
-method up to ``OFF`` dearer or cheaper on the machine than the controller believes, and all errors of the cost table.
+method up to ``OFF`` more or less expensive than the controller believes, and all errors of the cost table.
 Per budget ``settles`` is the share of it that frames take, the median of the last ``LAST`` seconds: least, median,
 most over seeds; ``within`` the share of runs that end within a tenth below the budget, or on the best methods there
 are (``at_the_top``); ``changes`` those after ``SETTLED`` seconds of a steady load. ``stepping``: the same in

@@ -1,8 +1,8 @@
 """Errors of light and picture for each fault of a simulated camera, alone and all together.
 
-Frames of ``../shared/truth`` go through the camera; so does the picture with the virtual things really there, which the
-program's is compared with. Clipped pixels of those frames are taken to be ``BEYOND`` before the lens, so that a lower
-exposure leaves them clipped, as it leaves a lamp.
+Frames of ``../shared/truth`` go through the camera; so does the picture with the virtual objects really there, with
+which the program's is compared. Clipped pixels of those frames are taken to be ``BEYOND`` before the lens, so that a
+lower exposure leaves them clipped, as it leaves a lamp.
 ``WARP_AR_FAULT_CASES`` names the cases, ``WARP_AR_FAULTS`` the faults.
 """
 
@@ -59,7 +59,7 @@ def score(case: Path, version: str, faults: Faults, device: str) -> dict[str, fl
     truths = sorted(path.name for path in (case / version).glob("*.png"))
     clean = {name: light_of(case / "camera" / name) for name in names}
     frames = expose([clean[name] for name in names], faults)
-    # The same clip with the things there, so that its noise, codec and drift are the same camera's.
+    # The same clip with the objects there, so that its noise, codec and drift are the same camera's.
     there = [light_of(case / version / name) if name in truths else clean[name] for name in names]
     wanted = dict(zip(names, expose(there, faults, phase=phase), strict=True))
     scene = load_scene(case / f"scene_{version}.toml")

@@ -74,7 +74,7 @@ def errors_of(radiance: Map, level: float) -> dict[str, float]:
         level: Radiance at which all channels clip.
 
     Returns:
-        ``clipped``; by each number, as text; ``best``; ``stops_N``; and ``lacking``, the mean radiance, over the level,
+        ``clipped``; by each number, as text; ``best``; ``stops_N``; and ``missing``, the mean radiance, over the level,
         that what clips lacks by all directions' irradiance.
     """
     truth, clipped = irradiance(radiance), irradiance(np.minimum(radiance, level))
@@ -89,18 +89,18 @@ def errors_of(radiance: Map, level: float) -> dict[str, float]:
     found |= {str(number): error(number * unit) for number in NUMBERS}
     for stops in SHORTER:
         found[f"stops_{stops}"] = error(irradiance(np.minimum(radiance, level * 2.0**stops)) - clipped)
-    return {**found, "lacking": float(missing.sum() / max(float(unit.sum()), 1e-12))}
+    return {**found, "missing": float(missing.sum() / max(float(unit.sum()), 1e-12))}
 
 
 def summarise(rows: Sequence[dict[str, float]]) -> dict[str, Any]:
     """Means over exposures, and in what share of them each number made the picture worse."""
-    means = {key: round(float(np.mean([row[key] for row in rows])), 3) for key in rows[0] if key != "lacking"}
+    means = {key: round(float(np.mean([row[key] for row in rows])), 3) for key in rows[0] if key != "missing"}
     worse = {
         str(number): round(float(np.mean([row[str(number)] > WORSE * row["clipped"] + 1e-4 for row in rows])), 3)
         for number in NUMBERS
     }
-    lacking = np.quantile([row["lacking"] for row in rows], [0.025, 0.25, 0.5, 0.75, 0.975])
-    return {"exposures": len(rows), "error": means, "worse": worse, "lacking": [round(float(q), 2) for q in lacking]}
+    missing = np.quantile([row["missing"] for row in rows], [0.025, 0.25, 0.5, 0.75, 0.975])
+    return {"exposures": len(rows), "error": means, "worse": worse, "missing": [round(float(q), 2) for q in missing]}
 
 
 def main(device: str, arguments: Sequence[str] = ()) -> None:

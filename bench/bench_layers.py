@@ -1,6 +1,6 @@
 """What each layer adds to a frame, against the picture alone, in turn; and what its file takes.
 
-``again`` is the picture alone a second time: how far two equal things lie apart here. ``WARP_AR_BENCH`` may say how
+``again`` is the picture alone a second time: how far two equal programs lie apart here. ``WARP_AR_BENCH`` may say how
 many frames are measured; 30 are usual. On a CPU the time is the processor's, of one thread; on CUDA it is the clock's,
 until the layers are on the host. ``file_ms`` is the processor time of encoding a frame's OpenEXR, ``file_kb`` its size.
 """

@@ -66,7 +66,7 @@ class Setup:
         self.solver = recovery.Recovery(surfaces, scene.marker.white, probe.center)
 
     def weigh(self) -> None:
-        """Weigh the rims of what clips."""
+        """Weigh the saturation boundaries."""
         weigh_boundaries(self.clipped, self.params, self.probes, self.missing)
 
     def condense(self) -> None:
@@ -81,7 +81,7 @@ class Setup:
         kernels.trace_transfer(*arrays, self.traced, self.transfer, self.mirrored, proxies=self.proxies)
 
     def add(self) -> None:
-        """Apply an excess."""
+        """Apply recovered radiance."""
         add_recovered(self.radiance, self.confidence, self.missing, self.cells, self.recovered, self.recovered)
 
     def solve(self) -> recovery.Estimate:

@@ -7,7 +7,7 @@ lights and proxies are used, with one reflectance for each proxy. The light is t
 the pipeline finds, all of it distant. One JSON line per scene and mode:
 
   whole   the whole scene by path tracing, reflectances given
-  known   Mitsuba's picture of the scene without virtual things is the frame, by which reflectance is found
+  known   Mitsuba's picture of the scene without virtual objects and lights is the frame, by which reflectance is found
   z_rms   root mean square of the z-scores of all blocks and channels; 1 where nothing but noise is left
   z_max   the largest; of n scores of noise about 3 (n = 36) to 4 (n = 900)
   beyond  share of scores beyond 3 standard errors

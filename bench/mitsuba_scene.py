@@ -37,7 +37,6 @@ from warp_ar.scene.geometry import Mesh, rotation_matrix
 from warp_ar.scene.object_materials import file_mesh
 from warp_ar.scene.shapes import silhouette_tolerance, torus_mesh
 
-VARIANT = "llvm_ad_rgb"
 DFG_SIZE = 32
 MIN_ALPHA = 1.0e-3
 DIELECTRIC_F0 = 0.04

@@ -82,8 +82,9 @@ def pulled(
     fine_width: wp.int32,
     height: wp.int32,
     width: wp.int32,
+    most: wp.float32,
 ) -> wp.vec4:
-    """Texel of the next coarser level: means over exactly what it covers."""
+    """Texel of the next coarser level: means over exactly what it covers, of values up to ``most``."""
     top = wp.float32(i * fine_height) / wp.float32(height)
     bottom = wp.float32((i + 1) * fine_height) / wp.float32(height)
     left = wp.float32(j * fine_width) / wp.float32(width)
@@ -100,7 +101,8 @@ def pulled(
             weight = part * texel[3]
             if weight > 0.0:
                 total += weight
-                mean += (weight / total) * (wp.vec3(texel[0], texel[1], texel[2]) - mean)
+                value = wp.vec3(wp.min(texel[0], most), wp.min(texel[1], most), wp.min(texel[2], most))
+                mean += (weight / total) * (value - mean)
     return wp.vec4(mean[0], mean[1], mean[2], wp.min(1.0, SUPPORT * total / area))
 
 
@@ -114,13 +116,16 @@ def pull_level_kernel(
     offset: wp.int32,
     height: wp.int32,
     width: wp.int32,
+    most: wp.float32,
     # Out:
     levels_out: wp.array[wp.vec4],
 ):
     """Next coarser level."""
     band_row, j = wp.tid()
     i = row_start + band_row
-    levels_out[offset + i * width + j] = pulled(levels_out, i, j, fine_offset, fine_height, fine_width, height, width)
+    levels_out[offset + i * width + j] = pulled(
+        levels_out, i, j, fine_offset, fine_height, fine_width, height, width, most
+    )
 
 
 @wp.func
@@ -177,6 +182,7 @@ def fill_coarse_kernel(
     first_height: wp.int32,
     first_width: wp.int32,
     count: wp.int32,
+    most: wp.float32,
     # Out:
     levels_out: wp.array[wp.vec4],
 ):
@@ -199,6 +205,7 @@ def fill_coarse_kernel(
                 width,
                 coarse_height,
                 coarse_width,
+                most,
             )
         wait_for_block()
         offset = coarse_offset
@@ -285,8 +292,7 @@ def push_pull(levels_out: wp.array, height: int, width: int, *, most: float = ma
         levels_out: As ``seed_fill`` left it; changed in place.
         height: Rows of level 0.
         width: Columns of level 0.
-        most: Radiance above which a texel counts as this much: what is unseen must not get a share of an emitter beside
-        it.
+        most: Radiance that a texel counts for at most: no share of an emitter is spread over what is unseen beside it.
     """
     shapes, offsets = fill_level_shapes(height, width), fill_level_offsets(height, width)
     device = levels_out.device
@@ -294,11 +300,11 @@ def push_pull(levels_out: wp.array, height: int, width: int, *, most: float = ma
     # Small levels take one block less time than a launch each.
     first = next((n for n, shape in enumerate(shapes) if n and shape[0] * shape[1] <= COARSE_TEXELS), len(levels) - 1)
     for fine, coarse in itertools.pairwise(levels[: first + 1]):
-        launch_rows(pull_level_kernel, coarse[1:], [*fine, *coarse], [levels_out], rows=None, device=device)
+        launch_rows(pull_level_kernel, coarse[1:], [*fine, *coarse, most], [levels_out], rows=None, device=device)
     launch_tiles(
         fill_coarse_kernel,
         [1],
-        [*levels[first], len(levels) - 1 - first],
+        [*levels[first], len(levels) - 1 - first, most],
         [levels_out],
         block_dim=COARSE_BLOCK,
         device=device,

@@ -110,26 +110,21 @@ class GlossConfig:
     """Whether one proxy may mirror another, whose light changes."""
 
 
-@functools.cache
-def make_may_mirror(trace: TraceConfig) -> wp.Function:
-    """``may_mirror(scene, point, direction, reach) -> bool``: an object's sphere may be within an angle of a ray."""
-
-    @wp.func(module="unique")
-    def may_mirror(scene: RayScene, point: wp.vec3, direction: wp.vec3, reach: wp.float32) -> wp.bool:
-        for index in range(scene.objects.shape[0]):
-            shape = scene.objects[index]
-            # A torus gives its two radii: their sum is no more than this.
-            radius = 1.5 * shape.scale * wp.length(shape.extent)
-            to = shape.position - point
-            distance = wp.length(to)
-            if distance <= radius:
-                return True
-            angle = wp.atan2(wp.length(wp.cross(direction, to)), wp.dot(direction, to))
-            if angle - wp.asin(radius / distance) <= reach:
-                return True
-        return False
-
-    return may_mirror
+@wp.func
+def may_mirror(scene: RayScene, point: wp.vec3, direction: wp.vec3, reach: wp.float32) -> wp.bool:
+    """Whether an object's sphere may be within an angle of a ray, ``reach`` in radians."""
+    for index in range(scene.objects.shape[0]):
+        shape = scene.objects[index]
+        # A torus gives its two radii: their sum is no more than this.
+        radius = 1.5 * shape.scale * wp.length(shape.extent)
+        to = shape.position - point
+        distance = wp.length(to)
+        if distance <= radius:
+            return True
+        angle = wp.atan2(wp.length(wp.cross(direction, to)), wp.dot(direction, to))
+        if angle - wp.asin(radius / distance) <= reach:
+            return True
+    return False
 
 
 @wp.struct
@@ -383,7 +378,6 @@ def make_draw_ray(config: GlossConfig) -> wp.Function:
 def make_gloss_kernel(config: GlossConfig) -> wp.Kernel:
     """Kernel specialised to ``config``; equal configs share one kernel."""
     closest_proxy = make_trace(config.trace).closest_proxy
-    may_mirror = make_may_mirror(config.trace)
     see_receiver, draw_ray, follow = make_see_receiver(config), make_draw_ray(config), make_follow(config)
     highlights = make_highlights(config) if config.lights else None
 

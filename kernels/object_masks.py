@@ -11,9 +11,6 @@ from warp_ar.kernels.visibility import inside_rect
 
 wp.set_module_options({"enable_backward": False})
 
-MOST_OBJECTS = 64
-"""Bits of a pixel."""
-
 
 @wp.kernel(enable_backward=False)
 def trace_object_masks_kernel(
@@ -62,7 +59,7 @@ def trace_object_masks(
     Args:
         params: Frame values: camera and object_rect, outside of which no object is.
         rays: (H, W) undistorted x / z and y / z of each pixel centre.
-        scene: At most ``MOST_OBJECTS`` objects.
+        scene: At most 64 objects: a pixel has a bit for each.
         masks_out: (H, W) bit k: the ray meets object k, in front of whatever else.
         rows: Band of rows; None means all.
     """

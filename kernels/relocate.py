@@ -1,16 +1,16 @@
 """Light that clips in the mirror balls, put back in the maps of the balls after the first.
 
-It is recovered in the first ball's map, M, from F, that map as captured: its excess is M - F. Another ball, at c, sees
-the part of it that comes from near emitters along other directions, and stronger or weaker. Where such emitters are
-known by their places, it is turned (``relocate``):
+It is recovered in the first ball's map, M, from F, that map as captured: the recovered radiance is M - F. Another
+ball, at c, sees the part of it that comes from near emitters along other directions, and stronger or weaker. Where such
+emitters are known by their places, it is turned (``relocate``):
 
     M'(d) = F'(d) + g(d) max(M - F, 0)(turned(d)),
 
 with ``correct_parallax`` for the turn and ``solid_angle_gain`` for g.
 
 Where none is, the other ball tells itself in which directions its light clips, and what it lacks is taken to be as much
-as the first one does, as of light far away (``share_excess``). With a' the solid angle and s' the share of its texels
-that lack light, and e_k what was found in cell k of the first ball's map, radiance times solid angle,
+as the first one does, as of light far away (``share_recovered``). With a' the solid angle and s' the share of its
+texels that lack light, and e_k what was found in cell k of the first ball's map, radiance times solid angle,
 
     M'(d) = F'(d) + s'(d) sum over k of w_k(d) e_k / sum over d of a' s' w_k,
     w_k(d) = 1 / (|d - d_k|^2 + NEARBY^2)^2:
@@ -69,12 +69,12 @@ def relocate_kernel(
     center = wp.vec3(place[0], place[1], place[2])
     gain = solid_angle_gain(emitters, center, direction)
     turned = correct_parallax(emitters, center, direction)
-    excess = sample_latlong(environment, turned) - sample_latlong(captured, turned)
-    environment_out[i, j] = filled[i, j] + gain * wp.max(excess, wp.vec3(0.0))
+    recovered = sample_latlong(environment, turned) - sample_latlong(captured, turned)
+    environment_out[i, j] = filled[i, j] + gain * wp.max(recovered, wp.vec3(0.0))
 
 
 @wp.func
-def nearness(a: wp.vec3, b: wp.vec3) -> wp.float32:
+def kinship(a: wp.vec3, b: wp.vec3) -> wp.float32:
     """Weight of a unit direction for another."""
     away = a - b
     near = wp.dot(away, away) + NEARBY * NEARBY
@@ -82,7 +82,7 @@ def nearness(a: wp.vec3, b: wp.vec3) -> wp.float32:
 
 
 @wp.kernel(enable_backward=False)
-def send_excess_kernel(
+def send_recovered_kernel(
     # In:
     row_start: wp.int32,
     share: wp.array2d[wp.vec3],
@@ -97,8 +97,8 @@ def send_excess_kernel(
     i += row_start
     cell = cells[i, j]
     sent_out[i, j] = wp.vec3(0.0)
-    excess = cell.solid_angle * wp.cw_mul(cell.missing, recovered[i, j])
-    if not wp.max(excess) > 0.0:
+    power = cell.solid_angle * wp.cw_mul(cell.missing, recovered[i, j])
+    if not wp.max(power) > 0.0:
         return
     whole = wp.vec3(0.0)
     if cell.hidden == 0.0:
@@ -110,16 +110,16 @@ def send_excess_kernel(
                 lost = trust(confidence[row, column]) * share[row, column]
                 if wp.max(lost) > 0.0:
                     toward = direction_from_latlong(wp.float32(row) + 0.5, wp.float32(column) + 0.5, height, width)
-                    whole += area * nearness(toward, cell.direction) * lost
+                    whole += area * kinship(toward, cell.direction) * lost
     sent = wp.vec3(-1.0)
     for channel in range(3):
         if whole[channel] > 0.0:
-            sent[channel] = excess[channel] / whole[channel]
+            sent[channel] = power[channel] / whole[channel]
     sent_out[i, j] = sent
 
 
 @wp.kernel(enable_backward=False)
-def share_excess_kernel(
+def share_recovered_kernel(
     # In:
     row_start: wp.int32,
     filled: wp.array2d[wp.vec3],
@@ -148,7 +148,7 @@ def share_excess_kernel(
             for column in range(cells.shape[1]):
                 arriving = wp.max(sent[row, column], wp.vec3(0.0))
                 if wp.max(arriving) > 0.0:
-                    light += nearness(toward, cells[row, column].direction) * wp.cw_mul(lost, arriving)
+                    light += kinship(toward, cells[row, column].direction) * wp.cw_mul(lost, arriving)
     stays = sent[i * cells.shape[0] / height, j * cells.shape[1] / width]
     for channel in range(3):
         if stays[channel] < 0.0:
@@ -204,7 +204,7 @@ def relocate(
     )
 
 
-def send_excess(
+def send_recovered(
     share: wp.array,
     confidence: wp.array,
     cells: wp.array,
@@ -224,10 +224,10 @@ def send_excess(
         rows: Band of rows of cells, None for all.
     """
     inputs = [share, confidence, cells, recovered]
-    launch_rows(send_excess_kernel, sent_out.shape, inputs, [sent_out], rows=rows, device=sent_out.device)
+    launch_rows(send_recovered_kernel, sent_out.shape, inputs, [sent_out], rows=rows, device=sent_out.device)
 
 
-def share_excess(
+def share_recovered(
     other: tuple[wp.array, wp.array, wp.array],
     environment: wp.array,
     captured: wp.array,
@@ -242,11 +242,11 @@ def share_excess(
 
     Args:
         other: (h, w) the other ball's light as captured and completed, and its share and confidence as for
-            ``send_excess``.
+            ``send_recovered``.
         environment: (h, w) the first ball's, with what was recovered.
         captured: (h, w) the first ball's without.
         emitters: Of the first ball's map; None: the method knows none.
-        cells: As for ``send_excess``.
+        cells: As for ``send_recovered``.
         sent: From there.
         environment_out: (h, w) ``wp.vec3``.
         rows: Band of rows, None for all.
@@ -254,7 +254,7 @@ def share_excess(
     device = environment.device
     emitters = wp.empty(0, dtype=Emitter, device=device) if emitters is None else emitters
     inputs = [*other, environment, captured, emitters, cells, sent]
-    launch_rows(share_excess_kernel, environment.shape, inputs, [environment_out], rows=rows, device=device)
+    launch_rows(share_recovered_kernel, environment.shape, inputs, [environment_out], rows=rows, device=device)
 
 
 def move_emitters(emitters: wp.array, places: wp.array, emitters_out: wp.array, *, ball: int) -> None:

@@ -9,7 +9,8 @@ import numpy as np
 
 from warp_ar.engine.pipeline import Pipeline, Result
 from warp_ar.scene import Camera, LambertMaterial, Light, MetallicRoughnessMaterial, Object, Pose, Probe, Proxy, Scene
-from warp_ar.scene.description import Animation, MirrorMaterial
+from warp_ar.scene.description import Animation
+from warp_ar.scene.materials import MirrorMaterial
 
 SIZE = (64, 48)
 BALL = Probe((-0.1, 0.03, 0.05), 0.03)

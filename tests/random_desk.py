@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import cv2
 import numpy as np
 import pypdfium2
@@ -67,19 +69,24 @@ class RandomDesk:
         around = ((np.arctan2(direction[..., 1], direction[..., 0]) / np.pi + 1) * 8).astype(int) % 16
         return np.where(on, self.table(np.where(on[..., None], points, 0.0)), self.walls[up, around])
 
-    def photograph(self, eye, target, roll=0.0, ball=True):
-        """An RGB frame, uint8."""
-        rotation, _ = look_at(np.array(eye), np.array(target), roll)
+    @functools.cached_property
+    def rays(self):
+        """Unit directions, in the camera's frame, of all samples of its pixels."""
         height, width = self.camera.height, self.camera.width
         sub = (np.arange(ACROSS) + 0.5) / ACROSS - 0.5
         y, x = ((np.arange(n)[:, None] + sub).reshape(-1) for n in (height, width))
         pixels = np.stack(np.meshgrid(x, y), -1).reshape(-1, 1, 2)
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-9)
-        flat = cv2.undistortPoints(
-            pixels, self.camera.matrix(), np.array(self.camera.distortion), criteria=criteria
-        ).reshape(len(y), len(x), 2)
+        lens = np.array(self.camera.distortion)
+        flat = cv2.undistortPoints(pixels, self.camera.matrix(), lens, criteria=criteria).reshape(len(y), len(x), 2)
         d = np.concatenate([flat, np.ones((*flat.shape[:2], 1))], -1)
-        d = d / np.linalg.norm(d, axis=-1, keepdims=True) @ rotation
+        return d / np.linalg.norm(d, axis=-1, keepdims=True)
+
+    def photograph(self, eye, target, roll=0.0, ball=True):
+        """An RGB frame, uint8."""
+        rotation, _ = look_at(np.array(eye), np.array(target), roll)
+        height, width = self.camera.height, self.camera.width
+        d = self.rays @ rotation
         o = np.broadcast_to(np.array(eye), d.shape)
         linear = self.around(o, d)
         if ball:

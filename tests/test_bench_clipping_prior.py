@@ -21,7 +21,7 @@ def lamp(radiance: float) -> np.ndarray:
 def test_a_lamp_of_one_radiance_is_made_up_for_by_its_number() -> None:
     """It lacks twice the level: 2 puts it right, 4 is as far off as nothing, and four stops later it does not clip."""
     found = errors_of(lamp(3.0), 1.0)
-    assert found["lacking"] == pytest.approx(2.0, rel=ROUNDING)
+    assert found["missing"] == pytest.approx(2.0, rel=ROUNDING)
     assert found["2.0"] == pytest.approx(0.0, abs=ROUNDING)
     assert found["best"] == pytest.approx(0.0, abs=ROUNDING)
     assert found["4.0"] == pytest.approx(found["clipped"], rel=ROUNDING)

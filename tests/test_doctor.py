@@ -62,7 +62,7 @@ def marker(scene: Scene, **changes) -> Scene:
     return dataclasses.replace(scene, marker=dataclasses.replace(scene.marker, **changes))
 
 
-def thing(scene: Scene, **changes) -> Scene:
+def first_object(scene: Scene, **changes) -> Scene:
     return dataclasses.replace(scene, objects=(dataclasses.replace(scene.objects[0], **changes),))
 
 
@@ -82,7 +82,7 @@ NUMBERS = {
     "focal length in millimetres": ("camera.field", lambda s: camera(s, fx=4 / 640, fy=4 / 640)),
     "pixels that are not square": ("camera.square", lambda s: camera(s, fy=1.1)),
     "center of another size": ("camera.center", lambda s: camera(s, cx=2.0, cy=2.0)),
-    "object in millimetres": ("units.at", lambda s: thing(s, at=(150.0, 55.0, 0.0))),
+    "object in millimetres": ("units.at", lambda s: first_object(s, at=(150.0, 55.0, 0.0))),
     "no ball and no light": ("probe.none", lambda s: dataclasses.replace(s, probes=(), lights=())),
 }
 

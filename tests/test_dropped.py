@@ -51,8 +51,8 @@ def test_a_mesh_lands_on_the_desk_at_a_sensible_size(files, wanted, sides, tall,
     for kind in ("ply", "obj", "stl"):
         make, label, words = files.take(f"my box.{kind}", box(*sides, kind=kind), wanted)
         made = make(wanted).scene
-        thing = made.objects[-1]
-        low, high = np.asarray(load_mesh(thing.file).bounds) * thing.scale + thing.at
+        item = made.objects[-1]
+        low, high = np.asarray(load_mesh(item.file).bounds) * item.scale + item.at
         assert low[2] == pytest.approx(0.0, abs=1e-4), "it floats, or is sunk"
         assert high[2] == pytest.approx(tall, abs=1e-3)
         assert (low + high)[:2] / 2 == pytest.approx(dropped.PLACE, abs=1e-3)
@@ -67,8 +67,8 @@ def test_gltf_stands_upright(files, wanted):
     """Its +Y is up: what is tall along y is tall on the desk."""
     data = trimesh.creation.box((0.05, 0.2, 0.05)).export(file_type="glb")
     make, _, _ = files.take("tower.glb", data, wanted)
-    thing = make(wanted).scene.objects[-1]
-    low, high = np.asarray(load_mesh(thing.file).bounds) * thing.scale
+    item = make(wanted).scene.objects[-1]
+    low, high = np.asarray(load_mesh(item.file).bounds) * item.scale
     assert high[2] - low[2] == pytest.approx(0.2, abs=1e-3)
 
 
@@ -176,8 +176,8 @@ def bundle(files, wanted, tmp_path):
     light.save(tmp_path / "own.exr")
     wanted = files.take("own.exr", (tmp_path / "own.exr").read_bytes(), wanted)[0](wanted)
     (tmp_path / "elsewhere").mkdir()
-    thing = dataclasses.replace(wanted.scene.objects[-1], file=textured(tmp_path / "elsewhere"))
-    scene = dataclasses.replace(wanted.scene, objects=(*wanted.scene.objects, thing), source=SourceSpec(tmp_path))
+    item = dataclasses.replace(wanted.scene.objects[-1], file=textured(tmp_path / "elsewhere"))
+    scene = dataclasses.replace(wanted.scene, objects=(*wanted.scene.objects, item), source=SourceSpec(tmp_path))
     return scene, pack_scene(scene)
 
 

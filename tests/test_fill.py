@@ -15,13 +15,13 @@ SUMS = 2e-5
 SIZES = [(32, 64), (64, 128), (7, 14), (5, 9), (1, 2), (1, 7), (3, 1), (1, 1), (16, 33), (2, 4)]
 
 
-def filled(radiance, confidence):
+def filled(radiance, confidence, **options):
     height, width = np.shape(confidence)
     levels = wp.zeros(fill.fill_level_offsets(height, width)[-1], dtype=wp.vec4)
     out = wp.full((height, width), wp.vec3(-1.0), dtype=wp.vec3)
     radiance = wp.array(np.ascontiguousarray(radiance, np.float32), dtype=wp.vec3)
     fill.seed_fill(radiance, wp.array(np.ascontiguousarray(confidence, np.float32), dtype=wp.float32), levels)
-    fill.push_pull(levels, height, width)
+    fill.push_pull(levels, height, width, **options)
     fill.finish_fill(levels, out)
     return out.numpy()
 
@@ -48,6 +48,21 @@ def test_fill_matches_twin(device, height, width):
     confidence = np.float32(rng.random((height, width)) * (rng.random((height, width)) > 0.5))
     expected = reference.fill(radiance.astype(float), confidence.astype(float))
     check_error("fill", filled(radiance, confidence), expected)
+
+
+@pytest.mark.parametrize(("height", "width"), [(32, 64), (128, 256)])
+def test_no_share_of_an_emitter_is_spread_over_what_is_unseen(device, height, width):
+    """The emitter stays; beside it the unseen gets what it would if the emitter were as bright as ``most``."""
+    confidence = np.ones((height, width))
+    confidence[: height // 2, : width // 2] = 0.0
+    dim = np.full((height, width, 3), 0.3)
+    dim[height // 2 + 1, width // 4] = 2.0
+    lit = np.where(dim > 1.0, [900.0, 4000.0, 2.0], dim)
+    known = confidence > 0.0
+    out = filled(lit, confidence, most=2.0)
+    assert (out[known] == np.float32(lit[known])).all()
+    assert (out[~known] == filled(dim, confidence)[~known]).all()
+    assert filled(lit, confidence)[~known].max() > 2.0, "without a bound it would be spread"
 
 
 def test_confident_texels_are_kept_as_they_are(device):

@@ -180,12 +180,12 @@ def test_a_polite_viewer_keeps_its_frames_beside_silent_connections(
                 while not (await page.until("frame"))[0]["plan"]:
                     pass
                 with attacked(port_of(site.url)):
-                    latest = site.server.host.latest
+                    latest = site.server.backend.host.latest
                     assert latest is not None
                     begun, shown = latest.id, page.frames
                     while page.frames < shown + ATTACKED_FRAMES:
                         await page.hear()
-                    taken = site.server.host.latest.id - begun  # type: ignore[union-attr]
+                    taken = site.server.backend.host.latest.id - begun  # type: ignore[union-attr]
                     assert ATTACKED_FRAMES / taken >= KEPT
                     assert len(site.server.gate) < FILES
                     # Whoever comes now, with a request, comes in.

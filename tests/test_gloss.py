@@ -11,10 +11,10 @@ import warp as wp
 from tests.error_model import check_error
 from tests.hard_cases.rig import SIZE, look_at, make_quality, make_scene
 from tests.kernel_rig import SMALL_CAMERA, TEXTURES, camera_fields, constant_environment, records, shape, tables
+from tests.mirror_ball_rig import CHALK, DESK, FOCAL, RAYS, H, W, grey_frame
 from tests.reference import color as reference_color
 from tests.reference import gloss as reference
 from tests.reference.visibility import Body
-from tests.test_mirror_ball import CHALK, DESK, FOCAL, RAYS, H, W, grey_frame
 from warp_ar.engine.graph import make_plan
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SceneError

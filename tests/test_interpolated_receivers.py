@@ -5,13 +5,13 @@ import pytest
 import warp as wp
 
 from tests import test_near_field as near_field
+from tests.environment_shadow_rig import SUM_ERROR, sky, sphere
+from tests.environment_shadow_rig import run as run_shadow
 from tests.kernel_rig import constant_environment
+from tests.receiver_cells_rig import View, box, middles
 from tests.reference.probe_weights import weights
-from tests.test_environment_shadow import SUM_ERROR, sky, sphere
-from tests.test_environment_shadow import run as run_shadow
-from tests.test_receiver_cells import View, box, middles
-from tests.test_relight import DESK, FLOAT_ERROR, POINTS, point
-from tests.test_relight import run as run_relight
+from tests.relight_rig import DESK, FLOAT_ERROR, POINTS, point
+from tests.relight_rig import run as run_relight
 from warp_ar.kernels import environment_samples
 from warp_ar.kernels.environment_samples import EnvironmentSample
 from warp_ar.kernels.interpolated_irradiance import OtherBalls

@@ -7,11 +7,11 @@ import pytest
 import trimesh
 import warp as wp
 
+from tests.environment_shadow_rig import COUNT, SIDE, draw, sky, sphere
 from tests.error_model import check_error
 from tests.kernel_rig import TEXTURES, camera_fields, constant_environment, records, tables
 from tests.reference import near_field as reference
-from tests.test_environment_shadow import COUNT, SIDE, draw, sky, sphere
-from tests.test_relight import CAMERA, DESK, LOOK_DOWN, POINTS, RAYS, H, W
+from tests.relight_rig import CAMERA, DESK, LOOK_DOWN, POINTS, RAYS, H, W
 from warp_ar.engine.graph import make_plan
 from warp_ar.kernels import frame_levels, near_field, near_field_rays, shade
 from warp_ar.kernels.lobes import lobe_texels

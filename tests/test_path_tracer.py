@@ -321,7 +321,7 @@ def test_standard_errors_are_honest(known: bool, device: str) -> None:
 
 
 def test_a_difference_to_a_frame_is_the_whole_scene(device: str) -> None:
-    """With a frame of the scene without virtual things, reflectance is found, and the picture is that with them."""
+    """With a frame of the scene without virtual objects, reflectance is found, and the picture is that with them."""
     light = latlong_sky()
     frame = trace(boxes(False), light, ABOVE, device, reflectances=RHO, samples=512)
     whole = trace(boxes(True), light, ABOVE, device, reflectances=RHO, samples=256, seed=1)

@@ -1,4 +1,4 @@
-"""Cells of the desk: the environment's share, one bounce of virtual light, and how pixels look both up."""
+"""Cells of the desk: the share of the environment that reaches them, and how pixels look cells up."""
 
 import dataclasses
 import math
@@ -8,209 +8,43 @@ import pytest
 import trimesh
 import warp as wp
 
+from tests.environment_shadow_rig import draw, lamp_at, list_texels, sky, with_sun
 from tests.error_model import check_error
 from tests.hard_cases.generators import frames
 from tests.hard_cases.rig import SIZE, Rig, assert_same_bits
-from tests.kernel_rig import constant_environment, records, shape, tables
+from tests.kernel_rig import records, shape, tables
+from tests.receiver_cells_rig import (
+    ABOVE,
+    FOCAL,
+    GREY,
+    OUTLINE,
+    SIZE_OF_FRAME,
+    SUM_ERROR,
+    WHITE,
+    View,
+    ball,
+    box,
+    cells_of,
+    middles,
+    pixel_rays,
+)
 from tests.reference import receiver_cells as reference
 from tests.reference import relight as reference_relight
 from tests.reference.environment_shadow import sphere_form_factor
-from tests.test_environment_shadow import draw, lamp_at, list_texels, sky, with_sun
-from tests.test_relight import CAMERA, DESK, FLOAT_ERROR, LOOK_DOWN, POINTS, point
+from tests.relight_rig import CAMERA, DESK, FLOAT_ERROR, LOOK_DOWN, POINTS
 from warp_ar.kernels import cells as frame_cells
-from warp_ar.kernels import environment_samples, receiver_cells, relight, summed_area
+from warp_ar.kernels import environment_samples
 from warp_ar.kernels.environment_samples import EnvironmentSample
-from warp_ar.kernels.receiver import ReceiverCells, RelightConfig, make_receiver
+from warp_ar.kernels.receiver import ReceiverCells
 from warp_ar.kernels.receiver_cells import Patch
 from warp_ar.kernels.structs import (
-    BOX,
     DIRECTIONAL,
-    MESH,
     PLANE,
-    FrameParams,
-    KeyLight,
     Light,
-    Probe,
-    RayScene,
-    Shape,
-    make_picture,
 )
-from warp_ar.kernels.trace import TraceConfig
 from warp_ar.scene import Camera, Proxy, Scene
-from warp_ar.scene.geometry import rotation_matrix
 from warp_ar.scene.kinds import proxies_face
 from warp_ar.scene.ray_scene import HostScene
-
-SIZE_OF_FRAME = (48, 64)
-FOCAL = 60.0
-GREY = reference.GREY
-# Sums of float32 over up to 32,768 samples of like size.
-SUM_ERROR = 2e-4
-# A texel of the sky at a shape's outline is hidden or not: one row of 64 over the height of a wall or ball.
-OUTLINE = 0.006
-# A patch is one sample of its area, softened by A / pi over r^2: patches of 1 cm from 10 cm on.
-PATCHES = 5e-3
-ABOVE = point((0, 0, 0.5))
-"""Shines on all of the desk."""
-WHITE = np.ones(3)
-
-
-def box(low, high):
-    low, high = np.asarray(low, float), np.asarray(high, float)
-    return shape(BOX, tuple((low + high) / 2), tuple((high - low) / 2))
-
-
-def ball(center, radius, reflectance=0.85):
-    return {"center": center, "radius": radius, "reflectance": (reflectance,) * 3}
-
-
-def pixel_rays(size):
-    rows, columns = ((np.arange(n) - (n - 1) / 2) / FOCAL for n in size)
-    return np.stack(np.meshgrid(columns, rows), -1).astype(np.float32)
-
-
-class View:
-    """A camera above the desk, and all that the launchers ask for."""
-
-    def __init__(
-        self,
-        proxies=(DESK,),
-        probes=(),
-        lights=(ABOVE,),
-        size=SIZE_OF_FRAME,
-        rect=None,
-        surroundings=WHITE,
-        frame=None,
-        camera=CAMERA,
-        turn=LOOK_DOWN,
-        irradiance=None,
-        scene=None,
-        others=None,
-        **forms,
-    ):
-        forms = {**forms, "several": others is not None}
-        self.others = others
-        kinds = tuple(sorted({int(proxy["kind"]) for proxy in proxies}))
-        trace = TraceConfig((), kinds if scene is None else (BOX, PLANE, MESH))
-        self.relight = RelightConfig("reflectance", trace, "sh" if irradiance is None else "map", bool(probes), **forms)
-        self.config = receiver_cells.CellConfig(self.relight)
-        self.size = size
-        self.params = records(
-            FrameParams,
-            {
-                "camera_position": camera,
-                "world_from_camera": turn,
-                "focal": (FOCAL, FOCAL),
-                "light_rect": rect or (0, size[0], 0, size[1]),
-                "direct_rect": rect or (0, size[0], 0, size[1]),
-            },
-        )
-        self.rays = wp.array(pixel_rays(size), dtype=wp.vec2)
-        self.scene = RayScene() if scene is None else scene
-        if scene is None:
-            self.scene.objects, self.scene.proxies = records(Shape), records(Shape, *proxies)
-        self.lights = records(Light, *lights)
-        image = np.full((*size, 3), 128, np.uint8) if frame is None else frame
-        self.frame, self.table = wp.array(image, dtype=wp.vec3ub), wp.zeros(size, wp.uint32)
-        summed_area.sum_area(self.frame, self.table)
-        self.keys = records(KeyLight, {"direction": (0, 0, 1), "directionality": 0.0})
-        self.probes = records(Probe, *probes)
-        self.surroundings = wp.array(constant_environment(surroundings), dtype=wp.vec3)
-        if irradiance is not None:
-            self.surroundings = wp.array(irradiance, dtype=wp.vec3)
-
-    def receiver(self, cells=None):
-        return make_receiver(
-            self.relight,
-            make_picture(self.frame, tables()[0], self.rays),
-            table=self.table,
-            probes=self.probes,
-            key_lights=self.keys,
-            irradiance=self.surroundings,
-            others=self.others,
-            cells=cells,
-        )
-
-    def cells(self, stride):
-        return tuple(-(-n // stride) for n in self.size)
-
-    def share(self, samples, stride=4, count=None, rows=None, out=None, cells=None, bounced=False, partials=1):
-        share = wp.full(self.cells(stride), wp.vec3(7.0, 7.0, 7.0), dtype=wp.vec3) if out is None else out[0]
-        surface = wp.full(self.cells(stride), 7, dtype=wp.int32) if out is None else out[1]
-        written = ReceiverCells()
-        written.ambient_visibility, written.ambient_surface, written.ambient_stride = share, surface, stride
-        sums = None
-        if partials > 1:
-            poison = wp.vec3(math.nan, math.nan, math.nan)
-            sums = wp.full(receiver_cells.partial_sums_shape(partials, *share.shape), poison, dtype=wp.vec3)
-        receiver_cells.estimate_ambient_visibility(
-            self.config,
-            self.params,
-            self.scene,
-            self.lights,
-            self.receiver(cells),
-            samples[:count],
-            written,
-            bounced=bounced,
-            sums_out=sums,
-            rows=rows,
-        )
-        return share.numpy(), surface.numpy()
-
-    def send(self, stride=4, rows=None, out=None, cells=None):
-        patches = wp.full(self.cells(stride), Patch(), dtype=Patch) if out is None else out
-        receiver_cells.send_light(
-            self.config, self.params, self.scene, self.lights, self.receiver(cells), stride, patches, rows=rows
-        )
-        return patches
-
-    def gather(self, patches, patch_stride=4, stride=4, rows=None, out=None):
-        listed, count = wp.full(patches.shape, Patch(), dtype=Patch), wp.full(patches.shape[0], 99, dtype=wp.int32)
-        for band in rows or [None]:
-            receiver_cells.list_patches(patches, listed, count, rows=band and (band[0] // 2, band[1] // 2))
-        if rows:
-            receiver_cells.list_patches(patches, listed, count, rows=(rows[-1][1] // 2, patches.shape[0]))
-        bounced = wp.full(self.cells(stride), wp.vec3(7.0, 7.0, 7.0), dtype=wp.vec3) if out is None else out[0]
-        surface = wp.full(self.cells(stride), 7, dtype=wp.int32) if out is None else out[1]
-        written = ReceiverCells()
-        written.bounced, written.bounced_surface, written.bounced_stride = bounced, surface, stride
-        inputs = self.config, self.params, self.scene, self.receiver(), listed, count, patch_stride
-        for band in rows or [None]:
-            receiver_cells.gather_light(*inputs, written, rows=band)
-        return bounced.numpy(), surface.numpy()
-
-    def light(self, cells=None, rows=None, **forms):
-        out = wp.full(self.size, wp.vec3(9.0, 9.0, 9.0), dtype=wp.vec3)
-        config = dataclasses.replace(self.relight, **forms)
-        relight.relight(config, self.params, self.scene, self.lights, self.receiver(cells), out, rows=rows)
-        return out.numpy()
-
-
-def patches_of(positions, normals, radiance, areas):
-    """One row of patches."""
-    positions = np.atleast_2d(positions)
-    out = np.zeros((1, len(positions)), np.dtype(Patch.numpy_dtype()))
-    out["position"], out["normal"], out["area"] = positions, normals, areas
-    out["flux"] = np.asarray(radiance, float) * np.reshape(areas, (-1, 1))
-    return wp.array(out, dtype=Patch)
-
-
-def middles(stride, size=SIZE_OF_FRAME):
-    return np.ix_(*(np.minimum(np.arange(-(-n // stride)) * stride + stride // 2, n - 1) for n in size))
-
-
-def cells_of(view, stride, share=None, share_surface=None, bounced=None, bounced_surface=None):
-    cells = ReceiverCells()
-    cells.ambient_stride = cells.bounced_stride = stride
-    for name, values in (("ambient_visibility", share), ("bounced", bounced)):
-        if values is not None:
-            values = np.broadcast_to(np.asarray(values, np.float32), (*view.cells(stride), 3)).copy()
-            setattr(cells, name, wp.array(values, dtype=wp.vec3))
-    for name, values in (("ambient_surface", share_surface), ("bounced_surface", bounced_surface)):
-        values = np.zeros(view.cells(stride), np.int32) if values is None else values
-        setattr(cells, name, wp.array(values, dtype=wp.int32))
-    return cells
-
 
 # --- Share: closed forms ----------------------------------------------------------------------------------------------
 
@@ -433,140 +267,6 @@ def test_a_mesh_hides_as_the_box_that_it_is(device, tmp_path):
     np.testing.assert_allclose(share[both], expected[both], atol=2e-3)
     assert expected[both].min() < 0.9
     assert set(np.unique(surface)) == {0, 15}
-
-
-# --- Bounced light: closed forms --------------------------------------------------------------------------------------
-
-
-def test_a_small_patch(device):
-    """L A cos cos' / r^2."""
-    at, normal, area = np.array([0.05, 0.02, 0.3]), np.array([0.96, 0.0, -0.28]), 1e-6
-    bounced, surface = View(surroundings=0 * WHITE).gather(
-        patches_of(at, normal, (0.5, 1.0, 2.0), area), patch_stride=48
-    )
-    way = at - POINTS[middles(4)]
-    r2 = (way**2).sum(-1)
-    expected = area * way[..., 2] * np.maximum(-(way @ normal), 0) / r2**2
-    assert (surface == 0).all()
-    np.testing.assert_allclose(bounced, expected[..., None] * (0.5, 1.0, 2.0), rtol=1e-4, atol=1e-12)
-    assert (expected == 0).any()
-
-
-def test_a_patch_that_fills_the_hemisphere(device):
-    """Pi L, straight before it."""
-    bounced, _ = View(size=(1, 1)).gather(patches_of((0, 0, 0.01), (0, 0, -1), WHITE, 1e6), patch_stride=1, stride=1)
-    np.testing.assert_allclose(bounced, np.pi, rtol=FLOAT_ERROR)
-
-
-def test_at_the_edge_of_a_lit_strip(device):
-    """Two faces at right angles: the desk, and at x = -0.45 a wall of which a strip of 0.2 is lit, 8 m long."""
-    size = 0.01
-    z, y = np.meshgrid(np.arange(size / 2, 0.2, size), np.arange(-4, 4, size) + size / 2)
-    positions = np.stack([np.full(z.size, -0.45), y.ravel(), z.ravel()], -1)
-    bounced, _ = View().gather(patches_of(positions, (1, 0, 0), WHITE, size**2), patch_stride=48, stride=8)
-    expected = np.pi * reference.strip_form_factor(POINTS[middles(8)][..., 0] + 0.45, 0.2)
-    np.testing.assert_allclose(bounced, np.broadcast_to(expected[..., None], bounced.shape), rtol=PATCHES)
-
-
-def test_nothing_receives_more_than_a_white_sky_of_its_radiance(device):
-    """A patch as near as 1 mm, 100 times as large as it is far: pi L and no more, as a point it would give 10,000 L."""
-    bounced, _ = View(size=(5, 5), surroundings=0 * WHITE).gather(
-        patches_of((0, 0, 1e-3), (0, 0, -1), WHITE, 1e-2), patch_stride=5, stride=1
-    )
-    assert 0.99 * np.pi < bounced.max() <= np.pi * (1 + FLOAT_ERROR)
-
-
-@pytest.mark.parametrize(("height", "area"), [(0.06, 1e-4), (0.005, 1e-2), (1e-3, 1.0)])
-def test_no_more_is_received_than_sent(device, height, area):
-    """A patch of pi L A watts: from the frame, nearly all that a small one sees, comes nearly all."""
-    patch = patches_of((0, 0, height), (0, 0, -1), WHITE, area)
-    bounced, _ = View(size=(96, 128), surroundings=0 * WHITE).gather(patch, patch_stride=96, stride=1)
-    received = bounced[..., 0].sum() * (CAMERA[2] / FOCAL) ** 2
-    assert received <= np.pi * area
-    if area < height**2:
-        assert received > 0.95 * np.pi * area
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_a_flat_surface_does_not_light_itself(device, seed):
-    """However it stands, and 100 m away: what rounding puts above a point turns its back on it."""
-    rng = np.random.default_rng(seed)
-    turn = rotation_matrix((*rng.uniform(-30, 30, 2), rng.uniform(0, 360)))
-    shift = np.array([60.0, -80.0, 0]) * (seed % 2)
-    slab = {**shape(PLANE, shift, (5, 5, 0)), "rotation": turn}
-    view = View(
-        (slab,),
-        surroundings=0 * WHITE,
-        lights=[point(shift + np.array([0, 0, 0.3]), (50.0,) * 3)],
-        camera=CAMERA + shift,
-    )
-    bounced, surface = view.gather(view.send(4))
-    assert (surface == 0).all()
-    assert (bounced == 0).all()
-
-
-def test_gather_matches_twin(device):
-    rng = np.random.default_rng(2)
-    positions = rng.uniform((-0.3, -0.3, -0.05), (0.3, 0.3, 0.4), (300, 3))
-    normals = rng.normal(size=(300, 3))
-    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    radiance, areas = rng.uniform(0, 1, (300, 3)), rng.uniform(1e-5, 1e-2, 300)
-    bounced, _ = View(surroundings=0 * WHITE).gather(patches_of(positions, normals, radiance, areas), patch_stride=48)
-    points = POINTS[middles(4)].reshape(-1, 3)
-    up = np.broadcast_to((0, 0, 1.0), points.shape)
-    expected = reference.gather_light(points, up, positions, normals, radiance * areas[:, None], areas)
-    check_error("relight", bounced.reshape(-1, 3), expected)
-    assert expected.max() > 0.1
-
-
-def test_what_no_picture_shows_is_none(device):
-    """Over the environment by less than 1 / 1024: nothing; in the dark every bit counts."""
-    patch = patches_of((0, 0, 0.3), (0, 0, -1), WHITE, 1e-4)
-    lit = View(surroundings=0 * WHITE).gather(patch, patch_stride=48)[0]
-    kept = View(surroundings=WHITE).gather(patch, patch_stride=48)[0]
-    limit = float(receiver_cells.NEGLIGIBLE) * np.pi
-    assert (lit > 0).all()
-    assert (lit < 0.9 * limit).any()
-    assert (kept[lit < 0.999 * limit] == 0).all()
-    bright = patches_of((0, 0, 0.3), (0, 0, -1), 100 * WHITE, 1e-4)
-    np.testing.assert_array_equal(
-        View(surroundings=WHITE).gather(bright, patch_stride=48)[0],
-        View(surroundings=0 * WHITE).gather(bright, patch_stride=48)[0],
-    )
-
-
-# --- Patches ----------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("size", [(48, 64), (47, 61), (1, 1), (3, 50)])
-@pytest.mark.parametrize("stride", [1, 4, 16])
-def test_patches_cover_what_the_frame_shows(device, size, stride):
-    """Looking straight down, areas sum to the desk's in the picture, patches at the border are smaller."""
-    sent = View(size=size).send(stride).numpy()
-    pixel = (CAMERA[2] / FOCAL) ** 2
-    # Toward the corners a pixel shows the same area of the desk: t^2 cos / (f^2 cos).
-    assert sent["area"].sum() == pytest.approx(size[0] * size[1] * pixel, rel=1e-5)
-    np.testing.assert_allclose(sent["normal"].reshape(-1, 3), np.broadcast_to((0, 0, 1), (sent.size, 3)))
-
-
-def test_patches_send_what_pixels_gain(device):
-    """The radiance that relighting adds at their middles."""
-    frame = np.random.default_rng(3).integers(60, 200, (*SIZE_OF_FRAME, 3)).astype(np.uint8)
-    view = View(frame=frame)
-    sent = view.send(4).numpy()
-    np.testing.assert_allclose(sent["flux"] / sent["area"][..., None], view.light()[middles(4)], rtol=1e-5)
-
-
-def test_lists_keep_the_order(device):
-    rng = np.random.default_rng(4)
-    areas = np.where(rng.random((7, 33)) < 0.4, 0, 1 + np.arange(7 * 33).reshape(7, 33)).astype(np.float32)
-    areas[3] = 0
-    values = np.zeros(areas.shape, np.dtype(Patch.numpy_dtype()))
-    values["area"] = areas
-    listed, count = wp.full(areas.shape, Patch(), dtype=Patch), wp.full(7, 99, dtype=wp.int32)
-    receiver_cells.list_patches(wp.array(values, dtype=Patch), listed, count)
-    for row, found, number in zip(areas, listed.numpy()["area"], count.numpy(), strict=True):
-        np.testing.assert_array_equal(found[:number], row[row > 0])
 
 
 # --- Looking cells up -------------------------------------------------------------------------------------------------

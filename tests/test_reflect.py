@@ -9,7 +9,7 @@ import pytest
 import warp as wp
 
 from tests.kernel_rig import records, shape
-from tests.test_relight import H, W
+from tests.relight_rig import H, W
 from warp_ar.kernels.lobes import lobe_texels
 from warp_ar.kernels.reflect import (
     DistantLight,

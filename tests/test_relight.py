@@ -1,13 +1,29 @@
+"""Virtual light on the desk: closed forms, the twin, geometry, culling, and the truth."""
+
 import numpy as np
 import pytest
 import warp as wp
 
 from tests.error_model import check_error
-from tests.kernel_rig import constant_environment, records, shape, tables
+from tests.kernel_rig import constant_environment, records, shape
 from tests.reference import color as reference_color
 from tests.reference import relight as reference
+from tests.relight_rig import (
+    CAMERA,
+    DESK,
+    FLOAT_ERROR,
+    HALF_CODE,
+    POINTS,
+    PRIOR,
+    RIM,
+    H,
+    W,
+    noise_frame,
+    point,
+    run,
+    unit,
+)
 from warp_ar.kernels import color, relight, summed_area
-from warp_ar.kernels.edges import EdgeLists
 from warp_ar.kernels.receiver import (
     METHODS,
     READINGS,
@@ -21,167 +37,14 @@ from warp_ar.kernels.receiver import (
 from warp_ar.kernels.structs import (
     BOX,
     DIRECTIONAL,
-    PLANE,
-    POINT,
     SPHERE,
     SPOT,
     FrameParams,
     KeyLight,
     Light,
     Probe,
-    RayScene,
-    Shape,
     make_picture,
 )
-from warp_ar.kernels.trace import TraceConfig
-
-H, W = 48, 64
-# Points on the desk are computed in float32, 1e-7 of a metre or so; lights are decimetres away and 1/d^2 doubles that.
-FLOAT_ERROR = 2e-5
-# What the prior takes from a white desk under irradiance pi: half of 0.002.
-PRIOR = 1.1e-3
-# Half a code is at most this share of the darkest radiance tested, 0.03 (code 48); the prior is the rest.
-HALF_CODE = 0.03
-# Shadow rays that pass a sphere's rim nearer than this share of its radius may fall on either side.
-RIM = 1e-3
-
-# A camera 0.6 m above the desk that looks straight down: x right, y down the picture is -y in the world.
-LOOK_DOWN = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
-CAMERA = np.array([0.0, 0.0, 0.6])
-COLUMNS, ROWS = np.meshgrid((np.arange(W) - (W - 1) / 2) / 60, (np.arange(H) - (H - 1) / 2) / 60)
-RAYS = np.stack([COLUMNS, ROWS], -1).astype(np.float32)
-POINTS = reference.plane_points(CAMERA, RAYS, LOOK_DOWN)
-
-
-def turn_z(angle):
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
-DESK = shape(PLANE, (0, 0, 0), (5, 5, 0))
-
-
-def point(at, intensity=(0.3, 0.3, 0.3), **more):
-    return {"kind": POINT, "position": at, "intensity": intensity, "attenuation": (0, 0, 1), **more}
-
-
-def run(
-    method,
-    lights,
-    frame=None,
-    objects=(),
-    proxies=(DESK,),
-    probes=(),
-    key=((0, 0, 1), 0.0),
-    sh=None,
-    irradiance_map=None,
-    rect=(0, H, 0, W),
-    out=None,
-    rows=None,
-    linear=None,
-    others=None,
-):
-    frame = np.full((H, W, 3), 128, np.uint8) if frame is None else frame
-    config = RelightConfig(
-        method,
-        TraceConfig(tuple(sorted({o["kind"] for o in objects})), tuple(sorted({p["kind"] for p in proxies}))),
-        "sh" if irradiance_map is None else "map",
-        bool(probes),
-        several=others is not None,
-    )
-    params = records(FrameParams, {"camera_position": CAMERA, "world_from_camera": LOOK_DOWN, "light_rect": rect})
-    scene = RayScene()
-    scene.objects, scene.proxies = records(Shape, *objects), records(Shape, *proxies)
-    frame_array, table = wp.array(frame, dtype=wp.vec3ub), wp.zeros((H, W), wp.uint32)
-    summed_area.sum_area(frame_array, table)
-    keys = records(KeyLight, {"direction": key[0], "directionality": key[1]})
-    surroundings = wp.array(constant_environment((1, 1, 1)) if sh is None else sh, dtype=wp.vec3)
-    if irradiance_map is not None:
-        surroundings = wp.array(irradiance_map, dtype=wp.vec3)
-    out = wp.full((H, W), wp.vec3(9.0, 9.0, 9.0), dtype=wp.vec3) if out is None else out
-    receiver = make_receiver(
-        config,
-        make_picture(
-            frame_array,
-            tables()[0],
-            wp.array(RAYS, dtype=wp.vec2),
-            None if linear is None else wp.array(np.float32(linear), dtype=wp.vec3),
-        ),
-        table=table,
-        probes=records(Probe, *probes),
-        key_lights=keys,
-        irradiance=surroundings,
-        others=others,
-    )
-    relight.relight(config, params, scene, records(Light, *lights), receiver, out, rows=rows)
-    return out.numpy()
-
-
-def run_edges(
-    samples,
-    lights,
-    objects=(),
-    proxies=(DESK,),
-    probes=(),
-    rect=(0, H, 0, W),
-    detail=1,
-    soft=False,
-    rows=None,
-    listed=0,
-):
-    """``relight`` on a white desk in a white environment, and ``smooth_edges`` where samples are more than one.
-
-    ``detail`` times as many pixels along each axis see the same view.
-    """
-    height, width = H * detail, W * detail
-    columns, lines = np.meshgrid(
-        (np.arange(width) - (width - 1) / 2) / (60 * detail), (np.arange(height) - (height - 1) / 2) / (60 * detail)
-    )
-    kinds = [tuple(sorted({s["kind"] for s in shapes})) for shapes in (objects, proxies)]
-    config = RelightConfig("reflectance", TraceConfig(*kinds), "sh", bool(probes), soft=soft, edge_samples=samples)
-    place = {"camera_position": CAMERA, "world_from_camera": LOOK_DOWN, "light_rect": rect, "focal": (60, 60)}
-    params = records(FrameParams, place)
-    scene = RayScene()
-    scene.objects, scene.proxies = records(Shape, *objects), records(Shape, *proxies)
-    frame, table = (
-        wp.full((height, width), wp.vec3ub(255, 255, 255), dtype=wp.vec3ub),
-        wp.zeros((height, width), wp.uint32),
-    )
-    summed_area.sum_area(frame, table)
-    keys = records(KeyLight, {"direction": (0, 0, 1), "directionality": 0.0})
-    rays = wp.array(np.stack([columns, lines], -1).astype(np.float32), dtype=wp.vec2)
-    receiver = make_receiver(
-        config,
-        make_picture(frame, tables()[0], rays),
-        table=table,
-        probes=records(Probe, *probes),
-        key_lights=keys,
-        irradiance=wp.array(constant_environment((1, 1, 1)), dtype=wp.vec3),
-    )
-    inputs = config, params, scene, records(Light, *lights), receiver
-    out, visibility = wp.zeros((height, width), dtype=wp.vec3), wp.zeros((height, width), dtype=wp.int32)
-    relight.relight(*inputs, out, visibility)
-    if samples > 1:
-        lists = None
-        if listed:
-            sizes = ((1, wp.int32), (listed, wp.vec2i), (listed * samples, wp.vec4))
-            lists = EdgeLists.of(*(wp.zeros(size, dtype=kind) for size, kind in sizes))
-        for band in rows or (None,):
-            relight.smooth_edges(*inputs, visibility, out, edge_lists=lists, rows=band)
-    return out.numpy()
-
-
-def pixel_means(image, detail):
-    return image.reshape(H, detail, W, detail, 3).mean((1, 3))
-
-
-def noise_frame(low=60, high=200, seed=0):
-    return np.random.default_rng(seed).integers(low, high, (H, W, 3)).astype(np.uint8)
-
-
-def unit(*v):
-    return np.asarray(v) / np.linalg.norm(v)
-
 
 # --- closed forms
 
@@ -507,93 +370,6 @@ def test_reflectance_is_within_bounds_for_any_environment(device, irradiance):
     got = run("reflectance", [point((0, 0, 0.3))], irradiance_map=surroundings)
     white = run("flat", [point((0, 0, 0.3))]) / 0.5
     assert ((got >= 0.0) & (got <= white * (1.0 + FLOAT_ERROR))).all()
-
-
-# --- edges
-
-HANGING = {**shape(BOX, (0.02, 0.01, 0.15), (0.06, 0.04, 0.01)), "rotation": turn_z(0.4)}
-"""Throws a slanted shadow; nearer to the camera than the desk."""
-
-
-@pytest.mark.parametrize("samples", [4, 16])
-def test_edges_of_shadows_are_means_over_pixels(device, samples):
-    """Against 256 times as many pixels: n samples err less than n random ones would, by 1 / sqrt n of what one does."""
-    lights = [point((-0.1, 0.05, 0.5)), {**point((0.2, 0.1, 0.4)), "kind": DIRECTIONAL, "direction": unit(1, 0.5, -2)}]
-    hard = run_edges(1, lights, [HANGING])
-    truth = pixel_means(run_edges(1, lights, [HANGING], rect=(0, 16 * H, 0, 16 * W), detail=16), 16)
-    smooth = run_edges(samples, lights, [HANGING])
-    edges = np.abs(hard - truth).max(-1) > 0.02 * truth.max()
-    assert edges.sum() > 50
-    before, after = (np.sqrt(((picture - truth)[edges] ** 2).mean()) for picture in (hard, smooth))
-    assert after < before / np.sqrt(samples)
-    changed = (hard != smooth).any(-1)
-    assert changed.sum() < 0.25 * H * W
-    assert np.abs(smooth - truth)[~edges].max() < 0.02 * truth.max()
-
-
-def test_edges_of_proxies_are_means_over_pixels(device):
-    """A lit box before the desk: where neither is lit, or one surface goes on, nothing changes."""
-    box = shape(BOX, (0.0, 0.0, 0.04), (0.1, 0.06, 0.04)) | {"rotation": turn_z(0.3)}
-    lights = [point((0.0, 0.0, 0.5))]
-    hard = run_edges(1, lights, proxies=(DESK, box))
-    truth = pixel_means(run_edges(1, lights, proxies=(DESK, box), rect=(0, 16 * H, 0, 16 * W), detail=16), 16)
-    smooth = run_edges(16, lights, proxies=(DESK, box))
-    edges = np.abs(hard - truth).max(-1) > 0.02 * truth.max()
-    assert edges.sum() > 50
-    before, after = (np.sqrt(((picture - truth)[edges] ** 2).mean()) for picture in (hard, smooth))
-    assert after < before / np.sqrt(16), "no better than as many random samples"
-    assert (hard == smooth).all(-1).mean() > 0.7
-    dark = run_edges(16, [point((0.0, 0.0, -1.0))], proxies=(DESK, box))
-    assert not dark.any()
-
-
-def test_edges_of_cones_and_penumbrae_stay(device):
-    """Both are smooth already: samples there would be wasted."""
-    spot = {**point((0.05, 0.0, 0.4)), "kind": SPOT, "direction": (0, 0, -1), "inner_angle": 0.1, "outer_angle": 0.3}
-    assert (run_edges(1, [spot]) == run_edges(16, [spot])).all()
-    wide = [point((-0.1, 0.05, 0.5), radius=0.05)]
-    hard, smooth = (run_edges(samples, wide, [HANGING], soft=True) for samples in (1, 16))
-    assert (hard == smooth).all()
-    assert len(np.unique(hard)) > 100, "no penumbra"
-
-
-def test_edges_leave_balls_to_themselves(device):
-    """Pixels of a ball stay black; those beside it are not darkened by what they see of it."""
-    ball = {"center": (0.0, 0.0, 0.03), "radius": 0.03, "reflectance": (0.6, 0.6, 0.6)}
-    lights = [point((0.0, 0.0, 0.55))]
-    hard, smooth = (run_edges(samples, lights, probes=[ball]) for samples in (1, 16))
-    shown = np.hypot(COLUMNS, ROWS) < 0.03 / np.sqrt(0.57**2 - 0.03**2)
-    assert shown.sum() > 20
-    assert not smooth[shown].any()
-    outside = run_edges(1, lights)
-    beside = smooth[~shown].max(-1)
-    lit = beside > 0
-    assert lit.any()
-    assert (beside[lit] <= outside[~shown].max(-1)[lit] * (1 + 1e-4)).all()
-    assert (smooth == hard)[~shown].all(-1).mean() > 0.9
-
-
-def test_bands_give_the_same_edges(device):
-    lights = [point((-0.1, 0.05, 0.5))]
-    whole, banded = (run_edges(4, lights, [HANGING], rows=rows) for rows in (None, ((0, 7), (7, 30), (30, H))))
-    assert (whole == banded).all()
-
-
-@pytest.mark.parametrize("listed", [5, H * W])
-def test_listed_edges_are_the_same(device, listed):
-    """Sampled on their own, or in place where the list does not hold them all."""
-    lights = [point((-0.1, 0.05, 0.5))]
-    box = shape(BOX, (0.0, 0.1, 0.04), (0.1, 0.06, 0.04)) | {"rotation": turn_z(0.3)}
-    ball = {"center": (0.1, -0.05, 0.03), "radius": 0.03, "reflectance": (0.6, 0.6, 0.6)}
-    expected, got = (run_edges(4, lights, [HANGING], (DESK, box), [ball], listed=n) for n in (0, listed))
-    hard = run_edges(1, lights, [HANGING], (DESK, box), [ball])
-    assert (expected != hard).any(-1).sum() > 50
-    np.testing.assert_allclose(got, expected, rtol=0 if device == "cpu" else 1e-6)
-
-
-def test_edge_samples_must_be_a_square_number():
-    with pytest.raises(ValueError, match="edge_samples is 3; expected a square number"):
-        RelightConfig("flat", TraceConfig((), (PLANE,)), edge_samples=3)
 
 
 # --- culling

@@ -5,7 +5,7 @@ import warp as wp
 
 from tests.reference import latlong
 from warp_ar.kernels.recover_cells import Cell
-from warp_ar.kernels.relocate import move_emitters, relocate, send_excess, share_excess
+from warp_ar.kernels.relocate import move_emitters, relocate, send_recovered, share_recovered
 from warp_ar.kernels.structs import Emitter
 
 HEIGHT = 64
@@ -100,8 +100,8 @@ def shared(*, clips, lamps, hidden=(), emitters=None, excess=None):
     out, sent = wp.full(shape, wp.vec3(-1.0), dtype=wp.vec3), wp.full(CELLS, wp.vec3(9.0), dtype=wp.vec3)
     maps = wp.array(first, wp.vec3), wp.zeros(shape, wp.vec3)
     given = wp.array(cells, dtype=Cell)
-    send_excess(*own, given, wp.array(recovered, wp.vec3), sent)
-    share_excess((wp.zeros(shape, wp.vec3), *own), *maps, emitters, given, sent, out)
+    send_recovered(*own, given, wp.array(recovered, wp.vec3), sent)
+    share_recovered((wp.zeros(shape, wp.vec3), *own), *maps, emitters, given, sent, out)
     return out.numpy()
 
 

@@ -27,12 +27,12 @@ from tests.viewer_rig import PATIENCE, Site, run, served
 from warp_ar import live
 from warp_ar.errors import UsageError
 from warp_ar.light.captured import latlong_directions, texel_solid_angles
-from warp_ar.output.environment_axes import AXES, to_cube
+from warp_ar.output.environment_axes import AXES, FACES, to_cube
 from warp_ar.output.environment_harmonics import basis
 from warp_ar.scene import Pose
 from warp_ar.viewer import shared_light
 from warp_ar.viewer.light_record import LightState, describe, encode_picture, key_light
-from warp_ar.viewer.shared_light import FACES, MOST_LISTENERS, check_origin
+from warp_ar.viewer.shared_light import MOST_LISTENERS, check_origin
 
 ROOT = Path(__file__).resolve().parents[1]
 # A lamp of 4 degrees within a map of 64 rows: half a texel is 1.4 degrees.
@@ -165,7 +165,7 @@ async def test_requests_that_are_wrong_are_named() -> None:
     async with served() as site:
         await known_light(site)
         for path, words in (
-            ("/light.json?axes=up", "axes = 'up': expected y-up, z-up, blender, opengl"),
+            ("/light.json?axes=up", "axes = 'up': expected z-up, blender, y-up, opengl"),
             ("/light.exr?layout=ball", "layout = 'ball': expected latlong or cube"),
             ("/light.hdr?layout=cube&size=0", "size = '0': expected 1 to 1024 texels"),
             ("/light.hdr?layout=cube&size=99999999", "expected 1 to 1024 texels"),
@@ -256,7 +256,7 @@ async def test_who_has_asked_counts_as_a_viewer_for_a_while(monkeypatch: pytest.
     async with served() as site:
         await known_light(site)
         await known_light(site)
-        controls = site.server.host._controls
+        controls = site.server.backend.host._controls
         assert controls.watchers == 1
         while controls.watchers:
             await asyncio.sleep(0.05)

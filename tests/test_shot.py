@@ -18,8 +18,9 @@ from warp_ar.output.gltf_file import quaternions, write_glb
 from warp_ar.output.shot import Look, Shot, look_of, mesh_of, placement, texture_files
 from warp_ar.output.usd_file import write_usd
 from warp_ar.scene import Camera, Light, Object
-from warp_ar.scene.description import Animation, EmissiveMaterial, PhongMaterial
+from warp_ar.scene.description import Animation
 from warp_ar.scene.geometry import rotation_matrix
+from warp_ar.scene.materials import EmissiveMaterial, PhongMaterial
 from warp_ar.scene.mesh_files import load_mesh
 
 # USD keeps a camera's lens in float32: 1e-7 of a picture of 64 pixels, and frusta of float64.

@@ -18,9 +18,9 @@ import pytest
 
 from tests.viewer_rig import Page, is_refused, jpeg, mutated, picture_message, run, served
 from warp_ar.light.captured import Light as CapturedMap
+from warp_ar.viewer.backend import MOST_VIEWERS
 from warp_ar.viewer.dropped import MOST_BYTES
 from warp_ar.viewer.protocol import Bucket
-from warp_ar.viewer.server import MOST_VIEWERS
 
 
 def encode_exr() -> bytes:
@@ -201,15 +201,15 @@ async def test_too_many_messages_close_their_sender() -> None:
 @run
 async def test_an_address_that_comes_too_often_waits_and_keeps_no_other_out() -> None:
     async with served() as site:
-        server = site.server
-        server._arrivals["often"] = Bucket(rate=0.0, burst=0.0)
-        waiting = [asyncio.create_task(server._may_come("often")) for _ in range(MOST_VIEWERS - 1)]
+        backend = site.server.backend
+        backend._arrivals["often"] = Bucket(rate=0.0, burst=0.0)
+        waiting = [asyncio.create_task(backend.may_come("often")) for _ in range(MOST_VIEWERS - 1)]
         await asyncio.sleep(0.1)
         assert not any(task.done() for task in waiting)
-        assert await server._may_come("seldom")
-        waiting.append(asyncio.create_task(server._may_come("often")))
+        assert await backend.may_come("seldom")
+        waiting.append(asyncio.create_task(backend.may_come("often")))
         await asyncio.sleep(0.1)
-        assert not await server._may_come("often"), "waiting connections pile up"
+        assert not await backend.may_come("often"), "waiting connections pile up"
         for task in waiting:
             task.cancel()
         await asyncio.gather(*waiting, return_exceptions=True)

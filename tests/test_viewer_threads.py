@@ -240,7 +240,7 @@ def test_a_camera_can_be_left_where_the_scene_has_no_source() -> None:
 async def test_who_goes_in_the_midst_of_a_file_is_no_fault_of_the_program(caplog: pytest.LogCaptureFixture) -> None:
     """Nothing is said of it, and another file is taken."""
     async with served() as site:
-        await site.server._started()
+        await site.server.backend.started()
         place = site.url.removeprefix("http://")
         _, writer = await asyncio.open_connection(*place.split(":"))
         head = f"POST /drop/scene.toml HTTP/1.1\r\nHost: {place}\r\nContent-Length: 100000\r\n\r\n"
@@ -268,7 +268,7 @@ async def test_a_camera_is_left_whatever_becomes_of_its_viewer() -> None:
         raise RuntimeError("nobody has thought of this")
 
     async with served() as site:
-        host = await site.server._started()
+        host = await site.server.backend.started()
         with pytest.MonkeyPatch.context() as patch:
             async with site.page() as page:
                 await page.until("frame")

@@ -31,8 +31,6 @@ HEIGHT = 128
 """Rows of the environment."""
 WINDOW = 1.25
 """Half side, in radii, of the part of a photograph that is unwrapped."""
-LARGEST = 560.0
-"""Pixels of a ball's radius beyond which photographs are reduced: the map has no use for more."""
 BRACKET_ERROR = 0.05
 """Relative error of merged radiance: what a response that was estimated or assumed leaves."""
 

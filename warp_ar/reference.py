@@ -56,7 +56,7 @@ def make_parser() -> argparse.ArgumentParser:
     add("--frame", type=int, default=0, metavar="N", help="which frame, from 0; those before it bring the light")
     text = "paths per pixel, at most (default: %(default)s)"
     add("--samples", type=int, default=DEFAULT_SAMPLES, metavar="N", help=text)
-    text = "stop at this relative standard error of what virtual things change, such as 0.01"
+    text = "stop at this relative standard error of what virtual objects and lights change, such as 0.01"
     add("--error", type=float, metavar="E", help=text)
     add("--output", type=Path, metavar="FILE", help=".png: the picture; .exr: linear radiance and its standard error")
     text = "write the pipeline's picture, the reference and their difference side by side"

@@ -428,8 +428,8 @@ MUTATIONS = (
         18,
         "holes are filled by a mean that is not normalised",
         "kernels/fill.py",
-        "                mean += (weight / total) * (wp.vec3(texel[0], texel[1], texel[2]) - mean)\n",
-        "                mean += (weight / area) * (wp.vec3(texel[0], texel[1], texel[2]) - mean)\n",
+        "                mean += (weight / total) * (value - mean)\n",
+        "                mean += (weight / area) * (value - mean)\n",
         f"{HARD}test_row18_energy.py::test_a_constant_environment_under_any_mask",
     ),
 )

@@ -93,6 +93,10 @@ def load_case(
         truth: By number of the frame in the clip: RGB, or RGBA that is transparent where nothing changes.
         times: By how much everything is shrunk.
         first: Number of the first frame.
+
+    Raises:
+        UsageError: The scene names no clip.
+        SourceError: It cannot be read.
     """
     if scene.source is None or scene.source.path is None:
         raise UsageError(f"scene {scene.name!r} has no clip to compare methods on; expected [source] path")
@@ -156,6 +160,14 @@ def open_scene(name: str, count: int, times: int = 1) -> Case:
     """A case from a scene file or a bundled scene, with the truth that it comes with.
 
     Bundled scenes come with one true frame, ``truth/SCENE_NNNN.png``; the frames end with it.
+
+    Args:
+        name: Of a bundled scene, or a scene file.
+        count: Frames at most.
+        times: By how much everything is shrunk.
+
+    Raises:
+        WarpArError: The scene or its clip cannot be read.
     """
     path = Path(name)
     if path.is_file():

@@ -156,7 +156,7 @@ def _known_frame(pipeline: Pipeline, frame: Frame, result: Result, seconds: floa
     if not result.shown:
         raise SourceError(f"{where} has another exposure than the frames that are shown; name one of those")
     if result.pose is None:
-        raise SourceError(f"{where} shows no marker, so where things are is not known; name another frame")
+        raise SourceError(f"{where} shows no marker, so where objects stand is not known; name another frame")
     return KnownFrame(
         exposed_scene(pipeline),
         frame.image.copy(),

@@ -50,7 +50,7 @@ DFG_SIZE = 32
 BAND = 8
 """Rows that a thread takes at a time."""
 LEAST_CHANGE = 1e-4
-"""Radiance, in camera values, by which a pixel that virtual things reach differs from the frame at least."""
+"""Radiance, in camera values, by which a pixel differs from the frame at least where something virtual shows in it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,8 +68,8 @@ class TracedPicture:
     seconds: float
     """That sampling took, from the first sample on."""
     relative_error: float
-    """Root mean square of the standard error over that of the radiance, in pixels that virtual things change; of a
-    pixel that clips, as far as it can be seen."""
+    """Root mean square of the standard error over that of the radiance, in pixels that virtual objects and lights
+    change; of a pixel that clips, as far as it can be seen."""
 
 
 def _relative_error(picture: FloatImage, error: FloatImage, frame: FloatImage | None) -> float:

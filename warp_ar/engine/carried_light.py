@@ -83,7 +83,17 @@ def resample_light(
     clipped: npt.NDArray[np.float32],
     shape: tuple[int, int],
 ) -> tuple[npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any]]:
-    """The remembered light at another size, (rows, columns): means weighted by confidence."""
+    """The remembered light at another size: means weighted by confidence.
+
+    Args:
+        radiance: Latlong (h, w, 3), camera values.
+        confidence: 0 to 1, (h, w).
+        clipped: Share of each texel that clips, by channel, (h, w, 3).
+        shape: Rows and columns of the new maps.
+
+    Returns:
+        The same three at that size.
+    """
 
     def resize(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
         way = cv2.INTER_AREA if shape[0] < values.shape[0] else cv2.INTER_LINEAR

@@ -138,7 +138,15 @@ class PipelineSwitcher:
         return self._shown is target
 
     def follow(self, target: Target, *, prepare: Prepare = Pipeline.warm_up, wait: bool = False) -> Pipeline | None:
-        """``want`` and ``take`` in one; with ``wait`` the pipeline is built on this thread, now.
+        """``want`` and ``take`` in one.
+
+        Args:
+            target: What frames are to be lit by.
+            prepare: Makes a new pipeline ready, on the thread that builds it.
+            wait: Build it on this thread, now, instead of beside the frames.
+
+        Returns:
+            What lights the next frame: the pipeline before, while the new one is built; None while there is none.
 
         Raises:
             WarpArError: As ``take``.

@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import glob
-import json
 import re
 from pathlib import Path
 from typing import Any
@@ -323,8 +322,3 @@ def source_of(jobs: JobFile, clip: int) -> tuple[Path, float | None]:
     assert own is not None
     assert own.path is not None
     return own.path, own.fps
-
-
-def dumps(data: dict[str, Any]) -> str:
-    """What ``read_jobs`` gave, as JSON."""
-    return json.dumps(data, indent=1)

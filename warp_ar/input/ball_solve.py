@@ -80,7 +80,16 @@ def rough_circle(camera: Camera, pose: Pose, probe: Probe) -> tuple[float, float
 
 
 def find_outlines(views: Sequence[tuple[Image, Pose]], camera: Camera, probe: Probe) -> list[tuple[BallOutline, Pose]]:
-    """The ball's outline in each frame that shows it near where the scene has it."""
+    """The ball's outline in each frame that shows it near where the scene has it.
+
+    Args:
+        views: 8-bit RGB frames and ``camera_from_world`` of each.
+        camera: It took them.
+        probe: The ball as the scene has it, metres.
+
+    Returns:
+        Outlines with the pose of their frame; frames in which none is found, or it is below 4 pixels, are left out.
+    """
     found = []
     for image, pose in views:
         circle = rough_circle(camera, pose, probe)

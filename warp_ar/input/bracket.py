@@ -76,7 +76,16 @@ class Aligned:
 
 
 def cut_ball(image: Image, circle: Circle, size: int) -> Image:
-    """The square about a ball, its side 2.1 radii, resampled to ``size`` pixels."""
+    """The square about a ball, its side 2.1 radii.
+
+    Args:
+        image: (height, width, 3).
+        circle: Column, row and radius of the ball in pixels.
+        size: Pixels along a side of the result.
+
+    Returns:
+        (size, size, 3), averaged where it is reduced.
+    """
     x, y, radius = circle
     scale = 2.1 * radius / size
     corner = (x - 1.05 * radius + 0.5 * scale - 0.5, y - 1.05 * radius + 0.5 * scale - 0.5)

@@ -20,7 +20,6 @@ from warp_ar.input.finding import Finding
 from warp_ar.input.ground_seen import ground_is_seen
 from warp_ar.scene import Camera, Pose, Probe, Scene
 
-Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 SMALL: Final = 14.0

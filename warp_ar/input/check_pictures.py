@@ -79,7 +79,18 @@ class Look:
 
 
 def take_look(scene: Scene, source: Source, frames: int, every: int = 1) -> Look:
-    """Look at every so many of a source's first frames; of alternating exposures the longest."""
+    """Look at some of a source's first frames; of alternating exposures the longest.
+
+    Args:
+        scene: Its marker is looked for, by its camera.
+        source: Gives the frames.
+        frames: How many are taken from it.
+        every: Look at each so many of them.
+
+    Raises:
+        SceneError: The camera was calibrated for another aspect ratio.
+        SourceError: The source breaks.
+    """
     shown = (
         frame for frame in itertools.islice(source, frames) if frame.exposure_time in (None, *source.exposures[:1])
     )
@@ -89,7 +100,13 @@ def take_look(scene: Scene, source: Source, frames: int, every: int = 1) -> Look
 
 
 def look_at(marker: Marker, camera: Camera, frames: Iterable[tuple[Image, float]]) -> Look:
-    """Look at frames: RGB pictures of the camera's size, each with its time in seconds."""
+    """Look for the marker in frames.
+
+    Args:
+        marker: The printed card.
+        camera: It took the frames.
+        frames: 8-bit RGB of the camera's size, each with its time in seconds.
+    """
     tracker = Tracker(marker, camera, steady=False)
     images, views, errors = [], [], []
     for image, seconds in frames:

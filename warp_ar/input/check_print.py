@@ -19,7 +19,6 @@ from warp_ar.input.finding import Finding
 from warp_ar.input.sheet import SHEET, board_top
 from warp_ar.scene import Camera, CharucoBoard, Marker, Pose
 
-Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 OFF: Final = 0.012

@@ -19,7 +19,6 @@ from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTr
 from warp_ar.input.plate import CLIP_MARGINS, Plate, srgb8
 from warp_ar.signals import P3_D65, REC_709, REC_2020, converted, light_of_hlg, light_of_pq, light_of_srgb
 
-Image = npt.NDArray[np.uint8]
 Float = npt.NDArray[np.float32]
 
 _LUMA: Final = {

@@ -108,7 +108,14 @@ def read_image(path: pathlib.Path) -> Image:
 
 
 def read_frame(path: pathlib.Path) -> tuple[Image, Plate | None]:
-    """8-bit RGB of an image file, as the module's docstring says, and the picture itself where it has more bits."""
+    """An image file as the module's docstring says.
+
+    Returns:
+        8-bit RGB, (height, width, 3); and where the file has more bits, the picture itself.
+
+    Raises:
+        SourceError: It cannot be read, is no picture, too large, or holds values of another kind.
+    """
     label = f"frame {path}"
     if path.suffix.lower() == LINEAR_SUFFIX:
         light = finite_light(read_linear_exr(path, SourceError, label))
@@ -136,7 +143,11 @@ def _three_channels(picture: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 def rgb8(picture: npt.NDArray[Any], name: str) -> Image:
-    """(H, W, 3) uint8 from grey, RGB or RGBA of 8 or 16 bits."""
+    """(H, W, 3) uint8 from grey, RGB or RGBA of 8 or 16 bits.
+
+    Raises:
+        SourceError: It holds values of another kind; ``name`` stands in the message.
+    """
     if picture.dtype == np.uint16:
         # Rounds v / 257 exactly: 257 is odd, so there are no ties.
         picture = ((picture.astype(np.uint32) + 128) // 257).astype(np.uint8)

@@ -51,7 +51,17 @@ def ground_is_seen(views: Sequence[View], camera: Camera, probe: Probe, ground: 
 
 
 def ground_correlations(views: Sequence[View], camera: Camera, probe: Probe, ground: float) -> list[float]:
-    """Correlations of the receiver that a ball would hide between frames from different sides, -1 to 1."""
+    """How alike the receiver that a ball would hide is in frames from different sides.
+
+    Args:
+        views: 8-bit RGB frames and ``camera_from_world`` of each.
+        camera: It took them.
+        probe: Where the ball is said to be, metres.
+        ground: Height of the receiver in metres.
+
+    Returns:
+        A correlation, -1 to 1, for each pair of frames that tells; none where nothing does.
+    """
     line = np.linspace(-1.2, 1.2, ACROSS) * probe.radius
     x, y = (value.ravel() for value in np.meshgrid(line, line))
     points = np.array([probe.center[0], probe.center[1], ground]) + np.column_stack([x, y, np.zeros_like(x)])

@@ -6,7 +6,7 @@ picture is searched along the edge's normal for the strongest step in colour, an
 its edges meet the steps. The points themselves hold it weakly, so that a shape without edges stays where it was pointed
 out. A box may be as bright as the wood behind it, so that steps are told in RGB.
 
-Steps of other things (a print on the box, its shadow, the desk's grain) make wrong shapes that fit as well. So the fit
+Other steps (a print on the box, its shadow, the desk's grain) make wrong shapes that fit as well. So the fit
 starts from several sizes, and a shape counts as fitted only if no other one, more than ``TRUSTED`` away, fits nearly as
 well, and if the edges that were met tell its corners within ``TRUSTED``. For that each edge has an offset of its own of
 ``EDGE`` pixels (its bevel, the card's pose, the lens) beside the scatter s of its n samples, so that it tells no more
@@ -262,7 +262,7 @@ def refit_outline(image: NDArray[np.uint8], camera: Camera, pose: Pose, proxy: P
             if moved is None:
                 break
             shape = moved
-    if not _is_sound(kind, shape):
+    if not _is_sound(shape):
         shape = start
     off = float(np.linalg.norm(view.pixels(_corners(kind, shape)) - seen, axis=1).max())
     return OutlineRefit(_proxy(kind, shape), _met(kind, shape, view, picture)[0], before, off)
@@ -395,7 +395,7 @@ def _start_box(view: _View, points: Array) -> Array:
     return np.array([*middle, math.atan2(along[1], along[0]), width, abs(depth), height])
 
 
-def _is_sound(kind: str, shape: Array) -> bool:
+def _is_sound(shape: Array) -> bool:
     return bool(
         np.isfinite(shape).all()
         and (shape[3:] >= SMALLEST).all()
@@ -405,7 +405,7 @@ def _is_sound(kind: str, shape: Array) -> bool:
 
 
 def _check(kind: str, shape: Array) -> None:
-    if _is_sound(kind, shape):
+    if _is_sound(shape):
         return
     order = {
         "plane": "its four corners, around it",
@@ -488,7 +488,7 @@ def _settled(kind: str, shape: Array, view: _View, anchors: tuple[list[int], Arr
         if not np.isfinite(jacobian).all():
             return shape
         moved = shape + np.linalg.lstsq(jacobian, pointed.ravel() - now, rcond=None)[0]
-        if not _is_sound(kind, moved):
+        if not _is_sound(moved):
             return shape
         shape = moved
     return shape
@@ -527,7 +527,7 @@ def _improve(
     step, *_ = np.linalg.lstsq(jacobian[good] * root[good, None], target[good] * root[good], rcond=None)
     moved = shape.copy()
     moved[:free] += step
-    return moved if _is_sound(kind, moved) else None
+    return moved if _is_sound(moved) else None
 
 
 def _met(kind: str, shape: Array, view: _View, picture: _Picture) -> tuple[float, float]:

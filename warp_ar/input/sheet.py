@@ -81,7 +81,7 @@ def draw_sheet(size: tuple[float, float], pixels_per_metre: float, board: Image)
         (x0, y0), (x1, y1) = (pixel(center[0] + s * half_width, center[1] - s * half_height) for s in (-1, 1))
         page[y0:y1, x0:x1] = _grey(share, (y1 - y0, x1 - x0), round(_DOT * pixels_per_metre))
     _draw_place(page, pixel(*BALL_PLACE), pixels_per_metre)
-    _draw_rulers(page, size, pixels_per_metre)
+    _draw_rulers(page, pixels_per_metre)
     return page
 
 
@@ -107,7 +107,7 @@ def _draw_place(page: Image, center: tuple[int, int], pixels_per_metre: float) -
     cv2.line(page, (center[0], center[1] - arm), (center[0], center[1] + arm), 0, thin)
 
 
-def _draw_rulers(page: Image, size: tuple[float, float], pixels_per_metre: float) -> None:
+def _draw_rulers(page: Image, pixels_per_metre: float) -> None:
     """A ruler of 100 mm each way, for printers scale both ways apart, and what to do with the sheet."""
     mm = pixels_per_metre / 1e3
     thin, left, bottom = max(1, round(0.2 * mm)), round(12 * mm), page.shape[0] - round(12 * mm)

@@ -194,7 +194,12 @@ def distinct(exposures: Iterable[float]) -> tuple[float, ...]:
 
 
 def existing_path(path: pathlib.Path) -> pathlib.Path:
-    """``path`` if it exists, else an error that names the nearest object that does."""
+    """The path itself, if frames can be read from it.
+
+    Raises:
+        SourceError: It does not exist (the error names the nearest name that does), cannot be read, or is neither file
+            nor folder.
+    """
     try:
         if (kind := kind_of(path)) != "nothing":
             if kind in ("file", "folder"):
@@ -213,7 +218,11 @@ def existing_path(path: pathlib.Path) -> pathlib.Path:
 
 
 def names_in(folder: pathlib.Path) -> list[str]:
-    """Names of all that a folder holds, sorted."""
+    """Names of all that a folder holds, sorted.
+
+    Raises:
+        SourceError: It cannot be read.
+    """
     try:
         return sorted(entry.name for entry in folder.iterdir())
     except OSError as error:

@@ -101,7 +101,7 @@ class EmitterSearch:
         )
 
     def neighbours(self, candidate: Candidate) -> list[Candidate]:
-        """Peaks in cells nearby, and at distances nearby."""
+        """Candidates in cells nearby, and at distances nearby."""
         close = np.flatnonzero(
             (self.problem.direction @ self.problem.direction[candidate.cell] > np.cos(0.2))
             & self.problem.may_hold_candidate

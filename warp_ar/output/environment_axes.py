@@ -34,6 +34,7 @@ __all__ = [
     "AXES",
     "CUBES",
     "DESCRIPTIONS",
+    "FACES",
     "LAYOUTS",
     "check_axes",
     "from_axes",
@@ -46,6 +47,9 @@ Radiance = npt.NDArray[np.float32]
 Array = npt.NDArray[np.float64]
 
 LAYOUTS = ("latlong", "cube")
+
+FACES = ("px", "nx", "py", "ny", "pz", "nz")
+"""Faces of a cube in the order in which they lie, as three.js and others name their files."""
 
 CUBES = {
     "y-up": "cube, faces +x -x +y -y +z -z from the top, y up, each as seen from inside (OpenEXR)",

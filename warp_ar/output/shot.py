@@ -18,21 +18,19 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_ar.scene import Camera, Pose, Scene
-from warp_ar.scene.description import (
+from warp_ar.scene.description import Light, Object, Proxy
+from warp_ar.scene.emissive_picture import load_emission
+from warp_ar.scene.geometry import Mesh, make_mesh, rotation_matrix
+from warp_ar.scene.materials import (
     RGB,
     Color,
     EmissiveMaterial,
     FileMaterial,
-    Light,
     Material,
     MetallicRoughnessMaterial,
     MirrorMaterial,
-    Object,
     PhongMaterial,
-    Proxy,
 )
-from warp_ar.scene.emissive_picture import load_emission
-from warp_ar.scene.geometry import Mesh, make_mesh, rotation_matrix
 from warp_ar.scene.mesh_cache import load_kept_mesh
 from warp_ar.scene.mesh_files import load_texture
 from warp_ar.scene.names import surface_names

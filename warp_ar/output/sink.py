@@ -24,8 +24,6 @@ from warp_ar.closing import Closing
 from warp_ar.errors import SinkError, reason
 from warp_ar.files import kind_of
 
-Image = npt.NDArray[np.uint8]
-
 FRAMES_WAITING = 4
 """How many frames may wait to be encoded before `Sink.write` waits."""
 
@@ -104,7 +102,12 @@ class ThreadedSink(Sink):
         """Encode and write one frame; runs on a thread, and raises SinkError."""
 
     def write(self, image: Any) -> None:
-        """Take the next frame, an array or whatever else has a shape and copies itself; it is stored on a thread."""
+        """Take the next frame, an array or whatever else has a shape and copies itself; it is stored on a thread.
+
+        Raises:
+            SinkError: The sink is closed, the frame has another size or kind than those before it, or an earlier one
+                could not be stored.
+        """
         if self._closed:
             raise SinkError(f"{self.description} is closed; open another one to write to")
         self._check(image)

@@ -2,7 +2,6 @@
 
 from warp_ar.scene.calibration_file import load_calibration
 from warp_ar.scene.description import (
-    RGB,
     SCHEMA,
     Animation,
     AreaLight,
@@ -10,19 +9,11 @@ from warp_ar.scene.description import (
     Camera,
     CapturedLight,
     CharucoBoard,
-    Color,
-    EmissiveMaterial,
     Exposure,
-    FileMaterial,
     GridBoard,
-    LambertMaterial,
     Light,
     Marker,
-    Material,
-    MetallicRoughnessMaterial,
-    MirrorMaterial,
     Object,
-    PhongMaterial,
     Play,
     PoseSpec,
     Probe,
@@ -31,6 +22,17 @@ from warp_ar.scene.description import (
     Scene,
     SourceSpec,
     Vec3,
+)
+from warp_ar.scene.materials import (
+    RGB,
+    Color,
+    EmissiveMaterial,
+    FileMaterial,
+    LambertMaterial,
+    Material,
+    MetallicRoughnessMaterial,
+    MirrorMaterial,
+    PhongMaterial,
 )
 from warp_ar.scene.object_materials import object_from_trimesh
 from warp_ar.scene.pose import Pose

@@ -14,18 +14,18 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_ar.kernels import structs
-from warp_ar.scene.description import (
+from warp_ar.scene.description import Object
+from warp_ar.scene.emissive_picture import load_emission
+from warp_ar.scene.geometry import Mesh
+from warp_ar.scene.materials import (
     RGB,
     Color,
     EmissiveMaterial,
     LambertMaterial,
     MetallicRoughnessMaterial,
     MirrorMaterial,
-    Object,
     PhongMaterial,
 )
-from warp_ar.scene.emissive_picture import load_emission
-from warp_ar.scene.geometry import Mesh
 from warp_ar.scene.mesh_materials import MeshMaterial, TextureUse
 from warp_ar.scene.object_materials import is_closed, look_of
 from warp_ar.scene.texture_codes import linear_texture

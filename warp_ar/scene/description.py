@@ -16,11 +16,9 @@ import numpy.typing as npt
 
 from warp_ar.errors import SceneError
 from warp_ar.scene.geometry import Mesh, rotation_matrix
+from warp_ar.scene.materials import OF_THE_FILE, RGB, EmissiveMaterial, Material
 
 Vec3: TypeAlias = tuple[float, float, float]
-RGB: TypeAlias = tuple[float, float, float]
-Color: TypeAlias = RGB | Path
-"""Linear RGB, or the path of a texture (sRGB-encoded picture)."""
 
 FloatMatrix: TypeAlias = npt.NDArray[np.float64]
 
@@ -300,70 +298,6 @@ class Play:
 
 
 @dataclasses.dataclass(frozen=True)
-class PhongMaterial:
-    """Diffuse plus a cosine lobe about the mirror direction."""
-
-    diffuse: Color = (0.8, 0.8, 0.8)
-    """Diffuse reflectance."""
-    specular: Color = (0.2, 0.2, 0.2)
-    """Reflectance of the lobe."""
-    shininess: float = 32.0
-    """Exponent of the lobe, from 0 (widest) on."""
-
-
-@dataclasses.dataclass(frozen=True)
-class MetallicRoughnessMaterial:
-    """glTF's BRDF: GGX with alpha = roughness squared, F0 = 0.04 for what is no metal."""
-
-    base_color: Color = (0.8, 0.8, 0.8)
-    """Diffuse reflectance of a non-metal, F0 of a metal."""
-    metallic: float = 0.0
-    """0 (no metal) to 1 (metal)."""
-    roughness: float = 0.5
-    """0 (mirror) to 1 (matt)."""
-
-
-@dataclasses.dataclass(frozen=True)
-class LambertMaterial:
-    """Perfectly diffuse."""
-
-    base_color: Color = (0.8, 0.8, 0.8)
-    """Diffuse reflectance."""
-
-
-@dataclasses.dataclass(frozen=True)
-class MirrorMaterial:
-    """Perfect mirror."""
-
-    base_color: Color = (1.0, 1.0, 1.0)
-    """Reflectance, the same at every angle."""
-
-
-@dataclasses.dataclass(frozen=True)
-class EmissiveMaterial:
-    """Sends out light of its own, alike in all directions, and reflects none."""
-
-    color: RGB = (1.0, 1.0, 1.0)
-    """Factor on the radiance per channel."""
-    intensity: float = 1.0
-    """Radiance in camera values: 1 is what the camera clips."""
-    image: Path | None = None
-    """Picture that multiplies the radiance: sRGB-encoded, or linear radiance (HDR, OpenEXR)."""
-    two_sided: bool = False
-    """Whether the back of an open surface emits too; else it is not there from behind, but throws a shadow."""
-
-
-@dataclasses.dataclass(frozen=True)
-class FileMaterial:
-    """The materials that the mesh's file brings; matt white where it brings none."""
-
-
-Material: TypeAlias = (
-    FileMaterial | PhongMaterial | MetallicRoughnessMaterial | LambertMaterial | MirrorMaterial | EmissiveMaterial
-)
-
-
-@dataclasses.dataclass(frozen=True)
 class Object:
     """A virtual object; a point p of its shape stands at R (scale p) + at. Fields unused by its shape are zero."""
 
@@ -388,7 +322,7 @@ class Object:
     """Degrees about the fixed x, then y, then z axis."""
     scale: float = 1.0
     """Factor on all lengths of the shape."""
-    material: Material = FileMaterial()
+    material: Material = OF_THE_FILE
     """How it reflects light."""
     animate: Animation | None = None
     """How it moves."""

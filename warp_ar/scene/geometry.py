@@ -12,13 +12,12 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
-if TYPE_CHECKING:
-    from warp_ar.scene.mesh_materials import MeshMaterial
+from warp_ar.scene.mesh_materials import MeshMaterial
 
 FloatArray = npt.NDArray[np.float32]
 IntArray = npt.NDArray[np.int32]

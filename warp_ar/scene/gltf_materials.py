@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final, cast
 
-from warp_ar.scene.description import RGB, MetallicRoughnessMaterial
+from warp_ar.scene.materials import RGB, MetallicRoughnessMaterial
 from warp_ar.scene.mesh_assets import fail, objects
 from warp_ar.scene.mesh_materials import IDENTITY, MeshMaterial, TextureUse, Wrap
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, Final
 
-from warp_ar.scene.description import (
+from warp_ar.scene.materials import (
     EmissiveMaterial,
     FileMaterial,
     LambertMaterial,

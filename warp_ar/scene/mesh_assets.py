@@ -38,7 +38,6 @@ class Assets:
             library_first: Whether the first file asked for is a material library (OBJ), which may be missing; all
                 others are textures.
         """
-        self.file_name = path.name
         self._path, self._library_due, self._pictures_follow = path, library_first, library_first
         self.known: dict[str, bytes] = {}
         """What was read, by the name that the mesh file has for it."""

@@ -30,7 +30,6 @@ from warp_ar.scene.mtl import read_library_material
 from warp_ar.scene.node_animation import MovingMesh
 from warp_ar.srgb import decode_srgb
 
-FloatArray = npt.NDArray[np.float32]
 ByteArray = npt.NDArray[np.uint8]
 
 MESH_SUFFIXES: Final = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")

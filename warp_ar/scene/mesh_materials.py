@@ -10,7 +10,7 @@ import dataclasses
 import json
 from typing import Any, Final, Literal, TypeAlias
 
-from warp_ar.scene.description import (
+from warp_ar.scene.materials import (
     RGB,
     LambertMaterial,
     Material,

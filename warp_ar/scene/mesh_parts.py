@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_ar.errors import SceneError
-from warp_ar.scene.description import LambertMaterial
 from warp_ar.scene.geometry import Mesh, creased_normals, make_mesh, smooth_normals, tangent_frames
+from warp_ar.scene.materials import LambertMaterial
 from warp_ar.scene.mesh_materials import MeshMaterial, TextureUse
 
 Array = npt.NDArray[np.float64]

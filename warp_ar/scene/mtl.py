@@ -18,8 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_ar.errors import SceneError
-from warp_ar.scene.description import RGB, LambertMaterial, Material, MetallicRoughnessMaterial, PhongMaterial
 from warp_ar.scene.gltf import decode_rgba
+from warp_ar.scene.materials import RGB, LambertMaterial, Material, MetallicRoughnessMaterial, PhongMaterial
 from warp_ar.scene.mesh_assets import Assets
 from warp_ar.scene.mesh_materials import MeshMaterial, TextureUse
 

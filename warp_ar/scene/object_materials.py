@@ -14,7 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from warp_ar.scene.description import (
+from warp_ar.scene.description import Object, Scene
+from warp_ar.scene.emissive_picture import load_emission
+from warp_ar.scene.geometry import Mesh
+from warp_ar.scene.materials import (
     Color,
     EmissiveMaterial,
     FileMaterial,
@@ -22,12 +25,8 @@ from warp_ar.scene.description import (
     Material,
     MetallicRoughnessMaterial,
     MirrorMaterial,
-    Object,
     PhongMaterial,
-    Scene,
 )
-from warp_ar.scene.emissive_picture import load_emission
-from warp_ar.scene.geometry import Mesh
 from warp_ar.scene.mesh_cache import load_kept_mesh
 from warp_ar.scene.mesh_files import load_moving_mesh, mesh_from_trimesh
 from warp_ar.scene.mesh_materials import MeshMaterial

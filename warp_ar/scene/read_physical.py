@@ -9,18 +9,9 @@ from typing import Any, Final, cast
 
 import cv2
 
-from warp_ar.scene.description import (
-    RGB,
-    Board,
-    CapturedLight,
-    CharucoBoard,
-    GridBoard,
-    Marker,
-    Probe,
-    Proxy,
-    ProxyMaterial,
-)
+from warp_ar.scene.description import Board, CapturedLight, CharucoBoard, GridBoard, Marker, Probe, Proxy, ProxyMaterial
 from warp_ar.scene.keys import PROXY_KEYS, keys_of
+from warp_ar.scene.materials import RGB
 from warp_ar.scene.mesh_files import MESH_SUFFIXES
 from warp_ar.scene.messages import LARGEST, SMALLEST
 from warp_ar.scene.scene_table import SceneTable

@@ -4,21 +4,17 @@ from __future__ import annotations
 
 from typing import Any, cast
 
-from warp_ar.scene.description import (
-    Animation,
-    AreaLight,
+from warp_ar.scene.description import Animation, AreaLight, Light, Object, Play
+from warp_ar.scene.keys import AREA_LIGHT_KEYS, LIGHT_KEYS, MATERIALS, OBJECT_KEYS, keys_of
+from warp_ar.scene.materials import (
     EmissiveMaterial,
     FileMaterial,
     LambertMaterial,
-    Light,
     Material,
     MetallicRoughnessMaterial,
     MirrorMaterial,
-    Object,
     PhongMaterial,
-    Play,
 )
-from warp_ar.scene.keys import AREA_LIGHT_KEYS, LIGHT_KEYS, MATERIALS, OBJECT_KEYS, keys_of
 from warp_ar.scene.mesh_files import GLTF_SUFFIXES
 from warp_ar.scene.messages import SMALLEST
 from warp_ar.scene.read_physical import _read_mesh_path, read_own_marker

@@ -22,20 +22,22 @@ from warp_ar.scene.description import (
     AreaLight,
     Camera,
     CapturedLight,
-    EmissiveMaterial,
     Exposure,
-    LambertMaterial,
     Light,
     Marker,
-    MetallicRoughnessMaterial,
-    MirrorMaterial,
     Object,
-    PhongMaterial,
     Play,
     Probe,
     Proxy,
     ProxyMaterial,
     SourceSpec,
+)
+from warp_ar.scene.materials import (
+    EmissiveMaterial,
+    LambertMaterial,
+    MetallicRoughnessMaterial,
+    MirrorMaterial,
+    PhongMaterial,
 )
 
 

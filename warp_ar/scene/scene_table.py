@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import cast
 
-from warp_ar.scene.description import RGB, Color, Marker
+from warp_ar.scene.description import Marker
+from warp_ar.scene.materials import RGB, Color
 from warp_ar.scene.table import Table
 
 

@@ -77,7 +77,11 @@ class Table:
     def number(
         self, key: str, default: float | None = None, *, low: float = -LARGEST, high: float = LARGEST, unit: str = ""
     ) -> float:
-        """A number."""
+        """A number from ``low`` to ``high``; ``unit`` stands in the message if it is not.
+
+        Raises:
+            SceneError: The key is missing and has no default, or its value is no such number.
+        """
         if default is not None and key not in self.data:
             return default
         return self._number(key, self.data.get(key), low, high, _range("a number", low, high, unit))
@@ -132,7 +136,7 @@ class Table:
         high: float = LARGEST,
         unit: str = "",
     ) -> tuple[float, ...]:
-        """A list of numbers, as many as one of ``sizes``."""
+        """A list of numbers from ``low`` to ``high``, as many as one of ``sizes``; errors as those of ``number``."""
         if default is not None and key not in self.data:
             return default
         value = self.data.get(key)

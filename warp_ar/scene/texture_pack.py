@@ -24,7 +24,6 @@ from warp_ar.scene.mesh_files import load_texture
 from warp_ar.scene.mesh_materials import IDENTITY, MeshMaterial, TextureUse
 from warp_ar.scene.texture_codes import DECODE, encode_texture, linear_texture
 
-FloatArray = npt.NDArray[np.float32]
 ByteArray = npt.NDArray[np.uint8]
 
 _WRAPS: Final = {"repeat": structs.REPEATED, "clamp": structs.CLAMP, "mirror": structs.MIRRORED}

@@ -97,7 +97,7 @@ class EnvironmentShadow(Stage):
     numerics: ClassVar[Numerics] = Numerics(
         precision="float32; a ratio of equal sums, exactly 1 where less than 1/512 is shaded",
         bound=2e-3,
-        cause="rays at the rims of balls fall to either side",
+        cause="rays at the outlines of balls fall to either side",
         measured=5.4e-06,
         rows=(5, 6, 8, 13, 14, 17, 18),
     )

@@ -214,10 +214,11 @@ class Recover(Stage):
         own = arrays["params"], arrays["probes"][ball + 1 : ball + 2], missing
         found = arrays["recover_cells"], arrays["recover_recovered"]
         other, cells = (filled, missing, confidence), found[0]
-        share = functools.partial(relocate.share_excess, other, *first, emitters, cells, sent, out)
+        send = functools.partial(relocate.send_recovered, missing, confidence, *found, sent)
+        share = functools.partial(relocate.share_recovered, other, *first, emitters, cells, sent, out)
         passes = [
             Pass(lambda rows: weigh_boundaries(clipped, *own, rows=rows), rows=height),
-            Pass(lambda rows: relocate.send_excess(missing, confidence, *found, sent, rows=rows), rows=cells.shape[0]),
+            Pass(lambda rows: send(rows=rows), rows=cells.shape[0]),
             Pass(lambda rows: share(rows=rows), rows=height),
         ]
         if emitters is not None:

@@ -114,14 +114,14 @@ def _mesh_edit(name: str, path: Path, wanted: Wanted) -> Edit:
     scale = next((unit for unit in (1.0, 0.001) if SIZES[0] <= longest * unit <= SIZES[1]), USUAL / longest)
     middle = (low + high) / 2
     at = (PLACE[0] - scale * middle[0], PLACE[1] - scale * middle[1], -scale * low[2])
-    thing = Object("mesh", file=path, at=_rounded(at), scale=float(f"{scale:.6g}"))
-    add_item(wanted.scene, "object", thing)  # whatever refuses it does so now
+    item = Object("mesh", file=path, at=_rounded(at), scale=float(f"{scale:.6g}"))
+    add_item(wanted.scene, "object", item)  # whatever refuses it does so now
     sides = " x ".join(f"{1e3 * scale * side:.0f}" for side in high - low)
     units = {1.0: "metres", 0.001: "millimetres"}.get(scale, "units of its own, so its longest side is 120 mm")
     words = f"{name}: {len(mesh.faces):,} triangles, {sides} mm, taken to be in {units}."
     if mesh.notes:
         words += f" Not shown: {'; '.join(mesh.notes[:4])}."
-    return lambda w: dataclasses.replace(w, scene=add_item(w.scene, "object", thing)), f"drop {name}", words
+    return lambda w: dataclasses.replace(w, scene=add_item(w.scene, "object", item)), f"drop {name}", words
 
 
 def _rounded(values: Iterable[float]) -> tuple[float, float, float]:

@@ -236,7 +236,16 @@ def add_item(scene: Scene, part: str, item: Object | Light | Proxy) -> Scene:
 
 
 def remove_part(scene: Scene, part: str, index: int) -> Scene:
-    """The scene without one object, light or proxy."""
+    """The scene without one object, light or proxy.
+
+    Args:
+        scene: The scene.
+        part: "object", "light" or "proxy".
+        index: Which of them, counted from 0.
+
+    Raises:
+        UsageError: It has not as many.
+    """
     items = getattr(scene, _LISTS[part])
     if index >= len(items):
         raise UsageError(f"{part} {index}: the scene has {len(items)}")

@@ -12,14 +12,13 @@ import numpy.typing as npt
 from warp_ar.errors import UsageError
 from warp_ar.kernels.irradiance import cosine_lobe
 from warp_ar.light.captured import find_emitters, latlong_directions, texel_solid_angles
-from warp_ar.output.environment_axes import CUBES, check_axes, to_cube, world_from_marker
+from warp_ar.output.environment_axes import CUBES, FACES, check_axes, to_cube, world_from_marker
 from warp_ar.output.environment_file import write_environment
 from warp_ar.output.environment_harmonics import BASIS, project_radiance
 from warp_ar.output.radiance_hdr import encode_hdr
 from warp_ar.scene import Pose
 from warp_ar.signature import PROGRAM
 from warp_ar.viewer.calibration import written
-from warp_ar.viewer.shared_light import FACES
 
 _DEGREES: Final = (0, 1, 1, 1, 2, 2, 2, 2, 2)
 _LOBE: Final = np.array([cosine_lobe(degree) for degree in _DEGREES])

@@ -5,15 +5,13 @@ from __future__ import annotations
 import asyncio
 import importlib.resources
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from aiohttp import web
 
 from warp_ar.errors import WarpArError
+from warp_ar.viewer.backend import Backend
 from warp_ar.viewer.dropped import MOST_BYTES
-
-if TYPE_CHECKING:
-    from warp_ar.viewer.server import Server
 
 DROP_SECONDS: Final = 60.0
 """How long a dropped file may be on its way."""
@@ -28,14 +26,14 @@ _TYPES: Final = {
 class PageFiles:
     """The routes of one server."""
 
-    def __init__(self, server: Server) -> None:
+    def __init__(self, app: web.Application, backend: Backend) -> None:
         """Add them to the server's application."""
-        self._server = server
+        self._backend = backend
         self._taking = False
         # Read once: no request's path ever becomes a file's.
         folder = importlib.resources.files("warp_ar.viewer") / "static"
         self._static = {item.name: item.read_bytes() for item in folder.iterdir() if item.name.split(".")[-1] in _TYPES}
-        server.app.add_routes(
+        app.add_routes(
             [
                 web.get("/", self._page),
                 web.get("/static/{name}", self._file),
@@ -54,13 +52,13 @@ class PageFiles:
         return web.Response(body=self._static[name], headers={"Content-Type": _TYPES[name.split(".")[-1]]})
 
     async def _download(self, request: web.Request) -> web.Response:
-        host = await self._server._started()
+        host = await self._backend.started()
         makers: dict[str, tuple[str, Callable[[], bytes]]] = {
             "frame.png": ("image/png", host.snapshot),
             "environment.exr": ("image/x-exr", host.environment_exr),
             "scene.toml": (
                 "application/toml",
-                lambda: host.scene_toml(full_paths=self._server.address.loopback).encode(),
+                lambda: host.scene_toml(full_paths=self._backend.address.loopback).encode(),
             ),
             "scene.zip": ("application/zip", host.scene_bundle),
             "recording.mp4": ("video/mp4", host.recording),
@@ -74,7 +72,7 @@ class PageFiles:
             raise web.HTTPNotFound(text="no such download\n")
         kind, make = makers[name]
         try:
-            body = await self._server._aside(make)
+            body = await self._backend.aside(make)
         except WarpArError as error:
             raise web.HTTPConflict(text=f"{error}\n") from error
         headers = {"Content-Type": kind, "Content-Disposition": f'attachment; filename="{name}"'}
@@ -82,7 +80,7 @@ class PageFiles:
 
     async def _drop_file(self, request: web.Request) -> web.Response:
         """Take a file that was dropped onto the picture; its answer says in words what became of it."""
-        host = await self._server._started()
+        host = await self._backend.started()
         name = request.match_info["name"]
         if self._taking:
             return web.Response(status=429, text="another file is being taken: wait until it is there\n")
@@ -98,7 +96,7 @@ class PageFiles:
                         refused.force_close()
                         return refused
                     parts.append(part)
-            words = await self._server._aside(host.drop, name, b"".join(parts))
+            words = await self._backend.aside(host.drop, name, b"".join(parts))
         except TimeoutError:
             return web.Response(status=408, text="the file took too long\n")
         except ConnectionError:

@@ -17,8 +17,7 @@ import socket
 import threading
 import time
 from collections.abc import Awaitable, Callable
-from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -29,6 +28,7 @@ from warp_ar.scene import bundled_scenes
 from warp_ar.stages.quality import PRESETS
 from warp_ar.viewer import protocol
 from warp_ar.viewer.address import LOOPBACK, Address, listen
+from warp_ar.viewer.backend import MOST_VIEWERS, Backend
 from warp_ar.viewer.encoding import encode_jpeg, encode_light
 from warp_ar.viewer.gate import HEADER_SECONDS, Gate
 from warp_ar.viewer.page_files import PageFiles
@@ -38,20 +38,12 @@ if TYPE_CHECKING:
     from warp_ar.viewer.frames import Lit
     from warp_ar.viewer.host import Host
 
-_T = TypeVar("_T")
-
-MOST_VIEWERS: Final = 8
 IN_FLIGHT: Final = 2
 """Frames that a viewer may have unshown: one on the way while another is decoded."""
 SEND_SECONDS: Final = 20.0
 """A viewer that takes nothing for so long is dropped."""
 STATE_SECONDS: Final = 0.5
-STOP_SECONDS: Final = 0.7
-"""How long the end waits for a frame in hand, and as long for what is being built."""
 MESSAGES_PER_SECOND: Final = 240.0
-CONNECTIONS_PER_SECOND: Final = 50.0
-"""From one address; each takes about a millisecond."""
-_MOST_ADDRESSES: Final = 256
 BYTES_PER_SECOND: Final = 8e6
 """Thirty pictures a second of a camera at 1920x1080."""
 LARGEST_MESSAGE: Final = protocol.MAX_PICTURE + 64
@@ -111,31 +103,27 @@ class Server:
             address: Where to serve.
             header_seconds: How long a connection may take for a request's header.
         """
-        self.address = address
         self._loop: asyncio.AbstractEventLoop | None = None
         self._viewers: set[_Viewer] = set()
         self._latest: Lit | None = None
         self._jpegs: dict[tuple[int, str], asyncio.Future[bytes]] = {}
         self._packed_light: tuple[npt.NDArray[np.float32], asyncio.Future[bytes]] | None = None
-        self._arrivals: dict[str, protocol.Bucket] = {}
-        self._waiting = 0
         self._encode_ms = 0.0
-        self._encoder = ThreadPoolExecutor(1, "warp-ar-encode")
-        self._hands = ThreadPoolExecutor(2, "warp-ar-page")
-        self._ending = False
-        self.failed: BaseException | None = None
-        """What ended the frames, if it was an error."""
         self._make_host = make_host
-        self._host: Host | None = None
-        self._starting: asyncio.Future[Host] | None = None
         self.ended = True
         """Whether all threads of the frames have ended; False when ``serve`` was not to wait for them."""
         self.gate = Gate(own_headers(), header_seconds=header_seconds)
+        self.backend = Backend(address, self.gate)
         self.app = web.Application(client_max_size=1024, middlewares=[self._guard])
-        PageFiles(self)
-        SharedLight(self)
+        PageFiles(self.app, self.backend)
+        SharedLight(self.app, self.backend)
         self.app.on_response_prepare.append(self._add_headers)
         self.app.add_routes([web.get("/live", self._live)])
+
+    @property
+    def address(self) -> Address:
+        """Where the page is served; with the port that was taken, once it is."""
+        return self.backend.address
 
     # ------------------------------------------------------------------------------------------------------- admission
 
@@ -220,7 +208,7 @@ class Server:
                 self._encode_ms = (time.perf_counter() - start) * 1e3
                 return data
 
-            self._jpegs[key] = self._aside(encode, pool=self._encoder)
+            self._jpegs[key] = self.backend.aside(encode, pool=self.backend.encoder)
         return await asyncio.shield(self._jpegs[key])
 
     async def _message(self, lit: Lit) -> bytes:
@@ -275,8 +263,8 @@ class Server:
             await asyncio.sleep(STATE_SECONDS)
             if not self._viewers:
                 continue
-            self._tell_all(json.dumps(self.host.state_message()))
-            light = self.host.light()
+            self._tell_all(json.dumps(self.backend.host.state_message()))
+            light = self.backend.host.light()
             if light is not shown:
                 shown = light
                 self._tell_all(await self._light_message(light))
@@ -286,7 +274,7 @@ class Server:
         if light is None:
             return protocol.pack({"type": "light", "known": False}, b"")
         if self._packed_light is None or self._packed_light[0] is not light:
-            packing = self._aside(encode_light, light, pool=self._encoder)
+            packing = self.backend.aside(encode_light, light, pool=self.backend.encoder)
             self._packed_light = (light, packing)
         data = await asyncio.shield(self._packed_light[1])
         return protocol.pack({"type": "light", "known": True}, data)
@@ -296,9 +284,9 @@ class Server:
     async def _live(self, request: web.Request) -> web.StreamResponse:
         if len(self._viewers) >= MOST_VIEWERS:
             return web.Response(status=503, text=f"{MOST_VIEWERS} viewers are here already\n")
-        if not await self._may_come(request.remote or ""):
+        if not await self.backend.may_come(request.remote or ""):
             return web.Response(status=429, text="too many connections\n")
-        host = await self._started()
+        host = await self.backend.started()
         socket = web.WebSocketResponse(max_msg_size=LARGEST_MESSAGE, heartbeat=30.0, compress=False)
         await socket.prepare(request)
         self.gate.upgrade(request)
@@ -309,7 +297,7 @@ class Server:
         try:
             viewer.tell(json.dumps(self._hello()))
             # Not here: to tell how large a mesh is, its file is read.
-            for message in await self._aside(host.greetings):
+            for message in await self.backend.aside(host.greetings):
                 viewer.tell(json.dumps(message))
             viewer.tell(await self._light_message(host.light()))
             early, viewer.early = viewer.early or [], None
@@ -326,39 +314,9 @@ class Server:
                 with contextlib.suppress(asyncio.CancelledError):
                     await sender
             finally:
-                if not self._ending:  # else the host gives up its camera by itself
-                    await self._aside(host.leave_camera, viewer)
+                if not self.backend.ending:  # else the host gives up its camera by itself
+                    await self.backend.aside(host.leave_camera, viewer)
         return socket
-
-    def _aside(
-        self, function: Callable[..., _T], *arguments: Any, pool: ThreadPoolExecutor | None = None
-    ) -> asyncio.Future[_T]:
-        """Begin what may take long beside the loop.
-
-        Raises:
-            asyncio.CancelledError: The server is ending, and its threads take nothing more.
-        """
-        if self._ending:
-            raise asyncio.CancelledError
-        loop = asyncio.get_running_loop()
-        return loop.run_in_executor(pool or self._hands, functools.partial(function, *arguments))
-
-    async def _may_come(self, address: str) -> bool:
-        """Let an address connect now and then: whoever is dropped and comes back at once takes the frames' time."""
-        if address not in self._arrivals:
-            while len(self._arrivals) >= _MOST_ADDRESSES:
-                del self._arrivals[next(iter(self._arrivals))]
-            self._arrivals[address] = protocol.Bucket(CONNECTIONS_PER_SECOND, 2 * CONNECTIONS_PER_SECOND)
-        bucket = self._arrivals[address]
-        if self._waiting >= MOST_VIEWERS:
-            return False
-        self._waiting += 1
-        try:
-            while not bucket.take(1.0, time.monotonic()):
-                await asyncio.sleep(1.0 / CONNECTIONS_PER_SECOND)
-        finally:
-            self._waiting -= 1
-        return True
 
     def _hello(self) -> dict[str, Any]:
         return {
@@ -399,13 +357,13 @@ class Server:
                 viewer.tell(json.dumps({"type": "pong", "sent": sent, "clock": time.monotonic() * 1e3}))
             case _:
                 try:
-                    await self._aside(self.host.edit, command, viewer)
+                    await self.backend.aside(self.backend.host.edit, command, viewer)
                 except WarpArError as error:
                     viewer.tell(json.dumps({"type": "notice", "text": str(error), "bad": True}))
-                    viewer.tell(json.dumps(self.host.scene_message()))
+                    viewer.tell(json.dumps(self.backend.host.scene_message()))
 
     def _camera_picture(self, viewer: _Viewer, data: bytes) -> None:
-        size = self.host.camera_size(viewer)
+        size = self.backend.host.camera_size(viewer)
         if size is None:
             # What was on the way when the camera was switched off.
             if len(data) > protocol.MAX_PICTURE:
@@ -418,7 +376,7 @@ class Server:
 
     async def _push(self, viewer: _Viewer, picture: protocol.Picture) -> None:
         try:
-            await self._aside(self.host.push, picture, viewer)
+            await self.backend.aside(self.backend.host.push, picture, viewer)
         except protocol.ProtocolError as error:
             await self._drop(viewer, WSCloseCode.POLICY_VIOLATION, str(error))
         except WarpArError as error:
@@ -452,23 +410,20 @@ class Server:
             ready(self.address)
             # The page is there before kernels, and even their libraries, are loaded.
             make_host = functools.partial(self._make_host, publish=self._publish, notify=self._notify)
-            self._starting = self._aside(make_host)
-            self._host = await asyncio.shield(self._starting)
+            host = await self.backend.start(make_host)
             ticker = asyncio.create_task(self._tick())
-            running = self._run_frames(self._host)
+            running = self._run_frames(host)
             await asyncio.shield(running)
         finally:
-            self._ending = True
+            self.backend.stop()
             if ticker is not None:
                 ticker.cancel()
-            if self._host is not None:
-                self._host.stop()
             reason = "the program has ended"
             drops = [self._drop(viewer, WSCloseCode.GOING_AWAY, reason, 0.5) for viewer in tuple(self._viewers)]
             await asyncio.gather(*drops)
             await self.gate.close()
             await runner.cleanup()
-            await self._end(running)
+            self.ended = await self.backend.end(running)
             self._loop = None
 
     def _run_frames(self, host: Host) -> asyncio.Future[None]:
@@ -493,34 +448,6 @@ class Server:
         threading.Thread(target=run, name="warp-ar-frames", daemon=True).start()
         return done
 
-    async def _end(self, running: asyncio.Future[None] | None) -> None:
-        """End the host; what takes too long is left behind."""
-        host = self._host
-        ended = True
-        waited: asyncio.Future[Any] | None = running if running is not None else self._starting
-        if waited is not None:
-            done, _ = await asyncio.wait({waited}, timeout=STOP_SECONDS)
-            ended = bool(done)
-            if done and not waited.cancelled() and waited.exception() is None and host is None:
-                host = waited.result()
-        for pool in (self._encoder, self._hands):
-            pool.shutdown(wait=ended, cancel_futures=True)
-        if host is not None:
-            ended = host.close(wait_seconds=STOP_SECONDS, frames_ended=ended)
-        self.ended = ended
-
-    async def _started(self) -> Host:
-        """The host, once it is there."""
-        while self._host is None:
-            await asyncio.sleep(0.05)
-        return self._host
-
-    @property
-    def host(self) -> Host:
-        """The host; there is one as soon as a viewer has been let in."""
-        assert self._host is not None
-        return self._host
-
     async def _listen(self, tries: int) -> list[socket.socket]:
         first = self.address.port
         for port in range(first, first + max(tries, 1)):
@@ -532,7 +459,7 @@ class Server:
                 raise UsageError(
                     f"cannot serve at {self.address.host} port {port}: {error.strerror or error}; choose another --port"
                 ) from error
-            self.address = dataclasses.replace(self.address, port=listeners[0].getsockname()[1])
+            self.backend.address = dataclasses.replace(self.address, port=listeners[0].getsockname()[1])
             return listeners
         raise AssertionError("a port was tried at least")
 

@@ -5,7 +5,7 @@
     GET /light/px.hdr ... nz.hdr    one face of the cube
     WS  /light                      the same JSON, when it has changed; text, no answer expected
 
-All take ``?axes=`` (y-up, the default, z-up, blender, opengl) and the token as the page does. Who asks counts as a
+All take ``?axes=`` (z-up, blender, opengl, and the default, y-up) and the token as the page does. Who asks counts as a
 viewer for some seconds, so that frames are lit though nobody looks at the page. What makes the answers loads Warp, for
 which the page does not wait: it is in ``light_record``.
 """
@@ -21,16 +21,11 @@ from typing import TYPE_CHECKING, Any, Final
 from aiohttp import WSMsgType, web
 
 from warp_ar.errors import UsageError, WarpArError
+from warp_ar.output.environment_axes import AXES, FACES, LAYOUTS
+from warp_ar.viewer.backend import Backend
 
 if TYPE_CHECKING:
     from warp_ar.viewer.light_record import LightState
-    from warp_ar.viewer.server import Server
-
-AXES: Final = ("y-up", "z-up", "blender", "opengl")
-LAYOUTS: Final = ("latlong", "cube")
-
-FACES: Final = ("px", "nx", "py", "ny", "pz", "nz")
-"""Of a cube, as three.js and others name their files."""
 
 WATCH_SECONDS: Final = 5.0
 """How long a request keeps frames going."""
@@ -43,12 +38,12 @@ LARGEST_FACE: Final = 1024
 class SharedLight:
     """The routes of one server."""
 
-    def __init__(self, server: Server) -> None:
+    def __init__(self, app: web.Application, backend: Backend) -> None:
         """Add them to the server's application."""
-        self._server = server
+        self._backend = backend
         self._watching: asyncio.TimerHandle | None = None
         self._listeners = 0
-        server.app.add_routes(
+        app.add_routes(
             [
                 web.get("/light.json", self._json),
                 web.get("/light.exr", self._picture),
@@ -61,7 +56,7 @@ class SharedLight:
     # ------------------------------------------------------------------------------------------------------- requests
 
     async def _state(self) -> LightState:
-        host = await self._server._started()
+        host = await self._backend.started()
         self._keep_watching()
         state = host.light_state()
         if state is None:
@@ -73,19 +68,19 @@ class SharedLight:
     def _keep_watching(self) -> None:
         """Count as a viewer from now on for some seconds."""
         if self._watching is None:
-            self._server.host.watch(1)
+            self._backend.host.watch(1)
         else:
             self._watching.cancel()
         self._watching = asyncio.get_running_loop().call_later(WATCH_SECONDS, self._rest)
 
     def _rest(self) -> None:
         self._watching = None
-        self._server.host.watch(-1)
+        self._backend.host.watch(-1)
 
     async def _json(self, request: web.Request) -> web.Response:
         axes = _axes(request)
         state = await self._state()
-        latest = self._server.host.latest
+        latest = self._backend.host.latest
         pose = None if latest is None else latest.pose
         from warp_ar.viewer.light_record import describe
 
@@ -113,7 +108,7 @@ class SharedLight:
     async def _made(self, make: Callable[..., Any], *arguments: Any) -> Any:
         """What a function makes beside the loop; what it refuses is the request's fault."""
         try:
-            return await self._server._aside(make, *arguments)
+            return await self._backend.aside(make, *arguments)
         except WarpArError as error:
             raise web.HTTPBadRequest(text=f"{error}\n") from error
 
@@ -128,14 +123,14 @@ class SharedLight:
         axes = _axes(request)
         if self._listeners >= MOST_LISTENERS:
             return web.Response(status=503, text=f"{MOST_LISTENERS} programs listen already\n")
-        if not await self._server._may_come(request.remote or ""):
+        if not await self._backend.may_come(request.remote or ""):
             return web.Response(status=429, text="too many connections\n")
-        await self._server._started()
+        await self._backend.started()
         socket = web.WebSocketResponse(max_msg_size=1024, heartbeat=30.0, compress=False)
         await socket.prepare(request)
-        self._server.gate.upgrade(request)
+        self._backend.gate.upgrade(request)
         self._listeners += 1
-        self._server.host.watch(1)
+        self._backend.host.watch(1)
         pusher = asyncio.create_task(self._push(socket, axes))
         try:
             async for message in socket:
@@ -143,7 +138,7 @@ class SharedLight:
                     await socket.close(code=1008, message=b"this channel takes no messages")
         finally:
             self._listeners -= 1
-            self._server.host.watch(-1)
+            self._backend.host.watch(-1)
             pusher.cancel()
             with contextlib.suppress(asyncio.CancelledError, ConnectionError):
                 await pusher
@@ -155,13 +150,13 @@ class SharedLight:
 
         sent: tuple[Any, ...] = ()
         while not socket.closed:
-            host = self._server.host
+            host = self._backend.host
             state, latest = host.light_state(), host.latest
             pose = None if latest is None else latest.pose
             now = (state, None if pose is None else (*pose.rotation.ravel(), *pose.translation))
             if state is not None and (not sent or now[0] is not sent[0] or now[1] != sent[1]):
                 sent = now
-                content = await self._server._aside(describe, state, pose, axes)
+                content = await self._backend.aside(describe, state, pose, axes)
                 await socket.send_str(json.dumps(content))
             await asyncio.sleep(PUSH_SECONDS)
 

@@ -1,0 +1,172 @@
+"""Environments and their samples, and shadows that virtual objects throw in them."""
+
+import numpy as np
+import warp as wp
+
+from tests.kernel_rig import TEXTURES, camera_fields, constant_environment, records, shape, tables
+from tests.relight_rig import CAMERA, DESK, LOOK_DOWN, RAYS, H, W
+from warp_ar.kernels import (
+    environment_samples,
+    environment_shadow,
+    environment_shadow_filter,
+    environment_shadow_wavefront,
+)
+from warp_ar.kernels.environment_samples import EnvironmentSample, SampleSets
+from warp_ar.kernels.environment_shadow_cells import (
+    EnvironmentShadowConfig,
+    ShadowCells,
+    shaded_shape,
+)
+from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
+from warp_ar.kernels.structs import (
+    LAMBERT,
+    SPHERE,
+    Emitter,
+    FrameParams,
+    Material,
+    Probe,
+    RayScene,
+    Shape,
+    make_picture,
+)
+from warp_ar.kernels.trace import TraceConfig
+
+COUNT, SIDE = 64, 4
+ORIGIN = (0.0, 0.0, 0.035)
+# Sums of float32 over up to 2048 terms of like size.
+SUM_ERROR = 2e-5
+# Rays that pass a sphere's rim nearer than this share of its radius may fall on either side of it.
+RIM = 1e-3
+# 1024 stratified samples of a smooth integrand: far below the 1 / sqrt 1024 of independent ones.
+STRATIFIED = 0.01
+# One sample of a sun may fall into the texel of the sky beside it.
+ONE_SAMPLE = 1.0 / 512
+# One set has 64 samples, of which half follow the light: a step of its visibility is 1/32, a few of them its error.
+SET_ERROR = 0.12
+# Mean over all pixels: 192 tiles of all 1024 samples each.
+MEAN_ERROR = 2e-3
+
+
+def draw(environment, count=COUNT * SIDE * SIDE):
+    environment = np.asarray(environment, np.float32)
+    height, width = environment.shape[:2]
+    cumulative, sums = wp.zeros((height, width), wp.float32), wp.zeros(height, wp.vec2)
+    directions, flux = wp.zeros(count, wp.vec3), wp.zeros(count, wp.vec3)
+    samples = wp.zeros(count, EnvironmentSample)
+    source = wp.array(environment, dtype=wp.vec3)
+    environment_samples.sum_environment(source, cumulative, sums)
+    environment_samples.draw_samples(source, cumulative, sums, wp.vec3(*ORIGIN), directions, flux, samples)
+    return directions, flux, samples
+
+
+def list_texels(environment):
+    environment = np.asarray(environment, np.float32)
+    count = environment.shape[0] * environment.shape[1]
+    directions, flux = wp.zeros(count, wp.vec3), wp.zeros(count, wp.vec3)
+    samples = wp.zeros(count, EnvironmentSample)
+    environment_samples.list_texels(wp.array(environment, dtype=wp.vec3), wp.vec3(*ORIGIN), directions, flux, samples)
+    return directions, flux, samples
+
+
+def sky(radiance=1.0, size=(32, 64)):
+    return np.full((*size, 3), radiance, np.float32)
+
+
+def with_sun(row, column, radiance, environment=None):
+    environment = sky() if environment is None else environment
+    environment[row, column] = radiance
+    return environment
+
+
+def sphere(center, radius):
+    return shape(SPHERE, center, (radius, 0, 0))
+
+
+def shadow_cells(shape, stride=1, *, like=None, notes=True):
+    """Cells with nothing in them yet, or with the estimates of others."""
+    cells = ShadowCells()
+    cells.stride = stride
+    cells.ratio, cells.bounced, cells.surface = (
+        (wp.zeros(shape, wp.vec4), wp.zeros(shape, wp.vec3), wp.full(shape, 7, wp.int32))
+        if like is None
+        else (like.ratio, like.bounced, like.surface)
+    )
+    cells.filtered = wp.zeros(shape, wp.vec3)
+    if notes:
+        tiles = shaded_shape(*shape)
+        cells.shaded = wp.full(tiles, -1, dtype=wp.int32) if like is None else like.shaded
+        cells.changed = wp.full(tiles, -1, dtype=wp.int32)
+    return cells
+
+
+def run(
+    drawn,
+    objects=(),
+    proxies=(DESK,),
+    probes=(),
+    count=COUNT,
+    side=SIDE,
+    stride=1,
+    bounce="estimated",
+    secondary=1.0,
+    albedo=0.0,
+    rect=(0, H, 0, W),
+    rows=None,
+    filtered=True,
+    out=None,
+    emitters=False,
+    partials=1,
+    as_wavefront=False,
+    others=None,
+):
+    kinds = tuple(tuple(sorted({item["kind"] for item in items})) for items in (objects, proxies))
+    several = others is not None
+    forms = DistantLightConfig(TraceConfig(*kinds), (LAMBERT,), False, "sh", False, bool(probes), several=several)
+    config = EnvironmentShadowConfig(forms, count, side, bounce, secondary, emitters, partials)
+    camera = camera_fields(CAMERA, LOOK_DOWN, 60, (H, W))
+    params = records(FrameParams, {**camera, "shadow_rect": rect})
+    scene = RayScene()
+    objects = [{**item, "material": 0} for item in objects]
+    scene.objects, scene.proxies = records(Shape, *objects), records(Shape, *proxies)
+    scene.materials = records(Material, {"model": LAMBERT, "base_color": (albedo,) * 3, **dict.fromkeys(TEXTURES, -1)})
+    surroundings = DistantLight()
+    surroundings.environment = wp.array(sky(), dtype=wp.vec3)
+    surroundings.probes = records(Probe, *probes)
+    surroundings.irradiance_sh = wp.array(constant_environment(1.0), dtype=wp.vec3)
+    if several:
+        surroundings.others = others
+    frame = wp.full((H, W), wp.vec3ub(255, 255, 255), dtype=wp.vec3ub)
+    shape = -(-H // stride), -(-W // stride)
+    cells = shadow_cells(shape, stride)
+    rays = wp.array(RAYS, dtype=wp.vec2)
+    wave = environment_shadow_wavefront.make_wavefront(config, *shape, rays.device) if as_wavefront else None
+    assert as_wavefront == (wave is not None)
+    picture = make_picture(frame, tables()[0], rays)
+    sets = SampleSets()
+    sets.directions, sets.flux, sets.samples = drawn
+    environment_shadow.shade_environment(
+        config, params, picture, scene, surroundings, sets, cells, wave=wave, rows=rows
+    )
+    if not filtered:
+        return cells.ratio.numpy()[..., :3], cells.surface.numpy()
+    # Around cells that are not shaded nothing is averaged, and tiles in which no cell differs from 1 are passed by.
+    every, skipped = shadow_cells(shape, stride, like=cells, notes=False), shadow_cells(shape, stride, like=cells)
+    out = wp.full((H, W), wp.vec3(9.0, 9.0, 9.0), dtype=wp.vec3) if out is None else out
+    passed = wp.full((H, W), wp.vec3(9.0, 9.0, 9.0), dtype=wp.vec3)
+    for some, target in ((every, out), (skipped, passed)):
+        environment_shadow_filter.filter_ratio(config, params, some, rows=rows)
+        environment_shadow_filter.spread_ratio(config, params, rays, scene, surroundings.probes, some, target)
+    np.testing.assert_array_equal(skipped.filtered.numpy(), every.filtered.numpy())
+    np.testing.assert_array_equal(passed.numpy(), out.numpy())
+    return out.numpy()
+
+
+def lamp_at(*positions, origin=ORIGIN):
+    """Records of lamps at positions in the world, and an unused one; None stands for a distant lamp straight up."""
+    values = []
+    for at in positions:
+        offset = np.array([0, 0, 1.0]) if at is None else np.asarray(at) - origin
+        distance = np.linalg.norm(offset)
+        far = np.inf if at is None else distance
+        values.append({"origin": origin, "direction": offset / distance, "distance": far})
+    return records(Emitter, *values, {})

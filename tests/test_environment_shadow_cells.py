@@ -1,0 +1,248 @@
+"""Which cells of the frame are estimated, on CPU and by wavefronts, and how pixels are filtered from them."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import warp as wp
+
+from tests.environment_shadow_rig import (
+    MEAN_ERROR,
+    SET_ERROR,
+    SUM_ERROR,
+    draw,
+    lamp_at,
+    run,
+    shadow_cells,
+    sky,
+    sphere,
+    with_sun,
+)
+from tests.kernel_rig import records, shape
+from tests.relight_rig import CAMERA, DESK, LOOK_DOWN, POINTS, RAYS, H, W
+from warp_ar.kernels import (
+    environment_samples,
+    environment_shadow_filter,
+    environment_shadow_wavefront,
+)
+from warp_ar.kernels.environment_shadow_cells import (
+    EnvironmentShadowConfig,
+    cell_column,
+)
+from warp_ar.kernels.reflect import DistantLightConfig
+from warp_ar.kernels.structs import (
+    BOX,
+    LAMBERT,
+    PLANE,
+    SPHERE,
+    FrameParams,
+    RayScene,
+    Shape,
+)
+from warp_ar.kernels.trace import TraceConfig
+
+# --- Cells ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("stride", [1, 2, 3])
+def test_bands_of_rows_and_rectangles(device, stride):
+    drawn = draw(with_sun(6, 20, 100.0))
+    item = [sphere((0, 0, 0.05), 0.05)]
+    whole = run(drawn, item, stride=stride)
+    assert whole.min() < 0.6
+    rect = (7, 31, 12, 50)
+    part = run(drawn, item, stride=stride, rect=rect)
+    inside = np.zeros((H, W), bool)
+    inside[7:31, 12:50] = True
+    np.testing.assert_array_equal(part[inside], whole[inside])
+    assert (part[~inside] == 1).all()
+    assert (run(drawn, item, stride=stride, rect=(0, 0, 0, 0)) == 1).all()
+
+
+@pytest.mark.parametrize("secondary", [1.0, 0.5])
+@pytest.mark.parametrize("bounce", ["estimated", "traced"])
+def test_a_wavefront_finds_the_same(device, bounce, secondary):
+    """By one kernel or by four: with a box, a ball and a lamp at a place, all of which may be before the objects."""
+    drawn = draw(with_sun(6, 20, 100.0))
+    environment_samples.place_emitters(lamp_at((0.1, 0.05, 0.4)), drawn[2])
+    scene = {
+        "objects": [sphere((0, 0, 0.05), 0.05), shape(BOX, (-0.1, -0.1, 0.03), (0.03, 0.02, 0.03))],
+        "proxies": (DESK, shape(BOX, (-0.12, 0.08, 0.04), (0.03, 0.04, 0.04))),
+        "probes": [{"center": (0.1, 0, 0.03), "radius": 0.03, "reflectance": (0.8, 0.7, 0.6)}],
+        "stride": 2,
+        "bounce": bounce,
+        "secondary": secondary,
+        "albedo": 0.5,
+        "emitters": True,
+    }
+    one = run(drawn, **scene)
+    assert one.min() < 0.7
+    for partials in (2, 8):
+        found = run(drawn, **scene, partials=partials, as_wavefront=True)
+        np.testing.assert_allclose(found, one, atol=SUM_ERROR)
+        np.testing.assert_array_equal(run(drawn, **scene, partials=partials, as_wavefront=True), found)
+    dark = run(drawn, **{**scene, "albedo": 0.0}, partials=8, as_wavefront=True)
+    assert (dark[one < 0.99] < one[one < 0.99]).mean() > 0.5, "objects send light"
+
+
+def test_a_wavefront_takes_one_set_and_little_memory(device):
+    forms = DistantLightConfig(TraceConfig((SPHERE,), (PLANE,)), (LAMBERT,), False, "none", False, False)
+
+    def wavefront(count, partials, secondary=1.0, size=(10, 20)):
+        config = EnvironmentShadowConfig(forms, count, 4, "traced", secondary, partials=partials)
+        return environment_shadow_wavefront.make_wavefront(config, *size, device)
+
+    found = wavefront(64, 4, 0.5)
+    assert (found.occluded.shape, found.queue.shape) == ((4, 10, 20), (10 * 20 * 32,))
+    assert wavefront(64, 1) is None, "more samples than a word has bits"
+    assert wavefront(128, 8) is None, "more than a set"
+    assert wavefront(64, 2, size=(1080, 1920)) is None, "too much memory"
+
+
+@wp.kernel(enable_backward=False)
+def _columns_kernel(side: wp.int32, lanes: wp.int32, out: wp.array[wp.int32]):
+    thread = wp.tid()
+    out[thread] = cell_column(thread, out.shape[0], side, lanes)
+
+
+@pytest.mark.parametrize("columns", [5, 128, 300, 640])
+def test_every_column_has_a_thread(device, columns):
+    for lanes in (1, 32):
+        out = wp.zeros(columns, wp.int32)
+        wp.launch(_columns_kernel, columns, [4, lanes], [out])
+        taken = out.numpy()
+        np.testing.assert_array_equal(np.sort(taken), np.arange(columns))
+        whole = taken[: columns // (4 * lanes) * 4 * lanes].reshape(-1, lanes)
+        assert (whole % 4 == whole[:, :1] % 4).all(), "a warp's cells are of one set"
+
+
+def test_half_resolution_agrees(device):
+    drawn = draw(sky(1.0))
+    item = [sphere((0, 0, 0.09), 0.05)]
+    full, half = run(drawn, item), run(drawn, item, stride=2)
+    assert np.abs(full - half).max() < SET_ERROR
+    assert abs((full - half).mean()) < MEAN_ERROR
+
+
+def test_bands_agree_with_the_whole(device):
+    drawn = draw(sky(1.0))
+    item = [sphere((0, 0, 0.09), 0.05)]
+    whole, key = run(drawn, item, filtered=False)
+    for rows in ((0, 13), (13, H)):
+        part, part_key = run(drawn, item, filtered=False, rows=rows)
+        np.testing.assert_array_equal(part[slice(*rows)], whole[slice(*rows)])
+        np.testing.assert_array_equal(part_key[slice(*rows)], key[slice(*rows)])
+
+
+ON_DESK = EnvironmentShadowConfig(
+    DistantLightConfig(TraceConfig((), (PLANE,)), (LAMBERT,), False, "none", False, False), 64, 4, "estimated"
+)
+
+
+def filtered_cells(ratio, surface, side=4):
+    cells = shadow_cells(surface.shape, notes=False)
+    cells.ratio.assign(np.asarray(ratio, np.float32))
+    cells.surface.assign(surface.astype(np.int32))
+    config = dataclasses.replace(ON_DESK, side=side)
+    environment_shadow_filter.filter_ratio(config, records(FrameParams, {}), cells)
+    return cells.filtered.numpy()
+
+
+def test_filter_keeps_surfaces_apart(device):
+    ratio = np.ones((16, 16, 4), np.float32)
+    ratio[:, 8:, :3] = 0.25
+    surface = np.zeros((16, 16), np.int32)
+    surface[:, 8:] = 8
+    surface[3, :] = -1
+    out = filtered_cells(ratio, surface)
+    expected = np.where(surface == 0, 1.0, 0.25)[..., None].repeat(3, -1)
+    expected[3] = 0.0
+    np.testing.assert_array_equal(out, expected)
+
+
+def filtered(ratio, side=4):
+    """What ``filter_ratio`` makes of one channel."""
+    cells = np.repeat(np.asarray(ratio, np.float32)[..., None], 4, -1)
+    return filtered_cells(cells, np.zeros(cells.shape[:2]), side)[..., 0]
+
+
+def test_filter_weights_every_set_alike(device):
+    # Each set has its own value; away from borders the mean of all is exact wherever the window lies.
+    rows, columns = np.mgrid[:24, :24]
+    value = 1 + 1e-3 * ((rows % 4) * 4 + columns % 4)
+    np.testing.assert_allclose(filtered(value)[2:-2, 2:-2], 1.0075, rtol=1e-6)
+
+
+def test_filter_narrows_where_that_makes_a_difference(device):
+    # An edge between two even halves: only the cells at the edge are blurred.
+    edge = np.full((24, 24), 0.2)
+    edge[:, 12:] = 0.8
+    expected = np.where(np.arange(24) < 12, 0.2, 0.8)
+    got = filtered(edge)[8]
+    np.testing.assert_allclose(np.delete(got, [11, 12]), np.delete(expected, [11, 12]), atol=1e-6)
+    assert 0.35 <= got[11] <= 0.425
+    weak = np.full((24, 24), 0.5)
+    weak[:, 12:] += 0.5 * environment_shadow_filter.CONTRAST
+    assert np.ptp(filtered(weak)[8, 10:14]) < np.ptp(filtered(weak, side=2)[8, 10:14])
+    # A mean of 16 cells has half the noise of a mean of 4: where cells differ by chance, few of the latter are picked.
+    noise = 0.5 + np.random.default_rng(0).normal(0, 0.1, (96, 96))
+    wide, narrow = (filtered(noise, side=side)[4:-4, 4:-4].std() for side in (4, 2))
+    assert wide < 0.8 * narrow
+
+
+def test_what_no_picture_shows_is_exactly_one(device):
+    value = np.ones((24, 24), np.float32)
+    value[:, 12:] = 1 - 0.9 * environment_shadow_filter.NEGLIGIBLE
+    assert (filtered(value) == 1).all()
+    value[:, 12:] = 1 - 1.1 * environment_shadow_filter.NEGLIGIBLE
+    assert (filtered(value)[:, 14:] != 1).all()
+
+
+def test_spread_is_a_ramp(device):
+    # Cells hold the row and column of the pixel that they were estimated at: between them a ramp has no step, no shift.
+    for stride in (1, 2, 3, 4):
+        cells = (9, 12)
+        size = (cells[0] * stride, cells[1] * stride)
+        axes = [np.arange(n) * stride + stride // 2 for n in cells]
+        values = np.stack([*np.meshgrid(*axes, indexing="ij"), np.zeros(cells)], -1).astype(np.float32)
+        params = records(FrameParams, {"shadow_rect": (0, size[0], 0, size[1])})
+        out, rays = wp.zeros(size, wp.vec3), wp.zeros(size, wp.vec2)
+        averaged = shadow_cells(cells, stride, notes=False)
+        averaged.filtered, averaged.surface = wp.array(values, dtype=wp.vec3), wp.zeros(cells, wp.int32)
+        environment_shadow_filter.spread_ratio(ON_DESK, params, rays, RayScene(), None, averaged, out)
+        expected = [np.clip(np.arange(n), axis[0], axis[-1]) for n, axis in zip(size, axes, strict=True)]
+        np.testing.assert_allclose(out.numpy()[..., :2], np.stack(np.meshgrid(*expected, indexing="ij"), -1), atol=1e-5)
+
+
+def test_pixels_between_surfaces_find_their_own(device):
+    # A board above the desk, dark, and the desk around it, unshaded: no pixel takes the other's ratio.
+    board = shape(PLANE, (0.003, 0.004, 0.1), (0.083, 0.061, 0))
+    params = records(
+        FrameParams, {"camera_position": CAMERA, "world_from_camera": LOOK_DOWN, "shadow_rect": (0, H, 0, W)}
+    )
+    scene = RayScene()
+    scene.proxies = records(Shape, DESK, board)
+    stride = 4
+    meets = CAMERA + (POINTS - CAMERA) * (0.6 - 0.1) / 0.6
+    on_board = (np.abs(meets[..., :2] - (0.003, 0.004)) <= (0.083, 0.061)).all(-1)
+    middle = on_board[stride // 2 :: stride, stride // 2 :: stride]
+    averaged = shadow_cells(middle.shape, stride, notes=False)
+    averaged.surface = wp.array(np.where(middle, 8, 0), dtype=wp.int32)
+    averaged.filtered = wp.array(np.where(middle, 0.25, 1.0)[..., None].repeat(3, -1), dtype=wp.vec3)
+    out, rays = wp.zeros((H, W), wp.vec3), wp.array(RAYS, dtype=wp.vec2)
+    environment_shadow_filter.spread_ratio(ON_DESK, params, rays, scene, None, averaged, out)
+    np.testing.assert_array_equal(out.numpy()[..., 0], np.where(on_board, 0.25, 1.0))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"count": 100}, "count is 100"),
+        ({"secondary": 0.0}, "secondary is 0"),
+        ({"secondary": 1.5}, "secondary is 1.5"),
+        ({"partials": 3}, "partials is 3"),
+    ],
+)
+def test_bad_configs_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(ON_DESK, **changes)
