@@ -452,8 +452,8 @@ class Pipeline(Closing):
             self._renderer = ThreadPoolExecutor(1, "warp_ar-render")
         sent = self._send(frame)
         if sent.slot is None or "image" not in self._arrays:
-            # The caller may write its picture anew before it is rendered.
-            sent = dataclasses.replace(sent, image=frame.image.copy())
+            # The caller may write its picture anew before it is rendered, unless nobody may.
+            sent = dataclasses.replace(sent, image=frame.image.copy() if frame.image.flags.writeable else frame.image)
         self._ahead.append(self._renderer.submit(lambda: self._keep(self._render(sent))))
         return self._ahead[-1]
 
@@ -463,16 +463,16 @@ class Pipeline(Closing):
             self._ahead.popleft().result()
 
     def _keep(self, rendered: Rendered) -> Rendered:
-        """Have the picture outlast the next frame."""
-        lit, light = rendered.image_array, rendered.environment_array
+        """Have the picture outlast the next frame; the light as well, on CPU and where no picture is made."""
+        lit, transfers = rendered.image_array, self.inputs.transfers
         if rendered.layers is not None:
             rendered = dataclasses.replace(rendered, layers=rendered.layers.to_host())
-        if not isinstance(lit, wp.array):
-            return dataclasses.replace(rendered, image=lit)
-        if self.inputs.transfers is not None:
-            return dataclasses.replace(rendered, image=self.inputs.transfers.download(lit))
-        kept, others = (None if one is None else np.array(one.numpy()) for one in (light, rendered.others_array))
-        return dataclasses.replace(rendered, image=np.array(lit.numpy()), environment=kept, others=others)
+        if transfers is None or "image" not in self._arrays:
+            with exclusive(self.device):
+                rendered = rendered.with_light_kept()
+        if isinstance(lit, wp.array):
+            lit = np.array(lit.numpy()) if transfers is None else transfers.download(lit)
+        return dataclasses.replace(rendered, image=lit)
 
     def _track(
         self, image: Any, now: float, pose: Pose | None, timings: dict[str, StageTiming]
@@ -536,7 +536,16 @@ class Pipeline(Closing):
             layers = layers.with_plate(self.inputs.radiance(frame.plate), clip)
         milliseconds = (time.perf_counter() - start) * 1e3
         light = self._light
-        return Rendered(self._shown, light.environment, timings, milliseconds, layers, others_array=light.others)
+        emitters = self._arrays.get("emitters") if light.environment is not None else None
+        return Rendered(
+            self._shown,
+            light.environment,
+            timings,
+            milliseconds,
+            layers,
+            others_array=light.others,
+            emitters_array=emitters,
+        )
 
     def _layers_of(self, unlit: Any = None) -> LayerArrays | None:
         """The layers that were asked for; those of a frame that passes as it came are neutral."""
