@@ -31,7 +31,7 @@ DECODERS = ("cpu", "gpu")
 """What decodes recordings: the processor, or the GPU's decoding unit where it has one for their coding."""
 AS_RECORDED = "recorded"
 """What recordings are written in, of ``CODINGS`` and this one: as deep as they came."""
-_RUN_KEYS = ("quality", "light", "segment_frames", "preroll", "decode", "coding")
+_RUN_KEYS = ("quality", "light", "segment_frames", "preroll", "decode", "coding", "digests")
 _CLIP_KEYS = ("name", "scene", "path", "light", "calibration", "frames")
 
 
@@ -51,6 +51,8 @@ class Settings:
     """One of ``DECODERS``."""
     coding: str = AS_RECORDED
     """Of what is written: one of ``CODINGS``, or ``AS_RECORDED``."""
+    digests: bool = False
+    """Whether digests of recordings' pictures are kept, as they were before they were encoded."""
 
     def gpu_of(self, device: str) -> int | None:
         """Number of the GPU that decodes for a worker on a device; None: the processor does."""
@@ -255,7 +257,8 @@ def _read_settings(table: JobTable) -> Settings:
     size = table.integer("segment_frames", low=1) if "segment_frames" in table else None
     light, decode = table.choice("light", LIGHTS, LIGHTS[0]), table.choice("decode", DECODERS, DECODERS[0])
     coding = table.choice("coding", (AS_RECORDED, *CODINGS), AS_RECORDED)
-    return Settings(quality, light, size, table.integer("preroll", 48, low=0), decode, coding)
+    digests = table.flag("digests", False)
+    return Settings(quality, light, size, table.integer("preroll", 48, low=0), decode, coding, digests)
 
 
 def _read_clip(table: JobTable, names: dict[str, int]) -> Clip:
