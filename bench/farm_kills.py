@@ -125,7 +125,7 @@ def work_with_deaths(bench: Bench, deaths: Deaths, workers: int, limit: float) -
     for _ in range(deaths.left.count("driver") + MOST_RUNS):
         left = end - time.monotonic()
         runs.append(work(deaths.folder, workers, bench.device, bench.say, limit=left, meddle=deaths.meddle))
-        if runs[-1].code == 0 or time.monotonic() > end:
+        if runs[-1].code != -signal.SIGKILL or time.monotonic() > end:
             break
     return runs
 

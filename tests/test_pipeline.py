@@ -105,6 +105,30 @@ def test_frames_sent_ahead_are_the_same(frames: Frames, device: str) -> None:
             np.testing.assert_array_equal(result.image, image)
 
 
+def test_light_of_submitted_frames_outlasts_them_where_no_picture_is_made(frames: Frames, device: str) -> None:
+    outputs = ("pose", "environment")
+    rising = [np.minimum(image, np.uint8(100 + 20 * index)) for index, image in enumerate(frames * 2)]
+    with (
+        Pipeline(make_scene(), device=device, quality="low", outputs=outputs, estimates="synchronous") as first,
+        Pipeline(make_scene(), device=device, quality="low", outputs=outputs, estimates="synchronous") as second,
+    ):
+        expected, ahead = [], []
+        for index, image in enumerate(rising):
+            result = first(image, time_seconds=index / 30)
+            expected.append((result.environment, result.emitters))
+        for index, image in enumerate(rising):
+            image.flags.writeable = False
+            ahead.append(second.submit(image, time_seconds=index / 30))
+        for result, (environment, emitters) in zip(ahead, expected, strict=True):
+            assert environment is not None
+            assert emitters is not None
+            np.testing.assert_array_equal(result.environment, environment)
+            assert result.emitters is not None
+            assert result.emitters.tobytes() == emitters.tobytes()
+    maps = {environment.tobytes() for environment, _ in expected if environment is not None}
+    assert len(maps) == len(rising), "the light must change"
+
+
 def test_submitted_frames_may_be_written_anew(frames: Frames, device: str) -> None:
     outputs = ("image", "environment")
     with (

@@ -371,6 +371,7 @@ class Pipeline(Closing):
         This thread looks for the marker and hands the frame over; another renders it, and on CUDA sends its picture
         ahead. With the next frame submitted before this one's image is read, tracking, both ways over the bus and the
         kernels run side by side. The device's own arrays of a result still hold only until the next frame is rendered.
+        An image that may not be written (``flags.writeable``) is taken to stay as it is, and not copied.
         """
         return self._begin(image, time_seconds, pose, exposure_time, ahead=True)
 

@@ -222,6 +222,8 @@ def parse_jobs(data: dict[str, Any], label: str) -> JobFile:
         )
     if dataset is not None and settings.coding != AS_RECORDED:
         raise JobsError(f"{label}: run.coding = {settings.coding!r}: a data set is pictures of 8 bits; leave it out")
+    if dataset is not None and settings.digests:
+        raise JobsError(f"{label}: run.digests: the manifest has a digest of each variation already; leave it out")
     jobs = JobFile(settings, tuple(clips), dataset)
     for scene in {clip.scene: index for index, clip in reversed(list(enumerate(clips)))}.values():
         base = scene_of(jobs, scene)
