@@ -49,6 +49,7 @@ from warp_ar.farm.jobs import JobFile, lit_range, scene_of, source_of
 from warp_ar.input.plate import check_linear
 from warp_ar.input.source import Frame, RecordedSource
 from warp_ar.input.sources import open_source
+from warp_ar.input.tracking import Track, Tracker
 from warp_ar.kernels.change import CHANGE_FLOOR, CHANGE_SHARE
 from warp_ar.light.captured import Light, find_emitters
 from warp_ar.light.solving_process import CORES_EACH, POOL
@@ -66,6 +67,9 @@ CONVERTERS = 4
 ASIDE_FRAMES = 1000
 """Frames of a clip from which on a process beside this one solves for light that clips: to start it takes a second of
 processor time and 150 MB for as long as the survey lasts."""
+AHEAD = 8
+"""Frames at most whose marker has been looked for and whose light has not been gathered: solving for light that clips
+takes as long as some frames, and comes with one of several."""
 WAITING = 4
 """Frames at most whose light waits to be compared with the last that was kept."""
 _MANTISSA = 12
@@ -277,7 +281,7 @@ def _look_at_frames(
         )
         with pipeline, ThreadPoolExecutor(1, "warp_ar-keep") as keeper:
             waiting: collections.deque[Future[None]] = collections.deque()
-            for frame, result in _submitted(source, pipeline, look.scene):
+            for frame, result in _submitted(source, pipeline):
                 if result.pose is not None:
                     look.poses[frame.index] = (*result.pose.rotation.ravel(), *result.pose.translation)
                     waiting.append(keeper.submit(look.take, frame.index, result, writer))
@@ -296,16 +300,39 @@ def _look_at_frames(
     Light(kept, np.ones(kept.shape[:2], np.float32), emitters).save(look.folder / LIGHT)
 
 
-def _submitted(source: RecordedSource, pipeline: Pipeline, scene: Scene) -> Iterator[tuple[Frame, Result]]:
+def _submitted(source: RecordedSource, pipeline: Pipeline) -> Iterator[tuple[Frame, Result]]:
     """Frames, each handed over to a pipeline; all are rendered when the last has been asked for."""
     result: Result | None = None
-    for frame in source:
-        pose = None if scene.pose is None else Pose(*scene.pose.at(frame.index))
+    for frame, track in _tracked(source, pipeline):
         frame.image.flags.writeable = False  # so that it need not be copied to wait for its turn
+        given = pipeline.scene.pose
+        pose = track if given is None else Pose(*given.at(frame.index))
         result = pipeline.submit(frame.deepest, time_seconds=frame.time, pose=pose)
         yield frame, result
     if result is not None:
         _ = result.stages  # waits, and tells what went wrong
+
+
+def _tracked(source: RecordedSource, pipeline: Pipeline) -> Iterator[tuple[Frame, Track | None]]:
+    """Frames with where their marker is, looked for some frames ahead; None: the pipeline looks, or nothing needs it.
+
+    Of frames of more than 8 bits the pipeline alone knows the codes that are looked at.
+    """
+    if pipeline.scene.pose is not None or source.keeps_depth:
+        yield from ((frame, None) for frame in source)
+        return
+    tracker = Tracker(pipeline.scene.marker, pipeline.camera)
+    waiting: collections.deque[tuple[Frame, Future[Track]]] = collections.deque()
+    with ThreadPoolExecutor(1, "warp_ar-track") as thread:
+        try:
+            for frame in source:
+                waiting.append((frame, thread.submit(tracker.track, frame.image, frame.time)))
+                if len(waiting) > AHEAD:
+                    ready, track = waiting.popleft()
+                    yield ready, track.result()
+            yield from ((ready, track.result()) for ready, track in waiting)
+        finally:
+            thread.shutdown(cancel_futures=True)
 
 
 @contextlib.contextmanager
