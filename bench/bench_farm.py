@@ -9,8 +9,9 @@ Parts, each of which keeps to its share of the minutes:
 - ``gpus``: frames a second of segments with one GPU and half of the cores, and with two and all of them, in turn; one
   and several workers per GPU. On a machine of one GPU only the first;
 - ``cpu``: the same on the processor alone, for several numbers of workers;
-- ``long``: a recording through 8 segments: memory over time, and every picture of them equal to those of one run. As
-  many of the asked frames as fit its minutes; the figures say how many;
+- ``long``: a recording through 8 segments while workers and driver are killed: each job once, memory over time, and
+  every picture equal to those of one run. As many of the asked frames as fit its minutes; the figures say how many.
+  With ``--phases`` all of them, one or some of its phases in a call: what they need lies in ``--work DIR``;
 - ``variations``: variations of one clip by 1, 2 and 4 workers at once, each with its share of the cores: bytes equal;
   and a variation's frame over one of ``live`` with the same light, in turn;
 - ``kills``: a recording lit while workers and driver are killed at random moments: bytes those of a run left alone.
@@ -23,11 +24,9 @@ from __future__ import annotations
 import argparse
 import contextlib
 import dataclasses
-import json
 import os
 import shutil
 import statistics
-import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -36,18 +35,18 @@ from typing import Any
 
 import warp as wp
 
-from bench.common import commit
-from bench.farm_recordings import write_recording, write_scene
+from bench.farm_bench import START_SECONDS, Bench, numbers_of
+from bench.farm_bounds import run_bounds
+from bench.farm_clip import surveyed, write_clips
+from bench.farm_kills import run_kills
+from bench.farm_long import PHASES, run_long
 from bench.farm_runs import jobs_done, prepare, rates, work
+from bench.farm_variations import run_variations
 from warp_ar.farm.fitting import probe_worker, workers_of_gpu
 from warp_ar.farm.jobs import parse_jobs, read_jobs
 
 PARTS = {"bounds": 0.1, "gpus": 0.4, "cpu": 0.1, "long": 0.22, "variations": 0.18, "kills": 0.2}
 """Parts in their order, and their shares of the minutes."""
-CLIP_FRAMES = 480
-"""Of the recording that ``gpus`` and ``cpu`` light again and again."""
-START_SECONDS = 90.0
-"""Within which workers should have done their first jobs, kernels compiled."""
 
 
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
@@ -62,9 +61,11 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--cpu-workers", default="1,2,4,8", metavar="N,M", help="of part cpu (default: 1,2,4,8)")
     parser.add_argument("--segment-frames", type=int, default=60, help="of parts gpus and cpu (default: 60)")
     parser.add_argument("--long-frames", type=int, default=54_000, help="asked of part long (default: 54000)")
+    parser.add_argument("--phases", default="", metavar="A,B", help=f"of part long, some of {', '.join(PHASES)}")
+    parser.add_argument("--kill-seconds", type=float, default=90.0, help="of part long, within which all die (90)")
     parser.add_argument("--variations", type=int, default=2000, help="of part variations (default: 2000)")
     parser.add_argument("--kill-frames", type=int, default=4800, help="of part kills' recording (default: 4800)")
-    parser.add_argument("--kills", type=int, default=20, help="deaths of workers in part kills (default: 20)")
+    parser.add_argument("--kills", type=int, default=20, help="deaths of workers in parts long and kills (20)")
     parser.add_argument("--driver-kills", type=int, default=3, help="deaths of the driver there (default: 3)")
     parser.add_argument("--decode", choices=("cpu", "gpu"), default="cpu", help="what decodes (default: cpu)")
     parser.add_argument("--variation-size", default="640x480", metavar="WxH", help="of their pictures (640x480)")
@@ -75,111 +76,20 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     unknown = [part for part in options.parts.split(",") if part not in PARTS]
     if unknown:
         parser.error(f"--parts {','.join(unknown)}: there are {', '.join(PARTS)}")
+    unknown = [phase for phase in filter(None, options.phases.split(",")) if phase not in PHASES]
+    if unknown or (options.phases and options.work is None):
+        parser.error(f"--phases: some of {', '.join(PHASES)}, and a folder that is kept: --work DIR")
     return options
-
-
-@dataclasses.dataclass
-class Bench:
-    """What all parts share."""
-
-    options: argparse.Namespace
-    device: str
-    folder: Path
-    """For recordings and runs."""
-    part: str = ""
-    until: float = 0.0
-    """When the part should be over, on ``time.monotonic``."""
-    begun: float = dataclasses.field(default_factory=time.monotonic)
-    costs: dict[str, float] = dataclasses.field(default_factory=dict)
-    """Milliseconds of a frame that were measured: ``survey``, ``worker``, ``worker_processor``."""
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Of the recordings."""
-        return size_of(self.options.size)
-
-    @property
-    def left(self) -> float:
-        """Seconds that the part has."""
-        return self.until - time.monotonic()
-
-    def say(self, line: str) -> None:
-        """A line of progress."""
-        print(f"[{time.monotonic() - self.begun:6.1f} s] {self.part}: {line}", file=sys.stderr, flush=True)
-
-    def tell(self, case: str, **figures: Any) -> None:
-        """One result."""
-        names = [str(device.name) for device in wp.get_cuda_devices()] if self.device != "cpu" else []
-        record = {
-            "case": f"farm {case}",
-            "size": self.options.variation_size if self.part == "variations" else self.options.size,
-            **figures,
-            "quality": self.options.quality,
-            "decode": self.options.decode,
-            "gpus": names,
-            "cores": len(os.sched_getaffinity(0)),
-            "warp": wp.__version__,
-            "commit": commit(),
-        }
-        line = json.dumps(record)
-        print(line, flush=True)
-        if self.options.output is not None:
-            self.options.output.mkdir(parents=True, exist_ok=True)
-            with open(self.options.output / f"farm_{self.part}.jsonl", "a", encoding="utf-8") as stream:
-                stream.write(line + "\n")
-
-    def surveyed(self) -> Path:
-        """A run that has surveyed the recording of parts ``bounds``, ``gpus`` and ``cpu``; made once."""
-        folder = self.folder / "surveyed"
-        if folder.exists():
-            return folder
-        scene, video = self.folder / "desk.toml", self.folder / "desk.mp4"
-        write_scene(scene, self.size)
-        start = time.monotonic()
-        write_recording(video, self.size, CLIP_FRAMES)
-        self.say(f"a recording of {CLIP_FRAMES} frames in {time.monotonic() - start:.1f} s")
-        start = time.monotonic()
-        prepare(self.folder / "first", self.write_jobs("first.toml", 1, 8, end=16), None)
-        work(self.folder / "first", 1, self.device, self.say, steady=0.0)
-        self.say(f"kernels are compiled and kept after {time.monotonic() - start:.1f} s")
-        prepare(folder, self.write_jobs("survey.toml", 1, 8), None)
-        seen = work(folder, 1, self.device, self.say, steady=0.0)
-        surveys = jobs_done(folder, "survey")
-        if not surveys:
-            raise SystemExit(f"the survey failed: {seen.errors}")
-        self.costs["survey"] = 1e3 * (surveys[0].end - surveys[0].start) / CLIP_FRAMES
-        self.tell("survey", ms_per_frame=round(self.costs["survey"], 2), frames=CLIP_FRAMES, bytes=surveys[0].bytes)
-        return folder
-
-    def write_jobs(self, name: str, clips: int, segment_frames: int, end: int = CLIP_FRAMES) -> Path:
-        """A job file of so many clips that are the first frames of one recording."""
-        settings = f'quality = "{self.options.quality}"\ndecode = "{self.options.decode}"\n'
-        run = f"schema = 1\n[run]\n{settings}segment_frames = {segment_frames}\n"
-        clip = '[[clip]]\nscene = "desk.toml"\npath = "desk.mp4"\nname = "c{:04d}"\nframes = [0, {}]\n'
-        path = self.folder / name
-        path.write_text(run + "".join(clip.format(number, end) for number in range(clips)), encoding="utf-8")
-        return path
-
-
-def size_of(text: str) -> tuple[int, int]:
-    """Width and height of ``WxH``."""
-    width, _, height = text.partition("x")
-    return int(width), int(height)
-
-
-def numbers_of(text: str) -> list[int]:
-    """Numbers with commas between."""
-    return [int(part) for part in text.split(",")]
 
 
 def steady_run(
     bench: Bench, name: str, workers: int, device: str, seconds: float, *, gpus: Sequence[int], cores: Sequence[int]
 ) -> dict[str, Any]:
     """Frames a second of segments with so many workers; what it writes is removed."""
-    surveyed = bench.surveyed()
-    jobs = bench.write_jobs(f"{name}.toml", 60, bench.options.segment_frames)
+    source = surveyed(bench)
+    jobs = write_clips(bench, f"{name}.toml", 60, bench.options.segment_frames)
     folder = bench.folder / name
-    prepare(folder, jobs, surveyed)
+    prepare(folder, jobs, source)
     limit = START_SECONDS + seconds
     seen = work(folder, workers, device, bench.say, gpus=gpus, cores=cores, limit=limit, steady=seconds)
     done = jobs_done(folder, "segment")
@@ -202,9 +112,9 @@ def run_gpus(bench: Bench) -> None:
     if not count or bench.device == "cpu":
         bench.tell("gpus", left_out="there is no CUDA device")
         return
-    bench.surveyed()
+    surveyed(bench)
     cores = sorted(os.sched_getaffinity(0))
-    jobs = parse_jobs(read_jobs(bench.write_jobs("trial.toml", 1, bench.options.segment_frames)), "trial.toml")
+    jobs = parse_jobs(read_jobs(write_clips(bench, "trial.toml", 1, bench.options.segment_frames)), "trial.toml")
     if (trial := probe_worker(jobs, "cuda:0")) is not None:
         each = workers_of_gpu(trial, len(cores), count)
         bench.tell("trial of one worker", **dataclasses.asdict(trial), workers_of_a_gpu=each)
@@ -245,7 +155,7 @@ def run_gpus(bench: Bench) -> None:
 
 def run_cpu(bench: Bench) -> None:
     """Numbers of workers on the processor alone."""
-    bench.surveyed()
+    surveyed(bench)
     cores = sorted(os.sched_getaffinity(0))
     counts = [count for count in numbers_of(bench.options.cpu_workers) if count <= len(cores)]
     frames, bench.options.segment_frames = bench.options.segment_frames, min(4, bench.options.segment_frames)
@@ -261,10 +171,6 @@ def run_cpu(bench: Bench) -> None:
 
 def run_parts(bench: Bench) -> None:
     """All parts that are asked for, each within its share of the minutes."""
-    from bench.farm_bounds import run_bounds
-    from bench.farm_equal import run_long, run_variations
-    from bench.farm_kills import run_kills
-
     runs = {
         "bounds": run_bounds,
         "gpus": run_gpus,

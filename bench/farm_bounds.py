@@ -9,7 +9,7 @@ import statistics
 import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import av
 import numpy as np
@@ -17,6 +17,8 @@ import warp as wp
 from av.codec.hwaccel import HWAccel
 from av.video.reformatter import VideoReformatter
 
+from bench.farm_bench import Bench
+from bench.farm_clip import surveyed, write_clips
 from bench.farm_recordings import RATE, TICK
 from warp_ar.device import usable_cores
 from warp_ar.engine.pipeline import Pipeline
@@ -30,9 +32,6 @@ from warp_ar.input.sources import open_source
 from warp_ar.input.tracking import Tracker
 from warp_ar.input.video_file import rgb_from_video
 from warp_ar.scene import load_scene
-
-if TYPE_CHECKING:
-    from bench.bench_farm import Bench
 
 FRAMES = {"cpu": 12, "cuda": 96}
 WARM = 3
@@ -54,11 +53,11 @@ def measure_worker(bench: Bench) -> None:
     """Milliseconds of a whole worker's frame, by the clock and of all its threads: ``bench.costs``."""
     if "worker" in bench.costs:
         return
-    surveyed, count = bench.surveyed(), FRAMES[bench.device]
-    jobs = parse_jobs(read_jobs(bench.write_jobs("bounds.toml", 1, count)), "bounds.toml")
+    source, count = surveyed(bench), FRAMES[bench.device]
+    jobs = parse_jobs(read_jobs(write_clips(bench, "bounds.toml", 1, count)), "bounds.toml")
     folder = bench.folder / "bounds"
-    shutil.copytree(surveyed / "clips", folder / "clips")
-    device = "cpu" if bench.device == "cpu" else "cuda:0"
+    shutil.copytree(source / "clips", folder / "clips")
+    device = bench.one_device
     with Work(Context(jobs, folder, device)) as worker:
         for number in (0, 1):  # the first loads kernels and allocates
             job = Job("segment", 0, number, number * count, (number + 1) * count)
@@ -75,7 +74,7 @@ def measure_worker(bench: Bench) -> None:
 
 def run_bounds(bench: Bench) -> None:
     """Every step alone, then a whole worker."""
-    bench.surveyed()
+    surveyed(bench)
     video, limit = bench.folder / "desk.mp4", FRAMES[bench.device]
     steps: dict[str, tuple[float, float]] = {}
 
@@ -150,11 +149,11 @@ def _encode(path: Path, images: list[np.ndarray], limit: int) -> tuple[float, fl
 
 def _light(bench: Bench, steps: dict[str, tuple[float, float]], limit: int) -> dict[str, float]:
     """Frames from the file to the host's picture, none written; returns the kernels' milliseconds on a CUDA device."""
-    surveyed = bench.surveyed()
-    jobs = parse_jobs(read_jobs(bench.write_jobs("light.toml", 1, limit)), "light.toml")
+    source = surveyed(bench)
+    jobs = parse_jobs(read_jobs(write_clips(bench, "light.toml", 1, limit)), "light.toml")
     folder = bench.folder / "light"
-    shutil.copytree(surveyed / "clips", folder / "clips")
-    device = "cpu" if bench.device == "cpu" else "cuda:0"
+    shutil.copytree(source / "clips", folder / "clips")
+    device = bench.one_device
     kernels: dict[str, float] = {}
     with Lighter(jobs, folder, device) as lighter:
         for lit in lighter.light(Job("segment", 0, 0, 0, WARM)):

@@ -21,12 +21,12 @@ from warp_ar.farm.part_video import PartSink, join_parts
 from warp_ar.input.sources import open_source
 from warp_ar.scene import Scene, SourceSpec, dumps_scene, load_scene
 
-RATE = 24
+RATE = 30
 TICK = fractions.Fraction(1, RATE)
 FORTH = 120
 """Frames of the bundled clip."""
 LOOP = 2 * (FORTH - 1)
-"""Frames of a loop, forth and back: about ten seconds."""
+"""Frames of a loop, forth and back: about eight seconds."""
 GAINS = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.6, 0.7, 0.8, 0.9)
 """Linear gain at the begin of each loop in turn; within a loop it goes evenly to the next."""
 
@@ -81,13 +81,16 @@ def _write_stretch(path: Path, size: tuple[int, int], loop: int, first: int, end
     return path
 
 
-def write_recording(path: Path, size: tuple[int, int], frames: int) -> None:
+def write_recording(path: Path, size: tuple[int, int], frames: int) -> int:
     """Write a recording of so many frames.
 
     Args:
         path: An MP4.
         size: Width and height in pixels.
         frames: How many; of as many loops as these take no more than ten are encoded.
+
+    Returns:
+        Frames that were encoded; the others are their packets again.
     """
     quarters = list(itertools.pairwise(round(LOOP * n / 4) for n in range(5)))
     wanted: list[tuple[int, int, int]] = []
@@ -109,3 +112,4 @@ def write_recording(path: Path, size: tuple[int, int], frames: int) -> None:
     join_parts([place[piece] for piece in wanted], starts, TICK, path, recording=None)
     for name in names:
         name.unlink()
+    return sum(end - first for _, first, end in unique)

@@ -17,26 +17,13 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from warp_ar.farm.jobs import read_jobs
 from warp_ar.farm.manifest import begin_run
 from warp_ar.farm.version import program_version
 
-if TYPE_CHECKING:
-    from bench.bench_farm import Bench
-
 ROOT = Path(__file__).resolve().parents[1]
-JOBS = """schema = 1
-[run]
-quality = "{quality}"
-decode = "{decode}"
-segment_frames = {segment}
-[[clip]]
-scene = "desk.toml"
-path = "{name}.mp4"
-name = "{name}"
-"""
 TELL_SECONDS = 10.0
 """Between two lines of progress."""
 
@@ -86,11 +73,15 @@ class Watched:
         }
 
 
-def write_jobs(bench: Bench, name: str, segment: int) -> Path:
-    """The job file of one recording, ``NAME.mp4``, lit by the scene ``desk.toml`` in segments of so many frames."""
-    path, options = bench.folder / f"{name}.toml", bench.options
-    path.write_text(JOBS.format(quality=options.quality, decode=options.decode, segment=segment, name=name))
-    return path
+def together(runs: Sequence[Watched]) -> Watched:
+    """What was seen of runs one after another, as of one."""
+    whole = Watched(code=runs[-1].code, errors=runs[-1].errors, gpus=runs[-1].gpus)
+    for run in runs:
+        whole.seconds += run.seconds
+        whole.processor_seconds += run.processor_seconds
+        for name in ("driver_mb", "worker_mb", "workers_mb"):
+            getattr(whole, name).extend(getattr(run, name))
+    return whole
 
 
 def prepare(folder: Path, jobs: Path, survey: Path | None) -> None:
@@ -112,10 +103,15 @@ def prepare(folder: Path, jobs: Path, survey: Path | None) -> None:
         for clip in data["clip"]:
             key = f"{clip['name']}/survey"
             place = folder / "clips" / clip["name"]
-            shutil.copytree(source, place)
+            shutil.copytree(source, place, copy_function=_copy_or_link)
             record = json.loads((place / "record.json").read_text())
             (place / "record.json").write_text(json.dumps({**record, "job": key}))
             manifest.write(json.dumps({**done, "job": key, "frames": 0}) + "\n")
+
+
+def _copy_or_link(source: str, target: str) -> None:
+    """Copy a file; maps of a long survey take gigabytes, and nobody writes to what has been published."""
+    (os.link if source.endswith(".bin") else shutil.copy2)(source, target)
 
 
 def work(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import pathlib
@@ -94,7 +95,7 @@ def tags(path: pathlib.Path) -> tuple[str, ...]:
 
 def test_segments_of_a_deep_recording_are_joined_as_deep_as_it_came(clip: tuple[str, pathlib.Path]) -> None:
     coding, folder = clip
-    jobs, parts = run_all(folder, "parts", segment_frames=3)
+    jobs, parts = run_all(folder, "parts", segment_frames=3, digests=True)
     _, whole = run_all(folder, "whole")
     with Lighter(jobs, parts, "cpu") as lighter:
 
@@ -111,6 +112,9 @@ def test_segments_of_a_deep_recording_are_joined_as_deep_as_it_came(clip: tuple[
     for a, b, picture in zip(joined, alone, one, strict=True):
         for got in (a, b):
             assert np.abs(signal(got, coding) - signal(picture, coding)).mean() < LOSS
+    assert (parts / "a.sha256").read_text().split() == [
+        hashlib.sha256(picture.tobytes()).hexdigest() for picture in one
+    ]
     # What nothing virtual touches keeps its depth: steps that 8 bits do not have, and light above white.
     same = np.abs(one[0] - before[0]).max(-1) == 0.0
     assert same.mean() > 0.3

@@ -68,6 +68,11 @@ def test_paths_are_relative_to_the_job_file_and_survive_a_resume(tmp_path):
         ('schema = 1\n[[clip]]\nlight = "no.exr"\n', 'clip[0].light = "no.exr": there is no file'),
         ('schema = 1\n[run]\nquality = "best"\n[[clip]]\n', 'run.quality = "best": expected one of "paper", "low"'),
         ('schema = 1\n[run]\nlight = "sun"\n[[clip]]\n', 'run.light = "sun": expected one of "follow"'),
+        ("schema = 1\n[run]\ndigests = 1\n[[clip]]\n", "run.digests = 1: expected true or false"),
+        (
+            f"schema = 1\n[run]\ndigests = true\n[[clip]]\n[dataset]\n{BALL}",
+            "run.digests: the manifest has a digest of",
+        ),
         ("schema = 1\n[run]\nsegment_frames = 0\n[[clip]]\n", "run.segment_frames = 0: expected a whole number from 1"),
         ("schema = 1\n[[clip]]\n[dataset]\n", "dataset.object is missing: expected at least one"),
         (f"schema = 1\n[[clip]]\n[dataset]\nvariations = 0\n{BALL}", "dataset.variations = 0: expected a whole number"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import weakref
 
 import cv2
@@ -12,7 +13,7 @@ import pytest
 from tests.farm_rig import make_jobs, write_recording
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SourceError, UsageError
-from warp_ar.farm.jobs import Job
+from warp_ar.farm.jobs import Job, job_of_clip, jobs_of_clip
 from warp_ar.farm.lighting import PIPELINES, Lighter
 from warp_ar.farm.records import Context
 from warp_ar.farm.survey import Survey, lit_scene
@@ -84,6 +85,29 @@ def test_a_surveyed_clip_is_lit_as_a_live_one(folder, quality):
         live = [result.image for _, result in session]
     for a, b in zip(whole, live, strict=True):
         assert np.abs(a.astype(int) - b).max() <= MOST_CODES
+
+
+@pytest.mark.parametrize("light", ["follow", "fixed"])
+def test_digests_are_those_of_pictures_before_they_are_encoded(folder, light):
+    _, plain = surveyed(folder, light=light)
+    texts = []
+    for size in (4, COUNT):
+        jobs = make_jobs(
+            folder,
+            [{"scene": "scene.toml", "path": "a.mp4"}],
+            run={"quality": "low", "light": light, "digests": True, "segment_frames": size},
+        )
+        run = folder / f"digests-{light}-{size}"
+        with Work(Context(jobs, run, "cpu")) as work:
+            segments = [job_of_clip(jobs, 0, number, COUNT) for number in range(jobs_of_clip(jobs, 0, COUNT))]
+            for job in (Job("survey"), *reversed(segments), Job("join")):
+                outcome = work.do(job, lambda _: None)
+                assert outcome.state == "done", outcome.reason
+        texts.append((run / "a.sha256").read_text())
+    assert texts[0] == texts[1]
+    jobs, run = surveyed(folder, light=light)
+    assert texts[0].split() == [hashlib.sha256(image.tobytes()).hexdigest() for image in lit_whole(jobs, plain)]
+    assert len(set(texts[0].split())) == COUNT
 
 
 def test_a_preroll_over_all_frames_is_the_live_run(folder):

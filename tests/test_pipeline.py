@@ -17,7 +17,7 @@ from warp_ar.engine.carried_light import resample_light
 from warp_ar.engine.pipeline import Pipeline, Result
 from warp_ar.errors import SceneError, UsageError
 from warp_ar.input.sources import Synthetic
-from warp_ar.input.tracking import TrackState
+from warp_ar.input.tracking import Tracker, TrackState
 from warp_ar.scene import (
     Camera,
     Exposure,
@@ -103,6 +103,51 @@ def test_frames_sent_ahead_are_the_same(frames: Frames, device: str) -> None:
         ahead = [second.submit(image, time_seconds=index / 30) for index, image in enumerate(many)]
         for result, image in zip(ahead, expected, strict=True):
             np.testing.assert_array_equal(result.image, image)
+
+
+def test_a_track_of_the_callers_is_that_of_the_pipelines_own(frames: Frames, device: str) -> None:
+    """One in which the marker is lost, too: the frame passes as it came."""
+    scene = make_scene()
+    shown = [*frames, np.full_like(frames[0], 90), frames[0]]
+    times = [0.1 * n for n in range(len(frames))] + [2.0, 2.1]
+    with (
+        Pipeline(scene, device=device, quality="low", outputs=("image", "pose")) as first,
+        Pipeline(scene, device=device, quality="low", outputs=("image", "pose")) as second,
+    ):
+        tracker = Tracker(second.scene.marker, second.camera)
+        states = set()
+        for image, now in zip(shown, times, strict=True):
+            own = first(image, time_seconds=now)
+            given = second.submit(image, time_seconds=now, pose=tracker.track(image, now))
+            np.testing.assert_array_equal(given.image, own.image)
+            assert given.state == own.state
+            assert (given.pose is None) == (own.pose is None)
+            states.add(own.state)
+    assert states == {TrackState.TRACKED, TrackState.LOST}
+
+
+def test_light_of_submitted_frames_outlasts_them_where_no_picture_is_made(frames: Frames, device: str) -> None:
+    outputs = ("pose", "environment")
+    rising = [np.minimum(image, np.uint8(100 + 20 * index)) for index, image in enumerate(frames * 2)]
+    with (
+        Pipeline(make_scene(), device=device, quality="low", outputs=outputs, estimates="synchronous") as first,
+        Pipeline(make_scene(), device=device, quality="low", outputs=outputs, estimates="synchronous") as second,
+    ):
+        expected, ahead = [], []
+        for index, image in enumerate(rising):
+            result = first(image, time_seconds=index / 30)
+            expected.append((result.environment, result.emitters))
+        for index, image in enumerate(rising):
+            image.flags.writeable = False
+            ahead.append(second.submit(image, time_seconds=index / 30))
+        for result, (environment, emitters) in zip(ahead, expected, strict=True):
+            assert environment is not None
+            assert emitters is not None
+            np.testing.assert_array_equal(result.environment, environment)
+            assert result.emitters is not None
+            assert result.emitters.tobytes() == emitters.tobytes()
+    maps = {environment.tobytes() for environment, _ in expected if environment is not None}
+    assert len(maps) == len(rising), "the light must change"
 
 
 def test_submitted_frames_may_be_written_anew(frames: Frames, device: str) -> None:

@@ -113,6 +113,32 @@ def test_pool_solves_here_until_a_process_is_ready_and_when_it_dies():
     assert pool.solve(Doubler(), sides(), trace)[1][1] == 1
 
 
+def test_a_pool_that_rests_has_no_process_until_it_is_asked_again():
+    pool = SolvingPool(1)
+    try:
+        assert not pool.ready
+        pool.prepare()
+        wait_until_ready(pool)
+        process = pool._all[0]._process
+        pool.rest()
+        assert process.returncode is not None
+        assert not pool.ready
+        assert not pool._all
+        pool.prepare()
+        wait_until_ready(pool)
+        solver = Doubler()
+        assert pool.solve(solver, sides(), trace)[0] is not solver
+    finally:
+        pool.close()
+
+
+def wait_until_ready(pool):
+    deadline = time.monotonic() + 60.0
+    while not pool.ready and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert pool.ready
+
+
 def test_all_who_wait_for_a_process_that_dies_solve_for_themselves(monkeypatch):
     """Three estimates, one process: two wait for it, and neither is left waiting when it has gone."""
     dies = threading.Event()

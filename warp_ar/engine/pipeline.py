@@ -32,7 +32,7 @@ from warp_ar.errors import UsageError
 from warp_ar.input.exposures import BracketPlan, brightened, find_exposure, plan_bracket
 from warp_ar.input.own_markers import OwnMarkers, Places, own_markers
 from warp_ar.input.plate import Plate, as_plate, check_plate, codes8
-from warp_ar.input.tracking import Tracker, TrackState
+from warp_ar.input.tracking import Track, Tracker, TrackState
 from warp_ar.light.captured import has_places
 from warp_ar.scene import Pose, Scene
 from warp_ar.scene.finite import check_finite
@@ -337,7 +337,7 @@ class Pipeline(Closing):
         image: npt.NDArray[np.uint8] | Any,
         *,
         time_seconds: float | None = None,
-        pose: Pose | None = None,
+        pose: Pose | Track | None = None,
         exposure_time: float | None = None,
     ) -> Result:
         """Light one frame.
@@ -349,7 +349,8 @@ class Pipeline(Closing):
                 marker must be found; on a CUDA device it must stay as it is until it has been rendered. A pipeline of
                 ``linear`` frames takes uint16 codes, linear floats and a `Plate` too.
             time_seconds: When the frame was taken; frames without a time are taken to come 30 times a second.
-            pose: ``camera_from_world`` where it is known from elsewhere; the marker is then not looked for.
+            pose: ``camera_from_world`` where it is known from elsewhere, or what a tracker of the caller's told of the
+                frame; the marker is then not looked for.
             exposure_time: Seconds; None means that of the frames that are shown.
 
         Raises:
@@ -363,7 +364,7 @@ class Pipeline(Closing):
         image: npt.NDArray[np.uint8] | Any,
         *,
         time_seconds: float | None = None,
-        pose: Pose | None = None,
+        pose: Pose | Track | None = None,
         exposure_time: float | None = None,
     ) -> Result:
         """Light one frame without waiting for it; arguments as those of a call.
@@ -371,11 +372,18 @@ class Pipeline(Closing):
         This thread looks for the marker and hands the frame over; another renders it, and on CUDA sends its picture
         ahead. With the next frame submitted before this one's image is read, tracking, both ways over the bus and the
         kernels run side by side. The device's own arrays of a result still hold only until the next frame is rendered.
+        An image that may not be written (``flags.writeable``) is taken to stay as it is, and not copied.
         """
         return self._begin(image, time_seconds, pose, exposure_time, ahead=True)
 
     def _begin(
-        self, image: Any, time_seconds: float | None, pose: Pose | None, exposure_time: float | None, *, ahead: bool
+        self,
+        image: Any,
+        time_seconds: float | None,
+        given: Pose | Track | None,
+        exposure_time: float | None,
+        *,
+        ahead: bool,
     ) -> Result:
         """Look at a frame and have it rendered, by this thread or, if ``ahead``, by another where it is the host's."""
         self._check_usable()
@@ -383,11 +391,12 @@ class Pipeline(Closing):
             check_number("time_seconds", time_seconds)
         if exposure_time is not None:
             check_number("exposure_time", exposure_time, above=0.0)
+        pose = given.pose if isinstance(given, Track) else given
         if pose is not None and not (np.isfinite(pose.rotation).all() and np.isfinite(pose.translation).all()):
             raise UsageError("pose holds a number that is not finite; expected a rotation and a translation")
         plate, image = self._take_depth(image)
         picture = adopt_frame(image, self.size, self.device)
-        result = self._light_frame(picture, time_seconds, pose, exposure_time, ahead=ahead, plate=plate)
+        result = self._light_frame(picture, time_seconds, given, exposure_time, ahead=ahead, plate=plate)
         if picture is not image and isinstance(picture, wp.array):
             self._borrowed.keep(picture)
         return result
@@ -411,7 +420,7 @@ class Pipeline(Closing):
         self,
         image: Any,
         time_seconds: float | None,
-        pose: Pose | None,
+        pose: Pose | Track | None,
         exposure_time: float | None,
         *,
         ahead: bool,
@@ -452,8 +461,8 @@ class Pipeline(Closing):
             self._renderer = ThreadPoolExecutor(1, "warp_ar-render")
         sent = self._send(frame)
         if sent.slot is None or "image" not in self._arrays:
-            # The caller may write its picture anew before it is rendered.
-            sent = dataclasses.replace(sent, image=frame.image.copy())
+            # The caller may write its picture anew before it is rendered, unless nobody may.
+            sent = dataclasses.replace(sent, image=frame.image.copy() if frame.image.flags.writeable else frame.image)
         self._ahead.append(self._renderer.submit(lambda: self._keep(self._render(sent))))
         return self._ahead[-1]
 
@@ -463,21 +472,23 @@ class Pipeline(Closing):
             self._ahead.popleft().result()
 
     def _keep(self, rendered: Rendered) -> Rendered:
-        """Have the picture outlast the next frame."""
-        lit, light = rendered.image_array, rendered.environment_array
+        """Have the picture outlast the next frame; the light as well, on CPU and where no picture is made."""
+        lit, transfers = rendered.image_array, self.inputs.transfers
         if rendered.layers is not None:
             rendered = dataclasses.replace(rendered, layers=rendered.layers.to_host())
-        if not isinstance(lit, wp.array):
-            return dataclasses.replace(rendered, image=lit)
-        if self.inputs.transfers is not None:
-            return dataclasses.replace(rendered, image=self.inputs.transfers.download(lit))
-        kept, others = (None if one is None else np.array(one.numpy()) for one in (light, rendered.others_array))
-        return dataclasses.replace(rendered, image=np.array(lit.numpy()), environment=kept, others=others)
+        if transfers is None or "image" not in self._arrays:
+            with exclusive(self.device):
+                rendered = rendered.with_light_kept()
+        if isinstance(lit, wp.array):
+            lit = np.array(lit.numpy()) if transfers is None else transfers.download(lit)
+        return dataclasses.replace(rendered, image=lit)
 
     def _track(
-        self, image: Any, now: float, pose: Pose | None, timings: dict[str, StageTiming]
+        self, image: Any, now: float, pose: Pose | Track | None, timings: dict[str, StageTiming]
     ) -> tuple[Pose | None, TrackState | None]:
         """Find the marker, unless the pose is known or nothing needs it."""
+        if isinstance(pose, Track):
+            return pose.pose, pose.state
         if self._tracker is None or pose is not None:
             return pose, None
         if isinstance(image, wp.array):
@@ -501,11 +512,11 @@ class Pipeline(Closing):
         timings[TRACK] = StageTiming(before + (time.perf_counter() - start) * 1e3, False)
         return places
 
-    def _look(self, image: Any, now: float, pose: Pose | None) -> tuple[SeenFrame, TrackState | None]:
+    def _look(self, image: Any, now: float, given: Pose | Track | None) -> tuple[SeenFrame, TrackState | None]:
         """Find the marker, go on with the clock."""
         timings: dict[str, StageTiming] = {}
-        pose, state = self._track(image, now, pose, timings)
-        lost = self._tracker is not None and pose is None
+        pose, state = self._track(image, now, given, timings)
+        lost = pose is None and (self._tracker is not None or isinstance(given, Track))
         places = self._find_own_markers(image, now, pose, timings)
         seconds, step = now - (self._start_time or 0.0), max(now - self._lit_time, 0.0)
         self._last_time = self._lit_time = now
@@ -536,7 +547,16 @@ class Pipeline(Closing):
             layers = layers.with_plate(self.inputs.radiance(frame.plate), clip)
         milliseconds = (time.perf_counter() - start) * 1e3
         light = self._light
-        return Rendered(self._shown, light.environment, timings, milliseconds, layers, others_array=light.others)
+        emitters = self._arrays.get("emitters") if light.environment is not None else None
+        return Rendered(
+            self._shown,
+            light.environment,
+            timings,
+            milliseconds,
+            layers,
+            others_array=light.others,
+            emitters_array=emitters,
+        )
 
     def _layers_of(self, unlit: Any = None) -> LayerArrays | None:
         """The layers that were asked for; those of a frame that passes as it came are neutral."""
@@ -548,16 +568,16 @@ class Pipeline(Closing):
         return layer_arrays(request, self._arrays)
 
     def _take_short(
-        self, image: Any, host_image: Image | None, exposure: int | None, now: float, pose: Pose | None
+        self, image: Any, host_image: Image | None, exposure: int | None, now: float, given: Pose | Track | None
     ) -> Result:
         """Let a frame of another exposure tell of the light, unless that was left out; the picture stays."""
         timings: dict[str, StageTiming] = {}
         bright: Any = image
-        if self._shown is None or (self._tracker is not None and pose is None):
+        if self._shown is None or (self._tracker is not None and given is None):
             picture = image.numpy() if host_image is None else host_image
             ratio = 1.0 if exposure is None else self.bracket.ratios[exposure]
             bright = brightened(picture, self.inputs.decode, ratio)
-        pose, state = self._track(bright, now, pose, timings)
+        pose, state = self._track(bright, now, given, timings)
         if self._short is not None and pose is not None and exposure is not None:
             start = time.perf_counter()
             with exclusive(self.device):

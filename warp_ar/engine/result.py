@@ -45,6 +45,18 @@ class Rendered:
     """Those of the mirror balls after the first, where the light is interpolated."""
     others: npt.NDArray[np.float32] | None = None
     """The same where they were kept."""
+    emitters_array: Any = None
+    """Where the environment's emitters are, records of ``Emitter``; None: the quality does not find their places."""
+    emitters: npt.NDArray[Any] | None = None
+    """The same where they were kept."""
+
+    def with_light_kept(self) -> Rendered:
+        """The same with arrays of its own for all that is known of the light."""
+        light, others, emitters = (
+            None if one is None else np.array(one.numpy())
+            for one in (self.environment_array, self.others_array, self.emitters_array)
+        )
+        return dataclasses.replace(self, environment=light, others=others, emitters=emitters)
 
     def at_once(self) -> Future[Rendered]:
         """The same as something that nobody needs to wait for."""
@@ -126,6 +138,18 @@ class Result:
             with exclusive(rendered.others_array.device):
                 others = np.array(rendered.others_array.numpy())
         return () if self.environment is None else (self.environment, *(() if others is None else others))
+
+    @functools.cached_property
+    def emitters(self) -> npt.NDArray[Any] | None:
+        """Where the environment's emitters are, an array of its own: what ``Pipeline.take_light`` takes.
+
+        None where the environment was not asked for or not seen yet, or the quality does not find their places.
+        """
+        rendered = self._rendered.result()
+        if rendered.emitters is not None or rendered.emitters_array is None:
+            return rendered.emitters
+        with exclusive(rendered.emitters_array.device):
+            return np.array(rendered.emitters_array.numpy())
 
     @property
     def layer_arrays(self) -> Mapping[str, Any]:

@@ -143,6 +143,7 @@ def work(options: argparse.Namespace, folder: Path) -> int:
             summary = Driver(jobs, folder, manifest, pool, mine, say).run()
         finally:
             manifest.close()
+            clear_aside(folder)  # what workers that were killed left takes room, and is nobody's
     return _tell(folder, summary.failed)
 
 

@@ -21,7 +21,7 @@ from warp_ar.input.sources import open_source
 from warp_ar.input.video_file import VideoFile
 
 CONVERTERS = 2
-"""Threads of a worker that turn decoded pictures into RGB: of all that is done in order, the slowest in a survey."""
+"""Threads of a worker that turn decoded pictures into RGB."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -51,14 +51,21 @@ class VideoPart(VideoFile):
         end: Number behind the last.
         fps: Show frame n at n / fps instead of at its own time.
         gpu: Number of the GPU whose decoding unit is to be used, where it has one for this coding; None: none is.
+        converters: Threads that turn decoded pictures into RGB.
     """
 
-    _converters = CONVERTERS
-
     def __init__(
-        self, path: Path, index: FrameIndex, first: int, end: int, fps: float | None, gpu: int | None = None
+        self,
+        path: Path,
+        index: FrameIndex,
+        first: int,
+        end: int,
+        fps: float | None,
+        gpu: int | None = None,
+        *,
+        converters: int = CONVERTERS,
     ) -> None:
-        self._gpu = gpu
+        self._gpu, self._converters = gpu, converters
         super().__init__(path, fps=fps)
         self._index, self._first, self._end = index, first, end
         self.length = end - first
@@ -162,13 +169,20 @@ def index_frames(path: Path, fps: float | None) -> FrameIndex:
 
 
 def open_part(
-    path: Path, index: FrameIndex, first: int, end: int, fps: float | None, gpu: int | None = None
+    path: Path,
+    index: FrameIndex,
+    first: int,
+    end: int,
+    fps: float | None,
+    gpu: int | None = None,
+    *,
+    converters: int = CONVERTERS,
 ) -> RecordedSource:
     """Frames ``first`` to ``end`` of a recording; arguments as ``VideoPart``."""
     with open_source(path, fps=fps) as source:
         is_video = isinstance(source, VideoFile)
     if is_video:
-        return VideoPart(path, index, first, end, fps, gpu)
+        return VideoPart(path, index, first, end, fps, gpu, converters=converters)
     return FolderPart(path, first, end, fps or DEFAULT_FPS)
 
 

@@ -30,7 +30,7 @@ DECODERS = ("cpu", "gpu")
 """What decodes recordings: the processor, or the GPU's decoding unit where it has one for their coding."""
 AS_RECORDED = "recorded"
 """What recordings are written in, of ``CODINGS`` and this one: as deep as they came."""
-_RUN_KEYS = ("quality", "light", "segment_frames", "preroll", "decode", "coding")
+_RUN_KEYS = ("quality", "light", "segment_frames", "preroll", "decode", "coding", "digests")
 _CLIP_KEYS = ("name", "scene", "path", "light", "calibration", "frames")
 
 
@@ -50,6 +50,8 @@ class Settings:
     """One of ``DECODERS``."""
     coding: str = AS_RECORDED
     """Of what is written: one of ``CODINGS``, or ``AS_RECORDED``."""
+    digests: bool = False
+    """Whether digests of recordings' pictures are kept, as they were before they were encoded."""
 
     def gpu_of(self, device: str) -> int | None:
         """Number of the GPU that decodes for a worker on a device; None: the processor does."""
@@ -219,6 +221,8 @@ def parse_jobs(data: dict[str, Any], label: str) -> JobFile:
         )
     if dataset is not None and settings.coding != AS_RECORDED:
         raise JobsError(f"{label}: run.coding = {settings.coding!r}: a data set is pictures of 8 bits; leave it out")
+    if dataset is not None and settings.digests:
+        raise JobsError(f"{label}: run.digests: the manifest has a digest of each variation already; leave it out")
     jobs = JobFile(settings, tuple(clips), dataset)
     for scene in {clip.scene: index for index, clip in reversed(list(enumerate(clips)))}.values():
         base = scene_of(jobs, scene)
@@ -254,7 +258,8 @@ def _read_settings(table: JobTable) -> Settings:
     size = table.integer("segment_frames", low=1) if "segment_frames" in table else None
     light, decode = table.choice("light", LIGHTS, LIGHTS[0]), table.choice("decode", DECODERS, DECODERS[0])
     coding = table.choice("coding", (AS_RECORDED, *CODINGS), AS_RECORDED)
-    return Settings(quality, light, size, table.integer("preroll", 48, low=0), decode, coding)
+    digests = table.flag("digests", False)
+    return Settings(quality, light, size, table.integer("preroll", 48, low=0), decode, coding, digests)
 
 
 def _read_clip(table: JobTable, names: dict[str, int]) -> Clip:

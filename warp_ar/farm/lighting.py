@@ -16,7 +16,7 @@ import numpy.typing as npt
 from warp_ar.closing import Closing
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.engine.result import Result
-from warp_ar.farm.frames import open_part
+from warp_ar.farm.frames import CONVERTERS, open_part
 from warp_ar.farm.jobs import Job, JobFile, lit_range, scene_of, source_of
 from warp_ar.farm.survey import Survey, keep_depth, lit_scene
 from warp_ar.input.plate import Plate
@@ -59,15 +59,16 @@ class Lit:
 class Lighter(Closing):
     """Lights segments and variations; one for each worker."""
 
-    def __init__(self, jobs: JobFile, folder: Path, device: str) -> None:
+    def __init__(self, jobs: JobFile, folder: Path, device: str, *, converters: int = CONVERTERS) -> None:
         """Light nothing yet.
 
         Args:
             jobs: The job file.
             folder: Of the run.
             device: ``cpu`` or ``cuda:N``.
+            converters: Threads that turn decoded pictures into RGB.
         """
-        self._jobs, self._folder, self._device = jobs, folder, device
+        self._jobs, self._folder, self._device, self._converters = jobs, folder, device, converters
         self._pipelines: collections.OrderedDict[Any, Pipeline] = collections.OrderedDict()
         self._survey: tuple[int, Survey] | None = None
         self._key: tuple[int, int, Any] | None = None
@@ -137,7 +138,7 @@ class Lighter(Closing):
         """Frames of a clip."""
         path, fps = source_of(self._jobs, clip)
         gpu = self._jobs.settings.gpu_of(self._device)
-        return open_part(path, self.survey(clip).index, first, end, fps, gpu)
+        return open_part(path, self.survey(clip).index, first, end, fps, gpu, converters=self._converters)
 
     def _follow(self, pipeline: Pipeline, survey: Survey, clip: int, frame: int) -> None:
         """Give a pipeline the light that holds for a frame."""

@@ -16,32 +16,43 @@ of a map, float32 (h, 2 h, 3), and, where the quality finds their places, its em
 
 A key is written once a texel of the environment has moved by more than one 8-bit step (``CHANGE_FLOOR + CHANGE_SHARE *
 value``) since the last key: the tolerance within which stages that read the environment do not run again either.
+
+Poses and light of a frame rest on the frames before it, so a clip is surveyed in order. But its steps run side by side:
+some threads decode, one follows the marker, one has kernels gather the light of the frame before, one compares and
+packs what came of the one before that; of a long clip another process finds the light that clips. What each step
+sees, and so every byte, is as if they were one after another.
 """
 
 from __future__ import annotations
 
+import collections
+import contextlib
 import dataclasses
 import fractions
 import io
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from warp_ar.device import exclusive
+from warp_ar.device import usable_cores
 from warp_ar.engine.pipeline import Pipeline
+from warp_ar.engine.result import Result
 from warp_ar.errors import SceneError, SourceError, reason
 from warp_ar.farm.frames import FrameIndex, index_frames, open_part
 from warp_ar.farm.jobs import JobFile, lit_range, scene_of, source_of
 from warp_ar.input.plate import check_linear
-from warp_ar.input.source import RecordedSource
+from warp_ar.input.source import Frame, RecordedSource
 from warp_ar.input.sources import open_source
+from warp_ar.input.tracking import Track, Tracker
 from warp_ar.kernels.change import CHANGE_FLOOR, CHANGE_SHARE
 from warp_ar.light.captured import Light, find_emitters
+from warp_ar.light.solving_process import CORES_EACH, POOL
 from warp_ar.scene import CapturedLight, Pose, Scene
 from warp_ar.stages.features import has_environment
 
@@ -51,6 +62,16 @@ NAME = "survey.npz"
 MAPS = "lights.bin"
 LIGHT = "light.exr"
 """The environment at the clip's end, with the emitters that were found."""
+CONVERTERS = 4
+"""Threads that turn decoded pictures into RGB: with fewer they are the slowest step."""
+ASIDE_FRAMES = 1000
+"""Frames of a clip from which on a process beside this one solves for light that clips: to start it takes a second of
+processor time and 150 MB for as long as the survey lasts."""
+AHEAD = 8
+"""Frames at most whose marker has been looked for and whose light has not been gathered: solving for light that clips
+takes as long as some frames, and comes with one of several."""
+WAITING = 4
+"""Frames at most whose light waits to be compared with the last that was kept."""
 _MANTISSA = 12
 """Bits of a radiance that are kept: a relative error of 2^-13, a hundredth of what a key may be off; the rest is noise
 that does not compress."""
@@ -195,7 +216,10 @@ class _Look:
     poses: npt.NDArray[np.float64]
     keys: list[int] = dataclasses.field(default_factory=list)
     saturation: npt.NDArray[np.float64] = dataclasses.field(default_factory=lambda: np.full(3, 255.0))
+    latest: tuple[Map, npt.NDArray[Any] | None] | None = None
+    """Environment and emitters of the last frame whose marker was found."""
     last: Map | None = None
+    """Of the last key."""
     emitters: npt.NDArray[Any] | None = None
     """Of the last key, as records of ``Emitter``."""
 
@@ -204,12 +228,14 @@ class _Look:
         """Whether the light is the frames' own, not a file's."""
         return self.scene.captured is None and has_environment(self.scene)
 
-    def take(self, frame: int, environment: Map, pipeline: Pipeline, writer: _Writer) -> None:
-        """Keep an environment if it has moved since the last one that was kept, or its emitters have."""
-        emitters = None
-        if "emitters" in pipeline.arrays:
-            with exclusive(pipeline.device):
-                emitters = np.array(pipeline.arrays["emitters"].numpy())
+    def take(self, frame: int, result: Result, writer: _Writer) -> None:
+        """Wait for the light of a frame; where all of it is wanted, ``keep`` it."""
+        self.latest = None if result.environment is None else (result.environment, result.emitters)
+        if self.latest is not None and self.jobs.settings.light == "follow":
+            self.keep(frame, *self.latest, writer)
+
+    def keep(self, frame: int, environment: Map, emitters: npt.NDArray[Any] | None, writer: _Writer) -> None:
+        """Write an environment if it has moved since the last one that was written, or its emitters have."""
         if self.last is not None:
             tolerated = CHANGE_FLOOR + CHANGE_SHARE * np.abs(self.last)
             same = emitters is None or (self.emitters is not None and emitters.tobytes() == self.emitters.tobytes())
@@ -239,38 +265,87 @@ def _look_at_frames(
             look.poses[number] = (*np.ravel(rotation), *np.ravel(translation))
         if not look.captures:
             return
-    outputs = ("pose", "environment") if look.captures else ("pose",)
-    environment: Map | None = None
-    with open_part(path, index, first, end, fps, jobs.settings.gpu_of(device)) as source:
+    gpu, converters = jobs.settings.gpu_of(device), min(CONVERTERS, usable_cores())
+    aside = _solving_aside() if look.captures and end - first >= ASIDE_FRAMES else contextlib.nullcontext()
+    with aside, open_part(path, index, first, end, fps, gpu, converters=converters) as source:
         linear = keep_depth(source, look.scene)
         pipeline = Pipeline(
             look.scene,
             device=device,
             quality=jobs.settings.quality,
             size=source.size,
-            outputs=outputs,
+            outputs=("pose", "environment") if look.captures else ("pose",),
             estimates="synchronous",
             follows_camera=False,
             linear=linear,
         )
-        with pipeline:
-            for frame in source:
-                pose = None if given is None else Pose(*given.at(frame.index))
-                result = pipeline(frame.deepest, time_seconds=frame.time, pose=pose)
+        with pipeline, ThreadPoolExecutor(1, "warp_ar-keep") as keeper:
+            waiting: collections.deque[Future[None]] = collections.deque()
+            for frame, result in _submitted(source, pipeline):
                 if result.pose is not None:
                     look.poses[frame.index] = (*result.pose.rotation.ravel(), *result.pose.translation)
-                    environment = result.environment if look.captures else None
-                    if environment is not None and jobs.settings.light == "follow":
-                        look.take(frame.index, environment, pipeline, writer)
+                    waiting.append(keeper.submit(look.take, frame.index, result, writer))
+                while len(waiting) > WAITING:
+                    waiting.popleft().result()
                 tell(frame.index - first + 1)
+            while waiting:
+                waiting.popleft().result()
             look.saturation = pipeline.inputs.saturation.levels
-            if environment is None:
-                return
-            if jobs.settings.light == "fixed":
-                look.take(first, environment, pipeline, writer)
-    kept = _rounded(environment)
+    if look.latest is None:
+        return
+    if jobs.settings.light == "fixed":
+        look.keep(first, *look.latest, writer)
+    kept = _rounded(look.latest[0])
     emitters = find_emitters(kept, np.zeros_like(kept), 0.0)
     Light(kept, np.ones(kept.shape[:2], np.float32), emitters).save(look.folder / LIGHT)
+
+
+def _submitted(source: RecordedSource, pipeline: Pipeline) -> Iterator[tuple[Frame, Result]]:
+    """Frames, each handed over to a pipeline; all are rendered when the last has been asked for."""
+    result: Result | None = None
+    for frame, track in _tracked(source, pipeline):
+        frame.image.flags.writeable = False  # so that it need not be copied to wait for its turn
+        given = pipeline.scene.pose
+        pose = track if given is None else Pose(*given.at(frame.index))
+        result = pipeline.submit(frame.deepest, time_seconds=frame.time, pose=pose)
+        yield frame, result
+    if result is not None:
+        _ = result.stages  # waits, and tells what went wrong
+
+
+def _tracked(source: RecordedSource, pipeline: Pipeline) -> Iterator[tuple[Frame, Track | None]]:
+    """Frames with where their marker is, looked for some frames ahead; None: the pipeline looks, or nothing needs it.
+
+    Of frames of more than 8 bits the pipeline alone knows the codes that are looked at.
+    """
+    if pipeline.scene.pose is not None or source.keeps_depth:
+        yield from ((frame, None) for frame in source)
+        return
+    tracker = Tracker(pipeline.scene.marker, pipeline.camera)
+    waiting: collections.deque[tuple[Frame, Future[Track]]] = collections.deque()
+    with ThreadPoolExecutor(1, "warp_ar-track") as thread:
+        try:
+            for frame in source:
+                waiting.append((frame, thread.submit(tracker.track, frame.image, frame.time)))
+                if len(waiting) > AHEAD:
+                    ready, track = waiting.popleft()
+                    yield ready, track.result()
+            yield from ((ready, track.result()) for ready, track in waiting)
+        finally:
+            thread.shutdown(cancel_futures=True)
+
+
+@contextlib.contextmanager
+def _solving_aside() -> Iterator[None]:
+    """Have another process solve for light that clips, on a machine with cores for it."""
+    if usable_cores() < CORES_EACH:
+        yield
+        return
+    POOL.prepare()
+    try:
+        yield
+    finally:
+        POOL.rest()
 
 
 def keep_depth(source: RecordedSource, scene: Scene) -> bool:

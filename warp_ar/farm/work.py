@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import gc
+import hashlib
 import shutil
 import time
 import traceback
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+import numpy.typing as npt
 
 from warp_ar.closing import Closing
 from warp_ar.engine.layers import RADIANCE
@@ -28,6 +33,8 @@ from warp_ar.scene import SourceSpec, dumps_scene
 
 PART = "frames.mp4"
 """A segment's frames."""
+DIGESTS = ".sha256"
+"""What the file of pictures' digests is called after its video: a line each, in hexadecimal digits."""
 
 LEAST_FREE = 1 << 20
 """Bytes below which a disk is full, whatever a library says of its failure."""
@@ -87,7 +94,9 @@ class Work(Closing):
                     values = self._light_variation(job, part, tell)
                 case "join":
                     values = self._join(job, part / place.name)
-                    publish_file(part / place.name, place)
+                    for name in (place.with_suffix(DIGESTS).name, place.name):
+                        if (part / name).is_file():
+                            publish_file(part / name, place.with_name(name))
                     shutil.rmtree(context.folder / "parts" / jobs.clips[job.clip].name, ignore_errors=True)
                     return {**values, "bytes": place.stat().st_size}
                 case _:
@@ -112,9 +121,16 @@ class Work(Closing):
         outputs = ("image",) if coding == "8bit" else (RADIANCE,)
         transfer = str(scene_of(self.context.jobs, job.clip).camera.transfer)
         stamps = ticks[job.first : job.end].tolist()
-        with PartSink(part / PART, stamps, tick, rate, coding=coding, transfer=transfer) as sink:
+        with contextlib.ExitStack() as stack:
+            sink = stack.enter_context(PartSink(part / PART, stamps, tick, rate, coding=coding, transfer=transfer))
+            digests = None
+            if self.context.jobs.settings.digests:
+                digests = stack.enter_context(open((part / PART).with_suffix(DIGESTS), "w", encoding="ascii"))
             for lit in self._lighter.light(job, outputs=outputs):
-                sink.write(lit.image if coding == "8bit" else lit.radiance)
+                picture = lit.image if coding == "8bit" else lit.radiance
+                sink.write(picture)
+                if digests is not None:
+                    digests.write(digest_of(picture) + "\n")
                 count += 1
                 tell(count)
         return {"frames": count}
@@ -161,7 +177,15 @@ class Work(Closing):
         )
         if count != end - first:
             raise WarpArError(f"{output.name} has {count} frames, not {end - first}; remove its parts and resume")
+        if jobs.settings.digests:
+            files = [(self.context.folder / segment.place(jobs) / PART).with_suffix(DIGESTS) for segment in segments]
+            output.with_suffix(DIGESTS).write_text("".join(file.read_text("ascii") for file in files), "ascii")
         return {"frames": count}
+
+
+def digest_of(picture: npt.NDArray[Any]) -> str:
+    """SHA-256 of a picture's bytes, row by row, in hexadecimal digits; other threads go on meanwhile."""
+    return hashlib.sha256(np.ascontiguousarray(picture).data).hexdigest()
 
 
 def _free_bytes(folder: Path) -> int:

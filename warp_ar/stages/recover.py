@@ -332,7 +332,9 @@ class Recover(Stage):
         now.gain = self._arrays["gain"]()
         if self._real_time:
             POOL.prepare()
-        aside = self._real_time and not self._at_once()
+        # In this process a solution holds the interpreter's lock, which frames beside it wait for. Where a frame waits
+        # for it, a process that is there already is used; to start one takes longer than most clips.
+        aside = POOL.ready if self._waits else self._real_time and not self._at_once()
         now.pending = self._worker.submit(self._solve, now.solver, aside)
         if self._at_once():
             self._take(None)
@@ -342,9 +344,14 @@ class Recover(Stage):
         """Whether no frame waits for an estimate."""
         return self.request.estimates == "real_time"
 
+    @property
+    def _waits(self) -> bool:
+        """Whether every frame waits for its estimate."""
+        return self.request.estimates == "synchronous"
+
     def _at_once(self) -> bool:
         """Whether this frame's estimate, if it begins one, takes effect in it: a stream's first do."""
-        return self.request.estimates == "synchronous" or self._progress.frames <= EVERY_FRAME
+        return self._waits or self._progress.frames <= EVERY_FRAME
 
     def _solve(self, solver: recovery.Recovery, aside: bool) -> _Solved:
         """In the worker, or, if ``aside``, in a process beside it.

@@ -1,0 +1,151 @@
+"""A survey, whose steps run side by side, is to the bit what frames one after another tell."""
+
+from __future__ import annotations
+
+import fractions
+import time
+
+import numpy as np
+import pytest
+
+from tests.farm_rig import desk_frames, make_jobs
+from warp_ar.engine.pipeline import Pipeline
+from warp_ar.farm import survey
+from warp_ar.farm.jobs import Job, scene_of
+from warp_ar.farm.part_video import PartSink
+from warp_ar.farm.records import Context
+from warp_ar.farm.survey import Survey
+from warp_ar.farm.work import Work
+from warp_ar.input.sources import open_source
+from warp_ar.kernels.change import CHANGE_FLOOR, CHANGE_SHARE
+from warp_ar.light.solving_process import SolvingPool
+from warp_ar.stages import recover
+
+LIT, DARK = 8, 7
+"""Frames with light that changes, and without any between them: long enough for the marker to be lost."""
+RATE = 24
+LATE = 0.05
+"""Seconds after which a frame's light is asked for: others have been rendered by then."""
+PATIENCE = 60.0
+"""Seconds in which a process that solves is there."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A recording that loses its marker in the middle."""
+    folder = tmp_path_factory.mktemp("survey")
+    images = [np.minimum(image, np.uint8(255 - 10 * n)) for n, image in enumerate(desk_frames(2 * LIT))]
+    shown = [*images[:LIT], *([np.full_like(images[0], 40)] * DARK), *images[LIT:]]
+    with PartSink(folder / "a.mp4", list(range(len(shown))), fractions.Fraction(1, RATE), RATE) as sink:
+        for image in shown:
+            sink.write(image)
+    return folder
+
+
+def surveyed(jobs, run):
+    with Work(Context(jobs, run, "cpu")) as work:
+        outcome = work.do(Job("survey"), lambda _: None)
+    assert outcome.state == "done", outcome.reason
+    return Survey(run / Job("survey").place(jobs))
+
+
+def one_after_another(jobs):
+    """Poses, keys with their light, and saturation, each frame looked at when the one before is done with."""
+    poses, keys, lights = [], [], []
+    options = {"outputs": ("pose", "environment"), "estimates": "synchronous", "follows_camera": False}
+    quality = jobs.settings.quality
+    with (
+        open_source(jobs.clips[0].source) as source,
+        Pipeline(scene_of(jobs, 0), device="cpu", quality=quality, size=source.size, **options) as pipeline,
+    ):
+        for frame in source:
+            result = pipeline(frame.image, time_seconds=frame.time)
+            poses.append(np.full(12, np.nan))
+            if result.pose is None:
+                continue
+            poses[-1][:] = (*result.pose.rotation.ravel(), *result.pose.translation)
+            light = np.array(pipeline.arrays["environment"].numpy())
+            emitters = pipeline.arrays["emitters"].numpy().tobytes()
+            if keys:
+                moved = np.abs(light - lights[-1][0]) > CHANGE_FLOOR + CHANGE_SHARE * np.abs(lights[-1][0])
+                if emitters == lights[-1][1] and not moved.any():
+                    continue
+            keys.append(frame.index)
+            lights.append((survey._rounded(light), emitters))
+        return np.array(poses), keys, lights, pipeline.inputs.saturation.levels
+
+
+class Ready(SolvingPool):
+    """A pool whose processes are there at once; counts what they solve."""
+
+    solved = 0
+
+    def prepare(self):
+        super().prepare()
+        deadline = time.monotonic() + PATIENCE
+        while not self.ready and time.monotonic() < deadline:
+            time.sleep(0.01)
+
+    def _take(self):
+        process = super()._take()
+        self.solved += process is not None
+        return process
+
+
+@pytest.mark.parametrize("aside", [False, True])
+def test_a_survey_is_that_of_frames_one_after_another(folder, tmp_path, monkeypatch, aside):
+    take, pool = survey._Look.take, Ready(1)
+
+    def take_late(self, *arguments):
+        time.sleep(LATE)
+        take(self, *arguments)
+
+    monkeypatch.setattr(survey._Look, "take", take_late)
+    monkeypatch.setattr(survey, "POOL", pool)
+    monkeypatch.setattr(recover, "POOL", pool)
+    if aside:
+        monkeypatch.setattr(survey, "ASIDE_FRAMES", 1)
+        monkeypatch.setattr(survey, "CORES_EACH", 1)
+    jobs = make_jobs(folder, [{"scene": "desk", "path": "a.mp4"}])
+    try:
+        found = surveyed(jobs, tmp_path / "run")
+        assert (pool.solved > 0) == aside
+        assert not pool._all, "what solved beside the survey is not kept"
+    finally:
+        pool.close()
+    poses, keys, lights, saturation = one_after_another(jobs)
+    np.testing.assert_array_equal(found.poses, poses)
+    assert np.isnan(poses[LIT + DARK - 1, 0]), "the marker must be lost"
+    assert found.keys.tolist() == keys
+    assert len(keys) > LIT, "the light must change"
+    for key, (light, emitters) in enumerate(lights):
+        own, places = found.light(key)
+        np.testing.assert_array_equal(own, light)
+        assert places.tobytes() == emitters
+    np.testing.assert_array_equal(found.saturation, saturation)
+
+
+def test_fixed_light_is_that_of_the_last_frame_with_a_marker(folder, tmp_path):
+    jobs = make_jobs(folder, [{"scene": "desk", "path": "a.mp4", "frames": [0, LIT + DARK]}], run={"light": "fixed"})
+    found = surveyed(jobs, tmp_path / "run")
+    assert found.keys.tolist() == [0]
+    jobs = make_jobs(folder, [{"scene": "desk", "path": "a.mp4", "frames": [0, LIT + DARK]}])
+    followed = surveyed(jobs, tmp_path / "followed")
+    last = len(followed.keys) - 1
+    np.testing.assert_array_equal(found.light(0)[0], followed.light(last)[0])
+    assert not np.array_equal(found.light(0)[0], followed.light(0)[0])
+
+
+def test_what_goes_wrong_beside_fails_the_survey(folder, tmp_path, monkeypatch):
+    """In the last frame, too: nobody waits for its light unless it is kept."""
+
+    def fail(self, frame, result, writer):
+        if frame == 2 * LIT + DARK - 1:
+            raise OSError("no room")
+
+    monkeypatch.setattr(survey._Look, "take", fail)
+    jobs = make_jobs(folder, [{"scene": "desk", "path": "a.mp4"}])
+    with Work(Context(jobs, tmp_path / "run", "cpu")) as work:
+        outcome = work.do(Job("survey"), lambda _: None)
+    assert outcome.state == "failed"
+    assert "no room" in outcome.reason
