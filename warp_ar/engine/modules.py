@@ -27,6 +27,7 @@ from typing import Any
 import warp as wp
 
 from warp_ar.device import compiling, exclusive, usable_cores
+from warp_ar.engine.nvrtc import Compilers, count_processes
 from warp_ar.engine.tiers import QUICK_FLAGS, choose, compile_better, digest
 from warp_ar.kernels.launch import UNCHECKED
 
@@ -157,11 +158,12 @@ def _compile(variants: list[tuple[Any, int | None]], device: Any, progress: Prog
     while _AHEAD:
         _AHEAD.pop().join()
     headers = _Headers({_flags(module) for module, _ in variants}) if device.is_cpu else None
+    compilers = Compilers(0 if device.is_cpu else count_processes(len(variants), cores))
 
     variants = _by_flags(variants)
 
     def work(module: Any, size: int | None) -> None:
-        with headers.shared(_flags(module)) if headers is not None else contextlib.nullcontext():
+        with headers.shared(_flags(module)) if headers is not None else compilers.used():
             if device.is_cpu:
                 _load(module, device)
             elif size is None:
@@ -182,6 +184,7 @@ def _compile(variants: list[tuple[Any, int | None]], device: Any, progress: Prog
                 pool.shutdown(wait=False, cancel_futures=True)  # who interrupts this does not wait for all the others
                 raise
     finally:
+        compilers.close()
         if headers is not None:
             headers.close()
 

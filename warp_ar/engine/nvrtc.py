@@ -1,0 +1,154 @@
+"""CUDA modules compiled in processes beside this one.
+
+NVRTC does a part of its work, some seventh of it, for one program of a process at a time, so that sixteen threads
+finish no sooner than seven. Here each thread hands what Warp has translated to a process of its own
+(``nvrtc_process``), which makes the same binary to the byte. The first thread compiles in this process: it begins with
+the longest module, and a process is up only after half a second.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import json
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from typing import Any, Final
+
+import warp as wp
+
+from warp_ar.errors import UsageError
+
+VARIABLE: Final = "WARP_AR_COMPILERS"
+"""Environment variable, for measuring: processes that compile CUDA modules at most; 0: threads of this one alone."""
+MOST: Final = 15
+"""Processes at most; each takes some 200 MB while it compiles."""
+
+_THREAD: Final = threading.local()
+_OWN: Final = threading.Lock()
+_ENABLED = threading.Event()
+
+
+def compile_beside() -> None:
+    """Have CUDA modules compiled by processes from now on. For commands alone: a library starts none."""
+    _ENABLED.set()
+
+
+def count_processes(modules: int, cores: int) -> int:
+    """Processes to compile so many modules with, beside this one's own thread.
+
+    Raises:
+        UsageError: The environment variable is no number.
+    """
+    asked = os.environ.get(VARIABLE, "")
+    if asked and not asked.isdecimal():
+        raise UsageError(f"{VARIABLE} = {asked!r}: expected a number of processes")
+    most = int(asked) if asked else MOST if _ENABLED.is_set() else 0
+    return max(min(modules, cores, most + 1) - 1, 0)
+
+
+class Compilers:
+    """The processes, each started by the thread that uses it."""
+
+    def __init__(self, count: int) -> None:
+        """Start none as yet.
+
+        Args:
+            count: Processes at most.
+        """
+        self._left = count
+        self._lock = threading.Lock()
+        self._processes: list[subprocess.Popen[str]] = []
+        self._here = False
+        self.closed = False
+        if count:
+            _hand_over()
+
+    @contextlib.contextmanager
+    def used(self) -> Iterator[None]:
+        """Around what a thread has Warp compile: the thread's own process does it, of all but the first thread."""
+        if not hasattr(_THREAD, "process") or _THREAD.owner is not self:
+            _THREAD.owner, _THREAD.process = self, self._start()
+        yield
+
+    def _start(self) -> subprocess.Popen[str] | None:
+        with self._lock:
+            if not self._here or not self._left:
+                self._here = True
+                return None
+            self._left -= 1
+        from warp_ar.engine import nvrtc_process
+
+        try:
+            process = subprocess.Popen(
+                [sys.executable, str(nvrtc_process.__file__)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                text=True,
+                env={**os.environ, "CUDA_VISIBLE_DEVICES": ""},  # it compiles alone
+                start_new_session=True,  # Ctrl-C is for this process, which ends them
+            )
+        except OSError:
+            return None
+        with self._lock:
+            self._processes.append(process)
+        return process
+
+    def close(self) -> None:
+        """End the processes, whatever they are at."""
+        with self._lock:
+            processes, self._processes, self._left, self.closed = self._processes, [], 0, True
+        for process in processes:
+            process.kill()
+        for process in processes:
+            process.wait()
+            for pipe in (process.stdin, process.stdout):
+                if pipe is not None:
+                    with contextlib.suppress(OSError):
+                        pipe.close()
+
+
+def _hand_over() -> None:
+    """Have Warp ask the thread's process, where it has one, before it compiles by itself."""
+    builder: Any = getattr(getattr(wp, "_src", None), "build", None)
+    build = getattr(builder, "build_cuda", None)
+    with _OWN:
+        if build is None or hasattr(build, "__wrapped__"):
+            return
+
+        @functools.wraps(build)
+        def build_cuda(
+            cu_path: str,
+            arch: int,
+            output_path: str,
+            *,
+            pch_dir: str | None = None,
+            ltoirs: Any = None,
+            fatbins: Any = None,
+            **options: Any,
+        ) -> None:
+            process = getattr(_THREAD, "process", None)
+            job = {"source": cu_path, "arch": arch, "target": output_path, "options": options}
+            if process is None or ltoirs or fatbins or not _ask(process, job):
+                if process is not None and _THREAD.owner.closed:
+                    raise RuntimeError("compiling was interrupted")
+                build(cu_path, arch, output_path, pch_dir=pch_dir, ltoirs=ltoirs, fatbins=fatbins, **options)
+
+        builder.build_cuda = build_cuda
+
+
+def _ask(process: subprocess.Popen[str], job: dict[str, Any]) -> bool:
+    """Whether a process has compiled a module."""
+    assert process.stdin is not None
+    assert process.stdout is not None
+    try:
+        process.stdin.write(json.dumps(job) + "\n")
+        process.stdin.flush()
+        answer = process.stdout.readline()
+    except (OSError, TypeError, ValueError):
+        return False  # it has ended, or what Warp asks for cannot be written down
+    return answer == "1\n"
