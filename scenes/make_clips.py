@@ -42,6 +42,8 @@ from make_virtual import HERE, virtual_light, virtual_object
 WIDTH, HEIGHT, FOCAL, FPS = 640, 480, 640.0, 24
 PATH = {"type": "path", "max_depth": 8, "rr_depth": 4}
 """Path tracing up to seven bounces: what more would add is below a grey level in an environment this bright."""
+PASS_SPP = 16
+"""Samples per pixel that are taken at a time: 128 at once need more memory than 16 GiB."""
 GUIDE_SPP = 32
 """Samples per pixel of the albedo and the normals that guide the denoiser: they need to resolve edges, not light."""
 
@@ -108,6 +110,7 @@ SCENES = {
     "desk": "desk",
     "torus": "desk",
     "mirror": "desk",
+    "product": "desk",
     "screen": "desk",
     "wire_coincident": "wire",
     "wire_opposing": "wire",
@@ -118,12 +121,13 @@ BUNDLED = {
     "desk": 24,
     "torus": 84,
     "mirror": 24,
+    "product": 108,
     "screen": 60,
     "wire_coincident": 36,
     "wire_opposing": 36,
     "darken": 36,
 }
-"""Frame of each scene whose truth is bundled; the light of the last three is still."""
+"""Frame of each scene whose truth is bundled; the light of the last three is still, that of ``product`` changes."""
 
 
 class Renderer:
@@ -135,7 +139,12 @@ class Renderer:
             folder = pathlib.Path(name)
             content = environment(clip) | essentials(clip, with_ball) | clutter(clip, folder)
             for k, item in enumerate((virtual or {}).get("object", [])):
-                content[f"object{k}"] = virtual_object(item, folder)
+                made = virtual_object(item, folder)
+                content |= (
+                    {f"object{k}": made}
+                    if "type" in made
+                    else {f"object{k}_{name}": part for name, part in made.items()}
+                )
             for k, light in enumerate((virtual or {}).get("light", [])):
                 content[f"light{k}"] = virtual_light(light)
             self.scene = mi.load_dict({"type": "scene", **content})
@@ -177,10 +186,15 @@ class Renderer:
                 "sampler": {"type": "independent"},
             }
         )
-        color = mi.render(self.scene, sensor=sensor, integrator=self.integrator, spp=self.spp, seed=seed)
+        passes = -(-self.spp // PASS_SPP)
+        shots = (
+            mi.render(self.scene, sensor, integrator=self.integrator, spp=self.spp // passes, seed=seed + 7919 * k)
+            for k in range(passes)
+        )
+        color = sum(map(np.array, shots)) / passes
         guides = np.array(mi.render(self.scene, sensor=sensor, integrator=self.guides, spp=GUIDE_SPP, seed=seed))
         albedo, normal = np.clip(guides[..., -6:-3], 0, 1), guides[..., -3:]
-        return pyoidn.denoise(np.array(color), albedo=albedo, normal=np.ascontiguousarray(normal), hdr=True)
+        return pyoidn.denoise(color, albedo=albedo, normal=np.ascontiguousarray(normal), hdr=True)
 
     def environment(self, t: float, height: int = 256, rounds: int = 64) -> np.ndarray:
         """Light arriving at the ball's centre, latlong ``(height, 2 height, 3)``; render it without the ball."""
@@ -346,3 +360,7 @@ def main() -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     for clip in options.clip or CLIPS:
         make_clip(clip, options)
+
+
+if __name__ == "__main__":
+    main()

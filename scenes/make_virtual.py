@@ -8,6 +8,7 @@ from typing import Any
 
 import mitsuba as mi
 import numpy as np
+import trimesh
 from make_shapes import Dict, glossy, grid_mesh, matte, mirror, rgb
 
 HERE = pathlib.Path(__file__).resolve().parent
@@ -119,9 +120,67 @@ def placed(item: Dict) -> Any:
     )
 
 
+def picture_of(image: Any, channel: int | None = None) -> Dict:
+    """A picture of a glTF as Mitsuba looks it up, its codes as numbers from 0 to 1: all channels, or one."""
+    values = np.asarray(image.convert("RGB"), np.float32) / 255.0
+    values = values if channel is None else values[..., channel : channel + 1]
+    return {"type": "bitmap", "bitmap": mi.Bitmap(np.ascontiguousarray(values)), "raw": True}
+
+
+def file_material(material: Any) -> Dict:
+    """A material of a glTF, as trimesh reads it; factors beside pictures must be 1."""
+    color = np.array(material.baseColorFactor if material.baseColorFactor is not None else (255,) * 4) / 255.0
+    base: Any = color[:3]
+    if material.baseColorTexture is not None:
+        codes = np.asarray(material.baseColorTexture.convert("RGB")) / 255.0
+        linear = np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)
+        base = {"type": "bitmap", "bitmap": mi.Bitmap(linear.astype(np.float32)), "raw": True}
+    made = glossy(base, material.roughnessFactor, material.metallicFactor)
+    if material.metallicRoughnessTexture is not None:
+        made |= {
+            name: picture_of(material.metallicRoughnessTexture, channel)
+            for name, channel in (("roughness", 1), ("metallic", 2))
+        }
+    if material.normalTexture is not None:
+        made = {"type": "normalmap", "normalmap": picture_of(material.normalTexture), "bsdf": made}
+    return {"type": "twosided", "bsdf": made}
+
+
+def file_mesh(path: pathlib.Path, place: Any) -> list[Any]:
+    """The parts of a glTF with the materials of the file, +Y up turned to +Z.
+
+    trimesh reads it, not ``warp_ar``: what is wrong with our own reading shows against this truth.
+    """
+    upright = place @ mi.ScalarTransform4f().rotate([1, 0, 0], 90)
+    parts = []
+    scene = trimesh.load(path)
+    for node in scene.graph.nodes_geometry:
+        matrix, name = scene.graph[node]
+        part = scene.geometry[name]
+        world = np.array(upright.matrix) @ matrix
+        props = mi.Properties()
+        props["bsdf"] = mi.load_dict(file_material(part.visual.material))
+        made = mi.Mesh(
+            name, len(part.vertices), len(part.faces), props, has_vertex_normals=True, has_vertex_texcoords=True
+        )
+        values = mi.traverse(made)
+        values["vertex_positions"] = (part.vertices @ world[:3, :3].T + world[:3, 3]).astype(np.float32).ravel()
+        normals = part.vertex_normals @ np.linalg.inv(world[:3, :3])
+        normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+        values["vertex_normals"] = normals.astype(np.float32).ravel()
+        # Mitsuba's v runs down, trimesh's up.
+        values["vertex_texcoords"] = (part.visual.uv * [1, -1] + [0, 1]).astype(np.float32).ravel()
+        values["faces"] = part.faces.astype(np.uint32).ravel()
+        values.update()
+        parts.append(made)
+    return parts
+
+
 def virtual_object(item: Dict, folder: pathlib.Path) -> Dict:
     t = mi.ScalarTransform4f()
     place = placed(item) @ t.scale(item.get("scale", 1.0))
+    if "material" not in item:
+        return {f"part{k}": part for k, part in enumerate(file_mesh(HERE / item["file"], place))}
     bsdf = virtual_material(item["material"])
     if item["shape"] == "mesh":
         return {

@@ -6,6 +6,7 @@ WARP_AR_BLENDER names an interpreter with ``bpy``.
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 import pathlib
 import re
@@ -97,6 +98,46 @@ def test_corners_of_proxies_are_rendered_where_the_plate_shows_them(tmp_path: pa
         print("corners off by", off.round(3), "pixels; layers are", seen["kind"], seen["size"])
         assert off.max() < PIXELS
         assert tuple(seen["size"]) == (32, 24) or str(seen["kind"]) == "MULTILAYER"
+
+
+PICTURES = """
+import bpy, json, sys
+bpy.ops.wm.read_factory_settings(use_empty=True)
+bpy.context.scene.world = bpy.data.worlds.new("world")
+bpy.ops.wm.usd_import(filepath=sys.argv[1])
+told = {}
+for item in bpy.data.objects:
+    for number, slot in enumerate(item.material_slots):
+        nodes, links = slot.material.node_tree.nodes, slot.material.node_tree.links
+        read = {}
+        for link in links:
+            if link.to_node.type == "BSDF_PRINCIPLED":
+                node = link.from_node
+                while node.type != "TEX_IMAGE" and any(entry.is_linked for entry in node.inputs):
+                    near = [entry for entry in node.inputs if entry.is_linked]
+                    node = max(near, key=lambda entry: entry.links[0].from_node.type == "TEX_IMAGE").links[0].from_node
+                read[link.to_socket.name] = node.image.name if node.type == "TEX_IMAGE" else node.type
+        polygons = sum(polygon.material_index == number for polygon in item.data.polygons)
+        told[slot.material.name] = [polygons, read]
+print("TOLD" + json.dumps(told))
+"""
+
+
+def test_a_model_s_materials_arrive_with_their_pictures(tmp_path: pathlib.Path) -> None:
+    scene = load_scene("product")
+    write_usd(tmp_path / "shot.usda", Shot(scene, 24.0, (Pose(np.eye(3), np.array([0.0, 0.0, 1.0])),)))
+    done = subprocess.run([BLENDER, "-c", PICTURES, str(tmp_path / "shot.usda")], capture_output=True, text=True)
+    told = json.loads(next(line for line in done.stdout.splitlines() if line.startswith("TOLD"))[4:])
+    polygons, read = told["object_0_jar"]
+    assert polygons == 576
+    assert {name: read[name] for name in ("Base Color", "Roughness", "Metallic", "Normal")} == {
+        "Base Color": "shot_object_0_jar.png",
+        "Roughness": "shot_object_0_jar_metallic_roughness.png",
+        "Metallic": "shot_object_0_jar_metallic_roughness.png",
+        "Normal": "shot_object_0_jar_normal.png",
+    }
+    polygons, read = told["object_0_jar_1"]
+    assert (polygons, read["Normal"]) == (448, "shot_object_0_jar_1_normal.png")
 
 
 def test_a_camera_in_alembic_becomes_usd_by_the_lines_of_the_docs(tmp_path: pathlib.Path) -> None:

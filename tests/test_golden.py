@@ -19,7 +19,7 @@ from warp_ar.scene import bundled_scenes, load_scene
 from warp_ar.stages.quality import PRESETS, Quality
 
 GOLDEN = Path(__file__).parent / "golden"
-SCENES = ("darken", "desk", "mirror", "screen", "torus", "wire_coincident", "wire_opposing")
+SCENES = ("darken", "desk", "mirror", "product", "screen", "torus", "wire_coincident", "wire_opposing")
 SIZE = (320, 240)
 FRAMES = 5  # the last one is compared: by then the light has been accumulated over several
 QUALITY = PRESETS["medium"]

@@ -144,7 +144,7 @@ def test_the_frame_passes_untouched_where_nothing_is_asked_for(tmp_path: Path) -
 def test_list_names_every_bundled_scene(capsys: pytest.CaptureFixture[str]) -> None:
     assert live.main(["--list"]) == 0
     names = [line.split()[0] for line in capsys.readouterr().out.splitlines()]
-    assert {"desk", "torus", "wire_coincident", "wire_opposing", "darken", "mirror"} <= set(names)
+    assert {"desk", "torus", "wire_coincident", "wire_opposing", "darken", "mirror", "product"} <= set(names)
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import pytest
 import trimesh
 
 SCENES = pathlib.Path(__file__).resolve().parents[1] / "scenes"
-NAMES = ("darken", "desk", "mirror", "screen", "torus", "wire_coincident", "wire_opposing")
+NAMES = ("darken", "desk", "mirror", "product", "screen", "torus", "wire_coincident", "wire_opposing")
 CLIP_BYTES = 2_500_000
 """Largest clip that may be committed."""
 NORMAL_TOLERANCE = 1e-5
@@ -21,6 +21,13 @@ NORMAL_TOLERANCE = 1e-5
 
 def load(name: str) -> dict:
     return tomllib.loads((SCENES / f"{name}.toml").read_text())
+
+
+@pytest.mark.parametrize("script", sorted(path.name for path in SCENES.glob("make_*.py")))
+def test_a_script_with_options_runs(script: str) -> None:
+    """What asks for options is a command, and a command that never calls its ``main`` ends in silence."""
+    text = (SCENES / script).read_text()
+    assert ("ArgumentParser(" in text) == text.endswith('\nif __name__ == "__main__":\n    main()\n')
 
 
 def test_the_scenes_are_these() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import struct
 
 import cv2
@@ -15,7 +16,8 @@ from tests.gltf_files import Gltf
 from tests.layer_rig import POSES, make_scene
 from warp_ar.errors import SinkError
 from warp_ar.output.gltf_file import quaternions, write_glb
-from warp_ar.output.shot import Look, Shot, look_of, mesh_of, placement, texture_files
+from warp_ar.output.looks import Look, looks_of
+from warp_ar.output.shot import Shot, mesh_of, placement, texture_files
 from warp_ar.output.usd_file import write_usd
 from warp_ar.scene import Camera, Light, Object
 from warp_ar.scene.description import Animation
@@ -245,7 +247,7 @@ def test_quaternions_turn_as_their_matrices():
 
 def test_a_phong_lobe_becomes_as_wide_a_one():
     item = Object("sphere", radius=0.1, material=PhongMaterial((0.1, 0.2, 0.3), (0.4, 0.5, 0.6), 30.0))
-    look = look_of(item, mesh_of(item))
+    (look,) = looks_of(item, mesh_of(item))
     assert look == Look((0.1, 0.2, 0.3), 0.0, pytest.approx((2 / 32) ** 0.25), (0.4, 0.5, 0.6), None)
 
 
@@ -321,3 +323,127 @@ def test_emission_is_told(tmp_path):
     assert not UsdShade.Shader(stage.GetPrimAtPath("/shot/materials/object_2_sphere/surface")).GetInput("emissiveColor")
     saved = cv2.imread(str(texture_files(scene, path)["object_0_screen_emission"]))
     np.testing.assert_array_equal(saved[..., ::-1], picture)
+
+
+COLORS = np.array([[1, 0, 0, 1], [0, 1, 0, 1], [0, 0, 1, 1], [0.5, 0.25, 1, 1]], np.float32)
+
+
+def make_detailed(path):
+    """A model of three materials: all five pictures, placed and wrapped; alpha by a picture; colours of vertices."""
+    made, rng = Gltf(), np.random.default_rng(5)
+    pictures = [rng.integers(0, 256, (4, 8, 3)).astype(np.uint8) for _ in range(4)]
+    turned = {"extensions": {"KHR_texture_transform": {"offset": [0.2, 0.7], "rotation": 0.6, "scale": [2.0, 3.0]}}}
+    sampler = {"wrapS": 33071, "wrapT": 33648, "magFilter": 9728}
+    label = {
+        "baseColorFactor": [0.9, 0.8, 0.7, 1.0],
+        "metallicFactor": 0.75,
+        "roughnessFactor": 0.5,
+        "baseColorTexture": {"index": made.texture(pictures[0], sampler), **turned},
+        "metallicRoughnessTexture": {"index": made.texture(pictures[1])},
+    }
+    made.material(
+        name="label",
+        pbrMetallicRoughness=label,
+        normalTexture={"index": made.texture(pictures[2]), "scale": 0.5},
+        occlusionTexture={"index": made.texture(pictures[3]), "strength": 0.25},
+        emissiveFactor=[0.1, 0.2, 0.3],
+    )
+    leaf = made.texture(rng.integers(0, 256, (4, 4, 4)).astype(np.uint8))
+    base = {"baseColorTexture": {"index": leaf}, "baseColorFactor": [1.0, 1.0, 1.0, 0.9]}
+    made.material(name="leaf", pbrMetallicRoughness=base, alphaMode="MASK", alphaCutoff=0.3, doubleSided=True)
+    made.material(name="paint", pbrMetallicRoughness={"baseColorFactor": [0.5, 1.0, 1.0, 1.0], "metallicFactor": 0.0})
+    made.node(made.square(0), made.square(1), made.square(2, COLOR_0=made.array(COLORS)))
+    return made.save(path)
+
+
+def told_of(use, mesh):
+    """A picture's codes and how it lies, whatever its number."""
+    if use is None:
+        return None
+    return mesh.images[use.image].tobytes(), use.uv_set, np.round(use.transform, 5).tolist(), use.wrap, use.nearest
+
+
+def test_all_materials_of_a_file_are_told_in_gltf(tmp_path):
+    """What leaves and comes back is what was there: every factor, picture, sampler and place, by triangle."""
+    source = make_detailed(tmp_path / "model.glb")
+    scene = make_scene(objects=(Object("mesh", file=source),), proxies=(), lights=())
+    write_glb(tmp_path / "shot.glb", Shot(scene, 24.0, (POSES[0],)))
+    before, after = load_mesh(source), load_mesh(tmp_path / "shot.glb")
+    assert len(after.materials) == 3
+    for one, other in zip(before.materials, after.materials, strict=True):
+        assert other.name == f"object_0_model_{one.name}"
+        for field in ("base", "metallic_roughness", "normal", "occlusion", "emissive"):
+            assert told_of(getattr(other, field), after) == told_of(getattr(one, field), before), (one.name, field)
+        for field in ("surface", "alpha", "opacity", "double_sided", "normal_scale", "occlusion_strength", "emission"):
+            assert getattr(other, field) == getattr(one, field), (one.name, field)
+    assert after.materials[1].cutoff == 0.3
+    assert np.bincount(after.triangle_materials).tolist() == np.bincount(before.triangle_materials).tolist()
+    painted = after.faces[after.triangle_materials == 2]
+    np.testing.assert_allclose(np.unique(after.colors[painted].reshape(-1, 4), axis=0), np.unique(COLORS, axis=0))
+    assert len(after.images) == len(before.images), "equal pictures are held once"
+
+
+def test_all_materials_of_a_file_are_told_in_usd(tmp_path):
+    """Each binds its own triangles; pictures carry channels, scale, bias, wrapping and place."""
+    usd = pytest.importorskip("pxr.Usd", reason="needs usd-core, of the extra exchange")
+    from pxr import UsdGeom, UsdShade
+
+    source = make_detailed(tmp_path / "model.glb")
+    scene = make_scene(objects=(Object("mesh", file=source),), proxies=(), lights=())
+    path = tmp_path / "usd" / "shot.usda"
+    path.parent.mkdir()
+    written = write_usd(path, Shot(scene, 24.0, (POSES[0],)))
+    assert set(written) == {path, *texture_files(scene, path).values()}
+    assert {file.name for file in written} == set(os.listdir(path.parent))
+    stage = usd.Stage.Open(str(path))
+    prim = stage.GetPrimAtPath("/shot/objects/object_0_model")
+    subsets = UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets()
+    assert [len(subset.GetIndicesAttr().Get()) for subset in subsets] == [2, 2, 2]
+    assert UsdGeom.Subset.ValidateFamily(UsdGeom.Mesh(prim), "face", "materialBind")[0]
+
+    def surface(number):
+        bound = UsdShade.MaterialBindingAPI(subsets[number].GetPrim()).ComputeBoundMaterial()[0]
+        found = bound.ComputeSurfaceSource()[0]
+        assert found.GetIdAttr().Get() == "UsdPreviewSurface"
+        return found
+
+    def read(number, name):
+        """The picture behind an input, the channel that is read, and its own inputs."""
+        source, channel, _ = surface(number).GetInput(name).GetConnectedSource()
+        shader = UsdShade.Shader(source.GetPrim())
+        assert shader.GetIdAttr().Get() in ("UsdUVTexture", "UsdPrimvarReader_float3")
+        return shader, channel, {entry.GetBaseName(): entry.Get() for entry in shader.GetInputs()}
+
+    texture, channel, told = read(0, "diffuseColor")
+    assert (channel, told["sourceColorSpace"], told["wrapS"], told["wrapT"]) == ("rgb", "sRGB", "clamp", "mirror")
+    np.testing.assert_allclose(told["scale"], (0.9, 0.8, 0.7, 1.0), rtol=1e-6)
+    place = UsdShade.Shader(texture.GetInput("st").GetConnectedSource()[0].GetPrim())
+    turn, scale, offset = (place.GetInput(name).Get() for name in ("rotation", "scale", "translation"))
+    u, v = np.random.default_rng(1).uniform(-1, 1, (2, 9))
+    a, b, c, d, e, f = load_mesh(source).materials[0].base.transform
+    sine, cosine = np.sin(np.radians(turn)), np.cos(np.radians(turn))
+    # As the specification of UsdTransform2d has it: scaled, turned counter-clockwise, moved.
+    x, y = scale[0] * u, scale[1] * v
+    np.testing.assert_allclose(cosine * x - sine * y + offset[0], a * u + b * v + c, atol=1e-5)
+    np.testing.assert_allclose(sine * x + cosine * y + offset[1], d * u + e * v + f, atol=1e-5)
+    for name, channel in (("roughness", "g"), ("metallic", "b")):
+        _, found, told = read(0, name)
+        assert (found, told["sourceColorSpace"]) == (channel, "raw")
+        np.testing.assert_allclose(told["scale"], (1.0, 0.5, 0.75, 1.0))
+    _, _, told = read(0, "normal")
+    np.testing.assert_allclose([told["scale"], told["bias"]], [(1, 1, 2, 1), (-0.5, -0.5, -1, 0)])
+    _, found, told = read(0, "occlusion")
+    assert (found, told["scale"][0], told["bias"][0]) == ("r", 0.25, 0.75)
+    _, found, told = read(1, "opacity")
+    assert found == "a"
+    assert told["scale"][3] == pytest.approx(0.9)
+    assert surface(1).GetInput("opacityThreshold").Get() == pytest.approx(0.3)
+    assert cv2.imread(str(path.parent / told["file"].path), cv2.IMREAD_UNCHANGED).shape == (4, 4, 4)
+    reader, _, told = read(2, "diffuseColor")
+    assert (reader.GetIdAttr().Get(), told["varname"]) == ("UsdPrimvarReader_float3", "displayColor")
+    colors = np.array(UsdGeom.PrimvarsAPI(prim).GetPrimvar("displayColor").Get())
+    painted = np.array(UsdGeom.Mesh(prim).GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)[
+        subsets[2].GetIndicesAttr().Get()
+    ]
+    expected = np.unique(COLORS[:, :3] * (0.5, 1.0, 1.0), axis=0)
+    np.testing.assert_allclose(np.unique(colors[painted].reshape(-1, 3), axis=0), expected)

@@ -274,7 +274,7 @@ print(json.dumps({"frames": seen.hexdigest(), "quick": quick}))
         ("desk", "medium"),
         ("desk", "high"),
         # All other bundled scenes but ``darken``, which runs no kernel that is marked.
-        *((name, "medium") for name in ("mirror", "screen", "torus", "wire_coincident", "wire_opposing")),
+        *((name, "medium") for name in ("mirror", "product", "screen", "torus", "wire_coincident", "wire_opposing")),
     ],
 )
 def test_both_ways_compute_the_same_bits(

@@ -8,7 +8,7 @@ I / (pi d^2).
 
 References:
     Khronos Group, "glTF 2.0 Specification", KHR_lights_punctual, KHR_materials_specular,
-    EXT_lights_image_based.
+    KHR_materials_emissive_strength, KHR_materials_unlit, KHR_texture_transform, EXT_lights_image_based.
 """
 
 from __future__ import annotations
@@ -25,8 +25,10 @@ import numpy.typing as npt
 
 from warp_ar.errors import SinkError, reason
 from warp_ar.files import write_whole
-from warp_ar.output.shot import Body, Look, Matrix, Shot, encode_texture, key_frames
+from warp_ar.output.looks import Look, Picture, placed_by
+from warp_ar.output.shot import Body, Matrix, Shot, key_frames
 from warp_ar.scene.description import Light
+from warp_ar.scene.materials import RGB
 from warp_ar.signature import PROGRAM
 
 GLTF_SUFFIX = ".glb"
@@ -37,6 +39,8 @@ _Y_UP = [-math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]
 """Quaternion, x first, that turns z up to y up."""
 _EVEN = 1e-6
 """Relative difference of the axes' lengths below which a placement is a turn and one scale for all frames."""
+_WRAPS = {"repeat": 10497, "clamp": 33071, "mirror": 33648}
+_NEAREST, _LINEAR, _TRILINEAR = 9728, 9729, 9987
 _DIELECTRIC = 0.04
 """Reflectance straight on of what is no metal."""
 
@@ -106,6 +110,7 @@ class _Builder:
         self._channels: list[dict[str, Any]] = []
         self._samplers: list[dict[str, Any]] = []
         self._times: dict[tuple[float, ...], int] = {}
+        self._images: dict[bytes, int] = {}
         self._add_camera()
         for body in shot.bodies():
             self._add_body(body)
@@ -252,15 +257,23 @@ class _Builder:
             "POSITION": self._positions(mesh.vertices),
             "NORMAL": self._accessor(mesh.normals),
         }
-        if mesh.uvs is not None:
-            # v runs down the picture.
-            attributes["TEXCOORD_0"] = self._accessor(mesh.uvs * np.array([1.0, -1.0]) + np.array([0.0, 1.0]))
-        primitive = {
-            "attributes": attributes,
-            "indices": self._accessor(mesh.faces.reshape(-1), indices=True),
-            "material": self._add_material(body.name, body.look, textured=mesh.uvs is not None),
-        }
-        self._tree.setdefault("meshes", []).append({"name": body.name, "primitives": [primitive]})
+        for name, coordinates in (("TEXCOORD_0", mesh.uvs), ("TEXCOORD_1", mesh.uvs_second)):
+            if coordinates is not None:
+                # v runs down the picture.
+                attributes[name] = self._accessor(coordinates * np.array([1.0, -1.0]) + np.array([0.0, 1.0]))
+        if mesh.tangents is not None and any(look.normal is not None for look in body.looks):
+            attributes["TANGENT"] = self._accessor(mesh.tangents)
+        if body.colors is not None:
+            attributes["COLOR_0"] = self._accessor(body.colors)
+        primitives = [
+            {
+                "attributes": attributes,
+                "indices": self._accessor(mesh.faces[body.triangles_of(number)].reshape(-1), indices=True),
+                "material": self._add_material(body.name, look),
+            }
+            for number, look in enumerate(body.looks)
+        ]
+        self._tree.setdefault("meshes", []).append({"name": body.name, "primitives": primitives})
         node = {"name": body.name, "mesh": len(self._tree["meshes"]) - 1, "extras": {"proxy": body.proxy}}
         self._add_node(node, dict(enumerate(key_frames(body.placements))))
 
@@ -269,37 +282,70 @@ class _Builder:
         self._tree["bufferViews"][self._tree["accessors"][index]["bufferView"]]["target"] = 34962
         return index
 
-    def _add_material(self, name: str, look: Look, *, textured: bool) -> int:
+    def _add_material(self, name: str, look: Look) -> int:
         surface: dict[str, Any] = {
-            "baseColorFactor": [*look.base_color, 1.0],
+            "baseColorFactor": [*look.base_color, look.opacity],
             "metallicFactor": look.metallic,
             "roughnessFactor": look.roughness,
         }
-        if look.texture is not None and textured:
+        label = f"{name}_{look.name}" if look.name else name
+        material: dict[str, Any] = {"name": label, "pbrMetallicRoughness": surface, "doubleSided": look.double_sided}
+        if look.texture is not None:
             surface["baseColorTexture"] = self._add_texture(look.texture)
-        material: dict[str, Any] = {"name": name, "pbrMetallicRoughness": surface, "doubleSided": True}
+        if look.metallic_roughness is not None:
+            surface["metallicRoughnessTexture"] = self._add_texture(look.metallic_roughness)
+        if look.normal is not None:
+            material["normalTexture"] = {**self._add_texture(look.normal), "scale": look.normal_scale}
+        if look.occlusion is not None:
+            material["occlusionTexture"] = {**self._add_texture(look.occlusion), "strength": look.occlusion_strength}
+        if look.alpha != "opaque":
+            material["alphaMode"] = look.alpha.upper()
+            material |= {"alphaCutoff": look.cutoff} if look.alpha == "mask" else {}
+        if look.unlit:
+            self._use("KHR_materials_unlit")
+            material.setdefault("extensions", {})["KHR_materials_unlit"] = {}
         if any(look.emission):
-            self._add_emission(material, look, textured=textured)
+            self._add_emission(material, look)
         if look.specular is not None:
-            self._use("KHR_materials_specular")
-            factor = max(look.specular) / _DIELECTRIC
-            # A factor goes to 1 at most; what is beyond is the colour's, which may be any.
-            strength = min(1.0, factor)
-            color = [0.0 if strength == 0.0 else value / (_DIELECTRIC * strength) for value in look.specular]
-            specular = {"specularFactor": strength, "specularColorFactor": color}
-            material.setdefault("extensions", {})["KHR_materials_specular"] = specular
+            self._add_specular(material, look.specular)
         self._tree.setdefault("materials", []).append(material)
         return len(self._tree["materials"]) - 1
 
-    def _add_texture(self, picture: npt.NDArray[np.uint8]) -> dict[str, int]:
-        image = self._add_image(encode_texture(picture))
-        self._tree.setdefault("textures", []).append({"source": image})
-        return {"index": len(self._tree["textures"]) - 1}
+    def _add_specular(self, material: dict[str, Any], specular: RGB) -> None:
+        """A factor goes to 1 at most; what is beyond is the colour's, which may be any."""
+        self._use("KHR_materials_specular")
+        factor = max(specular) / _DIELECTRIC
+        strength = min(1.0, factor)
+        color = [0.0 if strength == 0.0 else value / (_DIELECTRIC * strength) for value in specular]
+        told = {"specularFactor": strength, "specularColorFactor": color}
+        material.setdefault("extensions", {})["KHR_materials_specular"] = told
 
-    def _add_emission(self, material: dict[str, Any], look: Look, *, textured: bool) -> None:
+    def _add_texture(self, picture: Picture) -> dict[str, Any]:
+        """A reference to a picture with its sampler and its place; equal pictures are held once."""
+        wraps = [_WRAPS[wrap] for wrap in picture.wrap]
+        magnified = _NEAREST if picture.nearest else _LINEAR
+        sampler = {"wrapS": wraps[0], "wrapT": wraps[1], "magFilter": magnified, "minFilter": _TRILINEAR}
+        samplers = self._tree.setdefault("samplers", [])
+        if sampler not in samplers:
+            samplers.append(sampler)
+        if picture.digest not in self._images:
+            self._images[picture.digest] = self._add_image(picture.encode())
+        texture = {"source": self._images[picture.digest], "sampler": samplers.index(sampler)}
+        textures = self._tree.setdefault("textures", [])
+        if texture not in textures:
+            textures.append(texture)
+        made: dict[str, Any] = {"index": textures.index(texture)}
+        if picture.uv_set:
+            made["texCoord"] = picture.uv_set
+        if placed := placed_by(picture):
+            self._use("KHR_texture_transform")
+            made["extensions"] = {"KHR_texture_transform": placed}
+        return made
+
+    def _add_emission(self, material: dict[str, Any], look: Look) -> None:
         """Factors go to 1 at most; what is beyond is the strength's."""
         material["emissiveFactor"] = list(_bounded(look.emission))
-        if look.glow is not None and textured:
+        if look.glow is not None:
             material["emissiveTexture"] = self._add_texture(look.glow)
         if max(look.emission) > 1.0:
             self._use("KHR_materials_emissive_strength")

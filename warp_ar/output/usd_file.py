@@ -8,21 +8,29 @@ faces a sphere light of intensity i at distance d has radiance i / (4 pi d^2), s
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from warp_ar.errors import SinkError, UsageError, reason
 from warp_ar.files import write_whole
-from warp_ar.output.shot import FILM_WIDTH, Body, Matrix, Shot, encode_texture, key_frames, texture_file
+from warp_ar.output.looks import Look, texture_plan
+from warp_ar.output.shot import FILM_WIDTH, Body, Matrix, Shot, key_frames
 from warp_ar.scene.description import Light
+from warp_ar.scene.materials import RGB
+from warp_ar.scene.mesh_materials import IDENTITY
 from warp_ar.signature import PROGRAM
 
 USD_SUFFIXES = (".usda", ".usdc", ".usd")
 
 SUN_DEGREES = 0.53
 """Angle of a directional light: the sun's."""
+_COORDINATES = ("st", "st1")
+"""Names of both sets of texture coordinates."""
 _TENTHS = 10.0
 """Lengths of a camera's lens are told in tenths of the stage's unit."""
 
@@ -159,66 +167,172 @@ def _write_body(pxr: Any, stage: Any, body: Body, path: Path) -> list[Path]:
     prim.SetNormalsInterpolation(pxr.UsdGeom.Tokens.vertex)
     prim.CreateSubdivisionSchemeAttr(pxr.UsdGeom.Tokens.none)
     prim.CreateExtentAttr(pxr.Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(mesh.bounds)))
-    prim.CreateDoubleSidedAttr(True)
-    if mesh.uvs is not None:
-        coordinates = pxr.UsdGeom.PrimvarsAPI(prim).CreatePrimvar(
-            "st", pxr.Sdf.ValueTypeNames.TexCoord2fArray, pxr.UsdGeom.Tokens.vertex
-        )
-        coordinates.Set(pxr.Vt.Vec2fArray.FromNumpy(mesh.uvs))
+    prim.CreateDoubleSidedAttr(any(look.double_sided for look in body.looks))
+    primvars = pxr.UsdGeom.PrimvarsAPI(prim)
+    for name, coordinates in zip(_COORDINATES, (mesh.uvs, mesh.uvs_second), strict=True):
+        if coordinates is not None:
+            made = primvars.CreatePrimvar(name, pxr.Sdf.ValueTypeNames.TexCoord2fArray, pxr.UsdGeom.Tokens.vertex)
+            made.Set(pxr.Vt.Vec2fArray.FromNumpy(coordinates))
+    if body.colors is not None:
+        made = primvars.CreatePrimvar("displayColor", pxr.Sdf.ValueTypeNames.Color3fArray, pxr.UsdGeom.Tokens.vertex)
+        made.Set(pxr.Vt.Vec3fArray.FromNumpy(_base_colors(body)))
     prim.GetPrim().CreateAttribute("warp_ar:proxy", pxr.Sdf.ValueTypeNames.Bool).Set(body.proxy)
     _place(pxr, prim, dict(enumerate(key_frames(body.placements))))
-    return _write_look(pxr, stage, body, prim, path)
+    return _write_looks(pxr, stage, body, prim, path)
 
 
-def _write_look(pxr: Any, stage: Any, body: Body, prim: Any, path: Path) -> list[Path]:
-    """The material, as UsdPreviewSurface; its texture goes beside the file."""
-    sdf, look = pxr.Sdf.ValueTypeNames, body.look
-    where = f"/shot/materials/{body.name}"
-    material = pxr.UsdShade.Material.Define(stage, where)
-    shader = pxr.UsdShade.Shader.Define(stage, f"{where}/surface")
-    shader.CreateIdAttr("UsdPreviewSurface")
-    shader.CreateInput("roughness", sdf.Float).Set(look.roughness)
-    shader.CreateInput("metallic", sdf.Float).Set(look.metallic)
-    if look.specular is not None:
-        shader.CreateInput("useSpecularWorkflow", sdf.Int).Set(1)
-        shader.CreateInput("specularColor", sdf.Color3f).Set(pxr.Gf.Vec3f(*look.specular))
-    written = []
-    colors = [("diffuseColor", "texture", look.base_color, look.texture, texture_file(path, body.name))]
-    if any(look.emission):
-        own = texture_file(path, body.name, "emission")
-        colors.append(("emissiveColor", "emission", look.emission, look.glow, own))
-    for name, node, factor, values, picture in colors:
-        color = shader.CreateInput(name, sdf.Color3f)
-        if values is None or body.mesh.uvs is None:
-            color.Set(pxr.Gf.Vec3f(*factor))
-            continue
-        try:
-            write_whole(picture, encode_texture(values))
-        except OSError as error:
-            raise SinkError(f"{picture} cannot be written: {reason(error)}") from error
-        written.append(picture)
-        texture = _texture(pxr, stage, where, node, picture)
-        texture.CreateInput("scale", sdf.Float4).Set(pxr.Gf.Vec4f(*factor, 1.0))
-        color.ConnectToSource(texture.CreateOutput("rgb", sdf.Float3))
-    material.CreateSurfaceOutput().ConnectToSource(shader.ConnectableAPI(), "surface")
-    pxr.UsdShade.MaterialBindingAPI.Apply(prim.GetPrim()).Bind(material)
-    return written
+def _base_colors(body: Body) -> npt.NDArray[np.float32]:
+    """Base colour at vertices, (n, 3): USD's surface multiplies no colours, so the materials' are in it."""
+    assert body.colors is not None
+    found = np.ascontiguousarray(body.colors[:, :3])
+    for number, look in enumerate(body.looks):
+        own = np.unique(body.mesh.faces[body.triangles_of(number)])
+        found[own] = body.colors[own, :3] * np.array(look.base_color, np.float32)
+    return found
 
 
-def _texture(pxr: Any, stage: Any, where: str, name: str, picture: Path) -> Any:
-    """A picture, read by the texture coordinates ``st``."""
-    sdf = pxr.Sdf.ValueTypeNames
-    reader = pxr.UsdShade.Shader.Define(stage, f"{where}/st")
-    reader.CreateIdAttr("UsdPrimvarReader_float2")
-    reader.CreateInput("varname", sdf.String).Set("st")
-    texture = pxr.UsdShade.Shader.Define(stage, f"{where}/{name}")
-    texture.CreateIdAttr("UsdUVTexture")
-    texture.CreateInput("file", sdf.Asset).Set(f"./{picture.name}")
-    texture.CreateInput("sourceColorSpace", sdf.Token).Set("sRGB")
-    texture.CreateInput("wrapS", sdf.Token).Set("repeat")
-    texture.CreateInput("wrapT", sdf.Token).Set("repeat")
-    texture.CreateInput("st", sdf.Float2).ConnectToSource(reader.CreateOutput("result", sdf.Float2))
-    return texture
+def _write_looks(pxr: Any, stage: Any, body: Body, prim: Any, path: Path) -> list[Path]:
+    """The materials, of several each for its triangles; their pictures go beside the file."""
+    plan = texture_plan(path, body.name, body.looks)
+    written: dict[Path, None] = {}
+    for number, look in enumerate(body.looks):
+        for kind, picture in look.pictures.items():
+            file = plan[number, kind]
+            if file in written:
+                continue
+            try:
+                write_whole(file, picture.encode())
+            except OSError as error:
+                raise SinkError(f"{file} cannot be written: {reason(error)}") from error
+            written[file] = None
+        where = f"/shot/materials/{body.name}" + (f"_{number}" if number else "")
+        files = {kind: plan[number, kind] for kind in look.pictures}
+        material = _Material(pxr, stage, where, look, files).write(colored=body.colors is not None)
+        target = prim.GetPrim()
+        if len(body.looks) > 1:
+            chosen = pxr.Vt.IntArray.FromNumpy(body.triangles_of(number).astype(np.int32))
+            subset = pxr.UsdShade.MaterialBindingAPI(prim).CreateMaterialBindSubset(f"material_{number}", chosen)
+            target = subset.GetPrim()
+        pxr.UsdShade.MaterialBindingAPI.Apply(target).Bind(material)
+    return list(written)
+
+
+class _Material:
+    """A material as UsdPreviewSurface, with its pictures."""
+
+    def __init__(self, pxr: Any, stage: Any, where: str, look: Look, files: dict[str, Path]) -> None:
+        self._pxr, self._stage, self._where, self._look, self._files = pxr, stage, where, look, files
+        self._names = pxr.Sdf.ValueTypeNames
+        self._surface = self._shader("surface", "UsdPreviewSurface")
+
+    def write(self, *, colored: bool) -> Any:
+        """The material; ``colored``: where no picture does, the mesh's ``displayColor`` gives the base colour."""
+        look, names = self._look, self._names
+        own, black = look.base_color, (0.0, 0.0, 0.0)
+        if look.specular is not None:
+            self._surface.CreateInput("useSpecularWorkflow", names.Int).Set(1)
+            self._surface.CreateInput("specularColor", names.Color3f).Set(self._pxr.Gf.Vec3f(*look.specular))
+        # What is shown as it is neither reflects nor waits for light.
+        shown = "emissiveColor" if look.unlit else "diffuseColor"
+        if look.unlit:
+            self._color("diffuseColor", black)
+        if colored and look.texture is None:
+            self._read_vertex_colors(shown)
+        else:
+            self._color(shown, own, "")
+        if any(look.emission) and not look.unlit:
+            self._color("emissiveColor", look.emission, "emission")
+        self._set_lobe()
+        self._set_relief()
+        self._set_alpha()
+        material = self._pxr.UsdShade.Material.Define(self._stage, self._where)
+        material.CreateSurfaceOutput().ConnectToSource(self._surface.ConnectableAPI(), "surface")
+        return material
+
+    def _shader(self, name: str, kind: str) -> Any:
+        shader = self._pxr.UsdShade.Shader.Define(self._stage, f"{self._where}/{name}")
+        shader.CreateIdAttr(kind)
+        return shader
+
+    def _color(self, name: str, factor: RGB, kind: str | None = None) -> None:
+        entry = self._surface.CreateInput(name, self._names.Color3f)
+        if kind is None or kind not in self._files:
+            entry.Set(self._pxr.Gf.Vec3f(*factor))
+            return
+        opacity = 1.0 if kind else self._look.opacity
+        texture = self._texture(kind, (*factor, opacity), (0.0,) * 4, "sRGB")
+        entry.ConnectToSource(texture.CreateOutput("rgb", self._names.Float3))
+
+    def _read_vertex_colors(self, name: str) -> None:
+        reader = self._shader("colors", "UsdPrimvarReader_float3")
+        reader.CreateInput("varname", self._names.String).Set("displayColor")
+        entry = self._surface.CreateInput(name, self._names.Color3f)
+        entry.ConnectToSource(reader.CreateOutput("result", self._names.Float3))
+
+    def _set_lobe(self) -> None:
+        look = self._look
+        values = {"roughness": ("g", look.roughness), "metallic": ("b", look.metallic)}
+        entries = {name: self._surface.CreateInput(name, self._names.Float) for name in values}
+        if look.metallic_roughness is None:
+            for name, (_, value) in values.items():
+                entries[name].Set(value)
+            return
+        texture = self._texture("metallic_roughness", (1.0, look.roughness, look.metallic, 1.0), (0.0,) * 4, "raw")
+        for name, (channel, _) in values.items():
+            entries[name].ConnectToSource(texture.CreateOutput(channel, self._names.Float))
+
+    def _set_relief(self) -> None:
+        look = self._look
+        if look.normal is not None:
+            s = look.normal_scale
+            texture = self._texture("normal", (2.0 * s, 2.0 * s, 2.0, 1.0), (-s, -s, -1.0, 0.0), "raw")
+            entry = self._surface.CreateInput("normal", self._names.Normal3f)
+            entry.ConnectToSource(texture.CreateOutput("rgb", self._names.Float3))
+        if look.occlusion is not None:
+            s = look.occlusion_strength
+            texture = self._texture("occlusion", (s, s, s, 1.0), (1.0 - s, 1.0 - s, 1.0 - s, 0.0), "raw")
+            entry = self._surface.CreateInput("occlusion", self._names.Float)
+            entry.ConnectToSource(texture.CreateOutput("r", self._names.Float))
+
+    def _set_alpha(self) -> None:
+        look = self._look
+        if look.alpha == "opaque":
+            return
+        entry = self._surface.CreateInput("opacity", self._names.Float)
+        if "" in self._files:
+            texture = self._pxr.UsdShade.Shader.Get(self._stage, f"{self._where}/texture")
+            entry.ConnectToSource(texture.CreateOutput("a", self._names.Float))
+        else:
+            entry.Set(look.opacity)
+        if look.alpha == "mask":
+            self._surface.CreateInput("opacityThreshold", self._names.Float).Set(look.cutoff)
+
+    def _texture(self, kind: str, scale: Sequence[float], bias: Sequence[float], space: str) -> Any:
+        """A picture, read by its texture coordinates, times ``scale`` and plus ``bias``."""
+        picture, names, gf = self._look.pictures[kind], self._names, self._pxr.Gf
+        name = kind or "texture"
+        texture = self._shader(name, "UsdUVTexture")
+        texture.CreateInput("file", names.Asset).Set(f"./{self._files[kind].name}")
+        texture.CreateInput("sourceColorSpace", names.Token).Set(space)
+        texture.CreateInput("scale", names.Float4).Set(gf.Vec4f(*scale))
+        if any(bias):
+            texture.CreateInput("bias", names.Float4).Set(gf.Vec4f(*bias))
+        for entry, wrap in zip(("wrapS", "wrapT"), picture.wrap, strict=True):
+            texture.CreateInput(entry, names.Token).Set(wrap)
+        coordinates = _COORDINATES[picture.uv_set]
+        reader = self._shader(coordinates, "UsdPrimvarReader_float2")
+        reader.CreateInput("varname", names.String).Set(coordinates)
+        source = reader.CreateOutput("result", names.Float2)
+        if picture.transform != IDENTITY:
+            across, up, turn, c, f = picture.placing
+            place = self._shader(f"{name}_place", "UsdTransform2d")
+            place.CreateInput("in", names.Float2).ConnectToSource(source)
+            place.CreateInput("scale", names.Float2).Set(gf.Vec2f(across, up))
+            place.CreateInput("rotation", names.Float).Set(math.degrees(turn))
+            place.CreateInput("translation", names.Float2).Set(gf.Vec2f(c, f))
+            source = place.CreateOutput("result", names.Float2)
+        texture.CreateInput("st", names.Float2).ConnectToSource(source)
+        return texture
 
 
 def _write_light(pxr: Any, stage: Any, where: str, light: Light, shot: Shot) -> None:
