@@ -35,9 +35,10 @@ def main(device: str) -> None:
     by_work = os.environ.get("WARP_AR_CLOCK") == "processor"
     clock = WORK if by_work else time.perf_counter
     more = {"clock": "processor" if by_work else "wall", "load": round(os.getloadavg()[0], 1)}
-    if os.environ.get("WARP_AR_BENCH") != "presets":
+    part = os.environ.get("WARP_AR_BENCH")
+    if part != "presets":
         method_costs(device, clock, more)
-    for scene in bundled_scenes():
+    for scene in () if part == "methods" else bundled_scenes():
         case = open_scene(scene, FRAMES)
         times, _ = run_in_turn(case, {name: PRESETS[name] for name in RUNS}, device, clock)
         for name in RUNS:

@@ -1,14 +1,19 @@
 """The path tracer on bundled scenes: rays a second beside the bare rate, and the time to an error of 1 %.
 
+    python -m bench reference [--scenes torus,desk,mirror] [--size WxH] [--samples N] [--runs N] [--device D]
+
 Bare is one ray through the middle of every pixel to the first surface, objects included, and nothing else. The time to
-1 % is that of the samples that were taken times the square of their error over 1 %: what is left falls with the root of
-their number.
+1 % is that of finding what proxies reflect, and that of the samples that were taken times the square of their error
+over 1 %: what is left falls with the root of their number.
 """
 
 from __future__ import annotations
 
+import argparse
 import functools
+import os
 import statistics
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -78,34 +83,61 @@ class Primary:
             list(pool.map(self.launch, bands))
 
 
-def main(device: str) -> None:
+def main(device: str, arguments: list[str] | None = None) -> None:
     kind = "cpu" if wp.get_device(device).is_cpu else "cuda"
-    for name in CASES:
-        known = light_up_to(load_scene(name), FRAME, quality="high", device=device)
-        tracer = known.tracer(device=device, size=SIZES[kind])
-        *_, picture = tracer.render(SAMPLES, step=SAMPLES // 4)
-        assert np.isfinite(picture.radiance).all()
-        changed = np.abs(picture.image.astype(int) - np.round(255.0 * _encoded(tracer))).max(axis=2) > 2
-        assert 0.01 < changed.mean() < 0.9, "nothing virtual is in the picture"
-        pixels = SIZES[kind][0] * SIZES[kind][1]
-        before, samples = tracer.rays(), tracer.samples
-        contenders = {"paths": lambda t=tracer: t.sample(STEPS[kind]), "bare": Primary(tracer)}
-        times = _measure(contenders, device)
-        rays = (tracer.rays() - before) / (tracer.samples - samples) * STEPS[kind]
-        rate = rays / (statistics.median(times["paths"]) * 1e-3)
-        bare = pixels / (statistics.median(times["bare"]) * 1e-3)
-        report(
-            f"reference {name} {SIZES[kind][0]}x{SIZES[kind][1]}",
-            times["paths"],
-            device,
-            samples_per_call=STEPS[kind],
-            rays_per_sample=round(rays / pixels / STEPS[kind], 2),
-            million_rays_per_second=round(rate / 1e6, 3),
-            bare_million_rays_per_second=round(bare / 1e6, 3),
-            of_bare=round(rate / bare, 3),
-            relative_error=round(picture.relative_error, 4),
-            seconds_to_one_percent=round(picture.seconds * (picture.relative_error / WANTED) ** 2, 2),
-        )
+    parser = argparse.ArgumentParser(prog="python -m bench reference")
+    parser.add_argument("--scenes", default=",".join(CASES))
+    parser.add_argument("--size", default="x".join(map(str, SIZES[kind])))
+    parser.add_argument("--samples", type=int, default=SAMPLES, help="per pixel, for the time to an error")
+    parser.add_argument("--runs", type=int, default=RUNS, help="of the two rates")
+    options = parser.parse_args(arguments or [])
+    width, height = (int(side) for side in options.size.split("x"))
+    for name in options.scenes.split(","):
+        measure_scene(name, (width, height), options.samples, options.runs, device)
+
+
+def measure_scene(name: str, size: tuple[int, int], count: int, runs: int, device: str) -> None:
+    """One scene: the time to an error, then both rates in turn."""
+    kind = "cpu" if wp.get_device(device).is_cpu else "cuda"
+    known = light_up_to(load_scene(name), FRAME, quality="high", device=device)
+    # Kernels are loaded by a picture that does not count.
+    known.tracer(device=device, size=(64, 48)).sample(1)
+    tracer = known.tracer(device=device, size=size)
+    begun = time.perf_counter()
+    tracer.prepare()
+    prepared = time.perf_counter() - begun
+    worked = time.process_time()
+    *_, picture = tracer.render(count, step=max(count // 4, 1))
+    worked = time.process_time() - worked
+    assert np.isfinite(picture.radiance).all()
+    changed = np.abs(picture.image.astype(int) - np.round(255.0 * _encoded(tracer))).max(axis=2) > 2
+    assert 0.01 < changed.mean() < 0.9, "nothing virtual is in the picture"
+    pixels = size[0] * size[1]
+    before, samples = tracer.rays(), tracer.samples
+    contenders = {"paths": lambda t=tracer: t.sample(STEPS[kind]), "bare": Primary(tracer)}
+    times = _measure(contenders, device, runs)
+    rays = (tracer.rays() - before) / (tracer.samples - samples) * STEPS[kind]
+    rate = rays / (statistics.median(times["paths"]) * 1e-3)
+    bare = pixels / (statistics.median(times["bare"]) * 1e-3)
+    more = (picture.relative_error / WANTED) ** 2
+    report(
+        f"reference {name} {size[0]}x{size[1]}",
+        times["paths"],
+        device,
+        samples=count,
+        samples_per_call=STEPS[kind],
+        rays_per_sample=round(rays / pixels / STEPS[kind], 2),
+        million_rays_per_second=round(rate / 1e6, 3),
+        bare_million_rays_per_second=round(bare / 1e6, 3),
+        of_bare=round(rate / bare, 3),
+        relative_error=round(picture.relative_error, 4),
+        seconds=round(picture.seconds, 3),
+        prepare_seconds=round(prepared, 3),
+        seconds_to_one_percent=round(prepared + picture.seconds * more, 2),
+        processor_seconds_to_one_percent=round(worked * more, 1),
+        cores=len(os.sched_getaffinity(0)),
+        load=round(os.getloadavg()[0], 1),
+    )
 
 
 def _encoded(tracer: PathTracer) -> np.ndarray:
@@ -114,12 +146,12 @@ def _encoded(tracer: PathTracer) -> np.ndarray:
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
-def _measure(contenders: dict, device: str) -> dict[str, list[float]]:
+def _measure(contenders: dict, device: str, runs: int) -> dict[str, list[float]]:
     """In turn; by the clock of the host on CUDA as well, for sampling counts what is done."""
     if wp.get_device(device).is_cpu:
-        return measure(contenders, device, runs=RUNS)
+        return measure(contenders, device, runs=runs)
     times: dict[str, list[float]] = {name: [] for name in contenders}
-    for run in range(RUNS + 2):
+    for run in range(runs + 2):
         for name, contender in contenders.items():
             elapsed = time_once(contender, device)
             if run >= 2:

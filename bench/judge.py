@@ -10,8 +10,8 @@ follows paths in the light that the pipeline had. One JSON line per scene and qu
   lost       the same of the pipeline's picture
   kept       lost / nothing
   flip_*     nothing and lost as mean FLIP; flip_half between two halves of the reference's samples: its noise
-  truth_*    kept of the difference to the truth, by the pipeline and by the reference
-
+  truth_*    kept of the difference to the truth, by the pipeline and by the reference; ``truth_flip_*`` the same as
+             mean FLIP where the truth differs from the camera's frame
   unsure     share of those blocks that are left out: noise of the reference may or may not clip there
 
 Differences are those of means over blocks of BLOCK x BLOCK pixels in linear light, encoded. Noise of the reference is
@@ -24,7 +24,6 @@ means are too dark, and such blocks do not judge.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -33,7 +32,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from bench.common import commit
+from bench.common import KeptLines, commit
 from warp_ar.accuracy.known_frame import KnownFrame, light_up_to
 from warp_ar.accuracy.metrics import changed_region, flip_map
 from warp_ar.accuracy.path_tracer import TracedPicture
@@ -138,6 +137,10 @@ def judge(known: KnownFrame, truth: Image | None, width: int | None, samples: in
         before = difference(seen, [true], changed)
         row["truth_pipeline"] = round(difference(shown, [true], changed) / before, 3)
         row["truth_reference"] = round(difference(true, traced, changed) / before, 3)
+        true_image = averaged(truth, size)
+        region = changed_region(frame, true_image)
+        flips = [float(flip_map(true_image, image)[region].mean()) for image in (frame, lit, reference)]
+        row["truth_flip_pipeline"], row["truth_flip_reference"] = (round(flip / flips[0], 4) for flip in flips[1:])
     return row
 
 
@@ -162,17 +165,22 @@ def main() -> int:
     parser.add_argument("--width", type=int, help="of the pictures that are compared (default: the camera's)")
     parser.add_argument("--light", help="captured light instead of the ball's")
     parser.add_argument("--device", default="auto")
+    parser.add_argument("--keep", type=Path, metavar="FILE", help="JSON lines: go on where a run was ended")
     options = parser.parse_args()
+    lines = KeptLines(options.keep)
     for name in options.scenes:
         scene = load_scene(Path(name) if "/" in name else name)
+        key = {"scene": "/".join(Path(name).parts[-2:]), "frame": options.frame, "samples": options.samples}
+        key |= {"width": options.width, "light": "given" if options.light else "own"}
         if options.light is not None:
             scene = with_light(scene, options.light)
         for quality in options.quality.split(","):
+            if lines.has(**key, quality=quality):
+                continue
             known = light_up_to(scene, options.frame, quality=quality, device=options.device)
             truth = truth_of(scene, options.frame)
             row = judge(known, truth, options.width, options.samples, options.device)
-            about = {"scene": scene.name, "quality": quality, "light": "given" if options.light else "own"}
-            print(json.dumps({**about, **row, "samples": options.samples, "commit": commit()}), flush=True)
+            lines.add({**key, "quality": quality, **row, "commit": commit()})
     return 0
 
 

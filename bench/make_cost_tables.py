@@ -8,14 +8,17 @@ It runs, one after another, and says what each took:
   budget    the same of ``desk`` for the bench of budgets: ``bench/results/desk_budget_costs.json``
   tables    all of it into ``docs/accuracy.md`` and ``README.md``
 
-Errors do not depend on what else runs: they and the costs of other devices can be made at other times (``--only``).
-Errors run in as many processes as the machine has cores; costs run alone, and want a machine with nothing else to do.
+Errors do not depend on what else runs: they and the costs of other devices can be made at other times (``--only``), and
+on another machine or device (``--device``, ``--keep``). They run in as many processes as the machine has cores; costs
+run alone, and want a machine with nothing else to do.
 ``--processor-time`` counts the work of one thread instead, for a busy one.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import dataclasses
 import json
 import os
 import statistics
@@ -23,7 +26,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -41,19 +44,31 @@ KEYS = ("case", "setting", "method", "quality")
 STEPS = ("errors", "presets", "costs", "budget", "tables")
 
 
-def tradeoff(options: Sequence[str], scene: str, folder: Path) -> dict[str, str]:
-    """Run ``warp_ar.tradeoff`` on a scene, or ``all``; texts of the files that it wrote, by name."""
-    out = folder / scene
-    command = [sys.executable, "-m", "warp_ar.tradeoff", scene, *options, "--device", "cpu", "--out", str(out)]
-    subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
-    print(f"  {scene}: done", flush=True)
-    return {path.name: path.read_text(encoding="utf-8") for path in out.iterdir() if path.suffix != ".html"}
+@dataclasses.dataclass(frozen=True)
+class Runs:
+    """How ``warp_ar.tradeoff`` is run."""
 
+    device: str = "cpu"
+    folder: Path | None = None
+    """Keeps what it writes; what is there is not made again. None keeps nothing."""
 
-def every_scene(options: Sequence[str], scenes: Sequence[str] = ()) -> list[dict[str, str]]:
-    """The same for every bundled scene, or for these, as many at a time as there are cores."""
-    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(os.cpu_count() or 1) as workers:
-        return list(workers.map(lambda scene: tradeoff(options, scene, Path(folder)), scenes or bundled_scenes()))
+    def tradeoff(self, options: Sequence[str], scene: str, name: str) -> dict[str, str]:
+        """Run it on a scene, or ``all``; texts of the files that it wrote into a folder of this name."""
+        with contextlib.ExitStack() as stack:
+            folder = self.folder or Path(stack.enter_context(tempfile.TemporaryDirectory()))
+            out = folder / name
+            if not (out / "tradeoff.jsonl").exists():
+                command = [sys.executable, "-m", "warp_ar.tradeoff", scene, *options]
+                command += ["--device", self.device, "--out", str(out)]
+                subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
+                print(f"  {name}: done", flush=True)
+            return {path.name: path.read_text(encoding="utf-8") for path in out.iterdir() if path.suffix != ".html"}
+
+    def every(self, asked: Mapping[str, tuple[str, Sequence[str]]]) -> list[dict[str, str]]:
+        """The same for scenes and options by name, as many at a time as there are cores."""
+        with ThreadPoolExecutor(os.cpu_count() or 1) as workers:
+            runs = [workers.submit(self.tradeoff, options, scene, name) for name, (scene, options) in asked.items()]
+            return [run.result() for run in runs]
 
 
 def merge_errors(tables: Sequence[dict[str, Any]], lines: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -66,7 +81,7 @@ def merge_errors(tables: Sequence[dict[str, Any]], lines: Sequence[dict[str, Any
     rows = [line for line in lines if line["kind"] == "method"]
     merged = {key: tables[0][key] for key in ("program", "made")}
     cases = dict.fromkeys(row["case"] for row in rows)
-    merged["made"] = {**merged["made"], "by": f"python -m warp_ar.tradeoff {' '.join(cases)}"}
+    merged["made"] = {**merged["made"], "by": f"python -m warp_ar.tradeoff {' '.join(cases)}", "commit": commit()}
     found: dict[str, dict[str, list[dict[str, Any]]]] = {}
     for row in rows:
         found.setdefault(row["setting"], {}).setdefault(row["method"], []).append(row)
@@ -85,12 +100,14 @@ def merge_errors(tables: Sequence[dict[str, Any]], lines: Sequence[dict[str, Any
     return merged
 
 
-def make_errors() -> None:
+def make_errors(runs: Runs) -> None:
     """Errors of methods."""
-    written = every_scene(ERROR_OPTIONS)
-    with tempfile.TemporaryDirectory() as folder:
-        # Lights with a size are in no bundled scene; ``all`` brings a copy of one that has them.
-        written.append(tradeoff((*ERROR_OPTIONS, "--stage", "light_shadow"), "all", Path(folder)))
+    asked: dict[str, tuple[str, Sequence[str]]] = {
+        f"errors_{scene}": (scene, ERROR_OPTIONS) for scene in bundled_scenes()
+    }
+    # Lights with a size are in no bundled scene; ``all`` brings a copy of one that has them.
+    asked["errors_sized"] = ("all", (*ERROR_OPTIONS, "--stage", "light_shadow"))
+    written = runs.every(asked)
     found = [json.loads(line) for files in written for line in files["tradeoff.jsonl"].splitlines()]
     lines = list({(line["kind"], *(line.get(key) for key in KEYS)): line for line in found}.values())
     merged = merge_errors([json.loads(files["cost_table.json"]) for files in written], lines)
@@ -98,15 +115,17 @@ def make_errors() -> None:
     path.write_text(json.dumps(merged, indent=1) + "\n", encoding="utf-8")
 
 
-def make_presets(only: str | None, scenes: Sequence[str]) -> None:
+def make_presets(runs: Runs, only: str | None, scenes: Sequence[str]) -> None:
     """Errors of presets; where only some or some scenes are asked for, the others' stay as they are.
 
     Args:
+        runs: How they are made.
         only: Presets, separated by commas.
         scenes: Names of bundled scenes.
     """
     options = (*PRESET_OPTIONS, *(("--only", only) if only else ()))
-    lists = [json.loads(files["presets.json"]) for files in every_scene(options, scenes)]
+    written = runs.every({f"presets_{scene}": (scene, options) for scene in scenes or bundled_scenes()})
+    lists = [json.loads(files["presets.json"]) for files in written]
     errors = {scene: own for listed in lists for scene, own in listed["errors"].items()}
     by = f"python -m warp_ar.tradeoff {' '.join(errors)} {' '.join(options)}"
     merged = {**lists[0], "made": {**lists[0]["made"], "by": by, "commit": commit()}, "errors": errors}
@@ -142,13 +161,16 @@ def main() -> int:
         "--scenes", default=(), type=lambda text: text.split(","), metavar="A,B", help="the same for scenes"
     )
     parser.add_argument("--processor-time", action="store_true", help="count the work of one thread")
+    parser.add_argument("--device", default="cpu", help="where errors are measured")
+    parser.add_argument("--keep", type=Path, metavar="DIR", help="go on with errors where a run was ended")
     options = parser.parse_args()
     asked = options.only.split(",")
     if not set(asked) <= set(STEPS):
         parser.error(f"--only {options.only}: expected some of {', '.join(STEPS)}")
+    runs = Runs(options.device, options.keep)
     steps: dict[str, Callable[[], object]] = {
-        "errors": make_errors,
-        "presets": lambda: make_presets(options.presets, options.scenes),
+        "errors": lambda: make_errors(runs),
+        "presets": lambda: make_presets(runs, options.presets, options.scenes),
         "costs": lambda: make_costs(processor_time=options.processor_time),
         "budget": lambda: subprocess.run([sys.executable, "-m", "bench.record_costs"], cwd=ROOT, check=True),
         "tables": lambda: subprocess.run([sys.executable, "-m", "bench.write_cost_tables"], cwd=ROOT, check=True),
