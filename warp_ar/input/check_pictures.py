@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from warp_ar.input.board_finder import KNOWN, find_markers, recognise_board
 from warp_ar.input.finding import Finding
 from warp_ar.input.marker_pattern import Pattern, make_pattern, printed_cells
-from warp_ar.input.markers import MarkerDetector, find_dictionary
+from warp_ar.input.markers import Detection, MarkerDetector, find_dictionary
 from warp_ar.input.source import Source
 from warp_ar.input.tracking import Tracker, TrackState
 from warp_ar.kernels.color import decode_table
@@ -247,11 +247,13 @@ def _check_focal(marker: Marker, look: Look) -> list[Finding]:
     The squared residuals are a parabola about their least; leaving out one frame after the other says how sure it is.
     """
     images = [image for image, _ in look.views[:: -(-len(look.views) // FOCAL_VIEWS)]]
+    tracker = Tracker(marker, look.camera, steady=False)
+    pictures = [(image, tracker.detect(image)) for image in images]
     # Where it lies is looked for in few frames, and measured in all around there.
     rough = np.exp(np.linspace(-0.3, 0.3, 9))
-    few = [_squared_errors(marker, look.camera, images[:: -(-len(images) // 3)], factor).sum() for factor in rough]
+    few = [_squared_errors(marker, look.camera, pictures[:: -(-len(pictures) // 3)], factor).sum() for factor in rough]
     factors = rough[int(np.argmin(few))] * np.array([0.94, 0.97, 1.0, 1.03, 1.06])
-    squares = np.array([_squared_errors(marker, look.camera, images, factor) for factor in factors])
+    squares = np.array([_squared_errors(marker, look.camera, pictures, factor) for factor in factors])
     kept = np.isfinite(squares).all(0)
     if kept.sum() < 4:
         return []
@@ -261,7 +263,7 @@ def _check_focal(marker: Marker, look: Look) -> list[Finding]:
     left = np.array([_lowest(factors, squares.sum(1) - squares[:, k])[0] for k in range(count)])
     deviation = math.sqrt((count - 1) / count * float(((left - left.mean()) ** 2).sum()))
     # Views from one side alone leave the least so flat that anything moves it.
-    as_given = _squared_errors(marker, look.camera, images, 1.0)[kept].sum()
+    as_given = _squared_errors(marker, look.camera, pictures, 1.0)[kept].sum()
     if abs(best - 1) < max(FOCAL, 3 * deviation) or as_given < 1.02 * squares.sum(1).min():
         return []
     text = (
@@ -271,14 +273,12 @@ def _check_focal(marker: Marker, look: Look) -> list[Finding]:
     return [Finding("camera.focal", text, "python -m warp_ar.calibrate camera PICTURES")]
 
 
-def _squared_errors(marker: Marker, camera: Camera, images: Sequence[Image], factor: float) -> Array:
-    """Mean squared distance of the print's edges in each image, pixels squared; infinite where it is not seen."""
+def _squared_errors(
+    marker: Marker, camera: Camera, pictures: Sequence[tuple[Image, list[Detection]]], factor: float
+) -> Array:
+    """Mean squared distance of the print's edges in each picture, pixels squared; infinite where it is not seen."""
     tracker = Tracker(marker, dataclasses.replace(camera, fx=camera.fx * factor, fy=camera.fy * factor), steady=False)
-    errors = []
-    for image in images:
-        tracker.reset()
-        errors.append(tracker.track(image, 0.0).reprojection_error ** 2)
-    return np.array(errors)
+    return np.array([tracker.error_of(image, found) ** 2 for image, found in pictures])
 
 
 def _lowest(factors: Array, totals: Array) -> tuple[float, float]:

@@ -229,6 +229,23 @@ class Tracker:
         self._pose, self._time, self._quality = pose, time, quality
         return Track(pose, TrackState.TRACKED, quality, self._outline(pose), fit.error)
 
+    def detect(self, image: Image) -> list[Detection]:
+        """The followed markers in a whole picture, uint8 RGB or grey; they depend on the picture, not on the camera."""
+        return self._detect(_gray(image), (0, 0))
+
+    def error_of(self, image: Image, found: list[Detection]) -> float:
+        """How well the print fits where it was found, whatever earlier frames say.
+
+        Args:
+            image: As for ``track``.
+            found: What ``detect`` gave of it, by any tracker of this marker.
+
+        Returns:
+            What ``track`` of a new tracker says: root mean square distance in pixels; infinite where no pose fits.
+        """
+        fit = self._fit_detections(_gray(image), (0, 0), found, None)
+        return np.inf if fit is None else fit.error
+
     def _without(self, guess: Pose | None, time: float) -> Track:
         if guess is None:
             return Track(None, TrackState.LOST, 0.0, None, np.inf)
