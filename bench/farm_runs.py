@@ -41,9 +41,9 @@ class Watched:
     worker_mb: list[float] = dataclasses.field(default_factory=list)
     """Of the largest worker."""
     workers_mb: list[float] = dataclasses.field(default_factory=list)
-    """Of all workers."""
+    """Of all workers, and of the processes that they have begun."""
     processor_seconds: float = 0.0
-    """Of driver and workers."""
+    """Of driver and workers, and of the processes that these have begun."""
     gpus: dict[int, list[tuple[int, int]]] = dataclasses.field(default_factory=dict)
     """Share of the time in which a kernel ran in percent, and MB in use, of each GPU, one pair a sample."""
 
@@ -226,17 +226,18 @@ def _watch(pid: int, folder: Path, seen: Watched, say: Callable[[str], None], en
     spent: dict[int, float] = {}
     while not ended.wait(0.5):
         sizes = []
-        for process in [pid, *workers_of(pid)]:
+        mine = workers_of(pid)
+        for process in [pid, *mine, *(helper for worker in mine for helper in _children_of(worker))]:
             with contextlib.suppress(OSError, ValueError, IndexError):
                 resident = int(Path(f"/proc/{process}/statm").read_text().split()[1]) * page
                 fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
                 spent[process] = (int(fields[11]) + int(fields[12])) / ticks
                 sizes.append((process, resident))
-        workers = [size for process, size in sizes if process != pid]
-        if len(sizes) > len(workers):
+        others = [size for process, size in sizes if process != pid]
+        if len(sizes) > len(others):
             seen.driver_mb.append(next(size for process, size in sizes if process == pid))
-            seen.worker_mb.append(max(workers, default=0.0))
-            seen.workers_mb.append(sum(workers))
+            seen.worker_mb.append(max((size for process, size in sizes if process in mine), default=0.0))
+            seen.workers_mb.append(sum(others))
         seen.processor_seconds = sum(spent.values())
         if time.monotonic() - told > TELL_SECONDS:
             told = time.monotonic()
@@ -248,16 +249,22 @@ def _watch(pid: int, folder: Path, seen: Watched, say: Callable[[str], None], en
 
 def workers_of(pid: int) -> list[int]:
     """Workers: processes that a driver has started by spawning."""
-    found = []
-    with contextlib.suppress(OSError):
-        for task in Path(f"/proc/{pid}/task").iterdir():
-            found += [int(child) for child in (task / "children").read_text().split()]
     mine = []
-    for child in found:
+    for child in _children_of(pid):
         with contextlib.suppress(OSError):
             if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes():
                 mine.append(child)
     return mine
+
+
+def _children_of(pid: int) -> list[int]:
+    """Processes that a process has started and that are there."""
+    found = []
+    with contextlib.suppress(OSError):
+        for task in Path(f"/proc/{pid}/task").iterdir():
+            with contextlib.suppress(OSError):  # a thread that has ended meanwhile
+                found += [int(child) for child in (task / "children").read_text().split()]
+    return found
 
 
 @dataclasses.dataclass(frozen=True)

@@ -42,15 +42,14 @@ class Workers:
 
     def do(self, job):
         place = self.folder / job.place(self.jobs)
+        values = {"length": FRAMES, "found": FRAMES} if job.kind == "survey" else {"frames": 2}
         if job.kind in ("join", "index"):
             place.parent.mkdir(parents=True, exist_ok=True)
             place.write_text("")
         else:
             place.mkdir(parents=True)
-            (place / RECORD).write_text(json.dumps({"job": job.key(self.jobs), "bytes": 1}))
-        return Outcome(
-            "done", {"length": FRAMES, "found": FRAMES} if job.kind == "survey" else {"frames": 2, "bytes": 1}
-        )
+            (place / RECORD).write_text(json.dumps({**values, "job": job.key(self.jobs), "bytes": 1}))
+        return Outcome("done", {**values, "bytes": 1})
 
     def wait(self, seconds):
         self.most = max(self.most, len(self.events))
@@ -163,13 +162,34 @@ def test_outputs_without_a_line_are_taken_over(jobs, tmp_path):
     run = tmp_path / "run"
     drive(jobs, run)
     lines = (run / "manifest.jsonl").read_text().splitlines()
-    lost = [line for line in lines if '"b/segment-000003"' in line or "b/join" in line]
+    lost = [line for line in lines if any(f'"{key}"' in line for key in ("b/segment-000003", "b/join", "b/survey"))]
     (run / "manifest.jsonl").write_text("".join(f"{line}\n" for line in lines if line not in lost))
     (run / "b.mp4").unlink()
     pool, _, _ = drive(jobs, run)
     assert keys(jobs, pool.given) == ["b/join"]
-    done = [json.loads(line)["job"] for line in (run / "manifest.jsonl").read_text().splitlines()]
-    assert len(done) == len(set(done)) == 21
+    done = {line["job"]: line for line in map(json.loads, (run / "manifest.jsonl").read_text().splitlines())}
+    assert len(done) == len((run / "manifest.jsonl").read_text().splitlines()) == 21
+    assert done["b/survey"]["length"] == FRAMES, "a survey takes an hour, and is not done again"
+    assert done["b/segment-000003"]["frames"] == 2
+
+
+def test_a_survey_whose_record_is_damaged_is_done_again(jobs, tmp_path):
+    run = tmp_path / "run"
+    drive(jobs, run)
+    lines = (run / "manifest.jsonl").read_text().splitlines()
+    (run / "manifest.jsonl").write_text("".join(f"{line}\n" for line in lines if '"b/' not in line))
+    (run / "b.mp4").unlink()
+    place = run / "clips/b"
+    (place / RECORD).write_text(json.dumps({"job": "b/survey", "length": "many"}))
+
+    def again(job, _):
+        if job.kind == "survey":
+            (place / RECORD).unlink()
+            place.rmdir()
+
+    pool, summary, _ = drive(jobs, run, again)
+    assert keys(jobs, pool.given) == ["b/survey", "b/join"]
+    assert not summary.failed
 
 
 def test_lines_without_outputs_are_forgotten(jobs, tmp_path):

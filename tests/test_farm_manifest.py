@@ -108,8 +108,9 @@ def test_outputs_appear_whole_with_their_record(tmp_path):
     with aside(tmp_path, "one") as part:
         (part / "deep").mkdir()
         (part / "deep/x").write_bytes(b"12345")
-        told = publish(part, tmp_path / "out/one", "clip/one")
+        told = publish(part, tmp_path / "out/one", "clip/one", {"frames": 3})
     assert told["bytes"] == 5
+    assert told["frames"] == 3
     assert record_at(tmp_path / "out/one", "clip/one") == told
     assert record_at(tmp_path / "out/one", "clip/two") is None
     assert (tmp_path / "out/one/deep/x").read_bytes() == b"12345"

@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+import dataclasses
 import pathlib
 
 import pytest
 
 from warp_ar.errors import UsageError
 from warp_ar.farm.cli import main
+from warp_ar.farm.plan import Plan
 from warp_ar.farm.scale import Figures, Task, read_figures, scale_task
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 FIGURES = ROOT / "docs" / "examples" / "figures.toml"
-PLAIN = "kernel_ms = 1\nprocessor_ms = 40\nsurvey_ms = 10\njob_s = 2\nframe_bytes = 1e5\ncores = 16\nworkers = 10\n"
+PLAIN = (
+    "kernel_ms = 1\nprocessor_ms = 40\nsurvey_ms = 10\nsurvey_processor_ms = 12\njob_s = 2\n"
+    "frame_bytes = 1e5\ncores = 16\nworkers = 10\n"
+)
 TASK = "[[work]]\nclips = 1\nframes = 6000\nsegment_frames = 100\n"
 
 
 def figures(**changes: float) -> Figures:
     values = {"kernel_ms": 1, "processor_ms": 40, "survey_ms": 10, "job_s": 2, "frame_bytes": 1e5, "cores": 16}
-    return Figures(**{"workers": 10, **values, **changes})
+    return Figures(**{"workers": 10, "survey_processor_ms": 12, **values, **changes})
 
 
 def task(clips: int = 1, frames: int = 6000, variations: int = 0, segment: int = 100, **changes: float) -> Task:
@@ -43,6 +48,17 @@ def test_variations_are_a_job_each_and_surveys_run_side_by_side():
     row = scale_task(task(clips=40, frames=8, variations=5), 2)
     assert row.survey_s == pytest.approx(2 * 8 * 0.01)  # 40 clips on 20 workers
     assert row.lighting_s == pytest.approx(10 * (2.0 + 8 / 40.0))
+    # Ten surveys at once at 32 ms of processor time each keep 16 cores busy for 20 ms a frame of each.
+    assert scale_task(task(clips=40, frames=8, survey_processor_ms=32), 2).survey_s == pytest.approx(2 * 8 * 0.02)
+    assert scale_task(task(clips=4, frames=8, survey_processor_ms=32), 2).survey_s == pytest.approx(8 * 0.01)
+
+
+def test_a_plan_has_a_clip_surveyed_by_one_worker_and_a_job_done_by_one():
+    """2 clips and 3 jobs: of more workers the others have nothing to do."""
+    plan = Plan(2, 3, 100, 200, survey_ms=10, clip_ms=1000, frame_ms=20, job_ms=500, bytes=0, survey_bytes=0)
+    assert plan.seconds(1) == pytest.approx(2.0 + 2.0 + 2.0 + 1.5)
+    assert plan.seconds(8) == pytest.approx(4.0 / 2 + 3.5 / 3)
+    assert dataclasses.replace(plan, surveyed=0).seconds(1) == pytest.approx(3.5)
 
 
 def test_the_documented_tables_are_those_of_the_command(capsys):

@@ -212,7 +212,7 @@ def plan(options: argparse.Namespace) -> int:
     devices = devices_of(options.device, options.workers)
     cores = cores_of(len(devices))
     with keeping_to(cores[0]):  # as a worker has them
-        found = make_plan(jobs, devices[0], say)
+        found = make_plan(jobs, devices[0], say, sorted({core for own in cores for core in own}))
     # Workers that share a core are no faster than one that has it.
     at_once = len({core for own in cores for core in own} or devices) if devices[0] == "cpu" else len(devices)
     for problem in found.problems:

@@ -114,12 +114,12 @@ class Driver:
         else:
             record = record_at(place, key)
             there = record is not None
-            if record is not None and not listed and job.kind in ("segment", "variation"):
+            if record is not None and not listed:
+                if job.kind == "survey" and not isinstance(record.get("length"), int):
+                    return False  # damaged: without it nobody knows the clip's jobs
                 # Its worker had finished when the driver died: taken over.
                 self._manifest.add("done", key, **{k: v for k, v in record.items() if k != "job"}, adopted=True)
                 return True
-            if record is not None and not listed:
-                return False  # a survey says more than its record: it is quick to do again
         if listed and not there:
             self._manifest.add("again", key, reason="its outputs have gone")
             return False

@@ -17,7 +17,7 @@ import json
 import math
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -269,16 +269,17 @@ def aside(folder: Path, token: str) -> Iterator[Path]:
         shutil.rmtree(path, ignore_errors=True)
 
 
-def publish(part: Path, place: Path, key: str) -> dict[str, Any]:
+def publish(part: Path, place: Path, key: str, values: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """Move a folder of outputs to its place; if another worker was first, its outputs stay, for they are the same.
 
     Args:
         part: The folder, on the same disk.
         place: Where it goes.
         key: Of the job.
+        values: What else its line of the manifest says, for a driver that comes after one that could not write it.
 
     Returns:
-        Bytes, and a digest over names and contents.
+        These, bytes, and a digest over names and contents.
     """
     size, digest = 0, hashlib.sha256()
     for path in sorted(path for path in part.rglob("*") if path.is_file()):
@@ -287,7 +288,7 @@ def publish(part: Path, place: Path, key: str) -> dict[str, Any]:
             digest.update(hashlib.file_digest(stream, "sha256").digest())
             os.fsync(stream.fileno())
         size += path.stat().st_size
-    told = {"job": key, "bytes": size, "sha256": digest.hexdigest()}
+    told = {**(values or {}), "job": key, "bytes": size, "sha256": digest.hexdigest()}
     (part / RECORD).write_text(json.dumps(told), encoding="utf-8")
     place.parent.mkdir(parents=True, exist_ok=True)
     try:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from warp_ar.errors import WarpArError
 from warp_ar.farm.frames import index_frames
 from warp_ar.farm.jobs import Job, JobFile, job_of_clip, jobs_of_clip, lit_range, source_of
 from warp_ar.farm.manifest import RunError
+from warp_ar.farm.pool import keeping_to
 from warp_ar.farm.records import Context
 from warp_ar.farm.work import Work
 
@@ -34,6 +35,8 @@ class Plan:
     """Frames that are looked at once before."""
     survey_ms: float
     """Milliseconds of such a frame."""
+    clip_ms: float
+    """Milliseconds of a survey beside its frames."""
     frame_ms: float
     """Milliseconds of a frame that is lit and written."""
     job_ms: float
@@ -46,18 +49,20 @@ class Plan:
     """Clips that cannot be read, and why."""
 
     def seconds(self, workers: int) -> float:
-        """Seconds on so many workers that are all as fast as the one that was tried."""
-        total = self.surveyed * self.survey_ms + self.frames * self.frame_ms + self.jobs * self.job_ms
-        return total / 1e3 / workers
+        """Seconds on so many workers that are all as fast as the one that was tried; a clip is surveyed by one."""
+        surveys = (self.surveyed * self.survey_ms + self.clips * self.clip_ms) if self.surveyed else 0.0
+        lighting = self.frames * self.frame_ms + self.jobs * self.job_ms
+        return (surveys / min(workers, self.clips) + lighting / min(workers, self.jobs)) / 1e3
 
 
-def make_plan(jobs: JobFile, device: str, say: Callable[[str], None]) -> Plan:
+def make_plan(jobs: JobFile, device: str, say: Callable[[str], None], cores: Sequence[int] = ()) -> Plan:
     """Count jobs and try a few.
 
     Args:
         jobs: The job file.
         device: ``cpu`` or ``cuda:N``.
         say: Called with a line for people now and then.
+        cores: Of all workers, which a survey may use; empty: those that this thread keeps to.
 
     Raises:
         RunError: No job can be tried.
@@ -82,22 +87,24 @@ def make_plan(jobs: JobFile, device: str, say: Callable[[str], None]) -> Plan:
         if jobs.settings.light == "preroll":
             lit += (jobs_of_clip(jobs, clip, length) - 1) * jobs.settings.preroll
     step = max(1, len(lengths) // PROBES)
-    trials = [_try(jobs, clip, lengths[clip], device, say) for clip in list(lengths)[::step][:PROBES]]
+    trials = [_try(jobs, clip, lengths[clip], device, say, cores) for clip in list(lengths)[::step][:PROBES]]
     if not trials:
         raise RunError(f"no clip can be tried: {problems[0] if problems else 'there is none'}")
-    survey_ms, frame_ms, job_ms, size, kept = (sum(values) / len(trials) for values in zip(*trials, strict=True))
-    written = lit * size, surveyed * kept
-    return Plan(len(lengths), count, lit, surveyed, survey_ms, frame_ms, job_ms, *written, tuple(problems))
+    survey_ms, clip_ms, frame_ms, job_ms, size, kept = (
+        sum(values) / len(trials) for values in zip(*trials, strict=True)
+    )
+    found = survey_ms, clip_ms, frame_ms, job_ms, lit * size, surveyed * kept
+    return Plan(len(lengths), count, lit, surveyed, *found, tuple(problems))
 
 
 def _try(
-    jobs: JobFile, clip: int, length: int, device: str, say: Callable[[str], None]
-) -> tuple[float, float, float, float, float]:
+    jobs: JobFile, clip: int, length: int, device: str, say: Callable[[str], None], cores: Sequence[int]
+) -> tuple[float, float, float, float, float, float]:
     """Do the first job of a clip on a few frames, twice: the second time all is compiled and read.
 
     Returns:
-        Milliseconds of a surveyed frame, of a lit frame, of a job beside its frames; bytes of a lit frame, and of a
-        surveyed one.
+        Milliseconds of a surveyed frame, of a survey beside its frames, of a lit frame, of a job beside its frames;
+        bytes of a lit frame, and of a surveyed one.
     """
     first, end = lit_range(jobs.clips[clip], length)
     few = dataclasses.replace(jobs.clips[clip], end=min(end, first + FRAMES))
@@ -107,10 +114,11 @@ def _try(
         work = Work(Context(tried, Path(name), device))
         try:
             job = job_of_clip(tried, clip, 0, length)
-            whole = _time(work, Job("survey", clip))
-            again = Path(name) / Job("survey", clip).place(tried)
-            again.rename(again.with_name("first"))
-            survey, kept = _time(work, Job("survey", clip))[:2]
+            with keeping_to(cores):
+                whole = _time(work, Job("survey", clip))
+                again = Path(name) / Job("survey", clip).place(tried)
+                again.rename(again.with_name("first"))
+                survey, kept, _, looked_since = _time(work, Job("survey", clip))
             times = []
             for _ in range(2):
                 seconds, size, frames, begun = _time(work, job)
@@ -120,15 +128,17 @@ def _try(
         finally:
             work.close()
     seconds, size, frames, begun = times[1]
-    looked = few.end or 0
+    looked = max((few.end or 0) - first, 1)
     say(f"{jobs.clips[clip].name}: {frames} frames in {seconds:.2f} s (the first time {whole[0] + times[0][0]:.2f} s)")
     per_frame = (seconds - begun) / max(frames - 1, 1)
+    per_look = (survey - looked_since) / max(looked - 1, 1)
     return (
-        1e3 * survey / max(looked - first, 1),
+        1e3 * per_look,
+        1e3 * max(survey - looked * per_look, 0.0),
         1e3 * per_frame,
         1e3 * max(seconds - frames * per_frame, 0.0),
         size / max(frames, 1),
-        kept / max(looked - first, 1),
+        kept / looked,
     )
 
 

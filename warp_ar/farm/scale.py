@@ -3,7 +3,9 @@
     rate of a GPU = min(1 / kernel, cores / processor)              frames a second; the smaller one is what bounds it
     job           = start + frames of a segment workers / rate      seconds of one of the workers that share a GPU
     lighting      = ceil(jobs / (GPUs workers)) job                 whole rounds: the last of equal jobs is waited for
-    survey        = ceil(clips / (GPUs workers)) frames survey      a clip is surveyed in order, by one worker
+    at once       = min(workers, ceil(clips / GPUs))                clips that are surveyed by the workers of a GPU
+    survey        = ceil(clips / (GPUs workers)) frames max(survey, at once survey processor / cores)
+                                                                    a clip is surveyed in order, by one worker
 
 Nothing of a cluster's own is in it: no queue, no file system. What these would have to carry stands beside it: bytes a
 second that are written, and jobs a second that the driver notes.
@@ -34,7 +36,9 @@ class Figures:
     processor_ms: float
     """Milliseconds of one core for a frame: all that a worker does there, encoding included."""
     survey_ms: float
-    """Milliseconds of a frame of a survey, by the clock, on one stream."""
+    """Milliseconds of a frame of a survey, by the clock, where a worker has all cores."""
+    survey_processor_ms: float
+    """Milliseconds of one core for a frame of a survey."""
     job_s: float
     """Seconds of a job beside its frames: pipeline, kernels to load, files to open."""
     frame_bytes: float
@@ -134,7 +138,9 @@ def scale_task(task: Task, gpus: int) -> Row:
     size = task.frames if task.variations else min(task.segment_frames, task.frames)
     job = own.job_s + size * own.workers / rate
     lighting = math.ceil(task.jobs / slots) * job
-    survey = math.ceil(task.clips / slots) * task.frames * own.survey_ms / 1e3
+    at_once = min(own.workers, math.ceil(task.clips / gpus))
+    looked = max(own.survey_ms, at_once * own.survey_processor_ms / own.cores)
+    survey = math.ceil(task.clips / slots) * task.frames * looked / 1e3
     bound = "rounds" if task.jobs < slots / 2 else "GPU" if by_gpu < by_cores else "cores"
     per_s = task.lit / lighting
     return Row(gpus, survey, lighting, bound, per_s, per_s * own.frame_bytes, task.jobs / lighting)

@@ -109,7 +109,7 @@ class Work(Closing):
                     for name in ("datasheet.md", place.name):
                         publish_file(part / name, place.parent / name)
                     return {**values, "bytes": place.stat().st_size}
-            return {**values, **{k: v for k, v in publish(part, place, key).items() if k != "job"}}
+            return {k: v for k, v in publish(part, place, key, values).items() if k != "job"}
 
     def _light_segment(self, job: Job, part: Path, tell: Callable[[int], None]) -> dict[str, Any]:
         survey = self._lighter.survey(job.clip)
