@@ -5,8 +5,8 @@
 CASE is a folder with ``case.json``, ``camera``, ``env`` and a folder and a scene file of each version. The pictures
 have the frames' own size, for the truth was clipped there: a highlight that clips is dimmer after averaging down. One
 JSON line per case and version; ``kept`` is the mean FLIP to the truth where the truth differs from the camera's frame,
-over that of the frame itself. What of it is noise of the samples: ``kept_half`` is the same by the first half of them,
-``noise`` the difference between the halves, ``error`` the relative standard error where the picture changes.
+over that of the frame itself. Half of the samples have another seed, which tells the noise: ``kept_half`` is the same
+by one half, ``noise`` the difference between both, ``error`` the relative standard error where the picture changes.
 Samples go to pixels within MARGIN of those that count. With ``--keep FILE`` lines of single frames are kept there, and
 what it holds at these samples is not rendered again.
 """
@@ -66,15 +66,17 @@ def score(case: Path, version: str, frame: int, samples: int, device: str) -> di
     light = np.maximum(np.load(case / "env" / f"{frame:04d}.npy").astype(np.float32), 0.0)
     pose = Pose(np.array(entry["R"]), np.array(entry["t"]))
     rate = scene.source.fps if scene.source is not None and scene.source.fps is not None else 30.0
-    tracer = PathTracer(scene, light, camera, pose, device=device, seconds=frame / rate)
     region = changed_region(camera, truth)
-    leave_alone(tracer, ~cv2.dilate(region.astype(np.uint8), np.ones((2 * MARGIN + 1,) * 2)).astype(bool))
-    tracer.sample(max(samples // 2, 1))
-    first = tracer.picture()
-    tracer.sample(max(samples - samples // 2, 1))
-    both = tracer.picture()
+    aside = ~cv2.dilate(region.astype(np.uint8), np.ones((2 * MARGIN + 1,) * 2)).astype(bool)
+    halves = []
+    for seed in (0, 1):
+        tracer = PathTracer(scene, light, camera, pose, device=device, seconds=frame / rate, seed=seed)
+        leave_alone(tracer, aside)
+        tracer.sample(max(samples // 2, 1))
+        halves.append(tracer.picture())
     table = decode_table(scene.camera.transfer)
-    images = [encoded_by(r, table) for r in (both.radiance, first.radiance, 2.0 * both.radiance - first.radiance)]
+    first, second = (half.radiance for half in halves)
+    images = [encoded_by(radiance, table) for radiance in (0.5 * (first + second), first, second)]
     nothing = float(flip_map(truth, camera)[region].mean())
     kept, kept_half = (float(flip_map(truth, image)[region].mean()) / nothing for image in images[:2])
     return {
@@ -82,7 +84,7 @@ def score(case: Path, version: str, frame: int, samples: int, device: str) -> di
         "kept": kept,
         "kept_half": kept_half,
         "noise": float(flip_map(images[1], images[2])[region].mean()) / nothing,
-        "error": both.relative_error,
+        "error": float(np.hypot(*(half.relative_error for half in halves))) / 2.0,
     }
 
 

@@ -107,6 +107,14 @@ def make_sample_pixel(trace: TraceConfig) -> wp.Function:
     return sample_pixel
 
 
+# A pass adds ``share`` samples to a pixel: after n passes it has floor(n share + u), u its own number from 0 to 1. So
+# what a pixel has does not depend on how many passes are made at a time, and pixels of small shares take turns.
+@wp.func
+def samples_after(passes: wp.int32, share: wp.float32, bits: wp.uint32) -> wp.int32:
+    """Samples of a pixel after so many passes."""
+    return wp.int32(wp.floor(wp.float32(passes) * share + uniform_from_bits(bits)))
+
+
 @functools.cache
 def make_trace_paths_kernel(trace: TraceConfig) -> wp.Kernel:
     """Kernel of ``trace_paths`` for the kinds of shape in ``trace``."""
@@ -121,8 +129,9 @@ def make_trace_paths_kernel(trace: TraceConfig) -> wp.Kernel:
         asked: wp.int32,
         seed: wp.int32,
         first: wp.int32,
-        done: wp.int32,
+        begun: wp.int32,
         count: wp.int32,
+        shares: wp.array2d[wp.float32],
         # Out:
         moments_out: Moments,
     ):
@@ -132,8 +141,11 @@ def make_trace_paths_kernel(trace: TraceConfig) -> wp.Kernel:
         key = PathKey()
         key.pixel = wp.uint32(i * rays.shape[1] + j)
         key.seed = wp.uint32(seed)
-        for k in range(count):
-            key.sample = wp.uint32(first + k)
+        start = pcg3d_hash(key.pixel, ~wp.uint32(0), ~key.seed)
+        passed = samples_after(begun, shares[i, j], start[0])
+        more = samples_after(begun + count, shares[i, j], start[0]) - passed
+        for _k in range(more):
+            key.sample = wp.uint32(first + moments_out.samples[i, j])
             # A stream of its own: the vertices of the path use those from 0 on.
             bits = pcg3d_hash(key.pixel, key.sample, ~key.seed)
             x = rays[i, j][0] + (uniform_from_bits(bits[0]) - 0.5) / params[0].focal[0]
@@ -145,7 +157,7 @@ def make_trace_paths_kernel(trace: TraceConfig) -> wp.Kernel:
                 shown = scene.radiance[i, j]
             one = sample_pixel(params[0], scene, asked, vertex, direction, shown, key)
             moments_out.rays[i, j] = moments_out.rays[i, j] + one.rays + 1
-            add_sample(i, j, wp.float32(done + k + 1), one.z, one.g, one.e, one.shows, moments_out)
+            add_sample(i, j, one.z, one.g, one.e, one.shows, moments_out)
 
     return trace_paths_kernel
 
@@ -196,11 +208,12 @@ def trace_paths(
     asked: int,
     seed: int,
     first: int,
-    done: int,
+    begun: int,
     count: int,
+    shares: wp.array2d[wp.float32],
     rows: Rows | None = None,
 ) -> None:
-    """Add ``count`` samples to every pixel's moments.
+    """Add the samples of ``count`` passes to the pixels' moments.
 
     Args:
         trace: Kinds of shape in the scene.
@@ -209,13 +222,14 @@ def trace_paths(
         moments_out: (H, W).
         asked: ``WHOLE``, ``DIFFERENCE`` or ``IRRADIANCE``; all but the first need the frame's radiance.
         seed: Of the random numbers.
-        first: Number of the first sample among those of the seed.
-        done: Samples that the moments hold already.
-        count: Samples per pixel.
+        first: Number of the moments' first sample among those of the seed.
+        begun: Passes with these shares that were made before.
+        count: Passes.
+        shares: (H, W) samples of a pixel in a pass.
         rows: Band of rows; None means all.
     """
     rays = scene.picture.rays
-    inputs = [params, scene, asked, seed, first, done, count]
+    inputs = [params, scene, asked, seed, first, begun, count, shares]
     launch_rows(make_trace_paths_kernel(trace), rays.shape, inputs, [moments_out], rows=rows, device=rays.device)
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from tests.test_path_tracer import ABOVE, RHO, boxes, latlong_sky
 from tests.viewer_rig import Running, page_scene
+from warp_ar.accuracy import path_tracer
 from warp_ar.accuracy.path_tracer import FIRST_LIGHT_SAMPLES, PathTracer
 from warp_ar.errors import UsageError
 from warp_ar.scene import Scene
@@ -21,17 +22,18 @@ COARSE_GOAL = 0.3  # relative standard error that a few samples reach
 
 
 @pytest.mark.parametrize("known", [False, True], ids=["whole", "difference"])
-def test_slices_add_up_to_passes(known: bool, device: str) -> None:
+def test_slices_add_up_to_passes(known: bool, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Samples that were added a few rows at a time are those that were added at once, to the bit."""
+    monkeypatch.setattr(path_tracer, "FIRST_ROUND", 2)  # pixels get their shares after two passes
     frame = np.full((32, 48, 3), 0.5, np.float32) if known else None
     light_samples = FIRST_LIGHT_SAMPLES + 2
     more = {"light_samples": light_samples} if known else {"reflectances": RHO}
     tracers = [PathTracer(boxes(True), latlong_sky(), frame, ABOVE, device=device, **more) for _ in range(2)]
     passes = 0
-    while passes < 3:
+    while passes < 5:
         passes += tracers[0].sample_for(0.0)
-    assert tracers[0].samples == 3
-    tracers[1].sample(3)
+    assert tracers[0].samples == 5
+    tracers[1].sample(5)
     pictures = [tracer.picture() for tracer in tracers]
     np.testing.assert_array_equal(pictures[0].radiance, pictures[1].radiance)
     np.testing.assert_array_equal(pictures[0].error, pictures[1].error)

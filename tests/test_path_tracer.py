@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from warp_ar.accuracy import path_tracer
 from warp_ar.accuracy.path_tracer import PathTracer, TracedPicture
 from warp_ar.errors import UsageError
 from warp_ar.light.captured import CapturedEmitter, Light
@@ -290,7 +291,8 @@ def test_the_same_seed_gives_the_same_bits(device: str) -> None:
     """However many samples are added at a time; another seed gives others."""
     frame = np.full((32, 48, 3), 0.5, np.float32)
     images = []
-    for seed, counts in ((3, (8,)), (3, (3, 5)), (4, (8,))):
+    # Pixels get their shares anew after 16 samples, and after 32.
+    for seed, counts in ((3, (40,)), (3, (3, 13, 5, 19)), (4, (40,))):
         tracer = PathTracer(boxes(True), latlong_sky(), frame, ABOVE, device=device, seed=seed)
         for count in counts:
             tracer.sample(count)
@@ -318,6 +320,51 @@ def test_standard_errors_are_honest(known: bool, device: str) -> None:
     assert np.median(found[noisy] / claimed[noisy]) == pytest.approx(1.0, abs=0.15)
     common = claimed < np.quantile(claimed[noisy], 0.95)
     assert found[common].sum() / claimed[common].sum() == pytest.approx(1.0, abs=0.2)
+
+
+def test_pixels_have_their_share_by_the_noise_around_them() -> None:
+    """More where neighbours are noisy; what a pixel itself gave has no say; 1 in the mean, and no pixel without."""
+    picture = np.full((60, 60, 3), 0.5, np.float32)
+    error = np.full((60, 60, 3), 0.01, np.float32)
+    error[:, 30:] = 0.04
+    samples = np.full((60, 60), 16, np.int32)
+    shares = path_tracer.sample_shares(picture, error, samples)
+    assert shares.mean() == pytest.approx(1.0, abs=1e-5)
+    assert shares[30, 50] == pytest.approx(4.0 * shares[30, 10], rel=1e-5)
+    one = error.copy()
+    one[20, 10] = 0.5
+    others = path_tracer.sample_shares(picture, one, samples)
+    assert others[20, 11] > 2.0 * others[20, 20]
+    assert others[20, 10] / others[20, 20] == pytest.approx(1.0, rel=1e-5)
+    # An error of twice as many samples is one of a greater variance; noise of what surely clips is none.
+    samples[:, 30:] *= 2
+    more = path_tracer.sample_shares(picture, error, samples)
+    assert more[30, 50] == pytest.approx(4.0 * math.sqrt(2.0) * more[30, 10], rel=1e-5)
+    picture[:, 30:] = 2.0
+    clipped = path_tracer.sample_shares(picture, error, samples)
+    assert clipped[30, 50] == clipped.min() > 0.1
+    assert (path_tracer.sample_shares(picture, np.zeros_like(error), samples) == 1.0).all()
+
+
+@pytest.mark.parametrize("known", [False, True], ids=["whole", "difference"])
+def test_uneven_samples_are_no_bias(known: bool, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Means over blocks and seeds, where pixels got their shares from 4 samples on, are those of even samples."""
+    light = latlong_sky()
+    frame = trace(boxes(False), light, ABOVE, device, reflectances=RHO, samples=64).radiance if known else None
+    more: dict[str, Any] = {} if known else {"reflectances": RHO}
+    found = {}
+    for first, seeds in ((1 << 20, range(12)), (4, range(20, 32))):
+        monkeypatch.setattr(path_tracer, "FIRST_ROUND", first)
+        pictures = [
+            trace(boxes(True), light, ABOVE, device, frame=frame, samples=32, seed=seed, **more) for seed in seeds
+        ]
+        found[first] = np.stack([p.radiance for p in pictures]).astype(np.float64).reshape(12, 4, 8, 6, 8, 3)
+    blocks = {first: radiance.mean(axis=(2, 4)) for first, radiance in found.items()}
+    spread = sum(values.var(axis=0, ddof=1) / 12 for values in blocks.values())
+    off = blocks[4].mean(axis=0) - blocks[1 << 20].mean(axis=0)
+    assert (np.abs(off) <= ERRORS * np.sqrt(spread) + 1e-6).all(), off / np.sqrt(spread)
+    everywhere = off.mean() / np.sqrt(spread.mean() / spread.size)
+    assert abs(everywhere) < ERRORS
 
 
 def test_a_difference_to_a_frame_is_the_whole_scene(device: str) -> None:

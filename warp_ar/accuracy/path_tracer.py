@@ -49,6 +49,12 @@ DFG_SIZE = 32
 """Rows and columns of the table of directional albedo."""
 BAND = 8
 """Rows that a thread takes at a time."""
+FIRST_ROUND = 16
+"""Samples per pixel after which pixels get their shares; and again whenever there are twice as many."""
+AROUND = 9
+"""Width in pixels of the square whose noise tells a pixel's share."""
+LEAST_SHARE, MOST_SHARE = 0.25, 32.0
+"""Samples of a pixel over the mean: where none has met rare light yet, it is still looked for."""
 LEAST_CHANGE = 1e-4
 """Radiance, in camera values, by which a pixel differs from the frame at least where something virtual shows in it."""
 
@@ -64,7 +70,7 @@ class TracedPicture:
     image: Image
     """The picture as the camera would have encoded it at the scene's exposure, (H, W, 3) RGB."""
     samples: int
-    """Per pixel."""
+    """Per pixel, in the mean."""
     seconds: float
     """That sampling took, from the first sample on."""
     relative_error: float
@@ -73,16 +79,40 @@ class TracedPicture:
 
 
 def _relative_error(picture: FloatImage, error: FloatImage, frame: FloatImage | None) -> float:
-    seen = np.clip(picture, 0.0, 1.0)
-    changed = np.ones(picture.shape[:2], bool)
-    if frame is not None:
-        changed = (np.abs(picture - frame) > LEAST_CHANGE).any(axis=2) | (error > LEAST_CHANGE).any(axis=2)
-    hidden = picture - error > 1.0
-    noise = np.where(hidden, 0.0, np.minimum(error, 1.0))[changed].astype(np.float64)
-    signal = seen[changed].astype(np.float64)
+    changed = _changed(picture, error, frame)
+    noise = _seen_noise(picture, error)[changed]
+    signal = np.clip(picture, 0.0, 1.0)[changed].astype(np.float64)
     if not signal.size or not signal.any():
         return 0.0
     return float(np.sqrt((noise**2).mean() / (signal**2).mean()))
+
+
+def _changed(picture: FloatImage, error: FloatImage, frame: FloatImage | None) -> npt.NDArray[np.bool_]:
+    """Pixels that virtual things change, (H, W)."""
+    if frame is None:
+        return np.ones(picture.shape[:2], bool)
+    return np.asarray((np.abs(picture - frame) > LEAST_CHANGE).any(axis=2) | (error > LEAST_CHANGE).any(axis=2))
+
+
+def _seen_noise(picture: FloatImage, error: FloatImage) -> npt.NDArray[np.float64]:
+    """Standard error as far as it can be seen: not in what surely clips, (H, W, 3)."""
+    return np.where(picture - error > 1.0, 0.0, np.minimum(error, 1.0)).astype(np.float64)
+
+
+# With n_i of N samples in pixel i the variance of the picture is the sum of v_i / n_i, least where n_i grows as the
+# root of v_i, the variance of one sample. It is that of the neighbours' samples: what the pixel's own gave has no say
+# in how many more it gets, for the mean of samples that go on until a bright one came would be biased.
+def sample_shares(picture: FloatImage, error: FloatImage, samples: npt.NDArray[np.int32]) -> FloatImage:
+    """Samples of each pixel in a pass, 1 in the mean, by the noise of the pixels around it, (H, W)."""
+    variance = (_seen_noise(picture, error) ** 2).mean(axis=2) * samples
+    others = AROUND * AROUND - 1
+    sums = cv2.boxFilter(variance, -1, (AROUND, AROUND), normalize=False, borderType=cv2.BORDER_CONSTANT)
+    deviation = np.sqrt(np.maximum(sums - variance, 0.0) / others)
+    mean = deviation.mean()
+    if not mean > 0.0:
+        return np.ones(variance.shape, np.float32)
+    shares = np.clip(deviation / mean, LEAST_SHARE, MOST_SHARE)
+    return np.asarray(shares / shares.mean(), np.float32)
 
 
 class PathTracer:
@@ -139,6 +169,8 @@ class PathTracer:
         self._seconds = 0.0
         self._parts: Iterator[bool] | None = None
         self._compiled = False
+        self._passes = 0
+        """Made with the shares that are there."""
         self._prepared = frame is None
         self._linear = None if frame is None else _linear_frame(frame, self.camera)
         self._trace = trace_config(scene)
@@ -155,6 +187,7 @@ class PathTracer:
         """Moments of no samples, and what a picture of them is written to."""
         shape = (self.camera.height, self.camera.width)
         self._moments = make_moments(shape, self.device)
+        self._shares = wp.ones(shape, dtype=wp.float32, device=self.device)
         self._radiance = wp.zeros(shape, dtype=wp.vec3, device=self.device)
         self._error = wp.zeros(shape, dtype=wp.vec3, device=self.device)
         self._image = wp.zeros(shape, dtype=wp.vec3ub, device=self.device)
@@ -213,25 +246,30 @@ class PathTracer:
         values = np.asarray(reflectances, np.float32).reshape(count, 3)
         self._local.proxy_reflectance = wp.array(values, dtype=wp.vec3, device=self.device)
 
-    def _add(self, asked: int, done: int, count: int, first: int) -> None:
-        """Add samples to the moments, on CPU by as many threads as there are cores."""
+    def _trace_rows(self, asked: int, first: int, count: int, rows: Rows | None) -> None:
+        """Add the samples of some passes; ``first`` is the number of the moments' first one."""
+        path_tracer.trace_paths(
+            self._trace, self._params, self._local, self._moments,
+            asked=asked, seed=self.seed, first=first, begun=self._passes, count=count, shares=self._shares, rows=rows,
+        )  # fmt: skip
+
+    def _add(self, asked: int, count: int, first: int) -> None:
+        """Make so many passes, on CPU by as many threads as there are cores."""
 
         def trace(rows: Rows | None) -> None:
-            path_tracer.trace_paths(
-                self._trace, self._params, self._local, self._moments,
-                asked=asked, seed=self.seed, first=first, done=done, count=count, rows=rows,
-            )  # fmt: skip
+            self._trace_rows(asked, first, count, rows)
 
         if not self.device.is_cpu:
             with translating(self.device), wp.ScopedDevice(self.device):
                 trace(None)
-            return
-        height = self.camera.height
-        bands = [(row, min(row + BAND, height)) for row in range(0, height, BAND)]
-        with translating(self.device):
-            trace(bands[0])  # compiles, before threads would each do so
-        with ThreadPoolExecutor(usable_cores(), "warp_ar-paths") as pool:
-            list(pool.map(trace, bands[1:]))
+        else:
+            height = self.camera.height
+            bands = [(row, min(row + BAND, height)) for row in range(0, height, BAND)]
+            with translating(self.device):
+                trace(bands[0])  # compiles, before threads would each do so
+            with ThreadPoolExecutor(usable_cores(), "warp_ar-paths") as pool:
+                list(pool.map(trace, bands[1:]))
+        self._passes += count
 
     def prepare(self) -> None:
         """Find the reflectance of proxies; ``sample`` does it where it was not done."""
@@ -242,7 +280,7 @@ class PathTracer:
             path_tracer.find_shown(self._trace, self._params, self._local, self._local.shown)
         done = 0
         for count in self._light_counts():
-            self._add(path_tracer.IRRADIANCE, 0, count, done)
+            self._add(path_tracer.IRRADIANCE, count, done)
             done += count
             with translating(self.device), wp.ScopedDevice(self.device):
                 self._map_reflectance()
@@ -261,9 +299,27 @@ class PathTracer:
         ]
         self._set_reflectances(means)
         self._moments = make_moments(shown.shape, self.device)
+        self._passes = 0
+
+    def _share(self) -> None:
+        """Give pixels their shares anew wherever there are ``FIRST_ROUND`` samples, twice as many, and so on."""
+        rounds, rest = divmod(self.samples, FIRST_ROUND)
+        if rest or not rounds or rounds & (rounds - 1):
+            return
+        with exclusive(self.device), wp.ScopedDevice(self.device):
+            self._finish()
+            found = (np.array(a.numpy()) for a in (self._radiance, self._error, self._moments.samples))
+            self._shares = wp.array(sample_shares(*found), dtype=wp.float32, device=self.device)
+        self._passes = 0
+
+    def _finish(self) -> None:
+        """Write picture and error of the samples so far."""
+        finish_picture(
+            self._local, self._moments, self._encode, self._radiance, self._error, self._image, exposure=self.exposure
+        )
 
     def sample(self, count: int) -> None:
-        """Add ``count`` samples to every pixel.
+        """Add ``count`` samples per pixel: in the mean, from ``FIRST_ROUND`` on more where neighbours are noisy.
 
         Raises:
             UsageError: The count is not positive.
@@ -273,10 +329,17 @@ class PathTracer:
         self.prepare()
         start = time.perf_counter()
         asked = path_tracer.WHOLE if self._linear is None else path_tracer.DIFFERENCE
-        self._add(asked, self.samples, count, self.light_samples + self.samples)
+        end = self.samples + count
+        while self.samples < end:
+            self._share()
+            ahead = FIRST_ROUND
+            while ahead <= self.samples:
+                ahead *= 2
+            step = min(end, ahead) - self.samples
+            self._add(asked, step, self.light_samples)
+            self.samples += step
         with exclusive(self.device):
             wp.synchronize_device(self.device)
-        self.samples += count
         self._seconds += time.perf_counter() - start
 
     def sample_for(self, seconds: float) -> bool:
@@ -303,8 +366,8 @@ class PathTracer:
                 path_tracer.find_shown(self._trace, self._params, self._local, self._local.shown)
             first = 0
             for count in self._light_counts():
-                for k in range(count):
-                    for _ in self._pass(path_tracer.IRRADIANCE, k, first + k):
+                for _k in range(count):
+                    for _ in self._pass(path_tracer.IRRADIANCE, first):
                         yield False
                 first += count
                 with translating(self.device), wp.ScopedDevice(self.device):
@@ -312,24 +375,23 @@ class PathTracer:
             self._prepared = True
         asked = path_tracer.WHOLE if self._linear is None else path_tracer.DIFFERENCE
         while True:
-            for _ in self._pass(asked, self.samples, self.light_samples + self.samples):
+            self._share()
+            for _ in self._pass(asked, self.light_samples):
                 yield False
             self.samples += 1
             yield True
 
-    def _pass(self, asked: int, done: int, number: int) -> Iterator[None]:
-        """Add one sample to every pixel: on CPU a band of rows for each core at a time, on CUDA all at once."""
+    def _pass(self, asked: int, first: int) -> Iterator[None]:
+        """Make one pass: on CPU a band of rows for each core at a time, on CUDA all at once."""
 
         def trace(rows: Rows | None) -> None:
-            path_tracer.trace_paths(
-                self._trace, self._params, self._local, self._moments,
-                asked=asked, seed=self.seed, first=number, done=done, count=1, rows=rows,
-            )  # fmt: skip
+            self._trace_rows(asked, first, 1, rows)
 
         if not self.device.is_cpu:
             with exclusive(self.device), wp.ScopedDevice(self.device):
                 trace(None)
                 wp.synchronize_device(self.device)
+            self._passes += 1
             yield
             return
         height, cores = self.camera.height, usable_cores()
@@ -343,6 +405,7 @@ class PathTracer:
             with ThreadPoolExecutor(cores, "warp_ar-paths") as pool:
                 list(pool.map(trace, bands[start : start + cores]))
             yield
+        self._passes += 1
 
     def picture(self) -> TracedPicture:
         """What the samples so far give.
@@ -353,10 +416,7 @@ class PathTracer:
         if self.samples < 1:
             raise UsageError("no samples yet: call sample() first")
         with exclusive(self.device):
-            finish_picture(
-                self._local, self._moments, self.samples, self._encode, self._radiance, self._error, self._image,
-                exposure=self.exposure,
-            )  # fmt: skip
+            self._finish()
             radiance, error, image = (np.array(a.numpy()) for a in (self._radiance, self._error, self._image))
         relative = _relative_error(radiance, error, self._linear)
         return TracedPicture(radiance, error, image, self.samples, self._seconds, relative)
