@@ -40,13 +40,13 @@ def hurry_compilers(device: str) -> None:
     import warp as wp
 
     from warp_ar.device import start_warp
-    from warp_ar.engine.modules import drop_unused_adjoints, parse_headers_ahead, remember_references
+    from warp_ar.engine.modules import parse_headers_ahead
     from warp_ar.engine.nvrtc import compile_beside
     from warp_ar.engine.tiers import begin_quickly
+    from warp_ar.engine.translation import take_shortcuts
 
     start_warp()
-    remember_references()
-    drop_unused_adjoints()
+    take_shortcuts()
     begin_quickly()
     compile_beside()
     if device == "cpu" or not wp.is_cuda_available():

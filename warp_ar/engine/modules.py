@@ -11,11 +11,9 @@ from __future__ import annotations
 
 import atexit
 import contextlib
-import functools
 import hashlib
 import os
 import shutil
-import sys
 import tempfile
 import threading
 import time
@@ -103,51 +101,6 @@ def parse_headers_ahead() -> None:
     # No daemon: a process that ends sooner waits, so that no files are left.
     _AHEAD.append(threading.Thread(target=headers.parse, args=(build,), name="warp_ar-headers"))
     _AHEAD[-1].start()
-
-
-def remember_references() -> None:
-    """Have Warp look for what a function of this package refers to once, not again for each kernel that calls it.
-
-    That is half of what it takes to find a kernel in the cache. For commands alone, whose process changes no function
-    and no constant once a module is imported. Where this Warp looks in another way, nothing changes.
-    """
-    adjoint = getattr(getattr(getattr(wp, "_src", None), "codegen", None), "Adjoint", None)
-    find = getattr(adjoint, "get_references", None)
-    if adjoint is None or find is None or hasattr(find, "__wrapped__"):
-        return
-
-    @functools.wraps(find)
-    def get_references(adj: Any) -> Any:
-        kept = adj.__dict__.get("_warp_ar_references")
-        if kept is not None:
-            return kept
-        found = find(adj)
-        home = sys.modules.get(adj.func.__module__)
-        # While a module is imported, a function may name one that comes below it.
-        if home is not None and _is_own(home) and not getattr(home.__spec__, "_initializing", False):
-            adj._warp_ar_references = found
-        return found
-
-    adjoint.get_references = get_references
-
-
-def drop_unused_adjoints() -> None:
-    """Have Warp write the sums and adjoints of structs so that Clang leaves out those that a module does not call.
-
-    As Warp writes them, other modules could call them, though none does: for each struct of each module Clang makes an
-    atomic sum of all its fields, though no kernel here has an adjoint. For commands alone: it changes Warp's own text,
-    not what modules are named by, and where this Warp writes structs otherwise nothing changes.
-    """
-    codegen: Any = getattr(getattr(wp, "_src", None), "codegen", None)
-    template = getattr(codegen, "struct_template", None)
-    if isinstance(template, str):
-        for function in ("{name} add(", "void adj_atomic_add("):
-            template = template.replace(f"\nCUDA_CALLABLE {function}", f"\ninline CUDA_CALLABLE {function}")
-        codegen.struct_template = template
-
-
-def _is_own(module: Any) -> bool:
-    return str(module.__name__).startswith("warp_ar.")
 
 
 def _compile(variants: list[tuple[Any, int | None]], device: Any, progress: Progress | None) -> None:
