@@ -21,6 +21,7 @@ import multiprocessing
 import random
 import shutil
 import statistics
+import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -220,7 +221,7 @@ def digest_in_order(jobs: Path, folder: Path, device: str, frames: int) -> list[
                 digests.append(waiting.popleft().result())
             if lit.frame.index % TELL_FRAMES == TELL_FRAMES - 1:
                 rate = (lit.frame.index + 1) / (time.monotonic() - start)
-                print(f"one run: {lit.frame.index + 1} frames, {rate:.1f} a second", flush=True)
+                print(f"one run: {lit.frame.index + 1} frames, {rate:.1f} a second", file=sys.stderr, flush=True)
         digests += [task.result() for task in waiting]
     return digests
 
