@@ -21,6 +21,7 @@ import multiprocessing
 import random
 import shutil
 import statistics
+import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -43,6 +44,8 @@ from warp_ar.farm.lighting import Lighter
 from warp_ar.farm.work import digest_of
 
 SEGMENTS = 8
+LEAST_SECONDS = 120.0
+"""That segments have where all phases share some minutes."""
 EDGE = 24
 """Frames from a segment's begin on that are taken for its beginning."""
 CONVERTERS = 4
@@ -158,7 +161,7 @@ def _light_segments(bench: Bench, frames: int) -> None:
         dice,
         note,
     )
-    runs = work_with_deaths(bench, deaths, SEGMENTS, bench.left)
+    runs = work_with_deaths(bench, deaths, SEGMENTS, bench.left if options.phases else max(bench.left, LEAST_SECONDS))
     _tell_run(bench, folder, runs, [json.loads(line) for line in noted.read_text().splitlines()])
 
 
@@ -220,13 +223,13 @@ def digest_in_order(jobs: Path, folder: Path, device: str, frames: int) -> list[
                 digests.append(waiting.popleft().result())
             if lit.frame.index % TELL_FRAMES == TELL_FRAMES - 1:
                 rate = (lit.frame.index + 1) / (time.monotonic() - start)
-                print(f"one run: {lit.frame.index + 1} frames, {rate:.1f} a second", flush=True)
+                print(f"one run: {lit.frame.index + 1} frames, {rate:.1f} a second", file=sys.stderr, flush=True)
         digests += [task.result() for task in waiting]
     return digests
 
 
 def _check(bench: Bench, frames: int) -> None:
-    """Phase ``check``."""
+    """Phase ``check``; pictures of a run that is not whole yet are not compared."""
     folder, length = bench.folder / "long-run", _length(bench)
     lines = lines_of_jobs(folder)
     wanted = {"long/survey", "long/join", *(f"long/segment-{number:06d}" for number in range(SEGMENTS))}
@@ -245,8 +248,8 @@ def _check(bench: Bench, frames: int) -> None:
         pictures=len(own),
         of_one_run=len(one),
         asked=length,
-        unlike=len(unlike),
-        first_unlike=unlike[:10],
+        unlike=len(unlike) if own and one else None,
+        first_unlike=unlike[:10] if own and one else None,
         different_pictures=len(set(own)),
     )
     if (folder / "long.mp4").is_file():

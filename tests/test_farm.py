@@ -13,12 +13,16 @@ import signal
 import subprocess
 import sys
 import time
+import types
 
 import av
 import pytest
 
 from tests.farm_rig import TICK, write_recording
+from warp_ar.farm import cli
 from warp_ar.farm.cli import main
+from warp_ar.farm.driver import Driver
+from warp_ar.farm.manifest import RunError
 from warp_ar.farm.status import read_status
 
 TICKS = [0, 25, 40, 75, 100, 101, 150, 175, 230, 250, 275, 300]
@@ -238,6 +242,19 @@ def test_a_run_of_another_program_is_not_gone_on_with(tmp_path, capsys):
     (run / "run.json").write_text(json.dumps({"version": "warp_ar 0.0", "jobs": {"clip": []}}))
     assert main(["resume", str(run)]) == 2
     assert "was begun by warp_ar 0.0; this is warp_ar" in capsys.readouterr().err
+
+
+def test_what_killed_workers_left_is_gone_when_a_run_ends(finished, monkeypatch):
+    run = finished[0]
+
+    def work(self):
+        (run / ".aside/good.segment-000000.1").mkdir(parents=True)
+        raise RunError("the disk is full")
+
+    monkeypatch.setattr(cli, "_make_pool", lambda options, jobs, folder: types.SimpleNamespace(size=0, names=()))
+    monkeypatch.setattr(Driver, "run", work)
+    assert main(["resume", str(run)]) == 1
+    assert not (run / ".aside").exists()
 
 
 def test_the_same_on_a_local_ray_of_two_nodes(folder, finished):
