@@ -39,6 +39,18 @@ def _enter(box, origin, direction):
     return np.where(hit, enters, np.inf), axis, o + np.where(hit, enters, 0.0)[..., None] * d
 
 
+def _distance(box, origin, direction):
+    """As ``_enter``, the distance alone: most rays miss the sphere around the box, and need not be asked further."""
+    to = np.array(box.at) - origin
+    along = np.einsum("...k,...k", to, direction)
+    aside = np.einsum("...k,...k", to, to) - along**2
+    radius = 1.01 * np.linalg.norm(box.size) / 2
+    near = (aside < radius**2) & (along > -radius)
+    found = np.full(near.shape, np.inf)
+    found[near] = _enter(box, origin[near], direction[near])[0]
+    return found
+
+
 def _print(rng, box, axis, local):
     """Linear RGB of a box's faces: a colour, with a band and some lines of another on each."""
     color = rng.uniform(0.04, 0.6, 3)
@@ -83,7 +95,7 @@ def photograph_boxes(boxes: list[Proxy], camera: Camera, pose: Pose, seed: int, 
         color, on = np.where(first[..., None], painted, color), np.where(first, number, on)
     turn, tilt = rng.uniform(0, 2 * np.pi), rng.uniform(0.5, 1.2)
     lamp = 1.2 * np.array([np.cos(tilt) * np.cos(turn), np.cos(tilt) * np.sin(turn), np.sin(tilt)])
-    lit = np.zeros(nearest.shape)
+    lit, outside = np.zeros(nearest.shape), points + 1e-5 * normal
     # Some points of a lamp as large as a hand: its shadows are soft.
     for spot in lamp + rng.normal(0, 0.04, (6, 3)):
         way = spot - points
@@ -91,8 +103,7 @@ def photograph_boxes(boxes: list[Proxy], camera: Camera, pose: Pose, seed: int, 
         way = way / far[..., None]
         seen = np.ones(nearest.shape, bool)
         for number, box in enumerate(boxes):
-            hidden, _, _ = _enter(box, points + 1e-5 * normal, way)
-            seen &= (on == number) | (hidden > far)
+            seen &= (on == number) | (_distance(box, outside, way) > far)
         lit += seen * np.clip((way * normal).sum(-1), 0, None) / 6
     light = rng.uniform(0.25, 0.5) * (0.75 + 0.25 * normal[..., 2]) + lit
     linear = (color * light[..., None]).reshape(height, ACROSS, width, ACROSS, 3).mean((1, 3)) * exposure

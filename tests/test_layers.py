@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import graphlib
 import pathlib
 import tomllib
 
@@ -49,6 +50,15 @@ def test_no_stage_imports_another() -> None:
 )
 def test_an_import_of_a_stage_is_found(line: str) -> None:
     assert imported(line) & MODULES == {"warp_ar.stages.unwrap"}
+
+
+@pytest.mark.parametrize("folder", ["bench", "scenes", "tests"])
+def test_no_two_files_beside_the_package_import_each_other(folder: str) -> None:
+    """``lint-imports`` looks after the package alone."""
+    files = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in (ROOT / folder).rglob("*.py")}
+    graph = {name: imported(path.read_text(encoding="utf-8")) & files.keys() - {name} for name, path in files.items()}
+    assert len(graph) > 5
+    graphlib.TopologicalSorter(graph).prepare()
 
 
 def test_a_stage_has_a_file_of_its_name() -> None:

@@ -147,9 +147,18 @@ def measure_case(
     qualities = {name: PRESETS[name] for name in presets or RUNS}
     if is_complete(case, settings) and "paper" in qualities:
         qualities |= _find_equals(case, device, settings, rows, reference, clock, advance, quick=quick)
-    times, images = run_in_turn(case, qualities, device, clock)
+    wholes = _run_wholes(case, qualities, reference, device, clock)
     advance(f"{case.name}: presets", len(presets or RUNS))
-    wholes = tuple(
+    index = case.shown[-1]
+    return CaseReport(case, reference, tuple(rows), pictures, wholes, region_of(case, index, reference[index]))
+
+
+def _run_wholes(
+    case: Case, qualities: Mapping[str, Quality], reference: Mapping[int, Image], device: str, clock: Clock
+) -> tuple[Whole, ...]:
+    """Cost and error of whole pictures by several qualities, whose frames are run in turn."""
+    times, images = run_in_turn(case, qualities, device, clock)
+    return tuple(
         Whole(
             label,
             statistics.fmean(times[label]),
@@ -162,8 +171,6 @@ def measure_case(
         )
         for label, quality in qualities.items()
     )
-    index = case.shown[-1]
-    return CaseReport(case, reference, tuple(rows), pictures, wholes, region_of(case, index, reference[index]))
 
 
 def _best_images(case: Case, device: str, advance: Advance, *, quick: bool) -> Mapping[int, Image]:
