@@ -54,7 +54,7 @@ def make_parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("scene", nargs="?", default="desk", metavar="SCENE", help="a scene file, or a bundled scene's name")
     add("--frame", type=int, default=0, metavar="N", help="which frame, from 0; those before it bring the light")
-    text = "paths per pixel, at most (default: %(default)s)"
+    text = "paths per pixel in the mean, at most (default: %(default)s)"
     add("--samples", type=int, default=DEFAULT_SAMPLES, metavar="N", help=text)
     text = "stop at this relative standard error of what virtual objects and lights change, such as 0.01"
     add("--error", type=float, metavar="E", help=text)
