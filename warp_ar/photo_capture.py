@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import UsageError
-from warp_ar.input.ball_finder import BallOutline, far_camera, find_ball, sphere_of_circle
+from warp_ar.input.ball_finder import CERTAIN, BallOutline, far_camera, find_ball, sphere_of_circle
 from warp_ar.input.bracket import MOVED, Aligned, Circle, agree_exposures, align, thin_exposures
 from warp_ar.input.check_ball import DULL, disc_contrast
 from warp_ar.input.photographs import Photograph, exposures_by_exif, exposures_by_name, read_photograph
@@ -21,6 +21,7 @@ from warp_ar.input.response import write_response
 from warp_ar.input.support import Support
 from warp_ar.light.captured import Light, find_emitters, texel_solid_angles
 from warp_ar.scene import Camera, Pose, Probe, Scene
+from warp_ar.scene.exif import FULL_FRAME_DIAGONAL
 from warp_ar.scene.pose_file import pose_of_position
 from warp_ar.stages.quality import PRESETS
 
@@ -33,6 +34,8 @@ WINDOW = 1.25
 """Half side, in radii, of the part of a photograph that is unwrapped."""
 LARGEST = 560.0
 """Pixels of a ball's radius beyond which photographs are reduced: the map has no use for more."""
+NEAR = 0.08
+"""Share of the radius by which the ball lies elsewhere in another photograph of a bracket, at most."""
 BRACKET_ERROR = 0.05
 """Relative error of merged radiance: what a response that was estimated or assumed leaves."""
 
@@ -49,6 +52,8 @@ class Capture:
     """That photograph."""
     camera: Camera
     """Of that photograph."""
+    picture: Image
+    """That photograph, uint8 RGB, upright."""
     support: Support | None
     """The plane that the ball stands on, where it was asked for."""
     notes: tuple[str, ...]
@@ -77,7 +82,7 @@ def capture_light(
         exposures: Seconds of each photograph, instead of what EXIF or names say.
         shown: Which photograph's camera values the light is in; None: the one whose ball is best exposed.
         transfer: Response that is tried first.
-        focal_35mm: Focal length for a full frame in millimetres; None: by EXIF.
+        focal_35mm: Focal length for a full frame in millimetres, of the picture as it is; None: by EXIF.
         support: Finds the plane that the ball stands on, whose axes the light then has; None: a level camera's.
         reflectance: Of the ball.
         device: ``auto``, ``cpu`` or ``cuda:N``.
@@ -96,9 +101,14 @@ def capture_light(
         raise UsageError(f"shown = {shown}: expected the number of a photograph, 0 to {len(photos) - 1}")
     reference = photos[shown] if shown is not None else photos[_best_exposed(photos)]
     camera, notes = _camera_of(reference, transfer, focal_35mm)
-    outline = find_ball(reference.image, camera, ball)
+    outline = _find_outline(photos, reference, camera, ball)
     bracket = _merge_plan(photos, reference, outline, transfer, exposures)
     notes += [*bracket.notes, _describe_outline(outline)]
+    if outline.evidence < CERTAIN:
+        notes.append(
+            "this outline is doubtful: look at it (--outline FILE draws it), and give a rough circle (--ball) if it is "
+            "wrong"
+        )
     if disc_contrast(reference.image, (*outline.center, outline.radius)) < DULL:
         notes.append("where the ball is found, the picture is flat: is a ball there, uncovered and polished?")
     found = None if support is None else support(outline, camera)
@@ -108,7 +118,7 @@ def capture_light(
         notes.append(f"the support's normal is known within {found.tilt_deviation:.1f} degrees")
     light, more = _unwrap(bracket, reference, camera, outline, turn, reflectance, device, height)
     light = dataclasses.replace(light, exposure=reference.info.exposure)
-    return Capture(light, outline, reference.path, camera, found, (*notes, *more))
+    return Capture(light, outline, reference.path, camera, reference.image, found, (*notes, *more))
 
 
 def _best_exposed(photos: Sequence[Photograph]) -> int:
@@ -123,15 +133,36 @@ def _best_exposed(photos: Sequence[Photograph]) -> int:
 
 
 def _camera_of(photo: Photograph, transfer: str, focal_35mm: float | None) -> tuple[Camera, list[str]]:
-    info = (
-        photo.info if focal_35mm is None else dataclasses.replace(photo.info, focal_35mm=focal_35mm, focal_pixels=None)
-    )
+    """The photograph's camera, and what is to be said of it."""
+    info = photo.info
+    width, height = info.width, info.height
+    if focal_35mm is not None:
+        # Of the picture as it is, cut or not: who gives it has the angle of view in mind.
+        focal = focal_35mm / FULL_FRAME_DIAGONAL * math.hypot(width, height)
+        return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2, transfer=transfer), []
     camera = info.camera(transfer)
     if camera is not None:
         return camera, []
-    why = "has no focal length in its EXIF" if info.is_whole else "was cut, so that EXIF's focal length says nothing"
+    told = info.focal_35mm is not None or info.focal_pixels is not None
+    why = "was cut, so that EXIF's focal length says nothing" if told else "has no focal length in its EXIF"
     note = f"{photo.name} {why}: the ball is taken to be far away (--focal-35mm tells otherwise)"
-    return dataclasses.replace(far_camera(info.width, info.height), transfer=transfer), [note]
+    return dataclasses.replace(far_camera(width, height), transfer=transfer), [note]
+
+
+def _find_outline(
+    photos: Sequence[Photograph], reference: Photograph, camera: Camera, ball: Sequence[float] | None
+) -> BallOutline:
+    """The ball in the shown photograph; where that is none of the best exposed, near where that one has it."""
+    clearest = photos[_best_exposed(photos)]
+    if ball is not None or clearest is reference or clearest.image.shape != reference.image.shape:
+        return find_ball(reference.image, camera, ball)
+    seen = find_ball(clearest.image, camera)
+    try:
+        own = find_ball(reference.image, camera, (*seen.center, seen.radius), NEAR)
+    except UsageError:
+        # Too dark or too bright to see a rim: it is laid over the others by what it mirrors.
+        return seen
+    return dataclasses.replace(own, evidence=seen.evidence)
 
 
 def _describe_outline(outline: BallOutline) -> str:
