@@ -61,6 +61,7 @@ def test_a_bracket_becomes_light_and_a_picture(bracket, tmp_path, capsys):
     assert scene.captured.file == tmp_path / "light.exr"
     shown = ["--headless", "--device", "cpu", "--output", str(tmp_path / "out")]
     assert live([str(tmp_path / "new" / "photo.toml"), *shown]) == EXIT_DONE
+    assert "must be in the picture" not in capsys.readouterr().err  # which speaks of a card that nobody has
     picture = cv2.imread(str(tmp_path / "out" / "0000.png"))[..., ::-1]
     # The virtual mirror ball stands three radii to the right of the real one and shows nearly the same environment.
     real, virtual = (project([dx, 0.0, 0.04]) for dx in (0.0, 0.12))
@@ -136,6 +137,13 @@ def test_lying_exposures_end_the_command(tmp_path, capsys):
     assert not (tmp_path / "light.exr").exists()
     given = ["--exposures", *(f"1/{d}" for d in BRACKET[:4])]
     assert main([*map(str, photos), *given, "--output", str(tmp_path / "light.exr"), "--device", "cpu"]) == EXIT_DONE
+    capsys.readouterr()
+    # Who does not know the true ones lets the pictures tell: the same light, for these have sRGB's response.
+    told = ["--exposures", "pixels", "--output", str(tmp_path / "pixels.exr"), "--device", "cpu"]
+    assert main([*map(str, photos), *told]) == EXIT_DONE
+    assert "exposures are from the pixels alone" in capsys.readouterr().err
+    first, second = (irradiance(Light.load(tmp_path / f"{name}.exr").radiance) for name in ("light", "pixels"))
+    assert np.linalg.norm(second - first) / np.linalg.norm(first) < 0.05
 
 
 def test_a_moved_photograph_is_left_out_and_said(tmp_path):
@@ -154,6 +162,7 @@ def test_a_moved_photograph_is_left_out_and_said(tmp_path):
         (["--shown", "nothing.jpg"], "expected one of the photographs"),
         (["--reflectance", "1.5"], "0.01 to 1"),
         (["--exposures", "0.1", "0.2"], "expected one for each"),
+        (["--exposures", "pixels", "0.2"], "stands alone"),
     ],
 )
 def test_bad_usage_is_one_line(bracket, tmp_path, capsys, arguments, message):

@@ -22,7 +22,7 @@ from warp_ar.input.ball_finder import BallOutline
 from warp_ar.input.support import Support, plane_from_contact, plane_from_rectangle
 from warp_ar.output.places import check_places, check_replaceable
 from warp_ar.output.sink import make_folder
-from warp_ar.photo_capture import Capture, capture_light
+from warp_ar.photo_capture import PIXELS, Capture, capture_light
 from warp_ar.scene import (
     Camera,
     CapturedLight,
@@ -48,6 +48,10 @@ def _seconds(text: str) -> float:
     return value
 
 
+def _exposure(text: str) -> float | str:
+    return PIXELS if text == PIXELS else _seconds(text)
+
+
 def make_parser() -> argparse.ArgumentParser:
     """The command's options."""
     parser = Parser(
@@ -66,7 +70,10 @@ def make_parser() -> argparse.ArgumentParser:
     add(
         "--outline", type=Path, metavar="FILE.png", help="also write the shown photograph with the ball's outline on it"
     )
-    add("--exposures", type=_seconds, nargs="+", metavar="S", help="seconds of each photograph, not what EXIF says")
+    add(
+        "--exposures", type=_exposure, nargs="+", metavar="S",
+        help="seconds of each photograph, not what EXIF says; pixels: what the pictures themselves tell",
+    )  # fmt: skip
     add("--shown", type=Path, metavar="PHOTO", help="whose camera values the light is in (default: the best exposed)")
     add(
         "--transfer",
@@ -110,7 +117,11 @@ def _check(options: argparse.Namespace) -> None:
         raise UsageError("--scene needs the plane: give --rectangle and --rectangle-size, or --contact")
     if options.shown is not None and options.shown not in options.photos:
         raise UsageError(f"--shown {options.shown}: expected one of the photographs")
-    if options.exposures is not None and len(options.exposures) != len(options.photos):
+    if options.exposures == [PIXELS]:
+        options.exposures = PIXELS
+    elif options.exposures is not None and PIXELS in options.exposures:
+        raise UsageError(f"--exposures {PIXELS} stands alone; expected no seconds beside it")
+    elif options.exposures is not None and len(options.exposures) != len(options.photos):
         number = _count(len(options.photos), "photograph")
         raise UsageError(f"{_count(len(options.exposures), 'exposure')} for {number}; expected one for each")
     if not 0.01 <= options.reflectance <= 1.0:

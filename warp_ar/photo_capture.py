@@ -7,6 +7,7 @@ import math
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,8 @@ from warp_ar.stages.quality import PRESETS
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
+PIXELS: Final = "pixels"
+"""In the place of exposures: what the pictures themselves tell."""
 HEIGHT = 128
 """Rows of the environment."""
 WINDOW = 1.25
@@ -64,7 +67,7 @@ def capture_light(
     paths: Sequence[str | Path],
     *,
     ball: Sequence[float] | None = None,
-    exposures: Sequence[float] | None = None,
+    exposures: Sequence[float] | Literal["pixels"] | None = None,
     shown: int | None = None,
     transfer: str = "srgb",
     focal_35mm: float | None = None,
@@ -79,7 +82,8 @@ def capture_light(
         paths: Photographs of the ball, from one place, at one or more exposures.
         ball: Column, row and radius in pixels of a rough circle around the ball in the shown photograph; None: look
             for it.
-        exposures: Seconds of each photograph, instead of what EXIF or names say.
+        exposures: Seconds of each photograph, instead of what EXIF or names say; ``pixels``: by the pictures alone,
+            under ``transfer``.
         shown: Which photograph's camera values the light is in; None: the one whose ball is best exposed.
         transfer: Response that is tried first.
         focal_35mm: Focal length for a full frame in millimetres, of the picture as it is; None: by EXIF.
@@ -95,7 +99,7 @@ def capture_light(
     if not paths:
         raise UsageError("no photographs; expected one or more of a mirror ball")
     photos = [read_photograph(path) for path in paths]
-    if exposures is not None and len(exposures) != len(photos):
+    if exposures is not None and not isinstance(exposures, str) and len(exposures) != len(photos):
         raise UsageError(f"{len(exposures)} exposures for {len(photos)} photographs; expected one for each")
     if shown is not None and not 0 <= shown < len(photos):
         raise UsageError(f"shown = {shown}: expected the number of a photograph, 0 to {len(photos) - 1}")
@@ -154,15 +158,24 @@ def _find_outline(
 ) -> BallOutline:
     """The ball in the shown photograph; where that is none of the best exposed, near where that one has it."""
     clearest = photos[_best_exposed(photos)]
-    if ball is not None or clearest is reference or clearest.image.shape != reference.image.shape:
+    if ball is not None or clearest is reference:
         return find_ball(reference.image, camera, ball)
-    seen = find_ball(clearest.image, camera)
+    seen = find_ball(clearest.image)
+    rough = _same_place((*seen.center, seen.radius), clearest.image, reference.image)
     try:
-        own = find_ball(reference.image, camera, (*seen.center, seen.radius), NEAR)
+        own = find_ball(reference.image, camera, rough, NEAR)
     except UsageError:
         # Too dark or too bright to see a rim: it is laid over the others by what it mirrors.
-        return seen
+        x, y, z = map(float, sphere_of_circle(camera, *rough))
+        axes = (rough[2] / seen.radius * seen.axes[0], rough[2] / seen.radius * seen.axes[1])
+        own = dataclasses.replace(seen, center=rough[:2], axes=axes, sphere=(x, y, z))
     return dataclasses.replace(own, evidence=seen.evidence)
+
+
+def _same_place(circle: Circle, of: Image, other: Image) -> Circle:
+    """Where a ball is in a picture of another size: cut differently around it, at about the same share."""
+    sy, sx = other.shape[0] / of.shape[0], other.shape[1] / of.shape[1]
+    return (circle[0] + 0.5) * sx - 0.5, (circle[1] + 0.5) * sy - 0.5, circle[2] * math.sqrt(sx * sy)
 
 
 def _describe_outline(outline: BallOutline) -> str:
@@ -189,14 +202,15 @@ def _merge_plan(
     reference: Photograph,
     outline: BallOutline,
     transfer: str,
-    given: Sequence[float] | None,
+    given: Sequence[float] | Literal["pixels"] | None,
 ) -> _Bracket:
     """Which photographs to merge, where the ball is in them, and their exposures."""
     circle = (*outline.center, outline.radius)
     if len(photos) == 1:
         return _Bracket((reference,), (circle,), (1.0,), None, ())
-    exif, names = exposures_by_exif(photos), exposures_by_name(photos)
-    claims = {"given": given, "exif": exif, "names": names}
+    claims: dict[str, Sequence[float] | None] = {"given": None, "exif": None, "names": None}
+    if not isinstance(given, str):
+        claims = {"given": given, "exif": exposures_by_exif(photos), "names": exposures_by_name(photos)}
     # Brightness tells the order even where claims contradict each other.
     order = sorted(range(len(photos)), key=lambda k: -float(photos[k].image[::8, ::8].mean()))
     chosen = [photos[k] for k in order]
@@ -214,7 +228,7 @@ def _merge_plan(
         [aligned.patches[k] for k in stay], transfer, picked["exif"], picked["names"], picked["given"]
     )
     first = [chosen[k] for k in stay].index(reference)
-    kept, more = thin_exposures(agreed.ratios, first)
+    kept, more = thin_exposures(agreed.ratios, first, [chosen[k].name for k in stay])
     return _Bracket(
         tuple(chosen[stay[k]] for k in kept),
         tuple(aligned.circles[stay[k]] for k in kept),
@@ -226,16 +240,11 @@ def _merge_plan(
 
 def _align_all(photos: Sequence[Photograph], reference: int, circle: Circle, times: Sequence[float] | None) -> Aligned:
     """Align outward from the reference, to both sides."""
-    h, w = photos[reference].image.shape[:2]
-
-    def rough(photo: Photograph) -> Circle:
-        """Where the ball is in a picture of another size: cut differently around it, at about the same share."""
-        sy, sx = photo.image.shape[0] / h, photo.image.shape[1] / w
-        return (circle[0] + 0.5) * sx - 0.5, (circle[1] + 0.5) * sy - 0.5, circle[2] * math.sqrt(sx * sy)
+    shown = photos[reference].image
 
     def one_way(part: slice) -> Aligned:
-        own = photos[part]
-        return align([photo.image for photo in own], [rough(photo) for photo in own], times and times[part])
+        own = [photo.image for photo in photos[part]]
+        return align(own, [_same_place(circle, shown, image) for image in own], times and times[part])
 
     down, up = one_way(slice(reference, None)), one_way(slice(reference, None, -1))
     return Aligned(
