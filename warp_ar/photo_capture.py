@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import UsageError
-from warp_ar.input.ball_finder import CERTAIN, BallOutline, far_camera, find_ball, sphere_of_circle
+from warp_ar.input.ball_finder import BallOutline, far_camera, find_ball, sphere_of_circle
 from warp_ar.input.bracket import MOVED, Aligned, Circle, agree_exposures, align, thin_exposures
 from warp_ar.input.check_ball import DULL, disc_contrast
 from warp_ar.input.photographs import Photograph, exposures_by_exif, exposures_by_name, read_photograph
@@ -108,7 +108,7 @@ def capture_light(
     outline = _find_outline(photos, reference, camera, ball)
     bracket = _merge_plan(photos, reference, outline, transfer, exposures)
     notes += [*bracket.notes, _describe_outline(outline)]
-    if outline.evidence < CERTAIN:
+    if outline.is_doubtful:
         notes.append(
             "this outline is doubtful: look at it (--outline FILE draws it), and give a rough circle (--ball) if it is "
             "wrong"

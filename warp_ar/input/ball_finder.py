@@ -43,6 +43,10 @@ BLURS = (0.45, 0.6, 0.75, 0.95, 1.3, 1.8)
 """Standard deviations, pixels, of the picture's blur that are tried at full size."""
 STARTS = 4
 """Places from which a search descends: a mirrored edge makes a circle of its own, often a stronger one."""
+SEARCHED = 1600.0
+"""Pixels along the longer side of the picture in which a ball is looked for."""
+DIM_SUPPORT = 0.4
+"""Share of the rim that is seen, below which a person should look as well."""
 SEARCHES = 16
 """Proposed circles from which a ball is looked for in a whole picture."""
 CERTAIN = 9.0
@@ -88,7 +92,12 @@ class BallOutline:
     sphere: tuple[float, float, float]
     """The ball's centre in the camera's frame over its radius."""
     evidence: float = math.inf
-    """How much looks like a mirror ball, where the whole picture was searched: below ``CERTAIN`` it may be none."""
+    """How much looks like a mirror ball, where the whole picture was searched; else infinite."""
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether something else may have been taken for the ball: most such outlines are right, but not all."""
+        return math.isfinite(self.evidence) and (self.evidence < CERTAIN or self.support < DIM_SUPPORT)
 
     @property
     def radius(self) -> float:
@@ -267,11 +276,14 @@ def _coarse(image: Image, camera: Camera, sphere: Array, rough_error: float) -> 
     return _search(small, view, sphere, rough_error * min(radius, COARSE_RADIUS), 2.0)
 
 
-def refine_outline(image: Image, camera: Camera, sphere: Array) -> BallOutline:
-    """The outline near a sphere that is within some percent of right, with its uncertainty."""
+def refine_outline(image: Image, camera: Camera, sphere: Array, largest: float = LARGEST_RADIUS) -> BallOutline:
+    """The outline near a sphere that is within some percent of right, with its uncertainty.
+
+    Of a ball of more than ``largest`` pixels it is measured in a reduced picture.
+    """
     image, camera, corner = _window(image, camera, sphere)
     radius = _radius(camera, sphere)
-    share, finest = min(1.0, COARSE_RADIUS / radius), min(1.0, LARGEST_RADIUS / radius)
+    share, finest = min(1.0, COARSE_RADIUS / radius), min(1.0, largest / radius)
     while share < finest:
         share = min(2.0 * share, finest)
         picture, view = _reduced(image, camera, share)
@@ -374,27 +386,41 @@ def find_ball(
 
 def _find_anywhere(image: Image, camera: Camera) -> BallOutline:
     """The likeliest ball of a whole picture."""
-    height, width = image.shape[:2]
+    small, view = _reduced(image, camera, SEARCHED / max(image.shape))
+    height, width = small.shape[:2]
     # And a crop of a ball alone: as wide as the picture.
-    circles = [*propose_circles(image), ((width - 1) / 2, (height - 1) / 2, 0.48 * min(width, height))]
-    starts = [sphere_of_circle(camera, *circle) for circle in circles]
-    tries = [(view, start) for view in (image, lifted(image)) for start in starts if start[2] > 1.0]
+    circles = [*propose_circles(small), ((width - 1) / 2, (height - 1) / 2, 0.48 * min(width, height))]
+    starts = [sphere_of_circle(view, *circle) for circle in circles]
+    tries = [(lift, start) for lift in (False, True) for start in starts if start[2] > 1.0]
+    pictures = small, lifted(small)
     # What is worth a search is told by what the proposed circle itself shows: a mirrored edge may be one inside it.
-    tries = sorted(tries, key=lambda item: -_evidence(item[0], camera, item[1]))[:SEARCHES]
+    tries = sorted(tries, key=lambda item: -_evidence(pictures[item[0]], view, item[1]))[:SEARCHES]
     best, told = None, -math.inf
-    for view, start in tries:
-        sphere = _coarse(view, camera, start, ROUGH_ERROR)
-        strength = _evidence(view, camera, sphere)
+    for lift, start in tries:
+        sphere = _coarse(pictures[lift], view, start, ROUGH_ERROR)
+        strength = _evidence(pictures[lift], view, sphere)
         if strength > told:
-            best, told = (view, sphere), strength
+            best, told = (lift, sphere), strength
         if told > CERTAIN:
             break
     ask = "give a rough circle: column, row, radius in pixels"
     if best is None:
         raise UsageError(f"no ball was found in the picture; {ask}")
-    outline = dataclasses.replace(refine_outline(best[0], camera, best[1]), evidence=told)
+    lift, sphere = best
+    outline = _refine(lifted(image) if lift else image, camera, sphere)
+    outline = dataclasses.replace(outline, evidence=told)
     if told < LEAST_EVIDENCE or outline.support < LEAST_SUPPORT:
         raise _unseen(outline, ask)
+    return outline
+
+
+def _refine(image: Image, camera: Camera, sphere: Array) -> BallOutline:
+    """The outline near a sphere, in as large a picture as shows the rim: noise or a soft lens may hide it in larger."""
+    outline = refine_outline(image, camera, sphere)
+    largest = 0.5 * min(outline.radius, LARGEST_RADIUS)
+    while outline.support < LEAST_SUPPORT and largest >= COARSE_RADIUS:
+        outline = refine_outline(image, camera, sphere, largest)
+        largest *= 0.5
     return outline
 
 
