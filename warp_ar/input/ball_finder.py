@@ -51,7 +51,7 @@ SEARCHES = 16
 """Proposed circles from which a ball is looked for in a whole picture."""
 CERTAIN = 9.0
 """Evidence from which on no further circle is looked at, as most pictures of a ball have it and few others."""
-LEAST_EVIDENCE = 5.5
+LEAST_EVIDENCE = 6.0
 """Evidence below which there is no ball. From here to ``CERTAIN`` a person should look: most are right."""
 DARK = 6.0
 """Codes below which a lifted picture is no logarithm any more: there is noise."""
@@ -419,7 +419,9 @@ def _refine(image: Image, camera: Camera, sphere: Array) -> BallOutline:
     outline = refine_outline(image, camera, sphere)
     largest = 0.5 * min(outline.radius, LARGEST_RADIUS)
     while outline.support < LEAST_SUPPORT and largest >= COARSE_RADIUS:
-        outline = refine_outline(image, camera, sphere, largest)
+        reduced = refine_outline(image, camera, sphere, largest)
+        if reduced.support >= DIM_SUPPORT:
+            return reduced  # there it must be seen well: every desk has circles that are seen a little
         largest *= 0.5
     return outline
 
