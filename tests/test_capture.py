@@ -16,6 +16,8 @@ from warp_ar.scene import load_scene
 BRACKET = (15, 60, 250, 1000, 4000)
 LIT = 0.12
 """Relative error of irradiance: 10 % are asked for after one scale; the plane that is picked here is exact."""
+DARK_OUTLINE = 0.06
+"""Share of the radius by which an outline may be off in a photograph whose rim is two codes high."""
 
 
 def irradiance(radiance):
@@ -59,6 +61,7 @@ def test_a_bracket_becomes_light_and_a_picture(bracket, tmp_path, capsys):
     assert scene.captured.file == tmp_path / "light.exr"
     shown = ["--headless", "--device", "cpu", "--output", str(tmp_path / "out")]
     assert live([str(tmp_path / "new" / "photo.toml"), *shown]) == EXIT_DONE
+    assert "must be in the picture" not in capsys.readouterr().err  # which speaks of a card that nobody has
     picture = cv2.imread(str(tmp_path / "out" / "0000.png"))[..., ::-1]
     # The virtual mirror ball stands three radii to the right of the real one and shows nearly the same environment.
     real, virtual = (project([dx, 0.0, 0.04]) for dx in (0.0, 0.12))
@@ -86,6 +89,46 @@ def test_a_disc_that_mirrors_nothing_is_said(tmp_path):
     assert any("the picture is flat: is a ball there" in note for note in found.notes)
 
 
+def test_the_outline_is_drawn(bracket, tmp_path, capsys):
+    drawn = tmp_path / "outline.png"
+    arguments = [str(bracket[1]), "--device", "cpu", "--output", str(tmp_path / "light.exr"), "--outline", str(drawn)]
+    assert main(arguments) == EXIT_DONE
+    said = capsys.readouterr()
+    assert "looking for the ball in 1 photograph" in said.err
+    photo, picture = cv2.imread(str(bracket[1])), cv2.imread(str(drawn))
+    rows, columns = np.nonzero((picture != photo).any(2))
+    found = capture_light(bracket[1:2], device="cpu").outline
+    off = np.hypot(columns - found.center[0], rows - found.center[1]) - found.radius
+    assert np.abs(off).max() < 2.5
+    assert len(rows) > 2 * np.pi * found.radius
+    # What it wrote itself it replaces.
+    assert main(arguments) == EXIT_DONE
+
+
+def test_a_photograph_too_dark_for_a_rim_is_shown_by_another(bracket):
+    """The ball is found where it is seen best, and its light comes in camera values of the one that is asked for."""
+    dark = capture_light(bracket, device="cpu", shown=4)
+    found = capture_light(bracket, device="cpu", shown=1)
+    assert dark.outline.center == pytest.approx(found.outline.center, abs=DARK_OUTLINE * found.outline.radius)
+    assert irradiance(dark.light.radiance).sum() * BRACKET[4] / BRACKET[1] == pytest.approx(
+        irradiance(found.light.radiance).sum(), rel=0.1
+    )
+
+
+def test_a_focal_length_that_is_given_counts_for_a_cut_picture_too(tmp_path):
+    write_photo(tmp_path / "cut.jpg", exposed(60)[100:350, 120:420])
+    alone, given = (capture_light([tmp_path / "cut.jpg"], device="cpu", focal_35mm=mm) for mm in (None, 50.0))
+    assert any("was cut, so that EXIF's focal length says nothing" in note for note in alone.notes)
+    assert not any("focal" in note for note in given.notes)
+    assert given.camera.fx == pytest.approx(50.0 / np.hypot(36, 24) * np.hypot(300, 250))
+
+
+def test_a_picture_without_exif_was_not_cut(tmp_path):
+    cv2.imwrite(str(tmp_path / "cut.png"), exposed(60)[100:350, 120:420, ::-1])
+    notes = capture_light([tmp_path / "cut.png"], device="cpu").notes
+    assert any("cut.png has no focal length in its EXIF" in note for note in notes)
+
+
 def test_lying_exposures_end_the_command(tmp_path, capsys):
     photos = write_bracket(tmp_path, BRACKET[:4], exif=(50, 60, 72, 100), names=["d_4", "d_16", "d_64", "d_1024"])
     assert main([*map(str, photos), "--output", str(tmp_path / "light.exr"), "--device", "cpu"]) == EXIT_USAGE
@@ -94,6 +137,13 @@ def test_lying_exposures_end_the_command(tmp_path, capsys):
     assert not (tmp_path / "light.exr").exists()
     given = ["--exposures", *(f"1/{d}" for d in BRACKET[:4])]
     assert main([*map(str, photos), *given, "--output", str(tmp_path / "light.exr"), "--device", "cpu"]) == EXIT_DONE
+    capsys.readouterr()
+    # Who does not know the true ones lets the pictures tell: the same light, for these have sRGB's response.
+    told = ["--exposures", "pixels", "--output", str(tmp_path / "pixels.exr"), "--device", "cpu"]
+    assert main([*map(str, photos), *told]) == EXIT_DONE
+    assert "exposures are from the pixels alone" in capsys.readouterr().err
+    first, second = (irradiance(Light.load(tmp_path / f"{name}.exr").radiance) for name in ("light", "pixels"))
+    assert np.linalg.norm(second - first) / np.linalg.norm(first) < 0.05
 
 
 def test_a_moved_photograph_is_left_out_and_said(tmp_path):
@@ -112,6 +162,7 @@ def test_a_moved_photograph_is_left_out_and_said(tmp_path):
         (["--shown", "nothing.jpg"], "expected one of the photographs"),
         (["--reflectance", "1.5"], "0.01 to 1"),
         (["--exposures", "0.1", "0.2"], "expected one for each"),
+        (["--exposures", "pixels", "0.2"], "stands alone"),
     ],
 )
 def test_bad_usage_is_one_line(bracket, tmp_path, capsys, arguments, message):

@@ -23,7 +23,7 @@ from warp_ar.input.check_print import check_print
 from warp_ar.input.check_proxies import check_proxies
 from warp_ar.input.check_saturation import check_saturation
 from warp_ar.input.check_scene import check_scene
-from warp_ar.input.checkup import check_up
+from warp_ar.input.checkup import check_look, check_up
 from warp_ar.input.finding import Finding, fault_errors, worst_first
 from warp_ar.input.markers import find_dictionary
 from warp_ar.input.sheet import SHEET
@@ -294,6 +294,14 @@ def test_pictures_without_the_marker_say_why(looks):
     ):
         look = dataclasses.replace(looks["desk"], images=(picture,), views=(), errors=())
         assert [finding.name for finding in check_pictures(scene, look)] == [name]
+
+
+def test_no_card_is_asked_for_where_poses_are_written_down(looks):
+    """As in the scene of a photograph, which has no marker."""
+    look = dataclasses.replace(looks["desk"], views=(), errors=())
+    scene = dataclasses.replace(load_scene("desk"), has_marker=False)
+    assert check_look(scene, look) == []
+    assert [finding.name for finding in check_look(scene, dataclasses.replace(look, images=()))] == ["source.empty"]
 
 
 RIGHT = {

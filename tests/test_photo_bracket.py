@@ -114,10 +114,10 @@ def test_without_any_claim_the_pixels_decide():
 
 
 def test_near_exposures_are_left_out_and_said():
-    kept, notes = thin_exposures([1.0, 0.97, 0.3, 0.05], 1)
+    kept, notes = thin_exposures([1.0, 0.97, 0.3, 0.05], 1, ["a.jpg", "b.jpg", "c.jpg", "d.jpg"])
     assert kept == (1, 2, 3)
-    assert "left out" in notes[0]
-    assert thin_exposures([1.0, 0.8, 0.63], 0)[0] == (0, 1, 2)  # thirds of a stop
+    assert notes == ("a.jpg is left out: its exposure and that of b.jpg are 1.03 apart",)
+    assert thin_exposures([1.0, 0.8, 0.63], 0, ["a", "b", "c"])[0] == (0, 1, 2)  # thirds of a stop
 
 
 def test_exposures_far_apart_are_not_judged_by_what_they_share():

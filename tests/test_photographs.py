@@ -3,6 +3,7 @@
 import math
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -49,6 +50,14 @@ def test_no_photograph(tmp_path):
         read_exif(tmp_path / "a.jpg")
     with pytest.raises(SourceError, match="no photograph"):
         read_photograph(tmp_path / "b.jpg")
+
+
+def test_raw_photographs_are_refused_though_they_hold_a_thumbnail(tmp_path):
+    """As most raw files are, this is a TIFF with a small picture in it."""
+    cv2.imwrite(str(tmp_path / "thumbnail.tif"), np.full((120, 160, 3), 90, np.uint8))
+    (tmp_path / "a.NEF").write_bytes((tmp_path / "thumbnail.tif").read_bytes())
+    with pytest.raises(SourceError, match=r"a\.NEF is a raw photograph, which is not read: save it as JPEG"):
+        read_photograph(tmp_path / "a.NEF")
 
 
 def named(*names, infos=None):

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from warp_ar.command_line import EXIT_DONE, Parser, run_command, say
@@ -21,7 +22,7 @@ from warp_ar.input.ball_finder import BallOutline
 from warp_ar.input.support import Support, plane_from_contact, plane_from_rectangle
 from warp_ar.output.places import check_places, check_replaceable
 from warp_ar.output.sink import make_folder
-from warp_ar.photo_capture import Capture, capture_light
+from warp_ar.photo_capture import PIXELS, Capture, capture_light
 from warp_ar.scene import (
     Camera,
     CapturedLight,
@@ -34,6 +35,7 @@ from warp_ar.scene import (
     SourceSpec,
     dumps_scene,
 )
+from warp_ar.signature import sign_png
 
 
 def _seconds(text: str) -> float:
@@ -44,6 +46,10 @@ def _seconds(text: str) -> float:
     if value <= 0.0:
         raise argparse.ArgumentTypeError(f"{text!r}: expected a time in seconds, such as 0.02 or 1/50")
     return value
+
+
+def _exposure(text: str) -> float | str:
+    return PIXELS if text == PIXELS else _seconds(text)
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -61,7 +67,13 @@ def make_parser() -> argparse.ArgumentParser:
         "--ball", type=float, nargs=3, metavar=("X", "Y", "RADIUS"),
         help="a rough circle around the ball in pixels, where it is not found",
     )  # fmt: skip
-    add("--exposures", type=_seconds, nargs="+", metavar="S", help="seconds of each photograph, not what EXIF says")
+    add(
+        "--outline", type=Path, metavar="FILE.png", help="also write the shown photograph with the ball's outline on it"
+    )
+    add(
+        "--exposures", type=_exposure, nargs="+", metavar="S",
+        help="seconds of each photograph, not what EXIF says; pixels: what the pictures themselves tell",
+    )  # fmt: skip
     add("--shown", type=Path, metavar="PHOTO", help="whose camera values the light is in (default: the best exposed)")
     add(
         "--transfer",
@@ -105,9 +117,17 @@ def _check(options: argparse.Namespace) -> None:
         raise UsageError("--scene needs the plane: give --rectangle and --rectangle-size, or --contact")
     if options.shown is not None and options.shown not in options.photos:
         raise UsageError(f"--shown {options.shown}: expected one of the photographs")
+    if options.exposures == [PIXELS]:
+        options.exposures = PIXELS
+    elif options.exposures is not None and PIXELS in options.exposures:
+        raise UsageError(f"--exposures {PIXELS} stands alone; expected no seconds beside it")
+    elif options.exposures is not None and len(options.exposures) != len(options.photos):
+        number = _count(len(options.photos), "photograph")
+        raise UsageError(f"{_count(len(options.exposures), 'exposure')} for {number}; expected one for each")
     if not 0.01 <= options.reflectance <= 1.0:
         raise UsageError(f"--reflectance {options.reflectance:g}: expected a share from 0.01 to 1")
-    writes = {"--output": options.output} | ({} if options.scene is None else {"--scene": options.scene})
+    writes = {"--output": options.output, "--outline": options.outline, "--scene": options.scene}
+    writes = {name: path for name, path in writes.items() if path is not None}
     check_places({"the photographs": list(options.photos)}, writes)
     for path in writes.values():
         if words := check_replaceable(path, overwrite=options.overwrite):
@@ -143,9 +163,31 @@ def make_scene(found: Capture, light: Path, ball_radius: float | None) -> Scene:
     )
 
 
+def draw_outline(found: Capture) -> bytes:
+    """A PNG of the photograph with the ball's outline, as wide as one sees it in the whole picture."""
+    picture = np.ascontiguousarray(found.picture[..., ::-1])
+    width = max(1, round(max(picture.shape[:2]) / 600))
+    # With four bits of a fraction of a pixel.
+    points = np.round(16.0 * found.outline.points()).astype(np.int32)[:, None]
+    cv2.polylines(picture, [points], isClosed=True, color=(0, 0, 255), thickness=width, lineType=cv2.LINE_AA, shift=4)
+    return sign_png(bytes(cv2.imencode(".png", picture)[1]))
+
+
+def _write(path: Path, data: bytes) -> None:
+    try:
+        write_whole(path, data)
+    except OSError as error:
+        raise SinkError(f"{path} cannot be written: {reason(error)}") from error
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'s' * (number != 1)}"
+
+
 def capture(options: argparse.Namespace) -> int:
     """Capture, write, and say what was found."""
     _check(options)
+    say(f"looking for the ball in {_count(len(options.photos), 'photograph')}")
     wanted = options.rectangle is not None or options.contact is not None
     found = capture_light(
         options.photos,
@@ -161,7 +203,8 @@ def capture(options: argparse.Namespace) -> int:
     for note in found.notes:
         say(note)
     found.light.save(options.output)
-    print(f"{options.output}: light in camera values of {found.shown.name}, {len(found.light.emitters)} emitters")
+    emitters = _count(len(found.light.emitters), "emitter")
+    print(f"{options.output}: light in camera values of {found.shown.name}, {emitters}")
     for emitter in found.light.emitters:
         x, y, z = emitter.direction
         most = "or more" if emitter.high is None else f"to {sum(emitter.high) / 3:.3g}"
@@ -169,12 +212,12 @@ def capture(options: argparse.Namespace) -> int:
             f"  toward ({x:+.2f}, {y:+.2f}, {z:+.2f}): power {sum(emitter.low) / 3:.3g} {most}, "
             f"{emitter.solid_angle:.3f} sr"
         )
+    if options.outline is not None:
+        _write(options.outline, draw_outline(found))
+        print(f"{options.outline}: {found.shown.name} with the ball's outline in red")
     if options.scene is not None:
         scene = make_scene(found, options.output, options.ball_radius)
-        try:
-            write_whole(options.scene, dumps_scene(scene, options.scene.parent).encode())
-        except OSError as error:
-            raise SinkError(f"{options.scene} cannot be written: {reason(error)}") from error
+        _write(options.scene, dumps_scene(scene, options.scene.parent).encode())
         print(f"{options.scene}: python -m warp_ar.live {options.scene} --output out/")
     return EXIT_DONE
 

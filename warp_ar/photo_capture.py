@@ -7,6 +7,7 @@ import math
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,16 +22,21 @@ from warp_ar.input.response import write_response
 from warp_ar.input.support import Support
 from warp_ar.light.captured import Light, find_emitters, texel_solid_angles
 from warp_ar.scene import Camera, Pose, Probe, Scene
+from warp_ar.scene.exif import FULL_FRAME_DIAGONAL
 from warp_ar.scene.pose_file import pose_of_position
 from warp_ar.stages.quality import PRESETS
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
+PIXELS: Final = "pixels"
+"""In the place of exposures: what the pictures themselves tell."""
 HEIGHT = 128
 """Rows of the environment."""
 WINDOW = 1.25
 """Half side, in radii, of the part of a photograph that is unwrapped."""
+NEAR = 0.08
+"""Share of the radius by which the ball lies elsewhere in another photograph of a bracket, at most."""
 BRACKET_ERROR = 0.05
 """Relative error of merged radiance: what a response that was estimated or assumed leaves."""
 
@@ -47,6 +53,8 @@ class Capture:
     """That photograph."""
     camera: Camera
     """Of that photograph."""
+    picture: Image
+    """That photograph, uint8 RGB, upright."""
     support: Support | None
     """The plane that the ball stands on, where it was asked for."""
     notes: tuple[str, ...]
@@ -57,7 +65,7 @@ def capture_light(
     paths: Sequence[str | Path],
     *,
     ball: Sequence[float] | None = None,
-    exposures: Sequence[float] | None = None,
+    exposures: Sequence[float] | Literal["pixels"] | None = None,
     shown: int | None = None,
     transfer: str = "srgb",
     focal_35mm: float | None = None,
@@ -72,10 +80,11 @@ def capture_light(
         paths: Photographs of the ball, from one place, at one or more exposures.
         ball: Column, row and radius in pixels of a rough circle around the ball in the shown photograph; None: look
             for it.
-        exposures: Seconds of each photograph, instead of what EXIF or names say.
+        exposures: Seconds of each photograph, instead of what EXIF or names say; ``pixels``: by the pictures alone,
+            under ``transfer``.
         shown: Which photograph's camera values the light is in; None: the one whose ball is best exposed.
         transfer: Response that is tried first.
-        focal_35mm: Focal length for a full frame in millimetres; None: by EXIF.
+        focal_35mm: Focal length for a full frame in millimetres, of the picture as it is; None: by EXIF.
         support: Finds the plane that the ball stands on, whose axes the light then has; None: a level camera's.
         reflectance: Of the ball.
         device: ``auto``, ``cpu`` or ``cuda:N``.
@@ -88,15 +97,20 @@ def capture_light(
     if not paths:
         raise UsageError("no photographs; expected one or more of a mirror ball")
     photos = [read_photograph(path) for path in paths]
-    if exposures is not None and len(exposures) != len(photos):
+    if exposures is not None and not isinstance(exposures, str) and len(exposures) != len(photos):
         raise UsageError(f"{len(exposures)} exposures for {len(photos)} photographs; expected one for each")
     if shown is not None and not 0 <= shown < len(photos):
         raise UsageError(f"shown = {shown}: expected the number of a photograph, 0 to {len(photos) - 1}")
     reference = photos[shown] if shown is not None else photos[_best_exposed(photos)]
     camera, notes = _camera_of(reference, transfer, focal_35mm)
-    outline = find_ball(reference.image, camera, ball)
+    outline = _find_outline(photos, reference, camera, ball)
     bracket = _merge_plan(photos, reference, outline, transfer, exposures)
     notes += [*bracket.notes, _describe_outline(outline)]
+    if outline.is_doubtful:
+        notes.append(
+            "this outline is doubtful: look at it (--outline FILE draws it), and give a rough circle (--ball) if it is "
+            "wrong"
+        )
     if disc_contrast(reference.image, (*outline.center, outline.radius)) < DULL:
         notes.append("where the ball is found, the picture is flat: is a ball there, uncovered and polished?")
     found = None if support is None else support(outline, camera)
@@ -106,7 +120,7 @@ def capture_light(
         notes.append(f"the support's normal is known within {found.tilt_deviation:.1f} degrees")
     light, more = _unwrap(bracket, reference, camera, outline, turn, reflectance, device, height)
     light = dataclasses.replace(light, exposure=reference.info.exposure)
-    return Capture(light, outline, reference.path, camera, found, (*notes, *more))
+    return Capture(light, outline, reference.path, camera, reference.image, found, (*notes, *more))
 
 
 def _best_exposed(photos: Sequence[Photograph]) -> int:
@@ -121,15 +135,45 @@ def _best_exposed(photos: Sequence[Photograph]) -> int:
 
 
 def _camera_of(photo: Photograph, transfer: str, focal_35mm: float | None) -> tuple[Camera, list[str]]:
-    info = (
-        photo.info if focal_35mm is None else dataclasses.replace(photo.info, focal_35mm=focal_35mm, focal_pixels=None)
-    )
+    """The photograph's camera, and what is to be said of it."""
+    info = photo.info
+    width, height = info.width, info.height
+    if focal_35mm is not None:
+        # Of the picture as it is, cut or not: who gives it has the angle of view in mind.
+        focal = focal_35mm / FULL_FRAME_DIAGONAL * math.hypot(width, height)
+        return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2, transfer=transfer), []
     camera = info.camera(transfer)
     if camera is not None:
         return camera, []
-    why = "has no focal length in its EXIF" if info.is_whole else "was cut, so that EXIF's focal length says nothing"
+    told = info.focal_35mm is not None or info.focal_pixels is not None
+    why = "was cut, so that EXIF's focal length says nothing" if told else "has no focal length in its EXIF"
     note = f"{photo.name} {why}: the ball is taken to be far away (--focal-35mm tells otherwise)"
-    return dataclasses.replace(far_camera(info.width, info.height), transfer=transfer), [note]
+    return dataclasses.replace(far_camera(width, height), transfer=transfer), [note]
+
+
+def _find_outline(
+    photos: Sequence[Photograph], reference: Photograph, camera: Camera, ball: Sequence[float] | None
+) -> BallOutline:
+    """The ball in the shown photograph; where that is none of the best exposed, near where that one has it."""
+    clearest = photos[_best_exposed(photos)]
+    if ball is not None or clearest is reference:
+        return find_ball(reference.image, camera, ball)
+    seen = find_ball(clearest.image)
+    rough = _same_place((*seen.center, seen.radius), clearest.image, reference.image)
+    try:
+        own = find_ball(reference.image, camera, rough, NEAR)
+    except UsageError:
+        # Too dark or too bright to see a rim: it is laid over the others by what it mirrors.
+        x, y, z = map(float, sphere_of_circle(camera, *rough))
+        axes = (rough[2] / seen.radius * seen.axes[0], rough[2] / seen.radius * seen.axes[1])
+        own = dataclasses.replace(seen, center=rough[:2], axes=axes, sphere=(x, y, z))
+    return dataclasses.replace(own, evidence=seen.evidence)
+
+
+def _same_place(circle: Circle, of: Image, other: Image) -> Circle:
+    """Where a ball is in a picture of another size: cut differently around it, at about the same share."""
+    sy, sx = other.shape[0] / of.shape[0], other.shape[1] / of.shape[1]
+    return (circle[0] + 0.5) * sx - 0.5, (circle[1] + 0.5) * sy - 0.5, circle[2] * math.sqrt(sx * sy)
 
 
 def _describe_outline(outline: BallOutline) -> str:
@@ -156,14 +200,15 @@ def _merge_plan(
     reference: Photograph,
     outline: BallOutline,
     transfer: str,
-    given: Sequence[float] | None,
+    given: Sequence[float] | Literal["pixels"] | None,
 ) -> _Bracket:
     """Which photographs to merge, where the ball is in them, and their exposures."""
     circle = (*outline.center, outline.radius)
     if len(photos) == 1:
         return _Bracket((reference,), (circle,), (1.0,), None, ())
-    exif, names = exposures_by_exif(photos), exposures_by_name(photos)
-    claims = {"given": given, "exif": exif, "names": names}
+    claims: dict[str, Sequence[float] | None] = {"given": None, "exif": None, "names": None}
+    if not isinstance(given, str):
+        claims = {"given": given, "exif": exposures_by_exif(photos), "names": exposures_by_name(photos)}
     # Brightness tells the order even where claims contradict each other.
     order = sorted(range(len(photos)), key=lambda k: -float(photos[k].image[::8, ::8].mean()))
     chosen = [photos[k] for k in order]
@@ -181,7 +226,7 @@ def _merge_plan(
         [aligned.patches[k] for k in stay], transfer, picked["exif"], picked["names"], picked["given"]
     )
     first = [chosen[k] for k in stay].index(reference)
-    kept, more = thin_exposures(agreed.ratios, first)
+    kept, more = thin_exposures(agreed.ratios, first, [chosen[k].name for k in stay])
     return _Bracket(
         tuple(chosen[stay[k]] for k in kept),
         tuple(aligned.circles[stay[k]] for k in kept),
@@ -193,16 +238,11 @@ def _merge_plan(
 
 def _align_all(photos: Sequence[Photograph], reference: int, circle: Circle, times: Sequence[float] | None) -> Aligned:
     """Align outward from the reference, to both sides."""
-    h, w = photos[reference].image.shape[:2]
-
-    def rough(photo: Photograph) -> Circle:
-        """Where the ball is in a picture of another size: cut differently around it, at about the same share."""
-        sy, sx = photo.image.shape[0] / h, photo.image.shape[1] / w
-        return (circle[0] + 0.5) * sx - 0.5, (circle[1] + 0.5) * sy - 0.5, circle[2] * math.sqrt(sx * sy)
+    shown = photos[reference].image
 
     def one_way(part: slice) -> Aligned:
-        own = photos[part]
-        return align([photo.image for photo in own], [rough(photo) for photo in own], times and times[part])
+        own = [photo.image for photo in photos[part]]
+        return align(own, [_same_place(circle, shown, image) for image in own], times and times[part])
 
     down, up = one_way(slice(reference, None)), one_way(slice(reference, None, -1))
     return Aligned(

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warp_ar.errors import UsageError
+from warp_ar.input.ball_proposals import propose_circles
 from warp_ar.input.ball_rim import (
     MOST_COST,
     RimEvidence,
@@ -42,8 +43,18 @@ BLURS = (0.45, 0.6, 0.75, 0.95, 1.3, 1.8)
 """Standard deviations, pixels, of the picture's blur that are tried at full size."""
 STARTS = 4
 """Places from which a search descends: a mirrored edge makes a circle of its own, often a stronger one."""
-PROPOSALS = 3
-"""Circles of a Hough transform that are followed."""
+SEARCHED = 1600.0
+"""Pixels along the longer side of the picture in which a ball is looked for."""
+DIM_SUPPORT = 0.4
+"""Share of the rim that is seen, below which a person should look as well."""
+SEARCHES = 16
+"""Proposed circles from which a ball is looked for in a whole picture."""
+CERTAIN = 9.0
+"""Evidence from which on no further circle is looked at, as most pictures of a ball have it and few others."""
+LEAST_EVIDENCE = 6.0
+"""Evidence below which there is no ball. From here to ``CERTAIN`` a person should look: most are right."""
+DARK = 6.0
+"""Codes below which a lifted picture is no logarithm any more: there is noise."""
 LARGEST_RADIUS = 700.0
 """Pixels: a larger ball is measured in a reduced picture; a fifth of a pixel is more than a lens is good for then."""
 ALIKE = 0.06
@@ -80,6 +91,13 @@ class BallOutline:
     """Share of the rim in view that speaks for it."""
     sphere: tuple[float, float, float]
     """The ball's centre in the camera's frame over its radius."""
+    evidence: float = math.inf
+    """How much looks like a mirror ball, where the whole picture was searched; else infinite."""
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether something else may have been taken for the ball: most such outlines are right, but not all."""
+        return math.isfinite(self.evidence) and (self.evidence < CERTAIN or self.support < DIM_SUPPORT)
 
     @property
     def radius(self) -> float:
@@ -258,20 +276,21 @@ def _coarse(image: Image, camera: Camera, sphere: Array, rough_error: float) -> 
     return _search(small, view, sphere, rough_error * min(radius, COARSE_RADIUS), 2.0)
 
 
-def refine_outline(image: Image, camera: Camera, sphere: Array) -> BallOutline:
+def refine_outline(image: Image, camera: Camera, sphere: Array, largest: float = LARGEST_RADIUS) -> BallOutline:
     """The outline near a sphere that is within some percent of right, with its uncertainty.
 
     Args:
         image: 8-bit RGB.
         camera: It took the picture.
         sphere: Centre over radius, (3,), in the camera's frame.
+        largest: A ball of a larger radius, in pixels, is measured in a reduced picture.
 
     Raises:
         UsageError: What is found is no ball before the camera.
     """
     image, camera, corner = _window(image, camera, sphere)
     radius = _radius(camera, sphere)
-    share, finest = min(1.0, COARSE_RADIUS / radius), min(1.0, LARGEST_RADIUS / radius)
+    share, finest = min(1.0, COARSE_RADIUS / radius), min(1.0, largest / radius)
     while share < finest:
         share = min(2.0 * share, finest)
         picture, view = _reduced(image, camera, share)
@@ -331,35 +350,12 @@ def _describe(camera: Camera, sphere: Array, spread: Array, support: float) -> B
     return BallOutline((float(x), float(y)), (a / 2, b / 2), angle % 180.0, (dx, dy, dr), support, (cx, cy, cz))
 
 
-def propose_circles(image: Image, most: int = 8) -> list[tuple[float, float, float]]:
-    """Circles (x, y, radius) in pixels that a picture may show, by Hough transforms of a reduced one."""
-    height, width = image.shape[:2]
-    share = min(1.0, 480.0 / max(height, width))
-    small, _ = _reduced(image, far_camera(width, height), share)
-    gray = cv2.medianBlur(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), 3)
-    side = min(gray.shape)
-    found: list[tuple[float, float, float]] = []
-    for way, edge, votes in (
-        (cv2.HOUGH_GRADIENT_ALT, 120, 0.6),
-        (cv2.HOUGH_GRADIENT_ALT, 60, 0.3),
-        (cv2.HOUGH_GRADIENT, 80, 30),
-    ):
-        circles = cv2.HoughCircles(
-            gray,
-            way,
-            1.5,
-            max(side / 20, 4),
-            param1=edge,
-            param2=votes,
-            minRadius=max(side // 40, 5),
-            maxRadius=side * 6 // 10,
-        )
-        if circles is not None:
-            for x, y, r, *_ in circles.reshape(-1, circles.shape[-1])[:most]:
-                found.append((float((x + 0.5) / share - 0.5), float((y + 0.5) / share - 0.5), float(r) / share))
-    # A crop of a ball alone: as wide as the picture.
-    found.append(((width - 1) / 2, (height - 1) / 2, 0.48 * min(width, height)))
-    return found
+def lifted(image: Image) -> Image:
+    """The picture with darks as steep as brights: its codes are logarithms.
+
+    In a bracket's short exposures a rim is a few codes high, beside lamps of two hundred.
+    """
+    return np.asarray(_LIFT[image])
 
 
 def find_ball(
@@ -378,31 +374,71 @@ def find_ball(
     """
     height, width = image.shape[:2]
     camera = camera or far_camera(width, height)
-    if rough is not None and (len(rough) != 3 or not all(map(math.isfinite, rough)) or rough[2] < 4.0):
+    if rough is None:
+        return _find_anywhere(image, camera)
+    if len(rough) != 3 or not all(map(math.isfinite, rough)) or rough[2] < 4.0:
         raise UsageError(
             f"ball {', '.join(f'{v:g}' for v in rough)}: expected column, row and radius (4 or more) in pixels"
         )
-    starts = [
-        sphere_of_circle(camera, *circle) for circle in ([rough] if rough is not None else propose_circles(image))
-    ]
-    starts = [start for start in starts if start[2] > 1.0]
-    # Of what a Hough transform proposes, those that look most like a ball; a mirrored edge may be one inside it.
-    starts.sort(key=lambda start: -_strength(image, camera, start))
-    found = []
-    for start in starts[:PROPOSALS]:
-        sphere = _coarse(image, camera, start, rough_error)
-        found.append((_strength(image, camera, sphere), sphere))
-    if not found:
-        raise UsageError("no ball was found in the picture; give a rough circle: column, row, radius in pixels")
-    _, sphere = max(found, key=lambda item: item[0])
-    outline = refine_outline(image, camera, sphere)
-    if outline.support < LEAST_SUPPORT:
-        raise UsageError(
-            f"no ball was found in the picture: only {outline.support:.0%} of the best outline, about "
-            f"({outline.center[0]:.0f}, {outline.center[1]:.0f}) with a radius of {outline.radius:.0f} pixels, is "
-            "seen; give a rough circle: column, row, radius in pixels"
-        )
+    start = sphere_of_circle(camera, *rough)
+    if start[2] <= 1.0:
+        raise UsageError("no ball is before the camera at this circle; expected one that is nearer to the axis")
+    outlines = []
+    for view in (image, lifted(image)):
+        outlines.append(refine_outline(view, camera, _coarse(view, camera, start, rough_error)))
+        if outlines[-1].support >= LEAST_SUPPORT:
+            return outlines[-1]
+    raise _unseen(max(outlines, key=lambda outline: outline.support), "give a circle that is nearer to the rim")
+
+
+def _find_anywhere(image: Image, camera: Camera) -> BallOutline:
+    """The likeliest ball of a whole picture."""
+    small, view = _reduced(image, camera, SEARCHED / max(image.shape))
+    height, width = small.shape[:2]
+    # And a crop of a ball alone: as wide as the picture.
+    circles = [*propose_circles(small), ((width - 1) / 2, (height - 1) / 2, 0.48 * min(width, height))]
+    starts = [sphere_of_circle(view, *circle) for circle in circles]
+    tries = [(lift, start) for lift in (False, True) for start in starts if start[2] > 1.0]
+    pictures = small, lifted(small)
+    # What is worth a search is told by what the proposed circle itself shows: a mirrored edge may be one inside it.
+    tries = sorted(tries, key=lambda item: -_evidence(pictures[item[0]], view, item[1]))[:SEARCHES]
+    best, told = None, -math.inf
+    for lift, start in tries:
+        sphere = _coarse(pictures[lift], view, start, ROUGH_ERROR)
+        strength = _evidence(pictures[lift], view, sphere)
+        if strength > told:
+            best, told = (lift, sphere), strength
+        if told > CERTAIN:
+            break
+    ask = "give a rough circle: column, row, radius in pixels"
+    if best is None:
+        raise UsageError(f"no ball was found in the picture; {ask}")
+    lift, sphere = best
+    outline = _refine(lifted(image) if lift else image, camera, sphere)
+    outline = dataclasses.replace(outline, evidence=told)
+    if told < LEAST_EVIDENCE or outline.support < LEAST_SUPPORT:
+        raise _unseen(outline, ask)
     return outline
+
+
+def _refine(image: Image, camera: Camera, sphere: Array) -> BallOutline:
+    """The outline near a sphere, in as large a picture as shows the rim: noise or a soft lens may hide it in larger."""
+    outline = refine_outline(image, camera, sphere)
+    largest = 0.5 * min(outline.radius, LARGEST_RADIUS)
+    while outline.support < LEAST_SUPPORT and largest >= COARSE_RADIUS:
+        reduced = refine_outline(image, camera, sphere, largest)
+        if reduced.support >= DIM_SUPPORT:
+            return reduced  # there it must be seen well: every desk has circles that are seen a little
+        largest *= 0.5
+    return outline
+
+
+def _unseen(outline: BallOutline, ask: str) -> UsageError:
+    (x, y), radius = outline.center, outline.radius
+    return UsageError(
+        f"no ball was found in the picture: the best outline, about ({x:.0f}, {y:.0f}) with a radius of {radius:.0f} "
+        f"pixels, is hardly a mirror ball's ({outline.support:.0%} of its rim is seen); {ask}"
+    )
 
 
 def outline_strength(image: Image, camera: Camera, outline: BallOutline) -> float:
@@ -412,14 +448,47 @@ def outline_strength(image: Image, camera: Camera, outline: BallOutline) -> floa
 
 def _strength(image: Image, camera: Camera, sphere: Array) -> float:
     """How much of a mirror ball is seen at a sphere: steps at its rim, compression inside, more for larger balls."""
+    rim = _rim(image, camera, sphere)
+    return -math.inf if rim is None else (rim.steps + COMPRESSION * rim.compression) * rim.known * rim.size
+
+
+def _evidence(image: Image, camera: Camera, sphere: Array) -> float:
+    """The same where a whole picture is searched: what is round is often no ball, and balls are of all sizes.
+
+    A plate, a lid or a mirrored horizon has as sharp a rim as a ball. Only in a ball is what is inside squeezed toward
+    it, so that counts twice.
+    """
+    rim = _rim(image, camera, sphere)
+    return -math.inf if rim is None else (rim.steps + 2.0 * rim.compression) * rim.known * (1.0 + 0.1 * rim.size)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Rim:
+    """What is seen at a sphere's rim."""
+
+    steps: float
+    """How much better than a smooth curve a step explains the pieces of the rim, mean of at most ``MOST_COST`` each."""
+    compression: float
+    """Of gradients, by ``radial_compression``."""
+    known: float
+    """Share of the rim that is in the picture."""
+    size: float
+    """Logarithm of the radius in pixels."""
+
+
+def _rim(image: Image, camera: Camera, sphere: Array) -> _Rim | None:
+    """What a picture whose ball is ``COARSE_RADIUS`` pixels shows of a rim; None where it is not in the picture."""
     radius = _radius(camera, sphere)
     if not math.isfinite(radius):
-        return -math.inf
+        return None
     small, view = _reduced(image, camera, COARSE_RADIUS / radius)
     fit = _Fit(small, view, sphere, 1.0)
     if not fit.evidence.known.any():
-        return -math.inf
+        return None
     outline = (fit.points[None], fit.normals[None], np.array([fit.radius]))
     compression = float(radial_compression(gradients(small), *outline)[0])
-    seen = MOST_COST - float(fit.costs(np.zeros((1, 3)))[0]) + COMPRESSION * compression
-    return seen * float(fit.evidence.known.mean()) * math.log(max(radius, 4.0))
+    steps = MOST_COST - float(fit.costs(np.zeros((1, 3)))[0])
+    return _Rim(steps, compression, float(fit.evidence.known.mean()), math.log(max(radius, 4.0)))
+
+
+_LIFT = np.round(255 * np.log1p(np.arange(256) / DARK) / np.log1p(255 / DARK)).astype(np.uint8)

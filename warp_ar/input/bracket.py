@@ -334,7 +334,8 @@ def _believed(steps: dict[str, tuple[float, ...]], seen: Sequence[float], figure
     if _off(steps[best], seen) > 2.0 * HOLDS:
         raise UsageError(
             f"exposures contradict each other: from the longest to the shortest {figures} times; "
-            "give the true ones with --exposures, or leave out pictures with automatic ISO"
+            "give the true ones with --exposures, take what the pixels say (--exposures pixels), or leave out pictures "
+            "with automatic ISO"
         )
     return best, [f"{best} and pixels agree on the exposures, which the others contradict: {figures} times"]
 
@@ -373,7 +374,9 @@ def agree_exposures(
     )
     if not steps:
         if len(pixels) < len(seen.steps):
-            raise UsageError("neither EXIF nor names tell the exposures, and too few pixels do; give --exposures")
+            raise UsageError(
+                "neither EXIF nor names are left to tell the exposures, and too few pixels do; give --exposures"
+            )
         note = f"exposures are from the pixels alone, with the response {transfer}: {figures} times"
         return Exposures(tuple(np.cumprod([1.0, *seen.steps]).tolist()), None, (note,))
     best, notes = _believed(steps, seen.steps, figures)
@@ -387,7 +390,8 @@ def agree_exposures(
     if rest > CONTRADICTS:
         raise UsageError(
             f"exposures contradict the pictures: from the longest to the shortest {figures} times, and no response "
-            f"explains them (a step is off by {math.expm1(rest):.0%}); give the true ones with --exposures"
+            f"explains them (a step is off by {math.expm1(rest):.0%}); give the true ones with --exposures, or "
+            "take what the pixels say (--exposures pixels)"
         )
     dark = decode_table(transfer)[:, 1][40] / max(bent.curve[40, 1], 1e-9)
     notes.append(
@@ -397,12 +401,15 @@ def agree_exposures(
     return Exposures(ratios, bent.curve, tuple(notes))
 
 
-def thin_exposures(ratios: Sequence[float], shown: int) -> tuple[tuple[int, ...], tuple[str, ...]]:
+def thin_exposures(
+    ratios: Sequence[float], shown: int, names: Sequence[str]
+) -> tuple[tuple[int, ...], tuple[str, ...]]:
     """Which pictures of a bracket to use: of those that are within ``WAVERING`` of each other, one.
 
     Args:
         ratios: Exposures.
         shown: Index of the one that stays in any case.
+        names: Of the pictures.
 
     Returns:
         Indices, longest exposure first, and a note for each that is left out.
@@ -412,7 +419,7 @@ def thin_exposures(ratios: Sequence[float], shown: int) -> tuple[tuple[int, ...]
         near = [other for other in kept if abs(math.log(ratios[k] / ratios[other])) < math.log(WAVERING)]
         if k != shown and near:
             ratio = max(ratios[k] / ratios[near[0]], ratios[near[0]] / ratios[k])
-            notes.append(f"picture {k + 1} by brightness is left out: its exposure is {ratio:.2f} times another's")
+            notes.append(f"{names[k]} is left out: its exposure and that of {names[near[0]]} are {ratio:.2f} apart")
         elif k != shown:
             kept.append(k)
     return tuple(sorted(kept, key=lambda k: -ratios[k])), tuple(notes)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from warp_ar.errors import SceneError, SourceError
 from warp_ar.input.frame_folder import read_image
+from warp_ar.pictures import foreign_words
 from warp_ar.scene.exif import PhotoInfo, exposure_in_name, read_exif
 
 Image = NDArray[np.uint8]
@@ -45,6 +46,9 @@ def read_photograph(path: str | Path) -> Photograph:
     path = Path(path)
     if not path.is_file():
         raise SourceError(f"there is no photograph {path}")
+    if words := foreign_words(path.suffix.lower()):
+        # Many raw files are TIFFs too, and would be read as the thumbnail in them.
+        raise SourceError(f"{path} is {words}")
     image = read_image(path)
     try:
         info = read_exif(path)
