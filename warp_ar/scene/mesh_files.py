@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import io
-import re
 import logging
+import re
 import struct
 import zipfile
 import zlib
