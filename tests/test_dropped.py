@@ -13,6 +13,7 @@ import pytest
 import trimesh
 from PIL import Image
 
+from tests.gltf_files import Gltf
 from tests.test_pipeline import make_scene
 from warp_ar.errors import UsageError, WarpArError
 from warp_ar.light.captured import Light
@@ -211,6 +212,56 @@ def test_such_a_scene_is_dropped_onto_another_page(bundle, tmp_path_factory):
     assert label == "open desk.zip"
     # Saved from there it is the same again.
     assert len(pack_scene(make(shown).scene)) == pytest.approx(len(data), rel=0.02)
+
+
+def naming(uri):
+    """A GLB whose colour is a picture elsewhere."""
+    made = Gltf()
+    made.node(made.square(made.material(pbrMetallicRoughness={"baseColorTexture": {"index": 0}})))
+    made.tree |= {"images": [{"uri": uri}], "textures": [{"source": 0}]}
+    return made
+
+
+@pytest.mark.parametrize("place", ["{0}/secret.png", "../secret.png", "../drop/../secret.png"])
+def test_a_mesh_names_no_file_of_this_machine(wanted, tmp_path, place):
+    """What is there is refused in the words for what is not, dropped alone or in a ZIP."""
+    Image.fromarray(np.full((4, 4, 3), 77, np.uint8)).save(tmp_path / "secret.png")
+    own = tmp_path / "drop"
+    own.mkdir()
+    files, path, uri = DroppedFiles(own), tmp_path / "made.glb", place.format(tmp_path)
+    alone = naming(uri).save(path).read_bytes()
+    absent = naming(uri.replace("secret", "nothing")).save(path).read_bytes()
+    # In the ZIP it lies two folders deeper.
+    inside = naming(uri if uri.startswith("/") else f"../../{uri}").save(path).read_bytes()
+    zipped = packed(**{"scene.toml": SCENE_OF_ONE, "00__made.glb": inside})
+    for name, data in (("made.glb", alone), ("made.glb", absent), ("a.zip", zipped)):
+        with pytest.raises(UsageError, match="does not come with it") as caught:
+            files.take(name, data, wanted)
+        assert str(own) not in str(caught.value)
+        assert list(own.iterdir()) == [], "what was refused was kept"
+    # From the machine's own folders the same file is read.
+    assert load_mesh(naming("secret.png").save(path)).images[0][0, 0, 0] == 77
+    (tmp_path / "red.mtl").write_text("newmtl a\nKd 1 0 0\n")
+    text = f"mtllib {tmp_path}/red.mtl\nusemtl a\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
+    make, _, words = files.take("made.obj", text.encode(), wanted)
+    assert "red.mtl, which is not there" in words
+    assert load_mesh(make(wanted).scene.objects[-1].file).materials == ()
+
+
+SCENE_OF_ONE = """schema = 1
+[camera]
+width = 64
+height = 48
+fx = 64.0
+fy = 64.0
+cx = 31.5
+cy = 23.5
+[marker]
+size = 0.08
+[[object]]
+shape = "mesh"
+file = "00/made.glb"
+"""
 
 
 def packed(**members):

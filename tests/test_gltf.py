@@ -198,7 +198,8 @@ def test_skins_and_morph_targets_that_move_are_named_once(
 
 def test_what_is_not_shown_is_said_once(tmp_path: pathlib.Path, caplog: pytest.LogCaptureFixture) -> None:
     made = Gltf()
-    made.tree["extensionsUsed"] = ["KHR_materials_transmission", "KHR_materials_unlit"]
+    made.tree["extensionsUsed"] = ["KHR_materials_transmission", "KHR_materials_unlit", "EXT_\x1b[31m"]
+    made.material(extensions={"KHR_materials_sheen": {}, "KHR_materials_unlit": {}})  # one that the list lacks
     made.tree["animations"] = [{"channels": [], "samplers": []}]
     line = {"attributes": {"POSITION": made.array(SQUARE)}, "mode": 1}
     made.node(made.square(), line)
@@ -207,7 +208,8 @@ def test_what_is_not_shown_is_said_once(tmp_path: pathlib.Path, caplog: pytest.L
         for _ in range(3):
             look_of(Object("mesh", file=path))
     (record,) = caplog.records
-    said = "KHR_materials_transmission, animations (an object's key play names one), points and lines"
+    extensions = "KHR_materials_transmission, EXT_\\x1b[31m, KHR_materials_sheen"
+    said = f"{extensions}, animations (an object's key play names one), points and lines"
     assert record.getMessage() == f"{path}: not shown: {said}"
 
 
@@ -246,6 +248,7 @@ def deep(tree: dict[str, Any]) -> None:
     [
         (lambda t: t["nodes"].append({"children": [1]}) or t.update(scenes=[{"nodes": [1]}]), "reached twice"),
         (deep, "node 0 is reached twice"),
+        (lambda t: t["nodes"][0].update(children=[0]), "below each other in a circle"),
         (lambda t: t["nodes"][0].update(mesh=7), "meshes hold 7; there are 1"),
         (lambda t: t["nodes"][0].update(children=[-1]), "children hold -1"),
         (lambda t: t["nodes"][0].update(scale=[1, float("nan"), 1]), "node 0"),

@@ -297,6 +297,28 @@ def test_material_libraries(tmp_path):
         load_mesh(path)
 
 
+def test_a_library_that_is_missing_is_named(tmp_path):
+    path = tmp_path / "a.obj"
+    path.write_text("mtllib parts/paint.mtl\nusemtl red\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    mesh = load_mesh(path)
+    assert mesh.materials == ()
+    assert mesh.notes == ("the material library paint.mtl, which is not there",)
+
+
+def test_numbers_that_are_not_finite_are_named_and_nothing_else_is_said(tmp_path):
+    """In every format, whatever the reader computes of them first: a warning would be an error here."""
+    corners = "vertex 0 0 0\nvertex 1 0 inf\nvertex 0 1 0"
+    texts = {
+        "a.stl": f"solid x\nfacet normal 0 0 1\nouter loop\n{corners}\nendloop\nendfacet\nendsolid\n",
+        "a.obj": "v 0 0 0\nv 1 0 inf\nv 0 1 0\nf 1 2 3\n",
+        "a.off": "OFF\n3 1 0\n0 0 0\n1 0 inf\n0 1 0\n3 0 1 2\n",
+    }
+    for name, text in texts.items():
+        (tmp_path / name).write_text(text)
+        with pytest.raises(SceneError, match=r"vertex 1 is \[1.0, 0.0, inf\]"):
+            load_mesh(tmp_path / name)
+
+
 def test_boxes_of_drawing_formats_are_flat_and_balls_round(tmp_path):
     for suffix in (".obj", ".stl", ".off"):
         trimesh.creation.box().export(

@@ -95,7 +95,8 @@ class EmitterSearch:
                     candidate, cost, moved = around[place], other, True
             if not moved:
                 break
-        return self._at_its_distance(candidate, cost, fit, least)
+        # Costs that differ by less than one standard deviation tell no distance.
+        return self._at_its_distance(candidate, cost, fit, max(least, CONFIG.search.worth_moving))
 
     def _at_its_distance(self, candidate: Candidate, cost: float, fit: Fit, least: float) -> Candidate:
         """The candidate where, along its direction, the cost is least.

@@ -149,7 +149,10 @@ class _Reader:
         for name in required:
             if name in _COMPRESSED:
                 fail(self._path, f"it is compressed with {name}; save it without compression")
-        for name in dict.fromkeys(str(name)[:60] for name in [*used, *required]):
+        # A file should list all that it uses; what a material has and the list lacks is left out as well.
+        own = [item.get("extensions") for item in objects(self._path, self._header, "materials")]
+        found = [name for table in own if isinstance(table, dict) for name in table]
+        for name in dict.fromkeys(str(name)[:60] for name in [*used, *required, *found]):
             if name not in SUPPORTED:
                 self._note(name)
 
@@ -178,6 +181,8 @@ class _Reader:
                 child for node in self._nodes for child in self._indices(node.get("children"), "children", count)
             }
             waiting = [(node, np.eye(4)) for node in range(len(self._nodes)) if node not in children]
+            if self._nodes and not waiting:
+                fail(self._path, "its nodes stand below each other in a circle")
         found: dict[int, npt.NDArray[np.float64]] = {}
         waiting.reverse()
         while waiting:

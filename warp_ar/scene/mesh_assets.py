@@ -24,6 +24,15 @@ _HEADER: Final = 1 << 16
 """Bytes of a text header that are looked at."""
 
 
+_CONFINED: Final[set[Path]] = set()
+"""Folders of ``confine``."""
+
+
+def confine(folder: Path) -> None:
+    """Let mesh files in a folder name files in it only: they are not trusted, and would show what lies elsewhere."""
+    _CONFINED.add(folder.resolve())
+
+
 class Assets:
     """Finds the files that a mesh file names, as trimesh's resolvers do: beside it, or relative to it.
 
@@ -42,6 +51,9 @@ class Assets:
         self.known: dict[str, bytes] = {}
         """What was read, by the name that the mesh file has for it."""
         self.problem: SceneError | None = None
+        self.missing: str | None = None
+        """The material library that it names and that is not there."""
+        self._within = next((folder for folder in _CONFINED if path.resolve().is_relative_to(folder)), None)
 
     def get(self, name: str) -> bytes:
         """Bytes of a file by the name that the mesh file has for it.
@@ -53,7 +65,9 @@ class Assets:
         try:
             return self._read(name, library)
         except SceneError as error:
-            missing = library and self._found(name) is None and not (self._path.parent / name.strip()).exists()
+            elsewhere = self._path.parent / name.strip()
+            missing = library and self._found(name) is None and not (self._reaches(elsewhere) and elsewhere.exists())
+            self.missing = name.strip() if missing else self.missing
             self.problem = self.problem if self.problem or missing else error
             raise
 
@@ -61,12 +75,19 @@ class Assets:
 
     def _found(self, name: str) -> Path | None:
         candidates = (name.strip(), name.strip().lstrip("/"), re.split(r"[/\\]", name)[-1])
-        return next((path for text in candidates if is_file(path := self._path.parent / text)), None)
+        paths = (self._path.parent / text for text in candidates)
+        return next((path for path in paths if self._reaches(path) and is_file(path)), None)
+
+    def _reaches(self, path: Path) -> bool:
+        """Whether the file may name another one there."""
+        return self._within is None or path.resolve().is_relative_to(self._within)
 
     def _read(self, name: str, library: bool) -> bytes:
         if name not in self.known:
             limit = "text_bytes" if library else "picture_bytes" if self._pictures_follow else "mesh_bytes"
             path = self._found(name) or self._path.parent / name.strip()
+            if not self._reaches(path):
+                raise SceneError(f"{self._path}: the file {name[:60]!r}, which it names, does not come with it")
             label = f"{self._path}: {path}, which it names,"
             data = read_bytes(path, limit, SceneError, label)
             if self._pictures_follow and not library:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import logging
+import re
 import struct
 import zipfile
 import zlib
@@ -187,9 +188,13 @@ def _read_parts(path: Path, data: bytes, assets: Assets, images: list[ByteArray]
     import trimesh  # here, since it takes half a second and most scenes need no file
 
     suffix = path.suffix.lower()
-    scene = trimesh.load_scene(io.BytesIO(data), file_type=suffix[1:], resolver=assets, process=False)
+    with np.errstate(all="ignore"):  # what is not finite is named when it is looked through
+        scene = trimesh.load_scene(io.BytesIO(data), file_type=suffix[1:], resolver=assets, process=False)
     if suffix == ".obj" and assets.problem is not None:
         raise assets.problem
+    if assets.missing is not None:
+        name = re.split(r"[/\\]", assets.missing)[-1][:60]
+        notes.append(f"the material library {name}, which is not there")
     crease = CREASE if suffix in _DRAWN else None
     return _scene_parts(f"{path}", scene, images, notes, crease, assets)
 

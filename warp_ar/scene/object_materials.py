@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from warp_ar.errors import printable
 from warp_ar.scene.description import Object, Scene
 from warp_ar.scene.emissive_picture import load_emission
 from warp_ar.scene.geometry import Mesh
@@ -125,7 +126,7 @@ def _read_mesh(path: Path, stamp: tuple[int, int]) -> Mesh:
 
 @functools.cache
 def _say(path: Path, notes: tuple[str, ...]) -> None:
-    _LOG.warning("%s: not shown: %s", path, ", ".join(notes))
+    _LOG.warning("%s: not shown: %s", printable(path), printable(", ".join(notes)))
 
 
 def look_of(item: Object) -> Look:

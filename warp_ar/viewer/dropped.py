@@ -2,7 +2,7 @@
 
 Nothing of them is trusted. A file's name chooses how it is read and is shown again, nothing else; what it holds is kept
 in the page's own temporary folder, within limits, and goes with it. A scene may name no file but those of the scene
-that is shown: through the page nobody reads what lies on this machine.
+that is shown, and a mesh none but those that come with it: through the page nobody reads what lies on this machine.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from warp_ar.light.captured import Light
 from warp_ar.light.latlong_axes import from_axes
 from warp_ar.output.places import files_of
 from warp_ar.scene import CapturedLight, Object, load_scene, loads_scene
+from warp_ar.scene.mesh_assets import confine
 from warp_ar.scene.mesh_files import MESH_SUFFIXES, load_mesh
 from warp_ar.viewer.bundle import unpack_scene
 from warp_ar.viewer.edits import Wanted, add_item
@@ -52,6 +53,7 @@ class DroppedFiles:
     def __init__(self, folder: Path) -> None:
         """Keep files in a folder, which must be there."""
         self._folder, self._count = folder, 0
+        confine(folder)
 
     def take(self, name: str, data: bytes, wanted: Wanted) -> Edit:
         """Keep a file and say what to make of it.
