@@ -137,7 +137,7 @@ def test_who_interrupts_compiling_does_not_wait_for_all_of_it(monkeypatch) -> No
 
     monkeypatch.setattr(modules.wp, "compile_aot_module", compile_module)
     monkeypatch.setattr(modules, "usable_cores", lambda: 1)
-    variants = [(SimpleNamespace(number=number, options={}), None) for number in range(20)]
+    variants = [(SimpleNamespace(number=number, name="", options={}), None) for number in range(20)]
     with pytest.raises(KeyboardInterrupt):
         modules._compile(variants, SimpleNamespace(is_cpu=False), progress)
     assert len(compiled) <= 2
