@@ -91,11 +91,20 @@ def weigh_boundaries_kernel(
     pixels = params[0].focal[0] * probes[0].radius / wp.length(to_ball)
     # A pixel in the middle of the ball is 1 / pixels radians of its normals, twice that of what they mirror.
     half_pixel = wp.clamp(1.0 / pixels, 0.0, MAX_HALF_PIXEL)
-    around = wp.max(mean_around(clipped, i, j, half_pixel, 6.0))
-    if around < 0.999:
+    # One copy of the mean for both widths: two take compilers twice as long.
+    around = wp.float32(0.0)
+    turn = wp.int32(0)
+    while turn < 2:
         # Along rows and columns nearly everywhere: how wide something is need not be known exactly.
-        wide = wp.max(mean_around(clipped, i, j, WIDE * half_pixel, 1.5))
-        around = wp.pow(around, SHARPNESS * wp.max(1.0 - 2.0 * wide, 0.0))
+        deviation = wp.where(turn == 0, half_pixel, WIDE * half_pixel)
+        mean = wp.max(mean_around(clipped, i, j, deviation, wp.where(turn == 0, wp.float32(6.0), wp.float32(1.5))))
+        turn += 1
+        if turn == 2:
+            around = wp.pow(around, SHARPNESS * wp.max(1.0 - 2.0 * mean, 0.0))
+        else:
+            around = mean
+            if not around < 0.999:
+                turn = wp.int32(2)
     missing_out[i, j] = share * around
 
 

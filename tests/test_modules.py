@@ -137,7 +137,7 @@ def test_who_interrupts_compiling_does_not_wait_for_all_of_it(monkeypatch) -> No
 
     monkeypatch.setattr(modules.wp, "compile_aot_module", compile_module)
     monkeypatch.setattr(modules, "usable_cores", lambda: 1)
-    variants = [(SimpleNamespace(number=number, options={}), None) for number in range(20)]
+    variants = [(SimpleNamespace(number=number, name="", options={}), None) for number in range(20)]
     with pytest.raises(KeyboardInterrupt):
         modules._compile(variants, SimpleNamespace(is_cpu=False), progress)
     assert len(compiled) <= 2
@@ -201,3 +201,15 @@ def test_headers_are_parsed_once_ahead_of_the_kernels(tmp_path: Path) -> None:
     assert run.stdout.splitlines()[-4:] == ["0", "1", "True 0", "0"]
     assert "ResourceWarning" not in run.stderr, run.stderr
     assert list(temporary.iterdir()) == []
+
+
+def test_modules_that_take_nvrtc_longest_begin_first() -> None:
+    """By their names, which are those of their kernels' factories; the others keep their order."""
+    folder = Path(modules.__file__).parents[1] / "kernels"
+    factories = "".join(path.read_text(encoding="utf-8") for path in folder.glob("*.py"))
+    for word in modules._LONGEST:
+        assert f"def make_{word}" in factories, word
+    names = ["composite", "shade_kernel", "fill", "mirror_ball", "bands", "near_field", "trace_secondary"]
+    variants = [(SimpleNamespace(name=f"make_{name}__x"), None) for name in names]
+    ordered = [module.name[5:-3] for module, _ in modules._longest_first(variants)]
+    assert ordered == [*modules._LONGEST, "composite", "fill", "bands"]

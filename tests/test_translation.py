@@ -51,7 +51,7 @@ def translate(kernels, device, progress=None, **_):
     raise KeyboardInterrupt
 
 scheduler.load_modules = translate
-for scene, quality in (("desk", "medium"), ("torus", "high"), ("mirror", "high"), ("desk", "paper")):
+for scene, quality in (("desk", "medium"), ("torus", "high")):
     try:
         Pipeline(scene, device="cpu", quality=quality).warm_up()
     except KeyboardInterrupt:
@@ -61,7 +61,7 @@ print(json.dumps([written, tried, functions]))
 
 
 def test_what_is_written_is_the_same_to_the_byte(tmp_path: Path) -> None:
-    """For both targets, of four plans; overloads are tried half as often at most, and a third of the functions rest."""
+    """For both targets, of two plans; overloads are tried half as often at most, and a third of the functions rest."""
     script = tmp_path / "script.py"
     script.write_text(WRITTEN)
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
@@ -73,7 +73,7 @@ def test_what_is_written_is_the_same_to_the_byte(tmp_path: Path) -> None:
         return written, tried, functions
 
     (usual, often, all_functions), (short, once, few_functions) = run("usual"), run("short")
-    assert len(usual) > 80
+    assert len(usual) > 70
     assert short == usual
     assert once < 0.5 * often
     assert few_functions < 0.67 * all_functions

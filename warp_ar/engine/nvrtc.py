@@ -2,8 +2,8 @@
 
 NVRTC does a part of its work, some seventh of it, for one program of a process at a time, so that sixteen threads
 finish no sooner than seven. Here each thread hands what Warp has translated to a process of its own
-(``nvrtc_process``), which makes the same binary to the byte. The first thread compiles in this process: it begins with
-the longest module, and a process is up only after half a second.
+(``nvrtc_process``), which makes the same binary to the byte. The first two threads compile in this process: they begin
+with the longest modules, hardly wait for each other, and a process is up only after half a second.
 """
 
 from __future__ import annotations
@@ -24,8 +24,10 @@ from warp_ar.errors import UsageError
 
 VARIABLE: Final = "WARP_AR_COMPILERS"
 """Environment variable, for measuring: processes that compile CUDA modules at most; 0: threads of this one alone."""
-MOST: Final = 15
+MOST: Final = 14
 """Processes at most; each takes some 200 MB while it compiles."""
+HERE: Final = 2
+"""Threads that compile in this process."""
 
 _THREAD: Final = threading.local()
 _OWN: Final = threading.Lock()
@@ -38,7 +40,7 @@ def compile_beside() -> None:
 
 
 def count_processes(modules: int, cores: int) -> int:
-    """Processes to compile so many modules with, beside this one's own thread.
+    """Processes to compile so many modules with, beside threads of this one.
 
     Raises:
         UsageError: The environment variable is no number.
@@ -47,7 +49,7 @@ def count_processes(modules: int, cores: int) -> int:
     if asked and not asked.isdecimal():
         raise UsageError(f"{VARIABLE} = {asked!r}: expected a number of processes")
     most = int(asked) if asked else MOST if _ENABLED.is_set() else 0
-    return max(min(modules, cores, most + 1) - 1, 0)
+    return max(min(modules, cores, most + HERE) - HERE, 0)
 
 
 class Compilers:
@@ -62,22 +64,22 @@ class Compilers:
         self._left = count
         self._lock = threading.Lock()
         self._processes: list[subprocess.Popen[str]] = []
-        self._here = False
+        self._here = 0
         self.closed = False
         if count:
             _hand_over()
 
     @contextlib.contextmanager
     def used(self) -> Iterator[None]:
-        """Around what a thread has Warp compile: the thread's own process does it, of all but the first thread."""
+        """Around what a thread has Warp compile: the thread's own process does it, of all but the first threads."""
         if not hasattr(_THREAD, "process") or _THREAD.owner is not self:
             _THREAD.owner, _THREAD.process = self, self._start()
         yield
 
     def _start(self) -> subprocess.Popen[str] | None:
         with self._lock:
-            if not self._here or not self._left:
-                self._here = True
+            if self._here < HERE or not self._left:
+                self._here += 1
                 return None
             self._left -= 1
         from warp_ar.engine import nvrtc_process
