@@ -170,10 +170,14 @@ def test_a_library_starts_no_processes(monkeypatch) -> None:
     # Two threads compile here; no more at once than there are cores or modules.
     assert nvrtc.count_processes(40, 16) == 14
     assert nvrtc.count_processes(40, 64) == nvrtc.MOST
+    assert nvrtc.count_processes(40, 1) == 0
+    # What one more scene needs is compiled sooner by threads.
+    assert nvrtc.count_processes(nvrtc.LEAST, 64) > 0
+    assert nvrtc.count_processes(nvrtc.LEAST - 1, 64) == 0
+    monkeypatch.setenv(nvrtc.VARIABLE, "14")
     assert nvrtc.count_processes(3, 16) == 1
     assert nvrtc.count_processes(2, 16) == 0
     assert nvrtc.count_processes(1, 16) == 0
-    assert nvrtc.count_processes(40, 1) == 0
     monkeypatch.setenv(nvrtc.VARIABLE, "0")
     assert nvrtc.count_processes(40, 16) == 0
     monkeypatch.setenv(nvrtc.VARIABLE, "-1")
