@@ -12,7 +12,7 @@ import hypothesis
 import pytest
 import warp as wp
 
-from warp_ar.engine import modules, tiers
+from warp_ar.engine import tiers, translation
 
 wp.config.log_level = wp.LOG_WARNING
 # A test runs its kernels once or twice: compiled quickly they give the same bits (tests/test_tiers.py).
@@ -23,8 +23,8 @@ wp.config.cpu_compiler_flags = tiers.QUICK_FLAGS
 # As commands do. Half of what finds a kernel in the cache is looking through its functions, and the same ones are in
 # hundreds of kernels here. No test changes a function or a constant of a kernel (tests/hard_cases/mutations.py does, in
 # a copy and a process of its own).
-modules.remember_references()
-modules.drop_unused_adjoints()
+translation.remember_references()
+translation.drop_unused_adjoints()
 
 MOST_PROCESSES = 4
 """Processes that a run of a folder is spread over at most: each takes 1 to 3 GB."""

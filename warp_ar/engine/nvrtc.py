@@ -3,8 +3,8 @@
 NVRTC does a part of its work, some seventh of it, for one program of a process at a time, so that sixteen threads
 finish no sooner than seven. Here each thread hands what Warp has translated to a process of its own
 (``nvrtc_process``), which makes the same binary to the byte. The first two threads compile in this process: they begin
-with the longest modules, hardly wait for each other, and a process is up only after half a second. So processes pay where
-nothing is cached: the modules that one more scene needs are compiled sooner by threads.
+with the longest modules, hardly wait for each other, and a process is up only after half a second. So processes pay
+where nothing is cached: the modules that one more scene needs are compiled sooner by threads.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ MOST: Final = 14
 HERE: Final = 2
 """Threads that compile in this process."""
 LEAST: Final = 30
-"""Modules from which on processes are started: on an H100 they took 4 s off the 41 of ``desk`` and added 1 to 7 s to those
-that further scenes lack."""
+"""Modules from which on processes are started: on an H100 they took 4 s off the 41 of ``desk`` and added 1 to 7 s to
+those that further scenes lack."""
 
 _THREAD: Final = threading.local()
 _OWN: Final = threading.Lock()
