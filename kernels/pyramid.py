@@ -75,17 +75,27 @@ def sample_packed(
     j = wp.int32(wp.floor(x))
     fy = y - wp.float32(i)
     fx = x - wp.float32(j)
-    if i >= 0 and i + 1 < height and j >= 0 and j + 1 < width:
-        at = offset + i * width + j
-        top = levels[at] * (1.0 - fx) + levels[at + 1] * fx
-        bottom = levels[at + width] * (1.0 - fx) + levels[at + width + 1] * fx
-        return top * (1.0 - fy) + bottom * fy
-    t00 = wrap_texel(i, j, height, width)
-    t01 = wrap_texel(i, j + 1, height, width)
-    t10 = wrap_texel(i + 1, j, height, width)
-    t11 = wrap_texel(i + 1, j + 1, height, width)
-    top = levels[offset + t00[0] * width + t00[1]] * (1.0 - fx) + levels[offset + t01[0] * width + t01[1]] * fx
-    bottom = levels[offset + t10[0] * width + t10[1]] * (1.0 - fx) + levels[offset + t11[0] * width + t11[1]] * fx
+    # Texels' places first, then one copy of what is read and mixed; across the border one copy of the way round, too.
+    above_left = offset + i * width + j
+    above_right = above_left + 1
+    below_left = above_left + width
+    below_right = below_left + 1
+    if i < 0 or i + 1 >= height or j < 0 or j + 1 >= width:
+        corner = wp.int32(0)
+        while corner < 4:
+            texel = wrap_texel(i + corner / 2, j + corner % 2, height, width)
+            place = offset + texel[0] * width + texel[1]
+            if corner == 0:
+                above_left = place
+            elif corner == 1:
+                above_right = place
+            elif corner == 2:
+                below_left = place
+            else:
+                below_right = place
+            corner += 1
+    top = levels[above_left] * (1.0 - fx) + levels[above_right] * fx
+    bottom = levels[below_left] * (1.0 - fx) + levels[below_right] * fx
     return top * (1.0 - fy) + bottom * fy
 
 
