@@ -86,7 +86,7 @@ def main(device: str) -> None:
         *_, picture = tracer.render(SAMPLES, step=SAMPLES // 4)
         assert np.isfinite(picture.radiance).all()
         changed = np.abs(picture.image.astype(int) - np.round(255.0 * _encoded(tracer))).max(axis=2) > 2
-        assert 0.01 < changed.mean() < 0.9, "virtual things are not in the picture"
+        assert 0.01 < changed.mean() < 0.9, "nothing virtual is in the picture"
         pixels = SIZES[kind][0] * SIZES[kind][1]
         before, samples = tracer.rays(), tracer.samples
         contenders = {"paths": lambda t=tracer: t.sample(STEPS[kind]), "bare": Primary(tracer)}

@@ -6,7 +6,7 @@ CASE is a folder with ``case.json``, ``camera``, ``env`` and a folder and a scen
 have the frames' own size, for the truth was clipped there: a highlight that clips is dimmer after averaging down. One
 JSON line per case and version; ``kept`` is the mean FLIP to the truth where the truth differs from the camera's frame,
 over that of the frame itself. What of it is noise of the samples: ``kept_half`` is the same by the first half of them,
-``noise`` the difference between the halves, ``error`` the relative standard error of what virtual things change.
+``noise`` the difference between the halves, ``error`` the relative standard error where the picture changes.
 Samples go to pixels within MARGIN of those that count. With ``--keep FILE`` lines of single frames are kept there, and
 what it holds at these samples is not rendered again.
 """

@@ -259,7 +259,16 @@ def _coarse(image: Image, camera: Camera, sphere: Array, rough_error: float) -> 
 
 
 def refine_outline(image: Image, camera: Camera, sphere: Array) -> BallOutline:
-    """The outline near a sphere that is within some percent of right, with its uncertainty."""
+    """The outline near a sphere that is within some percent of right, with its uncertainty.
+
+    Args:
+        image: 8-bit RGB.
+        camera: It took the picture.
+        sphere: Centre over radius, (3,), in the camera's frame.
+
+    Raises:
+        UsageError: What is found is no ball before the camera.
+    """
     image, camera, corner = _window(image, camera, sphere)
     radius = _radius(camera, sphere)
     share, finest = min(1.0, COARSE_RADIUS / radius), min(1.0, LARGEST_RADIUS / radius)
