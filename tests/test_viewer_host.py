@@ -72,7 +72,7 @@ def test_changes_of_quality_leave_no_arrays_behind(monkeypatch: pytest.MonkeyPat
     try:
         with Running(page_scene()) as running:
             first = [arrays(running, quality) for quality in ("paper", "low")]
-            for _ in range(3):
+            for _ in range(2):
                 last = [arrays(running, quality) for quality in ("paper", "low")]
             assert 0 < max(last) <= max(first)
     finally:
