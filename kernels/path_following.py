@@ -249,7 +249,8 @@ def make_physical_radiance(trace: TraceConfig) -> wp.Function:
     find_vertex, sky_light = make_find_vertex(trace), make_sky_light(trace)
     see_proxy, look_up_material = make_see_proxy(trace), make_look_up_material()
 
-    @wp.func(module="unique")
+    # Not inlined, as ``follow_path``: its calls are rare beside what they do, and each copy is compiled anew.
+    @wp.func(module="unique", inline=False)
     def physical_radiance(
         params: FrameParams,
         scene: LocalScene,
@@ -372,7 +373,7 @@ def make_follow_path(trace: TraceConfig) -> wp.Function:
     physical_radiance, virtual_light = make_physical_radiance(trace), make_virtual_light(trace)
     occluded_by_objects = make_trace(trace).occluded_by_objects
 
-    @wp.func(module="unique")
+    @wp.func(module="unique", inline=False)
     def follow_path(
         params: FrameParams,
         scene: LocalScene,
