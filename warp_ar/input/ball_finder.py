@@ -47,6 +47,8 @@ SEARCHED = 1600.0
 """Pixels along the longer side of the picture in which a ball is looked for."""
 DIM_SUPPORT = 0.4
 """Share of the rim that is seen, below which a person should look as well."""
+TINY = 24.0
+"""Pixels of the radius below which many things look like a ball."""
 SEARCHES = 16
 """Proposed circles from which a ball is looked for in a whole picture."""
 CERTAIN = 9.0
@@ -97,7 +99,8 @@ class BallOutline:
     @property
     def is_doubtful(self) -> bool:
         """Whether something else may have been taken for the ball: most such outlines are right, but not all."""
-        return math.isfinite(self.evidence) and (self.evidence < CERTAIN or self.support < DIM_SUPPORT)
+        dim = self.support < DIM_SUPPORT or self.radius < TINY
+        return math.isfinite(self.evidence) and (self.evidence < CERTAIN or dim)
 
     @property
     def radius(self) -> float:
@@ -414,23 +417,25 @@ def _find_anywhere(image: Image, camera: Camera) -> BallOutline:
     if best is None:
         raise UsageError(f"no ball was found in the picture; {ask}")
     lift, sphere = best
-    outline = _refine(lifted(image) if lift else image, camera, sphere)
+    picture = lifted(image) if lift else image
+    outline = refine_outline(picture, camera, sphere)
+    if outline.support < LEAST_SUPPORT and (reduced := _refine_reduced(picture, camera, outline)) is not None:
+        outline, told = reduced, min(told, LEAST_EVIDENCE)  # right for soft photographs, but not beyond doubt
     outline = dataclasses.replace(outline, evidence=told)
     if told < LEAST_EVIDENCE or outline.support < LEAST_SUPPORT:
         raise _unseen(outline, ask)
     return outline
 
 
-def _refine(image: Image, camera: Camera, sphere: Array) -> BallOutline:
-    """The outline near a sphere, in as large a picture as shows the rim: noise or a soft lens may hide it in larger."""
-    outline = refine_outline(image, camera, sphere)
+def _refine_reduced(image: Image, camera: Camera, outline: BallOutline) -> BallOutline | None:
+    """The outline in as large a picture as shows the rim, which noise or a soft lens hides in larger ones."""
     largest = 0.5 * min(outline.radius, LARGEST_RADIUS)
-    while outline.support < LEAST_SUPPORT and largest >= COARSE_RADIUS:
-        reduced = refine_outline(image, camera, sphere, largest)
+    while largest >= COARSE_RADIUS:
+        reduced = refine_outline(image, camera, np.array(outline.sphere), largest)
         if reduced.support >= DIM_SUPPORT:
             return reduced  # there it must be seen well: every desk has circles that are seen a little
         largest *= 0.5
-    return outline
+    return None
 
 
 def _unseen(outline: BallOutline, ask: str) -> UsageError:
