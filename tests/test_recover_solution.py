@@ -98,8 +98,8 @@ def test_shading_finds_how_far_an_emitter_is(device, scene, distance):
     extra = surroundings.trace(emitter) * distance**2 * power * np.ones(3)
     estimate, _ = surroundings.estimate(radiance, extra=extra)
     (found,) = estimate.emitters
-    # Measured at these: 0.032 at most, and 0.067 at 0.9 m, where the costs differ by less than noise. The distances among
-    # which it is found first lie up to a quarter apart.
+    # Measured at these: 0.032 at most; 0.067 at 0.9 m, where costs differ by less than noise. The distances among which
+    # it is found first lie up to a quarter apart.
     assert found.distance == pytest.approx(distance, rel=0.04)
     # The grid of directions is 5.6 degrees wide.
     assert found.direction @ direction > np.cos(0.1)
