@@ -92,23 +92,24 @@ def test_device_is_not_released_while_it_is_read() -> None:
 def test_a_driver_that_hangs_does_not_hold_up_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
     """It is left to its thread, and not released under it."""
     monkeypatch.setattr(capture_device, "CLOSE_SECONDS", 0.2)
-    hangs = threading.Event()
+    broken, hangs, mended = threading.Event(), threading.Event(), threading.Event()
 
     class Hanging(FakeCapture):
         def read(self) -> tuple[bool, np.ndarray | None]:
-            if not self.gate.is_set():
+            if broken.is_set():
                 hangs.set()
+                mended.wait()
             return super().read()
 
     capture = Hanging(10**9)
     source = CaptureDevice(0, opener=lambda _: capture)
-    capture.gate.clear()
+    broken.set()
     assert hangs.wait(PATIENCE)
     closing = threading.Thread(target=source.close)
     closing.start()
     closing.join(0.5 * PATIENCE)
     ended, released = not closing.is_alive(), capture.released
-    capture.gate.set()
+    mended.set()
     closing.join()
     source._thread.join()
     assert ended, "it waits for the driver"

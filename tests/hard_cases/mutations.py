@@ -332,7 +332,7 @@ MUTATIONS = (
         15,
         "a lost marker is taken to be where it was",
         "warp_ar/engine/pipeline.py",
-        "lost = self._tracker is not None and pose is None",
+        "lost = pose is None and (self._tracker is not None or isinstance(given, Track))",
         "lost = False",
         f"{HARD}test_rows15_16_input.py::test_lost_and_found_every_frame",
     ),
