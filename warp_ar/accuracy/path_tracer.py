@@ -88,7 +88,7 @@ def _relative_error(picture: FloatImage, error: FloatImage, frame: FloatImage | 
 
 
 def _changed(picture: FloatImage, error: FloatImage, frame: FloatImage | None) -> npt.NDArray[np.bool_]:
-    """Pixels that virtual things change, (H, W)."""
+    """Pixels that virtual objects and lights change, (H, W)."""
     if frame is None:
         return np.ones(picture.shape[:2], bool)
     return np.asarray((np.abs(picture - frame) > LEAST_CHANGE).any(axis=2) | (error > LEAST_CHANGE).any(axis=2))
