@@ -46,7 +46,7 @@ from warp_ar.kernels.environment_shadow_cells import (
     first_of_set,
     ratio_of,
 )
-from warp_ar.kernels.environment_shadow_rays import make_aim, make_find_sender, make_masks
+from warp_ar.kernels.environment_shadow_rays import make_aim, make_find_sender, make_masks, may_be_one_sided
 from warp_ar.kernels.environment_shadow_wavefront import Wavefront, shade_wavefront
 from warp_ar.kernels.launch import Rows, launch_rows, slow_to_compile
 from warp_ar.kernels.reflect import DistantLight
@@ -109,6 +109,7 @@ def make_environment_shadow_kernel(config: EnvironmentShadowConfig) -> wp.Kernel
         own = hit.shape
         without = wp.vec3(0.0)
         hidden = wp.vec3(0.0)
+        one_sided = may_be_one_sided(scene.objects)
         reflected = ReflectedLight()
         before = Before()
         # A set is in the order of its sequence: any first part of it is a smaller set.
@@ -141,13 +142,16 @@ def make_environment_shadow_kernel(config: EnvironmentShadowConfig) -> wp.Kernel
                         if (virtual_mask & bit) != wp.uint64(0):
                             other = Hit()
                             other.shape = -1
+                            sure = wp.bool(False)
                             if wp.static(secondary_count == config.count) or block * wp.static(chunk) + k < wp.static(
                                 secondary_count
                             ):
                                 other = closest_object(scene, ray.origin, ray.direction, sender.distance)
-                                if other.shape >= 0:
-                                    hidden += weight * radiance
-                            elif occluded_by_objects(scene, ray.origin, ray.direction, sender.distance):
+                                sure = other.shape >= 0 or not one_sided
+                            hides = other.shape >= 0
+                            if not sure:
+                                hides = occluded_by_objects(scene, ray.origin, ray.direction, sender.distance)
+                            if hides:
                                 hidden += weight * radiance
                             if other.shape >= 0:
                                 meeting = Meeting()

@@ -21,10 +21,22 @@ from warp_ar.kernels.materials import reflect
 from warp_ar.kernels.probe_weights import probe_share
 from warp_ar.kernels.reflect import DistantLight, look_up, make_find_in_frame
 from warp_ar.kernels.shapes import FAR, intersect_sphere
-from warp_ar.kernels.structs import BOX, PLANE, FrameParams, Hit, Picture, RayScene
+from warp_ar.kernels.structs import BOX, PLANE, FrameParams, Hit, Picture, RayScene, Shape
 from warp_ar.kernels.trace import make_trace
 
 wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def may_be_one_sided(objects: wp.array[Shape]) -> wp.bool:
+    """Whether the closest hit may pass what hides the environment: triangles that are seen from one side only.
+
+    They throw shadows from both sides, and ``occluded_by_objects`` knows no other.
+    """
+    found = wp.bool(False)
+    for index in range(objects.shape[0]):
+        found = found or objects[index].holed != 0
+    return found
 
 
 @wp.func

@@ -20,6 +20,7 @@ from warp_ar.kernels.environment_shadow_cells import (
 from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
 from warp_ar.kernels.structs import (
     LAMBERT,
+    MESH,
     SPHERE,
     Emitter,
     FrameParams,
@@ -30,6 +31,7 @@ from warp_ar.kernels.structs import (
     make_picture,
 )
 from warp_ar.kernels.trace import TraceConfig
+from warp_ar.scene.ray_scene import HostScene
 
 COUNT, SIDE = 64, 4
 ORIGIN = (0.0, 0.0, 0.035)
@@ -118,17 +120,27 @@ def run(
     partials=1,
     as_wavefront=False,
     others=None,
+    loaded=None,
+    single_sided=0,
 ):
+    """Shade a desk; ``loaded`` is a scene whose objects are there in place of ``objects``."""
     kinds = tuple(tuple(sorted({item["kind"] for item in items})) for items in (objects, proxies))
     several = others is not None
-    forms = DistantLightConfig(TraceConfig(*kinds), (LAMBERT,), False, "sh", False, bool(probes), several=several)
+    trace = TraceConfig(*kinds) if loaded is None else TraceConfig((MESH,), kinds[1], detail=True)
+    forms = DistantLightConfig(trace, (LAMBERT,), False, "sh", False, bool(probes), several=several)
     config = EnvironmentShadowConfig(forms, count, side, bounce, secondary, emitters, partials)
     camera = camera_fields(CAMERA, LOOK_DOWN, 60, (H, W))
     params = records(FrameParams, {**camera, "shadow_rect": rect})
     scene = RayScene()
-    objects = [{**item, "material": 0} for item in objects]
-    scene.objects, scene.proxies = records(Shape, *objects), records(Shape, *proxies)
-    scene.materials = records(Material, {"model": LAMBERT, "base_color": (albedo,) * 3, **dict.fromkeys(TEXTURES, -1)})
+    if loaded is None:
+        objects = [{**item, "material": 0} for item in objects]
+        scene.objects = records(Shape, *objects)
+    else:
+        host = HostScene(loaded, wp.get_device())  # holds the meshes
+        scene = host.ray_scene
+    material = {"model": LAMBERT, "base_color": (albedo,) * 3, "single_sided": single_sided}
+    scene.materials = records(Material, {**material, **dict.fromkeys(TEXTURES, -1)})
+    scene.proxies = records(Shape, *proxies)
     surroundings = DistantLight()
     surroundings.environment = wp.array(sky(), dtype=wp.vec3)
     surroundings.probes = records(Probe, *probes)

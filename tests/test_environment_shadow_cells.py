@@ -18,6 +18,7 @@ from tests.environment_shadow_rig import (
     sphere,
     with_sun,
 )
+from tests.gltf_files import Gltf
 from tests.kernel_rig import records, shape
 from tests.relight_rig import CAMERA, DESK, LOOK_DOWN, POINTS, RAYS, H, W
 from warp_ar.kernels import (
@@ -40,6 +41,8 @@ from warp_ar.kernels.structs import (
     Shape,
 )
 from warp_ar.kernels.trace import TraceConfig
+from warp_ar.scene import Camera as SceneCamera
+from warp_ar.scene import Object, Scene
 
 # --- Cells ------------------------------------------------------------------------------------------------------------
 
@@ -83,6 +86,31 @@ def test_a_wavefront_finds_the_same(device, bounce, secondary):
         np.testing.assert_array_equal(run(drawn, **scene, partials=partials, as_wavefront=True), found)
     dark = run(drawn, **{**scene, "albedo": 0.0}, partials=8, as_wavefront=True)
     assert (dark[one < 0.99] < one[one < 0.99]).mean() > 0.5, "objects send light"
+
+
+@pytest.mark.parametrize("secondary", [1.0, 0.5])
+def test_what_is_seen_from_one_side_hides_the_sky_from_both(device, tmp_path, secondary):
+    """A sheet above the desk that faces up: rays of the desk come from behind it."""
+    drawn = draw(with_sun(6, 20, 100.0))
+    made = Gltf()
+    made.material()
+    made.node(made.square(0))
+    # A file's square stands upright and faces -y, toward whoever looks along +y.
+    sheet = Object(
+        "mesh", file=made.save(tmp_path / "sheet.glb"), at=(0.0, 0.0, 0.03), rotate=(-90.0, 0.0, 0.0), scale=0.05
+    )
+    about = {
+        "loaded": Scene(SceneCamera(W, H, 60, 60, W / 2, H / 2), objects=(sheet,)),
+        "stride": 2,
+        "bounce": "traced",
+        "secondary": secondary,
+        "filtered": False,
+    }
+    expected, _ = run(drawn, **about)
+    assert (expected < 0.5).mean() > 0.02
+    for way in ({}, {"as_wavefront": True, "partials": 4}):
+        ratio, _ = run(drawn, **about, single_sided=1, **way)
+        np.testing.assert_allclose(ratio, expected, atol=SUM_ERROR)
 
 
 def test_a_wavefront_takes_one_set_and_little_memory(device):
