@@ -30,6 +30,8 @@ from warp_ar.farm.version import program_version
 
 CORES = 4
 """Of a worker on CPU: more of them leave stages of few rows waiting."""
+ONE_THREAD = 1
+"""Of OpenCV in a worker: what it is asked for takes microseconds, and waking threads for that more."""
 TELL_SECONDS = 0.5
 """Between two messages about frames."""
 
@@ -225,7 +227,7 @@ def _serve(pipe: Any, context: Context, cores: Sequence[int], every: Sequence[in
 
     from warp_ar.farm.work import Work  # here: a driver does without Warp
 
-    cv2.setNumThreads(max(1, len(cores)))
+    cv2.setNumThreads(ONE_THREAD)
     jobs: queue.SimpleQueue[tuple[Job, Any]] = queue.SimpleQueue()
 
     def listen() -> None:

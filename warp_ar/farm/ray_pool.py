@@ -16,7 +16,7 @@ from typing import Any
 
 from warp_ar.errors import UsageError, reason
 from warp_ar.farm.jobs import Job
-from warp_ar.farm.pool import Event
+from warp_ar.farm.pool import ONE_THREAD, Event
 from warp_ar.farm.records import Context
 from warp_ar.farm.version import program_version
 
@@ -32,8 +32,11 @@ class Member:
 
     def __init__(self, context: Context) -> None:
         """Do nothing yet."""
+        import cv2
+
         from warp_ar.farm.work import Work
 
+        cv2.setNumThreads(ONE_THREAD)
         self._work, self._frames = Work(context), 0
         self._lock = threading.Lock()
 
