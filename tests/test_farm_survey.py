@@ -103,6 +103,13 @@ def test_a_survey_is_that_of_frames_one_after_another(folder, tmp_path, monkeypa
     monkeypatch.setattr(survey._Look, "take", take_late)
     monkeypatch.setattr(survey, "POOL", pool)
     monkeypatch.setattr(recover, "POOL", pool)
+    started, start = [], survey.TrackingProcess
+
+    def noted_start(*arguments, **options):
+        started.append(start(*arguments, **options))
+        return started[-1]
+
+    monkeypatch.setattr(survey, "TrackingProcess", noted_start)
     if aside:
         monkeypatch.setattr(survey, "ASIDE_FRAMES", 1)
         monkeypatch.setattr(survey, "CORES_EACH", 1)
@@ -110,6 +117,8 @@ def test_a_survey_is_that_of_frames_one_after_another(folder, tmp_path, monkeypa
     try:
         found = surveyed(jobs, tmp_path / "run")
         assert (pool.solved > 0) == aside
+        assert len(started) == aside, "frames are read beside the survey where that is to be"
+        assert all(process._process.poll() is not None for process in started), "what reads ends with the survey"
         assert not pool._all, "what solved beside the survey is not kept"
     finally:
         pool.close()
