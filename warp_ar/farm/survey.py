@@ -19,8 +19,8 @@ value``) since the last key: the tolerance within which stages that read the env
 
 Poses and light of a frame rest on the frames before it, so a clip is surveyed in order. But its steps run side by side:
 some threads decode, one follows the marker, one has kernels gather the light of the frame before, one compares and
-packs what came of the one before that. Of a long clip another process reads and follows the marker, and a third finds
-the light that clips. What each step sees, and so every byte, is as if they were one after another.
+packs what came of the one before that. Of a long clip another process reads and follows the marker. What each step
+sees, and so every byte, is as if they were one after another.
 """
 
 from __future__ import annotations
@@ -54,7 +54,6 @@ from warp_ar.input.sources import open_source
 from warp_ar.input.tracking import Track, Tracker
 from warp_ar.kernels.change import CHANGE_FLOOR, CHANGE_SHARE
 from warp_ar.light.captured import Light, find_emitters
-from warp_ar.light.solving_process import CORES_EACH, POOL
 from warp_ar.scene import CapturedLight, Pose, Scene
 from warp_ar.stages.features import has_environment
 
@@ -66,9 +65,11 @@ LIGHT = "light.exr"
 """The environment at the clip's end, with the emitters that were found."""
 CONVERTERS = 4
 """Threads that turn decoded pictures into RGB: with fewer they are the slowest step."""
-ASIDE_FRAMES = 1000
-"""Frames of a clip from which on a process beside this one reads and looks for the marker, and another solves for light
-that clips: to start each takes a second of processor time and 150 MB for as long as the survey lasts."""
+BESIDE_FRAMES = 1000
+"""Frames of a clip from which on a process beside this one reads and looks for the marker: to start it takes a second
+of processor time and 150 MB for as long as the survey lasts."""
+BESIDE_CORES = 4
+"""Cores from which on it does."""
 AHEAD = 8
 """Frames at most whose marker has been looked for and whose light has not been gathered: solving for light that clips
 takes as long as some frames, and comes with one of several."""
@@ -268,7 +269,7 @@ def _look_at_frames(
         if not look.captures:
             return
     gpu, converters = jobs.settings.gpu_of(device), min(CONVERTERS, usable_cores())
-    is_long = end - first >= ASIDE_FRAMES and usable_cores() >= CORES_EACH
+    is_long = end - first >= BESIDE_FRAMES and usable_cores() >= BESIDE_CORES
     with contextlib.ExitStack() as stack:
         source = stack.enter_context(open_part(path, index, first, end, fps, gpu, converters=converters))
         linear = keep_depth(source, look.scene)
@@ -277,8 +278,6 @@ def _look_at_frames(
             camera = look.scene.camera.scaled_to(*source.size)
             reading = Reading(path, index, first, end, fps, gpu, converters, look.scene.marker, camera)
             tracked = iter(stack.enter_context(TrackingProcess(reading, held=SUBMITTED)))
-        if is_long and look.captures:
-            stack.enter_context(_solving_aside())
         pipeline = Pipeline(
             look.scene,
             device=device,
@@ -343,16 +342,6 @@ def _tracked(source: RecordedSource, pipeline: Pipeline) -> Iterator[tuple[Frame
             yield from ((ready, track.result()) for ready, track in waiting)
         finally:
             thread.shutdown(cancel_futures=True)
-
-
-@contextlib.contextmanager
-def _solving_aside() -> Iterator[None]:
-    """Have another process solve for light that clips."""
-    POOL.prepare()
-    try:
-        yield
-    finally:
-        POOL.rest()
 
 
 def keep_depth(source: RecordedSource, scene: Scene) -> bool:

@@ -141,6 +141,7 @@ def serve() -> None:
             told = "error", error
         with contextlib.suppress(OSError):
             write_message(target, told)
+        os._exit(0)  # at once: a thread still reads
 
 
 def _read(reading: Reading, memory: mmap.mmap, free: threading.Semaphore, target: Any) -> None:
