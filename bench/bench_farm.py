@@ -42,11 +42,12 @@ from bench.farm_kills import run_kills
 from bench.farm_long import PHASES, run_long
 from bench.farm_recordings import RATE
 from bench.farm_runs import jobs_done, prepare, rates, work
+from bench.farm_survey import run_survey
 from bench.farm_variations import run_variations
 from warp_ar.farm.fitting import probe_worker, workers_of_gpu
 from warp_ar.farm.jobs import parse_jobs, read_jobs
 
-PARTS = {"bounds": 0.1, "gpus": 0.4, "cpu": 0.1, "long": 0.22, "variations": 0.18, "kills": 0.2}
+PARTS = {"bounds": 0.1, "survey": 0.1, "gpus": 0.4, "cpu": 0.1, "long": 0.22, "variations": 0.18, "kills": 0.2}
 """Parts in their order, and their shares of the minutes."""
 
 
@@ -175,6 +176,7 @@ def run_parts(bench: Bench) -> None:
     """All parts that are asked for, each within its share of the minutes."""
     runs = {
         "bounds": run_bounds,
+        "survey": run_survey,
         "gpus": run_gpus,
         "cpu": run_cpu,
         "long": run_long,
