@@ -32,8 +32,8 @@ _FORMATS = (
     "mov,mp4,matroska,webm,avi,mpegts,mpeg,mpegvideo,m4v,h264,hevc,av1,obu,ivf,flv,live_flv,asf,ogg,mxf,dv,nut,"
     "mjpeg,mjpeg_2000,gif,apng,yuv4mpegpipe,wtv,rm,vc1,vc1test,swf,r3d,bink,roq,nsv,smk,gxf,wav"
 )
-# FFmpeg converts these to planes by the processor's wide instructions, to RGB in turn number by number: the same bits
-# in half the time. Of halved chroma in an odd number of rows some codes differ by one.
+# FFmpeg converts these to RGB in planes in half the time that it takes for RGB in turn, to the same bits. Of halved
+# chroma in an odd number of rows some codes differ by one.
 _IN_PLANES = frozenset(
     ("yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p", "nv12", "yuv420p10le", "p010le")
 )
