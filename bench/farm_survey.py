@@ -26,7 +26,7 @@ from bench.farm_clip import keep_kernels, write_clips
 from bench.farm_recordings import write_recording, write_scene
 from warp_ar.farm import survey
 from warp_ar.farm.jobs import parse_jobs, read_jobs
-from warp_ar.farm.pool import ONE_THREAD
+from warp_ar.farm.records import OPENCV_THREADS
 
 FRAMES = {"cpu": 240, "cuda": 600}
 TURNS = 2
@@ -66,7 +66,7 @@ def survey_steps(path: Path, device: str, frames: int, beside: bool) -> dict[str
         frames: Of the clip.
         beside: Whether another process reads and tracks.
     """
-    cv2.setNumThreads(ONE_THREAD)
+    cv2.setNumThreads(OPENCV_THREADS)
     survey.BESIDE_FRAMES, survey.BESIDE_CORES = (1, 1) if beside else (sys.maxsize, 1)
     jobs = parse_jobs(read_jobs(path), str(path))
     begin, end = int(WARM * frames), frames - END

@@ -16,8 +16,8 @@ from typing import Any
 
 from warp_ar.errors import UsageError, reason
 from warp_ar.farm.jobs import Job
-from warp_ar.farm.pool import ONE_THREAD, Event
-from warp_ar.farm.records import Context
+from warp_ar.farm.pool import Event
+from warp_ar.farm.records import OPENCV_THREADS, Context
 from warp_ar.farm.version import program_version
 
 CONNECT_SECONDS = 30.0
@@ -36,7 +36,7 @@ class Member:
 
         from warp_ar.farm.work import Work
 
-        cv2.setNumThreads(ONE_THREAD)
+        cv2.setNumThreads(OPENCV_THREADS)
         self._work, self._frames = Work(context), 0
         self._lock = threading.Lock()
 

@@ -16,10 +16,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from warp_ar.closing import Closing
 from warp_ar.farm.frames import FrameIndex, open_part
+from warp_ar.farm.records import OPENCV_THREADS
 from warp_ar.input.source import Frame
 from warp_ar.input.tracking import Image, Track, Tracker
 from warp_ar.light.solving_process import own_streams, read_message, start_process, write_message
@@ -117,11 +119,7 @@ class TrackingProcess(Closing):
 def serve() -> None:
     """What the process does: reads, looks and tells, until the clip or the other process ends."""
     with own_streams() as (source, target):
-        import cv2
-
-        from warp_ar.farm.pool import ONE_THREAD
-
-        cv2.setNumThreads(ONE_THREAD)
+        cv2.setNumThreads(OPENCV_THREADS)
         reading, descriptor = read_message(source)
         memory = mmap.mmap(descriptor, 0)
         free = threading.Semaphore(reading.slots)
