@@ -120,6 +120,16 @@ def _lives(pid: int) -> bool:
         return False
 
 
+def test_where_memory_cannot_be_shared_it_is_said(monkeypatch):
+    def refuse(_):
+        raise OSError("not here")
+
+    monkeypatch.setattr("os.memfd_create", refuse)
+    assert not can_share()
+    monkeypatch.delattr("os.memfd_create")
+    assert not can_share()
+
+
 def test_memory_goes_with_the_last_picture(tmp_path):
     path = tmp_path / "a.mp4"
     write_recording(path, COUNT)

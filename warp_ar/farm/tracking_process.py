@@ -29,6 +29,8 @@ from warp_ar.scene import Camera, Marker
 
 SLOTS = 12
 """Pictures at once in shared memory: those that are being lit, and those by which tracking is ahead."""
+_MEMORY = "warp_ar-frames"
+"""What the system calls the shared memory."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,7 +64,11 @@ class Reading:
 
 def can_share() -> bool:
     """Whether this system shares memory that goes with the last process that uses it."""
-    return hasattr(os, "memfd_create")
+    try:
+        os.close(os.memfd_create(_MEMORY))
+    except (AttributeError, OSError):  # another system than Linux, or a Linux that does not let it
+        return False
+    return True
 
 
 class TrackingProcess(Closing):
@@ -76,7 +82,7 @@ class TrackingProcess(Closing):
             held: Frames whose pictures stay as they are when more are asked for; fewer than there are slots.
         """
         self._reading, self._held = reading, held
-        descriptor = os.memfd_create("warp_ar-frames")
+        descriptor = os.memfd_create(_MEMORY)
         try:
             os.ftruncate(descriptor, reading.slots * reading.bytes_each)
             self._memory = mmap.mmap(descriptor, 0)
