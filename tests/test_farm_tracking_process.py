@@ -71,13 +71,14 @@ def test_no_more_pictures_come_than_there_is_room_for(tmp_path):
 
 
 def test_what_goes_wrong_there_is_told_here_after_the_frames_before_it(tmp_path):
-    path = tmp_path / "a.mp4"
+    path, short = tmp_path / "a.mp4", COUNT - 4
     write_recording(path, COUNT)
-    reading = reading_of(path)
-    data = path.read_bytes()
-    path.write_bytes(data[: len(data) * 3 // 4])
-    with TrackingProcess(reading, held=2) as beside, pytest.raises(SourceError, match=r"a\.mp4"):
-        list(beside)
+    reading = reading_of(path, 1)
+    write_recording(path, short)
+    came = []
+    with TrackingProcess(reading, held=2) as beside, pytest.raises(SourceError, match=rf"ends before frame {short}"):
+        came.extend(frame.index for frame, _ in beside)
+    assert came == list(range(1, short))
 
 
 def test_a_process_that_dies_is_an_error_here(tmp_path):

@@ -13,6 +13,7 @@ import mmap
 import os
 import threading
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -79,7 +80,7 @@ class TrackingProcess(Closing):
 
         Args:
             reading: What to read.
-            held: Frames whose pictures stay as they are when more are asked for; fewer than there are slots.
+            held: Frames whose pictures stay as they are when more are asked for; there are two more slots, or more.
         """
         self._reading, self._held = reading, held
         descriptor = os.memfd_create(_MEMORY)
@@ -149,12 +150,23 @@ def serve() -> None:
 
 
 def _read(reading: Reading, memory: mmap.mmap, free: threading.Semaphore, target: Any) -> None:
-    """Tell of one frame after another, each as soon as there is room for its picture."""
+    """Tell of one frame after another; its picture goes to where there is room while its marker is looked for."""
     tracker = Tracker(reading.marker, reading.camera)
     part = reading.path, reading.index, reading.first, reading.end, reading.fps, reading.gpu
-    with open_part(*part, converters=reading.converters) as frames:
-        for number, frame in enumerate(frames):
-            track = tracker.track(frame.image, frame.time)
-            free.acquire()
-            np.copyto(reading.picture(memory, number), frame.image)
-            write_message(target, ("frame", (frame.index, frame.time, track)))
+    before: tuple[Frame, Future[Track]] | None = None
+
+    def tell() -> None:
+        if before is not None:
+            frame, track = before
+            write_message(target, ("frame", (frame.index, frame.time, track.result())))
+
+    with open_part(*part, converters=reading.converters) as frames, ThreadPoolExecutor(1, "warp_ar-track") as thread:
+        try:
+            for number, frame in enumerate(frames):
+                track = thread.submit(tracker.track, frame.image, frame.time)
+                free.acquire()
+                np.copyto(reading.picture(memory, number), frame.image)
+                tell()
+                before = frame, track
+        finally:
+            tell()  # what comes before damage comes before its error
