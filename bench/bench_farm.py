@@ -40,12 +40,14 @@ from bench.farm_bounds import run_bounds
 from bench.farm_clip import surveyed, write_clips
 from bench.farm_kills import run_kills
 from bench.farm_long import PHASES, run_long
+from bench.farm_recordings import RATE
 from bench.farm_runs import jobs_done, prepare, rates, work
+from bench.farm_survey import run_survey
 from bench.farm_variations import run_variations
 from warp_ar.farm.fitting import probe_worker, workers_of_gpu
 from warp_ar.farm.jobs import parse_jobs, read_jobs
 
-PARTS = {"bounds": 0.1, "gpus": 0.4, "cpu": 0.1, "long": 0.22, "variations": 0.18, "kills": 0.2}
+PARTS = {"bounds": 0.1, "survey": 0.1, "gpus": 0.4, "cpu": 0.1, "long": 0.22, "variations": 0.18, "kills": 0.2}
 """Parts in their order, and their shares of the minutes."""
 
 
@@ -61,6 +63,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--cpu-workers", default="1,2,4,8", metavar="N,M", help="of part cpu (default: 1,2,4,8)")
     parser.add_argument("--segment-frames", type=int, default=60, help="of parts gpus and cpu (default: 60)")
     parser.add_argument("--long-frames", type=int, default=54_000, help="asked of part long (default: 54000)")
+    parser.add_argument("--long-rate", type=int, default=RATE, help="its frames a second; the clips' own are 24 (30)")
     parser.add_argument("--phases", default="", metavar="A,B", help=f"of part long, some of {', '.join(PHASES)}")
     parser.add_argument("--kill-seconds", type=float, default=90.0, help="of part long, within which all die (90)")
     parser.add_argument("--variations", type=int, default=2000, help="of part variations (default: 2000)")
@@ -173,6 +176,7 @@ def run_parts(bench: Bench) -> None:
     """All parts that are asked for, each within its share of the minutes."""
     runs = {
         "bounds": run_bounds,
+        "survey": run_survey,
         "gpus": run_gpus,
         "cpu": run_cpu,
         "long": run_long,

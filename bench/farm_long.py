@@ -35,7 +35,7 @@ from bench.farm_bench import Bench
 from bench.farm_bounds import measure_worker
 from bench.farm_clip import keep_kernels, surveyed, write_jobs
 from bench.farm_kills import Deaths, lines_of_jobs, order_of_deaths, work_with_deaths
-from bench.farm_recordings import RATE, write_recording, write_scene
+from bench.farm_recordings import write_recording, write_scene
 from bench.farm_runs import Watched, jobs_done, prepare, rates, together, work
 from warp_ar.device import usable_cores
 from warp_ar.farm.frames import index_frames, open_part
@@ -95,12 +95,14 @@ def _write(bench: Bench, frames: int) -> None:
         return
     start, making = time.monotonic(), bench.folder / "long-making.mp4"
     write_scene(bench.folder / "desk.toml", bench.size)
-    encoded = write_recording(making, bench.size, frames)
+    rate = bench.options.long_rate
+    encoded = write_recording(making, bench.size, frames, rate)
     making.rename(video)
     bench.tell(
         f"recording of {frames} frames",
         seconds=round(time.monotonic() - start, 1),
-        minutes=round(frames / RATE / 60, 1),
+        frames_a_second=rate,
+        minutes=round(frames / rate / 60, 1),
         encoded_frames=encoded,
         megabytes=round(video.stat().st_size / 1e6),
     )

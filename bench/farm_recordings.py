@@ -68,26 +68,27 @@ def _brightened(gain: float) -> np.ndarray:
     return np.asarray(np.rint(255.0 * np.clip(raised, 0.0, 1.0)), np.uint8)
 
 
-def _write_stretch(path: Path, size: tuple[int, int], loop: int, first: int, end: int) -> Path:
+def _write_stretch(path: Path, size: tuple[int, int], rate: int, loop: int, first: int, end: int) -> Path:
     """Frames ``first`` to ``end`` of one loop; a process of its own writes it."""
     cv2.setNumThreads(1)
     forth = [n if n < FORTH else LOOP - n for n in range(first, end)]
     low = min(forth)
     images = desk_pictures(size, low, max(forth) - low + 1)
     start, stop = GAINS[loop], GAINS[(loop + 1) % len(GAINS)]
-    with PartSink(path, list(range(first, end)), TICK, RATE) as sink:
+    with PartSink(path, list(range(first, end)), fractions.Fraction(1, rate), rate) as sink:
         for number, source in zip(range(first, end), forth, strict=True):
             sink.write(cv2.LUT(images[source - low], _brightened(start + (stop - start) * number / LOOP)))
     return path
 
 
-def write_recording(path: Path, size: tuple[int, int], frames: int) -> int:
+def write_recording(path: Path, size: tuple[int, int], frames: int, rate: int = RATE) -> int:
     """Write a recording of so many frames.
 
     Args:
         path: An MP4.
         size: Width and height in pixels.
         frames: How many; of as many loops as these take no more than ten are encoded.
+        rate: Frames a second.
 
     Returns:
         Frames that were encoded; the others are their packets again.
@@ -106,10 +107,10 @@ def write_recording(path: Path, size: tuple[int, int], frames: int) -> int:
     with concurrent.futures.ProcessPoolExecutor(workers, mp_context=spawn) as pool:
         names = [path.with_name(f"{path.stem}-{loop}-{first}-{end}.mp4") for loop, first, end in unique]
         loops, firsts, ends = zip(*unique, strict=True)
-        list(pool.map(_write_stretch, names, [size] * len(unique), loops, firsts, ends))
+        list(pool.map(_write_stretch, names, [size] * len(unique), [rate] * len(unique), loops, firsts, ends))
     place = dict(zip(unique, names, strict=True))
     starts = [0, *itertools.accumulate(end - first for _, first, end in wanted)][:-1]
-    join_parts([place[piece] for piece in wanted], starts, TICK, path, recording=None)
+    join_parts([place[piece] for piece in wanted], starts, fractions.Fraction(1, rate), path, recording=None)
     for name in names:
         name.unlink()
     return sum(end - first for _, first, end in unique)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import fractions
 import time
 
@@ -15,19 +16,17 @@ from warp_ar.farm.jobs import Job, scene_of
 from warp_ar.farm.part_video import PartSink
 from warp_ar.farm.records import Context
 from warp_ar.farm.survey import Survey
+from warp_ar.farm.tracking_process import can_share
 from warp_ar.farm.work import Work
 from warp_ar.input.sources import open_source
 from warp_ar.kernels.change import CHANGE_FLOOR, CHANGE_SHARE
-from warp_ar.light.solving_process import SolvingPool
-from warp_ar.stages import recover
 
 LIT, DARK = 8, 7
 """Frames with light that changes, and without any between them: long enough for the marker to be lost."""
 RATE = 24
 LATE = 0.05
 """Seconds after which a frame's light is asked for: others have been rendered by then."""
-PATIENCE = 60.0
-"""Seconds in which a process that solves is there."""
+needs_sharing = pytest.mark.skipif(not can_share(), reason="needs memory that goes with the last process that uses it")
 
 
 @pytest.fixture(scope="module")
@@ -75,44 +74,27 @@ def one_after_another(jobs):
         return np.array(poses), keys, lights, pipeline.inputs.saturation.levels
 
 
-class Ready(SolvingPool):
-    """A pool whose processes are there at once; counts what they solve."""
-
-    solved = 0
-
-    def prepare(self):
-        super().prepare()
-        deadline = time.monotonic() + PATIENCE
-        while not self.ready and time.monotonic() < deadline:
-            time.sleep(0.01)
-
-    def _take(self):
-        process = super()._take()
-        self.solved += process is not None
-        return process
-
-
-@pytest.mark.parametrize("aside", [False, True])
-def test_a_survey_is_that_of_frames_one_after_another(folder, tmp_path, monkeypatch, aside):
-    take, pool = survey._Look.take, Ready(1)
+@pytest.mark.parametrize("beside", [False, pytest.param(True, marks=needs_sharing)])
+def test_a_survey_is_that_of_frames_one_after_another(folder, tmp_path, monkeypatch, beside):
+    take, started, start = survey._Look.take, [], survey.TrackingProcess
 
     def take_late(self, *arguments):
         time.sleep(LATE)
         take(self, *arguments)
 
+    def noted_start(reading, **options):
+        started.append(start(dataclasses.replace(reading, slots=options["held"] + 2), **options))
+        return started[-1]
+
     monkeypatch.setattr(survey._Look, "take", take_late)
-    monkeypatch.setattr(survey, "POOL", pool)
-    monkeypatch.setattr(recover, "POOL", pool)
-    if aside:
-        monkeypatch.setattr(survey, "ASIDE_FRAMES", 1)
-        monkeypatch.setattr(survey, "CORES_EACH", 1)
+    monkeypatch.setattr(survey, "TrackingProcess", noted_start)
+    monkeypatch.setattr(survey, "BESIDE_CORES", 1)
+    if beside:
+        monkeypatch.setattr(survey, "BESIDE_FRAMES", 1)
     jobs = make_jobs(folder, [{"scene": "desk", "path": "a.mp4"}])
-    try:
-        found = surveyed(jobs, tmp_path / "run")
-        assert (pool.solved > 0) == aside
-        assert not pool._all, "what solved beside the survey is not kept"
-    finally:
-        pool.close()
+    found = surveyed(jobs, tmp_path / "run")
+    assert len(started) == beside
+    assert all(process._process.poll() is not None for process in started), "what reads ends with the survey"
     poses, keys, lights, saturation = one_after_another(jobs)
     np.testing.assert_array_equal(found.poses, poses)
     assert np.isnan(poses[LIT + DARK - 1, 0]), "the marker must be lost"

@@ -17,12 +17,14 @@ import av
 import cv2
 import numpy as np
 import pytest
-from av.video.reformatter import ColorRange, Colorspace
+from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
 
 from warp_ar.errors import SourceError, UsageError
 from warp_ar.input import live_source
+from warp_ar.input.deep_video import TO_RGB
 from warp_ar.input.source import FRAMES_AHEAD
 from warp_ar.input.sources import Frame, FrameFolder, QueueSource, Source, Synthetic, VideoFile, open_source
+from warp_ar.input.video_file import _IN_PLANES, rgb_from_video
 
 # 4:2:0 at limited range keeps 219 of 255 levels, and the codec adds its own rounding.
 VIDEO_LEVELS = 3
@@ -30,6 +32,8 @@ VIDEO_LEVELS = 3
 CARD_PIXELS = 0.2
 # Long enough for any thread to come by on a loaded machine; a test that passes never waits for it.
 PATIENCE = 20.0
+# The colour matrix of a stream that says nothing of it.
+UNNAMED = 2
 
 
 @pytest.fixture(autouse=True)
@@ -352,6 +356,26 @@ def test_video_without_a_matrix_follows_its_height(tmp_path: pathlib.Path, rows:
     with open_source(write_video(tmp_path / "clip.mp4", [picture] * 2, matrix=matrix, tagged=False)) as source:
         image = next(iter(source)).image
     assert np.abs(patch_centers(image) - patch_centers(picture)).max() <= VIDEO_LEVELS
+
+
+@pytest.mark.parametrize("size", [(64, 48), (66, 50), (65, 46), (62, 47), (1922, 38)])
+@pytest.mark.parametrize("kind", sorted(_IN_PLANES))
+def test_colours_made_in_planes_are_those_made_in_turn(kind: str, size: tuple[int, int]) -> None:
+    rng = np.random.default_rng(3)
+    for given in (ColorRange.MPEG, ColorRange.JPEG):
+        for matrix in (Colorspace.ITU709, Colorspace.ITU601, UNNAMED):
+            picture = av.VideoFrame(*size, kind)
+            for plane in picture.planes:
+                codes = np.frombuffer(plane, np.uint16 if picture.format.components[0].bits > 8 else np.uint8)
+                codes[:] = rng.integers(0, 1 << picture.format.components[0].bits, codes.shape)
+            picture.colorspace, picture.color_range = matrix, given
+            expected = VideoReformatter().reformat(
+                picture,
+                format="rgb24",
+                src_colorspace=Colorspace.ITU601 if matrix == UNNAMED else None,
+                interpolation=TO_RGB,
+            )
+            np.testing.assert_array_equal(rgb_from_video(VideoReformatter(), picture), expected.to_ndarray())
 
 
 def test_full_range_video(tmp_path: pathlib.Path) -> None:

@@ -174,7 +174,7 @@ def _tell(folder: Path, failed: dict[str, str]) -> int:
     print(printable(f"{folder}: {counts or 'nothing'} done, {status['frames']} frames, {status['bytes'] / 1e6:.1f} MB"))
     if not failed:
         return EXIT_DONE
-    print(f"{len(failed)} jobs failed:")
+    print(f"{len(failed)} job{'s' if len(failed) != 1 else ''} failed:")
     for key, why in sorted(failed.items())[:50]:
         print(printable(f"  {key}: {why}"))
     return EXIT_FAILED

@@ -25,7 +25,7 @@ from typing import Any, Protocol
 
 from warp_ar.device import usable_cores
 from warp_ar.farm.jobs import Job
-from warp_ar.farm.records import Context, Outcome
+from warp_ar.farm.records import OPENCV_THREADS, Context, Outcome
 from warp_ar.farm.version import program_version
 
 CORES = 4
@@ -225,7 +225,7 @@ def _serve(pipe: Any, context: Context, cores: Sequence[int], every: Sequence[in
 
     from warp_ar.farm.work import Work  # here: a driver does without Warp
 
-    cv2.setNumThreads(max(1, len(cores)))
+    cv2.setNumThreads(OPENCV_THREADS)
     jobs: queue.SimpleQueue[tuple[Job, Any]] = queue.SimpleQueue()
 
     def listen() -> None:

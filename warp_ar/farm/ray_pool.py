@@ -17,7 +17,7 @@ from typing import Any
 from warp_ar.errors import UsageError, reason
 from warp_ar.farm.jobs import Job
 from warp_ar.farm.pool import Event
-from warp_ar.farm.records import Context
+from warp_ar.farm.records import OPENCV_THREADS, Context
 from warp_ar.farm.version import program_version
 
 CONNECT_SECONDS = 30.0
@@ -32,8 +32,11 @@ class Member:
 
     def __init__(self, context: Context) -> None:
         """Do nothing yet."""
+        import cv2
+
         from warp_ar.farm.work import Work
 
+        cv2.setNumThreads(OPENCV_THREADS)
         self._work, self._frames = Work(context), 0
         self._lock = threading.Lock()
 

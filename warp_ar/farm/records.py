@@ -8,6 +8,9 @@ from typing import Any
 
 from warp_ar.farm.jobs import JobFile
 
+OPENCV_THREADS = 1
+"""Of a worker: with more, to look for a marker takes more processor time and is no sooner done."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Context:

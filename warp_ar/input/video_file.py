@@ -12,6 +12,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeAlias
 
 import av
+import cv2
 import numpy as np
 import numpy.typing as npt
 from av.video.reformatter import Colorspace, VideoReformatter
@@ -30,6 +31,11 @@ Taken: TypeAlias = tuple[Image, float | None, Plate | None]
 _FORMATS = (
     "mov,mp4,matroska,webm,avi,mpegts,mpeg,mpegvideo,m4v,h264,hevc,av1,obu,ivf,flv,live_flv,asf,ogg,mxf,dv,nut,"
     "mjpeg,mjpeg_2000,gif,apng,yuv4mpegpipe,wtv,rm,vc1,vc1test,swf,r3d,bink,roq,nsv,smk,gxf,wav"
+)
+# FFmpeg converts these to RGB in planes in half the time that it takes for RGB in turn, to the same bits. Of halved
+# chroma in an odd number of rows some codes differ by one.
+_IN_PLANES = frozenset(
+    ("yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p", "nv12", "yuv420p10le", "p010le")
 )
 _OPTIONS = {"format_whitelist": _FORMATS, "protocol_whitelist": "file"}
 
@@ -227,6 +233,18 @@ def rgb_from_video(reformatter: VideoReformatter, picture: Any) -> Image:
     matrix = None
     if picture.colorspace not in {int(known) for known in Colorspace}:
         matrix = Colorspace.ITU709 if picture.height >= HD_HEIGHT else Colorspace.ITU601
-    rgb = reformatter.reformat(picture, format="rgb24", src_colorspace=matrix, interpolation=TO_RGB, threads=1)
+    in_planes = picture.format.name in _IN_PLANES and picture.height % 2 == 0
+    wanted = "gbrp" if in_planes else "rgb24"
+    converted = reformatter.reformat(picture, format=wanted, src_colorspace=matrix, interpolation=TO_RGB, threads=1)
+    rgb = _interleaved(converted) if in_planes else converted.to_ndarray()
     # Both count the angle counterclockwise.
-    return np.ascontiguousarray(np.rot90(rgb.to_ndarray(), round(picture.rotation / 90)))
+    return np.ascontiguousarray(np.rot90(rgb, round(picture.rotation / 90)))
+
+
+def _interleaved(picture: Any) -> Image:
+    """RGB of a picture that has green, blue and red in planes of their own."""
+    green, blue, red = (
+        np.frombuffer(plane, np.uint8).reshape(plane.height, plane.line_size)[:, : plane.width]
+        for plane in picture.planes
+    )
+    return np.asarray(cv2.merge([red, green, blue]), np.uint8)

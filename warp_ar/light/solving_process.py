@@ -18,7 +18,7 @@ import struct
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -80,22 +80,43 @@ def _read(stream: Any, size: int) -> bytearray:
     return data
 
 
+def start_process(module: str, descriptors: tuple[int, ...] = ()) -> subprocess.Popen[bytes]:
+    """A process that calls a module's ``serve``, with pipes to its standard input and output.
+
+    Args:
+        module: Its name.
+        descriptors: Of files that stay open there, by the same numbers.
+    """
+    # Where this process finds what it imports, wherever it stands now and however it was begun.
+    paths = [str(Path(__file__).parents[2]), *(os.path.abspath(path) for path in sys.path)]
+    code = f"import sys; sys.path[:] = {paths!r}; from {module} import serve; serve()"
+    return subprocess.Popen(
+        [sys.executable, "-c", code],
+        bufsize=0,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        env={**os.environ, **dict.fromkeys(_BLAS, "1")},
+        start_new_session=True,  # an interrupt of the terminal is not for it
+        pass_fds=descriptors,
+    )
+
+
+@contextlib.contextmanager
+def own_streams() -> Iterator[tuple[Any, Any]]:
+    """Of such a process: what comes from the one that started it, and what goes there, not buffered."""
+    with os.fdopen(os.dup(0), "rb", 0) as source, os.fdopen(os.dup(1), "wb", 0) as target:
+        with open(os.devnull, "r+b") as nothing:  # what libraries print is no message
+            os.dup2(nothing.fileno(), 0)
+            os.dup2(nothing.fileno(), 1)
+        yield source, target
+
+
 class SolvingProcess:
     """One process that solves; started here, ready when it has loaded what it needs."""
 
     def __init__(self) -> None:
         """Start; returns at once."""
-        # Where this process finds what it imports, wherever it stands now and however it was begun.
-        paths = [str(Path(__file__).parents[2]), *(os.path.abspath(path) for path in sys.path)]
-        code = f"import sys; sys.path[:] = {paths!r}; from {__name__} import serve; serve()"
-        self._process = subprocess.Popen(
-            [sys.executable, "-c", code],
-            bufsize=0,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            env={**os.environ, **dict.fromkeys(_BLAS, "1")},
-            start_new_session=True,  # an interrupt of the terminal is not for it
-        )
+        self._process = start_process(__name__)
         self.ready = False
         self._greeting = threading.Thread(target=self._wait, name="warp_ar-solving", daemon=True)
         self._greeting.start()
@@ -253,10 +274,7 @@ def solve_by(solver: Solver, sides: tuple[Any, ...], trace: Callable[[Any], Any]
 
 def serve() -> None:
     """What a process does: solve what comes on its standard input until that ends."""
-    with os.fdopen(os.dup(0), "rb", 0) as source, os.fdopen(os.dup(1), "wb", 0) as target:
-        with open(os.devnull, "r+b") as nothing:  # what libraries print is no message
-            os.dup2(nothing.fileno(), 0)
-            os.dup2(nothing.fileno(), 1)
+    with own_streams() as (source, target):
         import warp_ar.light.recovery  # noqa: F401 - what unpickling needs, loaded before it is asked for
 
         with contextlib.suppress(EOFError, OSError):
