@@ -99,10 +99,13 @@ def write_exr(path: pathlib.Path, image: OpenEXR.File) -> None:
 
 
 def check_whole_exr(path: pathlib.Path) -> None:
-    """Raise OSError if a file that was written ends before its last chunk does, with what the system says of the rest.
+    """Check that a file that was written does not end before its last chunk does.
 
     Args:
         path: The file; its parts are of rows, not of tiles.
+
+    Raises:
+        OSError: It does, with what the system says of the rest.
     """
     data = path.read_bytes()
     try:

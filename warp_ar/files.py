@@ -160,7 +160,11 @@ def read_bytes(path: str | os.PathLike[str], limit: str, error: type[WarpArError
 def read_text(
     path: str | os.PathLike[str], error: type[WarpArError], label: str | None = None, expected: str = "text"
 ) -> str:
-    """All of a regular file in UTF-8; arguments and errors as `read_bytes`, ``expected`` names its format."""
+    """All of a regular file in UTF-8; arguments and errors as `read_bytes`, ``expected`` names its format.
+
+    Raises:
+        WarpArError: As ``error``: it cannot be read, is too large, or is no text in UTF-8.
+    """
     data = read_bytes(path, "text_bytes", error, label)
     try:
         return data.decode("utf-8-sig")
@@ -233,7 +237,11 @@ def parse_toml(text: str, label: str, error: type[WarpArError]) -> dict[str, Any
 
 
 def check_depth(depth: int, label: str, error: type[WarpArError]) -> None:
-    """Raise ``error`` if a text is nested too deeply for its reader."""
+    """Check that a text is not nested too deeply for its reader.
+
+    Raises:
+        WarpArError: As ``error``: it is.
+    """
     if depth > limits().nesting:
         raise error(too_much(f"{label}: it", depth, "levels of nesting", "nesting"))
 

@@ -233,7 +233,11 @@ def read_environment(path: str | pathlib.Path) -> npt.NDArray[np.float32]:
 
 
 def read_environment_info(path: str | pathlib.Path) -> EnvironmentInfo:
-    """What the header of an OpenEXR says of an environment; errors as `read_environment`."""
+    """What the header of an OpenEXR says of an environment.
+
+    Raises:
+        SinkError: The file cannot be read, or its header holds a date or place that is none.
+    """
     path = pathlib.Path(path)
     header, _ = _read(path, header_only=True)
 
