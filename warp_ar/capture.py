@@ -19,6 +19,7 @@ from warp_ar.command_line import EXIT_DONE, Parser, run_command, say
 from warp_ar.errors import SinkError, UsageError, reason
 from warp_ar.files import write_whole
 from warp_ar.input.ball_finder import BallOutline
+from warp_ar.input.check_objects import check_objects, written_poses
 from warp_ar.input.support import Support, plane_from_contact, plane_from_rectangle
 from warp_ar.output.places import check_places, check_replaceable
 from warp_ar.output.sink import make_folder
@@ -218,6 +219,8 @@ def capture(options: argparse.Namespace) -> int:
     if options.scene is not None:
         scene = make_scene(found, options.output, options.ball_radius)
         _write(options.scene, dumps_scene(scene, options.scene.parent).encode())
+        for finding in check_objects(scene, scene.camera, written_poses(scene)):
+            say(f"{options.scene}: {finding.text}; to do: {finding.remedy}")
         print(f"{options.scene}: python -m warp_ar.live {options.scene} --output out/")
     return EXIT_DONE
 
