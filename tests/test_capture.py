@@ -191,6 +191,32 @@ def test_a_moved_photograph_is_left_out_and_said(tmp_path):
     assert any(photos[2].name in note and "left out" in note for note in found.notes)
 
 
+@pytest.mark.parametrize("size", [(1, 1), (16, 12), (23, 400)])
+def test_too_small_a_photograph_is_said(tmp_path, capsys, size):
+    noise = np.random.default_rng(0).integers(0, 256, (size[1], size[0], 3)).astype(np.uint8)
+    cv2.imwrite(str(tmp_path / "small.png"), noise)
+    assert main([str(tmp_path / "small.png"), "--output", str(tmp_path / "light.exr")]) == EXIT_USAGE
+    assert f"the picture is {size[0]}x{size[1]} pixels; expected 24 or more" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("ball", ["5000 5 30", "-90 200 30", "200 700 30"])
+def test_a_circle_outside_the_photograph_is_said(bracket, tmp_path, capsys, ball):
+    output = ["--output", str(tmp_path / "light.exr")]
+    assert main([str(bracket[0]), "--ball", *ball.split(), *output]) == EXIT_USAGE
+    said = f"ball {ball.replace(' ', ', ')}: the circle lies outside the picture, 600x450 pixels"
+    assert said in capsys.readouterr().err
+
+
+def test_light_is_written_as_openexr_alone(bracket, tmp_path, capsys):
+    assert main([str(bracket[0]), "--output", str(tmp_path / "light.jpg")]) == EXIT_USAGE
+    assert "light.jpg: expected a name that ends in .exr" in capsys.readouterr().err
+
+
+def test_a_folder_is_no_photograph(tmp_path, capsys):
+    assert main([str(tmp_path), "--output", str(tmp_path / "light.exr")]) == EXIT_USAGE
+    assert f"{tmp_path} is a folder; name the photographs in it" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -200,6 +226,7 @@ def test_a_moved_photograph_is_left_out_and_said(tmp_path):
         (["--reflectance", "1.5"], "0.01 to 1"),
         (["--exposures", "0.1", "0.2"], "expected one for each"),
         (["--exposures", "pixels", "0.2"], "stands alone"),
+        (["--outline", "outline.jpg"], "--outline outline.jpg: expected a name that ends in .png"),
     ],
 )
 def test_bad_usage_is_one_line(bracket, tmp_path, capsys, arguments, message):

@@ -38,6 +38,9 @@ from warp_ar.scene import (
 )
 from warp_ar.signature import sign_png
 
+SUFFIXES = {"--output": ".exr", "--outline": ".png", "--scene": ".toml"}
+"""What the names of written files end in."""
+
 
 def _seconds(text: str) -> float:
     try:
@@ -129,6 +132,9 @@ def _check(options: argparse.Namespace) -> None:
         raise UsageError(f"--reflectance {options.reflectance:g}: expected a share from 0.01 to 1")
     writes = {"--output": options.output, "--outline": options.outline, "--scene": options.scene}
     writes = {name: path for name, path in writes.items() if path is not None}
+    for name, path in writes.items():
+        if path.suffix.lower() != SUFFIXES[name]:
+            raise UsageError(f"{name} {path}: expected a name that ends in {SUFFIXES[name]}")
     check_places({"the photographs": list(options.photos)}, writes)
     for path in writes.values():
         if words := check_replaceable(path, overwrite=options.overwrite):

@@ -30,6 +30,7 @@ _BRACKETS[[ord("]"), ord("}")]] = -1
 
 _MOST_DOTS: Final = 16
 _PART: Final = r"""(?:[A-Za-z0-9_-]+|"[^"\n]*"|'[^'\n]*')"""
+_DECIMAL_COMMA = re.compile(r"^[ \t]*[\w.-]+[ \t]*=[ \t]*(-?\d+),(\d+)[ \t]*(?:#.*)?$", re.MULTILINE)
 _MANY_DOTS: Final = re.compile(rf"(?m)(?:^|[\[{{,])[ \t]*{_PART}(?:[ \t]*\.[ \t]*{_PART}){{{_MOST_DOTS}}}")
 
 
@@ -233,7 +234,9 @@ def parse_toml(text: str, label: str, error: type[WarpArError]) -> dict[str, Any
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as problem:  # ValueError: TOMLDecodeError, and integers of too many digits
-        raise error(f"{label}: not valid TOML: {reason(problem)}") from problem
+        comma = _DECIMAL_COMMA.search(text)
+        hint = f"; {comma[1]},{comma[2]} is written {comma[1]}.{comma[2]}" if comma else ""
+        raise error(f"{label}: not valid TOML: {reason(problem)}{hint}") from problem
 
 
 def check_depth(depth: int, label: str, error: type[WarpArError]) -> None:

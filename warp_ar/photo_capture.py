@@ -134,7 +134,7 @@ def _best_exposed(photos: Sequence[Photograph]) -> int:
     def share(photo: Photograph) -> float:
         h, w = photo.image.shape[:2]
         middle = photo.image[h // 8 : -h // 8 : 8, w // 8 : -w // 8 : 8].max(2)
-        return float(((middle > 30) & (middle < 245)).mean())
+        return float(((middle > 30) & (middle < 245)).mean()) if middle.size else 0.0
 
     return max(range(len(photos)), key=lambda k: share(photos[k]))
 

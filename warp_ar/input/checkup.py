@@ -94,8 +94,8 @@ def _check_look(scene: Scene, look: Look, views: int, before: list[Finding]) -> 
         # Its poses are written down: no print is there to tell camera, light and ball by.
         return check_objects(scene, look.camera, written_poses(scene))
     found = check_pictures(scene, look)
-    if any(finding.name == "marker.board" for finding in found):
-        return found  # poses of the wrong scale say nothing about prints, proxies and balls
+    if any(finding.name in ("marker.board", "marker.twice") for finding in found):
+        return found  # poses by another marker say nothing about prints, proxies and balls
     few = look.views[:: max(1, -(-len(look.views) // FEW_VIEWS))]
     found += [*check_print(scene.marker, look.camera, few), *check_proxies(scene, look.camera, few)]
     # Where the scene's own numbers cannot be, a picture says nothing more about them.
