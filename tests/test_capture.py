@@ -226,6 +226,12 @@ def test_a_folder_is_no_photograph(tmp_path, capsys):
         (["--reflectance", "1.5"], "0.01 to 1"),
         (["--exposures", "0.1", "0.2"], "expected one for each"),
         (["--exposures", "pixels", "0.2"], "stands alone"),
+        (["--focal-35mm", "0"], "--focal-35mm 0: expected millimetres"),
+        (["--focal-35mm", "nan"], "--focal-35mm nan: expected millimetres"),
+        (["--ball-radius", "-3"], "--ball-radius -3: expected metres above 0, 1 at most"),
+        (["--ball-radius", "4"], "1 at most; 4 cm are 0.04"),
+        (["--ball-radius", "35"], "1 at most; 35 mm are 0.035"),
+        (["--contact", "nan", "100"], "--contact nan 100: expected pixels"),
         (["--outline", "outline.jpg"], "--outline outline.jpg: expected a name that ends in .png"),
     ],
 )
