@@ -175,6 +175,8 @@ def sample_spherical_triangle(
     return wp.normalize(z * b + safe_sqrt((1.0 - z) * (1.0 + z)) * unit_across(toward_c, b))
 
 
+# With s = r / d the cone's half angle has 1 - cos = 1 - sqrt(1 - s^2) = s^2 / (1 + sqrt(1 - s^2)): no cancellation far
+# away. Even in the cone is even in 1 - cos, and 1 / p is its solid angle 2 pi (1 - cos).
 @wp.func
 def draw_on_sphere(scene: RayScene, shape: Shape, point: wp.vec3, u: wp.float32, v: wp.float32) -> AreaSample:
     """Even direction in the cone of an emitting sphere; none from inside, for its front is outside."""

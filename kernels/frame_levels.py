@@ -260,6 +260,8 @@ def shown_as(params: FrameParams, from_camera: wp.vec3, change: wp.vec3) -> wp.v
     )
 
 
+# A A' + B B' is a symmetric matrix of two rows, whose eigenvalues are the squares of the ellipse's half axes:
+# (xx + yy) / 2 +- sqrt((xx - yy)^2 / 4 + xy^2).
 @wp.func
 def look_up_covered(
     params: FrameParams, picture: Picture, layers: ReceiverLayers, at: wp.vec2, a: wp.vec2, b: wp.vec2

@@ -153,6 +153,7 @@ def make_sh_tables(height: int, width: int, order: int, device: wp.DeviceLike) -
     )
 
 
+# Factors: sqrt(1 / 4 pi), sqrt(3 / 4 pi), and for l = 2 sqrt(15 / 4 pi), sqrt(5 / 16 pi), sqrt(15 / 16 pi).
 @wp.func
 def sum_sh2(coefficients: wp.array[wp.vec3], d: wp.vec3) -> wp.vec3:
     """The first nine harmonics in a unit direction, weighted by their coefficients."""
@@ -242,6 +243,9 @@ def sh_window(strength: wp.float32) -> wp.vec2:
     return wp.vec2(1.0 / (1.0 + strength), 1.0 / (1.0 + 0.7 * strength))
 
 
+# n'Q n is the sum of the five terms of l = 2 on the unit sphere: half of 1.0925 c stands at each of the two places of a
+# product such as x y, and 3 z^2 - 1 is 2 z^2 - x^2 - y^2. 2 b'n is that of the three terms of l = 1. All is over the
+# mean, so that c = 1.
 @wp.kernel(enable_backward=False)
 def window_sh_kernel(
     # Out (and in: coefficients as projected):
@@ -284,6 +288,8 @@ def window_sh_kernel(
         irradiance_sh_out[i] = irradiance_sh_out[i] * w[wp.where(i > 3, 1, 0)]
 
 
+# For l = 4 the factors are those of m = 0, 3/16 sqrt(1 / pi), and of |m| = 1 to 4, times sqrt(1 / pi):
+# 3/4 sqrt(5/2), 3/8 sqrt 5 (twice that for xy), 3/4 sqrt(35/2), 3/16 sqrt 35 (four times that for xy (x^2 - y^2)).
 @wp.func
 def sh4_basis(i: wp.int32, d: wp.vec3) -> wp.float32:
     """Basis function 9 + i of order 4 (l = 4; l = 3 has no part in irradiance), for i = 0..8."""
@@ -346,6 +352,17 @@ class Cluster:
     covariance: wp.vec3  # yz, xz, xy
 
 
+# Moments of a texel's directions (r cos phi, r sin phi, z), r = sin, z = cos of the polar angle, from t0 to t1 with the
+# middle t and half the height h. Means weigh by sin, whose integral is c0 - c1 = 2 sin t sin h; c and s are the cosines
+# and sines of t0 and t1, and s1 - s0 = 2 cos t sin h:
+#
+#     mean z  = (s1^2 - s0^2) / 2 / (c0 - c1)   = cos t cos h
+#     mean z^2 = (c0^3 - c1^3) / 3 / (c0 - c1)  = (c0^2 + c0 c1 + c1^2) / 3,      mean r^2 = 1 - mean z^2
+#     mean r z = (s1^3 - s0^3) / 3 / (c0 - c1)  = cos t / sin t (s0^2 + s0 s1 + s1^2) / 3
+#     mean r  = (h - sin 2h cos 2t / 2) / (c0 - c1)  = sin t cos h + (2h - sin 2h) / (4 sin t sin h).
+#
+# Over a column of half the width g about phi the mean of cos phi is sin g / g of its middle's, that of cos 2 phi is
+# sin 2g / 2g of its middle's; cos^2 phi = (1 + cos 2 phi) / 2 and cos phi sin phi = sin 2 phi / 2.
 @wp.kernel(enable_backward=False)
 def gather_clusters_kernel(
     row_start: wp.int32,
@@ -418,6 +435,7 @@ def gather_clusters_kernel(
     clusters_out[bi * blocks_wide + bj] = cluster
 
 
+# n'C n is at most C's trace, so that h is at most sqrt(3 trace): where |c| is more, no product with C is needed.
 @wp.func
 def cluster_cosine(cluster: Cluster, normal: wp.vec3) -> wp.float32:
     """Mean of max(n.w, 0) over a cluster: exact above the horizon, a box of the same variance on it."""

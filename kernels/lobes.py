@@ -241,6 +241,8 @@ class LobeSamples:
 
 # Filtered importance sampling [KC08]: S directions drawn from the lobe, each read from the level of an isotropic
 # pyramid whose texel covers the direction's share 1 / (S pdf) of the sphere: m = log2(share / T_0^2) / 2 + bias.
+# GGX is that of a surface seen from straight ahead, its normal the axis: half vectors are drawn by D cos, which gives
+# cos^2 = (1 - u) / (1 - u + alpha^2 u), directions then have pdf D / 4, and count by n.l [Karis13].
 # Directions are a Hammersley set in the frame of theta and phi, the same for every texel of a level: no noise between
 # neighbours, no flicker between frames.
 def make_lobe_samples(height: int, lobe: Lobe, count: int, device: wp.DeviceLike) -> LobeSamples:

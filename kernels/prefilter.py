@@ -17,6 +17,7 @@ reference.
 
 References:
     [AG02] Ashikhmin, Ghosh 2002, Simple Blurry Reflections with Environment Maps.
+    [Karis13] Karis 2013, Real Shading in Unreal Engine 4.
     [KC08] Krivanek, Colbert 2008, Real-time Shading with Filtered Importance Sampling.
 """
 
@@ -141,6 +142,12 @@ def sample_lobes_kernel(
     levels_out[index] = total
 
 
+# The lobe of GGX is that of a surface seen from straight ahead, as [Karis13] has it, weighted by n.l: for light at the
+# angle w from the axis the half vector stands at w / 2, with sin^2 = (1 - cos w) / 2 and cos^2 = (1 + cos w) / 2, so
+#
+#     weight ~ cos w D(w / 2) ~ cos w alpha^4 / (sin^2 + alpha^2 cos^2)^2.
+#
+# That of Phong is cos^n w with n = 1 / alpha^2: near the axis D and cos^n both fall as 1 - w^2 / (2 alpha^2).
 @wp.kernel(enable_backward=False)
 def integrate_lobes_kernel(
     row_start: wp.int32,

@@ -250,6 +250,9 @@ def sum_columns(
     return total
 
 
+# Isotropic: to be as wide as high a texel wants a box of w = 1 / sin theta times its own width. A texel of the source
+# is half as wide and holds a box of w times that, which adds (w^2 - 1) / 4 to the variance, in units of a texel of the
+# target; so the box that is taken here has the width squared w^2 - (w^2 - 1) / 4 = 1 + 3/4 (w^2 - 1).
 @wp.func
 def reduce_texel(
     levels: wp.array[wp.vec3],

@@ -459,7 +459,11 @@ def join_lanes(part: Footprint, lane: wp.int32, lanes: wp.int32) -> Footprint:
 
 @functools.cache
 def make_gather_probe_kernel(method: str, linear: bool = False) -> wp.Kernel:
-    """Kernel of one method, of frames of 8-bit codes or ``linear`` ones; raises ValueError for an unknown method."""
+    """Kernel of one method, of frames of 8-bit codes or ``linear`` ones.
+
+    Raises:
+        ValueError: There is no such method.
+    """
     if method not in METHODS:
         raise ValueError(f"unwrap: no method {method!r}; expected {', '.join(METHODS)}")
     pixel = wp.vec3 if linear else wp.vec3ub

@@ -1,5 +1,7 @@
 """The command: photographs of a mirror ball become light, and light a picture."""
 
+import argparse
+
 import cv2
 import numpy as np
 import pytest
@@ -8,8 +10,11 @@ from tests.photo_files import write_photo
 from tests.photo_room import GAIN, environment, exposed, project, write_bracket
 from warp_ar.capture import main
 from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, EXIT_USAGE
+from warp_ar.input.ball_finder import find_ball
+from warp_ar.input.checkup import check_up
 from warp_ar.light.captured import Light, latlong_directions, texel_solid_angles
 from warp_ar.live import main as live
+from warp_ar.live_start import say_quick_check
 from warp_ar.photo_capture import capture_light
 from warp_ar.scene import load_scene
 
@@ -108,11 +113,43 @@ def test_the_outline_is_drawn(bracket, tmp_path, capsys):
 def test_a_photograph_too_dark_for_a_rim_is_shown_by_another(bracket):
     """The ball is found where it is seen best, and its light comes in camera values of the one that is asked for."""
     dark = capture_light(bracket, device="cpu", shown=4)
+    assert not any("no rim of the ball" in note for note in dark.notes)
     found = capture_light(bracket, device="cpu", shown=1)
     assert dark.outline.center == pytest.approx(found.outline.center, abs=DARK_OUTLINE * found.outline.radius)
     assert irradiance(dark.light.radiance).sum() * BRACKET[4] / BRACKET[1] == pytest.approx(
         irradiance(found.light.radiance).sum(), rel=0.1
     )
+
+
+def test_an_outline_of_another_photograph_is_said(tmp_path):
+    """Of one so dark that no rim is seen in it."""
+    clear = write_photo(tmp_path / "clear.jpg", exposed(60), denominator=60)
+    black = write_photo(tmp_path / "black.jpg", np.zeros_like(exposed(60)), denominator=60000)
+    found = capture_light([clear, black], device="cpu", shown=1)
+    (said,) = [note for note in found.notes if "rim of the ball" in note]
+    assert said.startswith("black.jpg shows no rim of the ball: this outline is that of clear.jpg")
+    assert "--shown" in said
+    # By a far camera, of the JPEG: the outline was found in the picture itself here.
+    assert found.outline.center == pytest.approx(find_ball(exposed(60).astype(np.uint8)).center, abs=0.5)
+
+
+@pytest.mark.parametrize("outside", [True, False])
+def test_a_scene_whose_objects_the_photograph_does_not_show_is_said(tmp_path, capsys, outside):
+    """Of a photograph cut to the ball alone; and of one with its surroundings."""
+    x, y = map(round, project([0.0, 0.0, 0.04]))
+    columns, rows = (slice(x - 62, x + 62), slice(y - 62, y + 62)) if outside else (slice(10, None), slice(10, None))
+    photo = write_photo(tmp_path / "ball.jpg", exposed(60)[rows, columns])
+    contact = np.subtract(project([0.0, 0.0, 0.0]), [columns.start, rows.start])
+    scene = tmp_path / "ball.toml"
+    files = ["--output", str(tmp_path / "light.exr"), "--scene", str(scene)]
+    assert main([str(photo), "--contact", *map(str, contact), "--device", "cpu", *files]) == EXIT_DONE
+    said = capsys.readouterr().err
+    assert (f"{scene}: [[object]] 0 (sphere) lies right of the picture, [[object]] 1" in said) == outside
+    assert ("outside" in str([finding.name for finding in check_up(load_scene(scene), photo)])) == outside
+    say_quick_check(argparse.Namespace(scene=str(scene), source=None), load_scene(scene))
+    said = capsys.readouterr().err
+    assert said.count("right of the picture") == outside
+    assert ("use pictures that show more" in said) == outside
 
 
 def test_a_focal_length_that_is_given_counts_for_a_cut_picture_too(tmp_path):
@@ -154,6 +191,32 @@ def test_a_moved_photograph_is_left_out_and_said(tmp_path):
     assert any(photos[2].name in note and "left out" in note for note in found.notes)
 
 
+@pytest.mark.parametrize("size", [(1, 1), (16, 12), (23, 400)])
+def test_too_small_a_photograph_is_said(tmp_path, capsys, size):
+    noise = np.random.default_rng(0).integers(0, 256, (size[1], size[0], 3)).astype(np.uint8)
+    cv2.imwrite(str(tmp_path / "small.png"), noise)
+    assert main([str(tmp_path / "small.png"), "--output", str(tmp_path / "light.exr")]) == EXIT_USAGE
+    assert f"the picture is {size[0]}x{size[1]} pixels; expected 24 or more" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("ball", ["5000 5 30", "-90 200 30", "200 700 30"])
+def test_a_circle_outside_the_photograph_is_said(bracket, tmp_path, capsys, ball):
+    output = ["--output", str(tmp_path / "light.exr")]
+    assert main([str(bracket[0]), "--ball", *ball.split(), *output]) == EXIT_USAGE
+    said = f"ball {ball.replace(' ', ', ')}: the circle lies outside the picture, 600x450 pixels"
+    assert said in capsys.readouterr().err
+
+
+def test_light_is_written_as_openexr_alone(bracket, tmp_path, capsys):
+    assert main([str(bracket[0]), "--output", str(tmp_path / "light.jpg")]) == EXIT_USAGE
+    assert "light.jpg: expected a name that ends in .exr" in capsys.readouterr().err
+
+
+def test_a_folder_is_no_photograph(tmp_path, capsys):
+    assert main([str(tmp_path), "--output", str(tmp_path / "light.exr")]) == EXIT_USAGE
+    assert f"{tmp_path} is a folder; name the photographs in it" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -163,6 +226,13 @@ def test_a_moved_photograph_is_left_out_and_said(tmp_path):
         (["--reflectance", "1.5"], "0.01 to 1"),
         (["--exposures", "0.1", "0.2"], "expected one for each"),
         (["--exposures", "pixels", "0.2"], "stands alone"),
+        (["--focal-35mm", "0"], "--focal-35mm 0: expected millimetres"),
+        (["--focal-35mm", "nan"], "--focal-35mm nan: expected millimetres"),
+        (["--ball-radius", "-3"], "--ball-radius -3: expected metres above 0, 1 at most"),
+        (["--ball-radius", "4"], "1 at most; 4 cm are 0.04"),
+        (["--ball-radius", "35"], "1 at most; 35 mm are 0.035"),
+        (["--contact", "nan", "100"], "--contact nan 100: expected pixels"),
+        (["--outline", "outline.jpg"], "--outline outline.jpg: expected a name that ends in .png"),
     ],
 )
 def test_bad_usage_is_one_line(bracket, tmp_path, capsys, arguments, message):

@@ -304,6 +304,22 @@ def test_no_card_is_asked_for_where_poses_are_written_down(looks):
     assert [finding.name for finding in check_look(scene, dataclasses.replace(look, images=()))] == ["source.empty"]
 
 
+@pytest.mark.parametrize("number", [0, 5])
+def test_a_marker_that_is_there_twice_is_seen(number, looks):
+    """Another one beside it is none of the scene's."""
+    look = looks["desk"]
+    tag = cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), number, 72)
+    tag = cv2.copyMakeBorder(tag, 12, 12, 12, 12, cv2.BORDER_CONSTANT, value=255)[..., None]
+    pictures = [image.copy() for image, _ in look.views[:8]]
+    for picture in pictures:
+        picture[20 : 20 + len(tag), 20 : 20 + len(tag)] = tag
+    views = tuple((picture, pose) for picture, (_, pose) in zip(pictures, look.views, strict=False))
+    twice = dataclasses.replace(look, images=tuple(pictures), views=views, errors=look.errors[:8])
+    found = [finding.name for finding in check_look(load_scene("desk"), twice, 1)]
+    assert (found == ["marker.twice"]) == (number == 0)
+    assert ("marker.twice" in found) == (number == 0)
+
+
 RIGHT = {
     "as it is": lambda image, _: image,
     "a little darker": gain(0.8),

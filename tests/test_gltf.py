@@ -14,7 +14,7 @@ from warp_ar.errors import SceneError
 from warp_ar.scene import MetallicRoughnessMaterial, Object, Play
 from warp_ar.scene.mesh_files import load_mesh
 from warp_ar.scene.mesh_materials import dump_materials, parse_materials
-from warp_ar.scene.object_materials import look_of
+from warp_ar.scene.object_materials import materials_of
 
 SINGLE = 1e-6  # float32 positions near 1
 PICTURE = np.arange(2 * 3 * 4).reshape(2, 3, 4)
@@ -188,7 +188,7 @@ def test_skins_and_morph_targets_that_move_are_named_once(
     path = made.save(tmp_path / "a.glb")
     with caplog.at_level(logging.WARNING):
         for _ in range(3):
-            look_of(Object("mesh", file=path, play=play))
+            materials_of(Object("mesh", file=path, play=play))
     expected = ["animations (an object's key play names one)"] if play is None else []
     expected += [f"movement of {said} (they stand as at the start)"] if said else []
     assert [record.getMessage() for record in caplog.records] == (
@@ -206,7 +206,7 @@ def test_what_is_not_shown_is_said_once(tmp_path: pathlib.Path, caplog: pytest.L
     path = made.save(tmp_path / "a.glb")
     with caplog.at_level(logging.WARNING):
         for _ in range(3):
-            look_of(Object("mesh", file=path))
+            materials_of(Object("mesh", file=path))
     (record,) = caplog.records
     extensions = "KHR_materials_transmission, EXT_\\x1b[31m, KHR_materials_sheen"
     said = f"{extensions}, animations (an object's key play names one), points and lines"
@@ -218,7 +218,7 @@ def test_a_material_is_its_files_unless_the_scene_says_one(tmp_path: pathlib.Pat
     made.material(pbrMetallicRoughness={"baseColorTexture": {"index": made.texture(PICTURE)}}, emissiveFactor=[1, 1, 1])
     made.node(made.square(0))
     path = made.save(tmp_path / "a.glb")
-    own, given = look_of(Object("mesh", file=path)), look_of(Object("mesh", file=path, material=GOLD))
+    own, given = materials_of(Object("mesh", file=path)), materials_of(Object("mesh", file=path, material=GOLD))
     assert (own.detailed, own.holed) == (True, True)  # a sheet without a back
     assert own.materials[0].emission == (1.0, 1.0, 1.0)
     assert given.materials[0].surface == GOLD

@@ -49,6 +49,8 @@ def test_nothing_is_written_over(tmp_path, capsys):
     assert "is there already" in capsys.readouterr().err
     assert not list((tmp_path / "desk").iterdir())
     assert init.main([str(tmp_path / "nowhere" / "desk")]) == 2
+    assert init.main([str(tmp_path / "other"), "--radius", "3"]) == 2
+    assert "3 cm are 0.03" in capsys.readouterr().err
     assert init.main([str(tmp_path / "other"), "--radius", "35"]) == 2
     assert "35 mm are 0.035" in capsys.readouterr().err
 

@@ -152,6 +152,12 @@ def test_list_names_every_bundled_scene(capsys: pytest.CaptureFixture[str]) -> N
     [
         (["no_such_scene"], "no_such_scene"),
         (["desk", "--quality", "best"], "quality 'best' is no preset; expected paper, low, medium"),
+        (["desk", "--quality", "hihg"], "did you mean high? expected"),
+        (["photo.JPG"], "photo.JPG is no scene; expected a scene file; frames go to --source"),
+        (["frames"], "it has none; frames go to --source"),
+        (["desk", "--source", "frames"], "frames are 48x64: another aspect ratio"),
+        (["desk", "--source", "frames"], "turn the frames by 90 degrees, record"),
+        (["desk", "--light", "photo.JPG"], "photo.JPG cannot be read as OpenEXR: it is another kind of file"),
         (["desk", "--device", "cuda:99"], "device 'cuda:99' is not here"),
         (["desk", "--frames", "0"], "--frames 0"),
         (["desk", "--frames", "many"], "--frames"),
@@ -170,6 +176,10 @@ def test_bad_usage_is_one_line_and_exit_code_2(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "frames").mkdir()
+    # On its side, as a phone held upright gives it; the desk's camera is calibrated for 640x480.
+    for name in ("photo.JPG", "frames/0.jpg"):
+        (tmp_path / name).write_bytes(cv2.imencode(".jpg", np.full((64, 48, 3), 90, np.uint8))[1].tobytes())
     assert live.main([*arguments, "--headless"]) == 2
     assert expected in message(capsys)
 
@@ -193,6 +203,12 @@ def test_no_marker_is_said_and_the_frames_are_kept(tmp_path: Path, capsys: pytes
     assert run(scene, "--headless", "--frames", 3, "--output", tmp_path / "out") == 1
     assert "no marker in the first 3 frames: expected DICT_4X4_50 id 7" in message(capsys)
     assert len(list((tmp_path / "out").iterdir())) == 3
+    board = scene.read_text().replace("id = 7", 'board = "charuco 5x4 0.032 0.024"').replace("size = 0.08", "")
+    scene.write_text(board)
+    assert run(scene, "--headless", "--frames", 1, "--output", tmp_path / "one") == 1
+    said = message(capsys)
+    assert "no marker in the first 1 frame: expected DICT_4X4_50 charuco 5x4 0.032 0.024; check" in said
+    assert said.endswith("(1 frame was written)\n")
 
 
 def test_a_source_that_breaks_leaves_a_valid_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -30,7 +30,7 @@ from warp_ar.scene import (
 )
 from warp_ar.scene.kinds import trace_config
 from warp_ar.scene.mesh_files import load_mesh, mesh_from_trimesh
-from warp_ar.scene.object_materials import look_of, reflects_diffusely, reflects_glossily
+from warp_ar.scene.object_materials import materials_of, reflects_diffusely, reflects_glossily
 from warp_ar.scene.ray_scene import HostScene
 
 CAMERA = Camera(width=64, height=48, fx=600.0, fy=620.0, cx=30.5, cy=24.0)
@@ -253,7 +253,7 @@ def test_a_closed_mesh_costs_no_questions(tmp_path):
     """Nobody sees its back: rays ask no triangle for its sides."""
     path = tmp_path / "box.glb"
     trimesh.creation.box().export(path)
-    assert not look_of(Object("mesh", file=path)).holed
+    assert not materials_of(Object("mesh", file=path)).holed
     assert not trace_config(Scene(CAMERA, objects=(Object("mesh", file=path),))).detail
 
 
@@ -350,10 +350,10 @@ def test_meshes_in_memory(device, tmp_path):
 
 def test_which_light_file_materials_show(tmp_path):
     path = square(tmp_path, extensions={"KHR_materials_unlit": {}})
-    (material,) = look_of(Object("mesh", file=path)).materials
+    (material,) = materials_of(Object("mesh", file=path)).materials
     assert (reflects_diffusely(material), reflects_glossily(material)) == (False, False)
     path = square(tmp_path, metallicRoughnessTexture=lambda made: {"index": made.texture(picture())})
-    (material,) = look_of(Object("mesh", file=path)).materials
+    (material,) = materials_of(Object("mesh", file=path)).materials
     assert (reflects_diffusely(material), reflects_glossily(material)) == (True, True)
     assert isinstance(Object("sphere", radius=1.0).material, FileMaterial)
-    assert look_of(Object("sphere", radius=1.0)).materials[0].surface == LambertMaterial()
+    assert materials_of(Object("sphere", radius=1.0)).materials[0].surface == LambertMaterial()

@@ -11,8 +11,9 @@ import pytest
 
 from warp_ar.errors import SceneError
 from warp_ar.scene import loads_scene
+from warp_ar.scene.description import SCHEMA
 from warp_ar.scene.keys import IN_MEMORY
-from warp_ar.scene.reference import SECTIONS, as_markdown, example_scene, keys
+from warp_ar.scene.reference import INTRINSICS, SECTIONS, Key, as_markdown, keys
 
 KEYS = list(keys())
 
@@ -31,6 +32,28 @@ def folder(tmp_path):
     for name in ("light.exr", "picture.png", "watch.glb"):
         (tmp_path / name).write_bytes(b"read when it is needed")
     return tmp_path
+
+
+def example_scene(key: Key) -> str:
+    """A whole scene file in which ``key`` has its example's value."""
+    lines = [f"schema = {SCHEMA}"]
+    if not key.section:
+        lines = [f"{key.name} = {key.example}"] + lines * (key.name != "schema")
+    sections = {section.name: section for section in SECTIONS}
+    if key.section != "camera":
+        lines += ["[camera]", INTRINSICS]
+    if key.section not in ("", "marker"):
+        lines += ["[marker]", "size = 0.08"]
+    if key.section == "object.play":
+        lines += ["[[object]]", 'shape = "mesh"', 'file = "watch.glb"']
+    elif key.section.startswith("object."):
+        lines += ["[[object]]", 'shape = "sphere"', "radius = 0.03"]
+    if key.section.startswith("proxy."):
+        lines += ["[[proxy]]", 'shape = "plane"', "size = [1.6, 1.2]"]
+    if key.section:
+        lines += [f"[[{key.section}]]" if sections[key.section].several else f"[{key.section}]", key.beside]
+        lines += [f"{key.name} = {key.example}"]
+    return "\n".join(lines) + "\n"
 
 
 @pytest.mark.parametrize("key", KEYS, ids=lambda key: f"{key.section}.{key.name}")

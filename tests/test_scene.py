@@ -386,6 +386,7 @@ def light(**changes: str) -> str:
 ERRORS = [
     # Not TOML, or not a scene.
     ("schema = ", r"not valid TOML"),
+    ("schema = 1\n[probe]\nradius = 0,035 # metres\n", r"not valid TOML: .*line 3.*; 0,035 is written 0\.035$"),
     ("[[" * 5000, r"levels of nesting"),
     ("schema = " + "1" * 5000, r"not valid TOML"),
     ("", r"schema is missing: expected schema = 1"),

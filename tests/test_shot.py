@@ -15,8 +15,8 @@ import trimesh
 from tests.gltf_files import Gltf
 from tests.layer_rig import POSES, make_scene
 from warp_ar.errors import SinkError
+from warp_ar.output.exchange_materials import ExchangeMaterial, exchange_materials_of
 from warp_ar.output.gltf_file import quaternions, write_glb
-from warp_ar.output.looks import Look, looks_of
 from warp_ar.output.shot import Shot, mesh_of, placement, texture_files
 from warp_ar.output.usd_file import write_usd
 from warp_ar.scene import Camera, Light, Object
@@ -247,8 +247,8 @@ def test_quaternions_turn_as_their_matrices():
 
 def test_a_phong_lobe_becomes_as_wide_a_one():
     item = Object("sphere", radius=0.1, material=PhongMaterial((0.1, 0.2, 0.3), (0.4, 0.5, 0.6), 30.0))
-    (look,) = looks_of(item, mesh_of(item))
-    assert look == Look((0.1, 0.2, 0.3), 0.0, pytest.approx((2 / 32) ** 0.25), (0.4, 0.5, 0.6), None)
+    (material,) = exchange_materials_of(item, mesh_of(item))
+    assert material == ExchangeMaterial((0.1, 0.2, 0.3), 0.0, pytest.approx((2 / 32) ** 0.25), (0.4, 0.5, 0.6), None)
 
 
 def test_a_texture_is_taken_along(shot, tmp_path):

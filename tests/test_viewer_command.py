@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import threading
+import types
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +20,19 @@ import numpy as np
 import pytest
 
 from tests.viewer_rig import PATIENCE, Page, Running, page_scene, run, served
-from warp_ar import live
+from warp_ar import live, live_page
 from warp_ar.errors import SourceError, UsageError
 from warp_ar.scene import dumps_scene, load_scene
 from warp_ar.viewer.address import Address, own_address
 from warp_ar.viewer.host import Host
 from warp_ar.viewer.server import Server
+
+
+@pytest.fixture(autouse=True)
+def process_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A command whose threads outlast it ends its process, on a busy machine: here that of all tests."""
+    others = {name: getattr(os, name) for name in dir(os) if name != "_exit"}
+    monkeypatch.setattr(live_page, "os", types.SimpleNamespace(**others, _exit=lambda code: None))
 
 
 def test_address() -> None:

@@ -39,6 +39,14 @@ def test_numbers_are_edited_in_place_and_structure_is_swapped_in() -> None:
         running.edit(type="set", part="object", index=0, key="at", value=[0.0, -0.08, 0.03])
         moved = running.next()
         assert moved.plan == 1, "moving an object built a new pipeline"
+        assert running.host.state_message()["missing"] is None
+        for index in range(2):
+            running.edit(type="set", part="object", index=index, key="at", value=[1.0, -0.08, 0.03])
+        missing = running.until(lambda: running.host.state_message()["missing"])
+        assert missing["name"] == "object.outside"
+        assert "lies right of the picture" in missing["text"]
+        running.edit(type="set", part="object", index=0, key="at", value=[0.0, -0.08, 0.03])
+        running.until(lambda: running.host.state_message()["missing"] is None)
         running.edit(type="effect", name="objects", on=False)
         without = running.until(lambda: running.frames[-1].plan == 2 and running.frames[-1])
         stages = {name for name, _, _ in without.stages}

@@ -75,7 +75,11 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Import what is asked for only when it is: a scene can be read without loading OpenCV's or Warp's libraries."""
+    """Import what is asked for only when it is: a scene can be read without loading OpenCV's or Warp's libraries.
+
+    Raises:
+        AttributeError: There is no such name.
+    """
     if name not in _HOME_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(f"{__name__}.{_HOME_OF[name]}"), name)

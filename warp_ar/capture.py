@@ -8,6 +8,7 @@ if __name__ == "__main__":
     begin("warp_ar.capture")
 
 import argparse
+import math
 from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -19,6 +20,7 @@ from warp_ar.command_line import EXIT_DONE, Parser, run_command, say
 from warp_ar.errors import SinkError, UsageError, reason
 from warp_ar.files import write_whole
 from warp_ar.input.ball_finder import BallOutline
+from warp_ar.input.check_objects import check_objects, written_poses
 from warp_ar.input.support import Support, plane_from_contact, plane_from_rectangle
 from warp_ar.output.places import check_places, check_replaceable
 from warp_ar.output.sink import make_folder
@@ -36,6 +38,11 @@ from warp_ar.scene import (
     dumps_scene,
 )
 from warp_ar.signature import sign_png
+
+SUFFIXES = {"--output": ".exr", "--outline": ".png", "--scene": ".toml"}
+"""What the names of written files end in."""
+LARGEST_BALL = 1.0
+"""Metres of the radius: beyond that another unit was meant."""
 
 
 def _seconds(text: str) -> float:
@@ -124,10 +131,12 @@ def _check(options: argparse.Namespace) -> None:
     elif options.exposures is not None and len(options.exposures) != len(options.photos):
         number = _count(len(options.photos), "photograph")
         raise UsageError(f"{_count(len(options.exposures), 'exposure')} for {number}; expected one for each")
-    if not 0.01 <= options.reflectance <= 1.0:
-        raise UsageError(f"--reflectance {options.reflectance:g}: expected a share from 0.01 to 1")
+    _check_numbers(options)
     writes = {"--output": options.output, "--outline": options.outline, "--scene": options.scene}
     writes = {name: path for name, path in writes.items() if path is not None}
+    for name, path in writes.items():
+        if path.suffix.lower() != SUFFIXES[name]:
+            raise UsageError(f"{name} {path}: expected a name that ends in {SUFFIXES[name]}")
     check_places({"the photographs": list(options.photos)}, writes)
     for path in writes.values():
         if words := check_replaceable(path, overwrite=options.overwrite):
@@ -136,8 +145,23 @@ def _check(options: argparse.Namespace) -> None:
         make_folder(path.parent)
 
 
+def _check_numbers(options: argparse.Namespace) -> None:
+    if not 0.01 <= options.reflectance <= 1.0:
+        raise UsageError(f"--reflectance {options.reflectance:g}: expected a share from 0.01 to 1")
+    if options.focal_35mm is not None and not 1.0 <= options.focal_35mm <= 10_000.0:
+        raise UsageError(f"--focal-35mm {options.focal_35mm:g}: expected millimetres from 1 to 10000, such as 26")
+    radius = options.ball_radius
+    if radius is not None and not 0.0 < radius <= LARGEST_BALL:
+        meant = [(unit, per * radius) for unit, per in (("cm", 1e-2), ("mm", 1e-3)) if per * radius <= 0.1]
+        hint = f"; {radius:g} {meant[0][0]} are {meant[0][1]:g}" if meant and radius > 0.0 else ""
+        raise UsageError(f"--ball-radius {radius:g}: expected metres above 0, {LARGEST_BALL:g} at most{hint}")
+    for name, place in (("--contact", options.contact), ("--rectangle", options.rectangle)):
+        if place is not None and not all(map(math.isfinite, place)):
+            raise UsageError(f"{name} {' '.join(f'{value:g}' for value in place)}: expected pixels")
+
+
 def make_scene(found: Capture, light: Path, ball_radius: float | None) -> Scene:
-    """A scene that shows the photograph with a ball and a torus beside the mirror ball, lit by what was captured."""
+    """A scene that shows the photograph with a ball on either side of the mirror ball, lit by what was captured."""
     assert found.support is not None
     unit = ball_radius or 1.0
     pose = found.support.pose
@@ -218,6 +242,8 @@ def capture(options: argparse.Namespace) -> int:
     if options.scene is not None:
         scene = make_scene(found, options.output, options.ball_radius)
         _write(options.scene, dumps_scene(scene, options.scene.parent).encode())
+        for finding in check_objects(scene, scene.camera, written_poses(scene)):
+            say(f"{options.scene}: {finding.text}; to do: {finding.remedy}")
         print(f"{options.scene}: python -m warp_ar.live {options.scene} --output out/")
     return EXIT_DONE
 

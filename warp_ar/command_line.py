@@ -39,7 +39,11 @@ class Parser(argparse.ArgumentParser):
     """Argument parser whose errors are one line, as all errors here are."""
 
     def error(self, message: str) -> NoReturn:
-        """Raise the message as an error of usage."""
+        """Tell what is wrong with an argument.
+
+        Raises:
+            UsageError: Always, with the message in one line.
+        """
         unknown = re.match(r"unrecognized arguments: (--[^\s=]+)", message)
         known = [option for option in _options(self) if unknown is None or option != unknown[1]]
         meant = difflib.get_close_matches(unknown[1], known, n=1, cutoff=0.75) if unknown else []
@@ -47,7 +51,11 @@ class Parser(argparse.ArgumentParser):
         raise UsageError(f"{message}{hint}; see {self.prog} --help")
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """As argparse does it, but nothing empty (a path of no name is the current folder) and no endless number."""
+        """As argparse does it, but nothing empty (a path of no name is the current folder) and no endless number.
+
+        Raises:
+            UsageError: An argument is empty, or a number has too many digits.
+        """
         given = list(sys.argv[1:] if args is None else args)
         for place, word in enumerate(given):
             if word == "" or (word is not None and re.fullmatch(r"--[a-z0-9-]+=", word)):

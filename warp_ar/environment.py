@@ -70,7 +70,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def convert(options: argparse.Namespace) -> int:
-    """Read, turn and write."""
+    """Read, turn and write.
+
+    Raises:
+        SinkError: A file cannot be read or written.
+        UsageError: The output is no environment by its ending, or options do not fit each other.
+    """
     output: Path = options.output
     if output.suffix.lower() not in ENVIRONMENT_SUFFIXES:
         raise UsageError(f"--output {output} ends in {output.suffix!r}; use {', '.join(ENVIRONMENT_SUFFIXES)}")

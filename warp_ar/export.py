@@ -60,7 +60,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def export(options: argparse.Namespace) -> int:
-    """Track the frames, take the light of the last one, write."""
+    """Track the frames, take the light of the last one, write.
+
+    Raises:
+        SinkError: The output cannot be written.
+        SceneError: The scene cannot be used.
+        SourceError: The frames cannot be read, or none shows a marker.
+        UsageError: The output has another ending, an option makes no sense, or a library is missing.
+    """
     output: Path = options.output
     if output.suffix.lower() not in SUFFIXES:
         raise UsageError(f"--output {output} ends in {output.suffix!r}; use {', '.join(SUFFIXES)}")

@@ -27,6 +27,16 @@ _SEVERAL_PARTS = 0x10
 """Bit of the second byte of the version's four."""
 
 
+def exr_problem(path: pathlib.Path, error: BaseException) -> str:
+    """Why OpenEXR could not read a file that is there, in words."""
+    try:
+        with path.open("rb") as stream:
+            start = stream.read(len(_MAGIC))
+    except OSError as problem:
+        return reason(problem)
+    return reason(error) if start == _MAGIC else "it is another kind of file"
+
+
 def read_linear_exr(path: pathlib.Path, error: type[WarpArError], label: str) -> npt.NDArray[np.float32]:
     """Linear RGB of an OpenEXR's first part, in Rec. 709's primaries.
 
@@ -49,7 +59,7 @@ def read_linear_exr(path: pathlib.Path, error: type[WarpArError], label: str) ->
         ]
         sizes = [tuple(int(side) for side in high - low + 1) for low, high in windows]
     except (RuntimeError, OSError, ValueError, KeyError) as problem:
-        raise error(f"{label} cannot be read as OpenEXR: {reason(problem)}") from problem
+        raise error(f"{label} cannot be read as OpenEXR: {exr_problem(path, problem)}") from problem
     for width, height in sizes:
         if width * height > limits().picture_pixels:
             raise error(too_much(f"{label} is {width}x{height}: it", width * height, "pixels", "picture_pixels"))
@@ -57,7 +67,7 @@ def read_linear_exr(path: pathlib.Path, error: type[WarpArError], label: str) ->
         with OpenEXR.File(str(path), separate_channels=True) as file:
             channels = {name: np.asarray(channel.pixels) for name, channel in file.channels().items()}
     except (RuntimeError, OSError, ValueError, KeyError) as problem:
-        raise error(f"{label} cannot be read as OpenEXR: {reason(problem)}") from problem
+        raise error(f"{label} cannot be read as OpenEXR: {exr_problem(path, problem)}") from problem
     names = "RGB" if {"R", "G", "B"} <= channels.keys() else "YYY"
     if names[0] not in channels:
         raise error(f"{label} has channels {', '.join(channels)}; R, G and B, or Y, are needed")
@@ -99,10 +109,13 @@ def write_exr(path: pathlib.Path, image: OpenEXR.File) -> None:
 
 
 def check_whole_exr(path: pathlib.Path) -> None:
-    """Raise OSError if a file that was written ends before its last chunk does, with what the system says of the rest.
+    """Check that a file that was written does not end before its last chunk does.
 
     Args:
         path: The file; its parts are of rows, not of tiles.
+
+    Raises:
+        OSError: It does, with what the system says of the rest.
     """
     data = path.read_bytes()
     try:

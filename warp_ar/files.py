@@ -30,6 +30,7 @@ _BRACKETS[[ord("]"), ord("}")]] = -1
 
 _MOST_DOTS: Final = 16
 _PART: Final = r"""(?:[A-Za-z0-9_-]+|"[^"\n]*"|'[^'\n]*')"""
+_DECIMAL_COMMA = re.compile(r"^[ \t]*[\w.-]+[ \t]*=[ \t]*(-?\d+),(\d+)[ \t]*(?:#.*)?$", re.MULTILINE)
 _MANY_DOTS: Final = re.compile(rf"(?m)(?:^|[\[{{,])[ \t]*{_PART}(?:[ \t]*\.[ \t]*{_PART}){{{_MOST_DOTS}}}")
 
 
@@ -160,7 +161,11 @@ def read_bytes(path: str | os.PathLike[str], limit: str, error: type[WarpArError
 def read_text(
     path: str | os.PathLike[str], error: type[WarpArError], label: str | None = None, expected: str = "text"
 ) -> str:
-    """All of a regular file in UTF-8; arguments and errors as `read_bytes`, ``expected`` names its format."""
+    """All of a regular file in UTF-8; arguments and errors as `read_bytes`, ``expected`` names its format.
+
+    Raises:
+        WarpArError: As ``error``: it cannot be read, is too large, or is no text in UTF-8.
+    """
     data = read_bytes(path, "text_bytes", error, label)
     try:
         return data.decode("utf-8-sig")
@@ -229,11 +234,17 @@ def parse_toml(text: str, label: str, error: type[WarpArError]) -> dict[str, Any
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as problem:  # ValueError: TOMLDecodeError, and integers of too many digits
-        raise error(f"{label}: not valid TOML: {reason(problem)}") from problem
+        comma = _DECIMAL_COMMA.search(text)
+        hint = f"; {comma[1]},{comma[2]} is written {comma[1]}.{comma[2]}" if comma else ""
+        raise error(f"{label}: not valid TOML: {reason(problem)}{hint}") from problem
 
 
 def check_depth(depth: int, label: str, error: type[WarpArError]) -> None:
-    """Raise ``error`` if a text is nested too deeply for its reader."""
+    """Check that a text is not nested too deeply for its reader.
+
+    Raises:
+        WarpArError: As ``error``: it is.
+    """
     if depth > limits().nesting:
         raise error(too_much(f"{label}: it", depth, "levels of nesting", "nesting"))
 

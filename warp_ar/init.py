@@ -64,7 +64,8 @@ def make_desk(folder: Path, source: str | int, radius: float) -> None:
         raise UsageError(f"{folder}: no folder {folder.absolute().parent} to make it in")
     largest = 1.25 * max(RINGS)
     if not (math.isfinite(radius) and 0.005 <= radius <= largest):
-        hint = f"; {radius:g} mm are {1e-3 * radius:g}" if 5 <= radius <= 1e3 * largest else ""
+        meant = [(unit, per * radius) for unit, per in (("cm", 1e-2), ("mm", 1e-3)) if 0.005 <= per * radius <= largest]
+        hint = "".join(f"; {radius:g} {unit} are {metres:g}" for unit, metres in meant)
         right = f"expected metres from 0.005 to {largest:g}, which stands on the card"
         raise UsageError(f"--radius {radius:g}: {right}{hint}")
     text = starter_scene(folder.absolute().name, source, SHEET, ball_center(radius), radius, MESH)

@@ -163,7 +163,11 @@ def _add_page_options(group: argparse._ArgumentGroup) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Build everything that ``options`` ask for, then let frames flow until they end."""
+    """Build everything that ``options`` ask for, then let frames flow until they end.
+
+    Raises:
+        UsageError: Options make no sense, or do not fit each other.
+    """
     if options.list:
         for name, path in bundled_scenes().items():
             print(f"{name:16s} {path}")

@@ -91,12 +91,13 @@ def _check_marker(log: RunLog, scene: Scene, *, live: bool) -> None:
     if not log.never_posed or log.count == 0:
         return
     marker = scene.marker
-    wanted = f"board {marker.board!r}" if marker.board else f"id {marker.id}"
     message = (
-        f"no marker in the first {log.count} frames: expected {marker.dictionary} {wanted}; "
-        "check the scene's [marker], "
-        "that the whole marker with its white border is in view, sharp and not mirrored"
+        f"no marker in the first {_counted(log.count, 'frame')}: expected {marker.dictionary} "
+        f"{marker.board or f'id {marker.id}'}; check the scene's [marker], that the whole marker with its white border "
+        "is in view, sharp and not mirrored"
     )
+    if log.count == MARKER_PATIENCE:
+        message += "; where it comes later, cut off what is before"
     if not live:
         raise RunError(message)
     say(message)
@@ -254,7 +255,8 @@ def _tell_end(options: argparse.Namespace, session: Session, log: RunLog, camera
     steps = ", ".join(f"{name} {milliseconds:.1f}" for name, milliseconds in log.steps().items())
     Console().print(f"side by side, in ms: {steps}", highlight=False)
     where = printable(camera.description if options.output is None else options.output)
-    Console().print(f"{log.count} frames, {log.fps:.1f} fps, written to {where}", highlight=False, markup=False)
+    told = f"{_counted(log.count, 'frame')}, {log.fps:.1f} fps, written to {where}"
+    Console().print(told, highlight=False, markup=False)
 
 
 def _light_clip(options: argparse.Namespace, loaded: Callable[[], None]) -> int:
@@ -381,8 +383,12 @@ def _open_camera(options: argparse.Namespace, session: Session) -> Sink:
 
 def _count(log: RunLog, sink: Sink, side: SideFiles) -> str:
     """What there is of a run that failed."""
-    frames = f"{log.count} frames were lit" if isinstance(sink, NullSink) else f"{sink.written} frames were written"
-    return frames + side.written
+    count, how = (log.count, "lit") if isinstance(sink, NullSink) else (sink.written, "written")
+    return f"{_counted(count, 'frame')} {'was' if count == 1 else 'were'} {how}{side.written}"
+
+
+def _counted(number: int, what: str) -> str:
+    return f"{number} {what}{'s' * (number != 1)}"
 
 
 def _write_report(path: Path | None, log: RunLog, balls: dict[str, Any]) -> str:

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import argparse
+from typing import Final
 
 from warp_ar.command_line import say
 from warp_ar.errors import WarpArError
 from warp_ar.output.places import files_of
 from warp_ar.scene import Scene, bundled_scenes
 
+ALWAYS: Final = ("camera.guessed", "object.outside")
+"""Findings that are said beside the worst."""
+
 
 def say_quick_check(options: argparse.Namespace, scene: Scene) -> bool:
-    """Say in one line each what is guessed, and the worst of what is wrong with the set-up.
+    """Say in one line each what is guessed, what lies outside the picture, and the worst of what else is wrong.
 
     Frames of a capture device are left to the run itself: a device is not opened twice.
 
@@ -27,8 +31,8 @@ def say_quick_check(options: argparse.Namespace, scene: Scene) -> bool:
     # What the run itself cannot start with, it says itself.
     told = ("source.", "camera.aspect")
     found = [finding for finding in checked.findings if not finding.name.startswith(told)]
-    worst = [finding for finding in found if finding.name != "camera.guessed"][:1]
-    for finding in [*worst, *(finding for finding in found if finding.name == "camera.guessed")]:
+    worst = [finding for finding in found if finding.name not in ALWAYS][:1]
+    for finding in [*worst, *(finding for finding in found if finding.name in ALWAYS)]:
         more = f"; all there is to say: python -m warp_ar.doctor {options.scene}" if finding in worst else ""
         own = None if scene.path in bundled_scenes().values() else options.scene
         say(f"{finding.text}; to do: {finding.remedy_for(own)}{more}")

@@ -55,7 +55,11 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def asked_figures(names: Sequence[str]) -> list[str]:
-    """Names of figures, checked."""
+    """Names of figures, checked.
+
+    Raises:
+        UsageError: There is no figure of that name.
+    """
     known = [*map(str, FIGURES), READINGS]
     for name in names:
         if name not in known:
@@ -123,7 +127,11 @@ def reading_rows(context: Context, progress: WorkProgress) -> tuple[tuple[str, .
 
 
 def make_all(options: argparse.Namespace) -> int:
-    """Make, print and write what was asked for."""
+    """Make, print and write what was asked for.
+
+    Raises:
+        UsageError: An option makes no sense, or a library is missing.
+    """
     names = asked_figures(options.figures)
     if options.frames < 1:
         raise UsageError(f"--frames {options.frames}: expected 1 or more")

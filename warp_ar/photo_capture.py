@@ -103,9 +103,14 @@ def capture_light(
         raise UsageError(f"shown = {shown}: expected the number of a photograph, 0 to {len(photos) - 1}")
     reference = photos[shown] if shown is not None else photos[_best_exposed(photos)]
     camera, notes = _camera_of(reference, transfer, focal_35mm)
-    outline = _find_outline(photos, reference, camera, ball)
+    outline, taken_from = _find_outline(photos, reference, camera, ball)
     bracket = _merge_plan(photos, reference, outline, transfer, exposures)
     notes += [*bracket.notes, _describe_outline(outline)]
+    if taken_from is not None:
+        notes.append(
+            f"{reference.name} shows no rim of the ball: this outline is that of {taken_from.name}, at the same place; "
+            "if the camera moved in between, show a brighter photograph (--shown)"
+        )
     if outline.is_doubtful:
         notes.append(
             "this outline is doubtful: look at it (--outline FILE draws it), and give a rough circle (--ball) if it is "
@@ -129,7 +134,7 @@ def _best_exposed(photos: Sequence[Photograph]) -> int:
     def share(photo: Photograph) -> float:
         h, w = photo.image.shape[:2]
         middle = photo.image[h // 8 : -h // 8 : 8, w // 8 : -w // 8 : 8].max(2)
-        return float(((middle > 30) & (middle < 245)).mean())
+        return float(((middle > 30) & (middle < 245)).mean()) if middle.size else 0.0
 
     return max(range(len(photos)), key=lambda k: share(photos[k]))
 
@@ -153,21 +158,33 @@ def _camera_of(photo: Photograph, transfer: str, focal_35mm: float | None) -> tu
 
 def _find_outline(
     photos: Sequence[Photograph], reference: Photograph, camera: Camera, ball: Sequence[float] | None
-) -> BallOutline:
-    """The ball in the shown photograph; where that is none of the best exposed, near where that one has it."""
+) -> tuple[BallOutline, Photograph | None]:
+    """The ball in the shown photograph; where that is none of the best exposed, near where that one has it.
+
+    Returns:
+        The outline, and the photograph whose outline it is where the shown one shows none.
+    """
     clearest = photos[_best_exposed(photos)]
     if ball is not None or clearest is reference:
-        return find_ball(reference.image, camera, ball)
+        return find_ball(reference.image, camera, ball), None
     seen = find_ball(clearest.image)
     rough = _same_place((*seen.center, seen.radius), clearest.image, reference.image)
     try:
-        own = find_ball(reference.image, camera, rough, NEAR)
+        own, taken_from = find_ball(reference.image, camera, rough, NEAR), None
     except UsageError:
         # Too dark or too bright to see a rim: it is laid over the others by what it mirrors.
         x, y, z = map(float, sphere_of_circle(camera, *rough))
-        axes = (rough[2] / seen.radius * seen.axes[0], rough[2] / seen.radius * seen.axes[1])
-        own = dataclasses.replace(seen, center=rough[:2], axes=axes, sphere=(x, y, z))
-    return dataclasses.replace(own, evidence=seen.evidence)
+        larger = rough[2] / seen.radius
+        (major, minor), (dx, dy, dr) = seen.axes, seen.deviation
+        own = dataclasses.replace(
+            seen,
+            center=rough[:2],
+            axes=(larger * major, larger * minor),
+            deviation=(larger * dx, larger * dy, larger * dr),
+            sphere=(x, y, z),
+        )
+        taken_from = clearest
+    return dataclasses.replace(own, evidence=seen.evidence), taken_from
 
 
 def _same_place(circle: Circle, of: Image, other: Image) -> Circle:

@@ -99,7 +99,11 @@ def decode_picture(data: bytes, flags: int, error: type[WarpArError], label: str
 
 
 def check_picture(data: bytes, error: type[WarpArError], label: str) -> None:
-    """Raise ``error`` if a picture must not be decoded: by its header it is none, too large, or cut off."""
+    """Check by its header whether a picture may be decoded.
+
+    Raises:
+        WarpArError: As ``error``: it is none, too large, or cut off.
+    """
     if not data:
         raise error(f"{label} is empty (0 bytes); an image is needed")
     # libpng would refuse a file without its last chunk too, but writes to stderr when it does.

@@ -92,7 +92,11 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def check(options: argparse.Namespace) -> None:
-    """Refuse options that make no sense, before anything is measured."""
+    """Refuse options that make no sense, before anything is measured.
+
+    Raises:
+        UsageError: One makes no sense, or does not fit another.
+    """
     if options.frames < 1:
         raise UsageError(f"--frames {options.frames}: expected 1 or more")
     if options.presets and options.stage is not None:
@@ -212,7 +216,11 @@ def write(
 
 
 def tradeoff(options: argparse.Namespace) -> int:
-    """Measure, print and write."""
+    """Measure, print and write.
+
+    Raises:
+        UsageError: Options make no sense, or the device is not there.
+    """
     check(options)
     device = resolve_device(options.device)
     if options.processor_time and not device.is_cpu:

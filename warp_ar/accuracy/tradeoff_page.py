@@ -72,7 +72,11 @@ text-align:center}.scale img{grid-column:1/-1;width:100%;height:10px;border-radi
 
 
 def data_uri(image: Image) -> str:
-    """An RGB picture as a data URI."""
+    """An RGB picture as a data URI.
+
+    Raises:
+        ValueError: It cannot be encoded.
+    """
     bgr = np.ascontiguousarray(image[..., ::-1])
     done, code = cv2.imencode(".webp", bgr, [cv2.IMWRITE_WEBP_QUALITY, QUALITY])
     if not done:

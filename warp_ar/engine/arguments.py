@@ -17,21 +17,33 @@ from warp_ar.stages.request import Estimates
 
 
 def check_number(name: str, value: object, above: float = -math.inf) -> None:
-    """Raise UsageError if an argument is no finite number, or not above a bound."""
+    """Check an argument that is a number of seconds.
+
+    Raises:
+        UsageError: It is no finite number, or not above the bound.
+    """
     if isinstance(value, bool) or not isinstance(value, numbers.Real) or not math.isfinite(value) or value <= above:
         right = "a finite number of seconds" if above == -math.inf else f"a finite number of seconds above {above:g}"
         raise UsageError(f"{name} = {value!r}: expected {right}")
 
 
 def check_estimates(estimates: object) -> None:
-    """Raise UsageError if an argument is no way to wait for light that is estimated."""
+    """Check an argument that says how to wait for light that is estimated.
+
+    Raises:
+        UsageError: There is no such way.
+    """
     ways = typing.get_args(Estimates)
     if estimates not in ways:
         raise UsageError(f"estimates = {estimates!r}: expected {', '.join(map(repr, ways))}")
 
 
 def check_exposure(scene: Scene) -> None:
-    """Raise UsageError if a scene's exposure is no number that a camera can have."""
+    """Check a scene's exposure.
+
+    Raises:
+        UsageError: It is no number that a camera can have.
+    """
     scale = scene.exposure.scale
     if scale != "auto" and (isinstance(scale, str) or not 0.0 <= scale < math.inf):
         raise UsageError(f'exposure.scale = {scale!r}: expected a finite number, 0 or more, or "auto"')

@@ -112,6 +112,9 @@ class Crew:
             bands_per_pass: Equal bands of each pass; None means by need.
             decide: Called as a stage begins for which ``ask`` was said: is to call ``begin`` or leave it.
             finish: Called as a stage ends for which ``begin`` was told so.
+
+        Raises:
+            ValueError: There are more stages than native threads run.
         """
         self._decide, self._finish = decide, finish
         self._error: BaseException | None = None

@@ -26,7 +26,11 @@ _COMPONENTS = {"objects": 4, "coverage": 8, "motion": 2, "ids": 0, "depth": 0}
 
 
 def check_outputs(outputs: Sequence[str]) -> None:
-    """Raise UsageError if an output has no name of ours."""
+    """Check the names of outputs.
+
+    Raises:
+        UsageError: There is no output of that name.
+    """
     known = (*OUTPUTS, *LAYERS)
     for name in outputs:
         if name not in known:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+import difflib
 import math
 import os
 import time
@@ -60,7 +61,9 @@ def resolve_quality(quality: str | Quality) -> Quality:
     if isinstance(quality, Quality):
         return quality
     if quality not in PRESETS:
-        raise UsageError(f"quality {quality!r} is no preset; expected {', '.join(PRESETS)}")
+        close = difflib.get_close_matches(str(quality), PRESETS, 1)
+        hint = f"did you mean {close[0]}? " if close else ""
+        raise UsageError(f"quality {quality!r} is no preset; {hint}expected {', '.join(PRESETS)}")
     return PRESETS[quality]
 
 

@@ -64,7 +64,11 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def command(options: argparse.Namespace) -> int:
-    """Do what the options ask for."""
+    """Do what the options ask for.
+
+    Raises:
+        UsageError: ``--workers`` is out of bounds, or as the command of the farm raises it.
+    """
     workers = getattr(options, "workers", None)
     if workers is not None and not 1 <= workers <= MOST_WORKERS:
         raise UsageError(f"--workers {workers}: expected a number from 1 to {MOST_WORKERS}")
@@ -79,7 +83,12 @@ def command(options: argparse.Namespace) -> int:
 
 
 def tell_status(options: argparse.Namespace) -> int:
-    """``farm status``."""
+    """``farm status``.
+
+    Raises:
+        RunError: The run is damaged.
+        UsageError: There is none in the folder, or ``--serve`` is no port.
+    """
     if options.html is not None or options.serve is not None:
         from warp_ar.farm.status_page import HOST, make_server, write_page
 
@@ -119,7 +128,12 @@ def resume(options: argparse.Namespace) -> int:
 
 
 def work(options: argparse.Namespace, folder: Path) -> int:
-    """Work through what is open of a run."""
+    """Work through what is open of a run.
+
+    Raises:
+        RunError: The run is damaged, or cannot go on.
+        UsageError: There is none in the folder, or another version of the program began it.
+    """
     with importing():
         from warp_ar.farm.driver import Driver
         from warp_ar.farm.version import program_version
@@ -199,7 +213,11 @@ def _tell_scale(options: argparse.Namespace) -> int:
 
 
 def plan(options: argparse.Namespace) -> int:
-    """``farm plan``."""
+    """``farm plan``.
+
+    Raises:
+        UsageError: No job file is named, and no figures; or ``--gpus`` makes no sense.
+    """
     if options.figures is not None:
         return _tell_scale(options)
     if options.jobs is None or options.gpus is not None:

@@ -135,7 +135,11 @@ class Manifest:
 
 
 def parse_line(line: bytes) -> dict[str, Any]:
-    """A line of a manifest; raises ValueError if it is none."""
+    """A line of a manifest.
+
+    Raises:
+        ValueError: It is none.
+    """
     try:
         told = json.loads(line)
     except RecursionError as error:

@@ -35,6 +35,8 @@ from warp_ar.scene import Camera
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
+SMALLEST_PICTURE = 24
+"""Pixels along the shorter side below which no picture shows a ball: noise fits any circle then."""
 COARSE_RADIUS = 48.0
 """Pixels of the ball in the smallest picture that is looked at."""
 ROUGH_ERROR = 0.22
@@ -373,9 +375,13 @@ def find_ball(
         rough_error: Share of the radius by which ``rough`` may be off.
 
     Raises:
-        UsageError: No ball is found.
+        UsageError: No ball is found, the picture is too small, or the circle lies outside of it.
     """
     height, width = image.shape[:2]
+    if min(width, height) < SMALLEST_PICTURE:
+        raise UsageError(
+            f"the picture is {width}x{height} pixels; expected {SMALLEST_PICTURE} or more on each side to find a ball"
+        )
     camera = camera or far_camera(width, height)
     if rough is None:
         return _find_anywhere(image, camera)
@@ -383,6 +389,9 @@ def find_ball(
         raise UsageError(
             f"ball {', '.join(f'{v:g}' for v in rough)}: expected column, row and radius (4 or more) in pixels"
         )
+    x, y, reach = rough
+    if not (-reach < x < width + reach and -reach < y < height + reach):
+        raise UsageError(f"ball {x:g}, {y:g}, {reach:g}: the circle lies outside the picture, {width}x{height} pixels")
     start = sphere_of_circle(camera, *rough)
     if start[2] <= 1.0:
         raise UsageError("no ball is before the camera at this circle; expected one that is nearer to the axis")

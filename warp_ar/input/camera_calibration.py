@@ -280,7 +280,8 @@ def write_camera(report: CameraReport, path: Path) -> None:
     """Write OpenCV's YAML (or JSON or XML, by the name's ending).
 
     Raises:
-        SinkError: if the file cannot be written.
+        SinkError: The file cannot be written.
+        UsageError: Its name has another ending.
     """
     if path.suffix.lower() not in (".yml", ".yaml", ".json", ".xml"):
         raise UsageError(f"--output {path}: expected a name that ends in .yml, .json or .xml")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import dataclasses
 import itertools
 import math
@@ -128,6 +129,8 @@ def check_pictures(scene: Scene, look: Look) -> list[Finding]:
     views = [image for image, _ in look.views]
     if (board := board_instead(scene.marker, views[:: -(-len(views) // BOARD_VIEWS)])) is not None:
         return [board]
+    if (twice := _marker_twice(scene.marker, views)) is not None:
+        return [twice]
     found = []
     share = len(look.views) / len(look.images)
     if share < RARE:
@@ -146,6 +149,19 @@ def check_pictures(scene: Scene, look: Look) -> list[Finding]:
     found += _check_focal(scene.marker, look)
     few = look.views[:: max(1, len(look.views) // 6)]
     return [*found, *_check_light(scene.marker, look, few), *_check_blur(scene.marker, look, few)]
+
+
+def _marker_twice(marker: Marker, images: Sequence[Image]) -> Finding | None:
+    """The finding that pictures show a marker of the scene twice, of which either may be followed."""
+    own = set(_pattern(marker).markers)
+    detector = MarkerDetector(marker.dictionary)
+    for image in (images[0], images[-1]):
+        counts = collections.Counter(each.id for each in detector.detect(_gray(image)) if each.id in own)
+        if not counts or counts.most_common(1)[0][1] < 2:
+            return None
+    wanted = f"{marker.dictionary} {marker.board or f'id {marker.id}'}"
+    text = f"{wanted} is in the picture twice, and either may be followed"
+    return Finding("marker.twice", text, "cover or take away the one that the scene does not mean")
 
 
 def _pattern(marker: Marker) -> Pattern:

@@ -10,7 +10,7 @@ import numpy as np
 from warp_ar.input.ball_solve import ground_below
 from warp_ar.input.card import card_size
 from warp_ar.input.finding import Finding
-from warp_ar.scene import CharucoBoard, Light, Object, Probe, Proxy, Scene
+from warp_ar.scene import CharucoBoard, EmissiveMaterial, Light, Object, Probe, Proxy, Scene
 
 LARGEST_BALL: Final = 0.3
 """Metres: no mirror ball on a desk has a larger radius, gazing globes included."""
@@ -38,11 +38,12 @@ def check_scene(scene: Scene) -> list[Finding]:
     for index, probe in enumerate(scene.probes):
         label = "[probe]" if len(scene.probes) == 1 else f"[[probe]] {index}"
         found += _check_ball(scene, probe, label)
-    if scene.objects and not scene.probes and not scene.lights:
+    emits = any(isinstance(item.material, EmissiveMaterial) for item in scene.objects)
+    if scene.objects and not (scene.probes or scene.lights or scene.captured or emits):
         found.append(
             Finding(
                 "probe.none",
-                "the scene has neither a mirror ball nor a light: its objects are black",
+                "the scene has neither a mirror ball nor a light nor captured light: its objects are black",
                 "add [probe] with center and radius",
             )
         )

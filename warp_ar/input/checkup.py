@@ -9,6 +9,7 @@ from typing import Any, Final
 from warp_ar.errors import SceneError, SourceError
 from warp_ar.input.ball_solve import find_outlines
 from warp_ar.input.check_ball import LOST, check_balls
+from warp_ar.input.check_objects import check_objects, written_poses
 from warp_ar.input.check_pictures import Look, check_pictures, take_look
 from warp_ar.input.check_print import check_print
 from warp_ar.input.check_proxies import check_proxies
@@ -90,15 +91,17 @@ def check_look(scene: Scene, look: Look, views: int = 4) -> list[Finding]:
 
 def _check_look(scene: Scene, look: Look, views: int, before: list[Finding]) -> list[Finding]:
     if not scene.has_marker and look.images:
-        return []  # its poses are written down: no print is there to tell camera, light and ball by
+        # Its poses are written down: no print is there to tell camera, light and ball by.
+        return check_objects(scene, look.camera, written_poses(scene))
     found = check_pictures(scene, look)
-    if any(finding.name == "marker.board" for finding in found):
-        return found  # poses of the wrong scale say nothing about prints, proxies and balls
+    if any(finding.name in ("marker.board", "marker.twice") for finding in found):
+        return found  # poses by another marker say nothing about prints, proxies and balls
     few = look.views[:: max(1, -(-len(look.views) // FEW_VIEWS))]
     found += [*check_print(scene.marker, look.camera, few), *check_proxies(scene, look.camera, few)]
     # Where the scene's own numbers cannot be, a picture says nothing more about them.
     if any(finding.name.startswith("units.") for finding in before):
         return found
+    found += check_objects(scene, look.camera, [pose for _, pose in look.views])
     told = {finding.name for finding in before}
     balls = check_balls(scene, look, views)
     if any(finding.name in ("camera.response", "card.contrast") for finding in found):

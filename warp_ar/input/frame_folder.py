@@ -59,6 +59,7 @@ class FrameFolder(RecordedSource):
 
     Raises:
         SourceError: The path does not exist, holds no image, its first image or its ``exposures.json`` cannot be used.
+        UsageError: ``fps`` or one of ``exposures`` is not a positive number.
     """
 
     def __init__(

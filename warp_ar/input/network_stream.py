@@ -65,6 +65,7 @@ class NetworkStream(LiveSource):
     Raises:
         SourceError: The stream cannot be opened or gives no picture; while iterating, its line stays broken, or its
             pictures change their size.
+        UsageError: ``fps`` is not a positive number.
     """
 
     def __init__(self, address: str, *, fps: float | None = None, grace: float = GRACE_SECONDS) -> None:

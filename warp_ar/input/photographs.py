@@ -44,6 +44,8 @@ def read_photograph(path: str | Path) -> Photograph:
         SourceError: The file is missing, damaged or no picture.
     """
     path = Path(path)
+    if path.is_dir():
+        raise SourceError(f"{path} is a folder; name the photographs in it, such as {path / '*.jpg'}")
     if not path.is_file():
         raise SourceError(f"there is no photograph {path}")
     if words := foreign_words(path.suffix.lower()):

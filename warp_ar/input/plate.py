@@ -119,7 +119,11 @@ def as_plate(image: npt.NDArray[Any], size: tuple[int, int]) -> Plate:
 
 
 def check_plate(image: npt.NDArray[Any], size: tuple[int, int]) -> None:
-    """Raise UsageError unless an array can be a plate's picture; arguments as those of `as_plate`."""
+    """Check an array that is to be a plate's picture; arguments as those of `as_plate`.
+
+    Raises:
+        UsageError: It has another size or type.
+    """
     expected = (size[1], size[0], 3)
     if image.shape != expected or (image.dtype != np.uint16 and image.dtype.kind != "f"):
         raise UsageError(
@@ -140,7 +144,11 @@ def codes8(plate: Plate, transfer: str) -> npt.NDArray[np.uint8]:
 
 
 def check_linear(transfer: str) -> None:
-    """Raise UsageError unless linear frames fit the camera's transfer: they are shown as sRGB."""
+    """Check that linear frames fit the camera's transfer: they are shown as sRGB.
+
+    Raises:
+        UsageError: It is another one.
+    """
     if transfer != "srgb":
         raise UsageError(
             f'camera.transfer = "{transfer}": frames of linear light are encoded as srgb; take the key out'

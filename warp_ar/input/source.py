@@ -121,6 +121,11 @@ class RecordedSource(Source):
         """One pass over the frames, index and time from 0."""
 
     def __iter__(self) -> Iterator[Frame]:
+        """Frames in order, decoded ahead on a thread; every call starts from the first.
+
+        Raises:
+            SourceError: The source is closed; while iterating, a frame cannot be decoded or has another size.
+        """
         if self._closed:
             raise SourceError(f"{self.description} is closed; open it again to read from it")
         frames = _ahead(self._passes())
@@ -169,7 +174,11 @@ def _ahead(frames: Generator[Frame, None, None]) -> Generator[Frame, None, None]
 
 
 def check_size(image: Image, size: tuple[int, int], name: str, index: int | None) -> None:
-    """Raise SourceError if a picture is not of the (width, height) of those before it."""
+    """Check that a picture is of the (width, height) of those before it.
+
+    Raises:
+        SourceError: It is not.
+    """
     height, width = image.shape[:2]
     if (width, height) != size:
         which = name if index is None else f"{name}: frame {index}"
@@ -177,13 +186,21 @@ def check_size(image: Image, size: tuple[int, int], name: str, index: int | None
 
 
 def check_fps(fps: float | None) -> None:
-    """Raise UsageError if ``fps`` is given and no rate."""
+    """Check a rate in frames per second; None is none given.
+
+    Raises:
+        UsageError: It is not a positive number.
+    """
     if fps is not None and not (math.isfinite(fps) and fps > 0):
         raise UsageError(f"fps is {fps}; it must be a positive number of frames per second")
 
 
 def check_exposures(exposures: Sequence[float]) -> None:
-    """Raise UsageError if one of ``exposures`` is no time."""
+    """Check exposure times in seconds.
+
+    Raises:
+        UsageError: One of them is not a positive number.
+    """
     if not all(math.isfinite(seconds) and seconds > 0 for seconds in exposures):
         raise UsageError(f"exposures {', '.join(map(str, exposures))}: expected positive numbers of seconds")
 

@@ -55,6 +55,7 @@ class VideoFile(RecordedSource):
 
     Raises:
         SourceError: The file does not exist, is no video, or its first frame cannot be decoded.
+        UsageError: ``fps`` or one of ``exposures`` is not a positive number.
     """
 
     _converters = 1

@@ -23,7 +23,7 @@ import OpenEXR
 from numpy.typing import NDArray
 
 from warp_ar.errors import SceneError, SinkError, UsageError, reason
-from warp_ar.exr_file import write_exr
+from warp_ar.exr_file import exr_problem, write_exr
 from warp_ar.files import is_file, limits, parse_json, too_much, write_whole
 from warp_ar.light.latlong_axes import DESCRIPTIONS, from_axes, world_from_marker
 
@@ -255,7 +255,7 @@ def _read_exr(path: Path) -> tuple[dict[str, Any], dict[str, Map]]:
     except (RuntimeError, OSError, ValueError) as error:
         if isinstance(error, SceneError):
             raise
-        raise SceneError(f"{path} cannot be read as OpenEXR: {reason(error)}") from error
+        raise SceneError(f"{path} cannot be read as OpenEXR: {exr_problem(path, error)}") from error
 
 
 def _attribute(path: Path, header: dict[str, Any], name: str, default: float) -> float:

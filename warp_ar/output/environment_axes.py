@@ -67,7 +67,11 @@ _SPANS = {
 
 
 def check_axes(axes: str, layout: str = "latlong") -> None:
-    """Raise UsageError unless these axes are known, and told for this layout."""
+    """Check that these axes are known, and told for this layout.
+
+    Raises:
+        UsageError: They are not, or there is no such layout.
+    """
     if layout not in LAYOUTS:
         raise UsageError(f"layout {layout!r}: expected {' or '.join(LAYOUTS)}")
     allowed = AXES if layout == "latlong" else tuple(CUBES)

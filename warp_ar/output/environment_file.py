@@ -24,7 +24,7 @@ import numpy.typing as npt
 import OpenEXR
 
 from warp_ar.errors import SinkError, UsageError, reason
-from warp_ar.exr_file import write_exr
+from warp_ar.exr_file import exr_problem, write_exr
 from warp_ar.files import is_file, limits, too_much, write_whole
 from warp_ar.output.color_spaces import COLOR_SPACES, convert_light, find_color_space
 from warp_ar.output.environment_axes import CUBES, DESCRIPTIONS, check_axes, from_axes, to_axes, to_cube
@@ -233,7 +233,11 @@ def read_environment(path: str | pathlib.Path) -> npt.NDArray[np.float32]:
 
 
 def read_environment_info(path: str | pathlib.Path) -> EnvironmentInfo:
-    """What the header of an OpenEXR says of an environment; errors as `read_environment`."""
+    """What the header of an OpenEXR says of an environment.
+
+    Raises:
+        SinkError: The file cannot be read, or its header holds a date or place that is none.
+    """
     path = pathlib.Path(path)
     header, _ = _read(path, header_only=True)
 
@@ -278,7 +282,7 @@ def _read(path: pathlib.Path, *, header_only: bool = False) -> tuple[dict[str, A
         with OpenEXR.File(str(path)) as file:
             return header, {name: np.array(channel.pixels, np.float32) for name, channel in file.channels().items()}
     except (RuntimeError, OSError, ValueError) as error:
-        raise SinkError(f"{path} cannot be read as OpenEXR: {reason(error)}") from error
+        raise SinkError(f"{path} cannot be read as OpenEXR: {exr_problem(path, error)}") from error
 
 
 def _check_environment(radiance: npt.NDArray[Any]) -> None:

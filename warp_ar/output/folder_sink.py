@@ -71,7 +71,11 @@ class FolderSink(ThreadedSink):
             self.replaced = f"{self._path}: {len(self._earlier)} numbered frames of an earlier run are replaced"
 
     def write(self, image: Any) -> None:
-        """Take the next frame; the first one clears away those of an earlier run."""
+        """Take the next frame; the first one clears away those of an earlier run.
+
+        Raises:
+            SinkError: It is no frame, another frame could not be written, or an earlier run's cannot be replaced.
+        """
         self._check(image)
         earlier, self._earlier = self._earlier, []
         # The last first: who is killed meanwhile leaves the beginning of the earlier run, all parts of its frames.

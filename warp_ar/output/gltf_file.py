@@ -25,7 +25,7 @@ import numpy.typing as npt
 
 from warp_ar.errors import SinkError, reason
 from warp_ar.files import write_whole
-from warp_ar.output.looks import Look, Picture, placed_by
+from warp_ar.output.exchange_materials import ExchangeMaterial, Picture, placed_by
 from warp_ar.output.shot import Body, Matrix, Shot, key_frames
 from warp_ar.scene.description import Light
 from warp_ar.scene.materials import RGB
@@ -261,7 +261,7 @@ class _Builder:
             if coordinates is not None:
                 # v runs down the picture.
                 attributes[name] = self._accessor(coordinates * np.array([1.0, -1.0]) + np.array([0.0, 1.0]))
-        if mesh.tangents is not None and any(look.normal is not None for look in body.looks):
+        if mesh.tangents is not None and any(material.normal is not None for material in body.materials):
             attributes["TANGENT"] = self._accessor(mesh.tangents)
         if body.colors is not None:
             attributes["COLOR_0"] = self._accessor(body.colors)
@@ -269,9 +269,9 @@ class _Builder:
             {
                 "attributes": attributes,
                 "indices": self._accessor(mesh.faces[body.triangles_of(number)].reshape(-1), indices=True),
-                "material": self._add_material(body.name, look),
+                "material": self._add_material(body.name, material),
             }
-            for number, look in enumerate(body.looks)
+            for number, material in enumerate(body.materials)
         ]
         self._tree.setdefault("meshes", []).append({"name": body.name, "primitives": primitives})
         node = {"name": body.name, "mesh": len(self._tree["meshes"]) - 1, "extras": {"proxy": body.proxy}}
@@ -282,43 +282,44 @@ class _Builder:
         self._tree["bufferViews"][self._tree["accessors"][index]["bufferView"]]["target"] = 34962
         return index
 
-    def _add_material(self, name: str, look: Look) -> int:
+    def _add_material(self, name: str, material: ExchangeMaterial) -> int:
         surface: dict[str, Any] = {
-            "baseColorFactor": [*look.base_color, look.opacity],
-            "metallicFactor": look.metallic,
-            "roughnessFactor": look.roughness,
+            "baseColorFactor": [*material.base_color, material.opacity],
+            "metallicFactor": material.metallic,
+            "roughnessFactor": material.roughness,
         }
-        label = f"{name}_{look.name}" if look.name else name
-        material: dict[str, Any] = {"name": label, "pbrMetallicRoughness": surface, "doubleSided": look.double_sided}
-        if look.texture is not None:
-            surface["baseColorTexture"] = self._add_texture(look.texture)
-        if look.metallic_roughness is not None:
-            surface["metallicRoughnessTexture"] = self._add_texture(look.metallic_roughness)
-        if look.normal is not None:
-            material["normalTexture"] = {**self._add_texture(look.normal), "scale": look.normal_scale}
-        if look.occlusion is not None:
-            material["occlusionTexture"] = {**self._add_texture(look.occlusion), "strength": look.occlusion_strength}
-        if look.alpha != "opaque":
-            material["alphaMode"] = look.alpha.upper()
-            material |= {"alphaCutoff": look.cutoff} if look.alpha == "mask" else {}
-        if look.unlit:
+        label = f"{name}_{material.name}" if material.name else name
+        entry: dict[str, Any] = {"name": label, "pbrMetallicRoughness": surface, "doubleSided": material.double_sided}
+        if material.texture is not None:
+            surface["baseColorTexture"] = self._add_texture(material.texture)
+        if material.metallic_roughness is not None:
+            surface["metallicRoughnessTexture"] = self._add_texture(material.metallic_roughness)
+        if material.normal is not None:
+            entry["normalTexture"] = {**self._add_texture(material.normal), "scale": material.normal_scale}
+        if material.occlusion is not None:
+            strength = material.occlusion_strength
+            entry["occlusionTexture"] = {**self._add_texture(material.occlusion), "strength": strength}
+        if material.alpha != "opaque":
+            entry["alphaMode"] = material.alpha.upper()
+            entry |= {"alphaCutoff": material.cutoff} if material.alpha == "mask" else {}
+        if material.unlit:
             self._use("KHR_materials_unlit")
-            material.setdefault("extensions", {})["KHR_materials_unlit"] = {}
-        if any(look.emission):
-            self._add_emission(material, look)
-        if look.specular is not None:
-            self._add_specular(material, look.specular)
-        self._tree.setdefault("materials", []).append(material)
+            entry.setdefault("extensions", {})["KHR_materials_unlit"] = {}
+        if any(material.emission):
+            self._add_emission(entry, material)
+        if material.specular is not None:
+            self._add_specular(entry, material.specular)
+        self._tree.setdefault("materials", []).append(entry)
         return len(self._tree["materials"]) - 1
 
-    def _add_specular(self, material: dict[str, Any], specular: RGB) -> None:
+    def _add_specular(self, entry: dict[str, Any], specular: RGB) -> None:
         """A factor goes to 1 at most; what is beyond is the colour's, which may be any."""
         self._use("KHR_materials_specular")
         factor = max(specular) / _DIELECTRIC
         strength = min(1.0, factor)
         color = [0.0 if strength == 0.0 else value / (_DIELECTRIC * strength) for value in specular]
         told = {"specularFactor": strength, "specularColorFactor": color}
-        material.setdefault("extensions", {})["KHR_materials_specular"] = told
+        entry.setdefault("extensions", {})["KHR_materials_specular"] = told
 
     def _add_texture(self, picture: Picture) -> dict[str, Any]:
         """A reference to a picture with its sampler and its place; equal pictures are held once."""
@@ -342,15 +343,15 @@ class _Builder:
             made["extensions"] = {"KHR_texture_transform": placed}
         return made
 
-    def _add_emission(self, material: dict[str, Any], look: Look) -> None:
+    def _add_emission(self, entry: dict[str, Any], material: ExchangeMaterial) -> None:
         """Factors go to 1 at most; what is beyond is the strength's."""
-        material["emissiveFactor"] = list(_bounded(look.emission))
-        if look.glow is not None:
-            material["emissiveTexture"] = self._add_texture(look.glow)
-        if max(look.emission) > 1.0:
+        entry["emissiveFactor"] = list(_bounded(material.emission))
+        if material.glow is not None:
+            entry["emissiveTexture"] = self._add_texture(material.glow)
+        if max(material.emission) > 1.0:
             self._use("KHR_materials_emissive_strength")
-            strength = {"emissiveStrength": max(look.emission)}
-            material.setdefault("extensions", {})["KHR_materials_emissive_strength"] = strength
+            strength = {"emissiveStrength": max(material.emission)}
+            entry.setdefault("extensions", {})["KHR_materials_emissive_strength"] = strength
 
     def _add_image(self, png: bytes) -> int:
         self._tree.setdefault("images", []).append({"bufferView": self._view(png), "mimeType": "image/png"})

@@ -1,8 +1,8 @@
 """A shot as other programs take it: the camera's way and lens, surfaces with their materials and motion, lights.
 
 Lengths are metres, angles radians but where a name says degrees, the world is the marker's, z up. Radiance is in camera
-values: 1 is where the camera clips. Exchange formats know fewer materials than scenes do; ``looks.Look`` is what all of
-them can say.
+values: 1 is where the camera clips. Exchange formats know fewer materials than scenes do; ``ExchangeMaterial`` is what
+all of them can say.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from warp_ar.output.looks import Look, texture_plan, used_looks, vertex_colors
+from warp_ar.output.exchange_materials import ExchangeMaterial, texture_plan, used_materials, vertex_colors
 from warp_ar.scene import Camera, Pose, Scene
 from warp_ar.scene.description import Light, Object, Proxy
 from warp_ar.scene.geometry import Mesh, make_mesh, rotation_matrix
@@ -36,14 +36,14 @@ class Body:
 
     name: str
     mesh: Mesh
-    looks: tuple[Look, ...]
+    materials: tuple[ExchangeMaterial, ...]
     """Materials that its triangles have, one or more."""
     proxy: bool
     """Physical: it is in the plate and only receives light and shadow."""
     placements: tuple[Matrix, ...]
     """``world_from_mesh``, (4, 4), of every frame; one where it stands still."""
     numbers: npt.NDArray[np.int64] | None = None
-    """Which of ``looks`` each triangle has, (m,); None: all the first."""
+    """Which of ``materials`` each triangle has, (m,); None: all the first."""
     colors: npt.NDArray[np.float32] | None = None
     """Factors of base colour and alpha at vertices, (n, 4), linear."""
 
@@ -102,11 +102,11 @@ class Shot:
     def _body(self, name: str, shape: ObjectShape | Proxy) -> Body:
         if isinstance(shape, Proxy):
             at = (placement(rotation_matrix(shape.rotate), np.array(shape.at)),)
-            return Body(name, mesh_of(shape), (Look(),), True, at)
+            return Body(name, mesh_of(shape), (ExchangeMaterial(),), True, at)
         item = shape.item
         mesh = shape.mesh or mesh_of(item)
-        looks, numbers = used_looks(item, mesh)
-        return Body(name, mesh, looks, False, self._placements(shape), numbers, vertex_colors(item, mesh))
+        materials, numbers = used_materials(item, mesh)
+        return Body(name, mesh, materials, False, self._placements(shape), numbers, vertex_colors(item, mesh))
 
     def _placements(self, shape: ObjectShape) -> tuple[Matrix, ...]:
         """``world_from_mesh`` of every frame; one where it stands still."""
@@ -162,8 +162,8 @@ def texture_files(scene: Scene, path: Path) -> dict[str, Path]:
     """Pictures that go beside a file, by the names of their bodies and what they are of."""
     found = {}
     for name, shape in zip(surface_names(scene), object_shapes(scene), strict=False):
-        looks, _ = used_looks(shape.item, shape.mesh or mesh_of(shape.item))
-        for (number, kind), file in texture_plan(path, name, looks).items():
+        materials, _ = used_materials(shape.item, shape.mesh or mesh_of(shape.item))
+        for (number, kind), file in texture_plan(path, name, materials).items():
             found["_".join(part for part in (name, str(number) if number else "", kind) if part)] = file
     return found
 

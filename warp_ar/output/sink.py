@@ -224,19 +224,31 @@ class TeeSink(Sink):
 
 
 def check_image(image: npt.NDArray[Any]) -> None:
-    """Raise SinkError if an array is no frame."""
+    """Check that an array is a frame.
+
+    Raises:
+        SinkError: It is none.
+    """
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or not image.size:
         raise SinkError(f"a frame is uint8 RGB (height, width, 3), not {image.dtype} {image.shape}")
 
 
 def check_radiance(image: npt.NDArray[Any]) -> None:
-    """Raise SinkError if an array is no frame of linear radiance."""
+    """Check that an array is a frame of linear radiance.
+
+    Raises:
+        SinkError: It is none.
+    """
     if image.dtype != np.float32 or image.ndim != 3 or image.shape[2] != 3 or not image.size:
         raise SinkError(f"a frame of radiance is float32 RGB (height, width, 3), not {image.dtype} {image.shape}")
 
 
 def make_folder(path: pathlib.Path) -> None:
-    """Make the folder and its parents, and find out whether files can be made in it."""
+    """Make the folder and its parents, and find out whether files can be made in it.
+
+    Raises:
+        SinkError: The path is no folder, or none that can be written to.
+    """
     try:
         if (kind := kind_of(path)) not in ("folder", "nothing"):
             raise SinkError(f"{path} is {'a file' if kind == 'file' else kind}, not a folder to write to")

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from warp_ar.errors import SinkError, UsageError, reason
 from warp_ar.files import write_whole
-from warp_ar.output.looks import Look, texture_plan
+from warp_ar.output.exchange_materials import ExchangeMaterial, texture_plan
 from warp_ar.output.shot import FILM_WIDTH, Body, Matrix, Shot, key_frames
 from warp_ar.scene.description import Light
 from warp_ar.scene.materials import RGB
@@ -167,7 +167,7 @@ def _write_body(pxr: Any, stage: Any, body: Body, path: Path) -> list[Path]:
     prim.SetNormalsInterpolation(pxr.UsdGeom.Tokens.vertex)
     prim.CreateSubdivisionSchemeAttr(pxr.UsdGeom.Tokens.none)
     prim.CreateExtentAttr(pxr.Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(mesh.bounds)))
-    prim.CreateDoubleSidedAttr(any(look.double_sided for look in body.looks))
+    prim.CreateDoubleSidedAttr(any(material.double_sided for material in body.materials))
     primvars = pxr.UsdGeom.PrimvarsAPI(prim)
     for name, coordinates in zip(_COORDINATES, (mesh.uvs, mesh.uvs_second), strict=True):
         if coordinates is not None:
@@ -178,25 +178,25 @@ def _write_body(pxr: Any, stage: Any, body: Body, path: Path) -> list[Path]:
         made.Set(pxr.Vt.Vec3fArray.FromNumpy(_base_colors(body)))
     prim.GetPrim().CreateAttribute("warp_ar:proxy", pxr.Sdf.ValueTypeNames.Bool).Set(body.proxy)
     _place(pxr, prim, dict(enumerate(key_frames(body.placements))))
-    return _write_looks(pxr, stage, body, prim, path)
+    return _write_materials(pxr, stage, body, prim, path)
 
 
 def _base_colors(body: Body) -> npt.NDArray[np.float32]:
     """Base colour at vertices, (n, 3): USD's surface multiplies no colours, so the materials' are in it."""
     assert body.colors is not None
     found = np.ascontiguousarray(body.colors[:, :3])
-    for number, look in enumerate(body.looks):
+    for number, material in enumerate(body.materials):
         own = np.unique(body.mesh.faces[body.triangles_of(number)])
-        found[own] = body.colors[own, :3] * np.array(look.base_color, np.float32)
+        found[own] = body.colors[own, :3] * np.array(material.base_color, np.float32)
     return found
 
 
-def _write_looks(pxr: Any, stage: Any, body: Body, prim: Any, path: Path) -> list[Path]:
+def _write_materials(pxr: Any, stage: Any, body: Body, prim: Any, path: Path) -> list[Path]:
     """The materials, of several each for its triangles; their pictures go beside the file."""
-    plan = texture_plan(path, body.name, body.looks)
+    plan = texture_plan(path, body.name, body.materials)
     written: dict[Path, None] = {}
-    for number, look in enumerate(body.looks):
-        for kind, picture in look.pictures.items():
+    for number, material in enumerate(body.materials):
+        for kind, picture in material.pictures.items():
             file = plan[number, kind]
             if file in written:
                 continue
@@ -206,42 +206,42 @@ def _write_looks(pxr: Any, stage: Any, body: Body, prim: Any, path: Path) -> lis
                 raise SinkError(f"{file} cannot be written: {reason(error)}") from error
             written[file] = None
         where = f"/shot/materials/{body.name}" + (f"_{number}" if number else "")
-        files = {kind: plan[number, kind] for kind in look.pictures}
-        material = _Material(pxr, stage, where, look, files).write(colored=body.colors is not None)
+        files = {kind: plan[number, kind] for kind in material.pictures}
+        bound = _Material(pxr, stage, where, material, files).write(colored=body.colors is not None)
         target = prim.GetPrim()
-        if len(body.looks) > 1:
+        if len(body.materials) > 1:
             chosen = pxr.Vt.IntArray.FromNumpy(body.triangles_of(number).astype(np.int32))
             subset = pxr.UsdShade.MaterialBindingAPI(prim).CreateMaterialBindSubset(f"material_{number}", chosen)
             target = subset.GetPrim()
-        pxr.UsdShade.MaterialBindingAPI.Apply(target).Bind(material)
+        pxr.UsdShade.MaterialBindingAPI.Apply(target).Bind(bound)
     return list(written)
 
 
 class _Material:
     """A material as UsdPreviewSurface, with its pictures."""
 
-    def __init__(self, pxr: Any, stage: Any, where: str, look: Look, files: dict[str, Path]) -> None:
-        self._pxr, self._stage, self._where, self._look, self._files = pxr, stage, where, look, files
+    def __init__(self, pxr: Any, stage: Any, where: str, material: ExchangeMaterial, files: dict[str, Path]) -> None:
+        self._pxr, self._stage, self._where, self._material, self._files = pxr, stage, where, material, files
         self._names = pxr.Sdf.ValueTypeNames
         self._surface = self._shader("surface", "UsdPreviewSurface")
 
     def write(self, *, colored: bool) -> Any:
         """The material; ``colored``: where no picture does, the mesh's ``displayColor`` gives the base colour."""
-        look, names = self._look, self._names
-        own, black = look.base_color, (0.0, 0.0, 0.0)
-        if look.specular is not None:
+        material, names = self._material, self._names
+        own, black = material.base_color, (0.0, 0.0, 0.0)
+        if material.specular is not None:
             self._surface.CreateInput("useSpecularWorkflow", names.Int).Set(1)
-            self._surface.CreateInput("specularColor", names.Color3f).Set(self._pxr.Gf.Vec3f(*look.specular))
+            self._surface.CreateInput("specularColor", names.Color3f).Set(self._pxr.Gf.Vec3f(*material.specular))
         # What is shown as it is neither reflects nor waits for light.
-        shown = "emissiveColor" if look.unlit else "diffuseColor"
-        if look.unlit:
+        shown = "emissiveColor" if material.unlit else "diffuseColor"
+        if material.unlit:
             self._color("diffuseColor", black)
-        if colored and look.texture is None:
+        if colored and material.texture is None:
             self._read_vertex_colors(shown)
         else:
             self._color(shown, own, "")
-        if any(look.emission) and not look.unlit:
-            self._color("emissiveColor", look.emission, "emission")
+        if any(material.emission) and not material.unlit:
+            self._color("emissiveColor", material.emission, "emission")
         self._set_lobe()
         self._set_relief()
         self._set_alpha()
@@ -259,7 +259,7 @@ class _Material:
         if kind is None or kind not in self._files:
             entry.Set(self._pxr.Gf.Vec3f(*factor))
             return
-        opacity = 1.0 if kind else self._look.opacity
+        opacity = 1.0 if kind else self._material.opacity
         texture = self._texture(kind, (*factor, opacity), (0.0,) * 4, "sRGB")
         entry.ConnectToSource(texture.CreateOutput("rgb", self._names.Float3))
 
@@ -270,46 +270,47 @@ class _Material:
         entry.ConnectToSource(reader.CreateOutput("result", self._names.Float3))
 
     def _set_lobe(self) -> None:
-        look = self._look
-        values = {"roughness": ("g", look.roughness), "metallic": ("b", look.metallic)}
+        material = self._material
+        values = {"roughness": ("g", material.roughness), "metallic": ("b", material.metallic)}
         entries = {name: self._surface.CreateInput(name, self._names.Float) for name in values}
-        if look.metallic_roughness is None:
+        if material.metallic_roughness is None:
             for name, (_, value) in values.items():
                 entries[name].Set(value)
             return
-        texture = self._texture("metallic_roughness", (1.0, look.roughness, look.metallic, 1.0), (0.0,) * 4, "raw")
+        factors = (1.0, material.roughness, material.metallic, 1.0)
+        texture = self._texture("metallic_roughness", factors, (0.0,) * 4, "raw")
         for name, (channel, _) in values.items():
             entries[name].ConnectToSource(texture.CreateOutput(channel, self._names.Float))
 
     def _set_relief(self) -> None:
-        look = self._look
-        if look.normal is not None:
-            s = look.normal_scale
+        material = self._material
+        if material.normal is not None:
+            s = material.normal_scale
             texture = self._texture("normal", (2.0 * s, 2.0 * s, 2.0, 1.0), (-s, -s, -1.0, 0.0), "raw")
             entry = self._surface.CreateInput("normal", self._names.Normal3f)
             entry.ConnectToSource(texture.CreateOutput("rgb", self._names.Float3))
-        if look.occlusion is not None:
-            s = look.occlusion_strength
+        if material.occlusion is not None:
+            s = material.occlusion_strength
             texture = self._texture("occlusion", (s, s, s, 1.0), (1.0 - s, 1.0 - s, 1.0 - s, 0.0), "raw")
             entry = self._surface.CreateInput("occlusion", self._names.Float)
             entry.ConnectToSource(texture.CreateOutput("r", self._names.Float))
 
     def _set_alpha(self) -> None:
-        look = self._look
-        if look.alpha == "opaque":
+        material = self._material
+        if material.alpha == "opaque":
             return
         entry = self._surface.CreateInput("opacity", self._names.Float)
         if "" in self._files:
             texture = self._pxr.UsdShade.Shader.Get(self._stage, f"{self._where}/texture")
             entry.ConnectToSource(texture.CreateOutput("a", self._names.Float))
         else:
-            entry.Set(look.opacity)
-        if look.alpha == "mask":
-            self._surface.CreateInput("opacityThreshold", self._names.Float).Set(look.cutoff)
+            entry.Set(material.opacity)
+        if material.alpha == "mask":
+            self._surface.CreateInput("opacityThreshold", self._names.Float).Set(material.cutoff)
 
     def _texture(self, kind: str, scale: Sequence[float], bias: Sequence[float], space: str) -> Any:
         """A picture, read by its texture coordinates, times ``scale`` and plus ``bias``."""
-        picture, names, gf = self._look.pictures[kind], self._names, self._pxr.Gf
+        picture, names, gf = self._material.pictures[kind], self._names, self._pxr.Gf
         name = kind or "texture"
         texture = self._shader(name, "UsdUVTexture")
         texture.CreateInput("file", names.Asset).Set(f"./{self._files[kind].name}")

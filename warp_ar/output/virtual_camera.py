@@ -49,7 +49,11 @@ class VirtualCameraSink(Sink):
         self.description = f"{self._camera.device} (virtual camera, {width}x{height}, {fps:g} fps)"
 
     def write(self, image: npt.NDArray[Any]) -> None:
-        """Show the frame."""
+        """Show the frame.
+
+        Raises:
+            SinkError: It is no frame of the camera's size, the camera is closed, or the device does not take it.
+        """
         check_image(image)
         if image.shape[1::-1] != self._size:
             had, got = (f"{width}x{height}" for width, height in (self._size, image.shape[1::-1]))

@@ -27,7 +27,7 @@ from warp_ar.scene.materials import (
     PhongMaterial,
 )
 from warp_ar.scene.mesh_materials import MeshMaterial, TextureUse
-from warp_ar.scene.object_materials import is_closed, look_of
+from warp_ar.scene.object_materials import is_closed, materials_of
 from warp_ar.scene.texture_codes import linear_texture
 
 FloatArray = npt.NDArray[np.float64]
@@ -63,7 +63,7 @@ def emits_light(item: Object) -> bool:
     Raises:
         SceneError: Its mesh cannot be read.
     """
-    return any(map(emits, look_of(item).materials))
+    return any(map(emits, materials_of(item).materials))
 
 
 def make_area_table(objects: Sequence[Object], meshes: Sequence[Mesh | None]) -> AreaTable:
@@ -109,13 +109,13 @@ def _varies(item: Object) -> bool:
         return item.material.image is not None
     return any(
         material.emissive is not None or (material.unlit and material.base is not None)
-        for material in look_of(item).materials
+        for material in materials_of(item).materials
     )
 
 
 def _faces_of(item: Object, mesh: Mesh | None) -> tuple[Any, ...]:
     """Areas (local), normals, mean emission, whether only the front emits, and numbers of an object's triangles."""
-    materials = look_of(item).materials
+    materials = materials_of(item).materials
     if mesh is None:
         area = 4.0 * np.pi * item.radius**2
         emission = np.array([_constant(materials[0])])

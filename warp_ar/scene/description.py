@@ -85,9 +85,12 @@ class Camera:
         if self.field_of_view is not None and min(width, height) >= 1:
             return Camera.guessed(width, height, self.field_of_view, self.transfer)
         if width < 1 or height < 1 or width * self.height != height * self.width:
+            sideways = width * self.width == height * self.height
+            turned = "turn the frames by 90 degrees, " if sideways else ""
             raise SceneError(
                 f"camera: calibrated for {self.width}x{self.height}, frames are {width}x{height}: another aspect "
-                "ratio, so the intrinsics cannot be scaled; record at the calibrated aspect or calibrate at this size"
+                f"ratio, so the intrinsics cannot be scaled; {turned}record at the calibrated aspect or calibrate at "
+                "this size"
             )
         s = width / self.width
         return dataclasses.replace(

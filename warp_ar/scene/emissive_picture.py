@@ -16,7 +16,8 @@ import numpy as np
 import numpy.typing as npt
 import OpenEXR
 
-from warp_ar.errors import SceneError, reason
+from warp_ar.errors import SceneError
+from warp_ar.exr_file import exr_problem
 from warp_ar.files import limits, read_bytes, too_much
 from warp_ar.scene.mesh_files import load_texture
 from warp_ar.scene.texture_codes import encode_texture
@@ -88,4 +89,4 @@ def _read_exr(path: Path) -> npt.NDArray[Any]:
     except (RuntimeError, OSError, ValueError) as error:
         if isinstance(error, SceneError):
             raise
-        raise SceneError(f"{path} cannot be read as OpenEXR: {reason(error)}") from error
+        raise SceneError(f"{path} cannot be read as OpenEXR: {exr_problem(path, error)}") from error

@@ -11,7 +11,7 @@ from warp_ar.kernels.trace import TraceConfig
 from warp_ar.scene.area_lights import emits
 from warp_ar.scene.geometry import rotation_matrix
 from warp_ar.scene.mesh_materials import MeshMaterial
-from warp_ar.scene.object_materials import look_of, reflects_diffusely, reflects_glossily
+from warp_ar.scene.object_materials import materials_of, reflects_diffusely, reflects_glossily
 from warp_ar.scene.ray_mesh import mesh_key
 
 _SHAPES: Final = {"plane": structs.PLANE, "box": structs.BOX, "mesh": structs.MESH, "sphere": structs.SPHERE}
@@ -45,11 +45,11 @@ def has_sized_lights(scene: scenes.Scene) -> bool:
 
 def trace_config(scene: scenes.Scene) -> TraceConfig:
     """Which kinds of shape the rays of ``scene`` can meet, and whether triangles must be asked for more."""
-    looks = [look_of(item) for item in scene.objects]
+    made_of = [materials_of(item) for item in scene.objects]
     return TraceConfig(
         objects=tuple(sorted({shape_kind(item) for item in scene.objects})),
         proxies=tuple(sorted({shape_kind(item) for item in scene.proxies})),
-        detail=any(look.holed or look.bumpy for look in looks),
+        detail=any(one.holed or one.bumpy for one in made_of),
         stretched=any(item.play is not None for item in scene.objects),
     )
 
@@ -69,9 +69,9 @@ def skeleton(scene: scenes.Scene) -> Any:
             item.play and item.play.animation,
             type(item.material),
             tuple(value for value in vars(item.material).values() if isinstance(value, Path)),
-            any(map(reflects_diffusely, look_of(item).materials)),
-            any(map(reflects_glossily, look_of(item).materials)),
-            tuple(map(emits, look_of(item).materials)),
+            any(map(reflects_diffusely, materials_of(item).materials)),
+            any(map(reflects_glossily, materials_of(item).materials)),
+            tuple(map(emits, materials_of(item).materials)),
         )
         for item in scene.objects
     )

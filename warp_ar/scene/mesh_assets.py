@@ -97,7 +97,11 @@ class Assets:
 
 
 def check_counts(path: Path, data: bytes) -> None:
-    """Raise SceneError if the header of a PLY, OFF or STL file promises more than may be read, or than it can hold."""
+    """Check what the header of a PLY, OFF or STL file promises.
+
+    Raises:
+        SceneError: It is more than may be read, or than the file can hold.
+    """
     suffix = path.suffix.lower()
     head = data[:_HEADER]
     counts: list[int] = []
@@ -151,7 +155,11 @@ def read_gltf(path: Path, data: bytes, assets: Assets) -> tuple[dict[str, Any], 
 
 
 def fail(path: Path, what: str) -> NoReturn:
-    """Raise SceneError: a file cannot be read because of ``what``."""
+    """Say that a mesh cannot be read.
+
+    Raises:
+        SceneError: Always, because of ``what``.
+    """
     raise SceneError(f"{path}: the mesh cannot be read: {what}")
 
 

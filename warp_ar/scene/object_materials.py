@@ -38,8 +38,8 @@ _NO_FILE = (MeshMaterial(),)
 
 
 @dataclasses.dataclass(frozen=True)
-class Look:
-    """What of an object's mesh decides which kernels and light its scene calls for."""
+class ObjectMaterials:
+    """What an object is made of, as far as it decides which kernels and light its scene calls for."""
 
     materials: tuple[MeshMaterial, ...]
     """One or more, in the order of ``Mesh.materials``."""
@@ -129,7 +129,7 @@ def _say(path: Path, notes: tuple[str, ...]) -> None:
     _LOG.warning("%s: not shown: %s", printable(path), printable(", ".join(notes)))
 
 
-def look_of(item: Object) -> Look:
+def materials_of(item: Object) -> ObjectMaterials:
     """What an object is made of.
 
     Raises:
@@ -154,7 +154,7 @@ def look_of(item: Object) -> Look:
     )
     plain = all(material.plain for material in materials) and len(set(materials)) == 1
     colored = own and mesh is not None and mesh.colors is not None
-    return Look(
+    return ObjectMaterials(
         materials=materials,
         detailed=pictured or colored or not plain,
         holed=any(material.alpha != "opaque" or not material.double_sided for material in materials),
@@ -193,7 +193,7 @@ def scene_materials(scene: Scene) -> tuple[MeshMaterial, ...]:
     Raises:
         SceneError: A mesh cannot be read.
     """
-    return tuple(material for item in scene.objects for material in look_of(item).materials)
+    return tuple(material for item in scene.objects for material in materials_of(item).materials)
 
 
 def is_detailed(scene: Scene) -> bool:
@@ -202,7 +202,7 @@ def is_detailed(scene: Scene) -> bool:
     Raises:
         SceneError: A mesh cannot be read.
     """
-    return any(look_of(item).detailed for item in scene.objects)
+    return any(materials_of(item).detailed for item in scene.objects)
 
 
 def _is_black(color: Color) -> bool:

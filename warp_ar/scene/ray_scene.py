@@ -23,7 +23,7 @@ from warp_ar.scene.geometry import Mesh, rotation_matrix
 from warp_ar.scene.kinds import light_kind, material_model, shape_kind, trace_config
 from warp_ar.scene.mesh_materials import MeshMaterial
 from warp_ar.scene.mesh_parts import LARGEST
-from warp_ar.scene.object_materials import is_detailed, look_of, mesh_of
+from warp_ar.scene.object_materials import is_detailed, materials_of, mesh_of
 from warp_ar.scene.object_shapes import ObjectShape, object_shapes, part_placements, split_linear
 from warp_ar.scene.pose import Pose
 from warp_ar.scene.ray_mesh import (
@@ -182,11 +182,11 @@ class HostScene:
         return len(self._shapes)
 
     def _place_objects(self) -> None:
-        looks = [look_of(item) for item in self.scene.objects]
-        counts = [len(look.materials) for look in looks]
+        made_of = [materials_of(item) for item in self.scene.objects]
+        counts = [len(one.materials) for one in made_of]
         starts = np.cumsum([0, *counts])
         self._objects["material"] = [starts[shape.index] for shape in self._shapes]
-        self._objects["holed"] = [looks[shape.index].holed for shape in self._shapes]
+        self._objects["holed"] = [made_of[shape.index].holed for shape in self._shapes]
         # Centres in local coordinates: a mesh is stored about the middle of its bounding box, wherever its origin was.
         self._centers = [
             record["scale"] * self._meshes[key][1].center if key is not None else np.zeros(3)
@@ -194,7 +194,7 @@ class HostScene:
         ]
 
     def _material_records(self) -> npt.NDArray[Any]:
-        materials = [(item, material) for item in self.scene.objects for material in look_of(item).materials]
+        materials = [(item, material) for item in self.scene.objects for material in materials_of(item).materials]
         records = np.zeros(len(materials), _dtype(structs.Material))
         for record, (item, material) in zip(records, materials, strict=True):
             self._fill_material(record, item, material)

@@ -41,6 +41,12 @@ from warp_ar.scene.scene_table import SceneTable
 _TOP_KEYS: Final = ("schema", "name")
 _SECTIONS: Final = ("camera", "source", "marker", "probe", "proxy", "object", "light", "pose", "exposure")
 _T = TypeVar("_T")
+FRAMES: Final = frozenset(
+    {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".heic", ".mp4", ".mov", ".mkv", ".avi", ".webm"}
+)
+"""Endings of what is taken for frames, not for a scene."""
+FRAMES_GO: Final = "; frames go to --source"
+"""What to say where frames may have been named as a scene."""
 
 
 def bundled_scenes() -> dict[str, Path]:
@@ -60,7 +66,7 @@ def _scene_in(folder: Path) -> Path:
     except OSError as error:
         raise SceneError(f"{folder}: cannot be read: {reason(error)}") from error
     if len(found) != 1:
-        names = ", ".join(path.name for path in found[:4]) or "none"
+        names = ", ".join(path.name for path in found[:4]) or f"none{FRAMES_GO}"
         raise SceneError(f"{folder}: expected a folder with one scene file, NAME.toml; it has {names}")
     return found[0]
 
@@ -93,6 +99,8 @@ def load_scene(path_or_name: str | Path) -> Scene:
             hint = f"a file, or a bundled scene ({nearest(str(path_or_name), known)})" if known else "a scene file"
             raise SceneError(f"{path}: no such scene; expected {hint}")
         path = bundled[str(path_or_name)]
+    if path.suffix.lower() in FRAMES:
+        raise SceneError(f"{path} is no scene; expected a scene file{FRAMES_GO}")
     return loads_scene(read_text(path, SceneError, expected="TOML"), path)
 
 

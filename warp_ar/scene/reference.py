@@ -101,7 +101,8 @@ SECTIONS: Final[tuple[Section, ...]] = (
     Section("exposure", False, "A simulated shorter exposure.", (Exposure,)),
 )
 
-_INTRINSICS = "width = 640\nheight = 480\nfx = 640.0\nfy = 640.0\ncx = 319.5\ncy = 239.5"
+INTRINSICS = "width = 640\nheight = 480\nfx = 640.0\nfy = 640.0\ncx = 319.5\ncy = 239.5"
+"""Of any camera, for examples."""
 
 # (section, key): unit, example, and the other keys that the example needs.
 _EXAMPLES: Final[dict[tuple[str, str], tuple[str, str, str]]] = {
@@ -111,8 +112,8 @@ _EXAMPLES: Final[dict[tuple[str, str], tuple[str, str, str]]] = {
     ("camera", "fy"): ("pixels", "640.0", "width = 640\nheight = 480\nfx = 640.0\ncx = 319.5\ncy = 239.5"),
     ("camera", "cx"): ("pixels", "319.5", "width = 640\nheight = 480\nfx = 640.0\nfy = 640.0\ncy = 239.5"),
     ("camera", "cy"): ("pixels", "239.5", "width = 640\nheight = 480\nfx = 640.0\nfy = 640.0\ncx = 319.5"),
-    ("camera", "distortion"): ("-", "[-0.12, 0.05, 0.0, 0.0, 0.0]", _INTRINSICS),
-    ("camera", "transfer"): ("-", '"gamma:2.2"', _INTRINSICS),
+    ("camera", "distortion"): ("-", "[-0.12, 0.05, 0.0, 0.0, 0.0]", INTRINSICS),
+    ("camera", "transfer"): ("-", '"gamma:2.2"', INTRINSICS),
     ("camera", "calibration"): ("-", '"camera.yml"', ""),
     ("camera", "field_of_view"): ("degrees", "60.0", ""),
     ("source", "path"): ("-", '"frames"', ""),
@@ -295,28 +296,6 @@ def _toml(value: object) -> str:
     if isinstance(value, tuple):
         return "[" + ", ".join(_toml(item) for item in value) + "]"
     return type(value).__name__ if dataclasses.is_dataclass(value) else repr(value)
-
-
-def example_scene(key: Key) -> str:
-    """A whole scene file in which ``key`` has its example's value."""
-    lines = [f"schema = {description.SCHEMA}"]
-    if not key.section:
-        lines = [f"{key.name} = {key.example}"] + lines * (key.name != "schema")
-    sections = {section.name: section for section in SECTIONS}
-    if key.section != "camera":
-        lines += ["[camera]", _INTRINSICS]
-    if key.section not in ("", "marker"):
-        lines += ["[marker]", "size = 0.08"]
-    if key.section == "object.play":
-        lines += ["[[object]]", 'shape = "mesh"', 'file = "watch.glb"']
-    elif key.section.startswith("object."):
-        lines += ["[[object]]", 'shape = "sphere"', "radius = 0.03"]
-    if key.section.startswith("proxy."):
-        lines += ["[[proxy]]", 'shape = "plane"', "size = [1.6, 1.2]"]
-    if key.section:
-        lines += [f"[[{key.section}]]" if sections[key.section].several else f"[{key.section}]", key.beside]
-        lines += [f"{key.name} = {key.example}"]
-    return "\n".join(lines) + "\n"
 
 
 def as_markdown() -> str:

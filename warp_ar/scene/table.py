@@ -54,7 +54,11 @@ class Table:
         return f"{self.section}.{show_key(key)}" if self.section else show_key(key)
 
     def fail(self, key: str, right: str) -> NoReturn:
-        """Say what is wrong with a key: its value if it has one, and what would be right."""
+        """Say what is wrong with a key: its value if it has one, and what would be right.
+
+        Raises:
+            WarpArError: Always, as ``error``.
+        """
         value = f" = {show_value(self.data[key])}" if key in self.data else " is missing"
         raise self.error(f"{self.label}: {self.name(key)}{value}: {right}")
 

@@ -131,7 +131,11 @@ class Arrays(Mapping[str, Any]):
         return len(self._arrays)
 
     def add(self, name: str, array: Any) -> None:
-        """Add a resource under a new name; its version starts at 0, which means never written."""
+        """Add a resource under a new name; its version starts at 0, which means never written.
+
+        Raises:
+            ValueError: There is one of that name.
+        """
         if name in self._arrays:
             raise ValueError(f"resource {name!r} is already there: two stages may not own one resource")
         self._arrays[name] = array

@@ -17,7 +17,13 @@ from warp_ar.kernels.reflect import DiffuseForm, DistantLightConfig
 from warp_ar.scene import Scene
 from warp_ar.scene.area_lights import emits_light
 from warp_ar.scene.kinds import has_sized_lights, material_model, proxies_face, trace_config
-from warp_ar.scene.object_materials import is_detailed, look_of, reflects_diffusely, reflects_glossily, scene_materials
+from warp_ar.scene.object_materials import (
+    is_detailed,
+    materials_of,
+    reflects_diffusely,
+    reflects_glossily,
+    scene_materials,
+)
 from warp_ar.stages.quality import Quality
 from warp_ar.stages.request import Request
 
@@ -193,7 +199,7 @@ def find_features(request: Request) -> Features:
 def _near_method(scene: Scene, quality: Quality) -> str:
     method = quality.method("shade")
     shadows = quality.method("environment_shadow") not in ("default", "none")
-    models = any(item.shape == "mesh" and look_of(item).detailed for item in scene.objects)
+    models = any(item.shape == "mesh" and materials_of(item).detailed for item in scene.objects)
     if method not in NEAR and shadows and models:
         return NEAR[0]
     return method if method in NEAR else ""

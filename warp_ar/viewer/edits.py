@@ -347,7 +347,12 @@ def beside(scene: Scene, folder: Path) -> Scene:
 
 
 def set_animation(scene: Scene, index: int, key: str, value: float, seconds: float) -> Scene:
-    """The scene with one value of an object's animation changed; arguments and errors as those of ``set_play``."""
+    """The scene with one value of an object's animation changed; arguments as those of ``set_play``.
+
+    Raises:
+        SceneError: As ``set_play``.
+        UsageError: There is no such object.
+    """
     if index >= len(scene.objects):
         raise UsageError(f"object {index}: the scene has {len(scene.objects)}")
     items = list(scene.objects)

@@ -287,7 +287,7 @@ class FrameLoop:
         self.latest = self._lit_by(pipeline, frame, now, pushed) or self._plain(frame, pushed)
         self._times.append(time.monotonic())
         if self.latest.plan:
-            helpers.setup.note(frame.image, self.latest.state, self._times[-1])
+            helpers.setup.note(frame.image, self.latest.state, self.latest.pose, self._times[-1])
         try:
             helpers.recorder.add(self.latest.image)
         except WarpArError as error:

@@ -396,9 +396,9 @@ class Host:
         }
 
     def _missing(self) -> dict[str, str] | None:
-        """Why there are no frames, or why the marker is not seen in them."""
+        """Why there are no frames, why the marker is not seen in them, or why no object is."""
         absent = self.no_camera  # once: another source may come meanwhile
-        missing = self._setup.missing if absent is None else absent.finding
+        missing = (self._setup.missing or self._setup.outside) if absent is None else absent.finding
         return None if missing is None else {"name": missing.name, "text": missing.text, "remedy": missing.remedy}
 
     def _lens(self) -> str:

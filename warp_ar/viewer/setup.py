@@ -15,13 +15,14 @@ import numpy.typing as npt
 
 from warp_ar.errors import UsageError, WarpArError
 from warp_ar.input.ball_measure import measure_ball
+from warp_ar.input.check_objects import check_objects, find_outside
 from warp_ar.input.check_pictures import Look, board_instead, look_at, why_unseen
 from warp_ar.input.checkup import check_look
 from warp_ar.input.finding import Finding
 from warp_ar.input.grey_response import MOST_DEVIATION, measure_grey_response
 from warp_ar.input.response import write_response
 from warp_ar.input.tracking import TrackState
-from warp_ar.scene import Camera, Probe, Scene
+from warp_ar.scene import Camera, Pose, Probe, Scene
 from warp_ar.viewer.beside import begin
 from warp_ar.viewer.controls import Controls, Notify
 
@@ -34,6 +35,8 @@ LOST_SECONDS: Final = 1.5
 """How long the marker must not have been seen before it is looked at why."""
 AGAIN_SECONDS: Final = 3.0
 """How often that is looked at."""
+PLACES_SECONDS: Final = 1.0
+"""How often it is looked at whether the picture shows an object."""
 RESPONSE: Final = "response.txt"
 """Name of a measured response's file."""
 FEWEST: Final = 3
@@ -79,15 +82,22 @@ class SetupChecks:
         self._failed: dict[str, str] = {}
         self.missing: Finding | None = None
         """Why the marker is not seen, or that it is one of a board's, in words; None while all is right."""
+        self.outside: Finding | None = None
+        """That all virtual objects lie outside the picture, and where; None while it shows one."""
+        self._placed = -math.inf
 
-    def note(self, image: Image, state: TrackState | None, now: float) -> None:
+    def note(self, image: Image, state: TrackState | None, pose: Pose | None, now: float) -> None:
         """Take notice of a frame.
 
         Args:
             image: As the camera gave it, RGB.
             state: Whether the marker was seen; None where nothing looked for it.
+            pose: ``camera_from_world``; None where it is not known.
             now: Seconds on a clock that does not jump.
         """
+        if now - self._placed > PLACES_SECONDS:
+            self._placed = now
+            self.outside = None if pose is None else self._find_outside(pose)
         feed = self._controls.feed
         of = (feed.source, self._controls.wanted.scene.marker)
         if self._of is None or of != self._of:
@@ -119,6 +129,16 @@ class SetupChecks:
         width, height = feed.source.size
         camera = self._controls.camera_of(feed, wanted).scaled_to(width, height)
         return dataclasses.replace(wanted.scene, camera=camera), camera
+
+    def _find_outside(self, pose: Pose) -> Finding | None:
+        """Say where the objects are, if the picture shows none of them."""
+        try:
+            scene, camera = self._shown()
+        except WarpArError:
+            return None  # the source has changed meanwhile
+        if len(find_outside(scene, camera, [pose])) < len(scene.objects):
+            return None
+        return next(iter(check_objects(scene, camera, [pose])), None)
 
     def _say_why(self, seen: bool) -> None:
         """Say why the marker is not seen; of one that is seen, whether it belongs to a board."""

@@ -52,7 +52,11 @@ def make_context(host: str) -> ssl.SSLContext:
 
 
 def make_certificate(host: str) -> bytes:
-    """A key and its certificate, PEM; arguments and errors as those of ``make_context``."""
+    """A key and its certificate, PEM; arguments as those of ``make_context``.
+
+    Raises:
+        UsageError: `cryptography` is not installed.
+    """
     try:
         from cryptography import x509
         from cryptography.hazmat.primitives import hashes, serialization

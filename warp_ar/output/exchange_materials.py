@@ -32,7 +32,7 @@ from warp_ar.scene.materials import (
 )
 from warp_ar.scene.mesh_files import load_texture
 from warp_ar.scene.mesh_materials import IDENTITY, MeshMaterial, TextureUse, Wrap
-from warp_ar.scene.object_materials import look_of as materials_of
+from warp_ar.scene.object_materials import materials_of
 from warp_ar.signature import sign_png
 from warp_ar.srgb import decode_srgb, encode_srgb
 
@@ -78,7 +78,7 @@ class Picture:
 
 
 @dataclasses.dataclass(frozen=True)
-class Look:
+class ExchangeMaterial:
     """A material as UsdPreviewSurface and glTF know it: metallic-roughness, or an explicit specular colour."""
 
     base_color: RGB = (0.8, 0.8, 0.8)
@@ -130,12 +130,12 @@ class Look:
         return {name: picture for name, picture in named.items() if picture is not None}
 
 
-def looks_of(item: Object, mesh: Mesh) -> tuple[Look, ...]:
+def exchange_materials_of(item: Object, mesh: Mesh) -> tuple[ExchangeMaterial, ...]:
     """Materials of an object's triangles, in the order of ``Mesh.materials``; one where it has none of its own."""
-    return tuple(_look_of(item, mesh, material) for material in materials_of(item).materials)
+    return tuple(_exchange_material(item, mesh, material) for material in materials_of(item).materials)
 
 
-def _look_of(item: Object, mesh: Mesh, material: MeshMaterial) -> Look:
+def _exchange_material(item: Object, mesh: Mesh, material: MeshMaterial) -> ExchangeMaterial:
     def picture(use: TextureUse | None, channels: int = 3) -> Picture | None:
         if use is None or (mesh.uvs if use.uv_set == 0 else mesh.uvs_second) is None:
             return None
@@ -164,8 +164,8 @@ def _look_of(item: Object, mesh: Mesh, material: MeshMaterial) -> Look:
     )
 
 
-def _reflection_of(own: MeshMaterial, base: Picture | None, mesh: Mesh) -> Look:
-    """What ``_look_of`` says of the colours and the lobe of reflected light."""
+def _reflection_of(own: MeshMaterial, base: Picture | None, mesh: Mesh) -> ExchangeMaterial:
+    """What ``_exchange_material`` says of the colours and the lobe of reflected light."""
     material = own.surface
     assert not isinstance(material, FileMaterial | EmissiveMaterial)
     if isinstance(material, PhongMaterial):
@@ -175,13 +175,13 @@ def _reflection_of(own: MeshMaterial, base: Picture | None, mesh: Mesh) -> Look:
         if own.specular is not None:
             shown = to_linear(mesh.images[own.specular.image][..., :3]).mean(axis=(0, 1))
             specular = (specular[0] * shown[0], specular[1] * shown[1], specular[2] * shown[2])
-        return Look(factor, 0.0, math.sqrt(alpha), specular, texture)
+        return ExchangeMaterial(factor, 0.0, math.sqrt(alpha), specular, texture)
     factor, texture = _colored(material.base_color, base, mesh)
     if isinstance(material, MetallicRoughnessMaterial):
-        return Look(factor, material.metallic, material.roughness, None, texture)
+        return ExchangeMaterial(factor, material.metallic, material.roughness, None, texture)
     if isinstance(material, MirrorMaterial):
-        return Look(factor, 1.0, 0.0, None, texture)
-    return Look(factor, 0.0, 1.0, (0.0, 0.0, 0.0), texture)
+        return ExchangeMaterial(factor, 1.0, 0.0, None, texture)
+    return ExchangeMaterial(factor, 0.0, 1.0, (0.0, 0.0, 0.0), texture)
 
 
 def _colored(color: Color, base: Picture | None, mesh: Mesh) -> tuple[RGB, Picture | None]:
@@ -222,28 +222,28 @@ def vertex_colors(item: Object, mesh: Mesh) -> npt.NDArray[np.float32] | None:
     return mesh.colors if isinstance(item.material, FileMaterial) else None
 
 
-def texture_plan(path: Path, name: str, looks: Sequence[Look]) -> dict[tuple[int, str], Path]:
+def texture_plan(path: Path, name: str, materials: Sequence[ExchangeMaterial]) -> dict[tuple[int, str], Path]:
     """Where the pictures of a body go that cannot lie in the file itself, by material and what they are of.
 
     Equal pictures share a file.
     """
     found: dict[tuple[int, str], Path] = {}
     known: dict[bytes, Path] = {}
-    for number, look in enumerate(looks):
-        for kind, picture in look.pictures.items():
+    for number, material in enumerate(materials):
+        for kind, picture in material.pictures.items():
             parts = (path.stem, name, str(number) if number else "", kind)
             file = path.with_name("_".join(part for part in parts if part) + ".png")
             found[number, kind] = known.setdefault(picture.digest, file)
     return found
 
 
-def used_looks(item: Object, mesh: Mesh) -> tuple[tuple[Look, ...], npt.NDArray[np.int64] | None]:
+def used_materials(item: Object, mesh: Mesh) -> tuple[tuple[ExchangeMaterial, ...], npt.NDArray[np.int64] | None]:
     """Materials that triangles have, and which of them each has, (m,); None: all the first."""
-    looks = looks_of(item, mesh)
-    if len(looks) == 1 or mesh.triangle_materials is None:
-        return looks[:1], None
+    materials = exchange_materials_of(item, mesh)
+    if len(materials) == 1 or mesh.triangle_materials is None:
+        return materials[:1], None
     used, numbers = np.unique(mesh.triangle_materials, return_inverse=True)
-    return tuple(looks[number] for number in used), None if len(used) == 1 else numbers.reshape(-1)
+    return tuple(materials[number] for number in used), None if len(used) == 1 else numbers.reshape(-1)
 
 
 def placed_by(picture: Picture) -> dict[str, Any]:
