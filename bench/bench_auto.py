@@ -14,6 +14,7 @@ cores of its own (``taskset -c 0,1``): on them other work is what this bench sta
   within    whether that is 0.9 to 1, or nothing errs less (``top``), or nothing costs less (``bottom``)
   after     seconds from which on medians over a second stay where they end, within a tenth of the budget
   changes   of settings in the phase, and ``error`` what the cost table expects of the last ones
+  next      what the cheapest choice that errs less is expected to take, over the budget; null: nothing errs less
 
 With ``--processor-time`` (headless only) frames are timed by what one thread works, and a load of LOAD multiplies that:
 other programs then hardly matter. Costs are measured first, in a folder of their own; kernels are compiled meanwhile.
@@ -79,10 +80,13 @@ def told(part: str, phase: str, budget: float, notes: list[Note], begun: float, 
     print(json.dumps({**line, "cores": len(os.sched_getaffinity(0)), "commit": commit()}), flush=True)
 
 
-def ends(controller: Controller) -> dict[str, bool]:
-    """Whether the controller runs what errs least, or what costs least."""
+def ends(controller: Controller) -> dict[str, Any]:
+    """Whether the controller runs what errs least, or what costs least, and what the next choice would take."""
     errors = [choice.error for choice in controller.choices]
+    better = [choice for choice in controller.choices if choice.error < controller.expected_error - 1e-9]
+    next_ms = min((controller.expected(dict(choice.settings)) for choice in better), default=None)
     return {
+        "next": None if next_ms is None else round(next_ms / controller.budget_ms, 3),
         "top": controller.expected_error <= min(errors) + 1e-9,
         "bottom": controller.expected_error >= max(errors) - 1e-9,
     }

@@ -118,19 +118,31 @@ def shrink_frame_kernel(
     second = start_of(height, width, 2)
     total = wp.vec3(0.0)
     pixels = float(0.0)
-    for part in range(4):
-        row = 2 * i + part / 2
-        column = 2 * j + part % 2
-        own = wp.vec3(0.0)
-        count = float(0.0)
-        for y in range(2 * row, wp.min(2 * row + 2, height)):
-            for x in range(2 * column, wp.min(2 * column + 2, width)):
-                own += composed_radiance(params[0], picture, layers, y, x)
-                count += 1.0
-        if count > 0.0:
-            levels_out[row * rows_of(width, 1) + column] = own / count
-        total += own
-        pixels += count
+    # Most blocks are whole: loops of a fixed length take half the time.
+    if 4 * i + 4 <= height and 4 * j + 4 <= width:
+        for part in range(4):
+            row = 2 * i + part / 2
+            column = 2 * j + part % 2
+            own = wp.vec3(0.0)
+            for pixel in range(4):
+                own += composed_radiance(params[0], picture, layers, 2 * row + pixel / 2, 2 * column + pixel % 2)
+            levels_out[row * rows_of(width, 1) + column] = own / 4.0
+            total += own
+        pixels = 16.0
+    else:
+        for part in range(4):
+            row = 2 * i + part / 2
+            column = 2 * j + part % 2
+            own = wp.vec3(0.0)
+            count = float(0.0)
+            for y in range(2 * row, wp.min(2 * row + 2, height)):
+                for x in range(2 * column, wp.min(2 * column + 2, width)):
+                    own += composed_radiance(params[0], picture, layers, y, x)
+                    count += 1.0
+            if count > 0.0:
+                levels_out[row * rows_of(width, 1) + column] = own / count
+            total += own
+            pixels += count
     levels_out[second + i * rows_of(width, 2) + j] = total / pixels
 
 

@@ -54,7 +54,7 @@ class RayCounts:
 
 
 RAYS: Mapping[str, RayCounts] = MappingProxyType(
-    {"few_rays": RayCounts(8, 1, 1, known=True), "one_bounce": RayCounts(32, 4, 4, known=False)}
+    {"few_rays": RayCounts(4, 1, 1, known=True), "one_bounce": RayCounts(32, 4, 4, known=False)}
 )
 """By method of ``shade``."""
 
