@@ -141,9 +141,7 @@ def test_chooses_once_what_fits_and_keeps_it(budget):
     machine = Machine(budget)
     times = machine.run(20.0)
     assert statistics.median(times[-300:]) <= budget
-    shown = [machine.cost(settings) for settings, _ in itertools.groupby(entry[2] for entry in machine.history)]
-    # Nothing changed, so nothing may; what leaves a tenth of the budget may be followed by what was not sure to fit.
-    assert len(shown) <= (2 if shown[1] >= 0.9 * budget else 3)
+    assert machine.changes() <= 1, "nothing changed, so nothing may"
     # The load that it chooses by has the noise of a median of nine frames: 2 %.
     assert machine.controller.expected_error <= best_error(0.95 * AIM * budget)
 
@@ -291,7 +289,7 @@ def test_no_flicker_where_the_better_method_does_not_quite_fit():
 
 def test_a_single_slow_frame_changes_nothing():
     machine = Machine(33.0)
-    machine.run(12.0)  # settled
+    machine.run(2.0)
     before = machine.changes()
     machine.controller.observe(900.0, machine.now)
     machine.run(5.0)

@@ -13,8 +13,8 @@ frames, a small one within hundreds, and noise moves nothing. Frames that surely
 and so have those that surely take less, where something errs less for it; between the two nothing changes. Settings
 are held for ``HELD_SECONDS``. A setting moves by one method at a time, and all move until they are where they were to
 go, or the budget is exceeded; of a mixed move that would not fit, what saves goes first. Where too little is
-spent and nothing that errs less should fit, what was timed and takes up to ``TRIAL`` is shown, and then what is
-expected to take up to ``REACH`` is tried, each once: costs may be too high.
+spent and nothing that errs less should fit, what is expected to take up to ``REACH`` is tried, once: costs may be too
+high.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ import collections
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 
 import numpy as np
 
@@ -42,13 +41,10 @@ REACH = 1.1
 """Share that they may be expected to take where nothing else is left to try: what costs say may be too much."""
 WINDOWS = (9, 27, 81, 243)
 """Frames whose medians tell what a frame takes."""
-FIRST_WINDOW = 27
+FIRST_WINDOW, RAISE_WINDOW = 27, 81
 """Frames at least before the first choice, and before what errs less is tried."""
-SURE, SURE_AT_LAST = 5.0, 1.0
-"""Standard errors of a median by which it must be over the budget, and of the longest window's."""
-SURE_BELOW = MappingProxyType({27: 5.0, 81: 3.0, 243: 2.0})
-"""The same by window, to be below what frames shall take. Many frames need fewer: what errs less is timed before it is
-shown, while waiting leaves a part of the budget unused."""
+SURE, SURE_AT_LAST, SURE_BELOW = 5.0, 1.0, 3.0
+"""Standard errors of a median by which it must be off; of the longest window's, to be over the budget, and below it."""
 HELD_SECONDS = 0.5
 """Shortest time for which settings are held."""
 SETTLE = 2
@@ -142,8 +138,6 @@ class Controller:
         self.settings: dict[str, str] = dict(self._best(AIM).settings if running is None else running)
         self._before = self._target = self.settings
         self._explored: dict[str, str] | None = None
-        self._again: set[frozenset[tuple[str, str]]] = set()
-        """Settings that were gone back to because they just fit."""
 
     def set_budget(self, budget_ms: float) -> None:
         """Choose anew for another budget; what is known of the load stays."""
@@ -220,7 +214,8 @@ class Controller:
     def confirm(self) -> bool:
         """Whether the present settings may be shown, now that they have been timed; if not, those before are back."""
         # The first choice may be any: it must be the best still. Later ones lead to it by way of what saves something.
-        fits = self.expected_ms <= TRIAL * self.budget_ms
+        # What was only tried must leave as much room as what is planned for.
+        fits = self.expected_ms <= (AIM if self.settings == self._explored else TRIAL) * self.budget_ms
         saves = self.expected_ms < self.expected(self._before)
         if fits or (saves if self._chosen else dict(self._best(AIM).settings) == self.settings):
             self._chosen = True
@@ -278,37 +273,22 @@ class Controller:
         return True
 
     def _raise(self) -> None:
-        """Go on to what errs less and should fit; else to what was timed and just fits, or the cheapest never timed."""
+        """Go on to what errs less and should fit; if there is nothing, to the cheapest that was never timed."""
         better = self._best(RAISE)
         if better.error < self.expected_error:
             self._target = dict(better.settings)
             return
         if all(timed.alone is None for timed in self._timed.values()):
             return  # no trials: what turns out to be too much would be seen
-        known = [choice for choice in self._within(TRIAL) if self._may_go_back(choice)]
-        new = [choice for choice in self._within(REACH) if self._is_new(choice)]
-        if known:
-            # Once: where it turns out to be too much, going back and forth would not end.
-            self._target = dict(known[-1].settings)
-            self._again.add(frozenset(known[-1].settings))
-        elif new:
-            cheapest = min(new, key=lambda choice: self._cost(dict(choice.settings)))
-            self._target = self._explored = dict(cheapest.settings)
-
-    def _within(self, share: float) -> list[Choice]:
-        """What errs less than the present settings and is expected to take up to a share of the budget."""
         assert self._predicted is not None
-        limit = share * self.budget_ms / self.factor
-        return [
-            choice
+        limit = REACH * self.budget_ms / self.factor
+        tried = [
+            (cost, choice)
             for choice, cost in zip(self._front, self._predicted, strict=True)
-            if cost <= limit and choice.error < self.expected_error
+            if cost <= limit and choice.error < self.expected_error and self._is_new(choice)
         ]
-
-    def _may_go_back(self, choice: Choice) -> bool:
-        """Whether a choice has been timed, so that what it takes is no guess, and was not gone back to before."""
-        settings = frozenset(choice.settings)
-        return settings in self._timed and settings not in self._again
+        if tried:
+            self._target = self._explored = dict(min(tried, key=lambda item: item[0])[1].settings)
 
     def _is_new(self, choice: Choice) -> bool:
         """Whether a choice was never timed, and no setting farther than a method away, not counting those between."""
@@ -335,7 +315,8 @@ class Controller:
         over = median - (doubt if count < WINDOWS[-1] else doubt * SURE_AT_LAST / SURE) > self.budget_ms
         if count < FIRST_WINDOW:
             return (median, True, False) if over else None
-        return median, over, median + doubt * SURE_BELOW[count] / SURE < LEAST * self.budget_ms
+        less = doubt if count < WINDOWS[-1] else doubt * SURE_BELOW / SURE
+        return median, over, count >= RAISE_WINDOW and median + less < LEAST * self.budget_ms
 
     def _tell_apart(self, measured: float, now: float, over: bool) -> None:
         """What frames took is what the settings cost times the load: find which of the two is not as it was thought."""
