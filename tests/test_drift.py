@@ -179,6 +179,18 @@ def test_virtual_lights_keep_their_value_while_the_exposure_moves():
     assert added[1][table].mean() == pytest.approx(added[0][table].mean(), rel=0.1)
 
 
+def test_virtual_lights_are_as_bright_as_the_level_at_which_the_camera_saturates():
+    """A light of 1 saturates: at code 238 that is the value of code 238."""
+    light = '[[light]]\nkind = "point"\nat = [0.0, 0.0, 0.3]\nintensity = 0.5\n'
+    with Pipeline(loads_scene(SCENE + light), device="cpu", quality="low") as pipeline:
+        picture = encode(linear_picture(pipeline.scene))
+        for level in (238, 255):
+            pipeline.inputs.fix_saturation(np.full(3, float(level)))
+            pipeline(picture, pose=POSE)
+            shone = pipeline.inputs.block.host("lights")["intensity"][0]
+            np.testing.assert_allclose(shone, 0.5 * decode_srgb(np.array([level]))[0], rtol=1e-6)  # float32
+
+
 def test_light_that_dims_on_all_surfaces_is_light_unless_the_camera_meters_by_itself() -> None:
     """Nothing tells the two apart: by default frames say what they show, and virtual lights stay as they are."""
     text = SCENE + '[[light]]\nkind = "point"\nat = [0.2, 0.0, 0.3]\nintensity = 0.2\n'
