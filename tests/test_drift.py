@@ -132,6 +132,15 @@ def test_what_covers_the_picture_holds_the_gain_and_then_ends_it():
     assert (drift.gain == 1.0).all()
 
 
+def test_a_hand_over_the_card_stops_no_drift_that_is_known():
+    """The table, most of which is in view, tells the gain of the frame in which the card shows a hand."""
+    picture = linear_picture(loads_scene(SCENE))
+    hand = picture.copy()
+    hand[36:84, 56:104] = 0.35, 0.2, 0.14
+    drift = follow([encode(picture), encode(0.7 * picture), encode(0.5 * hand)])
+    assert drift.gain == pytest.approx([0.5] * 3, rel=GAIN)
+
+
 @pytest.mark.parametrize("contrast", [0.0, 0.5, 1.0])
 def test_a_tone_curve_is_told_by_print_that_is_too_black(contrast):
     drift = follow([encode(linear_picture(loads_scene(SCENE)), contrast)])
