@@ -3,7 +3,8 @@
 Frames of ``../shared/truth`` go through the camera; so does the picture with the virtual objects really there, with
 which the program's is compared. Clipped pixels of those frames are taken to be ``BEYOND`` before the lens, so that a
 lower exposure leaves them clipped, as it leaves a lamp.
-``WARP_AR_FAULT_CASES`` names the cases, ``WARP_AR_FAULTS`` the faults.
+``WARP_AR_FAULT_CASES`` names the cases, ``WARP_AR_FAULTS`` the faults, ``WARP_AR_FAULT_SEEDS`` those of the noise, over
+which figures are means: by one alone it is partly chance what a codec leaves.
 """
 
 from __future__ import annotations
@@ -77,7 +78,9 @@ def score(case: Path, version: str, faults: Faults, device: str) -> dict[str, fl
             cv2.imwrite(str(Path(folder) / name), frame[..., ::-1])
         with Session(scene, source=folder, device=device, quality=QUALITY, outputs=("image", "environment")) as session:
             for index, (name, (_, result)) in enumerate(zip(names, session, strict=False)):
-                gain = 1.0 + faults.exposure_drift * np.sin(2 * np.pi * phase[index])
+                # A camera that ends at a code below 255 has that code's value where the light is 1.
+                gain = decode_srgb(np.array(faults.saturation))
+                gain = gain * (1.0 + faults.exposure_drift * np.sin(2 * np.pi * phase[index]))
                 tint = 1.0 + faults.white_balance_drift * np.array([1, 0, -1]) * phase[index]
                 env = case / "env" / f"{Path(name).stem}.npy"
                 if env.exists() and result.environment is not None:
@@ -107,9 +110,15 @@ def main(device: str) -> None:
         print(f"camera_faults: no {TRUTH}; nothing to compare with")
         return
     cases = os.environ.get("WARP_AR_FAULT_CASES", "plastic_bunny_sunset,gold_torus_interior").split(",")
+    seeds = [int(seed) for seed in os.environ.get("WARP_AR_FAULT_SEEDS", "0").split(",")]
     chosen = os.environ.get("WARP_AR_FAULTS", ",".join([*ALONE, "all"])).split(",")
     for case in cases:
         for fault in chosen:
-            figures = score(TRUTH / case, "both", ALL if fault == "all" else ALONE[fault], device)
-            rounded = {name: round(value, 4) for name, value in figures.items()}
+            faults = ALL if fault == "all" else ALONE[fault]
+            # Noise alone has a seed; a fault without any gives the same figures with each.
+            runs = [
+                score(TRUTH / case, "both", dataclasses.replace(faults, seed=seed), device)
+                for seed in (seeds if faults.noise else seeds[:1])
+            ]
+            rounded = {name: round(float(np.mean([run[name] for run in runs])), 4) for name in runs[0]}
             print(json.dumps({"bench": "camera_faults", "case": case, "fault": fault, **rounded}), flush=True)

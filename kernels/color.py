@@ -77,6 +77,16 @@ def saturation_codes(table: wp.array[wp.vec3]) -> wp.vec3:
 
 
 @wp.func
+def below_saturation(code: wp.vec3ub, shown: wp.vec3ub, saturation: wp.vec3) -> wp.vec3ub:
+    """``code``, ended where the camera's channels saturate; but no darker than what the frame has ``shown`` there."""
+    return wp.vec3ub(
+        wp.min(code[0], wp.max(shown[0], wp.uint8(saturation[0] + 0.5))),
+        wp.min(code[1], wp.max(shown[1], wp.uint8(saturation[1] + 0.5))),
+        wp.min(code[2], wp.max(shown[2], wp.uint8(saturation[2] + 0.5))),
+    )
+
+
+@wp.func
 def is_saturated(code: wp.vec3ub, saturation: wp.vec3) -> wp.vec3:
     """1 in the channels that are at clipping, where they saturate at the codes ``saturation``."""
     r = wp.float32(code[0]) - saturation[0]

@@ -39,6 +39,9 @@ shows; s = 1 is the identity.
 Frames of more than 8 bits: means of boxes have what 8 bits cut off (``summed_area.write_cut``). Linear light that clips
 above 1, if anywhere, needs no guess: a pixel of code 255 is what the linear picture says.
 
+What is drawn ends where the camera's channels saturate, as all that it sees does: a highlight is no brighter than a
+lamp in the frame.
+
 Pixels that no layer and no guess touches go through a table of 256 codes, made anew for every s.
 
 ``auto`` keeps highlights of virtual light on the receiver below clipping. Over a grid of pixels that virtual light
@@ -72,7 +75,7 @@ from warp_ar.kernels.codes import (
     set_code,
     store_codes,
 )
-from warp_ar.kernels.color import decode, encode, is_clipped
+from warp_ar.kernels.color import below_saturation, decode, encode, is_clipped, saturation_codes
 from warp_ar.kernels.composite import CompositeConfig, Layers, compose, is_changed, make_read_layers
 from warp_ar.kernels.launch import Rows, launch, launch_rows
 from warp_ar.kernels.structs import FrameParams, Picture
@@ -338,7 +341,8 @@ def make_exposed(config: ExposeConfig) -> wp.Function:
                 radiance = clipped.declipped[i, j]
         if known:
             radiance = picture.linear[i, j]
-        return encode(exposure.encode_table, s * compose(radiance, at))
+        made = encode(exposure.encode_table, s * compose(radiance, at))
+        return below_saturation(made, code, saturation_codes(picture.decode_table))
 
     return exposed
 

@@ -139,11 +139,15 @@ def _jpeg(picture: Image) -> Image:
 
 
 def _h264(pictures: Sequence[Image]) -> list[Image]:
-    """Through an H.264 stream, 4:2:0, as a recorder writes it."""
+    """Through an H.264 stream, 4:2:0, as a recorder writes it, which does not look ahead over macroblocks (``mbtree``).
+
+    With that the same pictures became other streams from run to run.
+    """
     file = io.BytesIO()
     height, width = pictures[0].shape[:2]
     with av.open(file, "w", format="mp4") as container:
-        stream = container.add_stream("libx264", rate=24, options={"crf": "23", "preset": "veryfast"})
+        options = {"crf": "23", "preset": "veryfast", "x264-params": "mbtree=0"}
+        stream = container.add_stream("libx264", rate=24, options=options)
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         for picture in pictures:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))

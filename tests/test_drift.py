@@ -132,6 +132,15 @@ def test_what_covers_the_picture_holds_the_gain_and_then_ends_it():
     assert (drift.gain == 1.0).all()
 
 
+def test_a_hand_over_the_card_stops_no_drift_that_is_known():
+    """The table, most of which is in view, tells the gain of the frame in which the card shows a hand."""
+    picture = linear_picture(loads_scene(SCENE))
+    hand = picture.copy()
+    hand[36:84, 56:104] = 0.35, 0.2, 0.14
+    drift = follow([encode(picture), encode(0.7 * picture), encode(0.5 * hand)])
+    assert drift.gain == pytest.approx([0.5] * 3, rel=GAIN)
+
+
 @pytest.mark.parametrize("contrast", [0.0, 0.5, 1.0])
 def test_a_tone_curve_is_told_by_print_that_is_too_black(contrast):
     drift = follow([encode(linear_picture(loads_scene(SCENE)), contrast)])
@@ -177,6 +186,18 @@ def test_virtual_lights_keep_their_value_while_the_exposure_moves():
     table = (slice(10, 30), slice(60, 100))
     assert added[0][table].mean() > 0.05
     assert added[1][table].mean() == pytest.approx(added[0][table].mean(), rel=0.1)
+
+
+def test_virtual_lights_are_as_bright_as_the_level_at_which_the_camera_saturates():
+    """A light of 1 saturates: at code 238 that is the value of code 238."""
+    light = '[[light]]\nkind = "point"\nat = [0.0, 0.0, 0.3]\nintensity = 0.5\n'
+    with Pipeline(loads_scene(SCENE + light), device="cpu", quality="low") as pipeline:
+        picture = encode(linear_picture(pipeline.scene))
+        for level in (238, 255):
+            pipeline.inputs.fix_saturation(np.full(3, float(level)))
+            pipeline(picture, pose=POSE)
+            shone = pipeline.inputs.block.host("lights")["intensity"][0]
+            np.testing.assert_allclose(shone, 0.5 * decode_srgb(np.array([level]))[0], rtol=1e-6)  # float32
 
 
 def test_light_that_dims_on_all_surfaces_is_light_unless_the_camera_meters_by_itself() -> None:

@@ -91,6 +91,30 @@ def test_plain_scales_linear_light(device, scale):
     check_error("expose", run(frame, scale, "plain"), exact)
 
 
+@pytest.mark.parametrize("level", [238, 255])
+def test_what_is_drawn_ends_where_the_camera_does(device, level):
+    """A white object over a frame whose lamps end at ``level``; what the frame shows above it stays."""
+    frame = np.full((8, 8, 3), 60, np.uint8)
+    frame[0] = 241
+    decode = wp.array(color.camera_table("srgb", (level, level, level)), dtype=wp.vec3)
+    encode = wp.array(color.encode_table("srgb"), dtype=wp.vec3)
+    scale, codes, image = wp.array([1.0], wp.float32), wp.zeros(256, wp.vec3ub), wp.zeros((8, 8), wp.vec3ub)
+    expose.expose_codes(decode, encode, scale, codes)
+    drawn = np.zeros((8, 8, 4), np.float32)
+    drawn[:, :4] = (5.0, 5.0, 0.2, 1.0)
+    picture = make_picture(wp.array(frame, dtype=wp.vec3ub), decode, None, None)
+    over = make_arrays(drawn)
+    clipped = expose.make_clipped_evidence(8, None, None)
+    params = make_params(*4 * [(0, 8, 0, 8)], 1.0)
+    config = expose.ExposeConfig("plain", CONFIGS[4])
+    expose.expose(config, params, picture, over, clipped, expose.make_exposure(encode, scale, codes), image)
+    shown = image.numpy()
+    np.testing.assert_array_equal(shown[:, 4:], frame[:, 4:])
+    dark = round(255.0 * float(color.encode_codes("srgb", np.array([[0.2]]))[0, 0]))
+    assert shown[1, 0].tolist() == [level, level, dark]
+    assert shown[0, 0].tolist() == [max(level, 241), max(level, 241), dark]
+
+
 @pytest.mark.parametrize("method", expose.BOXES)
 @pytest.mark.parametrize("scale", SCALES)
 def test_boxes_match_their_twins(device, scale, method):

@@ -163,20 +163,24 @@ class FrameInputs:
         self._drift.saturation = self.saturation.levels
         if not self._drift.observe(frame.image, frame.pose, frame.seconds, frame.plate):
             return None, False
-        self.host_scene.set_gain(self._drift.gain)
+        self._have_lights_shine()
         is_bent = contrast != self._drift.contrast
         if is_bent:
             self._write_decode()
         return np.asarray(self._drift.gain / gain), is_bent
 
     def continue_from(self, other: FrameInputs) -> None:
-        """Go on with what another pipeline's frames have told of the same camera's gain and tone curve."""
+        """Go on with what another pipeline's frames have told of the same camera: its white, gain and tone curve."""
+        if self._camera == other._camera and not self._saturation_is_known:
+            self.saturation = copy.deepcopy(other.saturation)
+            self._saturation_is_known = other._saturation_is_known
+            self._write_decode()
         if self._cover is not None and other._cover is not None and self._cover.watches == other._cover.watches:
             self._cover = copy.copy(other._cover)  # it replaces what it remembers, and changes nothing of it
         if self._drift is None or other._drift is None or self._drift.watches != other._drift.watches:
             return
         self._drift = other._drift.copied()
-        self.host_scene.set_gain(self._drift.gain)
+        self._have_lights_shine()
         if self._drift.contrast != 0.0:
             self._write_decode()
 
@@ -186,7 +190,7 @@ class FrameInputs:
             return
         is_bent = self._drift.contrast != 0.0
         self._drift = ExposureDrift(self.host_scene.scene, self._camera)
-        self.host_scene.set_gain(self._drift.gain)
+        self._have_lights_shine()
         if is_bent:
             self._write_decode()
 
@@ -197,6 +201,13 @@ class FrameInputs:
         if contrast != self._encoded[0] or (contrast != 0.0 and (levels != self._encoded[1]).any()):
             self._arrays["encode"].assign(encode_table(self._camera.transfer, contrast, levels))
             self._encoded = contrast, levels.copy()
+        self._have_lights_shine()
+
+    def _have_lights_shine(self) -> None:
+        """Have virtual lights follow the camera: their 1 is where it saturates, and it drifts as its gain does."""
+        levels, codes = self.saturation.levels, np.arange(256)
+        white = max(float(np.interp(levels[c], codes, self.decode[:, c])) for c in range(3))
+        self.host_scene.set_gain(white * self.gain)
 
     def close(self) -> None:
         """Stop the copying threads."""
@@ -231,7 +242,11 @@ class FrameInputs:
             frame: A frame whose marker is not lost.
             reset: Whether what was accumulated of the environment is to be forgotten.
         """
-        touched = ["clock", *self._place(frame)]
+        touched = ["clock", *self._place_probes(frame)]
+        self.covered = self._is_covered(frame, reset=reset)
+        if not self.covered:
+            self._note_saturation(frame)  # before lights are written, which shine by it
+        touched += self._place(frame)
         params = self._params
         if (frame.pose is not None and self._move(frame.pose)) or self._arrays.version("pose") == 0:
             touched.append("pose")
@@ -240,9 +255,6 @@ class FrameInputs:
         params["frame_index"][0] = frame.index
         params["environment_reset"][0] = reset
         self.block.upload()
-        self.covered = self._is_covered(frame, reset=reset)
-        if not self.covered:
-            self._note_saturation(frame)
         if self._take_picture(frame):
             touched.append("frame")
         if self._take_plate(frame):
@@ -275,6 +287,14 @@ class FrameInputs:
         if self.saturation.observe(frame.image, discs, float(self.gain.mean()), frame.plate):
             self._write_decode()
 
+    def _place_probes(self, frame: SeenFrame) -> Iterable[str]:
+        """Move balls to where their markers are now; gives the inputs that changed."""
+        scene = self.host_scene
+        if frame.pose is not None and scene.place_probes(frame.pose, frame.places):
+            self._arrays["probes"].assign(_probe_values(scene.probes))
+            self._probes = scene.probes
+            yield "pose"
+
     def _place(self, frame: SeenFrame) -> Iterable[str]:
         """Move lights and objects to where they are now; gives the inputs that changed."""
         scene, block, places = self.host_scene, self.block, frame.places
@@ -282,10 +302,6 @@ class FrameInputs:
         objects = scene.write_objects(block.host("objects"), frame.seconds, places)
         if scene.write_proxies(block.host("proxies"), places):
             yield "pose"  # all that asks where the receiver is asks where the camera is
-        if frame.pose is not None and scene.place_probes(frame.pose, places):
-            self._arrays["probes"].assign(_probe_values(scene.probes))
-            self._probes = scene.probes
-            yield "pose"
         if lights or frame.index == 0:
             yield "lights"
         if objects or frame.index == 0:

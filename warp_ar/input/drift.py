@@ -8,10 +8,11 @@ channel, and m their median,
 
     the gain is exp(m)    where the points agree: a share ``AGREEING`` of |d_i - m| is below ``SPREAD`` |m|,
 
-and where card and planes say the same. A drift must pass ``LEAST`` before it is believed: the light of a frame whose
-camera holds still is not touched. Where points disagree, because the light changes or something covers them, the last
-gain holds for a few frames, and the gain is 1 after them. Light that dims on all surfaces alike cannot be told from an
-exposure, and is taken for one: so all this is done only where the scene says that the camera meters by itself.
+and where card and planes say the same, until a drift is known: then a hand may be over either. A drift must pass
+``LEAST`` before it is believed: the light of a frame whose camera holds still is not touched. Where points disagree,
+because the light changes or something covers them, the last gain holds for a few frames, and the gain is 1 after them.
+Light that dims on all surfaces alike cannot be told from an exposure, and is taken for one: so all this is done only
+where the scene says that the camera meters by itself.
 
 Paper is at most some ``MOST_PRINT`` times as bright as the ink on it. Where the card looks more so, the camera lays an
 S-shaped curve over its transfer (``without_contrast``); the least contrast that explains the print is taken.
@@ -181,9 +182,11 @@ class ExposureDrift:
         apart = 0.0
         if BIN_POINTS <= is_card.sum() <= len(change) - BIN_POINTS:
             apart = float(np.abs(np.median(change[is_card], axis=0) - np.median(change[~is_card], axis=0)).max())
-        most = NOISE if self._moving else min(SPREAD * size / np.sqrt(3.0), FURTHEST)
-        if off > most or apart > CARD:
-            return None if self._moving or size > LEAST else np.zeros(3)
+        if self._moving:
+            # A hand may be over the card, and over as much of the planes as need not agree.
+            return middle if off <= NOISE else None
+        if off > min(SPREAD * size / np.sqrt(3.0), FURTHEST) or apart > CARD:
+            return None if size > LEAST else np.zeros(3)
         self._moving |= size > LEAST
         return middle
 

@@ -13,7 +13,8 @@ lies, whatever its blur, where the area says:
     e = (1 / (w - b)) * integral of (w - I(u)) du over [-h, h], minus h
 
 No derivative is taken, so noise averages out. What shifts all edges the same way, from black to white, is not motion: a
-clipped white, a transfer curve that is not quite known, ink that spreads. That shift is a seventh unknown.
+clipped white, a transfer curve that is not quite known, ink that spreads. A camera that moves smears edges by their
+direction, and so they shift. The shift of an edge with normal n in the picture is n'Sn, the three numbers of S unknown.
 
 References:
     [HS90] C. Harris and C. Stennett. RAPID, a video rate object tracker. BMVC 1990.
@@ -62,7 +63,7 @@ _DONE = 0.05
 a tenth of it."""
 
 _MIN_EDGES = 16
-"""Fewest measured edge points for a refinement: seven unknowns, and something left to vote."""
+"""Fewest measured edge points for a refinement: nine unknowns, and something left to vote."""
 
 _NOISE_FLOOR = 0.03
 """Pixels: smallest standard deviation that an edge point is ever given credit for (sampling, lens model, print)."""
@@ -444,7 +445,7 @@ class Tracker:
             area = (2 * white - values @ weights) / np.where(seen, contrast, 1.0)  # the weights sum to 2
             offset = np.clip(half * (area - 1.0), -half, half)
             rows = (normal[:, None, :] @ _pose_rows(jacobian, camera - pose.translation))[:, 0]
-            solved = _solve(rows[seen], offset[seen])
+            solved = _solve(rows[seen], offset[seen], normal[seen])
             if solved is None:
                 return None
             step, residual, keep, information = solved
@@ -520,19 +521,20 @@ def _pose_rows(jacobian: Array, arm: Array) -> Array:
     return np.stack([y * c - z * b, z * a - x * c, x * b - y * a, a, b, c], -1)
 
 
-def _solve(rows: Array, offset: Array) -> tuple[Array, Array, Array, Array] | None:
-    """Robust least squares of ``rows @ step + shift = offset``.
+def _solve(rows: Array, offset: Array, normals: Array) -> tuple[Array, Array, Array, Array] | None:
+    """Robust least squares of ``rows @ step + n'S n = offset``: n the ``normals``, (k, 2), S the shift of edges.
 
     Returns:
-        Pose step (6,), residuals after it, weights 0 to 1, and the information (6, 6) of the pose with the common shift
+        Pose step (6,), residuals after it, weights 0 to 1, and the information (6, 6) of the pose with the shift
         marginalised; None if singular.
     """
-    design = np.hstack([rows, np.ones((len(rows), 1))])
-    # The common shift is a fraction of a pixel; without inner edges it cannot be told from distance.
-    prior = np.zeros(7)
-    prior[6] = 1.0
+    x, y = normals.T
+    design = np.column_stack([rows, np.ones(len(rows)), x * x - y * y, 2.0 * x * y])
+    # The shift is a fraction of a pixel; without inner edges it cannot be told from distance.
+    prior = np.zeros(9)
+    prior[6:] = 1.0
     weights: Array = np.ones(len(rows))
-    solution: Array = np.zeros(7)
+    solution: Array = np.zeros(9)
     for _ in range(3):
         weighted = design * weights[:, None]
         normal = weighted.T @ design + np.diag(prior)
@@ -547,5 +549,6 @@ def _solve(rows: Array, offset: Array) -> tuple[Array, Array, Array, Array] | No
         # Tukey's weight: an edge that is covered, or lies under a reflection, must not pull at all.
         weights = np.square(np.maximum(1 - np.square(residual / (4.7 * spread)), 0.0))
     normal = (design * weights[:, None]).T @ design + np.diag(prior)
-    information = (normal[:6, :6] - np.outer(normal[:6, 6], normal[6, :6]) / normal[6, 6]) / (_CORRELATED * spread**2)
+    shared = normal[:6, 6:] @ np.linalg.solve(normal[6:, 6:], normal[6:, :6])
+    information = (normal[:6, :6] - shared) / (_CORRELATED * spread**2)
     return (solution[:6], residual, weights, information) if np.isfinite(solution).all() else None
