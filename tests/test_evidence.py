@@ -10,7 +10,15 @@ import pytest
 from tests.recover_rig import DistantLight, lit_environment, scene  # noqa: F401
 from warp_ar.light.card import check_card
 from warp_ar.light.config import CONFIG, Kind
-from warp_ar.light.evidence import allowed_factor, doubt_of, likely_gain, spread_directions
+from warp_ar.light.evidence import (
+    allowed_factor,
+    doubt_of,
+    held_to_card,
+    likely_gain,
+    share_by_card,
+    spread_directions,
+)
+from warp_ar.light.problem import Candidate, Problem
 from warp_ar.light.recovery import Recovery, tie_channels
 
 EMITTER = ((-0.5, -0.6, 0.6), 0.985, 30.0)
@@ -75,6 +83,32 @@ def test_what_a_factor_leaves_is_no_worse_than_nothing(share):
     assert likely_gain(taken, missing) >= -1e-9
 
 
+def test_light_that_the_card_hardly_sees_is_what_the_card_says():
+    """The best mean of two estimates of light at a cosine: one errs by s / cosine, the other by 1."""
+    s = CONFIG.evidence.flat
+    cosine = np.array([-0.3, 0.0, s, 3.0 * s, 1.0])
+    believed = np.array([0.0, 0.0, 0.5, 0.9, 1.0 / (1.0 + s * s)])
+    assert share_by_card(cosine) == pytest.approx(believed)
+    recovered, by_card = np.full((5, 3), [5.0, 1.0, 3.0]), np.full((5, 3), [2.0, 2.0, 0.0])
+    held = held_to_card(recovered, by_card, cosine)
+    assert held[:, 0] == pytest.approx(2.0 + 3.0 * believed)
+    assert held[:, 1] == pytest.approx(1.0)  # less than by the card invents nothing
+    assert held[:, 2] == pytest.approx(3.0 * believed)
+
+
+def test_cosines_of_light_at_the_card():
+    """A distant emitter has its direction's, a near one that of the way from the card to where it stands."""
+    problem = Problem.__new__(Problem)
+    problem.kind = np.array([Kind.CARD, Kind.CARD, Kind.PLANE])
+    problem.points = np.array([[-0.1, 0.0, 0.0], [0.1, 0.0, 0.0], [9.0, 9.0, 9.0]])
+    problem.direction = np.array([[1.0, 0.0, 0.0], [0.6, 0.0, 0.8]])
+    problem.origin = np.array([[0.0, 0.0, 0.3], [0.0, 0.0, 0.3]])
+    problem.candidates = [Candidate(1, np.inf), Candidate(0, 0.4)]
+    cells, candidates = problem.card_cosines()
+    assert cells == pytest.approx([0.0, 0.8])
+    assert candidates == pytest.approx([0.8, 0.6])
+
+
 def test_contrast_beyond_print_makes_the_card_doubtful():
     assert doubt_of(20.0) == doubt_of(CONFIG.evidence.usual_contrast) == CONFIG.evidence.white
     assert doubt_of(60.0) > 0.5
@@ -82,7 +116,12 @@ def test_contrast_beyond_print_makes_the_card_doubtful():
 
 @pytest.mark.parametrize(
     ("missing", "expected"),
-    [((1.0, 1.0, 1.0), (1.0, 0.5, 3.0)), ((0.1, 0.1, 1.0), (1.0, 0.5, 20.0)), ((1.0, 0.2, 1.0), (1.0, 0.5, 3.0))],
+    [
+        ((1.0, 1.0, 1.0), (1.0, 0.5, 2.25)),  # three times the mean of red and green
+        ((0.1, 0.1, 1.0), (1.0, 0.5, 20.0)),
+        ((1.0, 0.2, 1.0), (1.0, 0.5, 2.75)),  # of which green lacks a fifth, and counts as much
+        ((0.0, 1.0, 1.0), (1.0, 0.5, 1.5)),  # red lacks nothing, and says nothing
+    ],
 )
 def test_no_emitter_is_of_one_colour_unless_one_channel_clips(missing, expected):
     problem = types.SimpleNamespace(

@@ -140,6 +140,34 @@ def most_by_card(captured: Array, added: Array, share: float) -> float:
     return min(most / (1.0 - most) * float(np.linalg.norm(captured)) / size, 1.0)
 
 
+def share_by_card(cosine: Array) -> Array:
+    """Share of what was found, beyond what the card alone says, that is believed of light by how it meets the card.
+
+    Shading may say that light comes from where the card hardly sees it, from the horizon or below: a box's face that is
+    brighter than the light elsewhere has it. How much that is nothing of known reflectance tells. With the card's
+    irradiance E known within s E, light that meets it at the cosine c, E / c by the card, is known within s E / c; what
+    is expected of it beforehand deviates by about E. The best mean of both gives the first the weight
+
+        c^2 / (c^2 + s^2).
+
+    Args:
+        cosine: Of the angle between light and the card's normal, any shape.
+    """
+    squared = np.maximum(cosine, 0.0) ** 2
+    return np.asarray(squared / (squared + CONFIG.evidence.flat**2), np.float64)
+
+
+def held_to_card(recovered: Array, by_card: Array, cosine: Array) -> Array:
+    """Radiance that cells lack, where it exceeds the card's own estimate by as much as the card can tell, (m, 3).
+
+    Args:
+        recovered: As surfaces have it, (m, 3).
+        by_card: As the card alone has it, (m, 3).
+        cosine: At which the card meets it, (m,).
+    """
+    return np.asarray(recovered - (1.0 - share_by_card(cosine))[:, None] * np.maximum(recovered - by_card, 0.0))
+
+
 def likely_gain(added: Array, missing: Array) -> float:
     """By how much an estimate lowers the squared error of irradiance in nearly all draws."""
     gain = (missing**2).sum(axis=1) - ((missing - added) ** 2).sum(axis=1)

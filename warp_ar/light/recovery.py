@@ -24,6 +24,9 @@ card is used it is what makes the card right, and that alone is the method ``whi
 modelled surface (the card in the ball, a box) are lit, not lights: they stay close to clipping. Channels share their
 distribution: a second pass draws each to the mean of all three, in the hue of their totals.
 
+**What the card hardly sees**, light from its horizon and from below it, is told by surfaces of unknown reflectance
+alone. What was found there beyond what the card alone says counts by how well the card knows it (``share_by_card``).
+
 **Emitter candidates** are chosen one by one, among all directions that may lack light and a grid of distances, by how
 far they lower the cost to second order, (b' W r)^2 / (b' W b - b' W Z H^-1 Z' W b); the best few are fitted in earnest,
 then moved to neighbouring cells and distances while that helps, along their direction to where the cost is least, and
@@ -58,10 +61,12 @@ from warp_ar.light.evidence import (
     blocks_of,
     doubt_of,
     draw_missing,
+    held_to_card,
     irradiance_form,
     irradiance_interval,
     likely_gain,
     most_by_card,
+    share_by_card,
     spread_directions,
 )
 from warp_ar.light.fit import fit_channel
@@ -203,12 +208,13 @@ class Recovery:
         best = int(np.argmax(problem.exact.sum(axis=0) + np.array([0.0, 0.5, 0.0])))
         is_turn = self._search(problem, best, means[best])
         solution = tie_channels(problem, _solve_channels(problem, best, means, bounds))
+        of_cells, of_candidates = problem.card_cosines()
         # An emitter that gives nothing in any channel has gone out, or never was.
-        powers = solution[problem.parts :]
+        powers = share_by_card(of_candidates)[:, None] * solution[problem.parts :]
         self._candidates = [
             candidate for candidate, power in zip(problem.candidates, powers, strict=True) if power.any()
         ]
-        recovered = problem.member @ solution[: problem.parts]
+        recovered = held_to_card(problem.member @ solution[: problem.parts], by_card, of_cells)
         emitters = []
         for candidate, power in zip(problem.candidates, powers, strict=True):
             recovered += problem.patch(candidate.cell) * power
@@ -341,8 +347,8 @@ def tie_channels(problem: Problem, solution: Array) -> Array:
     """A solution without light of one channel only, unless that channel alone clips, (parts + candidates, 3).
 
     What emitters look like in one channel is told by surfaces that show that channel: texture, or another response in
-    it, makes emitters of one colour. Where all channels lack light, none is more than some times the median of the
-    three.
+    it, makes emitters of one colour. Where several channels lack light, none is more than some times the mean of the
+    others.
 
     Args:
         problem: The equations.
@@ -352,7 +358,9 @@ def tie_channels(problem: Problem, solution: Array) -> Array:
     cells = [np.flatnonzero(problem.part == part) for part in range(problem.parts)]
     cells += [np.array([candidate.cell]) for candidate in problem.candidates]
     missing = np.array([problem.solid_angle[own] @ problem.missing[own] for own in cells]).reshape(-1, 3)
-    most = config.colour * np.median(solution, axis=1, keepdims=True)
+    # Of each channel, by how much the others lack beside it: (parts + candidates, 3: channel, 3: other).
+    others = np.minimum(missing[:, None, :] / np.maximum(missing[:, :, None], 1e-9), 1.0) * (1.0 - np.eye(3))
+    most = config.colour * (others * solution[:, None, :]).sum(axis=2) / np.maximum(others.sum(axis=2), 1e-9)
     alone = missing > config.own_clipping * np.median(missing, axis=1, keepdims=True)
     return np.asarray(np.where(alone, solution, np.minimum(solution, most)), np.float64)
 
