@@ -76,7 +76,7 @@ class PriorConfig:
     hue: float = 0.5
     """Relative standard deviation of one channel's distribution about that of all."""
     colour: float = 3.0
-    """Ratio of one channel to the mean of the others that light which all of them lack may have: emitters are nearly
+    """Ratio of one channel to the median of all that light which all of them lack may have: emitters are nearly
     white."""
     own_clipping: float = 3.0
     """Ratio of what a channel lacks to what the others do from which it clips for itself, as a blue sky does."""
@@ -195,9 +195,9 @@ class EvidenceConfig:
     lever: float = 2.0
     """Share of light from all directions that may be missing, over that which is missing at the card: what hardly
     lights the card is hardly known by it."""
-    flat: float = 0.05
-    """Standard deviation of the card's irradiance, relatively, against that of an upward surface at the ball: light
-    that falls on the card at an angle whose cosine is no more than that is hardly known by it."""
+    unseen: float = 0.5
+    """Share of the card's irradiance that light may have, as a surface that faces it receives it, which the card does
+    not know: from its horizon, and from below it."""
     interval: float = 2.5
     """Standard deviations of the draws that an interval of irradiance reaches to either side."""
     found: float = 0.3

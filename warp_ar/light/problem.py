@@ -301,6 +301,10 @@ class Problem:
         columns = np.concatenate([self.columns, self.candidate_columns], axis=2)
         return np.asarray(np.einsum("cnk,kc->nc", columns, unknowns), np.float64)
 
+    def card_irradiance(self) -> Array:
+        """Irradiance of the card, (3,); where it clips, what it has at least."""
+        return np.asarray(np.median(self.light[self.kind == Kind.CARD], axis=0) / self.white, np.float64)
+
     def card_cosines(self) -> tuple[Array, Array]:
         """Cosines at which the card meets light from cells, (m,), and from candidates where they stand, (candidates,).
 

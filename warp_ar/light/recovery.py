@@ -25,7 +25,7 @@ modelled surface (the card in the ball, a box) are lit, not lights: they stay cl
 distribution: a second pass draws each to the mean of all three, in the hue of their totals.
 
 **What the card hardly sees**, light from its horizon and from below it, is told by surfaces of unknown reflectance
-alone. What was found there beyond what the card alone says counts by how well the card knows it (``share_by_card``).
+alone. There is no more of it than some share of what the card shows (``held_to_card``).
 
 **Emitter candidates** are chosen one by one, among all directions that may lack light and a grid of distances, by how
 far they lower the cost to second order, (b' W r)^2 / (b' W b - b' W Z H^-1 Z' W b); the best few are fitted in earnest,
@@ -66,7 +66,6 @@ from warp_ar.light.evidence import (
     irradiance_interval,
     likely_gain,
     most_by_card,
-    share_by_card,
     spread_directions,
 )
 from warp_ar.light.fit import fit_channel
@@ -208,13 +207,12 @@ class Recovery:
         best = int(np.argmax(problem.exact.sum(axis=0) + np.array([0.0, 0.5, 0.0])))
         is_turn = self._search(problem, best, means[best])
         solution = tie_channels(problem, _solve_channels(problem, best, means, bounds))
-        of_cells, of_candidates = problem.card_cosines()
+        doubt = doubt_of(card.contrast)
+        recovered, powers = held_to_card(problem, solution, by_card, problem.card_cosines(), doubt)
         # An emitter that gives nothing in any channel has gone out, or never was.
-        powers = share_by_card(of_candidates)[:, None] * solution[problem.parts :]
         self._candidates = [
             candidate for candidate, power in zip(problem.candidates, powers, strict=True) if power.any()
         ]
-        recovered = held_to_card(problem.member @ solution[: problem.parts], by_card, of_cells)
         emitters = []
         for candidate, power in zip(problem.candidates, powers, strict=True):
             recovered += problem.patch(candidate.cell) * power
@@ -227,7 +225,7 @@ class Recovery:
         if is_turn or self._evidence is None:
             c = _told_channel(problem)
             start = fit_channel(problem, c, problem.start(means[c]), CONFIG.solver.iterations).z
-            evidence = _weigh(problem, c, start, bounds, (recovered, by_card), self._blocks, doubt_of(card.contrast))
+            evidence = _weigh(problem, c, start, bounds, (recovered, by_card), self._blocks, doubt)
             if evidence.method == "white_card":
                 solution = np.concatenate([radiance_by_card, np.zeros((len(powers), 3))])
             reaching = reaching_factor(problem, solution, Ball(self._center, self._radius))
@@ -347,8 +345,8 @@ def tie_channels(problem: Problem, solution: Array) -> Array:
     """A solution without light of one channel only, unless that channel alone clips, (parts + candidates, 3).
 
     What emitters look like in one channel is told by surfaces that show that channel: texture, or another response in
-    it, makes emitters of one colour. Where several channels lack light, none is more than some times the mean of the
-    others.
+    it, makes emitters of one colour. Where all channels lack light, none is more than some times the median of the
+    three.
 
     Args:
         problem: The equations.
@@ -358,9 +356,7 @@ def tie_channels(problem: Problem, solution: Array) -> Array:
     cells = [np.flatnonzero(problem.part == part) for part in range(problem.parts)]
     cells += [np.array([candidate.cell]) for candidate in problem.candidates]
     missing = np.array([problem.solid_angle[own] @ problem.missing[own] for own in cells]).reshape(-1, 3)
-    # Of each channel, by how much the others lack beside it: (parts + candidates, 3: channel, 3: other).
-    others = np.minimum(missing[:, None, :] / np.maximum(missing[:, :, None], 1e-9), 1.0) * (1.0 - np.eye(3))
-    most = config.colour * (others * solution[:, None, :]).sum(axis=2) / np.maximum(others.sum(axis=2), 1e-9)
+    most = config.colour * np.median(solution, axis=1, keepdims=True)
     alone = missing > config.own_clipping * np.median(missing, axis=1, keepdims=True)
     return np.asarray(np.where(alone, solution, np.minimum(solution, most)), np.float64)
 
