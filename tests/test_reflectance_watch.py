@@ -10,15 +10,18 @@ import pytest
 
 from warp_ar import PRESETS, Pipeline
 from warp_ar.input import reflectance_watch
-from warp_ar.input.ball_reflectance import Reflected
+from warp_ar.input.ball_reflectance import Reflected, difference_of_halves, measure_reflectance
 from warp_ar.input.check_pictures import take_look
 from warp_ar.input.reflectance_watch import ENOUGH, FIRST, MOST, ReflectanceWatch
+from warp_ar.input.saturation import ball_discs
 from warp_ar.input.sources import open_source
 from warp_ar.kernels.color import decode_table
 from warp_ar.scene import Pose, load_scene
 
 TOLD = 0.08
 """Relative error of one frame: the desk's texture is mirrored smaller than it is seen."""
+ROUNDED = 0.02
+"""Relative error of codes."""
 NOWHERE = Pose(np.eye(3), np.zeros(3))
 BLACK = np.zeros((4, 4, 3), np.uint8)
 
@@ -58,6 +61,38 @@ def test_a_reflectance_that_frames_agree_with_is_kept_as_it_is():
     assert not looks.observe(*view(), scene.probes)
     assert looks.values == (scene.probes[0].reflectance,)
     assert not looks.is_told
+
+
+def beside(factor, clip="wire_opposing"):
+    """What is told where all beside the ball is brighter, by a factor for each column (width,), as codes of sRGB."""
+    scene, (image, pose) = load_scene(clip), view(clip)
+    table = decode_table(scene.camera.transfer).astype(np.float32)
+    ((x, y, radius),) = ball_discs(scene.probes, scene.camera, pose)
+    row, column = np.mgrid[: image.shape[0], : image.shape[1]]
+    outside = np.hypot(column - x, row - y) > 1.05 * radius
+    linear = np.take_along_axis(table, image.reshape(-1, 3).astype(int), axis=0).reshape(image.shape)
+    bright = np.where(outside[..., None], linear * factor[None, :, None], linear)
+    codes = np.stack([np.interp(bright[..., c], table[:, c], np.arange(256.0)) for c in range(3)], -1)
+    return measure_reflectance(scene, scene.camera, scene.probes[0], (np.round(codes).astype(np.uint8), pose), table)
+
+
+def test_what_shines_beside_the_ball_tells_nothing():
+    """Evenly brighter is a ball that reflects less; brighter to one side is a surface that shines."""
+    width = load_scene("wire_opposing").camera.width
+    even, less = beside(np.ones(width)), beside(np.full(width, 1.2))
+    assert np.array(less.reflectance) * 1.2 == pytest.approx(np.array(even.reflectance), rel=ROUNDED)
+    assert beside(np.linspace(0.4, 2.0, width)) is None
+
+
+def test_halves_that_differ():
+    """By columns, by rows, not at all."""
+    pixels = np.stack(np.meshgrid(np.arange(10), np.arange(6)), -1).reshape(-1, 2)
+    ratio = np.repeat(np.where(pixels[:, :1] < 5, 0.3, 0.1), 3, axis=1)
+    assert difference_of_halves(ratio, pixels) == pytest.approx(0.2)
+    ratio = np.where(pixels[:, 1:] < 3, [0.0, 0.0, 0.0], [0.0, 0.4, -0.1])
+    assert difference_of_halves(ratio, pixels) == pytest.approx(0.4)
+    assert difference_of_halves(np.full((60, 3), 0.7), pixels) == 0.0
+    assert difference_of_halves(np.full((1, 3), 0.7), pixels[:1]) == 0.0
 
 
 def telling(monkeypatch, answers):
