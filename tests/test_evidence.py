@@ -8,9 +8,18 @@ import numpy as np
 import pytest
 
 from tests.recover_rig import DistantLight, lit_environment, scene  # noqa: F401
+from warp_ar.kernels.recover_cells import CELL_ROWS
 from warp_ar.light.card import check_card
 from warp_ar.light.config import CONFIG, Kind
-from warp_ar.light.evidence import allowed_factor, doubt_of, likely_gain, spread_directions
+from warp_ar.light.evidence import (
+    allowed_factor,
+    doubt_of,
+    held_to_card,
+    likely_gain,
+    share_by_card,
+    spread_directions,
+)
+from warp_ar.light.problem import Candidate, Problem
 from warp_ar.light.recovery import Recovery, tie_channels
 
 EMITTER = ((-0.5, -0.6, 0.6), 0.985, 30.0)
@@ -73,6 +82,48 @@ def test_what_a_factor_leaves_is_no_worse_than_nothing(share):
     worse = np.linalg.norm(taken - missing, axis=1) > np.linalg.norm(missing, axis=1)
     assert worse.mean() <= CONFIG.evidence.share + 1.0 / 200
     assert likely_gain(taken, missing) >= -1e-9
+
+
+def test_light_is_known_by_how_it_meets_the_card():
+    """The best mean of two estimates of light at a cosine: one errs by s / cosine, the other by 1."""
+    config, doubt = CONFIG.evidence, 0.1
+    s = (doubt**2 + config.response**2 + config.ball**2 + (0.5 * np.pi / CELL_ROWS) ** 2) ** 0.5
+    cosine = np.array([-0.3, 0.0, s, 3.0 * s, 1.0])
+    assert share_by_card(cosine, doubt) == pytest.approx([0.0, 0.0, 0.5, 0.9, 1.0 / (1.0 + s * s)])
+
+
+@pytest.mark.parametrize(("found", "taken"), [(0.4, 0.4), (4.0, 1.0)])
+def test_no_more_comes_from_below_the_card_than_half_of_what_it_shows(found, taken):
+    """The card shows 2; a part above it and one below, and an emitter below, of which half is the part's."""
+    problem = types.SimpleNamespace(
+        parts=2,
+        member=np.eye(2),
+        solid_angle=np.array([1.0, 0.5]),
+        missing=np.ones((2, 3)),
+        card_irradiance=lambda: np.full(3, 2.0),
+    )
+    solution = np.repeat([[7.0], [1.0 + found], [0.5 * found]], 3, axis=1)  # the card alone says 1 of each part
+    cosines = np.array([1.0, -0.5]), np.array([-0.5])
+    recovered, powers = held_to_card(problem, solution, np.ones((2, 3)), cosines, 0.0)
+    beyond = 6.0 * (1.0 - float(share_by_card(np.array(1.0), 0.0)))  # not known of light from straight above
+    less = 1.0 - min(CONFIG.evidence.unseen * 2.0 / (beyond + found), 1.0)
+    assert recovered[0] == pytest.approx(7.0 - less * beyond)
+    assert recovered[1] == pytest.approx(1.0 + (1.0 - less) * found)
+    assert powers[0] == pytest.approx((1.0 - less) * 0.5 * found)
+    assert 0.5 * (recovered[1, 0] - 1.0) + powers[0, 0] == pytest.approx(taken, rel=0.01)
+
+
+def test_cosines_of_light_at_the_card():
+    """A distant emitter has its direction's, a near one that of the way from the card to where it stands."""
+    problem = Problem.__new__(Problem)
+    problem.kind = np.array([Kind.CARD, Kind.CARD, Kind.PLANE])
+    problem.points = np.array([[-0.1, 0.0, 0.0], [0.1, 0.0, 0.0], [9.0, 9.0, 9.0]])
+    problem.direction = np.array([[1.0, 0.0, 0.0], [0.6, 0.0, 0.8]])
+    problem.origin = np.array([[0.0, 0.0, 0.3], [0.0, 0.0, 0.3]])
+    problem.candidates = [Candidate(1, np.inf), Candidate(0, 0.4)]
+    cells, candidates = problem.card_cosines()
+    assert cells == pytest.approx([0.0, 0.8])
+    assert candidates == pytest.approx([0.8, 0.6])
 
 
 def test_contrast_beyond_print_makes_the_card_doubtful():

@@ -23,6 +23,7 @@ from warp_ar.input.cover import BallCover
 from warp_ar.input.drift import ExposureDrift
 from warp_ar.input.own_markers import Places
 from warp_ar.input.plate import Plate, decode_deep
+from warp_ar.input.reflectance_watch import ReflectanceWatch
 from warp_ar.input.saturation import PERIOD, WATCHED, SaturationLevels, ball_discs
 from warp_ar.kernels.color import camera_table, decode_table, encode_table
 from warp_ar.kernels.launch import Note, noting
@@ -85,7 +86,7 @@ class FrameInputs:
             arrays: Of the pipeline, empty.
             device: Warp device, the current one.
             follows_gain: Whether a drift of the camera's exposure and white balance is looked for.
-            watches_ball: Whether frames in which something covers a ball are told.
+            watches_ball: Whether frames in which something covers a ball are told, and what balls reflect.
             linear: Whether some stage reads frames as linear radiance.
         """
         shape = (camera.height, camera.width)
@@ -108,7 +109,9 @@ class FrameInputs:
         self.saturation = SaturationLevels()
         """Codes at which channels saturate, as frames have told so far."""
         self._drift = ExposureDrift(scene, camera) if follows_gain and scene.has_marker else None
-        self._cover = BallCover(scene, camera) if watches_ball and scene.has_marker and scene.probes else None
+        watches_ball = watches_ball and scene.has_marker and bool(scene.probes)
+        self._cover = BallCover(scene, camera) if watches_ball else None
+        self._reflectance = ReflectanceWatch(scene, camera, self.decode) if watches_ball else None
         self.covered = False
         """Whether something covers a ball in the frame: it then tells nothing of the light."""
         self._saturation_is_known = False
@@ -144,6 +147,13 @@ class FrameInputs:
         add("seconds", lambda: float(params["time"][0]))
         add("gain", lambda: self.gain)
         add("ball_covered", lambda: self.covered)
+        add("ball_reflectance", lambda: self.told_reflectance)
+
+    @property
+    def told_reflectance(self) -> tuple[scenes.RGB, ...] | None:
+        """What balls reflect by what frames have told; None while it is what the scene says."""
+        told = self._reflectance
+        return None if told is None or not told.is_told else told.values
 
     @property
     def gain(self) -> npt.NDArray[np.float64]:
@@ -151,17 +161,24 @@ class FrameInputs:
         return np.ones(3) if self._drift is None else self._drift.gain
 
     def look(self, frame: SeenFrame) -> tuple[npt.NDArray[np.float64] | None, bool]:
-        """Look whether the camera's gain drifts, if the frame is on the host and shows what stands still.
+        """Look whether the camera's gain drifts and what balls reflect, if the frame is on the host.
 
         Returns:
-            Ratio of the gain to that of the frame before, RGB, None where it is the same; and whether the tone curve
-            is taken for another one: light of former frames is of no use then.
+            Ratio of the gain to that of the frame before, RGB, None where it is the same; and whether the tone curve,
+            or a ball's reflectance, is taken for another one: light of former frames is of no use then.
         """
-        if self._drift is None or frame.pose is None or isinstance(frame.image, wp.array):
+        if frame.pose is None or isinstance(frame.image, wp.array):
+            return None, False
+        ratio, is_bent = self._look_for_drift(frame, frame.pose)
+        return ratio, self._note_reflectance(frame, frame.pose) or is_bent
+
+    def _look_for_drift(self, frame: SeenFrame, pose: Pose) -> tuple[npt.NDArray[np.float64] | None, bool]:
+        """As ``look``, of the camera alone."""
+        if self._drift is None:
             return None, False
         gain, contrast = self._drift.gain, self._drift.contrast
         self._drift.saturation = self.saturation.levels
-        if not self._drift.observe(frame.image, frame.pose, frame.seconds, frame.plate):
+        if not self._drift.observe(frame.image, pose, frame.seconds, frame.plate):
             return None, False
         self._have_lights_shine()
         is_bent = contrast != self._drift.contrast
@@ -177,6 +194,10 @@ class FrameInputs:
             self._write_decode()
         if self._cover is not None and other._cover is not None and self._cover.watches == other._cover.watches:
             self._cover = copy.copy(other._cover)  # it replaces what it remembers, and changes nothing of it
+        mine, yours = self._reflectance, other._reflectance
+        if mine is not None and yours is not None and mine.watches == yours.watches:
+            self._reflectance = copy.deepcopy(yours)
+            self._write_probes()
         if self._drift is None or other._drift is None or self._drift.watches != other._drift.watches:
             return
         self._drift = other._drift.copied()
@@ -277,6 +298,18 @@ class FrameInputs:
         discs = ball_discs(self._probes, self._camera, frame.pose)
         return self._cover.observe(frame.image, discs, frame.pose, frame.seconds, self.gain, frame.plate)
 
+    def _note_reflectance(self, frame: SeenFrame, pose: Pose) -> bool:
+        """Look what balls reflect; whether they are taken to reflect something else from now on."""
+        if self._reflectance is None or not self._reflectance.observe(frame.image, pose, self._probes):
+            return False
+        self._write_probes()
+        return True
+
+    def _write_probes(self) -> None:
+        """Where balls are, and what they reflect by what frames have told so far."""
+        told = None if self._reflectance is None else self._reflectance.values
+        self._arrays["probes"].assign(_probe_values(self._probes, told))
+
     def _note_saturation(self, frame: SeenFrame) -> None:
         """Look where channels saturate, if the frame is on the host and shows a ball."""
         if self._saturation_is_known or not self._probes or frame.pose is None or isinstance(frame.image, wp.array):
@@ -291,8 +324,8 @@ class FrameInputs:
         """Move balls to where their markers are now; gives the inputs that changed."""
         scene = self.host_scene
         if frame.pose is not None and scene.place_probes(frame.pose, frame.places):
-            self._arrays["probes"].assign(_probe_values(scene.probes))
             self._probes = scene.probes
+            self._write_probes()
             yield "pose"
 
     def _place(self, frame: SeenFrame) -> Iterable[str]:
@@ -379,10 +412,12 @@ class FrameInputs:
         return True
 
 
-def _probe_values(probes: Sequence[scenes.Probe]) -> npt.NDArray[Any]:
+def _probe_values(probes: Sequence[scenes.Probe], reflectances: Sequence[scenes.RGB] | None = None) -> npt.NDArray[Any]:
+    """Records of balls; None: they reflect what the scene says."""
     values = np.zeros(len(probes), dtype=np.dtype(Probe.numpy_dtype()))
-    for value, probe in zip(values, probes, strict=True):
-        value["center"], value["radius"], value["reflectance"] = probe.center, probe.radius, probe.reflectance
+    told = [probe.reflectance for probe in probes] if reflectances is None else reflectances
+    for value, probe, reflectance in zip(values, probes, told, strict=True):
+        value["center"], value["radius"], value["reflectance"] = probe.center, probe.radius, reflectance
     return values
 
 

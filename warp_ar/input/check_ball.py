@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from warp_ar.errors import UsageError
 from warp_ar.input.ball_finder import find_ball
 from warp_ar.input.ball_radius import explains_better
-from warp_ar.input.ball_reflectance import measure_reflectance
+from warp_ar.input.ball_reflectance import REFLECTANCE, measure_reflectance
 from warp_ar.input.ball_solve import BallSolution, ground_below, rough_circle, solve_ball
 from warp_ar.input.ball_views import agreeing_outlines
 from warp_ar.input.check_pictures import Look
@@ -37,10 +37,6 @@ SEEN: Final = 0.46
 
 A ball in the open, whose rim here and there looks like what is behind it, shows 0.50 to 0.97; half hidden it shows
 0.44.
-"""
-REFLECTANCE: Final = 0.12
-"""Logarithm by which a ball may reflect more or less than the scene says: another response than the camera's, or a
-radius that is 5 % off, moves what is measured by up to 0.09.
 """
 SIDES: Final = 6
 """Frames in which what the ball stands on is looked for in its place."""

@@ -195,6 +195,9 @@ class EvidenceConfig:
     lever: float = 2.0
     """Share of light from all directions that may be missing, over that which is missing at the card: what hardly
     lights the card is hardly known by it."""
+    unseen: float = 0.5
+    """Share of the card's irradiance that light may have, as a surface that faces it receives it, which the card does
+    not know: from its horizon, and from below it."""
     interval: float = 2.5
     """Standard deviations of the draws that an interval of irradiance reaches to either side."""
     found: float = 0.3

@@ -31,12 +31,16 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from warp_ar.kernels.recover_cells import CELL_ROWS
 from warp_ar.light.config import CONFIG, Kind
 from warp_ar.light.fit import fit_channel
 from warp_ar.light.problem import Problem
 from warp_ar.light.surfaces import Surfaces
 
 Array = NDArray[np.float64]
+
+HALF_CELL = 0.5 * np.pi / CELL_ROWS
+"""Radians within which the direction of light is known."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,6 +142,59 @@ def most_by_card(captured: Array, added: Array, share: float) -> float:
     if most >= 1.0 or size <= 0.0:
         return 1.0
     return min(most / (1.0 - most) * float(np.linalg.norm(captured)) / size, 1.0)
+
+
+def card_error(doubt: float) -> float:
+    """Standard deviation of the logarithm of the card's irradiance against that of the map: white, response and ball.
+
+    Args:
+        doubt: Standard deviation of the card's logarithm.
+    """
+    return float(np.linalg.norm([doubt, CONFIG.evidence.response, CONFIG.evidence.ball]))
+
+
+def share_by_card(cosine: Array, doubt: float) -> Array:
+    """Share of light, by how it meets the card, that is known by the card.
+
+    Shading may say that light comes from where the card hardly sees it, from the horizon or below: a box's face that is
+    brighter than the light elsewhere has it. How much that is, nothing of known reflectance tells. With the card's
+    irradiance E known within s E, light that meets it at the cosine c, E / c by the card, is known within s E / c; what
+    is expected of it beforehand deviates by about E. The best mean of both gives the first the weight
+
+        c^2 / (c^2 + s^2).
+
+    A cosine is itself known within half a cell, a, which adds a E / c: s^2 + a^2 stand in the place of s^2.
+
+    Args:
+        cosine: Of the angle between light and the card's normal, any shape.
+        doubt: Standard deviation of the card's logarithm.
+    """
+    squared = np.maximum(cosine, 0.0) ** 2
+    return np.asarray(squared / (squared + card_error(doubt) ** 2 + HALF_CELL**2), np.float64)
+
+
+def held_to_card(
+    problem: Problem, solution: Array, by_card: Array, cosines: tuple[Array, Array], doubt: float
+) -> tuple[Array, Array]:
+    """What was found, without more light from where the card hardly sees it than some share of what the card shows.
+
+    Args:
+        problem: The equations, their candidates chosen.
+        solution: Radiance of parts, then power of candidates, (parts + candidates, 3).
+        by_card: Radiance that cells lack as the card alone has it, (m, 3).
+        cosines: From ``card_cosines``.
+        doubt: Standard deviation of the card's logarithm.
+
+    Returns:
+        Radiance that cells lack by parts, (m, 3), and power of candidates, (candidates, 3).
+    """
+    recovered, powers = problem.member @ solution[: problem.parts], solution[problem.parts :]
+    unknown = [(1.0 - share_by_card(cosine, doubt))[:, None] for cosine in cosines]
+    beyond, own = unknown[0] * np.maximum(recovered - by_card, 0.0), unknown[1] * powers
+    total = problem.solid_angle @ (beyond * problem.missing) + own.sum(axis=0)
+    most = CONFIG.evidence.unseen * problem.card_irradiance()
+    less = 1.0 - np.minimum(most / np.maximum(total, 1e-9), 1.0)
+    return recovered - less * beyond, powers - less * own
 
 
 def likely_gain(added: Array, missing: Array) -> float:

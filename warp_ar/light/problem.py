@@ -301,6 +301,24 @@ class Problem:
         columns = np.concatenate([self.columns, self.candidate_columns], axis=2)
         return np.asarray(np.einsum("cnk,kc->nc", columns, unknowns), np.float64)
 
+    def card_irradiance(self) -> Array:
+        """Irradiance of the card, (3,); where it clips, what it has at least."""
+        return np.asarray(np.median(self.light[self.kind == Kind.CARD], axis=0) / self.white, np.float64)
+
+    def card_cosines(self) -> tuple[Array, Array]:
+        """Cosines at which the card meets light from cells, (m,), and from candidates where they stand, (candidates,).
+
+        The card lies in the world's z = 0 and faces +z.
+        """
+        middle = self.points[self.kind == Kind.CARD].mean(axis=0)
+        cosines = []
+        for one in self.candidates:
+            ray = self.direction[one.cell]
+            if np.isfinite(one.distance):
+                ray = self.origin[one.cell] + one.distance * ray - middle
+            cosines.append(ray[2] / np.linalg.norm(ray))
+        return self.direction[:, 2], np.array(cosines)
+
     def push(self, candidate: Candidate) -> None:
         """Add a candidate to the unknowns."""
         patch = self.patch(candidate.cell)

@@ -24,6 +24,9 @@ card is used it is what makes the card right, and that alone is the method ``whi
 modelled surface (the card in the ball, a box) are lit, not lights: they stay close to clipping. Channels share their
 distribution: a second pass draws each to the mean of all three, in the hue of their totals.
 
+**What the card hardly sees**, light from its horizon and from below it, is told by surfaces of unknown reflectance
+alone. There is no more of it than some share of what the card shows (``held_to_card``).
+
 **Emitter candidates** are chosen one by one, among all directions that may lack light and a grid of distances, by how
 far they lower the cost to second order, (b' W r)^2 / (b' W b - b' W Z H^-1 Z' W b); the best few are fitted in earnest,
 then moved to neighbouring cells and distances while that helps, along their direction to where the cost is least, and
@@ -58,6 +61,7 @@ from warp_ar.light.evidence import (
     blocks_of,
     doubt_of,
     draw_missing,
+    held_to_card,
     irradiance_form,
     irradiance_interval,
     likely_gain,
@@ -203,12 +207,12 @@ class Recovery:
         best = int(np.argmax(problem.exact.sum(axis=0) + np.array([0.0, 0.5, 0.0])))
         is_turn = self._search(problem, best, means[best])
         solution = tie_channels(problem, _solve_channels(problem, best, means, bounds))
+        doubt = doubt_of(card.contrast)
+        recovered, powers = held_to_card(problem, solution, by_card, problem.card_cosines(), doubt)
         # An emitter that gives nothing in any channel has gone out, or never was.
-        powers = solution[problem.parts :]
         self._candidates = [
             candidate for candidate, power in zip(problem.candidates, powers, strict=True) if power.any()
         ]
-        recovered = problem.member @ solution[: problem.parts]
         emitters = []
         for candidate, power in zip(problem.candidates, powers, strict=True):
             recovered += problem.patch(candidate.cell) * power
@@ -221,7 +225,7 @@ class Recovery:
         if is_turn or self._evidence is None:
             c = _told_channel(problem)
             start = fit_channel(problem, c, problem.start(means[c]), CONFIG.solver.iterations).z
-            evidence = _weigh(problem, c, start, bounds, (recovered, by_card), self._blocks, doubt_of(card.contrast))
+            evidence = _weigh(problem, c, start, bounds, (recovered, by_card), self._blocks, doubt)
             if evidence.method == "white_card":
                 solution = np.concatenate([radiance_by_card, np.zeros((len(powers), 3))])
             reaching = reaching_factor(problem, solution, Ball(self._center, self._radius))

@@ -208,7 +208,8 @@ class Probe:
     radius: float
     """Radius in metres."""
     reflectance: RGB = (0.85, 0.85, 0.85)
-    """Share of light that the ball reflects; a silvered ornament if left out. A file may give one number for grey."""
+    """Share of light that the ball reflects; a silvered ornament if left out. A file may give one number for grey.
+    Frames that show otherwise are believed, but for the quality ``paper``."""
     marker: Marker | None = None
     """A marker or board of its own, in whose frame its centre is: it may be moved; lost, its last light remains."""
 

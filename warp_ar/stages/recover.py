@@ -459,7 +459,10 @@ class Recover(Stage):
     def status(self) -> Mapping[str, Any]:
         """What the last estimate rests on, for reports, and why none was made since; see ``_take``."""
         estimate, failed = self._progress.estimate, self._progress.failed
-        reason = {"failed": failed} if failed else {}
+        reason: dict[str, Any] = {"failed": failed} if failed else {}
+        told = self._arrays["ball_reflectance"]()
+        if told is not None:
+            reason["ball_reflectance"] = [[round(value, 3) for value in ball] for ball in told]
         if estimate is None:
             return reason
         emitters = [

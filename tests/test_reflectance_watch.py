@@ -1,0 +1,172 @@
+"""What balls reflect is told by frames where the scene is wrong about it, and left alone where it is right."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+
+from warp_ar import PRESETS, Pipeline
+from warp_ar.input import reflectance_watch
+from warp_ar.input.ball_reflectance import Reflected, difference_of_halves, measure_reflectance
+from warp_ar.input.check_pictures import take_look
+from warp_ar.input.reflectance_watch import ENOUGH, FIRST, MOST, ReflectanceWatch
+from warp_ar.input.saturation import ball_discs
+from warp_ar.input.sources import open_source
+from warp_ar.kernels.color import decode_table
+from warp_ar.scene import Pose, load_scene
+
+TOLD = 0.08
+"""Relative error of one frame: the desk's texture is mirrored smaller than it is seen."""
+ROUNDED = 0.02
+"""Relative error of codes."""
+NOWHERE = Pose(np.eye(3), np.zeros(3))
+BLACK = np.zeros((4, 4, 3), np.uint8)
+
+
+def said(reflectance, clip="desk"):
+    """A scene that says this of its ball."""
+    scene = load_scene(clip)
+    return dataclasses.replace(scene, probes=(dataclasses.replace(scene.probes[0], reflectance=reflectance),))
+
+
+@functools.lru_cache(maxsize=2)
+def view(clip="desk"):
+    """A picture of a clip and its pose."""
+    scene = load_scene(clip)
+    with open_source(str(scene.source.path)) as source:
+        return take_look(scene, source, 1).views[0]
+
+
+def watch(scene):
+    return ReflectanceWatch(scene, scene.camera, decode_table(scene.camera.transfer).astype(np.float32))
+
+
+@pytest.mark.parametrize("clip", ["desk", "wire_opposing"])
+@pytest.mark.parametrize("wrong", [(0.6, 0.6, 0.6), (0.85, 0.6, 0.4)])
+def test_frames_take_the_place_of_a_wrong_reflectance(clip, wrong):
+    """Grey or tinted; the clips' balls have 0.85, 0.85, 0.87."""
+    scene = said(wrong, clip)
+    looks = watch(scene)
+    assert looks.observe(*view(clip), scene.probes)
+    assert looks.is_told
+    assert looks.values[0] == pytest.approx(load_scene(clip).probes[0].reflectance, rel=TOLD)
+
+
+def test_a_reflectance_that_frames_agree_with_is_kept_as_it_is():
+    scene = load_scene("desk")
+    looks = watch(scene)
+    assert not looks.observe(*view(), scene.probes)
+    assert looks.values == (scene.probes[0].reflectance,)
+    assert not looks.is_told
+
+
+def beside(factor, clip="wire_opposing"):
+    """What is told where all beside the ball is brighter, by a factor for each column (width,), as codes of sRGB."""
+    scene, (image, pose) = load_scene(clip), view(clip)
+    table = decode_table(scene.camera.transfer).astype(np.float32)
+    ((x, y, radius),) = ball_discs(scene.probes, scene.camera, pose)
+    row, column = np.mgrid[: image.shape[0], : image.shape[1]]
+    outside = np.hypot(column - x, row - y) > 1.05 * radius
+    linear = np.take_along_axis(table, image.reshape(-1, 3).astype(int), axis=0).reshape(image.shape)
+    bright = np.where(outside[..., None], linear * factor[None, :, None], linear)
+    codes = np.stack([np.interp(bright[..., c], table[:, c], np.arange(256.0)) for c in range(3)], -1)
+    return measure_reflectance(scene, scene.camera, scene.probes[0], (np.round(codes).astype(np.uint8), pose), table)
+
+
+def test_what_shines_beside_the_ball_tells_nothing():
+    """Evenly brighter is a ball that reflects less; brighter to one side is a surface that shines."""
+    width = load_scene("wire_opposing").camera.width
+    even, less = beside(np.ones(width)), beside(np.full(width, 1.2))
+    assert np.array(less.reflectance) * 1.2 == pytest.approx(np.array(even.reflectance), rel=ROUNDED)
+    assert beside(np.linspace(0.4, 2.0, width)) is None
+
+
+def test_halves_that_differ():
+    """By columns, by rows, not at all."""
+    pixels = np.stack(np.meshgrid(np.arange(10), np.arange(6)), -1).reshape(-1, 2)
+    ratio = np.repeat(np.where(pixels[:, :1] < 5, 0.3, 0.1), 3, axis=1)
+    assert difference_of_halves(ratio, pixels) == pytest.approx(0.2)
+    ratio = np.where(pixels[:, 1:] < 3, [0.0, 0.0, 0.0], [0.0, 0.4, -0.1])
+    assert difference_of_halves(ratio, pixels) == pytest.approx(0.4)
+    assert difference_of_halves(np.full((60, 3), 0.7), pixels) == 0.0
+    assert difference_of_halves(np.full((1, 3), 0.7), pixels[:1]) == 0.0
+
+
+def telling(monkeypatch, answers):
+    """Frames tell ``answers`` in turn; gives the list of calls."""
+    calls = []
+
+    def measure(*_):
+        calls.append(1)
+        value = answers[min(len(calls), len(answers)) - 1]
+        return None if value is None else Reflected((value,) * 3, 1000)
+
+    monkeypatch.setattr(reflectance_watch, "measure_reflectance", measure)
+    return calls
+
+
+@pytest.mark.parametrize(("answer", "asked"), [(0.8, ENOUGH), (None, MOST)])
+def test_frames_are_asked_until_enough_have_told_or_were_asked_in_vain(monkeypatch, answer, asked):
+    scene, calls = load_scene("desk"), telling(monkeypatch, [answer])
+    looks = watch(scene)
+    for _ in range(1000):
+        looks.observe(BLACK, NOWHERE, scene.probes)
+    assert len(calls) == asked
+    assert looks.values == (scene.probes[0].reflectance,)
+
+
+def test_light_changes_only_where_the_median_moves(monkeypatch):
+    """0.5, then 0.505 changes nothing; a median of 0.7 does; one that agrees with the scene gives its number back."""
+    scene = said((0.85,) * 3)
+    telling(monkeypatch, [0.5, 0.51, 0.7, 0.84, 0.84, 0.84, 0.84])
+    looks = watch(scene)
+    changed, values = [], []
+    for _ in range(40):
+        changed.append(looks.observe(BLACK, NOWHERE, scene.probes))
+        values.append(looks.values[0][0])
+    assert changed[:FIRST] == [True, False, False]  # medians 0.5, 0.505, 0.51
+    assert values[FIRST - 1] == pytest.approx(0.5)
+    assert 0.605 in [pytest.approx(value) for value in values]  # of 0.5, 0.51, 0.7, 0.84
+    assert values[-1] == 0.85
+    assert not looks.is_told
+
+
+def test_the_light_is_that_of_a_scene_which_says_so():
+    """A pipeline that a frame tells lights as one whose scene says the same, to the bit; `paper` believes the scene."""
+    image, pose = view()
+
+    def lit(scene, quality):
+        pipeline = Pipeline(scene, device="cpu", quality=PRESETS[quality], outputs=("environment",))
+        try:
+            environment = np.array(pipeline(image, time_seconds=0.0, pose=pose).environment)
+            status = pipeline.arrays["recover_status"]() if "recover_status" in pipeline.arrays else {}
+            return environment, status.get("ball_reflectance"), pipeline.inputs.told_reflectance
+        finally:
+            pipeline.close()
+
+    wrong = said((0.5, 0.5, 0.5))
+    found, reported, told = lit(wrong, "low")
+    assert reported == [[pytest.approx(value, abs=1e-3) for value in told[0]]]
+    again, reported, _ = lit(said(told[0]), "low")
+    assert reported is None
+    assert np.array_equal(found, again)
+    assert lit(wrong, "paper")[2] is None
+
+
+def test_another_pipeline_of_the_same_scene_goes_on_with_what_was_told():
+    image, pose = view()
+    scene = said((0.5, 0.5, 0.5))
+    first = Pipeline(scene, device="cpu", quality=PRESETS["low"], outputs=("environment",))
+    second = Pipeline(scene, device="cpu", quality=PRESETS["medium"], outputs=("environment",))
+    try:
+        first(image, time_seconds=0.0, pose=pose)
+        second.continue_from(first)
+        assert second.inputs.told_reflectance == first.inputs.told_reflectance
+        probes = second.arrays["probes"].numpy()
+        assert probes["reflectance"][0] == pytest.approx(np.array(first.inputs.told_reflectance[0]), rel=1e-6)
+    finally:
+        first.close()
+        second.close()
