@@ -337,24 +337,37 @@ def make_wavefront(config: EnvironmentShadowConfig, rows: int, columns: int, dev
     return wave
 
 
-def shade_wavefront(
-    config: EnvironmentShadowConfig,
-    params: wp.array[FrameParams],
-    picture: Picture,
-    scene: RayScene,
-    distant: DistantLight,
-    sets: SampleSets,
-    cells_out: ShadowCells,
-    wave: Wavefront,
-) -> None:
-    """Estimate all cells; arguments as those of ``shade_environment``, and the scratch of ``make_wavefront``."""
-    device = picture.rays.device
-    inputs = [params, picture, scene, distant, sets]
-    threads = min(wave.queue.shape[0], QUEUE_THREADS)
-    size = wave.occluded.shape
+Given = tuple[wp.array[FrameParams], Picture, RayScene, DistantLight, SampleSets]
+"""What the kernels read, as ``shade_environment`` has it: params, picture, scene, distant, sets."""
+
+
+def find_occluded(config: EnvironmentShadowConfig, given: Given, cells_out: ShadowCells, wave: Wavefront) -> None:
+    """First pass: what objects hide, and which secondary rays there are. Of the light it reads the samples alone."""
     wave.queue_length.zero_()
-    launch(make_find_occluded_kernel(config), size, inputs, [cells_out, wave], device=device)
-    launch(make_sum_light_kernel(config), size, [*inputs, cells_out], [wave], device=device)
-    secondary = [*inputs, cells_out, threads]
-    launch(make_trace_secondary_kernel(config), threads, secondary, [wave], device=device)
-    launch(make_reduce_partials_kernel(config), size[1:], [params, wave], [cells_out], device=device)
+    kernel, size = make_find_occluded_kernel(config), wave.occluded.shape
+    launch(kernel, size, given, [cells_out, wave], device=wave.occluded.device)
+
+
+def sum_light(config: EnvironmentShadowConfig, given: Given, cells: ShadowCells, wave: Wavefront) -> None:
+    """Second pass: light of the environment, and how much of it is hidden."""
+    kernel, size = make_sum_light_kernel(config), wave.occluded.shape
+    launch(kernel, size, [*given, cells], [wave], device=wave.occluded.device)
+
+
+def trace_secondary(config: EnvironmentShadowConfig, given: Given, cells: ShadowCells, wave: Wavefront) -> None:
+    """Third pass: what objects send. It reads nothing that the second writes."""
+    threads = min(wave.queue.shape[0], QUEUE_THREADS)
+    kernel = make_trace_secondary_kernel(config)
+    launch(kernel, threads, [*given, cells, threads], [wave], device=wave.occluded.device)
+
+
+def reduce_partials(config: EnvironmentShadowConfig, given: Given, cells_out: ShadowCells, wave: Wavefront) -> None:
+    """Last pass: the estimates."""
+    kernel, size = make_reduce_partials_kernel(config), wave.occluded.shape[1:]
+    launch(kernel, size, [given[0], wave], [cells_out], device=wave.occluded.device)
+
+
+def shade_wavefront(config: EnvironmentShadowConfig, given: Given, cells_out: ShadowCells, wave: Wavefront) -> None:
+    """Estimate all cells, pass after pass, with the scratch of ``make_wavefront``."""
+    for one in (find_occluded, sum_light, trace_secondary, reduce_partials):
+        one(config, given, cells_out, wave)

@@ -22,6 +22,7 @@ from tests.kernel_rig import records, shape
 from tests.relight_rig import CAMERA, DESK, LOOK_DOWN, POINTS, RAYS, H, W
 from warp_ar.kernels import (
     environment_samples,
+    environment_shadow,
     environment_shadow_filter,
     environment_shadow_wavefront,
 )
@@ -29,7 +30,7 @@ from warp_ar.kernels.environment_shadow_cells import (
     EnvironmentShadowConfig,
     cell_column,
 )
-from warp_ar.kernels.reflect import DistantLightConfig
+from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
 from warp_ar.kernels.structs import (
     BOX,
     LAMBERT,
@@ -38,6 +39,7 @@ from warp_ar.kernels.structs import (
     FrameParams,
     RayScene,
     Shape,
+    make_picture,
 )
 from warp_ar.kernels.trace import TraceConfig
 
@@ -83,6 +85,31 @@ def test_a_wavefront_finds_the_same(device, bounce, secondary):
         np.testing.assert_array_equal(run(drawn, **scene, partials=partials, as_wavefront=True), found)
     dark = run(drawn, **{**scene, "albedo": 0.0}, partials=8, as_wavefront=True)
     assert (dark[one < 0.99] < one[one < 0.99]).mean() > 0.5, "objects send light"
+
+
+def test_the_first_pass_of_a_wavefront_reads_samples_alone_and_the_next_two_not_each_other(device, monkeypatch):
+    """So they may begin before the light is filtered, and run side by side."""
+    wavefront = environment_shadow_wavefront
+
+    def in_another_order(config, given, cells, wave):
+        samples_alone = DistantLight()
+        samples_alone.probes = given[3].probes
+        bare = make_picture(wp.zeros((1, 1), dtype=wp.vec3ub), given[1].decode_table, given[1].rays)
+        wavefront.find_occluded(config, (given[0], bare, given[2], samples_alone, given[4]), cells, wave)
+        for one in (wavefront.trace_secondary, wavefront.sum_light, wavefront.reduce_partials):
+            one(config, given, cells, wave)
+
+    drawn = draw(with_sun(6, 20, 100.0))
+    environment_samples.place_emitters(lamp_at((0.1, 0.05, 0.4)), drawn[2])
+    ball = {"center": (0.1, 0, 0.03), "radius": 0.03, "reflectance": (0.8, 0.7, 0.6)}
+    for bounce in ("estimated", "traced"):
+        scene = {"objects": [sphere((0, 0, 0.05), 0.05)], "probes": [ball], "bounce": bounce, "emitters": True}
+        scene |= {"albedo": 0.5, "partials": 4, "as_wavefront": True}
+        whole = run(drawn, **scene)
+        with monkeypatch.context() as patch:
+            patch.setattr(environment_shadow, "shade_wavefront", in_another_order)
+            np.testing.assert_array_equal(run(drawn, **scene), whole)
+        assert whole.min() < 0.7
 
 
 def test_a_wavefront_takes_one_set_and_little_memory(device):

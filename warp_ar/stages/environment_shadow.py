@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Literal
 
 import warp as wp
@@ -68,6 +68,10 @@ METHODS: Mapping[str, Method] = {
     "brute_force": Method(REFERENCE_SIZE[0] * REFERENCE_SIZE[1], 1, 1, "traced"),
 }
 """Cheapest first, after ``none``."""
+
+
+DRAWN = ("pose", "objects", "environment_samples", "probe_places")
+"""What says where the samples are and what hides them."""
 
 
 def find_stride(method: Method, rows: int) -> int:
@@ -163,10 +167,10 @@ class EnvironmentShadow(Stage):
         sets = SampleSets()
         sets.directions, sets.flux, sets.samples = (arrays[name] for name in sample_names(self.features))
 
+        given = params, picture, scene, distant, sets
+
         def estimate(rows: Rows | None) -> None:
-            environment_shadow.shade_environment(
-                config, params, picture, scene, distant, sets, cells, wave=wave, rows=rows
-            )
+            environment_shadow.shade_environment(config, *given, cells, rows=rows)
 
         def average(rows: Rows | None) -> None:
             filters.filter_ratio(config, params, cells, rows=rows)
@@ -183,10 +187,29 @@ class EnvironmentShadow(Stage):
             reach = config.side  # the filter looks beyond the rows that it writes
             return max(start // stride - reach, 0), min(-(-stop // stride) + reach, count)
 
+        estimates = [Pass(estimate, rows=count, extent=cell_rows)]
+        if wave is not None:
+            estimates = self._wavefront(config, given, cells, wave)
         return [
-            Pass(estimate, rows=count, extent=cell_rows),
-            Pass(average, rows=count, extent=cell_rows),
-            Pass(spread, rows=self.request.size[1], extent=GrowingRows(shadow_rows)),
+            *estimates,
+            Pass(average, rows=count, extent=cell_rows, leaves_idle=True),
+            Pass(spread, rows=self.request.size[1], extent=GrowingRows(shadow_rows), leaves_idle=True),
+        ]
+
+    def _wavefront(
+        self, config: EnvironmentShadowConfig, given: wavefront.Given, cells: ShadowCells, wave: wavefront.Wavefront
+    ) -> list[Pass]:
+        """Estimates, kernel by kernel: rays need not wait for the light's filtered forms, nor for each other."""
+
+        def launcher(one: Callable[..., None]) -> Callable[[Rows | None], None]:
+            return lambda rows: one(config, given, cells, wave)
+
+        drawn = tuple(name for name in self.wiring.reads if name in DRAWN)
+        return [
+            Pass(launcher(wavefront.find_occluded), reads=drawn),
+            Pass(launcher(wavefront.sum_light)),
+            Pass(launcher(wavefront.trace_secondary), beside_last=True),
+            Pass(launcher(wavefront.reduce_partials), leaves_idle=True),
         ]
 
     def _config(self, arrays: Arrays, device: Any) -> EnvironmentShadowConfig:
