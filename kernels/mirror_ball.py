@@ -22,6 +22,7 @@ import warp as wp
 
 from warp_ar.kernels.launch import MOST_REGISTERS, QUICK_TO_COMPILE, Rows, launch_rows
 from warp_ar.kernels.materials import reflect
+from warp_ar.kernels.pixel_order import own_pixel
 from warp_ar.kernels.pixels import shown_radiance
 from warp_ar.kernels.receiver import Receiver, RelightConfig
 from warp_ar.kernels.reflect import DistantLight, look_up_layer, make_find_in_frame
@@ -134,7 +135,9 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
         mirrored_out: wp.array2d[wp.vec3],
     ):
         i, j = wp.tid()
-        i += row_start
+        pixel = own_pixel(i, j, row_start, params[0].ball_rect, mirrored_out.shape[0], mirrored_out.shape[1])
+        i = pixel[0]
+        j = pixel[1]
         mirrored_out[i, j] = wp.vec3(0.0, 0.0, 0.0)
         if not inside_rect(i, j, params[0].ball_rect):
             return
@@ -221,4 +224,5 @@ def mirror_ball(
         [mirrored_out],
         rows=rows,
         device=rays.device,
+        rectangle_first=True,
     )

@@ -52,6 +52,7 @@ from warp_ar.kernels.near_field_rays import (
     make_see_point,
     mirrored_level,
 )
+from warp_ar.kernels.pixel_order import own_pixel
 from warp_ar.kernels.reflect import DistantLight, make_distant_irradiance, make_reflected_radiance
 from warp_ar.kernels.structs import FrameParams, Hit, Picture, RayScene
 from warp_ar.kernels.visibility import VisibleObjects, inside_rect
@@ -125,7 +126,10 @@ def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
         near_out: NearLight,
     ):
         i, j = wp.tid()
-        i += row_start
+        objects = visible.objects
+        pixel = own_pixel(i, j, row_start, params[0].object_rect, objects.shape[0], objects.shape[1])
+        i = pixel[0]
+        j = pixel[1]
         if not inside_rect(i, j, params[0].object_rect):
             return
         if visible.objects[i, j] < 0:
@@ -242,11 +246,13 @@ def make_filter_kernel(config: NearFieldConfig) -> wp.Kernel:
         near_out: NearLight,
     ):
         i, j = wp.tid()
-        i += row_start
         rect = params[0].object_rect
+        objects = visible.objects
+        pixel = own_pixel(i, j, row_start, rect, objects.shape[0], objects.shape[1])
+        i = pixel[0]
+        j = pixel[1]
         if not inside_rect(i, j, rect):
             return
-        objects = visible.objects
         hits = visible.hits
         found = objects[i, j]
         if found < 0:
@@ -318,6 +324,7 @@ def estimate_near_field(
         [near_out],
         rows=rows,
         device=picture.rays.device,
+        rectangle_first=True,
     )
 
 
@@ -343,4 +350,5 @@ def filter_near_field(
         [near_out],
         rows=rows,
         device=visible.objects.device,
+        rectangle_first=True,
     )
