@@ -273,3 +273,30 @@ def test_pixels_between_surfaces_find_their_own(device):
 def test_bad_configs_are_refused(changes, message):
     with pytest.raises(ValueError, match=message):
         dataclasses.replace(ON_DESK, **changes)
+
+
+@pytest.mark.parametrize("stride", [1, 4, 5, 9])
+def test_pixels_between_surfaces_may_have_a_kernel_of_their_own(device, monkeypatch, stride):
+    """Cells of random surfaces, each on what is there or not: every pixel is written once, the same by both ways."""
+    rng = np.random.default_rng(stride)
+    shape_of_cells = -(-H // stride), -(-W // stride)
+    board = shape(PLANE, (0.003, 0.004, 0.1), (0.083, 0.061, 0))
+    scene = RayScene()
+    scene.proxies = records(Shape, DESK, board)
+    averaged = shadow_cells(shape_of_cells, stride, notes=False)
+    averaged.surface = wp.array(rng.choice([-1, 0, 8], shape_of_cells, p=[0.2, 0.5, 0.3]), dtype=wp.int32)
+    averaged.filtered = wp.array(rng.uniform(0.1, 0.9, (*shape_of_cells, 3)), dtype=wp.vec3)
+    rays = wp.array(RAYS, dtype=wp.vec2)
+    for rect in ((0, H, 0, W), (3, H - 2, 5, W - 1), (0, 0, 0, 0)):
+        params = records(FrameParams, {"camera_position": CAMERA, "world_from_camera": LOOK_DOWN, "shadow_rect": rect})
+        found = []
+        for apart in (False, True):
+            out = wp.full((H, W), wp.vec3(9.0, 9.0, 9.0), dtype=wp.vec3)
+            monkeypatch.setattr(environment_shadow_filter, "spreads_apart", lambda *_, apart=apart: apart)
+            environment_shadow_filter.spread_ratio(ON_DESK, params, rays, scene, None, averaged, out)
+            found.append(out.numpy())
+        if str(device) == "cpu":
+            np.testing.assert_array_equal(found[1], found[0])
+        else:  # NVRTC joins products and sums in each kernel as it likes
+            np.testing.assert_allclose(found[1], found[0], rtol=1e-6)
+        assert (found[1] < 2.0).all()

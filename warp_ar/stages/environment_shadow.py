@@ -157,7 +157,10 @@ class EnvironmentShadow(Stage):
         if wave is None:
             environment_shadow.make_environment_shadow_kernel(config)
         filters.make_filter_ratio_kernel(config.side)
-        filters.make_spread_ratio_kernel(config.distant)
+        if filters.spreads_apart(find_stride(METHODS[self.method], self.request.size[1]), device):
+            filters.make_spread_mixed_kernel(config.distant)
+        else:
+            filters.make_spread_ratio_kernel(config.distant)
         distant = make_distant_light(self.features, arrays, self.name)
         distant.environment = arrays["environment"]
         if self.features.others:
