@@ -32,12 +32,15 @@ from warp_ar.kernels.shadow import tile_turn
 from warp_ar.kernels.shapes import FAR, ROUNDING, intersect_sphere
 from warp_ar.kernels.structs import FrameParams, Light, Probe, RayScene
 from warp_ar.kernels.trace import TraceConfig, make_trace, offset_origin
+from warp_ar.kernels.trial import tried
 from warp_ar.kernels.visibility import inside_rect, look_within_pixel
 
 wp.set_module_options({"enable_backward": False})
 
 MIN_REFLECTANCE = wp.constant(wp.float32(0.05))
 """Of a ball that is a mirror at all: what a pixel shows is divided by it."""
+SHARED = (4, 16)
+"""Numbers of samples of a pixel that a CUDA device takes side by side, a lane each."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,15 +111,101 @@ def make_reflect_at_ball(config: MirrorBallConfig) -> wp.Function:
     return reflect_at_ball
 
 
+@wp.struct
+class Change:
+    """What a sample adds to a pixel's radiance: by an object or by shadow, and by virtual light."""
+
+    first: wp.vec3
+    second: wp.vec3
+
+
 @functools.cache
-def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
-    """Kernel specialised to ``config``; equal configs share one kernel."""
+def make_mirrored_change(config: MirrorBallConfig) -> wp.Function:
+    """``mirrored_change(params, scene, lights, distant, receiver, shadow_ratio, pixel, direction, shown) -> Change``.
+
+    Of a sample of the pixel that looks in ``direction``.
+    """
     trace = make_trace(config.trace)
     closest_object, closest_proxy = trace.closest_object, trace.closest_proxy
     reflect_at_ball = make_reflect_at_ball(config)
     shade_hit = make_shade_hit(config.shade) if config.shade is not None else None
     direct_lighting = make_direct_lighting(config.relight) if config.relight is not None else None
     find_in_frame = make_find_in_frame(config.trace, True)
+
+    @wp.func(module="unique")
+    def mirrored_change(
+        params: wp.array[FrameParams],
+        scene: RayScene,
+        lights: wp.array[Light],
+        distant: DistantLight,
+        receiver: Receiver,
+        shadow_ratio: wp.array2d[wp.vec3],
+        pixel: wp.vec2i,
+        direction: wp.vec3,
+        shown: wp.vec3,
+    ) -> Change:
+        i = pixel[0]
+        j = pixel[1]
+        change = Change()
+        seen = reflect_at_ball(scene, receiver.probes, params[0].camera_position, direction)
+        if seen.ball < 0:
+            return change
+        start = seen.origin
+        wi = seen.wi
+        probe = receiver.probes[seen.ball]
+        surface = closest_proxy(scene, start, wi, FAR)
+        reach = surface.t
+        if wp.static(config.shade is not None):
+            item = closest_object(scene, start, wi, reach)
+            reach = item.t
+        if nearest_ball(receiver.probes, start, wi, reach) >= 0:
+            return change
+        rho = wp.max(probe.reflectance, wp.vec3(MIN_REFLECTANCE, MIN_REFLECTANCE, MIN_REFLECTANCE))
+        if wp.static(config.shade is not None):
+            if item.shape >= 0:
+                # A pixel's rays leave the ball turned by twice the angle between the normals where they meet it.
+                spread = seen.width / wp.max(item.t, 1.0e-6) + 2.0 * seen.width / probe.radius
+                radiance = shade_hit(scene, lights, distant, item, wi, NearPoint(), tile_turn(i, j), spread)
+                change.first = wp.cw_mul(rho, radiance) - shown
+                return change
+        if surface.shape < 0 or wp.dot(surface.geometric_normal, wi) >= 0.0:
+            return change
+        if wp.static(config.ratio):
+            if shadow_ratio.shape[0] > 0:
+                at = find_in_frame(params[0], receiver.picture, scene, receiver.probes, surface)
+                if at[0] >= 0.0:
+                    ratio = look_up_layer(shadow_ratio, at[0], at[1])
+                    change.first = wp.cw_mul(shown, ratio - wp.vec3(1.0, 1.0, 1.0))
+        if wp.static(config.relight is not None):
+            lit = direct_lighting(scene, lights, receiver, surface, i, j, rho, tile_turn(i, j))
+            change.second = wp.cw_mul(rho, lit.added)
+        return change
+
+    return mirrored_change
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const unsigned int first = (threadIdx.x & 31) / share * share;
+    const unsigned int mask = (share == 32 ? 0xffffffffu : (1u << share) - 1u) << first;
+    wp::vec_t<3, float> total(0.0f);
+    for (int lane = 0; lane < share; ++lane) {
+        for (int k = 0; k < 3; ++k) total[k] += __shfl_sync(mask, own[k], first + lane);
+        for (int k = 0; k < 3; ++k) total[k] += __shfl_sync(mask, more[k], first + lane);
+    }
+    return total;
+#else
+    return add(own, more);
+#endif
+""")
+def sum_of_lanes(own: wp.vec3, more: wp.vec3, share: wp.int32) -> wp.vec3:
+    """Sum over so many lanes beside each other of both, in their order; ``share`` is a power of 2, 32 at most."""
+
+
+@functools.cache
+def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
+    """Kernel specialised to ``config``; equal configs share one kernel."""
+    mirrored_change = make_mirrored_change(config)
 
     @wp.kernel(
         module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS, module_options=QUICK_TO_COMPILE
@@ -131,54 +220,31 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
         receiver: Receiver,
         shadow_ratio: wp.array2d[wp.vec3],
         side: wp.int32,
+        share: wp.int32,
         # Out:
         mirrored_out: wp.array2d[wp.vec3],
     ):
-        i, j = wp.tid()
+        """A pixel; or one of its samples, which ``share`` lanes take, one each."""
+        i, j, part = wp.tid()
         pixel = own_pixel(i, j, row_start, params[0].ball_rect, mirrored_out.shape[0], mirrored_out.shape[1])
         i = pixel[0]
         j = pixel[1]
-        mirrored_out[i, j] = wp.vec3(0.0, 0.0, 0.0)
         if not inside_rect(i, j, params[0].ball_rect):
+            mirrored_out[i, j] = wp.vec3(0.0, 0.0, 0.0)
             return
-        origin = params[0].camera_position
         ray = receiver.picture.rays[i, j]
         shown = shown_radiance(receiver.picture, i, j)
         change = wp.vec3(0.0, 0.0, 0.0)
-        for sample in range(side * side):
+        one = Change()
+        for sample in range(part, side * side, share):
             direction = look_within_pixel(params, ray, sample, side)
-            seen = reflect_at_ball(scene, receiver.probes, origin, direction)
-            if seen.ball < 0:
-                continue
-            start = seen.origin
-            wi = seen.wi
-            probe = receiver.probes[seen.ball]
-            surface = closest_proxy(scene, start, wi, FAR)
-            reach = surface.t
-            if wp.static(config.shade is not None):
-                item = closest_object(scene, start, wi, reach)
-                reach = item.t
-            if nearest_ball(receiver.probes, start, wi, reach) >= 0:
-                continue
-            rho = wp.max(probe.reflectance, wp.vec3(MIN_REFLECTANCE, MIN_REFLECTANCE, MIN_REFLECTANCE))
-            if wp.static(config.shade is not None):
-                if item.shape >= 0:
-                    # A pixel's rays leave the ball turned by twice the angle between the normals where they meet it.
-                    spread = seen.width / wp.max(item.t, 1.0e-6) + 2.0 * seen.width / probe.radius
-                    radiance = shade_hit(scene, lights, distant, item, wi, NearPoint(), tile_turn(i, j), spread)
-                    change += wp.cw_mul(rho, radiance) - shown
-                    continue
-            if surface.shape < 0 or wp.dot(surface.geometric_normal, wi) >= 0.0:
-                continue
-            if wp.static(config.ratio):
-                if shadow_ratio.shape[0] > 0:
-                    at = find_in_frame(params[0], receiver.picture, scene, receiver.probes, surface)
-                    if at[0] >= 0.0:
-                        change += wp.cw_mul(shown, look_up_layer(shadow_ratio, at[0], at[1]) - wp.vec3(1.0, 1.0, 1.0))
-            if wp.static(config.relight is not None):
-                lit = direct_lighting(scene, lights, receiver, surface, i, j, rho, tile_turn(i, j))
-                change += wp.cw_mul(rho, lit.added)
-        mirrored_out[i, j] = change / wp.float32(side * side)
+            one = mirrored_change(params, scene, lights, distant, receiver, shadow_ratio, pixel, direction, shown)
+            change += one.first
+            change += one.second
+        if share > 1:
+            change = sum_of_lanes(one.first, one.second, share)
+        if part == 0:
+            mirrored_out[i, j] = change / wp.float32(side * side)
 
     return mirror_ball_kernel
 
@@ -217,10 +283,11 @@ def mirror_ball(
     if samples < 1 or side**2 != samples:
         raise ValueError(f"samples is {samples}; expected a square number such as 1 or 4")
     rays = receiver.picture.rays
+    share = samples if samples in SHARED and not rays.device.is_cpu and tried("lanes") else 1
     launch_rows(
         make_mirror_ball_kernel(config),
-        rays.shape,
-        [params, scene, lights, distant, receiver, shadow_ratio, side],
+        (*rays.shape, share),
+        [params, scene, lights, distant, receiver, shadow_ratio, side, share],
         [mirrored_out],
         rows=rows,
         device=rays.device,
