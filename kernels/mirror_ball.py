@@ -20,6 +20,7 @@ import math
 
 import warp as wp
 
+from warp_ar.kernels.cooperative import sum_of_lanes
 from warp_ar.kernels.launch import MOST_REGISTERS, QUICK_TO_COMPILE, Rows, launch_rows
 from warp_ar.kernels.materials import reflect
 from warp_ar.kernels.pixel_order import own_pixel
@@ -182,24 +183,6 @@ def make_mirrored_change(config: MirrorBallConfig) -> wp.Function:
         return change
 
     return mirrored_change
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    const unsigned int first = (threadIdx.x & 31) / share * share;
-    const unsigned int mask = (share == 32 ? 0xffffffffu : (1u << share) - 1u) << first;
-    wp::vec_t<3, float> total(0.0f);
-    for (int lane = 0; lane < share; ++lane) {
-        for (int k = 0; k < 3; ++k) total[k] += __shfl_sync(mask, own[k], first + lane);
-        for (int k = 0; k < 3; ++k) total[k] += __shfl_sync(mask, more[k], first + lane);
-    }
-    return total;
-#else
-    return add(own, more);
-#endif
-""")
-def sum_of_lanes(own: wp.vec3, more: wp.vec3, share: wp.int32) -> wp.vec3:
-    """Sum over so many lanes beside each other of both, in their order; ``share`` is a power of 2, 32 at most."""
 
 
 @functools.cache
