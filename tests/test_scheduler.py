@@ -436,7 +436,7 @@ def launch_order(
     monkeypatch.setattr(wp, "Stream", FakeStream)
     monkeypatch.setattr(Scheduler, "_launch_on", note)
     scheduler = Scheduler.__new__(Scheduler)
-    scheduler.device, scheduler._stream, scheduler._streams = None, FakeStream(), []
+    scheduler.device, scheduler._stream, scheduler._streams = None, FakeStream(), {False: [], True: []}
     steps = []
     for kind, wiring in plan.stages:
         given = passes.get(kind.name, [{}])

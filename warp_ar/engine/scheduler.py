@@ -25,7 +25,7 @@ from warp_ar.engine.graph import Plan
 from warp_ar.engine.modules import Progress, load_modules
 from warp_ar.kernels.bands import serve_kernel
 from warp_ar.kernels.launch import Note, noting
-from warp_ar.kernels.trial import tried
+from warp_ar.kernels.trial import also, tried
 from warp_ar.stages.base import Arrays, Pass, Reach, Rows, Stage
 
 Step = tuple[Stage, list[Pass]]
@@ -46,6 +46,17 @@ class StageTiming:
 
 
 SKIPPED = StageTiming(0.0, True)
+URGENT = (
+    "unwrap",
+    "accumulate",
+    "fill",
+    "recover",
+    "environment_samples",
+    "prefilter",
+    "environment_shadow",
+    "near_field",
+)
+"""Stages that others wait for: where it is asked for, the device takes their blocks first."""
 
 
 class Scheduler:
@@ -91,7 +102,7 @@ class Scheduler:
         self._patterns: dict[Any, list[Segment]] = {}
         self._graphs: dict[tuple[int, ...], Any] = {}
         self._stream: Any = wp.get_stream(device) if device.is_cuda else None
-        self._streams: list[Any] = []
+        self._streams: dict[bool, list[Any]] = {False: [], True: []}
         self._marks: dict[tuple[int, ...], tuple[Any, Any]] | None = {} if profile and device.is_cuda else None
         self.clock = time.perf_counter
         """Seconds by which stages are timed on the host."""
@@ -441,10 +452,13 @@ class Scheduler:
         begun = stream.record_event()
         written: dict[str, Any] = {}
         ends: dict[str, Any] = {}
-        for number, (stage, passes) in enumerate(_in_launch_order(part)):
-            own, other = self._stream_at(2 * number), self._stream_at(2 * number + 1)
+        urgent, used = also("priority"), {False: 0, True: 0}
+        for stage, passes in _in_launch_order(part):
+            first = urgent and stage.name in URGENT
+            own, other = self._stream_at(used[first], first), self._stream_at(used[first] + 1, first)
+            used[first] += 2
             own.wait_event(begun)
-            for name in stage.runs_after():
+            for name in () if also("eager") else stage.runs_after():
                 if name in ends:
                     own.wait_event(ends[name])
             awaited = [name for name in stage.wiring.reads if name in written]
@@ -474,10 +488,11 @@ class Scheduler:
             written.update(dict.fromkeys(stage.wiring.writes, done))
             stream.wait_event(done)
 
-    def _stream_at(self, number: int) -> Any:
-        while len(self._streams) <= number:
-            self._streams.append(wp.Stream(self.device))
-        return self._streams[number]
+    def _stream_at(self, number: int, urgent: bool) -> Any:
+        streams = self._streams[urgent]
+        while len(streams) <= number:
+            streams.append(wp.Stream(self.device, priority=-1) if urgent else wp.Stream(self.device))
+        return streams[number]
 
     def _launch_on(self, stream: Any, step: Pass) -> None:
         with wp.ScopedStream(stream, sync_enter=False):
