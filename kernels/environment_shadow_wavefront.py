@@ -32,6 +32,8 @@ from warp_ar.kernels.environment_shadow_cells import (
     cell_column,
     first_of_set,
     ratio_of,
+    tiled_cell,
+    tiled_shape,
 )
 from warp_ar.kernels.environment_shadow_rays import make_aim, make_find_sender, make_masks
 from warp_ar.kernels.launch import MOST_REGISTERS, launch
@@ -40,6 +42,7 @@ from warp_ar.kernels.sampling import pcg3d_hash
 from warp_ar.kernels.shapes import FAR, intersect_sphere, surface_key
 from warp_ar.kernels.structs import FrameParams, Picture, RayScene
 from warp_ar.kernels.trace import make_trace, offset_origin
+from warp_ar.kernels.trial import tried
 from warp_ar.kernels.visibility import make_visible_proxy
 
 wp.set_module_options({"enable_backward": False})
@@ -83,6 +86,7 @@ def make_find_occluded_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
         scene: RayScene,
         distant: DistantLight,
         sets: SampleSets,
+        tiled: wp.int32,
         # Out:
         cells_out: ShadowCells,
         wave_out: Wavefront,
@@ -92,6 +96,12 @@ def make_find_occluded_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
         stride = cells_out.stride
         columns = cells_out.surface.shape[1]
         j = cell_column(thread, columns, side, WARP_LANES)
+        if tiled > 0:
+            cell = tiled_cell(i, thread, side, tiled)
+            i = cell[0]
+            j = cell[1]
+            if i >= cells_out.surface.shape[0] or j >= columns:
+                return
         row = cell_pixel(i, stride, rays.shape[0])
         column = cell_pixel(j, stride, rays.shape[1])
         key = wp.int32(-1)
@@ -172,12 +182,19 @@ def make_sum_light_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
         scene: RayScene,
         distant: DistantLight,
         sets: SampleSets,
+        tiled: wp.int32,
         cells: ShadowCells,
         # Out:
         wave_out: Wavefront,
     ):
         partial, i, thread = wp.tid()
         j = cell_column(thread, cells.surface.shape[1], side, WARP_LANES)
+        if tiled > 0:
+            cell = tiled_cell(i, thread, side, tiled)
+            i = cell[0]
+            j = cell[1]
+            if i >= cells.surface.shape[0] or j >= cells.surface.shape[1]:
+                return
         if not any_occluded(wave_out.occluded, i, j):
             return
         rays = picture.rays
@@ -341,17 +358,26 @@ Given = tuple[wp.array[FrameParams], Picture, RayScene, DistantLight, SampleSets
 """What the kernels read, as ``shade_environment`` has it: params, picture, scene, distant, sets."""
 
 
+def _threads(config: EnvironmentShadowConfig, wave: Wavefront) -> tuple[tuple[int, int, int], int]:
+    """Extent of a launch over partial sums and cells, and its last axis for ``tiled_cell``; 0: cells in a row."""
+    partials, rows, columns = wave.occluded.shape
+    if not tried("tiles"):
+        return (partials, rows, columns), 0
+    down, across = tiled_shape(rows, columns, config.side)
+    return (partials, down, across), across
+
+
 def find_occluded(config: EnvironmentShadowConfig, given: Given, cells_out: ShadowCells, wave: Wavefront) -> None:
     """First pass: what objects hide, and which secondary rays there are. Of the light it reads the samples alone."""
     wave.queue_length.zero_()
-    kernel, size = make_find_occluded_kernel(config), wave.occluded.shape
-    launch(kernel, size, given, [cells_out, wave], device=wave.occluded.device)
+    kernel, (size, tiled) = make_find_occluded_kernel(config), _threads(config, wave)
+    launch(kernel, size, [*given, tiled], [cells_out, wave], device=wave.occluded.device)
 
 
 def sum_light(config: EnvironmentShadowConfig, given: Given, cells: ShadowCells, wave: Wavefront) -> None:
     """Second pass: light of the environment, and how much of it is hidden."""
-    kernel, size = make_sum_light_kernel(config), wave.occluded.shape
-    launch(kernel, size, [*given, cells], [wave], device=wave.occluded.device)
+    kernel, (size, tiled) = make_sum_light_kernel(config), _threads(config, wave)
+    launch(kernel, size, [*given, tiled, cells], [wave], device=wave.occluded.device)
 
 
 def trace_secondary(config: EnvironmentShadowConfig, given: Given, cells: ShadowCells, wave: Wavefront) -> None:

@@ -29,6 +29,8 @@ from warp_ar.kernels import (
 from warp_ar.kernels.environment_shadow_cells import (
     EnvironmentShadowConfig,
     cell_column,
+    tiled_cell,
+    tiled_shape,
 )
 from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
 from warp_ar.kernels.structs import (
@@ -141,6 +143,27 @@ def test_every_column_has_a_thread(device, columns):
         np.testing.assert_array_equal(np.sort(taken), np.arange(columns))
         whole = taken[: columns // (4 * lanes) * 4 * lanes].reshape(-1, lanes)
         assert (whole % 4 == whole[:, :1] % 4).all(), "a warp's cells are of one set"
+
+
+@wp.kernel(enable_backward=False)
+def _tiles_kernel(side: wp.int32, columns: wp.int32, out: wp.array2d[wp.vec2i]):
+    i, thread = wp.tid()
+    out[i, thread] = tiled_cell(i, thread, side, columns)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (17, 33), (135, 240), (16, 32)])
+def test_every_cell_has_a_thread_in_a_tile(device, size):
+    for side in (1, 2, 4):
+        threads = tiled_shape(*size, side)
+        out = wp.zeros(threads, wp.vec2i)
+        wp.launch(_tiles_kernel, threads, [side, threads[1]], [out])
+        taken = out.numpy().reshape(-1, 2)
+        every = np.stack(np.meshgrid(*map(np.arange, threads), indexing="ij"), -1).reshape(-1, 2)
+        np.testing.assert_array_equal(taken[np.lexsort(taken.T[::-1])], every)
+        assert (np.array(threads) >= size).all()
+        warps = taken.reshape(-1, 32, 2)
+        assert (warps % side == warps[:, :1] % side).all(), "a warp's cells are of one set"
+        assert (np.ptp(warps, axis=1) == [3 * side, 7 * side]).all()
 
 
 def test_half_resolution_agrees(device):
