@@ -31,7 +31,7 @@ from warp_ar.kernels.relight import make_direct_lighting
 from warp_ar.kernels.shade import NearPoint, ShadeConfig, make_shade_hit
 from warp_ar.kernels.shadow import tile_turn
 from warp_ar.kernels.shapes import FAR, ROUNDING, intersect_sphere
-from warp_ar.kernels.structs import FrameParams, Light, Probe, RayScene
+from warp_ar.kernels.structs import FrameParams, Light, Picture, Probe, RayScene
 from warp_ar.kernels.trace import TraceConfig, make_trace, offset_origin
 from warp_ar.kernels.trial import tried
 from warp_ar.kernels.visibility import inside_rect, look_within_pixel
@@ -118,14 +118,18 @@ class Change:
 
     first: wp.vec3
     second: wp.vec3
+    shows: wp.vec2  # row and column of the frame at which the shadow is to be looked up; below zero: nowhere
+
+
+@wp.func
+def shadow_change(shadow_ratio: wp.array2d[wp.vec3], at: wp.vec2, shown: wp.vec3) -> wp.vec3:
+    """What shadows of the environment change where a ball shows what the frame shows at a row and column."""
+    return wp.cw_mul(shown, look_up_layer(shadow_ratio, at[0], at[1]) - wp.vec3(1.0, 1.0, 1.0))
 
 
 @functools.cache
 def make_mirrored_change(config: MirrorBallConfig) -> wp.Function:
-    """``mirrored_change(params, scene, lights, distant, receiver, shadow_ratio, pixel, direction, shown) -> Change``.
-
-    Of a sample of the pixel that looks in ``direction``.
-    """
+    """``mirrored_change``: of a sample of the pixel, which looks in ``direction``; if ``later``, without shadow."""
     trace = make_trace(config.trace)
     closest_object, closest_proxy = trace.closest_object, trace.closest_proxy
     reflect_at_ball = make_reflect_at_ball(config)
@@ -144,10 +148,12 @@ def make_mirrored_change(config: MirrorBallConfig) -> wp.Function:
         pixel: wp.vec2i,
         direction: wp.vec3,
         shown: wp.vec3,
+        later: wp.bool,
     ) -> Change:
         i = pixel[0]
         j = pixel[1]
         change = Change()
+        change.shows = wp.vec2(-1.0, -1.0)
         seen = reflect_at_ball(scene, receiver.probes, params[0].camera_position, direction)
         if seen.ball < 0:
             return change
@@ -172,11 +178,12 @@ def make_mirrored_change(config: MirrorBallConfig) -> wp.Function:
         if surface.shape < 0 or wp.dot(surface.geometric_normal, wi) >= 0.0:
             return change
         if wp.static(config.ratio):
-            if shadow_ratio.shape[0] > 0:
+            if later or shadow_ratio.shape[0] > 0:
                 at = find_in_frame(params[0], receiver.picture, scene, receiver.probes, surface)
                 if at[0] >= 0.0:
-                    ratio = look_up_layer(shadow_ratio, at[0], at[1])
-                    change.first = wp.cw_mul(shown, ratio - wp.vec3(1.0, 1.0, 1.0))
+                    change.shows = wp.vec2(at[0], at[1])
+                    if not later:
+                        change.first = shadow_change(shadow_ratio, change.shows, shown)
         if wp.static(config.relight is not None):
             lit = direct_lighting(scene, lights, receiver, surface, i, j, rho, tile_turn(i, j))
             change.second = wp.cw_mul(rho, lit.added)
@@ -206,8 +213,12 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
         share: wp.int32,
         # Out:
         mirrored_out: wp.array2d[wp.vec3],
+        shows_out: wp.array2d[wp.vec2],
     ):
-        """A pixel; or one of its samples, which ``share`` lanes take, one each."""
+        """A pixel; or one of its samples, which ``share`` lanes take, one each.
+
+        With ``shows_out`` of a pixel's one sample, shadows are left to ``shade_mirrored_kernel``.
+        """
         i, j, part = wp.tid()
         pixel = own_pixel(i, j, row_start, params[0].ball_rect, mirrored_out.shape[0], mirrored_out.shape[1])
         i = pixel[0]
@@ -218,18 +229,62 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
         ray = receiver.picture.rays[i, j]
         shown = shown_radiance(receiver.picture, i, j)
         change = wp.vec3(0.0, 0.0, 0.0)
+        later = shows_out.shape[0] > 0
         one = Change()
         for sample in range(part, side * side, share):
             direction = look_within_pixel(params, ray, sample, side)
-            one = mirrored_change(params, scene, lights, distant, receiver, shadow_ratio, pixel, direction, shown)
+            one = mirrored_change(
+                params, scene, lights, distant, receiver, shadow_ratio, pixel, direction, shown, later
+            )
             change += one.first
             change += one.second
         if share > 1:
             change = sum_of_lanes(one.first, one.second, share)
         if part == 0:
             mirrored_out[i, j] = change / wp.float32(side * side)
+            if later:
+                shows_out[i, j] = one.shows
 
     return mirror_ball_kernel
+
+
+@wp.kernel(enable_backward=False)
+def shade_mirrored_kernel(
+    # In:
+    row_start: wp.int32,
+    params: wp.array[FrameParams],
+    picture: Picture,
+    shadow_ratio: wp.array2d[wp.vec3],
+    shows: wp.array2d[wp.vec2],
+    # Out:
+    mirrored_out: wp.array2d[wp.vec3],
+):
+    """Shadows of the environment in a pixel of a ball of which the rest is known."""
+    i, j = wp.tid()
+    pixel = own_pixel(i, j, row_start, params[0].ball_rect, mirrored_out.shape[0], mirrored_out.shape[1])
+    i = pixel[0]
+    j = pixel[1]
+    if inside_rect(i, j, params[0].ball_rect):
+        at = shows[i, j]
+        if at[0] >= 0.0:
+            mirrored_out[i, j] = mirrored_out[i, j] + shadow_change(shadow_ratio, at, shown_radiance(picture, i, j))
+
+
+def shade_mirrored(
+    params: wp.array, picture: Picture, shadow_ratio: wp.array, shows: wp.array, mirrored_out: wp.array
+) -> None:
+    """Add shadows of the environment to what ``mirror_ball`` wrote without them.
+
+    Args:
+        params: As that of ``mirror_ball``, and so are all arguments that are not named here.
+        picture: That of its receiver.
+        shadow_ratio: Likewise.
+        shows: (H, W) vec2 as ``mirror_ball`` writes.
+        mirrored_out: Likewise.
+    """
+    given = [params, picture, shadow_ratio, shows]
+    shape, whole = mirrored_out.shape, {"rows": None, "device": mirrored_out.device, "rectangle_first": True}
+    launch_rows(shade_mirrored_kernel, shape, given, [mirrored_out], **whole)
 
 
 def mirror_ball(
@@ -243,6 +298,7 @@ def mirror_ball(
     mirrored_out: wp.array,
     *,
     samples: int = 1,
+    shows_out: wp.array | None = None,
     rows: Rows | None = None,
 ) -> None:
     """Write what virtual objects change in the picture of mirror balls; zero outside ``params[0].ball_rect``.
@@ -256,6 +312,8 @@ def mirror_ball(
         receiver: From ``make_receiver``; picture and probes are always needed.
         shadow_ratio: (H, W) vec3 of ``environment_shadow``; needed if ``config.ratio``.
         mirrored_out: (H, W) vec3, change of linear radiance in camera values.
+        shows_out: (H, W) vec2, if there is one ray per pixel: the shadows are left to ``shade_mirrored``, and it says
+            where. ``shadow_ratio`` is not read.
         samples: Rays per pixel, spread as ``shade``'s along edges: a square number. A number, not a kernel of its own.
         rows: Band of rows; None means all.
 
@@ -271,7 +329,7 @@ def mirror_ball(
         make_mirror_ball_kernel(config),
         (*rays.shape, share),
         [params, scene, lights, distant, receiver, shadow_ratio, side, share],
-        [mirrored_out],
+        [mirrored_out, shows_out],
         rows=rows,
         device=rays.device,
         rectangle_first=True,
