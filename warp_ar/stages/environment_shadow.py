@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Literal
 
@@ -56,6 +57,9 @@ class Method:
     secondary: float = 1.0
     """Share of the rays that look for it: light that takes rays to find is smooth, and half of them find it."""
 
+
+PARTIALS = "WARP_AR_PARTIALS"
+"""Environment variable, for measuring: threads of a CUDA device for each estimate."""
 
 METHODS: Mapping[str, Method] = {
     "coarse8": Method(32, 4, 8, "estimated"),
@@ -219,6 +223,8 @@ class EnvironmentShadow(Stage):
         """What the kernels are compiled for."""
         method = METHODS[self.method]
         partials = 1 if device.is_cpu else count_partials(*arrays["environment_shadow_ratio"].shape)
+        if not device.is_cpu and PARTIALS in os.environ:
+            partials = int(os.environ[PARTIALS])
         return EnvironmentShadowConfig(
             distant_variant(self.features, device),
             method.count * (sample_slots(self.features) if lists_texels(self.features) else 1),
