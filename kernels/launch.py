@@ -20,7 +20,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_ar.kernels.pixel_order import RECTANGLE_FIRST
+from warp_ar.kernels.pixel_order import RECTANGLE_FIRST, RECTANGLE_ONLY
 from warp_ar.kernels.trial import tried
 
 Rows = tuple[int, int]
@@ -72,6 +72,11 @@ MOST_BLOCKS = 2048
 def most_blocks() -> int:
     """How many those are."""
     return int(os.environ.get("WARP_AR_BLOCKS", MOST_BLOCKS))
+
+
+def clears_first(device: wp.DeviceLike) -> bool:
+    """Whether what a rectangle does not reach is cleared before, while the device has little to do."""
+    return not wp.get_device(device).is_cpu and tried("cleared") and tried("rectangles")
 
 
 MAX_PARTIALS = 8
@@ -170,6 +175,7 @@ def launch_rows(
     device: wp.DeviceLike,
     stream: wp.Stream | None = None,
     rectangle_first: bool = False,
+    alone: bool = False,
 ) -> None:
     """Launch ``kernel`` over ``shape``, restricted to ``rows`` along the first axis.
 
@@ -183,6 +189,7 @@ def launch_rows(
         stream: CUDA stream; None means the device's current one.
         rectangle_first: Whether the kernel takes ``own_pixel``: on CUDA a limited number of blocks does all rows, and
             those of its rectangle first.
+        alone: Whether, where that is so, other pixels need not be written.
     """
     whole = rows is None or tuple(rows) == (0, shape[0])
     limited = rectangle_first and whole and not wp.get_device(device).is_cpu and tried("rectangles")
@@ -191,7 +198,8 @@ def launch_rows(
         start, stop = rows if rows is not None else (0, shape[0])
         if limited:
             given = {"outputs": outputs, "device": device, "stream": stream, "max_blocks": most_blocks()}
-            wp.launch(kernel, dim=tuple(shape), inputs=[RECTANGLE_FIRST, *inputs], **given)
+            code = RECTANGLE_ONLY if alone else RECTANGLE_FIRST
+            wp.launch(kernel, dim=tuple(shape), inputs=[code, *inputs], **given)
         elif stop > start:
             dim = (stop - start, *shape[1:])
             wp.launch(kernel, dim=dim, inputs=[start, *inputs], outputs=outputs, device=device, stream=stream)

@@ -223,6 +223,8 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
         pixel = own_pixel(i, j, row_start, params[0].ball_rect, mirrored_out.shape[0], mirrored_out.shape[1])
         i = pixel[0]
         j = pixel[1]
+        if i < 0:
+            return
         if not inside_rect(i, j, params[0].ball_rect):
             mirrored_out[i, j] = wp.vec3(0.0, 0.0, 0.0)
             return
@@ -264,6 +266,8 @@ def shade_mirrored_kernel(
     pixel = own_pixel(i, j, row_start, params[0].ball_rect, mirrored_out.shape[0], mirrored_out.shape[1])
     i = pixel[0]
     j = pixel[1]
+    if i < 0:
+        return
     if inside_rect(i, j, params[0].ball_rect):
         at = shows[i, j]
         if at[0] >= 0.0:
@@ -283,8 +287,8 @@ def shade_mirrored(
         mirrored_out: Likewise.
     """
     given = [params, picture, shadow_ratio, shows]
-    shape, whole = mirrored_out.shape, {"rows": None, "device": mirrored_out.device, "rectangle_first": True}
-    launch_rows(shade_mirrored_kernel, shape, given, [mirrored_out], **whole)
+    whole = {"rows": None, "device": mirrored_out.device, "rectangle_first": True, "alone": True}
+    launch_rows(shade_mirrored_kernel, mirrored_out.shape, given, [mirrored_out], **whole)
 
 
 def mirror_ball(
@@ -299,6 +303,7 @@ def mirror_ball(
     *,
     samples: int = 1,
     shows_out: wp.array | None = None,
+    cleared: bool = False,
     rows: Rows | None = None,
 ) -> None:
     """Write what virtual objects change in the picture of mirror balls; zero outside ``params[0].ball_rect``.
@@ -314,6 +319,7 @@ def mirror_ball(
         mirrored_out: (H, W) vec3, change of linear radiance in camera values.
         shows_out: (H, W) vec2, if there is one ray per pixel: the shadows are left to ``shade_mirrored``, and it says
             where. ``shadow_ratio`` is not read.
+        cleared: Whether ``mirrored_out`` is zero, so that on CUDA it need not be written outside.
         samples: Rays per pixel, spread as ``shade``'s along edges: a square number. A number, not a kernel of its own.
         rows: Band of rows; None means all.
 
@@ -333,4 +339,5 @@ def mirror_ball(
         rows=rows,
         device=rays.device,
         rectangle_first=True,
+        alone=cleared,
     )

@@ -136,6 +136,8 @@ def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
         pixel = own_pixel(i, j, row_start, params[0].object_rect, objects.shape[0], objects.shape[1])
         i = pixel[0]
         j = pixel[1]
+        if i < 0:
+            return
         if not inside_rect(i, j, params[0].object_rect):
             return
         if visible.objects[i, j] < 0:
@@ -267,6 +269,8 @@ def make_filter_kernel(config: NearFieldConfig) -> wp.Kernel:
         pixel = own_pixel(i, j, row_start, rect, objects.shape[0], objects.shape[1])
         i = pixel[0]
         j = pixel[1]
+        if i < 0:
+            return
         if not inside_rect(i, j, rect):
             return
         hits = visible.hits
@@ -343,6 +347,7 @@ def estimate_near_field(
         rows=rows,
         device=picture.rays.device,
         rectangle_first=True,
+        alone=True,
     )
 
 
@@ -369,4 +374,5 @@ def filter_near_field(
         rows=rows,
         device=visible.objects.device,
         rectangle_first=True,
+        alone=True,
     )

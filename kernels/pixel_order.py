@@ -15,8 +15,8 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-RECTANGLE_FIRST = -1
-"""As a kernel's ``row_start``: all rows, the rectangle first."""
+RECTANGLE_FIRST, RECTANGLE_ONLY = -1, -2
+"""As a kernel's ``row_start``: all rows, the rectangle first; or no pixel but those of its tiles."""
 
 
 @wp.func_native("""
@@ -31,8 +31,10 @@ def on_cuda() -> wp.bool:
 
 
 @wp.func
-def rectangle_first(index: wp.int32, rect: wp.vec4i, height: wp.int32, width: wp.int32) -> wp.vec2i:
+def rectangle_first(index: wp.int32, rect: wp.vec4i, height: wp.int32, width: wp.int32, alone: wp.bool) -> wp.vec2i:
     """Row and column of a frame's pixel by number: the rectangle's first, tile by tile, then those around it.
+
+    If the rectangle is ``alone``, those around it are (-1, -1).
 
     Tiles of 4 rows and 8 columns are aligned with the frame: the rectangle is taken as large as they make it. Where the
     frame cuts one, its rows follow one another. Each pixel has one number below ``height * width``.
@@ -41,9 +43,11 @@ def rectangle_first(index: wp.int32, rect: wp.vec4i, height: wp.int32, width: wp
     left = (wp.clamp(rect[2], 0, width) / 8) * 8
     high = wp.min((wp.clamp(rect[1], 0, height) + 3) / 4 * 4, height) - top
     wide = wp.min((wp.clamp(rect[3], 0, width) + 7) / 8 * 8, width) - left
+    left_over = index - wp.max(high, 0) * wp.max(wide, 0)
+    if alone and left_over >= 0:
+        return wp.vec2i(-1, -1)
     if high <= 0 or wide <= 0:
         return wp.vec2i(index / width, index % width)
-    left_over = index - high * wide
     if left_over < 0:
         if high % 4 != 0 or wide % 8 != 0:
             return wp.vec2i(top + index / wide, left + index % wide)
@@ -66,8 +70,8 @@ def rectangle_first(index: wp.int32, rect: wp.vec4i, height: wp.int32, width: wp
 def own_pixel(
     i: wp.int32, j: wp.int32, row_start: wp.int32, rect: wp.vec4i, height: wp.int32, width: wp.int32
 ) -> wp.vec2i:
-    """Row and column of the pixel of thread (i, j); ``row_start`` is that of ``launch_rows``."""
+    """Row and column of the pixel of thread (i, j), (-1, -1): it has none; ``row_start`` is that of ``launch_rows``."""
     if on_cuda():
         if row_start < 0:
-            return rectangle_first(i * width + j, rect, height, width)
+            return rectangle_first(i * width + j, rect, height, width, row_start == RECTANGLE_ONLY)
     return wp.vec2i(row_start + i, j)

@@ -195,6 +195,8 @@ def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
         pixel = own_pixel(i, j, row_start, params[0].light_rect, added_out.shape[0], added_out.shape[1])
         i = pixel[0]
         j = pixel[1]
+        if i < 0:
+            return
         black = wp.vec3(0.0, 0.0, 0.0)
         added_out[i, j] = black
         if not inside_rect(i, j, params[0].light_rect):
@@ -312,6 +314,8 @@ def make_smooth_edges_kernel(config: RelightConfig, *, left: bool = False) -> wp
         pixel = own_pixel(i, j, row_start, rect, added_out.shape[0], added_out.shape[1])
         i = pixel[0]
         j = pixel[1]
+        if i < 0:
+            return
         if not inside_rect(i, j, rect):
             return
         if not is_edge(visibility, rect, i, j):
@@ -341,6 +345,8 @@ def list_edges_kernel(
     pixel = own_pixel(i, j, row_start, rect, visibility.shape[0], visibility.shape[1])
     i = pixel[0]
     j = pixel[1]
+    if i < 0:
+        return
     if inside_rect(i, j, rect):
         if is_edge(visibility, rect, i, j):
             list_edge(i, j, list_out)
@@ -383,6 +389,7 @@ def relight(
     added_out: wp.array2d[wp.vec3],
     visibility_out: wp.array2d[wp.int32] | None = None,
     *,
+    cleared: bool = False,
     rows: Rows | None = None,
 ) -> None:
     """Write the radiance that virtual lights add to the receiver; zero outside ``params[0].light_rect``.
@@ -398,6 +405,7 @@ def relight(
         added_out: (H, W) linear radiance in camera values.
         visibility_out: (H, W) which surface a pixel sees and which lights do not; needed if ``config.edge_samples`` is
             more than 1. Only what lies in ``light_rect`` is written.
+        cleared: Whether ``added_out`` is zero, so that on CUDA it need not be written outside.
         rows: Band of rows; None means all.
     """
     rays = receiver.picture.rays
@@ -409,6 +417,7 @@ def relight(
         rows=rows,
         device=rays.device,
         rectangle_first=True,
+        alone=cleared,
     )
 
 
@@ -444,7 +453,7 @@ def smooth_edges(
         launch_rows(kernel, shape, [*inputs, visibility, EdgeList()], [added_out], rows=rows, device=device)
         return
     edge_lists.listed.count.zero_()
-    whole = {"rows": None, "device": device, "rectangle_first": True}
+    whole = {"rows": None, "device": device, "rectangle_first": True, "alone": True}
     launch_rows(list_edges_kernel, shape, [params, visibility], [edge_lists.listed], **whole)
     kernel = make_smooth_edges_kernel(config, left=True)
     launch_rows(kernel, shape, [*inputs, visibility, edge_lists.listed], [added_out], **whole)

@@ -15,14 +15,14 @@ LANES = 32
 
 
 @wp.kernel(enable_backward=False)
-def _number_kernel(rect: wp.vec4i, height: wp.int32, width: wp.int32, out: wp.array[wp.vec2i]):
+def _number_kernel(rect: wp.vec4i, height: wp.int32, width: wp.int32, alone: wp.int32, out: wp.array[wp.vec2i]):
     index = wp.tid()
-    out[index] = rectangle_first(index, rect, height, width)
+    out[index] = rectangle_first(index, rect, height, width, alone != 0)
 
 
-def numbered(rect, height, width, device):
+def numbered(rect, height, width, device, alone=False):
     out = wp.empty(height * width, dtype=wp.vec2i, device=device)
-    wp.launch(_number_kernel, height * width, [wp.vec4i(*rect), height, width], [out], device=device)
+    wp.launch(_number_kernel, height * width, [wp.vec4i(*rect), height, width, int(alone)], [out], device=device)
     return out.numpy()
 
 
@@ -45,7 +45,14 @@ def test_each_pixel_has_one_number(height, width, rect):
     inside = (row >= rect[0]) & (row < rect[1]) & (column >= rect[2]) & (column < rect[3])
     if inside.any():
         down, across = np.ptp(row[inside]) + 1, np.ptp(column[inside]) + 1
-        assert np.flatnonzero(inside)[-1] < (down + 6) * (across + 14)
+        last = np.flatnonzero(inside)[-1]
+        assert last < (down + 6) * (across + 14)
+    # Alone, they have the same numbers, and the others none.
+    alone = numbered(rect, height, width, "cpu", alone=True)
+    counted = alone[:, 0] >= 0
+    np.testing.assert_array_equal(alone[counted], found[: counted.sum()])
+    np.testing.assert_array_equal(alone[~counted], -1)
+    assert not inside[counted.sum() :].any()
 
 
 def test_a_warp_has_a_tile(device):

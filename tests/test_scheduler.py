@@ -466,4 +466,8 @@ def test_stages_do_not_wait_for_what_leaves_the_device_idle(monkeypatch: pytest.
     assert launch_order(monkeypatch, ("b",), b=[{}, idle, idle])["d0"] == {"a0", "b0", "c0"}
     assert launch_order(monkeypatch, ("b",), b=[{}, {"beside_last": True}, idle])["d0"] == {"a0", "b0", "b1", "c0"}
     assert launch_order(monkeypatch, ("b",), b=[{}, idle, busy])["d0"] == {"a0", "b2", "c0"}
+    early = launch_order(monkeypatch, ("b",), d=[{"reads": ("c",)}, {}])
+    assert (early["d0"], early["d1"]) == ({"c0"}, {"a0", "b0", "d0"}), (
+        "what says itself what it reads waits for no more"
+    )
     assert launch_order(monkeypatch, ("c",), c=[{}, idle])["d0"] == {"a0", "c0", "c1"}, "what it reads is waited for"

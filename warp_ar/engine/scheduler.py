@@ -458,9 +458,7 @@ class Scheduler:
             own, other = self._stream_at(used[first], first), self._stream_at(used[first] + 1, first)
             used[first] += 2
             own.wait_event(begun)
-            for name in () if also("eager") else stage.runs_after():
-                if name in ends:
-                    own.wait_event(ends[name])
+            behind = [] if also("eager") else [ends[name] for name in stage.runs_after() if name in ends]
             awaited = [name for name in stage.wiring.reads if name in written]
             before, beside = begun, None
             for step in passes:
@@ -471,7 +469,10 @@ class Scheduler:
                     continue
                 if beside is not None:
                     own.wait_event(beside)
-                reads = step.reads if step.reads is not None and tried("passes") else stage.wiring.reads
+                early = step.reads is not None and tried("passes")
+                while behind and not early:
+                    own.wait_event(behind.pop())
+                reads = (step.reads or ()) if early else stage.wiring.reads
                 for name in [name for name in awaited if name in reads]:
                     own.wait_event(written[name])
                     awaited.remove(name)
