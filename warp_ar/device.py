@@ -77,25 +77,6 @@ def capturing() -> Iterator[None]:
             now.changed.notify_all()
 
 
-def waited_event(device: Any, *, timing: bool = False) -> Any:
-    """An event of a CUDA device for ``wait_for``: a thread that waits for it sleeps.
-
-    Left alone a thread looks for it again and again, at the cost of a core. Warp makes no such events; where its own
-    call to make them is not to be found, the event is a plain one.
-    """
-    make = getattr(getattr(getattr(wp, "_src", None), "context", None), "runtime", None)
-    make = getattr(getattr(make, "core", None), "wp_cuda_event_create", None)
-    flags = getattr(wp.Event, "Flags", None)
-    if make is None or flags is None or "blocking" in os.environ.get("WARP_AR_WITHOUT", ""):
-        return wp.Event(device, enable_timing=timing)
-    made = make(device.context, flags.BLOCKING_SYNC | (flags.DEFAULT if timing else flags.DISABLE_TIMING))
-    if not made:
-        return wp.Event(device, enable_timing=timing)
-    event = wp.Event(device, cuda_event=made, enable_timing=timing)
-    event.owner = True  # it goes with the object
-    return event
-
-
 def wait_for(event: Any) -> None:
     """Wait until an event that has been recorded has come to pass on its CUDA device."""
     now = _CAPTURES

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_ar.device import wait_for, waited_event
+from warp_ar.device import wait_for
 from warp_ar.kernels.structs import FrameParams, Light, Shape
 
 _ALIGNMENT = 16
@@ -46,7 +46,7 @@ class FrameBlock:
         self._pinned: list[tuple[Any, Any, Any]] = []
         if not device.is_cpu:
             buffers = [wp.zeros(size, dtype=wp.uint8, device="cpu", pinned=True) for _ in range(_SLOTS)]
-            self._pinned = [(buffer, buffer.numpy(), waited_event(device)) for buffer in buffers]
+            self._pinned = [(buffer, buffer.numpy(), wp.Event(device)) for buffer in buffers]
             self._stream = wp.get_stream(device)
         self._uploads = 0
         self._bytes = self._device_buffer.numpy() if device.is_cpu else np.zeros(size, np.uint8)

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_ar.device import exclusive, wait_for, waited_event
+from warp_ar.device import exclusive, wait_for
 
 Image = npt.NDArray[np.uint8]
 
@@ -46,8 +46,7 @@ class Marks:
 
     def __init__(self, device: Any) -> None:
         self.frame = -1
-        self.sent, self.started = (wp.Event(device, enable_timing=True) for _ in range(2))
-        self.arrived = waited_event(device, timing=True)
+        self.sent, self.arrived, self.started = (wp.Event(device, enable_timing=True) for _ in range(3))
 
 
 class Slot:
@@ -72,7 +71,7 @@ class Buffer:
     def __init__(self, shape: tuple[int, int], device: Any, *, pinned: bool) -> None:
         self.array = wp.empty(shape, dtype=wp.vec3ub, device="cpu", pinned=pinned)
         self.host = self.array.numpy()
-        self.rendered, self.done = wp.Event(device, enable_timing=True), waited_event(device, timing=True)
+        self.rendered, self.done = (wp.Event(device, enable_timing=True) for _ in range(2))
 
 
 class _Holder:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy.typing as npt
 import warp as wp
 
-from warp_ar.device import wait_for, waited_event
+from warp_ar.device import wait_for
 
 
 class HostCopies:
@@ -33,7 +33,7 @@ class HostCopies:
                 name: wp.zeros(array.shape, dtype=array.dtype, device="cpu", pinned=True)
                 for name, array in arrays.items()
             }
-            self._done, self._begun = waited_event(device), wp.Event(device)
+            self._done, self._begun = wp.Event(device), wp.Event(device)
             self._used = False
         self._views: dict[str, npt.NDArray[Any]] = {name: host.numpy() for name, host in self._hosts.items()}
 
