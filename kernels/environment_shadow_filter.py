@@ -39,7 +39,7 @@ NOISE = wp.constant(wp.float32(1.0))
 """The same, in standard errors of the narrow mean."""
 NEGLIGIBLE = wp.constant(wp.float32(1.0 / 512.0))
 """Change of the environment that no 8-bit picture shows: a quarter of a code at most, taken for none."""
-LEAST_APART = 4
+LEAST_APART = 10
 """Pixels along a cell from which those between surfaces have a kernel of their own on CUDA."""
 CPU_RUN = 32
 """Pixels of a row that one thread of a CPU does: it looks once whether any of them can be shaded."""

@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import math
 import os
 import threading
 import weakref
@@ -65,8 +66,10 @@ def is_slow_to_compile(kernel: wp.Kernel) -> bool:
     return kernel in _SLOW
 
 
-MOST_BLOCKS = 2048
-"""Blocks of 256 threads with which a CUDA device does all pixels of a frame, where most of them are soon done."""
+BLOCK = 256
+"""Threads of a block, where nothing else is said."""
+MOST_BLOCKS = 4096
+"""Blocks of ``BLOCK`` threads with which a CUDA device does all pixels of a frame, where most of them are soon done."""
 
 
 def most_blocks() -> int:
@@ -192,7 +195,8 @@ def launch_rows(
         alone: Whether, where that is so, other pixels need not be written.
     """
     whole = rows is None or tuple(rows) == (0, shape[0])
-    limited = rectangle_first and whole and not wp.get_device(device).is_cpu and tried("rectangles")
+    many = math.prod(shape) > BLOCK * most_blocks()
+    limited = rectangle_first and whole and many and not wp.get_device(device).is_cpu and tried("rectangles")
 
     def do() -> None:
         start, stop = rows if rows is not None else (0, shape[0])

@@ -452,7 +452,7 @@ class Scheduler:
         begun = stream.record_event()
         written: dict[str, Any] = {}
         ends: dict[str, Any] = {}
-        urgent, used = also("priority"), {False: 0, True: 0}
+        urgent, used = tried("priority"), {False: 0, True: 0}
         for stage, passes in _in_launch_order(part):
             first = urgent and stage.name in URGENT
             own, other = self._stream_at(used[first], first), self._stream_at(used[first] + 1, first)
