@@ -263,8 +263,7 @@ def _light_clip(options: argparse.Namespace, loaded: Callable[[], None]) -> int:
     # Here, for they load Warp: the page is to be there before, and what is wrong with a scene is told before.
     with importing():
         hurry_compilers(options.device)
-        if options.samples is not None:  # else nothing traces paths
-            from warp_ar.accuracy.traced_frames import TracedFrames
+        from warp_ar.accuracy.traced_frames import TracedFrames
         from warp_ar.output.report import RunLog
 
     side, outputs, replaced = _open_side_files(options)
