@@ -33,6 +33,36 @@ def warp_sum(value: wp.vec4) -> wp.vec4:
     """Sum over the warp's lanes, known to all of them, the same in all bits."""
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const unsigned int lanes = ((1u << share) - 1u) << ((threadIdx.x & 31) / share * share);
+    for (int reach = share / 2; reach > 0; reach /= 2)
+        for (int k = 0; k < 4; ++k) value[k] += __shfl_xor_sync(lanes, value[k], reach);
+#endif
+    return value;
+""")
+def sum_beside(value: wp.vec4, share: wp.int32) -> wp.vec4:
+    """Sum over so many lanes beside each other, a power of 2 below 32, known to all of them."""
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const unsigned int first = (threadIdx.x & 31) / share * share;
+    const unsigned int mask = (share == 32 ? 0xffffffffu : (1u << share) - 1u) << first;
+    wp::vec_t<3, float> total(0.0f);
+    for (int lane = 0; lane < share; ++lane) {
+        for (int k = 0; k < 3; ++k) total[k] += __shfl_sync(mask, own[k], first + lane);
+        for (int k = 0; k < 3; ++k) total[k] += __shfl_sync(mask, more[k], first + lane);
+    }
+    return total;
+#else
+    return add(own, more);
+#endif
+""")
+def sum_of_lanes(own: wp.vec3, more: wp.vec3, share: wp.int32) -> wp.vec3:
+    """Sum over so many lanes beside each other of both, in their order; ``share`` is a power of 2, 32 at most."""
+
+
 # A team is the block, or several blocks of one cluster where the device has them (from compute capability 9.0 on):
 # their sums go into each other's shared memory. Where they go is another place every other time, so that a block which
 # is ahead does not overwrite what one that is behind still reads.

@@ -203,7 +203,7 @@ def shade_environment(
         rows: Band of rows of the cells; None means all.
     """
     if wave is not None:
-        shade_wavefront(config, params, picture, scene, distant, sets, cells_out, wave)
+        shade_wavefront(config, (params, picture, scene, distant, sets), cells_out, wave)
         return
     device = picture.rays.device
     lanes = 1 if device.is_cpu else WARP_LANES

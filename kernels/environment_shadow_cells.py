@@ -26,6 +26,8 @@ CHUNK = wp.constant(64)
 """Samples that are culled together: the bits of a mask."""
 WARP_LANES = 32
 """Threads of a CUDA device that go the same way or wait for each other."""
+TILE_ROWS, TILE_COLUMNS = 4, 8
+"""Cells of a warp, where it takes a square of the frame."""
 MIN_IRRADIANCE = wp.constant(wp.float32(1.0e-6))
 """Irradiance, in camera values, below which a surface is dark and a shadow on it means nothing."""
 MAX_RATIO = wp.constant(wp.float32(4.0))
@@ -111,6 +113,28 @@ def cell_column(thread: wp.int32, columns: wp.int32, side: wp.int32, lanes: wp.i
     if thread - place + group > columns:
         return thread
     return thread - place + (place % lanes) * side + place / lanes
+
+
+@wp.func
+def tiled_cell(i: wp.int32, thread: wp.int32, side: wp.int32, columns: wp.int32) -> wp.vec2i:
+    """Row and column of the cell of a thread, of those that ``tiled_shape`` asks for; ``columns`` is its second.
+
+    A warp takes cells of one set, so that their rays go the same way, from a square of the frame, so that they meet the
+    same or nothing: TILE_ROWS x TILE_COLUMNS of them, ``side`` apart. The warps that follow take the other sets there.
+    """
+    number = i * columns + thread
+    lane = number % WARP_LANES
+    one_of = number / WARP_LANES % (side * side)
+    tile = number / (WARP_LANES * side * side)
+    across = columns / (TILE_COLUMNS * side)
+    row = (tile / across * TILE_ROWS + lane / TILE_COLUMNS) * side + one_of / side
+    return wp.vec2i(row, (tile % across * TILE_COLUMNS + lane % TILE_COLUMNS) * side + one_of % side)
+
+
+def tiled_shape(rows: int, columns: int, side: int) -> tuple[int, int]:
+    """Rows and columns of threads with which ``tiled_cell`` reaches all cells, and some beyond."""
+    down, across = side * int(TILE_ROWS), side * int(TILE_COLUMNS)
+    return -(-rows // down) * down, -(-columns // across) * across
 
 
 @wp.func

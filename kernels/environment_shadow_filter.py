@@ -18,14 +18,17 @@ import warp as wp
 
 from warp_ar.kernels.environment_shadow_cells import (
     SHADED_TILE,
+    WARP_LANES,
     EnvironmentShadowConfig,
     ShadowCells,
     any_shaded,
 )
-from warp_ar.kernels.launch import MOST_REGISTERS, QUICK_TO_COMPILE, Rows, launch_rows
+from warp_ar.kernels.launch import MOST_REGISTERS, QUICK_TO_COMPILE, Rows, launch, launch_rows
+from warp_ar.kernels.pixel_order import own_pixel
 from warp_ar.kernels.reflect import DistantLightConfig
 from warp_ar.kernels.shapes import FACES, MESH_KEY, surface_key
 from warp_ar.kernels.structs import FrameParams, Probe, RayScene
+from warp_ar.kernels.trial import tried
 from warp_ar.kernels.visibility import inside_rect, make_visible_proxy
 
 wp.set_module_options({"enable_backward": False})
@@ -36,6 +39,8 @@ NOISE = wp.constant(wp.float32(1.0))
 """The same, in standard errors of the narrow mean."""
 NEGLIGIBLE = wp.constant(wp.float32(1.0 / 512.0))
 """Change of the environment that no 8-bit picture shows: a quarter of a code at most, taken for none."""
+LEAST_APART = 10
+"""Pixels along a cell from which those between surfaces have a kernel of their own on CUDA."""
 CPU_RUN = 32
 """Pixels of a row that one thread of a CPU does: it looks once whether any of them can be shaded."""
 DEPTH_STEP = wp.constant(wp.float32(0.03))
@@ -133,6 +138,47 @@ def make_filter_ratio_kernel(side: int) -> wp.Kernel:
     return filter_ratio_kernel
 
 
+@wp.func
+def between_surfaces(surface: wp.array2d[wp.int32], row: wp.int32, column: wp.int32) -> wp.vec2i:
+    """The surface of the first of four cells, and 1 where another is on another."""
+    key = surface[wp.clamp(row, 0, surface.shape[0] - 1), wp.clamp(column, 0, surface.shape[1] - 1)]
+    mixed = wp.bool(False)
+    for corner in range(1, 4):
+        ni = wp.clamp(row + corner / 2, 0, surface.shape[0] - 1)
+        nj = wp.clamp(column + corner % 2, 0, surface.shape[1] - 1)
+        mixed = mixed or surface[ni, nj] != key
+    return wp.vec2i(key, wp.where(mixed, 1, 0))
+
+
+@wp.func
+def ratio_between(cells: ShadowCells, key: wp.int32, y: wp.float32, x: wp.float32) -> wp.vec3:
+    """From cells to a pixel between them: bilinear among those on its surface."""
+    filtered = cells.filtered
+    surface = cells.surface
+    row = wp.int32(wp.floor(y))
+    column = wp.int32(wp.floor(x))
+    total = wp.vec3(0.0)
+    weights = float(0.0)
+    for corner in range(4):
+        ni = wp.clamp(row + corner / 2, 0, surface.shape[0] - 1)
+        nj = wp.clamp(column + corner % 2, 0, surface.shape[1] - 1)
+        weight = 1.0 - wp.abs(y - wp.float32(row + corner / 2))
+        weight *= 1.0 - wp.abs(x - wp.float32(column + corner % 2))
+        if weight > 0.0 and surface[ni, nj] == key:
+            total += weight * filtered[ni, nj]
+            weights += weight
+    if weights == 0.0:
+        # None of the four is on this surface: those around them.
+        for a in range(wp.max(row - 1, 0), wp.min(row + 3, surface.shape[0])):
+            for b in range(wp.max(column - 1, 0), wp.min(column + 3, surface.shape[1])):
+                if surface[a, b] == key:
+                    total += filtered[a, b]
+                    weights += 1.0
+    if weights > 0.0:
+        return total / weights
+    return wp.vec3(1.0, 1.0, 1.0)
+
+
 @functools.cache
 def make_spread_ratio_kernel(config: DistantLightConfig) -> wp.Kernel:
     """Kernel of ``spread_ratio``, specialised to ``config``."""
@@ -153,16 +199,19 @@ def make_spread_ratio_kernel(config: DistantLightConfig) -> wp.Kernel:
         # Out:
         shadow_ratio_out: wp.array2d[wp.vec3],
     ):
-        """From cells to pixels: bilinear among the cells on the pixel's surface."""
+        """A run of pixels of one row; those between surfaces look for their own."""
         i, place = wp.tid()
-        i += row_start
-        filtered = cells.filtered
-        surface = cells.surface
+        rect = params[0].shadow_rect
+        begin = place * run
+        if run == 1:
+            pixel = own_pixel(i, place, row_start, rect, shadow_ratio_out.shape[0], shadow_ratio_out.shape[1])
+            i = pixel[0]
+            begin = pixel[1]
+        else:
+            i += row_start
         changed = cells.changed
         stride = cells.stride
-        begin = place * run
         stop = wp.min(begin + run, shadow_ratio_out.shape[1])
-        rect = params[0].shadow_rect
         # Cell c was estimated at pixel c * stride + stride / 2.
         y = wp.float32(i - stride / 2) / wp.float32(stride)
         row = wp.int32(wp.floor(y))
@@ -175,41 +224,92 @@ def make_spread_ratio_kernel(config: DistantLightConfig) -> wp.Kernel:
             value = wp.vec3(1.0, 1.0, 1.0)
             if touched and inside_rect(i, j, rect):
                 x = wp.float32(j - stride / 2) / wp.float32(stride)
-                column = wp.int32(wp.floor(x))
-                key = surface[wp.clamp(row, 0, surface.shape[0] - 1), wp.clamp(column, 0, surface.shape[1] - 1)]
-                mixed = wp.bool(False)
-                for corner in range(1, 4):
-                    ni = wp.clamp(row + corner / 2, 0, surface.shape[0] - 1)
-                    nj = wp.clamp(column + corner % 2, 0, surface.shape[1] - 1)
-                    mixed = mixed or surface[ni, nj] != key
-                if mixed:
+                found = between_surfaces(cells.surface, row, wp.int32(wp.floor(x)))
+                key = found[0]
+                if found[1] != 0:
                     hit = visible_proxy(params[0], rays[i, j], scene, probes)
                     key = wp.int32(-1)
                     if hit.shape >= 0:
                         key = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
                 if key >= 0:
-                    total = wp.vec3(0.0)
-                    weights = float(0.0)
-                    for corner in range(4):
-                        ni = wp.clamp(row + corner / 2, 0, surface.shape[0] - 1)
-                        nj = wp.clamp(column + corner % 2, 0, surface.shape[1] - 1)
-                        weight = 1.0 - wp.abs(y - wp.float32(row + corner / 2))
-                        weight *= 1.0 - wp.abs(x - wp.float32(column + corner % 2))
-                        if weight > 0.0 and surface[ni, nj] == key:
-                            total += weight * filtered[ni, nj]
-                            weights += weight
-                    if weights == 0.0:
-                        # None of the four is on this surface: those around them.
-                        for a in range(wp.max(row - 1, 0), wp.min(row + 3, surface.shape[0])):
-                            for b in range(wp.max(column - 1, 0), wp.min(column + 3, surface.shape[1])):
-                                if surface[a, b] == key:
-                                    total += filtered[a, b]
-                                    weights += 1.0
-                    if weights > 0.0:
-                        value = total / weights
+                    value = ratio_between(cells, key, y, x)
             shadow_ratio_out[i, j] = value
 
     return spread_ratio_kernel
+
+
+@wp.kernel(enable_backward=False)
+def spread_even_kernel(
+    # In:
+    row_start: wp.int32,
+    params: wp.array[FrameParams],
+    cells: ShadowCells,
+    # Out:
+    shadow_ratio_out: wp.array2d[wp.vec3],
+):
+    """A pixel, unless cells of several surfaces surround it."""
+    i, j = wp.tid()
+    rect = params[0].shadow_rect
+    pixel = own_pixel(i, j, row_start, rect, shadow_ratio_out.shape[0], shadow_ratio_out.shape[1])
+    i = pixel[0]
+    j = pixel[1]
+    stride = cells.stride
+    value = wp.vec3(1.0, 1.0, 1.0)
+    if inside_rect(i, j, rect):
+        y = wp.float32(i - stride / 2) / wp.float32(stride)
+        x = wp.float32(j - stride / 2) / wp.float32(stride)
+        found = between_surfaces(cells.surface, wp.int32(wp.floor(y)), wp.int32(wp.floor(x)))
+        if found[1] != 0:
+            return
+        if found[0] >= 0:
+            value = ratio_between(cells, found[0], y, x)
+    shadow_ratio_out[i, j] = value
+
+
+@functools.cache
+def make_spread_mixed_kernel(config: DistantLightConfig) -> wp.Kernel:
+    """Kernel for the pixels that ``spread_even_kernel`` leaves, specialised to ``config``."""
+    visible_proxy = make_visible_proxy(config.trace, config.probes)
+
+    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
+    def spread_mixed_kernel(
+        # In:
+        params: wp.array[FrameParams],
+        rays: wp.array2d[wp.vec2],
+        scene: RayScene,
+        probes: wp.array[Probe],
+        cells: ShadowCells,
+        across: wp.int32,
+        # Out:
+        shadow_ratio_out: wp.array2d[wp.vec3],
+    ):
+        """The pixels between four cells, if those are on several surfaces: a warp's threads take them in turn."""
+        index = wp.tid()
+        lane = index % WARP_LANES
+        row = (index / WARP_LANES) / across - 1
+        column = (index / WARP_LANES) % across - 1
+        stride = cells.stride
+        if between_surfaces(cells.surface, row, column)[1] == 0:
+            return
+        rect = params[0].shadow_rect
+        pixel = lane
+        while pixel < stride * stride:
+            i = row * stride + stride / 2 + pixel / stride
+            j = column * stride + stride / 2 + pixel % stride
+            pixel += WARP_LANES
+            inside = i >= 0 and j >= 0 and i < shadow_ratio_out.shape[0] and j < shadow_ratio_out.shape[1]
+            if inside and inside_rect(i, j, rect):
+                value = wp.vec3(1.0, 1.0, 1.0)
+                hit = visible_proxy(params[0], rays[i, j], scene, probes)
+                if hit.shape >= 0:
+                    key = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
+                    if key >= 0:
+                        y = wp.float32(i - stride / 2) / wp.float32(stride)
+                        x = wp.float32(j - stride / 2) / wp.float32(stride)
+                        value = ratio_between(cells, key, y, x)
+                shadow_ratio_out[i, j] = value
+
+    return spread_mixed_kernel
 
 
 def filter_ratio(
@@ -254,15 +354,38 @@ def spread_ratio(
         probes: Mirror balls; needed if ``config.distant.probes``.
         cells: From ``filter_ratio``. Without changed, every pixel is looked at.
         shadow_ratio_out: (H, W) factor on the frame; 1 outside the rectangle and where no proxy is seen.
-        rows: Band of rows; None means all.
+        rows: Band of rows; None means all. On CUDA, where cells are large, all are done in any case.
     """
     height, width = shadow_ratio_out.shape
-    run = CPU_RUN if rays.device.is_cpu else 1
+    device = rays.device
+    if spreads_apart(int(cells.stride), device):
+        whole = {"rows": None, "device": device, "rectangle_first": True}
+        launch_rows(spread_even_kernel, (height, width), [params, cells], [shadow_ratio_out], **whole)
+        down, across = (_last_cell(size, int(cells.stride)) + 2 for size in (height, width))
+        given = [params, rays, scene, probes, cells, across]
+        threads = down * across * WARP_LANES
+        launch(make_spread_mixed_kernel(config.distant), threads, given, [shadow_ratio_out], device=device)
+        return
+    run = CPU_RUN if device.is_cpu else 1
     launch_rows(
         make_spread_ratio_kernel(config.distant),
         (height, -(-width // run)),
         [params, rays, scene, probes, cells, run],
         [shadow_ratio_out],
         rows=rows,
-        device=rays.device,
+        device=device,
+        rectangle_first=run == 1,
     )
+
+
+def spreads_apart(stride: int, device: wp.DeviceLike) -> bool:
+    """Whether pixels between surfaces are left to a kernel of their own.
+
+    On CUDA, where a warp would wait for their rays, and all other pixels would have fewer registers for them.
+    """
+    return not wp.get_device(device).is_cpu and stride >= LEAST_APART and tried("apart")
+
+
+def _last_cell(size: int, stride: int) -> int:
+    """The last cell that is estimated at or before the last of so many rows; -1: all are before the first."""
+    return (size - 1 - stride // 2) // stride

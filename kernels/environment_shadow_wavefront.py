@@ -32,6 +32,8 @@ from warp_ar.kernels.environment_shadow_cells import (
     cell_column,
     first_of_set,
     ratio_of,
+    tiled_cell,
+    tiled_shape,
 )
 from warp_ar.kernels.environment_shadow_rays import make_aim, make_find_sender, make_masks
 from warp_ar.kernels.launch import MOST_REGISTERS, launch
@@ -40,6 +42,7 @@ from warp_ar.kernels.sampling import pcg3d_hash
 from warp_ar.kernels.shapes import FAR, intersect_sphere, surface_key
 from warp_ar.kernels.structs import FrameParams, Picture, RayScene
 from warp_ar.kernels.trace import make_trace, offset_origin
+from warp_ar.kernels.trial import tried
 from warp_ar.kernels.visibility import make_visible_proxy
 
 wp.set_module_options({"enable_backward": False})
@@ -83,6 +86,7 @@ def make_find_occluded_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
         scene: RayScene,
         distant: DistantLight,
         sets: SampleSets,
+        tiled: wp.int32,
         # Out:
         cells_out: ShadowCells,
         wave_out: Wavefront,
@@ -92,6 +96,12 @@ def make_find_occluded_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
         stride = cells_out.stride
         columns = cells_out.surface.shape[1]
         j = cell_column(thread, columns, side, WARP_LANES)
+        if tiled > 0:
+            cell = tiled_cell(i, thread, side, tiled)
+            i = cell[0]
+            j = cell[1]
+            if i >= cells_out.surface.shape[0] or j >= columns:
+                return
         row = cell_pixel(i, stride, rays.shape[0])
         column = cell_pixel(j, stride, rays.shape[1])
         key = wp.int32(-1)
@@ -172,12 +182,19 @@ def make_sum_light_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
         scene: RayScene,
         distant: DistantLight,
         sets: SampleSets,
+        tiled: wp.int32,
         cells: ShadowCells,
         # Out:
         wave_out: Wavefront,
     ):
         partial, i, thread = wp.tid()
         j = cell_column(thread, cells.surface.shape[1], side, WARP_LANES)
+        if tiled > 0:
+            cell = tiled_cell(i, thread, side, tiled)
+            i = cell[0]
+            j = cell[1]
+            if i >= cells.surface.shape[0] or j >= cells.surface.shape[1]:
+                return
         if not any_occluded(wave_out.occluded, i, j):
             return
         rays = picture.rays
@@ -337,24 +354,46 @@ def make_wavefront(config: EnvironmentShadowConfig, rows: int, columns: int, dev
     return wave
 
 
-def shade_wavefront(
-    config: EnvironmentShadowConfig,
-    params: wp.array[FrameParams],
-    picture: Picture,
-    scene: RayScene,
-    distant: DistantLight,
-    sets: SampleSets,
-    cells_out: ShadowCells,
-    wave: Wavefront,
-) -> None:
-    """Estimate all cells; arguments as those of ``shade_environment``, and the scratch of ``make_wavefront``."""
-    device = picture.rays.device
-    inputs = [params, picture, scene, distant, sets]
-    threads = min(wave.queue.shape[0], QUEUE_THREADS)
-    size = wave.occluded.shape
+Given = tuple[wp.array[FrameParams], Picture, RayScene, DistantLight, SampleSets]
+"""What the kernels read, as ``shade_environment`` has it: params, picture, scene, distant, sets."""
+
+
+def _threads(config: EnvironmentShadowConfig, wave: Wavefront) -> tuple[tuple[int, int, int], int]:
+    """Extent of a launch over partial sums and cells, and its last axis for ``tiled_cell``; 0: cells in a row."""
+    partials, rows, columns = wave.occluded.shape
+    if not tried("tiles"):
+        return (partials, rows, columns), 0
+    down, across = tiled_shape(rows, columns, config.side)
+    return (partials, down, across), across
+
+
+def find_occluded(config: EnvironmentShadowConfig, given: Given, cells_out: ShadowCells, wave: Wavefront) -> None:
+    """First pass: what objects hide, and which secondary rays there are. Of the light it reads the samples alone."""
     wave.queue_length.zero_()
-    launch(make_find_occluded_kernel(config), size, inputs, [cells_out, wave], device=device)
-    launch(make_sum_light_kernel(config), size, [*inputs, cells_out], [wave], device=device)
-    secondary = [*inputs, cells_out, threads]
-    launch(make_trace_secondary_kernel(config), threads, secondary, [wave], device=device)
-    launch(make_reduce_partials_kernel(config), size[1:], [params, wave], [cells_out], device=device)
+    kernel, (size, tiled) = make_find_occluded_kernel(config), _threads(config, wave)
+    launch(kernel, size, [*given, tiled], [cells_out, wave], device=wave.occluded.device)
+
+
+def sum_light(config: EnvironmentShadowConfig, given: Given, cells: ShadowCells, wave: Wavefront) -> None:
+    """Second pass: light of the environment, and how much of it is hidden."""
+    kernel, (size, tiled) = make_sum_light_kernel(config), _threads(config, wave)
+    launch(kernel, size, [*given, tiled, cells], [wave], device=wave.occluded.device)
+
+
+def trace_secondary(config: EnvironmentShadowConfig, given: Given, cells: ShadowCells, wave: Wavefront) -> None:
+    """Third pass: what objects send. It reads nothing that the second writes."""
+    threads = min(wave.queue.shape[0], QUEUE_THREADS)
+    kernel = make_trace_secondary_kernel(config)
+    launch(kernel, threads, [*given, cells, threads], [wave], device=wave.occluded.device)
+
+
+def reduce_partials(config: EnvironmentShadowConfig, given: Given, cells_out: ShadowCells, wave: Wavefront) -> None:
+    """Last pass: the estimates."""
+    kernel, size = make_reduce_partials_kernel(config), wave.occluded.shape[1:]
+    launch(kernel, size, [given[0], wave], [cells_out], device=wave.occluded.device)
+
+
+def shade_wavefront(config: EnvironmentShadowConfig, given: Given, cells_out: ShadowCells, wave: Wavefront) -> None:
+    """Estimate all cells, pass after pass, with the scratch of ``make_wavefront``."""
+    for one in (find_occluded, sum_light, trace_secondary, reduce_partials):
+        one(config, given, cells_out, wave)

@@ -18,6 +18,7 @@ from typing import Any
 
 import warp as wp
 
+from warp_ar.kernels.fill_frame import with_seen
 from warp_ar.kernels.guards import smooth_ramp, usable_confidence
 from warp_ar.kernels.latlong import PI, beside_in_row
 from warp_ar.kernels.launch import Rows, launch_rows, launch_tiles, wait_for_block
@@ -57,6 +58,7 @@ def seed_fill_kernel(
     row_start: wp.int32,
     radiance: wp.array2d[wp.vec3],
     confidence: wp.array2d[wp.float32],
+    seen: wp.array2d[wp.vec4],
     # Out:
     levels_out: wp.array[wp.vec4],  # radiance and trust
 ):
@@ -67,9 +69,10 @@ def seed_fill_kernel(
     trust = smooth_ramp(0.0, FULL_TRUST, usable_confidence(value, confidence[i, j]))
     if trust == 0.0:
         value = wp.vec3(0.0, 0.0, 0.0)
-    levels_out[i * radiance.shape[1] + j] = wp.vec4(
-        wp.max(value[0], 0.0), wp.max(value[1], 0.0), wp.max(value[2], 0.0), trust
-    )
+    level = wp.vec4(wp.max(value[0], 0.0), wp.max(value[1], 0.0), wp.max(value[2], 0.0), trust)
+    if seen.shape[0] > 0:
+        level = with_seen(level, seen[i, j])
+    levels_out[i * radiance.shape[1] + j] = level
 
 
 @wp.func
@@ -271,17 +274,25 @@ def fill_level_offsets(height: int, width: int) -> tuple[int, ...]:
     return (0, *itertools.accumulate(rows * columns for rows, columns in fill_level_shapes(height, width)))
 
 
-def seed_fill(radiance: wp.array, confidence: wp.array, levels_out: wp.array, *, rows: Rows | None = None) -> None:
+def seed_fill(
+    radiance: wp.array,
+    confidence: wp.array,
+    levels_out: wp.array,
+    *,
+    seen: wp.array | None = None,
+    rows: Rows | None = None,
+) -> None:
     """Write level 0 of the fill pyramid.
 
     Args:
         radiance: Light that is known in part, ``wp.vec3`` (h, w).
         confidence: ``wp.float32`` (h, w) in 0..1.
         levels_out: ``wp.vec4`` (``fill_level_offsets(h, w)[-1]``): radiance and trust.
+        seen: Of ``fill_frame.see_frame``: what the frame shows, where the rest leaves trust open.
         rows: Band of rows, None for all.
     """
     launch_rows(
-        seed_fill_kernel, radiance.shape, [radiance, confidence], [levels_out], rows=rows, device=radiance.device
+        seed_fill_kernel, radiance.shape, [radiance, confidence, seen], [levels_out], rows=rows, device=radiance.device
     )
 
 

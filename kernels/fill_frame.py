@@ -20,7 +20,7 @@ import warp as wp
 
 from warp_ar.kernels.camera import project
 from warp_ar.kernels.latlong import direction_from_latlong
-from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.launch import Rows, launch, launch_rows
 from warp_ar.kernels.pixels import pixel_radiance
 from warp_ar.kernels.shapes import FAR
 from warp_ar.kernels.structs import FrameParams, Picture, Probe, RayScene
@@ -65,29 +65,24 @@ def shaded_by_ball(probes: wp.array[Probe], point: wp.vec3) -> wp.bool:
 
 
 @functools.cache
-def make_fill_frame_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
-    """Kernel for the given kinds of proxy."""
+def make_see_texel(proxies: tuple[int, ...]) -> wp.Function:
+    """``see_texel(picture, params, probes, scene, shape, ball, i, j) -> vec4``: radiance and number of directions seen.
+
+    The radiance is their sum.
+    """
     trace = make_trace(TraceConfig(objects=(), proxies=proxies))
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def fill_frame_kernel(
-        # In:
-        row_start: wp.int32,
+    @wp.func(module="unique")
+    def see_texel(
         picture: Picture,
         params: wp.array[FrameParams],
         probes: wp.array[Probe],
         scene: RayScene,
-        height: wp.int32,
-        width: wp.int32,
+        shape: wp.vec2i,
         ball: wp.int32,
-        # In and out:
-        levels_out: wp.array[wp.vec4],
-    ):
-        band_row, j = wp.tid()
-        i = row_start + band_row
-        known = levels_out[i * width + j]
-        if known[3] >= ENOUGH:
-            return
+        i: wp.int32,
+        j: wp.int32,
+    ) -> wp.vec4:
         camera = params[0]
         frame = picture.frame
         total = wp.vec3(0.0, 0.0, 0.0)
@@ -97,7 +92,7 @@ def make_fill_frame_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
             y = wp.float32(i) + (wp.float32(row_of_texel) + 0.5) / wp.float32(SIDE)
             for column_of_texel in range(side):
                 x = wp.float32(j) + (wp.float32(column_of_texel) + 0.5) / wp.float32(SIDE)
-                direction = direction_from_latlong(y, x, height, width)
+                direction = direction_from_latlong(y, x, shape[0], shape[1])
                 ray = direction
                 reach = wp.float32(FAR)
                 hit = trace.closest_proxy(scene, probes[ball].center, direction, FAR)
@@ -115,13 +110,101 @@ def make_fill_frame_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
                     if not trace.occluded_by_proxies(scene, camera.camera_position, ray, (1.0 - CLOSE) * reach):
                         total += pixel_radiance(frame, picture.decode_table, picture.linear, row, column)
                         count += 1.0
-        if count > 0.0:
-            weight = (1.0 - known[3]) * FRAME_TRUST * count / wp.float32(SIDE * SIDE)
-            trust = known[3] + weight
-            mixed = (known[3] * wp.vec3(known[0], known[1], known[2]) + (weight / count) * total) / trust
-            levels_out[i * width + j] = wp.vec4(mixed[0], mixed[1], mixed[2], trust)
+        return wp.vec4(total[0], total[1], total[2], count)
+
+    return see_texel
+
+
+@wp.func
+def with_seen(known: wp.vec4, seen: wp.vec4) -> wp.vec4:
+    """A texel of which the ball knows a part, and what ``see_texel`` found."""
+    count = seen[3]
+    if count <= 0.0 or known[3] >= ENOUGH:
+        return known
+    weight = (1.0 - known[3]) * FRAME_TRUST * count / wp.float32(SIDE * SIDE)
+    trust = known[3] + weight
+    total = wp.vec3(seen[0], seen[1], seen[2])
+    mixed = (known[3] * wp.vec3(known[0], known[1], known[2]) + (weight / count) * total) / trust
+    return wp.vec4(mixed[0], mixed[1], mixed[2], trust)
+
+
+@functools.cache
+def make_fill_frame_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
+    """Kernel for the given kinds of proxy."""
+    see_texel = make_see_texel(proxies)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def fill_frame_kernel(
+        # In:
+        row_start: wp.int32,
+        picture: Picture,
+        params: wp.array[FrameParams],
+        probes: wp.array[Probe],
+        scene: RayScene,
+        shape: wp.vec2i,
+        ball: wp.int32,
+        # In and out:
+        levels_out: wp.array[wp.vec4],
+    ):
+        band_row, j = wp.tid()
+        i = row_start + band_row
+        known = levels_out[i * shape[1] + j]
+        if known[3] >= ENOUGH:
+            return
+        seen = see_texel(picture, params, probes, scene, shape, ball, i, j)
+        levels_out[i * shape[1] + j] = with_seen(known, seen)
 
     return fill_frame_kernel
+
+
+@functools.cache
+def make_see_frame_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
+    """Kernel of ``see_frame``."""
+    see_texel = make_see_texel(proxies)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def see_frame_kernel(
+        # In:
+        picture: Picture,
+        params: wp.array[FrameParams],
+        probes: wp.array[Probe],
+        scene: RayScene,
+        ball: wp.int32,
+        # Out:
+        seen_out: wp.array2d[wp.vec4],
+    ):
+        i, j = wp.tid()
+        shape = wp.vec2i(seen_out.shape[0], seen_out.shape[1])
+        seen_out[i, j] = see_texel(picture, params, probes, scene, shape, ball, i, j)
+
+    return see_frame_kernel
+
+
+def see_frame(
+    picture: Picture,
+    params: wp.array,
+    probes: wp.array,
+    scene: RayScene,
+    seen_out: wp.array,
+    *,
+    proxies: tuple[int, ...],
+    ball: int = 0,
+) -> None:
+    """Look up all directions in the frame, for ``fill.seed_fill``: together they do what ``fill_frame`` does.
+
+    It needs nothing of the ball's picture, and so can run before that has been read.
+
+    Args:
+        picture: As those of ``fill_frame``, and so are all arguments that are not named here.
+        params: Likewise.
+        probes: Likewise.
+        scene: Likewise.
+        seen_out: ``wp.vec4`` (h, w): sum of the radiance of directions that the camera sees, and their number.
+        proxies: Likewise.
+        ball: Likewise.
+    """
+    kernel = make_see_frame_kernel(proxies)
+    launch(kernel, seen_out.shape, [picture, params, probes, scene, ball], [seen_out], device=seen_out.device)
 
 
 def fill_frame(
@@ -152,7 +235,7 @@ def fill_frame(
     launch_rows(
         make_fill_frame_kernel(proxies),
         shape,
-        [picture, params, probes, scene, *shape, ball],
+        [picture, params, probes, scene, wp.vec2i(*shape), ball],
         [levels_out],
         rows=rows,
         device=levels_out.device,

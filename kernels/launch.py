@@ -12,12 +12,17 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import math
+import os
 import threading
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import warp as wp
+
+from warp_ar.kernels.pixel_order import RECTANGLE_FIRST, RECTANGLE_ONLY
+from warp_ar.kernels.trial import tried
 
 Rows = tuple[int, int]
 """A band of rows: first, and one past the last."""
@@ -59,6 +64,22 @@ def slow_to_compile(kernel: wp.Kernel) -> wp.Kernel:
 def is_slow_to_compile(kernel: wp.Kernel) -> bool:
     """Whether a kernel is marked by ``slow_to_compile``."""
     return kernel in _SLOW
+
+
+BLOCK = 256
+"""Threads of a block, where nothing else is said."""
+MOST_BLOCKS = 4096
+"""Blocks of ``BLOCK`` threads with which a CUDA device does all pixels of a frame, where most of them are soon done."""
+
+
+def most_blocks() -> int:
+    """How many those are."""
+    return int(os.environ.get("WARP_AR_BLOCKS", MOST_BLOCKS))
+
+
+def clears_first(device: wp.DeviceLike) -> bool:
+    """Whether what a rectangle does not reach is cleared before, while the device has little to do."""
+    return not wp.get_device(device).is_cpu and tried("cleared") and tried("rectangles")
 
 
 MAX_PARTIALS = 8
@@ -156,6 +177,8 @@ def launch_rows(
     rows: Rows | None,
     device: wp.DeviceLike,
     stream: wp.Stream | None = None,
+    rectangle_first: bool = False,
+    alone: bool = False,
 ) -> None:
     """Launch ``kernel`` over ``shape``, restricted to ``rows`` along the first axis.
 
@@ -167,11 +190,21 @@ def launch_rows(
         rows: Band to launch; None means all rows.
         device: Where the arrays live.
         stream: CUDA stream; None means the device's current one.
+        rectangle_first: Whether the kernel takes ``own_pixel``: on CUDA a limited number of blocks does all rows, and
+            those of its rectangle first.
+        alone: Whether, where that is so, other pixels need not be written.
     """
+    whole = rows is None or tuple(rows) == (0, shape[0])
+    many = math.prod(shape) > BLOCK * most_blocks()
+    limited = rectangle_first and whole and many and not wp.get_device(device).is_cpu and tried("rectangles")
 
     def do() -> None:
         start, stop = rows if rows is not None else (0, shape[0])
-        if stop > start:
+        if limited:
+            given = {"outputs": outputs, "device": device, "stream": stream, "max_blocks": most_blocks()}
+            code = RECTANGLE_ONLY if alone else RECTANGLE_FIRST
+            wp.launch(kernel, dim=tuple(shape), inputs=[code, *inputs], **given)
+        elif stop > start:
             dim = (stop - start, *shape[1:])
             wp.launch(kernel, dim=dim, inputs=[start, *inputs], outputs=outputs, device=device, stream=stream)
 

@@ -36,6 +36,7 @@ import math
 import warp as wp
 
 from warp_ar.kernels.color import brightness
+from warp_ar.kernels.cooperative import sum_beside
 from warp_ar.kernels.environment_samples import EnvironmentSample
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows, slow_to_compile
 from warp_ar.kernels.materials import material_at, roughness_at, surface_point
@@ -52,14 +53,18 @@ from warp_ar.kernels.near_field_rays import (
     make_see_point,
     mirrored_level,
 )
+from warp_ar.kernels.pixel_order import own_pixel
 from warp_ar.kernels.reflect import DistantLight, make_distant_irradiance, make_reflected_radiance
 from warp_ar.kernels.structs import FrameParams, Hit, Picture, RayScene
+from warp_ar.kernels.trial import tried
 from warp_ar.kernels.visibility import VisibleObjects, inside_rect
 
 wp.set_module_options({"enable_backward": False})
 
 MIN_LIGHT = wp.constant(wp.float32(1.0e-6))
 """Brightness, in camera values, below which a lobe's share is 0 over 0."""
+LANES = 4
+"""Lanes of a CUDA device that share a pixel's rays, where no kind has fewer."""
 NO_RAY = wp.constant(wp.float32(-1.0))
 """Share of a pixel whose rays all ran into its surface: it knows nothing of its lobe."""
 SAME_NORMAL = wp.constant(wp.float32(math.cos(math.radians(20.0))))
@@ -121,11 +126,18 @@ def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
         distant: DistantLight,
         samples: wp.array[EnvironmentSample],
         visible: VisibleObjects,
+        share: wp.int32,
         # Out:
         near_out: NearLight,
     ):
-        i, j = wp.tid()
-        i += row_start
+        """A pixel; or, of every ``share`` of its rays, the one that is the lane's."""
+        i, j, part = wp.tid()
+        objects = visible.objects
+        pixel = own_pixel(i, j, row_start, params[0].object_rect, objects.shape[0], objects.shape[1])
+        i = pixel[0]
+        j = pixel[1]
+        if i < 0:
+            return
         if not inside_rect(i, j, params[0].object_rect):
             return
         if visible.objects[i, j] < 0:
@@ -139,7 +151,7 @@ def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
         reflected = wp.vec4(0.0)
         transmitted = wp.vec4(0.0)
         leaving = float(0.0)  # rays; those into the surface are part of its reflectance
-        for n in range(diffuse + rays[1]):
+        for n in range(part, diffuse + rays[1], share):
             ray = pick_ray(params, scene, samples, distant.others.places, at, n, diffuse)
             near = wp.vec4(0.0)
             if ray.leaves:
@@ -174,6 +186,16 @@ def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
                             beyond = look_beyond(distant, ray)
                             missed = (1.0 - near[3]) * beyond
                             transmitted += wp.vec4(missed[0], missed[1], missed[2], brightness(beyond))
+        if share > 1:
+            leaving = sum_beside(wp.vec4(leaving, 0.0, 0.0, 0.0), share)[0]
+            if wp.static(config.distant.diffuse != "none"):
+                together = sum_beside(wp.vec4(total[0], total[1], total[2], 0.0), share)
+                total = wp.vec3(together[0], together[1], together[2])
+            if wp.static(config.distant.specular):
+                reflected = sum_beside(reflected, share)
+                transmitted = sum_beside(transmitted, share)
+            if part > 0:
+                return
         if wp.static(config.distant.diffuse != "none"):
             if wp.static(config.known):
                 total += distant_irradiance(distant, at.hit.point, at.normal)
@@ -242,11 +264,15 @@ def make_filter_kernel(config: NearFieldConfig) -> wp.Kernel:
         near_out: NearLight,
     ):
         i, j = wp.tid()
-        i += row_start
         rect = params[0].object_rect
+        objects = visible.objects
+        pixel = own_pixel(i, j, row_start, rect, objects.shape[0], objects.shape[1])
+        i = pixel[0]
+        j = pixel[1]
+        if i < 0:
+            return
         if not inside_rect(i, j, rect):
             return
-        objects = visible.objects
         hits = visible.hits
         found = objects[i, j]
         if found < 0:
@@ -311,13 +337,17 @@ def estimate_near_field(
         near_out: (H, W) estimates of single pixels; written only where an object is visible.
         rows: Band of rows; None means all.
     """
+    least = min(count for count in (config.count, config.lobe_count, config.mirror_samples) if count > 0)
+    share = LANES if least >= LANES and not picture.rays.device.is_cpu and tried("near") else 1
     launch_rows(
         make_near_field_kernel(config),
-        picture.rays.shape,
-        [params, picture, layers, scene, distant, samples, visible],
+        (*picture.rays.shape, share),
+        [params, picture, layers, scene, distant, samples, visible, share],
         [near_out],
         rows=rows,
         device=picture.rays.device,
+        rectangle_first=True,
+        alone=True,
     )
 
 
@@ -343,4 +373,6 @@ def filter_near_field(
         [near_out],
         rows=rows,
         device=visible.objects.device,
+        rectangle_first=True,
+        alone=True,
     )

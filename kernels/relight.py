@@ -27,7 +27,8 @@ import warp as wp
 from warp_ar.kernels.area_lights import make_area_count, make_area_sample
 from warp_ar.kernels.cells import any_cell_above_zero
 from warp_ar.kernels.edges import EdgeList, EdgeLists, holds_all, list_edge, listed_edges, sample_listed_edges
-from warp_ar.kernels.launch import MOST_REGISTERS, QUICK_TO_COMPILE, Rows, launch, launch_rows, slow_to_compile
+from warp_ar.kernels.launch import MOST_REGISTERS, QUICK_TO_COMPILE, Rows, launch_rows, slow_to_compile
+from warp_ar.kernels.pixel_order import own_pixel
 from warp_ar.kernels.receiver import (
     DEFAULT_REFLECTANCE,
     Matter,
@@ -191,7 +192,11 @@ def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
         visibility_out: wp.array2d[wp.int32],
     ):
         i, j = wp.tid()
-        i += row_start
+        pixel = own_pixel(i, j, row_start, params[0].light_rect, added_out.shape[0], added_out.shape[1])
+        i = pixel[0]
+        j = pixel[1]
+        if i < 0:
+            return
         black = wp.vec3(0.0, 0.0, 0.0)
         added_out[i, j] = black
         if not inside_rect(i, j, params[0].light_rect):
@@ -302,11 +307,15 @@ def make_smooth_edges_kernel(config: RelightConfig, *, left: bool = False) -> wp
         added_out: wp.array2d[wp.vec3],
     ):
         i, j = wp.tid()
-        i += row_start
         if wp.static(left):
             if holds_all(listed):
                 return
         rect = params[0].light_rect
+        pixel = own_pixel(i, j, row_start, rect, added_out.shape[0], added_out.shape[1])
+        i = pixel[0]
+        j = pixel[1]
+        if i < 0:
+            return
         if not inside_rect(i, j, rect):
             return
         if not is_edge(visibility, rect, i, j):
@@ -324,6 +333,7 @@ def make_smooth_edges_kernel(config: RelightConfig, *, left: bool = False) -> wp
 @wp.kernel(enable_backward=False)
 def list_edges_kernel(
     # In:
+    row_start: wp.int32,
     params: wp.array[FrameParams],
     visibility: wp.array2d[wp.int32],
     # Out:
@@ -332,6 +342,11 @@ def list_edges_kernel(
     """List the pixels that ``is_edge`` finds."""
     i, j = wp.tid()
     rect = params[0].light_rect
+    pixel = own_pixel(i, j, row_start, rect, visibility.shape[0], visibility.shape[1])
+    i = pixel[0]
+    j = pixel[1]
+    if i < 0:
+        return
     if inside_rect(i, j, rect):
         if is_edge(visibility, rect, i, j):
             list_edge(i, j, list_out)
@@ -374,6 +389,7 @@ def relight(
     added_out: wp.array2d[wp.vec3],
     visibility_out: wp.array2d[wp.int32] | None = None,
     *,
+    cleared: bool = False,
     rows: Rows | None = None,
 ) -> None:
     """Write the radiance that virtual lights add to the receiver; zero outside ``params[0].light_rect``.
@@ -389,6 +405,7 @@ def relight(
         added_out: (H, W) linear radiance in camera values.
         visibility_out: (H, W) which surface a pixel sees and which lights do not; needed if ``config.edge_samples`` is
             more than 1. Only what lies in ``light_rect`` is written.
+        cleared: Whether ``added_out`` is zero, so that on CUDA it need not be written outside.
         rows: Band of rows; None means all.
     """
     rays = receiver.picture.rays
@@ -399,6 +416,8 @@ def relight(
         [added_out, visibility_out],
         rows=rows,
         device=rays.device,
+        rectangle_first=True,
+        alone=cleared,
     )
 
 
@@ -434,9 +453,10 @@ def smooth_edges(
         launch_rows(kernel, shape, [*inputs, visibility, EdgeList()], [added_out], rows=rows, device=device)
         return
     edge_lists.listed.count.zero_()
-    launch(list_edges_kernel, shape, [params, visibility], [edge_lists.listed], device=device)
+    whole = {"rows": None, "device": device, "rectangle_first": True, "alone": True}
+    launch_rows(list_edges_kernel, shape, [params, visibility], [edge_lists.listed], **whole)
     kernel = make_smooth_edges_kernel(config, left=True)
-    launch_rows(kernel, shape, [*inputs, visibility, edge_lists.listed], [added_out], rows=None, device=device)
+    launch_rows(kernel, shape, [*inputs, visibility, edge_lists.listed], [added_out], **whole)
     sample_listed_edges(
         make_sample_edges_kernel(config), inputs, edge_lists, config.edge_samples, added_out, weighted=True
     )

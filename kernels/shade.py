@@ -34,6 +34,7 @@ from warp_ar.kernels.edges import EdgeList, EdgeLists, holds_all, list_edge, lis
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows, slow_to_compile
 from warp_ar.kernels.materials import Surface, lobe_axis, make_reflect_direct, make_surface, reflect, specular_occlusion
 from warp_ar.kernels.near_field import NearLight
+from warp_ar.kernels.pixel_order import own_pixel
 from warp_ar.kernels.reflect import (
     DiffuseForm,
     DistantLight,
@@ -422,13 +423,17 @@ def make_shade_kernel(config: ShadeConfig, edges: str = SAMPLED) -> wp.Kernel:
         list_out: EdgeList,
     ):
         i, j = wp.tid()
-        i += row_start
         if wp.static(edges == LEFT):
             if holds_all(list_out):
                 return
         result = wp.vec4(0.0)
         samples = wp.int32(0)
         rect = params[0].object_rect
+        own = own_pixel(i, j, row_start, rect, virtual_out.shape[0], virtual_out.shape[1])
+        i = own[0]
+        j = own[1]
+        if i < 0:
+            return
         if inside_rect(i, j, rect):
             found = visible.objects[i, j]
             hit = Hit()
@@ -499,6 +504,7 @@ def shade(
     virtual_out: wp.array2d[wp.vec4],
     *,
     edge_lists: EdgeLists | None = None,
+    cleared: bool = False,
     rows: Rows | None = None,
 ) -> None:
     """Shade what ``trace_pixels`` found.
@@ -515,6 +521,7 @@ def shade(
         visible: (H, W) as ``trace_pixels`` writes.
         virtual_out: (H, W) premultiplied linear RGB and coverage; zero outside ``params.object_rect``.
         edge_lists: Scratch, for a launch over all rows.
+        cleared: Whether ``virtual_out`` is zero, so that on CUDA it need not be written outside.
         rows: Band of rows; None means all.
     """
     inputs = [params, rays, scene, light, visible]
@@ -524,8 +531,9 @@ def shade(
         return
     edge_lists.listed.count.zero_()
     outputs = [virtual_out, edge_lists.listed]
+    given = {"rows": rows, "device": device, "rectangle_first": True, "alone": cleared}
     for kernel in (make_shade_kernel(config, LISTED), make_shade_kernel(config, LEFT)):
-        launch_rows(kernel, rays.shape, inputs, outputs, rows=rows, device=device)
+        launch_rows(kernel, rays.shape, inputs, outputs, **given)
     sample_listed_edges(
         make_sample_edges_kernel(config), inputs, edge_lists, config.edge_samples, virtual_out, weighted=False
     )

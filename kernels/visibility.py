@@ -12,6 +12,7 @@ import math
 import warp as wp
 
 from warp_ar.kernels.launch import QUICK_TO_COMPILE, Rows, launch_rows
+from warp_ar.kernels.pixel_order import own_pixel
 from warp_ar.kernels.shapes import FAR, ROUNDING
 from warp_ar.kernels.structs import FrameParams, Hit, Probe, RayScene
 from warp_ar.kernels.trace import TraceConfig, make_trace, meets_probe
@@ -137,7 +138,9 @@ def make_trace_pixels_kernel(config: TraceConfig) -> wp.Kernel:
         visible_out: VisibleObjects,
     ):
         i, j = wp.tid()
-        i += row_start
+        pixel = own_pixel(i, j, row_start, params[0].object_rect, rays.shape[0], rays.shape[1])
+        i = pixel[0]
+        j = pixel[1]
         found = wp.int32(-1)
         if inside_rect(i, j, params[0].object_rect):
             ray = rays[i, j]
@@ -177,4 +180,5 @@ def trace_pixels(
         [visible_out],
         rows=rows,
         device=rays.device,
+        rectangle_first=True,
     )

@@ -100,8 +100,12 @@ def run(
     out=None,
     irradiance=None,
     config=None,
+    later=False,
 ):
-    """The change of radiance, (H, W, 3); objects are lit by ``lights`` and the even environment ``irradiance``."""
+    """The change of radiance, (H, W, 3); objects are lit by ``lights`` and the even environment ``irradiance``.
+
+    If ``later``, shadows are added when the rest is known.
+    """
     frame = grey_frame() if frame is None else frame
     trace = TraceConfig(kinds(objects), kinds(proxies))
     models = tuple(sorted({one["model"] for one in materials}))
@@ -125,19 +129,15 @@ def run(
         irradiance=wp.array(constant_environment(ENVIRONMENT), dtype=wp.vec3),
     )
     out = wp.full((H, W), wp.vec3(9.0, 9.0, 9.0), dtype=wp.vec3) if out is None else out
-    light = np.ones(3) if irradiance is None else irradiance
-    mirror_ball.mirror_ball(
-        config,
-        params,
-        scene,
-        records(Light, *lights),
-        even_light(light),
-        receiver,
-        None if ratio is None else wp.array(ratio.astype(np.float32), dtype=wp.vec3),
-        out,
-        samples=samples,
-        rows=rows,
-    )
+    surroundings = even_light(np.ones(3) if irradiance is None else irradiance)
+    given = config, params, scene, records(Light, *lights), surroundings, receiver
+    ratio = None if ratio is None else wp.array(ratio.astype(np.float32), dtype=wp.vec3)
+    if later:
+        shows = wp.full((H, W), wp.vec2(7.0, 7.0), dtype=wp.vec2)
+        mirror_ball.mirror_ball(*given, None, out, shows_out=shows)
+        mirror_ball.shade_mirrored(params, receiver.picture, ratio, shows, out)
+    else:
+        mirror_ball.mirror_ball(*given, ratio, out, samples=samples, rows=rows)
     return out.numpy()
 
 

@@ -23,14 +23,17 @@ from tests.kernel_rig import records, shape
 from tests.relight_rig import CAMERA, DESK, LOOK_DOWN, POINTS, RAYS, H, W
 from warp_ar.kernels import (
     environment_samples,
+    environment_shadow,
     environment_shadow_filter,
     environment_shadow_wavefront,
 )
 from warp_ar.kernels.environment_shadow_cells import (
     EnvironmentShadowConfig,
     cell_column,
+    tiled_cell,
+    tiled_shape,
 )
-from warp_ar.kernels.reflect import DistantLightConfig
+from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
 from warp_ar.kernels.structs import (
     BOX,
     LAMBERT,
@@ -39,6 +42,7 @@ from warp_ar.kernels.structs import (
     FrameParams,
     RayScene,
     Shape,
+    make_picture,
 )
 from warp_ar.kernels.trace import TraceConfig
 from warp_ar.scene import Camera as SceneCamera
@@ -113,6 +117,31 @@ def test_what_is_seen_from_one_side_hides_the_sky_from_both(device, tmp_path, se
         np.testing.assert_allclose(ratio, expected, atol=SUM_ERROR)
 
 
+def test_the_first_pass_of_a_wavefront_reads_samples_alone_and_the_next_two_not_each_other(device, monkeypatch):
+    """So they may begin before the light is filtered, and run side by side."""
+    wavefront = environment_shadow_wavefront
+
+    def in_another_order(config, given, cells, wave):
+        samples_alone = DistantLight()
+        samples_alone.probes = given[3].probes
+        bare = make_picture(wp.zeros((1, 1), dtype=wp.vec3ub), given[1].decode_table, given[1].rays)
+        wavefront.find_occluded(config, (given[0], bare, given[2], samples_alone, given[4]), cells, wave)
+        for one in (wavefront.trace_secondary, wavefront.sum_light, wavefront.reduce_partials):
+            one(config, given, cells, wave)
+
+    drawn = draw(with_sun(6, 20, 100.0))
+    environment_samples.place_emitters(lamp_at((0.1, 0.05, 0.4)), drawn[2])
+    ball = {"center": (0.1, 0, 0.03), "radius": 0.03, "reflectance": (0.8, 0.7, 0.6)}
+    for bounce in ("estimated", "traced"):
+        scene = {"objects": [sphere((0, 0, 0.05), 0.05)], "probes": [ball], "bounce": bounce, "emitters": True}
+        scene |= {"albedo": 0.5, "partials": 4, "as_wavefront": True}
+        whole = run(drawn, **scene)
+        with monkeypatch.context() as patch:
+            patch.setattr(environment_shadow, "shade_wavefront", in_another_order)
+            np.testing.assert_array_equal(run(drawn, **scene), whole)
+        assert whole.min() < 0.7
+
+
 def test_a_wavefront_takes_one_set_and_little_memory(device):
     forms = DistantLightConfig(TraceConfig((SPHERE,), (PLANE,)), (LAMBERT,), False, "none", False, False)
 
@@ -142,6 +171,27 @@ def test_every_column_has_a_thread(device, columns):
         np.testing.assert_array_equal(np.sort(taken), np.arange(columns))
         whole = taken[: columns // (4 * lanes) * 4 * lanes].reshape(-1, lanes)
         assert (whole % 4 == whole[:, :1] % 4).all(), "a warp's cells are of one set"
+
+
+@wp.kernel(enable_backward=False)
+def _tiles_kernel(side: wp.int32, columns: wp.int32, out: wp.array2d[wp.vec2i]):
+    i, thread = wp.tid()
+    out[i, thread] = tiled_cell(i, thread, side, columns)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (17, 33), (135, 240), (16, 32)])
+def test_every_cell_has_a_thread_in_a_tile(device, size):
+    for side in (1, 2, 4):
+        threads = tiled_shape(*size, side)
+        out = wp.zeros(threads, wp.vec2i)
+        wp.launch(_tiles_kernel, threads, [side, threads[1]], [out])
+        taken = out.numpy().reshape(-1, 2)
+        every = np.stack(np.meshgrid(*map(np.arange, threads), indexing="ij"), -1).reshape(-1, 2)
+        np.testing.assert_array_equal(taken[np.lexsort(taken.T[::-1])], every)
+        assert (np.array(threads) >= size).all()
+        warps = taken.reshape(-1, 32, 2)
+        assert (warps % side == warps[:, :1] % side).all(), "a warp's cells are of one set"
+        assert (np.ptp(warps, axis=1) == [3 * side, 7 * side]).all()
 
 
 def test_half_resolution_agrees(device):
@@ -274,3 +324,30 @@ def test_pixels_between_surfaces_find_their_own(device):
 def test_bad_configs_are_refused(changes, message):
     with pytest.raises(ValueError, match=message):
         dataclasses.replace(ON_DESK, **changes)
+
+
+@pytest.mark.parametrize("stride", [1, 4, 5, 9])
+def test_pixels_between_surfaces_may_have_a_kernel_of_their_own(device, monkeypatch, stride):
+    """Cells of random surfaces, each on what is there or not: every pixel is written once, the same by both ways."""
+    rng = np.random.default_rng(stride)
+    shape_of_cells = -(-H // stride), -(-W // stride)
+    board = shape(PLANE, (0.003, 0.004, 0.1), (0.083, 0.061, 0))
+    scene = RayScene()
+    scene.proxies = records(Shape, DESK, board)
+    averaged = shadow_cells(shape_of_cells, stride, notes=False)
+    averaged.surface = wp.array(rng.choice([-1, 0, 8], shape_of_cells, p=[0.2, 0.5, 0.3]), dtype=wp.int32)
+    averaged.filtered = wp.array(rng.uniform(0.1, 0.9, (*shape_of_cells, 3)), dtype=wp.vec3)
+    rays = wp.array(RAYS, dtype=wp.vec2)
+    for rect in ((0, H, 0, W), (3, H - 2, 5, W - 1), (0, 0, 0, 0)):
+        params = records(FrameParams, {"camera_position": CAMERA, "world_from_camera": LOOK_DOWN, "shadow_rect": rect})
+        found = []
+        for apart in (False, True):
+            out = wp.full((H, W), wp.vec3(9.0, 9.0, 9.0), dtype=wp.vec3)
+            monkeypatch.setattr(environment_shadow_filter, "spreads_apart", lambda *_, apart=apart: apart)
+            environment_shadow_filter.spread_ratio(ON_DESK, params, rays, scene, None, averaged, out)
+            found.append(out.numpy())
+        if str(device) == "cpu":
+            np.testing.assert_array_equal(found[1], found[0])
+        else:  # NVRTC joins products and sums in each kernel as it likes
+            np.testing.assert_allclose(found[1], found[0], rtol=1e-6)
+        assert (found[1] < 2.0).all()

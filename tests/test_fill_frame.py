@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_ar.kernels import structs
+from warp_ar.kernels import fill, structs
 from warp_ar.kernels.color import decode_table
-from warp_ar.kernels.fill_frame import FRAME_TRUST, OWN_SHADOW, fill_frame
+from warp_ar.kernels.fill_frame import FRAME_TRUST, OWN_SHADOW, fill_frame, see_frame
 from warp_ar.scene import loads_scene
 from warp_ar.scene.kinds import trace_config
 from warp_ar.scene.ray_scene import HostScene
@@ -45,8 +45,8 @@ CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """``world_from_camera``."""
 
 
-def filled(device, frame, text, seed, *, balls=((0.0, 0.0, 0.1),), ball=0):
-    """Level 0 of the pyramid, (h, w, 4), after the frame was put into ``seed``."""
+def given(device, frame, text, balls):
+    """What ``fill_frame`` reads, and the kinds of proxy."""
     scene = loads_scene(text)
     host = HostScene(scene, device)
     params = np.zeros(1, np.dtype(structs.FrameParams.numpy_dtype()))
@@ -54,21 +54,21 @@ def filled(device, frame, text, seed, *, balls=((0.0, 0.0, 0.1),), ball=0):
     params["focal"], params["principal"] = (160.0, 160.0), (159.5, 119.5)
     probes = np.zeros(len(balls), np.dtype(structs.Probe.numpy_dtype()))
     probes["center"], probes["radius"], probes["reflectance"] = balls, 0.03, 0.85
-    levels = wp.array(seed.reshape(-1, 4), dtype=wp.vec4, device=device)
-    fill_frame(
-        structs.make_picture(
-            wp.array(frame, dtype=wp.vec3ub, device=device),
-            wp.array(decode_table("linear"), dtype=wp.vec3, device=device),
-            None,
-        ),
+    codes, table = wp.array(frame, dtype=wp.vec3ub, device=device), decode_table("linear")
+    arguments = (
+        structs.make_picture(codes, wp.array(table, dtype=wp.vec3, device=device), None),
         wp.array(params, dtype=structs.FrameParams, device=device),
         wp.array(probes, dtype=structs.Probe, device=device),
         host.ray_scene,
-        levels,
-        (HEIGHT, WIDTH),
-        proxies=trace_config(scene).proxies,
-        ball=ball,
     )
+    return host, arguments, trace_config(scene).proxies
+
+
+def filled(device, frame, text, seed, *, balls=((0.0, 0.0, 0.1),), ball=0):
+    """Level 0 of the pyramid, (h, w, 4), after the frame was put into ``seed``."""
+    _host, arguments, proxies = given(device, frame, text, balls)
+    levels = wp.array(seed.reshape(-1, 4), dtype=wp.vec4, device=device)
+    fill_frame(*arguments, levels, (HEIGHT, WIDTH), proxies=proxies, ball=ball)
     return levels.numpy().reshape(HEIGHT, WIDTH, 4)
 
 
@@ -101,6 +101,28 @@ def test_a_map_is_that_of_its_ball(device):
     second = filled(device, ramp(), SCENE + PLANE, seed, balls=balls, ball=1).copy()
     np.testing.assert_array_equal(second, filled(device, ramp(), SCENE + PLANE, seed, balls=balls[::-1]))
     assert (second != filled(device, ramp(), SCENE + PLANE, seed, balls=balls)).any()
+
+
+def test_what_the_frame_shows_may_be_looked_up_first(device):
+    """Before the ball's own picture is known: both ways end with the same map."""
+    random, shape = np.random.default_rng(5), (HEIGHT, WIDTH)
+    balls = ((0.0, 0.0, 0.1), (0.1, 0.15, 0.06))
+    radiance = wp.array(random.uniform(0.0, 1.0, (*shape, 3)), dtype=wp.vec3, device=device)
+    confidence = random.uniform(0.0, 1.0, shape) * (random.uniform(size=shape) > 0.3)
+    confidence = wp.array(confidence, dtype=wp.float32, device=device)
+    _host, arguments, proxies = given(device, ramp(), SCENE + PLANE, balls)
+    size = fill.fill_level_offsets(*shape)[-1]
+    for ball in range(2):
+        at_once, first = (wp.zeros(size, dtype=wp.vec4, device=device) for _ in range(2))
+        seen = wp.empty(shape, dtype=wp.vec4, device=device)
+        fill.seed_fill(radiance, confidence, at_once)
+        bare = at_once.numpy().copy()
+        fill_frame(*arguments, at_once, shape, proxies=proxies, ball=ball)
+        see_frame(*arguments, seen, proxies=proxies, ball=ball)
+        fill.seed_fill(radiance, confidence, first, seen=seen)
+        # NVRTC joins products and sums in each kernel as it likes.
+        np.testing.assert_allclose(first.numpy(), at_once.numpy(), rtol=0.0 if device == "cpu" else 1e-6)
+        assert (at_once.numpy() != bare).any(axis=-1).sum() > 300
 
 
 def test_at_infinity_a_direction_is_where_the_camera_looks_along_it(device):

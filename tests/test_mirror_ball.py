@@ -405,6 +405,15 @@ def test_more_rays_converge(device):
     assert errors[0] > 1.5 * errors[1] > 1.5**2 * errors[2]
 
 
+def test_shadows_may_be_added_when_the_rest_is_known(device):
+    """Which need not wait for them then: the same bits on CPU, on CUDA but for products and sums that are joined."""
+    ratio = np.random.default_rng(3).uniform(0.2, 0.9, (H, W, 3))
+    scene = {**BUSY, "ratio": ratio, "rect": (2, H - 3, 1, W - 4)}
+    whole, without = run(**scene), run(**{**scene, "ratio": np.ones((H, W, 3))})
+    assert (whole != without).any(axis=-1).sum() > 100
+    np.testing.assert_allclose(run(**scene, later=True), whole, rtol=0.0, atol=0.0 if device == "cpu" else FLOAT_ERROR)
+
+
 def test_samples_that_are_no_square_are_refused(device):
     for samples in (0, 2, 8, -4):
         with pytest.raises(ValueError, match=f"samples is {samples}; expected a square number"):

@@ -401,3 +401,73 @@ def test_a_stage_gives_way_as_far_as_its_readers_allow(monkeypatch: pytest.Monke
     assert order(a=("e",)) == ["a", "b", "c", "d", "e"]  # d, in between, reads it
     assert order(b=("e",)) == ["a", "c", "d", "e", "b"]
     assert order(b=("a",)) == ["a", "b", "c", "d", "e"]
+
+
+class FakeStream:
+    """Knows which launches and events it comes after."""
+
+    def __init__(self, *_: Any) -> None:
+        self.behind: set[str] = set()
+
+    def record_event(self) -> set[str]:
+        return set(self.behind)
+
+    def wait_event(self, event: set[str]) -> None:
+        self.behind |= event
+
+
+def launch_order(
+    monkeypatch: pytest.MonkeyPatch, after: tuple[str, ...] = (), **passes: list[dict[str, Any]]
+) -> dict[str, set[str]]:
+    """What each launch of a captured graph directly waits for: stages a, b (frame -> a -> b), c, d (reads a and c)."""
+    reads = {"a": ("frame",), "b": ("a",), "c": ("frame",), "d": ("a", "c")}
+    stages = []
+    for name, read in reads.items():
+        fields = {"name": name, "wire": classmethod(lambda cls, _, name=name, read=read: Wiring(read, (name,)))}
+        fields["runs_after"] = lambda self, way=(after if name == "d" else ()): way
+        stages.append(type(name, (AddOne,), fields))
+    plan = plan_of(monkeypatch, tuple(stages), tuple(reads))
+    waits: dict[str, set[str]] = {}
+
+    def note(_: Scheduler, stream: FakeStream, step: Any) -> None:
+        waits[step.launch] = set(stream.behind)
+        stream.behind = {step.launch}
+
+    monkeypatch.setattr(wp, "Stream", FakeStream)
+    monkeypatch.setattr(Scheduler, "_launch_on", note)
+    scheduler = Scheduler.__new__(Scheduler)
+    scheduler.device, scheduler._stream, scheduler._streams = None, FakeStream(), {False: [], True: []}
+    steps = []
+    for kind, wiring in plan.stages:
+        given = passes.get(kind.name, [{}])
+        own = [Pass(f"{kind.name}{index}", **fields) for index, fields in enumerate(given)]  # type: ignore[arg-type]
+        steps.append((kind(plan.features, wiring), own))
+    scheduler._launch_side_by_side(steps)
+    assert scheduler._stream.behind >= {f"{name}{len(passes.get(name, [{}])) - 1}" for name in reads}
+    return waits
+
+
+def test_a_pass_waits_for_what_it_reads(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert launch_order(monkeypatch) == {"a0": set(), "b0": {"a0"}, "c0": set(), "d0": {"a0", "c0"}}
+    found = launch_order(monkeypatch, d=[{"reads": ("frame",)}, {"reads": ("c",)}, {}])
+    assert (found["d0"], found["d1"], found["d2"]) == (set(), {"c0", "d0"}, {"a0", "d1"})
+
+
+def test_a_pass_may_run_beside_the_one_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = launch_order(monkeypatch, a=[{}, {"beside_last": True}, {}], c=[{}, {"beside_last": True}])
+    assert (found["a0"], found["a1"], found["a2"]) == (set(), set(), {"a0", "a1"})
+    assert found["b0"] == {"a2"}
+    assert found["d0"] == {"a2", "c0", "c1"}
+
+
+def test_stages_do_not_wait_for_what_leaves_the_device_idle(monkeypatch: pytest.MonkeyPatch) -> None:
+    idle, busy = {"leaves_idle": True}, {"leaves_idle": False}
+    assert launch_order(monkeypatch, ("b",), b=[{}, busy])["d0"] == {"a0", "b1", "c0"}
+    assert launch_order(monkeypatch, ("b",), b=[{}, idle, idle])["d0"] == {"a0", "b0", "c0"}
+    assert launch_order(monkeypatch, ("b",), b=[{}, {"beside_last": True}, idle])["d0"] == {"a0", "b0", "b1", "c0"}
+    assert launch_order(monkeypatch, ("b",), b=[{}, idle, busy])["d0"] == {"a0", "b2", "c0"}
+    early = launch_order(monkeypatch, ("b",), d=[{"reads": ("c",)}, {}])
+    assert (early["d0"], early["d1"]) == ({"c0"}, {"a0", "b0", "d0"}), (
+        "what says itself what it reads waits for no more"
+    )
+    assert launch_order(monkeypatch, ("c",), c=[{}, idle])["d0"] == {"a0", "c0", "c1"}, "what it reads is waited for"

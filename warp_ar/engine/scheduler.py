@@ -25,6 +25,7 @@ from warp_ar.engine.graph import Plan
 from warp_ar.engine.modules import Progress, load_modules
 from warp_ar.kernels.bands import serve_kernel
 from warp_ar.kernels.launch import Note, noting
+from warp_ar.kernels.trial import also, tried
 from warp_ar.stages.base import Arrays, Pass, Reach, Rows, Stage
 
 Step = tuple[Stage, list[Pass]]
@@ -45,6 +46,17 @@ class StageTiming:
 
 
 SKIPPED = StageTiming(0.0, True)
+URGENT = (
+    "unwrap",
+    "accumulate",
+    "fill",
+    "recover",
+    "environment_samples",
+    "prefilter",
+    "environment_shadow",
+    "near_field",
+)
+"""Stages that others wait for: where it is asked for, the device takes their blocks first."""
 
 
 class Scheduler:
@@ -90,7 +102,7 @@ class Scheduler:
         self._patterns: dict[Any, list[Segment]] = {}
         self._graphs: dict[tuple[int, ...], Any] = {}
         self._stream: Any = wp.get_stream(device) if device.is_cuda else None
-        self._streams: list[Any] = []
+        self._streams: dict[bool, list[Any]] = {False: [], True: []}
         self._marks: dict[tuple[int, ...], tuple[Any, Any]] | None = {} if profile and device.is_cuda else None
         self.clock = time.perf_counter
         """Seconds by which stages are timed on the host."""
@@ -435,26 +447,57 @@ class Scheduler:
                 wp.record_event(end)
 
     def _launch_side_by_side(self, part: list[Step]) -> None:
-        """Launch each stage on a stream of its own that waits for the writers of what it reads."""
+        """Launch each stage on a stream of its own, whose passes wait for the writers of what they read."""
         stream = self._stream
-        self._streams += [wp.Stream(self.device) for _ in range(len(part) - len(self._streams))]
         begun = stream.record_event()
         written: dict[str, Any] = {}
         ends: dict[str, Any] = {}
-        for own, (stage, passes) in zip(self._streams, _in_launch_order(part), strict=False):
+        urgent, used = tried("priority"), {False: 0, True: 0}
+        for stage, passes in _in_launch_order(part):
+            first = urgent and stage.name in URGENT
+            own, other = self._stream_at(used[first], first), self._stream_at(used[first] + 1, first)
+            used[first] += 2
             own.wait_event(begun)
-            for name in stage.wiring.reads:
-                if name in written:
+            behind = [] if also("eager") else [ends[name] for name in stage.runs_after() if name in ends]
+            awaited = [name for name in stage.wiring.reads if name in written]
+            before, beside = begun, None
+            for step in passes:
+                if step.beside_last and tried("beside"):
+                    other.wait_event(before)
+                    self._launch_on(other, step)
+                    beside = other.record_event()
+                    continue
+                if beside is not None:
+                    own.wait_event(beside)
+                early = step.reads is not None and tried("passes")
+                while behind and not early:
+                    own.wait_event(behind.pop())
+                reads = (step.reads or ()) if early else stage.wiring.reads
+                for name in [name for name in awaited if name in reads]:
                     own.wait_event(written[name])
-            for name in stage.runs_after():
-                if name in ends:
-                    own.wait_event(ends[name])
-            with wp.ScopedStream(own, sync_enter=False):
-                for step in passes:
-                    step.launch(None)
-            done = ends[stage.name] = own.record_event()
+                    awaited.remove(name)
+                before, beside = own.record_event(), None
+                if not (step.leaves_idle and tried("free")):
+                    ends.pop(stage.name, None)
+                elif stage.name not in ends:
+                    ends[stage.name] = before
+                self._launch_on(own, step)
+            if beside is not None:
+                own.wait_event(beside)
+            done = own.record_event()
+            ends.setdefault(stage.name, done)
             written.update(dict.fromkeys(stage.wiring.writes, done))
             stream.wait_event(done)
+
+    def _stream_at(self, number: int, urgent: bool) -> Any:
+        streams = self._streams[urgent]
+        while len(streams) <= number:
+            streams.append(wp.Stream(self.device, priority=-1) if urgent else wp.Stream(self.device))
+        return streams[number]
+
+    def _launch_on(self, stream: Any, step: Pass) -> None:
+        with wp.ScopedStream(stream, sync_enter=False):
+            step.launch(None)
 
 
 @dataclasses.dataclass(frozen=True)

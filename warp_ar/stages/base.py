@@ -83,6 +83,18 @@ class Pass:
     """Works on the host between launches: it cannot be part of a captured graph, which is cut where it is enabled."""
     enabled: Callable[[], bool] | None = None
     """Whether the pass takes part in this frame, asked once, after ``Stage.begin``; None means always."""
+    reads: tuple[str, ...] | None = None
+    """What of the stage's resources it reads: on CUDA it begins when that is there, whatever the stage runs after. None
+    means all."""
+    beside_last: bool = False
+    """On CUDA it runs beside the pass before it, whose results it does not read; what that waits for is there."""
+    leaves_idle: bool = False
+    """It leaves most of a CUDA device idle: stages that run after this one do not wait for it."""
+
+
+def clearing(array: Any) -> Pass:
+    """A stage's first pass on CUDA: zero where its rectangle will not reach, while the device has little to do."""
+    return Pass(lambda rows: array.zero_(), reads=())
 
 
 @dataclasses.dataclass(frozen=True)

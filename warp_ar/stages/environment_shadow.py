@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+import os
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Literal
 
 import warp as wp
@@ -57,6 +58,9 @@ class Method:
     """Share of the rays that look for it: light that takes rays to find is smooth, and half of them find it."""
 
 
+PARTIALS = "WARP_AR_PARTIALS"
+"""Environment variable, for measuring: threads of a CUDA device for each estimate."""
+
 METHODS: Mapping[str, Method] = {
     "coarse8": Method(32, 4, 8, "estimated"),
     "coarse6": Method(32, 4, 6, "estimated"),
@@ -68,6 +72,10 @@ METHODS: Mapping[str, Method] = {
     "brute_force": Method(REFERENCE_SIZE[0] * REFERENCE_SIZE[1], 1, 1, "traced"),
 }
 """Cheapest first, after ``none``."""
+
+
+DRAWN = ("pose", "objects", "environment_samples", "probe_places")
+"""What says where the samples are and what hides them."""
 
 
 def find_stride(method: Method, rows: int) -> int:
@@ -153,7 +161,10 @@ class EnvironmentShadow(Stage):
         if wave is None:
             environment_shadow.make_environment_shadow_kernel(config)
         filters.make_filter_ratio_kernel(config.side)
-        filters.make_spread_ratio_kernel(config.distant)
+        if filters.spreads_apart(find_stride(METHODS[self.method], self.request.size[1]), device):
+            filters.make_spread_mixed_kernel(config.distant)
+        else:
+            filters.make_spread_ratio_kernel(config.distant)
         distant = make_distant_light(self.features, arrays, self.name)
         distant.environment = arrays["environment"]
         if self.features.others:
@@ -163,10 +174,10 @@ class EnvironmentShadow(Stage):
         sets = SampleSets()
         sets.directions, sets.flux, sets.samples = (arrays[name] for name in sample_names(self.features))
 
+        given = params, picture, scene, distant, sets
+
         def estimate(rows: Rows | None) -> None:
-            environment_shadow.shade_environment(
-                config, params, picture, scene, distant, sets, cells, wave=wave, rows=rows
-            )
+            environment_shadow.shade_environment(config, *given, cells, rows=rows)
 
         def average(rows: Rows | None) -> None:
             filters.filter_ratio(config, params, cells, rows=rows)
@@ -183,16 +194,37 @@ class EnvironmentShadow(Stage):
             reach = config.side  # the filter looks beyond the rows that it writes
             return max(start // stride - reach, 0), min(-(-stop // stride) + reach, count)
 
+        estimates = [Pass(estimate, rows=count, extent=cell_rows)]
+        if wave is not None:
+            estimates = self._wavefront(config, given, cells, wave)
         return [
-            Pass(estimate, rows=count, extent=cell_rows),
-            Pass(average, rows=count, extent=cell_rows),
-            Pass(spread, rows=self.request.size[1], extent=GrowingRows(shadow_rows)),
+            *estimates,
+            Pass(average, rows=count, extent=cell_rows, leaves_idle=True),
+            Pass(spread, rows=self.request.size[1], extent=GrowingRows(shadow_rows), leaves_idle=True),
+        ]
+
+    def _wavefront(
+        self, config: EnvironmentShadowConfig, given: wavefront.Given, cells: ShadowCells, wave: wavefront.Wavefront
+    ) -> list[Pass]:
+        """Estimates, kernel by kernel: rays need not wait for the light's filtered forms, nor for each other."""
+
+        def launcher(one: Callable[..., None]) -> Callable[[Rows | None], None]:
+            return lambda rows: one(config, given, cells, wave)
+
+        drawn = tuple(name for name in self.wiring.reads if name in DRAWN)
+        return [
+            Pass(launcher(wavefront.find_occluded), reads=drawn),
+            Pass(launcher(wavefront.sum_light)),
+            Pass(launcher(wavefront.trace_secondary), beside_last=True),
+            Pass(launcher(wavefront.reduce_partials), leaves_idle=True),
         ]
 
     def _config(self, arrays: Arrays, device: Any) -> EnvironmentShadowConfig:
         """What the kernels are compiled for."""
         method = METHODS[self.method]
         partials = 1 if device.is_cpu else count_partials(*arrays["environment_shadow_ratio"].shape)
+        if not device.is_cpu and PARTIALS in os.environ:
+            partials = int(os.environ[PARTIALS])
         return EnvironmentShadowConfig(
             distant_variant(self.features, device),
             method.count * (sample_slots(self.features) if lists_texels(self.features) else 1),

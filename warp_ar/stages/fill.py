@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_ar.kernels import change, fill, fill_frame
+from warp_ar.kernels.trial import tried
 from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring, unobserved
 from warp_ar.stages.features import Features
@@ -53,6 +54,7 @@ class Fill(Stage):
         return {
             **{name: ArraySpec((self.features.others, *shape), wp.vec3) for name in self.wiring.writes[1:]},
             self.wiring.writes[0]: ArraySpec(shape, wp.vec3),
+            "fill_seen": ArraySpec((self.features.others + 1, *shape), wp.vec4),
             "fill_levels": ArraySpec((fill.fill_level_offsets(*shape)[-1],), wp.vec4),
             "fill_published": ArraySpec(shape, wp.vec3),
             "fill_difference": ArraySpec((height,), wp.float32),
@@ -79,25 +81,49 @@ class Fill(Stage):
                 arrays[self.wiring.writes[0]], arrays["fill_published"], arrays["fill_difference"], rows=rows
             )
 
-        passes = [one for ball, known in enumerate(maps) for one in self._complete(arrays, ball, *known, most)]
+        frame = find_picture(arrays), arrays["params"], arrays["probes"], arrays["ray_scene"]
+        proxies = trace_variant(trace_config(self.request.scene), device).proxies
+        apart = not device.is_cpu and tried("seen")
+        passes = self._look_first(arrays, frame, proxies) if apart else []
+        for ball, known in enumerate(maps):
+            passes += self._complete(arrays, ball, *known, most, None if apart else (frame, proxies))
         if self._on_cpu:
             passes.append(Pass(measure, rows=height))
         return [dataclasses.replace(one, enabled=lambda: not self._holds) for one in passes]
 
+    def _look_first(self, arrays: Arrays, frame: tuple[Any, ...], proxies: tuple[int, ...]) -> list[Pass]:
+        """On CUDA: what the frame shows of all directions, while the ball's own picture is still read."""
+        reads = tuple(name for name in self.wiring.reads if name in (*frame_reads(self.features), "pose"))
+        return [
+            Pass(
+                lambda rows, ball=ball: fill_frame.see_frame(  # type: ignore[misc]
+                    *frame, arrays["fill_seen"][ball], proxies=proxies, ball=ball
+                ),
+                reads=reads,
+            )
+            for ball in range(self.features.others + 1)
+        ]
+
     def _complete(
-        self, arrays: Arrays, ball: int, radiance: Any, confidence: Any, filled: Any, most: float
+        self,
+        arrays: Arrays,
+        ball: int,
+        radiance: Any,
+        confidence: Any,
+        filled: Any,
+        most: float,
+        frame: tuple[tuple[Any, ...], tuple[int, ...]] | None,
     ) -> list[Pass]:
-        """Passes that complete the map of one ball; balls take turns with the pyramid."""
+        """Passes that complete the map of one ball; balls take turns with the pyramid.
+
+        ``frame`` is what is looked up in between, and the kinds of proxy; None: it was before.
+        """
         shape = height, _ = radiance.shape
         levels = arrays["fill_levels"]
-        proxies = trace_variant(trace_config(self.request.scene), levels.device).proxies
-        scene = find_picture(arrays), arrays["params"], arrays["probes"], arrays["ray_scene"]
+        seen = arrays["fill_seen"][ball] if frame is None else None
 
         def seed(rows: Rows | None) -> None:
-            fill.seed_fill(radiance, confidence, levels, rows=rows)
-
-        def see(rows: Rows | None) -> None:
-            fill_frame.fill_frame(*scene, levels, shape, proxies=proxies, ball=ball, rows=rows)
+            fill.seed_fill(radiance, confidence, levels, seen=seen, rows=rows)
 
         def push_pull(rows: Rows | None) -> None:
             fill.push_pull(levels, *shape, most=most)
@@ -105,7 +131,15 @@ class Fill(Stage):
         def finish(rows: Rows | None) -> None:
             fill.finish_fill(levels, filled, rows=rows)
 
-        return [Pass(seed, rows=height), Pass(see, rows=height), Pass(push_pull), Pass(finish, rows=height)]
+        passes = [Pass(seed, rows=height), Pass(push_pull), Pass(finish, rows=height)]
+        if frame is not None:
+            scene, proxies = frame
+
+            def see(rows: Rows | None) -> None:
+                fill_frame.fill_frame(*scene, levels, shape, proxies=proxies, ball=ball, rows=rows)
+
+            passes.insert(1, Pass(see, rows=height))
+        return passes
 
     def begin(self) -> None:
         """Keep the last map where something covers a ball: it covers what the frame shows behind it as well."""

@@ -9,10 +9,12 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_ar.kernels import mirror_ball
+from warp_ar.kernels.launch import clears_first
 from warp_ar.kernels.receiver import RelightConfig, make_receiver
 from warp_ar.kernels.reflect import DistantLight
+from warp_ar.kernels.trial import tried
 from warp_ar.scene.kinds import trace_config
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring, clearing
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.distant_light import (
     distant_light_arrays,
@@ -160,7 +162,24 @@ class MirrorBall(Stage):
             arrays["shadow_ratio"] if config.ratio else None,
         )
 
-        def launch(rows: Rows | None) -> None:
-            mirror_ball.mirror_ball(variant, *inputs, arrays["mirror_ball"], samples=samples, rows=rows)
+        out = arrays["mirror_ball"]
 
-        return [Pass(launch, rows=self.request.size[1], extent=GrowingRows(arrays["ball_rows"]))]
+        cleared = clears_first(device)
+        first = [clearing(out)] if cleared else []
+
+        def launch(rows: Rows | None) -> None:
+            mirror_ball.mirror_ball(variant, *inputs, out, samples=samples, cleared=cleared, rows=rows)
+
+        if device.is_cpu or samples > 1 or not config.ratio or not tried("mirrored"):
+            return [*first, Pass(launch, rows=self.request.size[1], extent=GrowingRows(arrays["ball_rows"]))]
+        # All but the shadows comes first, and need not wait for them.
+        shows = wp.full(out.shape, wp.vec2(-1.0, -1.0), dtype=wp.vec2, device=device)
+        early = tuple(name for name in reads if name != "shadow_ratio")
+
+        def trace(rows: Rows | None) -> None:
+            mirror_ball.mirror_ball(variant, *inputs[:-1], None, out, shows_out=shows, cleared=cleared)
+
+        def shade(rows: Rows | None) -> None:
+            mirror_ball.shade_mirrored(arrays["params"], receiver.picture, arrays["shadow_ratio"], shows, out)
+
+        return [*first, Pass(trace, reads=early), Pass(shade)]

@@ -12,11 +12,11 @@ import warp as wp
 
 from warp_ar.kernels import receiver_cells, relight
 from warp_ar.kernels.cells import cell_shape, cell_stride
-from warp_ar.kernels.launch import count_partials
+from warp_ar.kernels.launch import clears_first, count_partials
 from warp_ar.kernels.receiver import Receiver, ReceiverCells, RelightConfig, make_receiver
 from warp_ar.kernels.structs import PLANE
 from warp_ar.scene.kinds import trace_config
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring, clearing
 from warp_ar.stages.features import Features, sheds_light
 from warp_ar.stages.request import Request
 from warp_ar.stages.shared.distant_light import make_other_balls
@@ -129,11 +129,14 @@ class Relight(Stage):
         added = arrays["added_light"]
         visibility = arrays["relight_visibility"] if config.edge_samples > 1 else None
 
+        cleared = clears_first(device)
+
         def launch(rows: Rows | None) -> None:
-            relight.relight(config, *inputs, added, visibility, rows=rows)
+            relight.relight(config, *inputs, added, visibility, cleared=cleared, rows=rows)
 
         height, light_rows = self.request.size[1], arrays["light_rows"]
-        passes = [*self._cell_passes(config, inputs, arrays, device)]
+        passes = [clearing(added)] if cleared else []
+        passes += self._cell_passes(config, inputs, arrays, device)
         passes.append(Pass(launch, rows=height, extent=GrowingRows(light_rows)))
         if config.edge_samples > 1:
             lists = make_edge_lists(arrays, device, self.name)

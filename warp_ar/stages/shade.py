@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 
 import warp as wp
 
+from warp_ar.kernels.launch import clears_first
 from warp_ar.kernels.near_field import NearLight
 from warp_ar.kernels.shade import make_object_light, shade
 from warp_ar.stages.base import (
@@ -21,6 +22,7 @@ from warp_ar.stages.base import (
     Rows,
     Stage,
     Wiring,
+    clearing,
 )
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.distant_light import distant_light_arrays, distant_light_reads, make_distant_light
@@ -95,7 +97,10 @@ class Shade(Stage):
         light = make_object_light(distant, arrays["light_array"] if config.lights else None, near)
         inputs = arrays["params"], arrays["rays"], arrays["ray_scene"], light, find_visible(arrays)
 
-        def launch(rows: Rows | None) -> None:
-            shade(variant, *inputs, arrays["virtual"], edge_lists=lists, rows=rows)
+        cleared = lists is not None and clears_first(device)
 
-        return [Pass(launch, rows=self.request.size[1], extent=GrowingRows(arrays["object_rows"]))]
+        def launch(rows: Rows | None) -> None:
+            shade(variant, *inputs, arrays["virtual"], edge_lists=lists, cleared=cleared, rows=rows)
+
+        first = [clearing(arrays["virtual"])] if cleared else []
+        return [*first, Pass(launch, rows=self.request.size[1], extent=GrowingRows(arrays["object_rows"]))]
