@@ -28,7 +28,6 @@ from warp_ar.kernels.pixel_order import own_pixel
 from warp_ar.kernels.reflect import DistantLightConfig
 from warp_ar.kernels.shapes import FACES, MESH_KEY, surface_key
 from warp_ar.kernels.structs import FrameParams, Probe, RayScene
-from warp_ar.kernels.trial import tried
 from warp_ar.kernels.visibility import inside_rect, make_visible_proxy
 
 wp.set_module_options({"enable_backward": False})
@@ -383,7 +382,7 @@ def spreads_apart(stride: int, device: wp.DeviceLike) -> bool:
 
     On CUDA, where a warp would wait for their rays, and all other pixels would have fewer registers for them.
     """
-    return not wp.get_device(device).is_cpu and stride >= LEAST_APART and tried("apart")
+    return not wp.get_device(device).is_cpu and stride >= LEAST_APART
 
 
 def _last_cell(size: int, stride: int) -> int:

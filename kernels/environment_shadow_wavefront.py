@@ -24,12 +24,10 @@ from warp_ar.kernels.environment_shadow_bounce import (
 from warp_ar.kernels.environment_shadow_cells import (
     CHUNK,
     SHADED_TILE,
-    WARP_LANES,
     EnvironmentShadowConfig,
     ShadowCells,
     bounced_of,
     can_matter,
-    cell_column,
     first_of_set,
     ratio_of,
     tiled_cell,
@@ -42,7 +40,6 @@ from warp_ar.kernels.sampling import pcg3d_hash
 from warp_ar.kernels.shapes import FAR, intersect_sphere, surface_key
 from warp_ar.kernels.structs import FrameParams, Picture, RayScene
 from warp_ar.kernels.trace import make_trace, offset_origin
-from warp_ar.kernels.trial import tried
 from warp_ar.kernels.visibility import make_visible_proxy
 
 wp.set_module_options({"enable_backward": False})
@@ -95,13 +92,11 @@ def make_find_occluded_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
         rays = picture.rays
         stride = cells_out.stride
         columns = cells_out.surface.shape[1]
-        j = cell_column(thread, columns, side, WARP_LANES)
-        if tiled > 0:
-            cell = tiled_cell(i, thread, side, tiled)
-            i = cell[0]
-            j = cell[1]
-            if i >= cells_out.surface.shape[0] or j >= columns:
-                return
+        cell = tiled_cell(i, thread, side, tiled)
+        i = cell[0]
+        j = cell[1]
+        if i >= cells_out.surface.shape[0] or j >= columns:
+            return
         row = cell_pixel(i, stride, rays.shape[0])
         column = cell_pixel(j, stride, rays.shape[1])
         key = wp.int32(-1)
@@ -188,13 +183,11 @@ def make_sum_light_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
         wave_out: Wavefront,
     ):
         partial, i, thread = wp.tid()
-        j = cell_column(thread, cells.surface.shape[1], side, WARP_LANES)
-        if tiled > 0:
-            cell = tiled_cell(i, thread, side, tiled)
-            i = cell[0]
-            j = cell[1]
-            if i >= cells.surface.shape[0] or j >= cells.surface.shape[1]:
-                return
+        cell = tiled_cell(i, thread, side, tiled)
+        i = cell[0]
+        j = cell[1]
+        if i >= cells.surface.shape[0] or j >= cells.surface.shape[1]:
+            return
         if not any_occluded(wave_out.occluded, i, j):
             return
         rays = picture.rays
@@ -359,10 +352,8 @@ Given = tuple[wp.array[FrameParams], Picture, RayScene, DistantLight, SampleSets
 
 
 def _threads(config: EnvironmentShadowConfig, wave: Wavefront) -> tuple[tuple[int, int, int], int]:
-    """Extent of a launch over partial sums and cells, and its last axis for ``tiled_cell``; 0: cells in a row."""
+    """Extent of a launch over partial sums and cells, and its last axis for ``tiled_cell``."""
     partials, rows, columns = wave.occluded.shape
-    if not tried("tiles"):
-        return (partials, rows, columns), 0
     down, across = tiled_shape(rows, columns, config.side)
     return (partials, down, across), across
 

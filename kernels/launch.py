@@ -13,7 +13,6 @@ import contextlib
 import dataclasses
 import functools
 import math
-import os
 import threading
 import weakref
 from collections.abc import Callable, Iterator, Sequence
@@ -22,7 +21,6 @@ from typing import Any
 import warp as wp
 
 from warp_ar.kernels.pixel_order import RECTANGLE_FIRST, RECTANGLE_ONLY
-from warp_ar.kernels.trial import tried
 
 Rows = tuple[int, int]
 """A band of rows: first, and one past the last."""
@@ -72,14 +70,9 @@ MOST_BLOCKS = 4096
 """Blocks of ``BLOCK`` threads with which a CUDA device does all pixels of a frame, where most of them are soon done."""
 
 
-def most_blocks() -> int:
-    """How many those are."""
-    return int(os.environ.get("WARP_AR_BLOCKS", MOST_BLOCKS))
-
-
 def clears_first(device: wp.DeviceLike) -> bool:
     """Whether what a rectangle does not reach is cleared before, while the device has little to do."""
-    return not wp.get_device(device).is_cpu and tried("cleared") and tried("rectangles")
+    return not wp.get_device(device).is_cpu
 
 
 MAX_PARTIALS = 8
@@ -195,13 +188,13 @@ def launch_rows(
         alone: Whether, where that is so, other pixels need not be written.
     """
     whole = rows is None or tuple(rows) == (0, shape[0])
-    many = math.prod(shape) > BLOCK * most_blocks()
-    limited = rectangle_first and whole and many and not wp.get_device(device).is_cpu and tried("rectangles")
+    many = math.prod(shape) > BLOCK * MOST_BLOCKS
+    limited = rectangle_first and whole and many and not wp.get_device(device).is_cpu
 
     def do() -> None:
         start, stop = rows if rows is not None else (0, shape[0])
         if limited:
-            given = {"outputs": outputs, "device": device, "stream": stream, "max_blocks": most_blocks()}
+            given = {"outputs": outputs, "device": device, "stream": stream, "max_blocks": MOST_BLOCKS}
             code = RECTANGLE_ONLY if alone else RECTANGLE_FIRST
             wp.launch(kernel, dim=tuple(shape), inputs=[code, *inputs], **given)
         elif stop > start:

@@ -33,7 +33,6 @@ from warp_ar.kernels.shadow import tile_turn
 from warp_ar.kernels.shapes import FAR, ROUNDING, intersect_sphere
 from warp_ar.kernels.structs import FrameParams, Light, Picture, Probe, RayScene
 from warp_ar.kernels.trace import TraceConfig, make_trace, offset_origin
-from warp_ar.kernels.trial import tried
 from warp_ar.kernels.visibility import inside_rect, look_within_pixel
 
 wp.set_module_options({"enable_backward": False})
@@ -330,7 +329,7 @@ def mirror_ball(
     if samples < 1 or side**2 != samples:
         raise ValueError(f"samples is {samples}; expected a square number such as 1 or 4")
     rays = receiver.picture.rays
-    share = samples if samples in SHARED and not rays.device.is_cpu and tried("lanes") else 1
+    share = samples if samples in SHARED and not rays.device.is_cpu else 1
     launch_rows(
         make_mirror_ball_kernel(config),
         (*rays.shape, share),

@@ -56,7 +56,6 @@ from warp_ar.kernels.near_field_rays import (
 from warp_ar.kernels.pixel_order import own_pixel
 from warp_ar.kernels.reflect import DistantLight, make_distant_irradiance, make_reflected_radiance
 from warp_ar.kernels.structs import FrameParams, Hit, Picture, RayScene
-from warp_ar.kernels.trial import tried
 from warp_ar.kernels.visibility import VisibleObjects, inside_rect
 
 wp.set_module_options({"enable_backward": False})
@@ -338,7 +337,7 @@ def estimate_near_field(
         rows: Band of rows; None means all.
     """
     least = min(count for count in (config.count, config.lobe_count, config.mirror_samples) if count > 0)
-    share = LANES if least >= LANES and not picture.rays.device.is_cpu and tried("near") else 1
+    share = LANES if least >= LANES and not picture.rays.device.is_cpu else 1
     launch_rows(
         make_near_field_kernel(config),
         (*picture.rays.shape, share),

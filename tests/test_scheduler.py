@@ -416,15 +416,12 @@ class FakeStream:
         self.behind |= event
 
 
-def launch_order(
-    monkeypatch: pytest.MonkeyPatch, after: tuple[str, ...] = (), **passes: list[dict[str, Any]]
-) -> dict[str, set[str]]:
+def launch_order(monkeypatch: pytest.MonkeyPatch, **passes: list[dict[str, Any]]) -> dict[str, set[str]]:
     """What each launch of a captured graph directly waits for: stages a, b (frame -> a -> b), c, d (reads a and c)."""
     reads = {"a": ("frame",), "b": ("a",), "c": ("frame",), "d": ("a", "c")}
     stages = []
     for name, read in reads.items():
         fields = {"name": name, "wire": classmethod(lambda cls, _, name=name, read=read: Wiring(read, (name,)))}
-        fields["runs_after"] = lambda self, way=(after if name == "d" else ()): way
         stages.append(type(name, (AddOne,), fields))
     plan = plan_of(monkeypatch, tuple(stages), tuple(reads))
     waits: dict[str, set[str]] = {}
@@ -436,7 +433,7 @@ def launch_order(
     monkeypatch.setattr(wp, "Stream", FakeStream)
     monkeypatch.setattr(Scheduler, "_launch_on", note)
     scheduler = Scheduler.__new__(Scheduler)
-    scheduler.device, scheduler._stream, scheduler._streams = None, FakeStream(), {False: [], True: []}
+    scheduler.device, scheduler._stream, scheduler._streams = None, FakeStream(), []
     steps = []
     for kind, wiring in plan.stages:
         given = passes.get(kind.name, [{}])
@@ -458,16 +455,3 @@ def test_a_pass_may_run_beside_the_one_before(monkeypatch: pytest.MonkeyPatch) -
     assert (found["a0"], found["a1"], found["a2"]) == (set(), set(), {"a0", "a1"})
     assert found["b0"] == {"a2"}
     assert found["d0"] == {"a2", "c0", "c1"}
-
-
-def test_stages_do_not_wait_for_what_leaves_the_device_idle(monkeypatch: pytest.MonkeyPatch) -> None:
-    idle, busy = {"leaves_idle": True}, {"leaves_idle": False}
-    assert launch_order(monkeypatch, ("b",), b=[{}, busy])["d0"] == {"a0", "b1", "c0"}
-    assert launch_order(monkeypatch, ("b",), b=[{}, idle, idle])["d0"] == {"a0", "b0", "c0"}
-    assert launch_order(monkeypatch, ("b",), b=[{}, {"beside_last": True}, idle])["d0"] == {"a0", "b0", "b1", "c0"}
-    assert launch_order(monkeypatch, ("b",), b=[{}, idle, busy])["d0"] == {"a0", "b2", "c0"}
-    early = launch_order(monkeypatch, ("b",), d=[{"reads": ("c",)}, {}])
-    assert (early["d0"], early["d1"]) == ({"c0"}, {"a0", "b0", "d0"}), (
-        "what says itself what it reads waits for no more"
-    )
-    assert launch_order(monkeypatch, ("c",), c=[{}, idle])["d0"] == {"a0", "c0", "c1"}, "what it reads is waited for"

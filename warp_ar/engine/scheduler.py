@@ -25,7 +25,6 @@ from warp_ar.engine.graph import Plan
 from warp_ar.engine.modules import Progress, load_modules
 from warp_ar.kernels.bands import serve_kernel
 from warp_ar.kernels.launch import Note, noting
-from warp_ar.kernels.trial import also, tried
 from warp_ar.stages.base import Arrays, Pass, Reach, Rows, Stage
 
 Step = tuple[Stage, list[Pass]]
@@ -46,17 +45,6 @@ class StageTiming:
 
 
 SKIPPED = StageTiming(0.0, True)
-URGENT = (
-    "unwrap",
-    "accumulate",
-    "fill",
-    "recover",
-    "environment_samples",
-    "prefilter",
-    "environment_shadow",
-    "near_field",
-)
-"""Stages that others wait for: where it is asked for, the device takes their blocks first."""
 
 
 class Scheduler:
@@ -102,7 +90,7 @@ class Scheduler:
         self._patterns: dict[Any, list[Segment]] = {}
         self._graphs: dict[tuple[int, ...], Any] = {}
         self._stream: Any = wp.get_stream(device) if device.is_cuda else None
-        self._streams: dict[bool, list[Any]] = {False: [], True: []}
+        self._streams: list[Any] = []
         self._marks: dict[tuple[int, ...], tuple[Any, Any]] | None = {} if profile and device.is_cuda else None
         self.clock = time.perf_counter
         """Seconds by which stages are timed on the host."""
@@ -451,49 +439,31 @@ class Scheduler:
         stream = self._stream
         begun = stream.record_event()
         written: dict[str, Any] = {}
-        ends: dict[str, Any] = {}
-        urgent, used = tried("priority"), {False: 0, True: 0}
-        for stage, passes in _in_launch_order(part):
-            first = urgent and stage.name in URGENT
-            own, other = self._stream_at(used[first], first), self._stream_at(used[first] + 1, first)
-            used[first] += 2
+        self._streams += [wp.Stream(self.device) for _ in range(2 * len(part) - len(self._streams))]
+        for index, (stage, passes) in enumerate(_in_launch_order(part)):
+            own, other = self._streams[2 * index : 2 * index + 2]
             own.wait_event(begun)
-            behind = [] if also("eager") else [ends[name] for name in stage.runs_after() if name in ends]
             awaited = [name for name in stage.wiring.reads if name in written]
             before, beside = begun, None
             for step in passes:
-                if step.beside_last and tried("beside"):
+                if step.beside_last:
                     other.wait_event(before)
                     self._launch_on(other, step)
                     beside = other.record_event()
                     continue
                 if beside is not None:
                     own.wait_event(beside)
-                early = step.reads is not None and tried("passes")
-                while behind and not early:
-                    own.wait_event(behind.pop())
-                reads = (step.reads or ()) if early else stage.wiring.reads
+                reads = stage.wiring.reads if step.reads is None else step.reads
                 for name in [name for name in awaited if name in reads]:
                     own.wait_event(written[name])
                     awaited.remove(name)
                 before, beside = own.record_event(), None
-                if not (step.leaves_idle and tried("free")):
-                    ends.pop(stage.name, None)
-                elif stage.name not in ends:
-                    ends[stage.name] = before
                 self._launch_on(own, step)
             if beside is not None:
                 own.wait_event(beside)
             done = own.record_event()
-            ends.setdefault(stage.name, done)
             written.update(dict.fromkeys(stage.wiring.writes, done))
             stream.wait_event(done)
-
-    def _stream_at(self, number: int, urgent: bool) -> Any:
-        streams = self._streams[urgent]
-        while len(streams) <= number:
-            streams.append(wp.Stream(self.device, priority=-1) if urgent else wp.Stream(self.device))
-        return streams[number]
 
     def _launch_on(self, stream: Any, step: Pass) -> None:
         with wp.ScopedStream(stream, sync_enter=False):

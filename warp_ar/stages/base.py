@@ -84,12 +84,9 @@ class Pass:
     enabled: Callable[[], bool] | None = None
     """Whether the pass takes part in this frame, asked once, after ``Stage.begin``; None means always."""
     reads: tuple[str, ...] | None = None
-    """What of the stage's resources it reads: on CUDA it begins when that is there, whatever the stage runs after. None
-    means all."""
+    """What of the stage's resources it reads: on CUDA it begins when that is there. None means all."""
     beside_last: bool = False
     """On CUDA it runs beside the pass before it, whose results it does not read; what that waits for is there."""
-    leaves_idle: bool = False
-    """It leaves most of a CUDA device idle: stages that run after this one do not wait for it."""
 
 
 def clearing(array: Any) -> Pass:
@@ -258,7 +255,7 @@ class Stage(abc.ABC):
         """Called instead of ``begin`` in a frame in which nothing reads what the stage writes."""
 
     def runs_after(self) -> tuple[str, ...]:
-        """Names of stages that are slower beside this one than before it: on CUDA it waits for them.
+        """Names of stages that are launched before this one on CUDA, though it reads nothing of theirs.
 
         For a stage that nobody waits for before those are done, and that fills the device by itself.
         """

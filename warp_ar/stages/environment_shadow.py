@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Literal
 
@@ -57,9 +56,6 @@ class Method:
     secondary: float = 1.0
     """Share of the rays that look for it: light that takes rays to find is smooth, and half of them find it."""
 
-
-PARTIALS = "WARP_AR_PARTIALS"
-"""Environment variable, for measuring: threads of a CUDA device for each estimate."""
 
 METHODS: Mapping[str, Method] = {
     "coarse8": Method(32, 4, 8, "estimated"),
@@ -199,8 +195,8 @@ class EnvironmentShadow(Stage):
             estimates = self._wavefront(config, given, cells, wave)
         return [
             *estimates,
-            Pass(average, rows=count, extent=cell_rows, leaves_idle=True),
-            Pass(spread, rows=self.request.size[1], extent=GrowingRows(shadow_rows), leaves_idle=True),
+            Pass(average, rows=count, extent=cell_rows),
+            Pass(spread, rows=self.request.size[1], extent=GrowingRows(shadow_rows)),
         ]
 
     def _wavefront(
@@ -216,15 +212,13 @@ class EnvironmentShadow(Stage):
             Pass(launcher(wavefront.find_occluded), reads=drawn),
             Pass(launcher(wavefront.sum_light)),
             Pass(launcher(wavefront.trace_secondary), beside_last=True),
-            Pass(launcher(wavefront.reduce_partials), leaves_idle=True),
+            Pass(launcher(wavefront.reduce_partials)),
         ]
 
     def _config(self, arrays: Arrays, device: Any) -> EnvironmentShadowConfig:
         """What the kernels are compiled for."""
         method = METHODS[self.method]
         partials = 1 if device.is_cpu else count_partials(*arrays["environment_shadow_ratio"].shape)
-        if not device.is_cpu and PARTIALS in os.environ:
-            partials = int(os.environ[PARTIALS])
         return EnvironmentShadowConfig(
             distant_variant(self.features, device),
             method.count * (sample_slots(self.features) if lists_texels(self.features) else 1),

@@ -10,7 +10,6 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_ar.kernels import change, fill, fill_frame
-from warp_ar.kernels.trial import tried
 from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring, unobserved
 from warp_ar.stages.features import Features
@@ -83,7 +82,7 @@ class Fill(Stage):
 
         frame = find_picture(arrays), arrays["params"], arrays["probes"], arrays["ray_scene"]
         proxies = trace_variant(trace_config(self.request.scene), device).proxies
-        apart = not device.is_cpu and tried("seen")
+        apart = not device.is_cpu
         passes = self._look_first(arrays, frame, proxies) if apart else []
         for ball, known in enumerate(maps):
             passes += self._complete(arrays, ball, *known, most, None if apart else (frame, proxies))

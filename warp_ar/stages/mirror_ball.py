@@ -12,7 +12,6 @@ from warp_ar.kernels import mirror_ball
 from warp_ar.kernels.launch import clears_first
 from warp_ar.kernels.receiver import RelightConfig, make_receiver
 from warp_ar.kernels.reflect import DistantLight
-from warp_ar.kernels.trial import tried
 from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring, clearing
 from warp_ar.stages.features import Features
@@ -170,7 +169,7 @@ class MirrorBall(Stage):
         def launch(rows: Rows | None) -> None:
             mirror_ball.mirror_ball(variant, *inputs, out, samples=samples, cleared=cleared, rows=rows)
 
-        if device.is_cpu or samples > 1 or not config.ratio or not tried("mirrored"):
+        if device.is_cpu or samples > 1 or not config.ratio:
             return [*first, Pass(launch, rows=self.request.size[1], extent=GrowingRows(arrays["ball_rows"]))]
         # All but the shadows comes first, and need not wait for them.
         shows = wp.full(out.shape, wp.vec2(-1.0, -1.0), dtype=wp.vec2, device=device)
