@@ -16,6 +16,7 @@ from warp_ar.input.reflectance_watch import ENOUGH, FIRST, MOST, ReflectanceWatc
 from warp_ar.input.saturation import ball_discs
 from warp_ar.input.sources import open_source
 from warp_ar.kernels.color import decode_table
+from warp_ar.live_clip import reflectances_told
 from warp_ar.scene import Pose, load_scene
 
 TOLD = 0.08
@@ -170,3 +171,14 @@ def test_another_pipeline_of_the_same_scene_goes_on_with_what_was_told():
     finally:
         first.close()
         second.close()
+
+
+def test_a_run_says_which_reflectances_were_taken():
+    first, second = said((0.5, 0.5, 0.5)).probes[0], said((0.85, 0.85, 0.87)).probes[0]
+    status = {"ball_reflectance": [[0.61, 0.62, 0.63], [0.85, 0.85, 0.87]]}
+    (line,) = reflectances_told((first, second), lambda: status)
+    assert "mirror ball 0" in line
+    assert "0.61, 0.62, 0.63" in line
+    assert "0.50, 0.50, 0.50" in line
+    assert reflectances_told((first, second), dict) == []
+    assert reflectances_told((first, second), None) == []

@@ -8,7 +8,7 @@ import itertools
 import json
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +24,7 @@ from warp_ar.output.encoders import parse_options
 from warp_ar.output.places import check_places, check_replaceable, files_of
 from warp_ar.output.sink import make_folder
 from warp_ar.output.sinks import NullSink, Sink, open_sink
-from warp_ar.scene import Scene, load_scene
+from warp_ar.scene import Probe, Scene, load_scene
 from warp_ar.signature import PROGRAM
 from warp_ar.stages.quality import AUTO
 
@@ -175,6 +175,24 @@ def _ball_report(scene: Scene, session: Session) -> dict[str, Any]:
     return {"balls": found} if found else {}
 
 
+def reflectances_told(probes: Sequence[Probe], status: Callable[[], Mapping[str, Any]] | None) -> list[str]:
+    """A line for each ball whose reflectance frames have told otherwise than the scene.
+
+    Args:
+        probes: The scene's.
+        status: Of recovered light; None where none is recovered.
+    """
+    told = None if status is None else status().get("ball_reflectance")
+    lines = []
+    for index, (probe, found) in enumerate(zip(probes, told or (), strict=False)):
+        if tuple(found) != tuple(round(value, 3) for value in probe.reflectance):
+            said, taken = (", ".join(f"{value:.2f}" for value in values) for values in (probe.reflectance, found))
+            lines.append(
+                f"mirror ball {index} was taken to reflect {taken}, as frames show it, not {said}, as [probe] has it"
+            )
+    return lines
+
+
 def _compile(session: Session, *, shown: bool) -> None:
     """Have the kernels ready, with a bar where some must be compiled."""
     words = TextColumn("compiling kernels, once for this kind of scene")
@@ -294,6 +312,8 @@ def _light_clip(options: argparse.Namespace, loaded: Callable[[], None]) -> int:
                 _light_frames(options, session, log, (sink, camera), side, stop, evidence, traced)
             if stop.code is None:
                 _check_run(log, session, evidence)
+            for words in reflectances_told(session.scene.probes, session.pipeline.arrays.get("recover_status")):
+                say(words)
         except WarpArError as error:
             problem = _write_report(options.report, log, balls)
             also = f"; and {problem}" if problem else ""
