@@ -249,8 +249,7 @@ def make_physical_radiance(trace: TraceConfig) -> wp.Function:
     find_vertex, sky_light = make_find_vertex(trace), make_sky_light(trace)
     see_proxy, look_up_material = make_see_proxy(trace), make_look_up_material()
 
-    # Not inlined, as ``follow_path``: its calls are rare beside what they do, and each copy is compiled anew.
-    @wp.func(module="unique", inline=False)
+    @wp.func(module="unique")
     def physical_radiance(
         params: FrameParams,
         scene: LocalScene,
@@ -373,7 +372,7 @@ def make_follow_path(trace: TraceConfig) -> wp.Function:
     physical_radiance, virtual_light = make_physical_radiance(trace), make_virtual_light(trace)
     occluded_by_objects = make_trace(trace).occluded_by_objects
 
-    @wp.func(module="unique", inline=False)
+    @wp.func(module="unique")
     def follow_path(
         params: FrameParams,
         scene: LocalScene,
@@ -434,25 +433,26 @@ def make_follow_path(trace: TraceConfig) -> wp.Function:
             if wp.max(weight) <= 0.0:
                 return carried
             origin = offset_origin(hit.point, hit.geometric_normal, drawn.direction, hit.error)
+            also_without = is_white
+            if not only_light:
+                chance = survival(weight, k)
+                if pick[1] >= chance:
+                    return carried
+                weight = weight / chance
+                vertex = find_vertex(scene, origin, drawn.direction, True)
+                carried.rays += 1
+                disks = lights_in_the_way(scene.lights, hit.point, drawn.direction, vertex.hit.t, drawn.density)
+                carried.radiance += wp.cw_mul(weight, disks)
+                also_without = is_white or (changes_only and vertex.kind == OBJECT)
             physical = Carried()
-            if is_white:
+            if also_without:
                 physical = physical_radiance(params, scene, origin, drawn.direction, drawn.density, key, k)
-                carried.light += wp.cw_mul(weight, physical.radiance)
                 carried.rays += physical.rays
+            if is_white:
+                carried.light += wp.cw_mul(weight, physical.radiance)
                 if only_light:
                     return carried
-            chance = survival(weight, k)
-            if pick[1] >= chance:
-                return carried
-            weight = weight / chance
-            vertex = find_vertex(scene, origin, drawn.direction, True)
-            carried.rays += 1
-            disks = lights_in_the_way(scene.lights, hit.point, drawn.direction, vertex.hit.t, drawn.density)
-            carried.radiance += wp.cw_mul(weight, disks)
             if changes_only and vertex.kind == OBJECT:
-                if not is_white:
-                    physical = physical_radiance(params, scene, origin, drawn.direction, drawn.density, key, k)
-                    carried.rays += physical.rays
                 carried.radiance -= wp.cw_mul(weight, physical.radiance)
                 changes_only = False
             if not changes_only:

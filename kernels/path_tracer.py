@@ -71,37 +71,37 @@ def make_sample_pixel(trace: TraceConfig) -> wp.Function:
     ) -> PixelSample:
         out = PixelSample()
         whole = asked == wp.static(WHOLE)
+        only_light = asked == wp.static(IRRADIANCE)
+        paths = wp.int32(0)
+        white = bool(False)
         if whole and vertex.kind == NOTHING:
             out.z = sky_radiance(scene.sky, direction, NO_DENSITY)
         elif whole or vertex.kind == OBJECT:
-            if asked != wp.static(IRRADIANCE):
-                carried = follow_path(params, scene, vertex, direction, False, False, False, False, key)
-                out.z = carried.radiance
-                out.rays = carried.rays
+            paths = wp.where(only_light, 0, 1)
         else:
             out.z = shown
             # A face that is seen from behind is not the surface that the camera sees.
             if vertex.kind == PROXY and not is_turned(vertex, direction):
-                only_light = asked == wp.static(IRRADIANCE)
-                lobes = wp.where(is_glossy(scene, vertex), 2, 1)
-                for lobe in range(lobes):
-                    of_lobe = key
-                    if lobe == 1:
-                        of_lobe.seed = ~key.seed
-                    one = follow_path(params, scene, vertex, direction, True, True, lobe == 1, only_light, of_lobe)
-                    out.rays += one.rays
-                    if lobe == 0:
-                        out.g = one.radiance
-                        out.e = one.light
-                    elif only_light:
-                        out.g = one.light  # what the frame shows mirrored
-                    else:
-                        out.z += one.radiance
+                white = True
+                paths = wp.where(is_glossy(scene, vertex), 2, 1)
                 out.shows = 1.0
-            elif vertex.kind == BALL and asked == wp.static(DIFFERENCE):
-                carried = follow_path(params, scene, vertex, direction, True, False, False, False, key)
-                out.z += carried.radiance
-                out.rays = carried.rays
+            elif vertex.kind == BALL and not only_light:
+                paths = 1
+        difference = not whole and vertex.kind != OBJECT
+        # All kinds of path by one call: each would be a copy of what follows paths, by far the largest part.
+        for lobe in range(paths):
+            of_lobe = key
+            if lobe == 1:
+                of_lobe.seed = ~key.seed
+            one = follow_path(params, scene, vertex, direction, difference, white, lobe == 1, only_light, of_lobe)
+            out.rays += one.rays
+            if not white or (lobe == 1 and not only_light):
+                out.z += one.radiance
+            elif lobe == 0:
+                out.g = one.radiance
+                out.e = one.light
+            else:
+                out.g = one.light  # what the frame shows mirrored
         return out
 
     return sample_pixel
