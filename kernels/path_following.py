@@ -35,6 +35,7 @@ from warp_ar.kernels.path_sampling import (
     reflect_direct,
     sky_radiance,
     surface_density,
+    weigh_drawn,
 )
 from warp_ar.kernels.path_vertices import (
     NOTHING,
@@ -81,6 +82,19 @@ class Carried:
 
 
 @wp.struct
+class Path:
+    """Where a path is: at its surface number ``k``, or on the ray that leads to it."""
+
+    weight: wp.vec3
+    origin: wp.vec3  # of the ray
+    direction: wp.vec3  # unit
+    density: wp.float32  # with which the direction was drawn
+    k: wp.int32
+    changes_only: wp.bool  # whether it carries the difference that virtual content makes
+    without: wp.bool  # whether it meets no virtual content
+
+
+@wp.struct
 class SkyLight:
     """Light of the environment from one direction, as a surface reflects it."""
 
@@ -97,44 +111,37 @@ class SkyLight:
 # sphere of a virtual object or a ball, or to where one of these mirrors light (``path_guides``). The density of every
 # direction is then that of the mixture, (1 - q) p + q g.
 @wp.func
-def guided_chance(scene: LocalScene, surface: Surface, changes_only: wp.bool) -> wp.float32:
+def guided_chance(scene: LocalScene, surface: Surface, path: Path) -> wp.float32:
     """Chance of a direction to be drawn toward an object or a ball."""
-    if guide_count(scene.guides, changes_only) == 0 or surface.model == wp.static(int(MIRROR)):
+    if path.without or guide_count(scene.guides, path.changes_only) == 0 or surface.model == wp.static(int(MIRROR)):
         return 0.0
     return GUIDED * (1.0 - lobe_chance(surface))
 
 
 @wp.func
-def next_density(
-    scene: LocalScene, hit: Hit, surface: Surface, wo: wp.vec3, wi: wp.vec3, changes_only: wp.bool
-) -> wp.float32:
+def next_density(scene: LocalScene, hit: Hit, surface: Surface, wo: wp.vec3, wi: wp.vec3, path: Path) -> wp.float32:
     """Density with which ``draw_next`` gives a direction."""
-    chance = guided_chance(scene, surface, changes_only)
+    chance = guided_chance(scene, surface, path)
     density = (1.0 - chance) * surface_density(surface, hit.normal, wo, wi)
     if chance > 0.0:
-        density += chance * guide_density(scene.guides, scene.sky, hit.point, wi, changes_only)
+        density += chance * guide_density(scene.guides, scene.sky, hit.point, wi, path.changes_only)
     return density
 
 
 @wp.func
 def draw_next(
-    scene: LocalScene, hit: Hit, surface: Surface, wo: wp.vec3, pick: wp.vec3, u: wp.vec2, changes_only: wp.bool
+    scene: LocalScene, hit: Hit, surface: Surface, wo: wp.vec3, pick: wp.vec3, u: wp.vec2, path: Path
 ) -> Drawn:
     """Direction in which a path goes on, with its weight and density; ``pick``'s first and last number choose how."""
-    chance = guided_chance(scene, surface, changes_only)
-    if chance <= 0.0:
-        return draw_reflected(surface, hit.normal, hit.geometric_normal, wo, pick[0], u)
-    drawn = Drawn()
+    chance = guided_chance(scene, surface, path)
+    wi = wp.vec3(0.0, 0.0, 0.0)
     if pick[2] < chance:
-        drawn.direction = draw_guide(scene.guides, scene.sky, hit.point, pick[2] / chance, u, changes_only)
+        wi = draw_guide(scene.guides, scene.sky, hit.point, pick[2] / chance, u, path.changes_only)
     else:
-        drawn = draw_reflected(surface, hit.normal, hit.geometric_normal, wo, pick[0], u)
-    wi = drawn.direction
-    drawn.weight = wp.vec3(0.0, 0.0, 0.0)
-    if wp.dot(wi, hit.geometric_normal) > 0.0:
-        drawn.density = next_density(scene, hit, surface, wo, wi, changes_only)
-        drawn.weight = reflect_direct(surface, hit.normal, wo, wi) / wp.max(drawn.density, 1.0e-20)
-    return drawn
+        wi = draw_reflected(surface, hit.normal, hit.geometric_normal, wo, pick[0], u)
+    if wp.dot(wi, hit.geometric_normal) <= 0.0:
+        return Drawn()
+    return weigh_drawn(surface, hit.normal, wo, wi, next_density(scene, hit, surface, wo, wi, path))
 
 
 @wp.func
@@ -199,26 +206,16 @@ def white_surface(scene: LocalScene, vertex: Vertex, lobe: wp.bool) -> Surface:
 
 @functools.cache
 def make_sky_light(trace: TraceConfig) -> wp.Function:
-    """``sky_light(scene, hit, surface, wo, guided, changes_only, key, k) -> SkyLight``: reflected, of one direction.
+    """``sky_light(scene, hit, surface, wo, path, key) -> SkyLight``: reflected, of one direction.
 
-    The direction is drawn by the environment's light; its share is that which balances with going on by ``draw_next``
-    if ``guided``, else by ``draw_reflected``.
+    The direction is drawn by the environment's light; its share is that which balances with going on by ``draw_next``.
     """
     hidden_by_physical = make_hidden_by_physical(trace)
 
     @wp.func(module="unique")
-    def sky_light(
-        scene: LocalScene,
-        hit: Hit,
-        surface: Surface,
-        wo: wp.vec3,
-        guided: wp.bool,
-        changes_only: wp.bool,
-        key: PathKey,
-        k: wp.int32,
-    ) -> SkyLight:
+    def sky_light(scene: LocalScene, hit: Hit, surface: Surface, wo: wp.vec3, path: Path, key: PathKey) -> SkyLight:
         light = SkyLight()
-        u = random_triple(key, k, SKY)
+        u = random_triple(key, path.k, SKY)
         sky = draw_sky(scene.sky, hit.point, wp.vec2(u[0], u[1]), u[2])
         reflected = reflect_direct(surface, hit.normal, wo, sky.direction)
         if wp.max(reflected) > 0.0 and wp.dot(hit.geometric_normal, sky.direction) > 0.0:
@@ -227,11 +224,7 @@ def make_sky_light(trace: TraceConfig) -> wp.Function:
             light.distance = sky.distance
             light.rays = 1
             if not hidden_by_physical(scene, light.origin, sky.direction, sky.distance):
-                other = float(0.0)
-                if guided:
-                    other = next_density(scene, hit, surface, wo, sky.direction, changes_only)
-                else:
-                    other = surface_density(surface, hit.normal, wo, sky.direction)
+                other = next_density(scene, hit, surface, wo, sky.direction, path)
                 light.reaches = True
                 light.radiance = balance(sky.density, other) / sky.density * wp.cw_mul(reflected, sky.radiance)
         return light
@@ -240,93 +233,18 @@ def make_sky_light(trace: TraceConfig) -> wp.Function:
 
 
 @functools.cache
-def make_physical_radiance(trace: TraceConfig) -> wp.Function:
-    """``physical_radiance(params, scene, origin, direction, density, key, first) -> Carried``: without virtual content.
-
-    What a ray brings that was drawn with ``density`` at vertex ``first`` of a path; of the environment the share that
-    balances with drawing it by its light.
-    """
-    find_vertex, sky_light = make_find_vertex(trace), make_sky_light(trace)
-    see_proxy, look_up_material = make_see_proxy(trace), make_look_up_material()
-
-    @wp.func(module="unique")
-    def physical_radiance(
-        params: FrameParams,
-        scene: LocalScene,
-        origin: wp.vec3,
-        direction: wp.vec3,
-        density: wp.float32,
-        key: PathKey,
-        first: wp.int32,
-    ) -> Carried:
-        carried = Carried()
-        weight = wp.vec3(1.0, 1.0, 1.0)
-        at = origin
-        toward = direction
-        drawn_with = density
-        k = first + 1
-        while k < MOST_VERTICES:
-            vertex = find_vertex(scene, at, toward, False)
-            carried.rays += 1
-            carried.radiance += wp.cw_mul(weight, light_along(scene.sky, at, toward, vertex, drawn_with))
-            if vertex.kind == NOTHING:
-                return carried
-            wo = -toward
-            reflectance = wp.vec3(0.0, 0.0, 0.0)
-            if vertex.kind == PROXY:
-                seen = see_proxy(params, scene, vertex)
-                carried.rays += seen.rays
-                if seen.shows:
-                    carried.radiance += wp.cw_mul(weight, seen.radiance)
-                    return carried
-                reflectance = seen.reflectance
-            vertex = from_viewer(vertex, wo)
-            hit = vertex.hit
-            surface = look_up_material(scene, vertex, wo, reflectance)
-            if vertex.kind == PROXY:
-                lit = sky_light(scene, hit, surface, wo, False, False, key, k)
-                carried.rays += lit.rays
-                carried.radiance += wp.cw_mul(weight, lit.radiance)
-            u = random_triple(key, k, SCATTER)
-            pick = random_triple(key, k, PICK)
-            drawn = draw_reflected(surface, hit.normal, hit.geometric_normal, wo, pick[0], wp.vec2(u[0], u[1]))
-            weight = wp.cw_mul(weight, drawn.weight)
-            if wp.max(weight) <= 0.0:
-                return carried
-            chance = survival(weight, k)
-            if pick[1] >= chance:
-                return carried
-            weight = weight / chance
-            at = offset_origin(hit.point, hit.geometric_normal, drawn.direction, hit.error)
-            toward = drawn.direction
-            drawn_with = drawn.density
-            k += 1
-        return carried
-
-    return physical_radiance
-
-
-@functools.cache
 def make_virtual_light(trace: TraceConfig) -> wp.Function:
-    """``virtual_light(scene, hit, surface, wo, changes_only, key, k) -> Carried``: reflected, of all virtual lights."""
+    """``virtual_light(scene, hit, surface, wo, path, key) -> Carried``: reflected, of all virtual lights."""
     hidden_by_physical = make_hidden_by_physical(trace)
     occluded_by_objects = make_trace(trace).occluded_by_objects
 
     @wp.func(module="unique")
-    def virtual_light(
-        scene: LocalScene,
-        hit: Hit,
-        surface: Surface,
-        wo: wp.vec3,
-        changes_only: wp.bool,
-        key: PathKey,
-        k: wp.int32,
-    ) -> Carried:
+    def virtual_light(scene: LocalScene, hit: Hit, surface: Surface, wo: wp.vec3, path: Path, key: PathKey) -> Carried:
         carried = Carried()
         for index in range(scene.lights.shape[0]):
             light = sample_light(scene.lights[index], hit.point)
             if wp.max(light.irradiance_normal) > 0.0:
-                u = random_triple(key, k, FIRST_LIGHT + index % (STREAMS - FIRST_LIGHT))
+                u = random_triple(key, path.k, FIRST_LIGHT + index % (STREAMS - FIRST_LIGHT))
                 away = draw_on_light(scene.lights[index], light, wp.vec2(u[0], u[1]))
                 wi = wp.vec3(away[0], away[1], away[2])
                 reflected = reflect_direct(surface, hit.normal, wo, wi)
@@ -342,11 +260,81 @@ def make_virtual_light(trace: TraceConfig) -> wp.Function:
                                 cosine = light.distance / away[3]
                                 radius = scene.lights[index].radius
                                 own = away[3] * away[3] / (wp.pi * radius * radius * cosine)
-                                share = balance(own, next_density(scene, hit, surface, wo, wi, changes_only))
+                                share = balance(own, next_density(scene, hit, surface, wo, wi, path))
                             carried.radiance += share * wp.cw_mul(reflected, light.irradiance_normal)
         return carried
 
     return virtual_light
+
+
+@wp.struct
+class Arrived:
+    """Light that arrives at a surface, as it reflects it."""
+
+    radiance: wp.vec3  # or the difference that virtual content makes; with what the surface itself sends
+    light: wp.vec3  # of the environment, without virtual content
+    rays: wp.int32  # that were traced for it
+
+
+@functools.cache
+def make_arrive(trace: TraceConfig) -> wp.Function:
+    """``arrive(scene, hit, surface, wo, path, only_light, key) -> Arrived``: straight from lights; 0 at mirrors."""
+    sky_light, virtual_light = make_sky_light(trace), make_virtual_light(trace)
+    occluded_by_objects = make_trace(trace).occluded_by_objects
+
+    @wp.func(module="unique")
+    def arrive(
+        scene: LocalScene, hit: Hit, surface: Surface, wo: wp.vec3, path: Path, only_light: wp.bool, key: PathKey
+    ) -> Arrived:
+        out = Arrived()
+        with_virtual = not (only_light or path.without)
+        if with_virtual:
+            out.radiance = surface.emission
+        if surface.model != wp.static(int(MIRROR)):
+            sky = sky_light(scene, hit, surface, wo, path, key)
+            out.rays = sky.rays
+            if sky.reaches:
+                out.light = sky.radiance
+                if with_virtual:
+                    if occluded_by_objects(scene.rays, sky.origin, sky.direction, sky.distance):
+                        if path.changes_only:
+                            out.radiance -= sky.radiance
+                    elif not path.changes_only:
+                        out.radiance += sky.radiance
+            if with_virtual:
+                lit = virtual_light(scene, hit, surface, wo, path, key)
+                out.radiance += lit.radiance
+                out.rays += lit.rays
+        return out
+
+    return arrive
+
+
+@wp.func
+def go_on(scene: LocalScene, hit: Hit, surface: Surface, wo: wp.vec3, path: Path, key: PathKey) -> Path:
+    """The path on its next ray; without weight where it ends."""
+    u = random_triple(key, path.k, SCATTER)
+    pick = random_triple(key, path.k, PICK)
+    drawn = draw_next(scene, hit, surface, wo, pick, wp.vec2(u[0], u[1]), path)
+    following = path
+    following.weight = wp.cw_mul(path.weight, drawn.weight)
+    chance = survival(following.weight, path.k)
+    following.weight = wp.where(pick[1] < chance, following.weight / wp.max(chance, 1.0e-30), wp.vec3(0.0, 0.0, 0.0))
+    following.origin = offset_origin(hit.point, hit.geometric_normal, drawn.direction, hit.error)
+    following.direction = drawn.direction
+    following.density = drawn.density
+    following.k += 1
+    return following
+
+
+@wp.func
+def start_without(path: Path) -> Path:
+    """The path that leaves virtual content out, on the ray on which ``path`` is."""
+    other = path
+    other.weight = wp.vec3(1.0, 1.0, 1.0)
+    other.changes_only = False
+    other.without = True
+    return other
 
 
 # The frame. The camera has seen the physical surfaces, so a path that meets a proxy where the frame shows it knows the
@@ -359,6 +347,10 @@ def make_virtual_light(trace: TraceConfig) -> wp.Function:
 # content as well: it takes away light of the environment that virtual objects hide, adds that of virtual lights, and
 # where it meets a virtual object it becomes whole, less the radiance that the same ray brings without objects. Of a
 # pixel that nothing virtual reaches, every path gives exactly 0.
+#
+# That radiance is found by a path of its own, for which the other waits and which meets nothing virtual. Both go round
+# the same loop: threads of a warp do the same whichever of the two they follow, and what a path does at a surface
+# is compiled once.
 @functools.cache
 def make_follow_path(trace: TraceConfig) -> wp.Function:
     """``follow_path(params, scene, first, direction, difference, white, lobe, only_light, key) -> Carried``.
@@ -367,10 +359,8 @@ def make_follow_path(trace: TraceConfig) -> wp.Function:
     makes. ``white``: the first surface is one, and what it sends without virtual content is found too; ``only_light``:
     nothing else is. ``lobe``: it is not white but the gloss of its proxy alone.
     """
-    find_vertex, sky_light = make_find_vertex(trace), make_sky_light(trace)
+    find_vertex, arrive = make_find_vertex(trace), make_arrive(trace)
     see_proxy, look_up_material = make_see_proxy(trace), make_look_up_material()
-    physical_radiance, virtual_light = make_physical_radiance(trace), make_virtual_light(trace)
-    occluded_by_objects = make_trace(trace).occluded_by_objects
 
     @wp.func(module="unique")
     def follow_path(
@@ -385,83 +375,88 @@ def make_follow_path(trace: TraceConfig) -> wp.Function:
         key: PathKey,
     ) -> Carried:
         carried = Carried()
-        weight = wp.vec3(1.0, 1.0, 1.0)
         vertex = first
-        wo = -direction
-        changes_only = difference
-        k = wp.int32(0)
-        while k < MOST_VERTICES:
-            is_white = white and k == 0
-            reflectance = wp.vec3(1.0, 1.0, 1.0)
-            if vertex.kind == PROXY and not is_white:
-                seen = see_proxy(params, scene, vertex)
-                carried.rays += seen.rays
-                reflectance = seen.reflectance
-                if seen.shows and not changes_only:
-                    carried.radiance += wp.cw_mul(weight, seen.radiance)
-                    changes_only = True
-            vertex = from_viewer(vertex, wo)
-            hit = vertex.hit
-            surface = Surface()
-            if is_white:
-                surface = white_surface(scene, vertex, lobe)
-            else:
-                surface = look_up_material(scene, vertex, wo, reflectance)
-            if not only_light:
-                carried.radiance += wp.cw_mul(weight, surface.emission)
-            if surface.model != wp.static(int(MIRROR)):
-                arriving = sky_light(scene, hit, surface, wo, True, changes_only, key, k)
-                carried.rays += arriving.rays
-                if arriving.reaches:
-                    light = wp.cw_mul(weight, arriving.radiance)
+        path = Path()
+        path.weight = wp.vec3(1.0, 1.0, 1.0)
+        path.direction = direction
+        path.changes_only = difference
+        waiting = Path()  # while one without virtual content is followed
+        physical = wp.vec3(0.0, 0.0, 0.0)  # what that one brings
+        is_known = bool(False)  # whether it is of the ray on which ``path`` is
+        at_surface = bool(True)
+        while True:
+            ended = bool(False)
+            if at_surface:
+                is_white = white and path.k == 0
+                wo = -path.direction
+                reflectance = wp.vec3(1.0, 1.0, 1.0)
+                if vertex.kind == PROXY and not is_white:
+                    seen = see_proxy(params, scene, vertex)
+                    carried.rays += seen.rays
+                    reflectance = seen.reflectance
+                    if seen.shows and not path.changes_only:
+                        if path.without:
+                            physical += wp.cw_mul(path.weight, seen.radiance)
+                            ended = True
+                        else:
+                            carried.radiance += wp.cw_mul(path.weight, seen.radiance)
+                            path.changes_only = True
+                if not ended:
+                    vertex = from_viewer(vertex, wo)
+                    surface = Surface()
                     if is_white:
-                        carried.light += light
-                    if not only_light:
-                        if occluded_by_objects(scene.rays, arriving.origin, arriving.direction, arriving.distance):
-                            if changes_only:
-                                carried.radiance -= light
-                        elif not changes_only:
-                            carried.radiance += light
-                if not only_light:
-                    lit = virtual_light(scene, hit, surface, wo, changes_only, key, k)
-                    carried.radiance += wp.cw_mul(weight, lit.radiance)
+                        surface = white_surface(scene, vertex, lobe)
+                    else:
+                        surface = look_up_material(scene, vertex, wo, reflectance)
+                    lit = arrive(scene, vertex.hit, surface, wo, path, only_light, key)
                     carried.rays += lit.rays
-            u = random_triple(key, k, SCATTER)
-            pick = random_triple(key, k, PICK)
-            drawn = draw_next(scene, hit, surface, wo, pick, wp.vec2(u[0], u[1]), changes_only)
-            weight = wp.cw_mul(weight, drawn.weight)
-            if wp.max(weight) <= 0.0:
-                return carried
-            origin = offset_origin(hit.point, hit.geometric_normal, drawn.direction, hit.error)
-            also_without = is_white
-            if not only_light:
-                chance = survival(weight, k)
-                if pick[1] >= chance:
-                    return carried
-                weight = weight / chance
-                vertex = find_vertex(scene, origin, drawn.direction, True)
+                    if path.without:
+                        physical += wp.cw_mul(path.weight, lit.light)
+                    else:
+                        carried.radiance += wp.cw_mul(path.weight, lit.radiance)
+                        if is_white:
+                            carried.light += wp.cw_mul(path.weight, lit.light)
+                    path = go_on(scene, vertex.hit, surface, wo, path, key)
+                    ended = wp.max(path.weight) <= 0.0
+                    if is_white and not ended:
+                        waiting = path
+                        path = start_without(path)
+                        physical = wp.vec3(0.0, 0.0, 0.0)
+            at_surface = True
+            if not ended:
+                vertex = find_vertex(scene, path.origin, path.direction, not path.without)
                 carried.rays += 1
-                disks = lights_in_the_way(scene.lights, hit.point, drawn.direction, vertex.hit.t, drawn.density)
-                carried.radiance += wp.cw_mul(weight, disks)
-                also_without = is_white or (changes_only and vertex.kind == OBJECT)
-            physical = Carried()
-            if also_without:
-                physical = physical_radiance(params, scene, origin, drawn.direction, drawn.density, key, k)
-                carried.rays += physical.rays
-            if is_white:
-                carried.light += wp.cw_mul(weight, physical.radiance)
+                meets = path.changes_only and vertex.kind == OBJECT
+                if meets and not is_known:
+                    waiting = path
+                    path = start_without(path)
+                    physical = wp.vec3(0.0, 0.0, 0.0)
+                    at_surface = False
+                else:
+                    if not path.without:
+                        disks = lights_in_the_way(scene.lights, path.origin, path.direction, vertex.hit.t, path.density)
+                        carried.radiance += wp.cw_mul(path.weight, disks)
+                        if meets:
+                            carried.radiance -= wp.cw_mul(path.weight, physical)
+                            path.changes_only = False
+                        is_known = False
+                    if not path.changes_only:
+                        light = light_along(scene.sky, path.origin, path.direction, vertex, path.density)
+                        if path.without:
+                            physical += wp.cw_mul(path.weight, light)
+                        else:
+                            carried.radiance += wp.cw_mul(path.weight, light)
+                    ended = vertex.kind == NOTHING or path.k >= MOST_VERTICES
+            if ended:
+                if not path.without:
+                    return carried
+                path = waiting
+                is_known = True
+                at_surface = False
+                if white and path.k == 1:
+                    carried.light += wp.cw_mul(path.weight, physical)
                 if only_light:
                     return carried
-            if changes_only and vertex.kind == OBJECT:
-                carried.radiance -= wp.cw_mul(weight, physical.radiance)
-                changes_only = False
-            if not changes_only:
-                light = light_along(scene.sky, origin, drawn.direction, vertex, drawn.density)
-                carried.radiance += wp.cw_mul(weight, light)
-            if vertex.kind == NOTHING:
-                return carried
-            wo = -drawn.direction
-            k += 1
         return carried
 
     return follow_path

@@ -154,7 +154,9 @@ def place_on_sphere(distance: wp.float32, phi: wp.float32) -> wp.float32:
         return -1.0
     angle = phi * high / (high + 0.5 * wp.pi)
     gap = distance - 1.0
-    for _step in range(STEPS):
+    step = wp.int32(0)
+    while step < STEPS:  # not unrolled: each step is a hundred instructions
+        step += 1
         # 1 - cos(a) by half of a: near the sphere d cos a - 1 and d - cos a are small.
         sine = wp.sin(0.5 * angle)
         fall = 2.0 * distance * sine * sine

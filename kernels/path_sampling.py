@@ -291,29 +291,33 @@ def surface_density(surface: Surface, normal: wp.vec3, wo: wp.vec3, wi: wp.vec3)
 @wp.func
 def draw_reflected(
     surface: Surface, normal: wp.vec3, geometric: wp.vec3, wo: wp.vec3, pick: wp.float32, u: wp.vec2
-) -> Drawn:
-    """Direction from which a surface reflects light toward ``wo``; none if it leads into the surface."""
+) -> wp.vec3:
+    """Direction from which a surface reflects light toward ``wo``, unit; zero if it leads into the surface."""
+    wi = reflect(wo, normal)
+    if surface.model != wp.static(int(MIRROR)):
+        basis = frame_from_normal(normal)
+        if pick >= lobe_chance(surface):
+            wi = basis * sample_cosine_hemisphere(u)
+        elif surface.model == wp.static(int(PHONG)):
+            wi = frame_from_normal(wi) * sample_phong_lobe(u, surface.shininess)
+        else:
+            half = basis * sample_ggx_visible(u, wp.transpose(basis) * wo, lobe_alpha(surface))
+            wi = reflect(wo, half)
+        wi = wp.normalize(wi)
+    if wp.dot(wi, geometric) <= 0.0:
+        return wp.vec3(0.0, 0.0, 0.0)
+    return wi
+
+
+@wp.func
+def weigh_drawn(surface: Surface, normal: wp.vec3, wo: wp.vec3, wi: wp.vec3, density: wp.float32) -> Drawn:
+    """What a direction that was drawn with ``density`` stands for; nothing where that is 0, but for mirrors."""
     drawn = Drawn()
     if surface.model == wp.static(int(MIRROR)):
-        wi = reflect(wo, normal)
-        if wp.dot(wi, geometric) > 0.0:
-            drawn.direction = wi
-            drawn.weight = surface.reflectance
-            drawn.density = NO_DENSITY
-        return drawn
-    basis = frame_from_normal(normal)
-    if pick >= lobe_chance(surface):
-        wi = basis * sample_cosine_hemisphere(u)
-    elif surface.model == wp.static(int(PHONG)):
-        wi = frame_from_normal(reflect(wo, normal)) * sample_phong_lobe(u, surface.shininess)
-    else:
-        half = basis * sample_ggx_visible(u, wp.transpose(basis) * wo, lobe_alpha(surface))
-        wi = reflect(wo, half)
-    wi = wp.normalize(wi)
-    if wp.dot(wi, geometric) <= 0.0:
-        return drawn
-    density = surface_density(surface, normal, wo, wi)
-    if density > 0.0:
+        drawn.direction = wi
+        drawn.weight = surface.reflectance
+        drawn.density = NO_DENSITY
+    elif density > 0.0:
         drawn.direction = wi
         drawn.weight = reflect_direct(surface, normal, wo, wi) / density
         drawn.density = density

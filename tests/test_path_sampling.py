@@ -27,6 +27,7 @@ from warp_ar.kernels.path_sampling import (
     sky_tables,
     split_emitters,
     surface_density,
+    weigh_drawn,
 )
 from warp_ar.kernels.sampling import sample_cosine_hemisphere
 from warp_ar.kernels.shapes import FAR
@@ -105,7 +106,8 @@ def surface_kernel(
     key = PathKey()
     key.sample = wp.uint32(i)
     u = random_triple(key, 0, 0)
-    drawn = draw_reflected(surface, normal, normal, wo, u[2], wp.vec2(u[0], u[1]))
+    direction = draw_reflected(surface, normal, normal, wo, u[2], wp.vec2(u[0], u[1]))
+    drawn = weigh_drawn(surface, normal, wo, direction, surface_density(surface, normal, wo, direction))
     estimates[0, i] = drawn.weight[0]
     if wp.length(drawn.direction) == 0.0:
         missing[i] = 1
