@@ -21,7 +21,7 @@ import warp as wp
 
 from bench.common import measure, report, time_once
 from warp_ar.accuracy.known_frame import light_up_to
-from warp_ar.accuracy.path_tracer import BAND, PathTracer
+from warp_ar.accuracy.path_tracer import PathTracer
 from warp_ar.device import usable_cores
 from warp_ar.kernels.launch import launch_rows
 from warp_ar.kernels.path_vertices import LocalScene, make_find_vertex
@@ -31,6 +31,8 @@ from warp_ar.scene import load_scene
 
 CASES = ("torus", "desk", "mirror")
 FRAME = 6
+BAND = 8
+"""Rows of bare rays that a thread takes at a time."""
 SIZES = {"cpu": (160, 120), "cuda": (1440, 1080)}
 STEPS = {"cpu": 2, "cuda": 4}
 """Samples per pixel of one timed call."""

@@ -1,7 +1,7 @@
 """The picture that the local scene would give, by following paths of light: the judge of what is approximated.
 
-A path starts at the camera (``path_vertices``: what it meets; ``path_following``: how it goes on). ``trace_paths`` adds
-samples to the moments of every pixel, ``path_picture`` makes the picture of them:
+A path starts at the camera (``path_vertices``: what it meets; ``path_following``: how it goes on). ``trace_paths``
+takes samples, of which ``path_samples`` makes the moments of every pixel, and ``path_picture`` the picture of these:
 
     find_shown -> trace_paths (IRRADIANCE) -> map_reflectance -> trace_paths (DIFFERENCE) -> finish_picture.
 
@@ -16,7 +16,7 @@ import warp as wp
 
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
 from warp_ar.kernels.path_following import make_follow_path
-from warp_ar.kernels.path_picture import Moments, add_sample
+from warp_ar.kernels.path_samples import Round
 from warp_ar.kernels.path_sampling import NO_DENSITY, PathKey, sky_radiance
 from warp_ar.kernels.path_vertices import (
     BALL,
@@ -107,14 +107,6 @@ def make_sample_pixel(trace: TraceConfig) -> wp.Function:
     return sample_pixel
 
 
-# A pass adds ``share`` samples to a pixel: after n passes it has floor(n share + u), u its own number from 0 to 1. So
-# what a pixel has does not depend on how many passes are made at a time, and pixels of small shares take turns.
-@wp.func
-def samples_after(passes: wp.int32, share: wp.float32, bits: wp.uint32) -> wp.int32:
-    """Samples of a pixel after so many passes."""
-    return wp.int32(wp.floor(wp.float32(passes) * share + uniform_from_bits(bits)))
-
-
 @functools.cache
 def make_trace_paths_kernel(trace: TraceConfig) -> wp.Kernel:
     """Kernel of ``trace_paths`` for the kinds of shape in ``trace``."""
@@ -129,35 +121,34 @@ def make_trace_paths_kernel(trace: TraceConfig) -> wp.Kernel:
         asked: wp.int32,
         seed: wp.int32,
         first: wp.int32,
-        begun: wp.int32,
-        count: wp.int32,
-        shares: wp.array2d[wp.float32],
+        done: wp.array2d[wp.int32],
         # Out:
-        moments_out: Moments,
+        samples_out: Round,
     ):
-        i, j = wp.tid()
-        i += row_start
+        k = wp.tid() + row_start
+        pixel = samples_out.pixels[k]
         rays = scene.picture.rays
+        i = pixel / rays.shape[1]
+        j = pixel % rays.shape[1]
         key = PathKey()
-        key.pixel = wp.uint32(i * rays.shape[1] + j)
+        key.pixel = wp.uint32(pixel)
         key.seed = wp.uint32(seed)
-        start = pcg3d_hash(key.pixel, ~wp.uint32(0), ~key.seed)
-        passed = samples_after(begun, shares[i, j], start[0])
-        more = samples_after(begun + count, shares[i, j], start[0]) - passed
-        for _k in range(more):
-            key.sample = wp.uint32(first + moments_out.samples[i, j])
-            # A stream of its own: the vertices of the path use those from 0 on.
-            bits = pcg3d_hash(key.pixel, key.sample, ~key.seed)
-            x = rays[i, j][0] + (uniform_from_bits(bits[0]) - 0.5) / params[0].focal[0]
-            y = rays[i, j][1] + (uniform_from_bits(bits[1]) - 0.5) / params[0].focal[1]
-            direction = wp.normalize(params[0].world_from_camera * wp.vec3(x, y, 1.0))
-            vertex = find_vertex(scene, params[0].camera_position, direction, True)
-            shown = wp.vec3(0.0, 0.0, 0.0)
-            if asked != wp.static(WHOLE):
-                shown = scene.radiance[i, j]
-            one = sample_pixel(params[0], scene, asked, vertex, direction, shown, key)
-            moments_out.rays[i, j] = moments_out.rays[i, j] + one.rays + 1
-            add_sample(i, j, one.z, one.g, one.e, one.shows, moments_out)
+        key.sample = wp.uint32(first + done[i, j] + k - (samples_out.ends[pixel] - samples_out.counts[pixel]))
+        # A stream of its own: the vertices of the path use those from 0 on.
+        bits = pcg3d_hash(key.pixel, key.sample, ~key.seed)
+        x = rays[i, j][0] + (uniform_from_bits(bits[0]) - 0.5) / params[0].focal[0]
+        y = rays[i, j][1] + (uniform_from_bits(bits[1]) - 0.5) / params[0].focal[1]
+        direction = wp.normalize(params[0].world_from_camera * wp.vec3(x, y, 1.0))
+        vertex = find_vertex(scene, params[0].camera_position, direction, True)
+        shown = wp.vec3(0.0, 0.0, 0.0)
+        if asked != wp.static(WHOLE):
+            shown = scene.radiance[i, j]
+        one = sample_pixel(params[0], scene, asked, vertex, direction, shown, key)
+        samples_out.z[k] = one.z
+        samples_out.g[k] = one.g
+        samples_out.e[k] = one.e
+        samples_out.shows[k] = one.shows
+        samples_out.rays[k] = one.rays + 1
 
     return trace_paths_kernel
 
@@ -203,34 +194,32 @@ def trace_paths(
     trace: TraceConfig,
     params: wp.array[FrameParams],
     scene: LocalScene,
-    moments_out: Moments,
+    done: wp.array2d[wp.int32],
+    samples_out: Round,
     *,
+    count: int,
     asked: int,
     seed: int,
     first: int,
-    begun: int,
-    count: int,
-    shares: wp.array2d[wp.float32],
-    rows: Rows | None = None,
+    part: Rows | None = None,
 ) -> None:
-    """Add the samples of ``count`` passes to the pixels' moments.
+    """Trace the samples of a round.
 
     Args:
         trace: Kinds of shape in the scene.
         params: (1,) FrameParams: the camera.
         scene: All that paths meet.
-        moments_out: (H, W).
+        done: (H, W) samples of each pixel in rounds before.
+        samples_out: Of ``list_samples``.
+        count: Its samples.
         asked: ``WHOLE``, ``DIFFERENCE`` or ``IRRADIANCE``; all but the first need the frame's radiance.
         seed: Of the random numbers.
-        first: Number of the moments' first sample among those of the seed.
-        begun: Passes with these shares that were made before.
-        count: Passes.
-        shares: (H, W) samples of a pixel in a pass.
-        rows: Band of rows; None means all.
+        first: Number of a pixel's first sample among those of the seed.
+        part: First sample, and one past the last; None means all.
     """
-    rays = scene.picture.rays
-    inputs = [params, scene, asked, seed, first, begun, count, shares]
-    launch_rows(make_trace_paths_kernel(trace), rays.shape, inputs, [moments_out], rows=rows, device=rays.device)
+    inputs = [params, scene, asked, seed, first, done]
+    kernel = make_trace_paths_kernel(trace)
+    launch_rows(kernel, (count,), inputs, [samples_out], rows=part, device=done.device)
 
 
 def find_shown(

@@ -22,9 +22,9 @@ from warp_ar.device import exclusive, resolve_device, translating, usable_cores
 from warp_ar.errors import UsageError
 from warp_ar.kernels import path_tracer, structs
 from warp_ar.kernels.color import decode_table, encode_table
-from warp_ar.kernels.launch import Rows
 from warp_ar.kernels.path_guides import make_guides
 from warp_ar.kernels.path_picture import finish_picture, make_moments, map_reflectance
+from warp_ar.kernels.path_samples import add_samples, list_samples, make_round
 from warp_ar.kernels.path_sampling import make_sky
 from warp_ar.kernels.path_vertices import LocalScene
 from warp_ar.kernels.split_sum import integrate_dfg
@@ -47,8 +47,10 @@ UNKNOWN_REFLECTANCE = 0.5
 """Of a proxy that no pixel shows."""
 DFG_SIZE = 32
 """Rows and columns of the table of directional albedo."""
-BAND = 8
-"""Rows that a thread takes at a time."""
+PART = 2048
+"""Samples that a thread takes at a time, on CPU."""
+MOST_SAMPLES = 1 << 21
+"""Of a round, where a pass has no more: a GPU's memory holds 52 bytes for each."""
 FIRST_ROUND = 16
 """Samples per pixel after which pixels get their shares; and again whenever there are twice as many."""
 AROUND = 9
@@ -187,6 +189,7 @@ class PathTracer:
         """Moments of no samples, and what a picture of them is written to."""
         shape = (self.camera.height, self.camera.width)
         self._moments = make_moments(shape, self.device)
+        self._round = make_round(shape, self.device)
         self._shares = wp.ones(shape, dtype=wp.float32, device=self.device)
         self._radiance = wp.zeros(shape, dtype=wp.vec3, device=self.device)
         self._error = wp.zeros(shape, dtype=wp.vec3, device=self.device)
@@ -246,30 +249,55 @@ class PathTracer:
         values = np.asarray(reflectances, np.float32).reshape(count, 3)
         self._local.proxy_reflectance = wp.array(values, dtype=wp.vec3, device=self.device)
 
-    def _trace_rows(self, asked: int, first: int, count: int, rows: Rows | None) -> None:
-        """Add the samples of some passes; ``first`` is the number of the moments' first one."""
-        path_tracer.trace_paths(
-            self._trace, self._params, self._local, self._moments,
-            asked=asked, seed=self.seed, first=first, begun=self._passes, count=count, shares=self._shares, rows=rows,
-        )  # fmt: skip
+    def _begin_round(self, passes: int) -> int:
+        """List the samples of some passes; how many there are."""
+        with translating(self.device), wp.ScopedDevice(self.device):
+            return list_samples(self._shares, self._round, seed=self.seed, begun=self._passes, count=passes)
 
-    def _add(self, asked: int, count: int, first: int) -> None:
-        """Make so many passes, on CPU by as many threads as there are cores."""
+    def _end_round(self, passes: int) -> None:
+        """Take the samples of some passes into the moments."""
+        with translating(self.device), wp.ScopedDevice(self.device):
+            add_samples(self._round, self._moments)
+        self._passes += passes
 
-        def trace(rows: Rows | None) -> None:
-            self._trace_rows(asked, first, count, rows)
+    def _follow(self, asked: int, first: int, count: int, at_once: int) -> Iterator[None]:
+        """Trace a round of ``count`` samples: on CPU ``at_once`` parts of it by all cores, then others, on CUDA all.
+
+        ``first`` is the number of a pixel's first sample in the moments.
+        """
+
+        def trace(part: tuple[int, int] | None) -> None:
+            path_tracer.trace_paths(
+                self._trace, self._params, self._local, self._moments.samples, self._round,
+                count=count, asked=asked, seed=self.seed, first=first, part=part,
+            )  # fmt: skip
 
         if not self.device.is_cpu:
             with translating(self.device), wp.ScopedDevice(self.device):
                 trace(None)
-        else:
-            height = self.camera.height
-            bands = [(row, min(row + BAND, height)) for row in range(0, height, BAND)]
+            yield
+            return
+        parts = [(start, min(start + PART, count)) for start in range(0, count, PART)]
+        if parts and not self._compiled:
             with translating(self.device):
-                trace(bands[0])  # compiles, before threads would each do so
-            with ThreadPoolExecutor(usable_cores(), "warp_ar-paths") as pool:
-                list(pool.map(trace, bands[1:]))
-        self._passes += count
+                trace(parts.pop(0))  # compiles, before threads would each do so
+            self._compiled = True
+            yield
+        with ThreadPoolExecutor(usable_cores(), "warp_ar-paths") as pool:
+            for start in range(0, len(parts), at_once):
+                list(pool.map(trace, parts[start : start + at_once]))
+                yield
+
+    def _add(self, asked: int, count: int, first: int) -> None:
+        """Make so many passes, as many of them in a round as it has room for."""
+        most = max(1, MOST_SAMPLES // (self.camera.width * self.camera.height))
+        while count > 0:
+            passes = min(count, most)
+            samples = self._begin_round(passes)
+            for _ in self._follow(asked, first, samples, at_once=max(samples, 1)):
+                pass
+            self._end_round(passes)
+            count -= passes
 
     def prepare(self) -> None:
         """Find the reflectance of proxies; ``sample`` does it where it was not done."""
@@ -382,30 +410,12 @@ class PathTracer:
             yield True
 
     def _pass(self, asked: int, first: int) -> Iterator[None]:
-        """Make one pass: on CPU a band of rows for each core at a time, on CUDA all at once."""
-
-        def trace(rows: Rows | None) -> None:
-            self._trace_rows(asked, first, 1, rows)
-
-        if not self.device.is_cpu:
-            with exclusive(self.device), wp.ScopedDevice(self.device):
-                trace(None)
+        """Make one pass in parts."""
+        for _ in self._follow(asked, first, self._begin_round(1), at_once=usable_cores()):
+            with exclusive(self.device):
                 wp.synchronize_device(self.device)
-            self._passes += 1
             yield
-            return
-        height, cores = self.camera.height, usable_cores()
-        bands = [(row, min(row + BAND, height)) for row in range(0, height, BAND)]
-        if not self._compiled:
-            with translating(self.device):
-                trace(bands.pop(0))
-            self._compiled = True
-            yield
-        for start in range(0, len(bands), cores):
-            with ThreadPoolExecutor(cores, "warp_ar-paths") as pool:
-                list(pool.map(trace, bands[start : start + cores]))
-            yield
-        self._passes += 1
+        self._end_round(1)
 
     def picture(self) -> TracedPicture:
         """What the samples so far give.
