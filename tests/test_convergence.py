@@ -23,8 +23,9 @@ COARSE_GOAL = 0.3  # relative standard error that a few samples reach
 
 @pytest.mark.parametrize("known", [False, True], ids=["whole", "difference"])
 def test_slices_add_up_to_passes(known: bool, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Samples that were added a few rows at a time are those that were added at once, to the bit."""
+    """Samples that were added a few at a time, pass by pass, are those that were added at once, to the bit."""
     monkeypatch.setattr(path_tracer, "FIRST_ROUND", 2)  # pixels get their shares after two passes
+    monkeypatch.setattr(path_tracer, "PART", 300)  # five of them are a pass
     frame = np.full((32, 48, 3), 0.5, np.float32) if known else None
     light_samples = FIRST_LIGHT_SAMPLES + 2
     more = {"light_samples": light_samples} if known else {"reflectances": RHO}
