@@ -120,7 +120,7 @@ def _blurred(image: Image, table: NDArray[np.float32], places: Array) -> Array:
     around = image[low[1] : high[1], low[0] : high[0]]
     blurred = cv2.GaussianBlur(cv2.LUT(around, table[None]), (BLUR_SIZE, BLUR_SIZE), BLUR)
     x, y = (places.astype(np.float32) - low.astype(np.float32)).T
-    return cv2.remap(blurred, x[:, None], y[:, None], cv2.INTER_LINEAR)[:, 0].astype(float)
+    return np.asarray(cv2.remap(blurred, x[:, None], y[:, None], cv2.INTER_LINEAR)[:, 0], float)
 
 
 def difference_of_halves(ratio: Array, pixels: NDArray[np.int64]) -> float:
