@@ -5,12 +5,13 @@ from __future__ import annotations
 import dataclasses
 import functools
 
+import cv2
 import numpy as np
 import pytest
 
 from warp_ar import PRESETS, Pipeline
 from warp_ar.input import reflectance_watch
-from warp_ar.input.ball_reflectance import Reflected, difference_of_halves, measure_reflectance
+from warp_ar.input.ball_reflectance import BLUR, Reflected, _blurred, difference_of_halves, measure_reflectance
 from warp_ar.input.check_pictures import take_look
 from warp_ar.input.reflectance_watch import ENOUGH, FIRST, MOST, ReflectanceWatch
 from warp_ar.input.saturation import ball_discs
@@ -23,6 +24,8 @@ TOLD = 0.08
 """Relative error of one frame: the desk's texture is mirrored smaller than it is seen."""
 ROUNDED = 0.02
 """Relative error of codes."""
+ORDER = 5e-7
+"""Relative: four roundings of float32. OpenCV adds in another order at the end of a row."""
 NOWHERE = Pose(np.eye(3), np.zeros(3))
 BLACK = np.zeros((4, 4, 3), np.uint8)
 
@@ -182,3 +185,14 @@ def test_a_run_says_which_reflectances_were_taken():
     assert "0.50, 0.50, 0.50" in line
     assert reflectances_told((first, second), dict) == []
     assert reflectances_told((first, second), None) == []
+
+
+@pytest.mark.parametrize("corner", [(1.2, 1.2), (60.3, 1.5), (61.4, 41.6), (30.0, 20.7)])
+def test_what_is_blurred_around_places_is_as_in_the_whole_picture(corner):
+    random = np.random.default_rng(3)
+    picture, table = random.integers(0, 256, (44, 64, 3), np.uint8), decode_table("srgb")
+    places = np.array(corner) + random.uniform(-1.0, 1.0, (50, 2))
+    x, y = places.astype(np.float32).T
+    whole = cv2.GaussianBlur(np.stack([table[picture[..., k], k] for k in range(3)], -1), (0, 0), BLUR)
+    expected = cv2.remap(whole, x[:, None], y[:, None], cv2.INTER_LINEAR)[:, 0]
+    np.testing.assert_allclose(_blurred(picture, table, places), expected, rtol=ORDER)

@@ -42,6 +42,16 @@ class Doubler:
         return 2.0 * cells + trace(camera), self.count
 
 
+class Noting(Doubler):
+    """Rests in a light that it has been asked about."""
+
+    seen = None
+
+    def rests(self, cells, observations) -> bool:
+        before, self.seen = self.seen, float(observations.sum())
+        return before == self.seen
+
+
 def sides(observed: float = 1.0):
     return np.arange(4.0), np.ones((3, 200_000), np.float32), np.zeros(0), np.full(2, observed), np.array([1.0, 2, 3])
 
@@ -81,9 +91,6 @@ def test_process_solves_traces_by_the_caller_and_learns(process):
         solver, (values, said) = process.solve(solver, sides(), trace)
         np.testing.assert_array_equal(values, 2.0 * np.arange(4.0) + 6.0)
         assert said == count == solver.count
-    solver, nothing = process.solve(solver, sides(0.0), trace)
-    assert nothing is None
-    assert solver.count == 3
 
 
 def test_errors_come_back_and_the_process_goes_on(process):
@@ -111,6 +118,35 @@ def test_pool_solves_here_until_a_process_is_ready_and_when_it_dies():
     finally:
         pool.close()
     assert pool.solve(Doubler(), sides(), trace)[1][1] == 1
+
+
+def test_nothing_goes_to_a_process_while_the_last_solution_holds(monkeypatch):
+    pool = SolvingPool(1)
+    try:
+        pool.prepare()
+        wait_until_ready(pool)
+        asked = []
+        monkeypatch.setattr(pool._all[0], "solve", lambda solver, *sides: asked.append(sides) or (solver, "solved"))
+        solver = Doubler()
+        assert pool.solve(solver, sides(0.0), trace) == (solver, None)
+        assert not asked
+        assert pool.solve(solver, sides(), trace) == (solver, "solved")
+        assert len(asked) == 1
+    finally:
+        pool.close()
+
+
+def test_light_is_noted_once_where_a_process_dies():
+    """A solver that is asked twice about one light would find that it stands still, and nothing would be solved for."""
+    pool = SolvingPool(1)
+    try:
+        pool.prepare()
+        wait_until_ready(pool)
+        pool._all[0]._process.kill()
+        pool._all[0]._process.wait()
+        assert pool.solve(Noting(), sides(), trace)[1][1] == 1
+    finally:
+        pool.close()
 
 
 def test_a_pool_that_rests_has_no_process_until_it_is_asked_again():

@@ -283,7 +283,6 @@ def _light_clip(options: argparse.Namespace, loaded: Callable[[], None]) -> int:
     # Here, for they load Warp: the page is to be there before, and what is wrong with a scene is told before.
     with importing():
         hurry_compilers(options.device)
-        from warp_ar.accuracy.traced_frames import TracedFrames
         from warp_ar.output.report import RunLog
 
     side, outputs, replaced = _open_side_files(options)
@@ -297,6 +296,8 @@ def _light_clip(options: argparse.Namespace, loaded: Callable[[], None]) -> int:
             say(note)
         traced = None
         if options.samples is not None:
+            with importing():  # the path tracer's kernels, which no other run declares
+                from warp_ar.accuracy.traced_frames import TracedFrames
             traced = TracedFrames(session.pipeline, options.samples, options.error)  # type: ignore[arg-type]
             session.ahead = False
         _compile(session, shown=not options.headless)

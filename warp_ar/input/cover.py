@@ -201,7 +201,8 @@ class BallCover:
             seen = _pairs((rows >= 0) & (rows < height))[self._cell_row]
             seen &= _pairs((columns >= 0) & (columns < width))[self._cell_column]
             shown, rows, columns = picture, rows.clip(0, height - 1), columns.clip(0, width - 1)
-        grid = shown.take(rows, axis=0).take(columns, axis=1)
+        # By indices first: ``take`` would copy all of a part of a picture.
+        grid = shown[rows].take(columns, axis=1)
         grid = grid.astype(np.float64 if grid.dtype.kind == "f" else np.int64)
         halves = grid[::2] + grid[1::2]
         sums = (halves[:, ::2] + halves[:, 1::2])[self._cell_row, self._cell_column]

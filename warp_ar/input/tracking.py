@@ -48,6 +48,13 @@ _ENVIRONMENT = 0.6
 _TAPS = 9
 """Samples across an edge."""
 
+_PLACES = np.linspace(-1.0, 1.0, _TAPS)
+"""Where they lie in the window."""
+
+_WEIGHTS = np.full(_TAPS, 2.0 / (_TAPS - 1))
+"""Trapezoid rule over [-1, 1]; each end's level is the mean of its two outermost samples."""
+_WEIGHTS[[0, -1]] /= 2
+
 _REACH = (4.0, 3.0, 2.5, 2.5)
 """Half width of the sampled window in pixels, per Gauss-Newton step; a cell that is narrower limits it further."""
 
@@ -193,6 +200,7 @@ class Tracker:
         self._distortion = np.asarray(camera.distortion, float).ravel()
         self._hold, self._steady = hold, steady
         self._linear = decode_table(camera.transfer).mean(1)
+        self._decoded: tuple[Image, NDArray[np.float32]] | None = None
         self.reset()
 
     def reset(self) -> None:
@@ -398,7 +406,7 @@ class Tracker:
         rows = _pose_rows(jacobian, camera - pose.translation).reshape(-1, 6)
         information = rows.T @ rows / _CORNER_NOISE**2
         cost = float((residual**2).mean())
-        pattern = self._correlation(_linear_part(gray, self._linear), origin, pose)
+        pattern = self._correlation(self._linear_part(gray), origin, pose)
         return _Fit(pose, information, float(np.sqrt(2 * cost)), 0.5, cost, pattern, edges=False)
 
     def _fit_guess(self, gray: Image, origin: tuple[int, int], guess: Pose) -> _Fit | None:
@@ -407,50 +415,25 @@ class Tracker:
 
     def _fit_edges(self, gray: Image, origin: tuple[int, int], pose: Pose, reaches: Sequence[float]) -> _Fit | None:
         """Gauss-Newton on the printed edges from ``pose``; None where too few are seen."""
-        pattern = self._pattern
-        part = _linear_part(gray, self._linear)
-        taps = np.linspace(-1.0, 1.0, _TAPS)
-        # Trapezoid rule over [-1, 1]; each end's level is the mean of its two outermost samples.
-        weights = np.full(_TAPS, 2.0 / (_TAPS - 1))
-        weights[[0, -1]] /= 2
+        pattern, part = self._pattern, self._linear_part(gray)
         for reach in reaches:
             camera = pose.apply(pattern.points)
             if camera[:, 2].min() <= 1e-6:
                 return None
             pixels, jacobian = self._project(camera)
-            along = (jacobian @ (pattern.tangents @ pose.rotation.T)[..., None])[..., 0]
-            across = (jacobian @ (pattern.normals @ pose.rotation.T)[..., None])[..., 0]
-            normal = (
-                np.stack([-along[:, 1], along[:, 0]], -1) / np.maximum(np.linalg.norm(along, axis=1), 1e-9)[:, None]
-            )
-            width = (normal * across).sum(1)
-            normal *= np.sign(width)[:, None]
-            half = np.minimum(0.45 * np.abs(width) * pattern.clearances, reach)
-            at = (pixels - origin)[:, None, :] + (half[:, None] * taps)[..., None] * normal[:, None, :]
-            h, w = gray.shape
-            ends = at[:, [0, -1]]
-            inside = ((ends >= 0) & (ends <= (w - 1, h - 1))).all((1, 2)) & (half >= _MIN_REACH)
-            if inside.sum() < _MIN_EDGES:
+            normal, width = self._print_lines(pose, jacobian)
+            half = np.minimum(0.45 * width * pattern.clearances, reach)
+            seen, offset = _edge_offsets(part, (pixels - origin).T, normal, half)
+            if seen is None:
                 return None
-            at32 = at.astype(np.float32)
-            values = cv2.remap(
-                part, at32[..., 0], at32[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-            ).astype(float)
-            black, white = 0.5 * (values[:, 0] + values[:, 1]), 0.5 * (values[:, -2] + values[:, -1])
-            contrast = white - black
-            typical = float(np.median(contrast[inside]))
-            seen = inside & (contrast > max(0.3 * typical, 1e-4))
-            if seen.sum() < _MIN_EDGES:
-                return None
-            area = (2 * white - values @ weights) / np.where(seen, contrast, 1.0)  # the weights sum to 2
-            offset = np.clip(half * (area - 1.0), -half, half)
-            rows = (normal[:, None, :] @ _pose_rows(jacobian, camera - pose.translation))[:, 0]
-            solved = _solve(rows[seen], offset[seen], normal[seen])
+            facing = np.ascontiguousarray(normal[:, seen].T)
+            rows = (facing[:, None, :] @ _pose_rows(jacobian[seen], camera[seen] - pose.translation))[:, 0]
+            solved = _solve(rows, offset, facing)
             if solved is None:
                 return None
             step, residual, keep, information = solved
             pose = _moved(pose, step)
-            if reach == reaches[-1] or (reach <= reaches[1] and np.abs(rows[seen] @ step).max() < _DONE):
+            if reach == reaches[-1] or (reach <= reaches[1] and np.abs(rows @ step).max() < _DONE):
                 break
         if pose.apply(pattern.outline)[:, 2].min() <= 0 or pose.rotation[:, 2] @ pose.translation >= 0:
             return None
@@ -458,6 +441,24 @@ class Tracker:
         support = float(keep.sum() / len(pattern.points))
         cost = float(np.minimum(residual**2, 1.0).mean())
         return _Fit(pose, information, error, support, cost, self._correlation(part, origin, pose), edges=True)
+
+    def _print_lines(self, pose: Pose, jacobian: Array) -> tuple[Array, Array]:
+        """Of printed edges in the picture: normals from black to white, (2, n); pixels per metre along them, (n,)."""
+        pattern = self._pattern
+        along = (jacobian @ (pattern.tangents @ pose.rotation.T)[..., None])[..., 0].T
+        across = (jacobian @ (pattern.normals @ pose.rotation.T)[..., None])[..., 0].T
+        length = np.maximum(np.sqrt(along[0] * along[0] + along[1] * along[1]), 1e-9)
+        x, y = -along[1] / length, along[0] / length
+        width = x * across[0] + y * across[1]
+        sign = np.sign(width)
+        return np.stack([x * sign, y * sign]), np.abs(width)
+
+    def _linear_part(self, gray: Image) -> NDArray[np.float32]:
+        """A part of an image in linear light, decoded once for all poses that are tried on it."""
+        decoded = self._decoded
+        if decoded is None or decoded[0] is not gray:
+            self._decoded = decoded = gray, np.asarray(cv2.LUT(gray, self._linear), np.float32)
+        return decoded[1]
 
     def _correlation(self, part: NDArray[np.float32], origin: tuple[int, int], pose: Pose) -> float:
         """Correlation, -1 to 1, of the brightness at cell centres with the print; 0 where it cannot be seen."""
@@ -507,8 +508,46 @@ def _gray(image: Image) -> Image:
     return np.asarray(gray, np.uint8)
 
 
-def _linear_part(gray: Image, linear: NDArray[np.float32]) -> NDArray[np.float32]:
-    return np.asarray(cv2.LUT(gray, linear), np.float32)
+def _edge_offsets(
+    part: NDArray[np.float32], at: Array, normal: Array, half: Array
+) -> tuple[NDArray[np.bool_], Array] | tuple[None, Array]:
+    """How far edges lie from where they are expected.
+
+    Args:
+        part: Linear light.
+        at: Pixels of it at which edges are expected, (2, n).
+        normal: Theirs, from black to white, (2, n).
+        half: Half width of the window that is sampled along each, pixels, (n,).
+
+    Returns:
+        Which of them are seen, (n,), and of those the distances along their normals, pixels; None where too few are.
+    """
+    h, w = part.shape
+    along = half[:, None] * _PLACES
+    x, y = (at[axis][:, None] + along * normal[axis][:, None] for axis in (0, 1))
+    inside = (np.minimum(x[:, 0], x[:, -1]) >= 0) & (np.maximum(x[:, 0], x[:, -1]) <= w - 1) & (half >= _MIN_REACH)
+    inside &= (np.minimum(y[:, 0], y[:, -1]) >= 0) & (np.maximum(y[:, 0], y[:, -1]) <= h - 1)
+    if np.count_nonzero(inside) < _MIN_EDGES:
+        return None, half
+    places = x.astype(np.float32), y.astype(np.float32)
+    values = cv2.remap(part, *places, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(float)
+    black, white = 0.5 * (values[:, 0] + values[:, 1]), 0.5 * (values[:, -2] + values[:, -1])
+    contrast = white - black
+    seen = inside & (contrast > max(0.3 * _median(contrast[inside]), 1e-4))
+    if np.count_nonzero(seen) < _MIN_EDGES:
+        return None, half
+    area = (2 * white - values @ _WEIGHTS)[seen] / contrast[seen]  # the weights sum to 2
+    reach = half[seen]
+    return seen, np.minimum(np.maximum(reach * (area - 1.0), -reach), reach)
+
+
+def _median(values: Array) -> float:
+    """The middle of finite values, as NumPy's, which takes four times as long for a few hundred."""
+    middle = len(values) // 2
+    if len(values) % 2:
+        return float(np.partition(values, middle)[middle])
+    low, high = np.partition(values, (middle - 1, middle))[middle - 1 : middle + 1]
+    return 0.5 * float(low + high)
 
 
 def _pose_rows(jacobian: Array, arm: Array) -> Array:
@@ -518,7 +557,13 @@ def _pose_rows(jacobian: Array, arm: Array) -> Array:
     """
     x, y, z = arm.T[:, :, None]
     a, b, c = np.moveaxis(jacobian, 2, 0)
-    return np.stack([y * c - z * b, z * a - x * c, x * b - y * a, a, b, c], -1)
+    rows = np.empty((len(arm), 2, 6))
+    rows[..., 0], rows[..., 1], rows[..., 2], rows[..., 3:] = y * c - z * b, z * a - x * c, x * b - y * a, jacobian
+    return rows
+
+
+_PRIOR = np.diag([0.0] * 6 + [1.0] * 3)
+"""The shift of edges is a fraction of a pixel; without inner edges it cannot be told from distance."""
 
 
 def _solve(rows: Array, offset: Array, normals: Array) -> tuple[Array, Array, Array, Array] | None:
@@ -529,15 +574,13 @@ def _solve(rows: Array, offset: Array, normals: Array) -> tuple[Array, Array, Ar
         marginalised; None if singular.
     """
     x, y = normals.T
-    design = np.column_stack([rows, np.ones(len(rows)), x * x - y * y, 2.0 * x * y])
-    # The shift is a fraction of a pixel; without inner edges it cannot be told from distance.
-    prior = np.zeros(9)
-    prior[6:] = 1.0
+    design = np.empty((len(rows), 9))
+    design[:, :6], design[:, 6], design[:, 7], design[:, 8] = rows, 1.0, x * x - y * y, 2.0 * x * y
     weights: Array = np.ones(len(rows))
     solution: Array = np.zeros(9)
     for _ in range(3):
         weighted = design * weights[:, None]
-        normal = weighted.T @ design + np.diag(prior)
+        normal = weighted.T @ design + _PRIOR
         try:
             solution = np.asarray(np.linalg.solve(normal, weighted.T @ offset), float)
         except np.linalg.LinAlgError:
@@ -548,7 +591,7 @@ def _solve(rows: Array, offset: Array, normals: Array) -> tuple[Array, Array, Ar
         )
         # Tukey's weight: an edge that is covered, or lies under a reflection, must not pull at all.
         weights = np.square(np.maximum(1 - np.square(residual / (4.7 * spread)), 0.0))
-    normal = (design * weights[:, None]).T @ design + np.diag(prior)
+    normal = (design * weights[:, None]).T @ design + _PRIOR
     shared = normal[:6, 6:] @ np.linalg.solve(normal[6:, 6:], normal[6:, :6])
     information = (normal[:6, :6] - shared) / (_CORRELATED * spread**2)
     return (solution[:6], residual, weights, information) if np.isfinite(solution).all() else None

@@ -5,7 +5,8 @@ launch kernels or look for markers then wait for it at each of their calls. In a
 the copies of its equations, some 12 MB. A process keeps nothing between two estimates: a solver goes there and comes
 back with what it learnt, so a process that dies costs one estimate, which is then made here.
 
-A message is a pickle and its arrays beside it, with their lengths before them.
+A message is a pickle and its arrays beside it, with their lengths before them. Whether there is anything to solve for
+is asked before the message is written: in a light that stands still most of the time there is not.
 """
 
 from __future__ import annotations
@@ -26,6 +27,9 @@ from warp_ar.device import usable_cores
 
 CORES_EACH = 4
 """Cores for each process: solutions are a small part of what a frame costs."""
+PIPE = 1 << 20
+"""Bytes that a pipe to a process holds, the most that Linux gives an ordinary user: each time that it is full or empty
+both sides wait for each other, and here for Python's lock. By default it is 64 KB."""
 _COUNT = struct.Struct("<I")
 _SIZE = struct.Struct("<Q")
 _BLAS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS")
@@ -93,6 +97,7 @@ def start_process(module: str, descriptors: tuple[int, ...] = ()) -> subprocess.
     return subprocess.Popen(
         [sys.executable, "-c", code],
         bufsize=0,
+        pipesize=PIPE,
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         env={**os.environ, **dict.fromkeys(_BLAS, "1")},
@@ -127,6 +132,8 @@ class SolvingProcess:
 
     def solve(self, solver: Solver, sides: tuple[Any, ...], trace: Callable[[Any], Any] | None) -> tuple[Any, Any]:
         """The solver with what it learnt, and its solution; arguments as ``SolvingPool.solve``.
+
+        Whether the last solution still holds is not asked.
 
         Raises:
             EOFError: The process has gone.
@@ -203,21 +210,24 @@ class SolvingPool:
         """Solve, in a process that is ready, or here.
 
         Args:
-            solver: It is not changed where another process solves.
+            solver: Where another process solves it only takes note of the light.
             sides: Cells, transfer, mirrored, observations and the camera's place, as ``Recovery.update``.
             trace: Traces emitters, called by this thread.
 
         Returns:
             The solver with what it learnt, and its solution; None where the last still holds.
         """
+        cells, _, _, observations, _ = sides
+        if solver.rests(cells, observations):
+            return solver, None
         process = self._take()
         if process is None:
-            return solver, solve_by(solver, sides, trace)
+            return solver, _update_by(solver, sides, trace)
         try:
             solved = process.solve(solver, sides, trace)
         except (EOFError, OSError):
             self._drop(process)
-            return solver, solve_by(solver, sides, trace)
+            return solver, _update_by(solver, sides, trace)
         except BaseException:
             self._drop(process)  # where the trace failed, it waits for an answer that will not come
             raise
@@ -266,9 +276,12 @@ class SolvingPool:
 
 def solve_by(solver: Solver, sides: tuple[Any, ...], trace: Callable[[Any], Any] | None) -> Any:
     """A solution by this thread; None where the last still holds. Arguments as ``SolvingPool.solve``."""
+    cells, _, _, observations, _ = sides
+    return None if solver.rests(cells, observations) else _update_by(solver, sides, trace)
+
+
+def _update_by(solver: Solver, sides: tuple[Any, ...], trace: Callable[[Any], Any] | None) -> Any:
     cells, transfer, mirrored, observations, camera = sides
-    if solver.rests(cells, observations):
-        return None
     return solver.update(cells, transfer, mirrored, observations, trace, camera)
 
 
@@ -293,7 +306,7 @@ def _answer(source: Any, target: Any) -> None:
         solver, sides, traced = read_message(source)
         answer: tuple[str, Any]
         try:
-            answer = "solved", (solver, solve_by(solver, sides, trace if traced else None))
+            answer = "solved", (solver, _update_by(solver, sides, trace if traced else None))
         except (EOFError, OSError):
             raise
         except Exception as error:
