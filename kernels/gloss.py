@@ -216,10 +216,10 @@ def make_follow(config: GlossConfig) -> wp.Function:
     return follow
 
 
-# A sphere of angular radius e is seen by half vectors that lie, in the plane of slopes (tangents from the normal), in an
-# ellipse about the one of its centre, of radii e / 2 and e / (2 cos_d), cos_d between half vector and ray; taken as the
-# circle of the same area, s^2 = e^2 / (4 cos_d). GGX's density of slopes, alpha^2 / (pi (alpha^2 + m^2)^2), is that of
-# points spread evenly over a sphere and projected stereographically onto the plane, m = alpha tan(theta / 2). The
+# A sphere of angular radius e is seen by half vectors that lie, in the plane of slopes (tangents from the normal), in
+# an ellipse about the one of its centre, of radii e / 2 and e / (2 cos_d), cos_d between half vector and ray; taken as
+# the circle of the same area, s^2 = e^2 / (4 cos_d). GGX's density of slopes, alpha^2 / (pi (alpha^2 + m^2)^2), is that
+# of points spread evenly over a sphere and projected stereographically onto the plane, m = alpha tan(theta / 2). The
 # projection takes circles to circles, so a circle of radius s at slope m has the share of a cap between
 # 2 atan((m - s) / alpha) and 2 atan((m + s) / alpha) of the sphere. Over the circle's area the mean is
 #
