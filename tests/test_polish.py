@@ -61,8 +61,8 @@ def test_what_the_scene_says_is_not_asked():
 
 def test_doctor_says_what_to_write(tmp_path):
     """Of the same film as pictures in a folder, by the poses that it finds itself; of a matt table, nothing."""
-    for name, reflectance in (("polished", 0.05), ("matt", 0.0)):
-        made = film(1, 0.08, reflectance)
+    for name, reflectance in (("polished", 0.04), ("matt", 0.0)):
+        made = film(6, 0.15, reflectance)
         (tmp_path / name).mkdir()
         for number, (image, _) in enumerate(made.views):
             cv2.imwrite(str(tmp_path / name / f"{number}.png"), image[..., ::-1])
@@ -72,5 +72,5 @@ def test_doctor_says_what_to_write(tmp_path):
         else:
             assert line is not None
             assert "[proxy.material]" in line
-            assert float(re.search(r"reflectance = (\S+)", line)[1]) == pytest.approx(0.05, rel=0.5)
+            assert float(re.search(r"reflectance = (\S+)", line)[1]) == pytest.approx(0.04, rel=0.5)
     assert look_for_polish(made.scene, None, 120) is None
