@@ -35,32 +35,26 @@ def warp_sum(value: wp.vec4) -> wp.vec4:
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    const unsigned int lanes = ((1u << share) - 1u) << ((threadIdx.x & 31) / share * share);
-    for (int reach = share / 2; reach > 0; reach /= 2)
-        for (int k = 0; k < 4; ++k) value[k] += __shfl_xor_sync(lanes, value[k], reach);
+    const unsigned int first = (threadIdx.x & 31) / share * share;
+    const unsigned int lanes = (share == 32 ? 0xffffffffu : (1u << share) - 1u) << first;
+    for (int k = 0; k < 3; ++k) value[k] = __shfl_sync(lanes, value[k], first + lane);
 #endif
     return value;
 """)
-def sum_beside(value: wp.vec4, share: wp.int32) -> wp.vec4:
-    """Sum over so many lanes beside each other, a power of 2 below 32, known to all of them."""
+def of_lane(value: wp.vec3, lane: wp.int32, share: wp.int32) -> wp.vec3:
+    """What one of ``share`` lanes beside each other has, known to all of them.
+
+    ``share`` is a power of 2, 32 at most, and 1 on CPU.
+    """
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    const unsigned int first = (threadIdx.x & 31) / share * share;
-    const unsigned int mask = (share == 32 ? 0xffffffffu : (1u << share) - 1u) << first;
-    wp::vec_t<3, float> total(0.0f);
-    for (int lane = 0; lane < share; ++lane) {
-        for (int k = 0; k < 3; ++k) total[k] += __shfl_sync(mask, own[k], first + lane);
-        for (int k = 0; k < 3; ++k) total[k] += __shfl_sync(mask, more[k], first + lane);
-    }
-    return total;
-#else
-    return add(own, more);
-#endif
-""")
-def sum_of_lanes(own: wp.vec3, more: wp.vec3, share: wp.int32) -> wp.vec3:
-    """Sum over so many lanes beside each other of both, in their order; ``share`` is a power of 2, 32 at most."""
+@wp.func
+def sum_beside(value: wp.vec3, share: wp.int32) -> wp.vec3:
+    """Sum over ``share`` lanes beside each other in their order, known to all of them; ``share`` as in ``of_lane``."""
+    total = wp.vec3(0.0)
+    for lane in range(share):
+        total += of_lane(value, lane, share)
+    return total
 
 
 # A team is the block, or several blocks of one cluster where the device has them (from compute capability 9.0 on):

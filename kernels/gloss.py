@@ -39,7 +39,7 @@ import warp as wp
 from warp_ar.kernels.emitters import correct_parallax
 from warp_ar.kernels.launch import MOST_REGISTERS, QUICK_TO_COMPILE, Rows, launch_rows
 from warp_ar.kernels.lobes import level_from_alpha, sample_levels
-from warp_ar.kernels.materials import ggx_lobe, reflect, schlick
+from warp_ar.kernels.materials import MIN_ALPHA, ggx_lobe, reflect, schlick
 from warp_ar.kernels.pixels import shown_radiance
 from warp_ar.kernels.reflect import DistantLight, look_up, look_up_layer, make_find_in_frame
 from warp_ar.kernels.sampling import (
@@ -216,6 +216,34 @@ def make_follow(config: GlossConfig) -> wp.Function:
     return follow
 
 
+# A sphere of angular radius e is seen by half vectors that lie, in the plane of slopes (tangents from the normal), in
+# an ellipse about the one of its centre, of radii e / 2 and e / (2 cos_d), cos_d between half vector and ray; taken as
+# the circle of the same area, s^2 = e^2 / (4 cos_d). GGX's density of slopes, alpha^2 / (pi (alpha^2 + m^2)^2), is that
+# of points spread evenly over a sphere and projected stereographically onto the plane, m = alpha tan(theta / 2). The
+# projection takes circles to circles, so a circle of radius s at slope m has the share of a cap between
+# 2 atan((m - s) / alpha) and 2 atan((m + s) / alpha) of the sphere. Over the circle's area the mean is
+#
+#     2 alpha^2 / (pi H (H + X)),   X = alpha^2 + m^2 - s^2,   H = sqrt(X^2 + 4 s^2 alpha^2);
+#
+# where X < 0 the product H (H + X) cancels, and 1 / (H + X) is (H - X) / (4 s^2 alpha^2).
+@wp.func
+def sphere_over_point(
+    normal: wp.vec3, half: wp.vec3, cos_d: wp.float32, roughness: wp.float32, reach: wp.float32
+) -> wp.float32:
+    """Highlight of a sphere over that of a point in its middle, ``reach`` being its radius over its distance."""
+    alpha = wp.max(roughness * roughness, MIN_ALPHA)
+    cross = wp.cross(normal, half)
+    cos_h = wp.max(wp.dot(normal, half), 1.0e-3)
+    point = alpha * alpha + wp.dot(cross, cross) / (cos_h * cos_h)
+    square = 0.25 * reach * reach / wp.max(cos_d, 1.0e-3)
+    x = point - square
+    cap = 4.0 * square * alpha * alpha
+    h = wp.sqrt(x * x + cap)
+    if x < 0.0:
+        return 2.0 * point * (point / h) * ((h - x) / cap)
+    return 2.0 * (point / h) * (point / (h + x))
+
+
 @functools.cache
 def make_highlights(config: GlossConfig) -> wp.Function:
     """``highlights(sight, lights, surface, hit, wo, turn) -> vec3``: radiance that virtual lights add at a hit."""
@@ -228,16 +256,16 @@ def make_highlights(config: GlossConfig) -> wp.Function:
     ) -> wp.vec3:
         result = wp.vec3(0.0, 0.0, 0.0)
         cos_o = wp.dot(hit.normal, wo)
-        alpha = surface.roughness * surface.roughness
         for index in range(lights.shape[0]):
             light = sample_light(lights[index], hit.point)
             cos_i = wp.dot(hit.normal, light.wi)
             if cos_i > 0.0 and wp.dot(hit.geometric_normal, light.wi) > 0.0:
-                # A sphere of radius r widens its highlight by about r over twice its distance.
-                wide = wp.min(alpha + 0.5 * lights[index].radius / wp.max(light.distance, 1.0e-6), 1.0)
                 half = wp.normalize(wo + light.wi)
                 f = surface.reflectance + schlick(wp.dot(wo, half)) * (wp.vec3(1.0) - surface.reflectance)
-                lobe = cos_i * ggx_lobe(hit.normal, half, cos_i, cos_o, wp.sqrt(wide))
+                lobe = cos_i * ggx_lobe(hit.normal, half, cos_i, cos_o, surface.roughness)
+                if lights[index].radius > 0.0:
+                    reach = lights[index].radius / wp.max(light.distance, 1.0e-6)
+                    lobe *= sphere_over_point(hit.normal, half, wp.dot(wo, half), surface.roughness, reach)
                 sent = lobe * wp.cw_mul(f, light.irradiance_normal)
                 if wp.max(sent) > LEAST and not meets_probe(sight.probes, hit.point, light.wi, light.distance):
                     result += sent * visible_share(

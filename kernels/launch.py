@@ -70,9 +70,12 @@ MOST_BLOCKS = 4096
 """Blocks of ``BLOCK`` threads with which a CUDA device does all pixels of a frame, where most of them are soon done."""
 
 
-def clears_first(device: wp.DeviceLike) -> bool:
-    """Whether what a rectangle does not reach is cleared before, while the device has little to do."""
-    return not wp.get_device(device).is_cpu
+def takes_few_blocks(shape: Sequence[int], device: wp.DeviceLike) -> bool:
+    """Whether a launch over all of a shape with ``rectangle_first`` has a limited number of blocks.
+
+    What its rectangle does not reach is then better cleared before, while the device has little to do.
+    """
+    return not wp.get_device(device).is_cpu and math.prod(shape) > BLOCK * MOST_BLOCKS
 
 
 MAX_PARTIALS = 8
@@ -185,11 +188,10 @@ def launch_rows(
         stream: CUDA stream; None means the device's current one.
         rectangle_first: Whether the kernel takes ``own_pixel``: on CUDA a limited number of blocks does all rows, and
             those of its rectangle first.
-        alone: Whether, where that is so, other pixels need not be written.
+        alone: Whether, where that is so (``takes_few_blocks``), other pixels need not be written.
     """
     whole = rows is None or tuple(rows) == (0, shape[0])
-    many = math.prod(shape) > BLOCK * MOST_BLOCKS
-    limited = rectangle_first and whole and many and not wp.get_device(device).is_cpu
+    limited = rectangle_first and whole and takes_few_blocks(shape, device)
 
     def do() -> None:
         start, stop = rows if rows is not None else (0, shape[0])

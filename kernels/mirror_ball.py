@@ -17,10 +17,11 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+from collections.abc import Sequence
 
 import warp as wp
 
-from warp_ar.kernels.cooperative import sum_of_lanes
+from warp_ar.kernels.cooperative import of_lane
 from warp_ar.kernels.launch import MOST_REGISTERS, QUICK_TO_COMPILE, Rows, launch_rows
 from warp_ar.kernels.materials import reflect
 from warp_ar.kernels.pixel_order import own_pixel
@@ -240,7 +241,10 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
             change += one.first
             change += one.second
         if share > 1:
-            change = sum_of_lanes(one.first, one.second, share)
+            change = wp.vec3(0.0, 0.0, 0.0)
+            for lane in range(share):  # in the order in which one thread adds them
+                change += of_lane(one.first, lane, share)
+                change += of_lane(one.second, lane, share)
         if part == 0:
             mirrored_out[i, j] = change / wp.float32(side * side)
             if later:
@@ -290,6 +294,12 @@ def shade_mirrored(
     launch_rows(shade_mirrored_kernel, mirrored_out.shape, given, [mirrored_out], **whole)
 
 
+def launch_shape(size: Sequence[int], samples: int, device: wp.DeviceLike) -> tuple[int, int, int]:
+    """Threads of a picture of (H, W) pixels: on CUDA some numbers of samples have a lane each."""
+    height, width = size
+    return height, width, samples if samples in SHARED and not wp.get_device(device).is_cpu else 1
+
+
 def mirror_ball(
     config: MirrorBallConfig,
     params: wp.array,
@@ -329,11 +339,11 @@ def mirror_ball(
     if samples < 1 or side**2 != samples:
         raise ValueError(f"samples is {samples}; expected a square number such as 1 or 4")
     rays = receiver.picture.rays
-    share = samples if samples in SHARED and not rays.device.is_cpu else 1
+    shape = launch_shape(rays.shape, samples, rays.device)
     launch_rows(
         make_mirror_ball_kernel(config),
-        (*rays.shape, share),
-        [params, scene, lights, distant, receiver, shadow_ratio, side, share],
+        shape,
+        [params, scene, lights, distant, receiver, shadow_ratio, side, shape[2]],
         [mirrored_out, shows_out],
         rows=rows,
         device=rays.device,

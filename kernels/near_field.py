@@ -186,13 +186,15 @@ def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
                             missed = (1.0 - near[3]) * beyond
                             transmitted += wp.vec4(missed[0], missed[1], missed[2], brightness(beyond))
         if share > 1:
-            leaving = sum_beside(wp.vec4(leaving, 0.0, 0.0, 0.0), share)[0]
             if wp.static(config.distant.diffuse != "none"):
-                together = sum_beside(wp.vec4(total[0], total[1], total[2], 0.0), share)
-                total = wp.vec3(together[0], together[1], together[2])
+                total = sum_beside(total, share)
             if wp.static(config.distant.specular):
-                reflected = sum_beside(reflected, share)
-                transmitted = sum_beside(transmitted, share)
+                met = sum_beside(wp.vec3(reflected[0], reflected[1], reflected[2]), share)
+                missed_by = sum_beside(wp.vec3(transmitted[0], transmitted[1], transmitted[2]), share)
+                counts = sum_beside(wp.vec3(reflected[3], transmitted[3], leaving), share)
+                reflected = wp.vec4(met[0], met[1], met[2], counts[0])
+                transmitted = wp.vec4(missed_by[0], missed_by[1], missed_by[2], counts[1])
+                leaving = counts[2]
             if part > 0:
                 return
         if wp.static(config.distant.diffuse != "none"):

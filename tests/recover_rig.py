@@ -14,9 +14,11 @@ from warp_ar.kernels import structs
 from warp_ar.kernels.recover_cells import CELL_COLUMNS, CELL_ROWS, Cell
 from warp_ar.light import recovery
 from warp_ar.light import surfaces as light_surfaces
+from warp_ar.light.solving_process import SolvingPool
 from warp_ar.scene import loads_scene
 from warp_ar.scene.kinds import trace_config
 from warp_ar.scene.ray_scene import HostScene
+from warp_ar.stages import recover as recover_stage
 
 SCENE = """
 schema = 1
@@ -54,6 +56,13 @@ at = [0.1, 0.0, 0.03]
 @pytest.fixture(scope="module")
 def scene():
     return loads_scene(SCENE)
+
+
+def solve_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let this process make all estimates of a test: one that another test has left would count for itself."""
+    pool = SolvingPool(1)
+    pool.close()
+    monkeypatch.setattr(recover_stage, "POOL", pool)
 
 
 def probes_of(device, center=(-0.12, 0.03, 0.035), radius=0.035, reflectance=0.85):

@@ -251,3 +251,11 @@ def test_errors_are_one_line(arguments, said, capsys, tmp_path, monkeypatch):
     assert said in error
     assert error.count("\n") == 1
     assert not list(tmp_path.iterdir())
+
+
+def test_a_picture_without_a_marker_is_counted(capsys, tmp_path):
+    """One picture is one, whatever the number of frames that would be read."""
+    (tmp_path / "frames").mkdir()
+    cv2.imwrite(str(tmp_path / "frames" / "a.png"), np.full((480, 640, 3), 128, np.uint8))
+    assert calibrate.main(["ball", "desk", "--source", str(tmp_path / "frames")]) == 2
+    assert "no marker in the only frame" in capsys.readouterr().err

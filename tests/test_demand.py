@@ -13,10 +13,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.hard_cases.rig import SIZE, look_at, make_quality, make_scene
+from tests.recover_rig import solve_here
 from warp_ar.engine.demand import Demand
 from warp_ar.engine.pipeline import Pipeline, Result
 from warp_ar.light.recovery import Estimate, Recovery
-from warp_ar.light.solving_process import POOL
 from warp_ar.scene import Exposure, Light, Scene
 from warp_ar.stages.base import Reach, Wiring
 from warp_ar.stages.quality import PRESETS
@@ -239,7 +239,7 @@ def number_estimates(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(Recovery, "update", update)
     monkeypatch.setattr(Recovery, "rests", lambda *_: False)
-    POOL.rest()  # a process that another test has left would count for itself
+    solve_here(monkeypatch)
 
 
 @pytest.mark.parametrize("path", PATHS)

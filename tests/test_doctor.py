@@ -112,6 +112,7 @@ SEEN = {
     "focal length 3 % long": ("camera.focal", lambda s: camera(s, fx=1.03, fy=1.03)),
     "focal length 3 % short": ("camera.focal", lambda s: camera(s, fx=0.97, fy=0.97)),
     "focal length of another size": ("camera.focal", lambda s: camera(s, fx=0.8, fy=0.8)),
+    "focal length that no pose fits": ("camera.focal", lambda s: camera(s, fx=0.15, fy=0.15)),
 }
 
 

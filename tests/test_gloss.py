@@ -49,6 +49,10 @@ LAMP = {"kind": POINT, "position": (0.05, 0.35, 0.3), "intensity": (0.3, 0.2, 0.
 FLOAT_ERROR = 1e-5
 # Relative spread of 4,096 rays, of which a lobe's tail brings a few hundred, and their four-pixel neighbourhood.
 RAYS_ERROR = 0.04
+# Radiance of a highlight that is looked for, and as much again.
+LEAST_HIGHLIGHT = 4e-4
+# Masking and Fresnel at the middle of a sphere; aslant, an ellipse of half vectors that is taken as a circle.
+SPHERE_ERROR = {"from above": 0.02, "aslant": 0.2}
 
 
 def directions(pose=POSE, rays=RAYS):
@@ -173,6 +177,31 @@ def test_a_lamp_has_a_highlight(device):
     shaded = run((0.4, F0), lights=[LAMP], objects=[half_way], around=np.zeros(3)).reshape(-1, 3)
     peak = np.argmax(expected[:, 0])
     assert shaded[peak, 0] < 0.5 * expected[peak, 0]
+
+
+@pytest.mark.parametrize("seen", ["from above", "aslant"])
+@pytest.mark.parametrize(("roughness", "radius"), [(0.4, 0.005), (0.4, 0.06), (0.2, 0.02), (0.2, 0.06), (0.1, 0.005)])
+def test_a_sphere_has_a_wider_highlight(device, roughness, radius, seen):
+    """That of all its directions, summed up; a point's would be up to five times as bright."""
+    above = seen == "from above"
+    eye = np.array([0.0, -0.03, 0.4]) if above else EYE
+    pose = look_at(eye, np.array([0.0, 0.05, 0.0])) if above else POSE
+    lamp = {**LAMP, "radius": radius, "position": (0.02, 0.1, 0.35) if above else LAMP["position"]}
+    got = run((roughness, F0), lights=[lamp], objects=(), pose=pose)
+    point = run((roughness, F0), lights=[{**lamp, "radius": 0.0}], objects=(), pose=pose)
+    pixels = np.argwhere(np.maximum(got, point).max(-1) > LEAST_HIGHLIGHT)
+    pixels = pixels[:: max(len(pixels) // 100, 1)]
+    radiance, place = np.array(LAMP["intensity"]) / (np.pi * radius**2), np.array(lamp["position"])
+    expected = np.array(
+        [reference.rough(eye, directions(pose)[i, j], place, radius, radiance, F0, roughness**2) for i, j in pixels]
+    )
+
+    def error(change):
+        return np.abs(change[tuple(pixels.T)] - expected).sum() / expected.sum()
+
+    assert len(pixels) > 30
+    assert error(got) < SPHERE_ERROR[seen]
+    assert error(got) < 0.6 * error(point)
 
 
 # --- hard cases

@@ -27,6 +27,7 @@ def test_folder_is_a_scene(tmp_path, capsys):
     assert init.main([str(tmp_path / "my desk"), "--radius", "0.025", "--source", "3"]) == 0
     said = capsys.readouterr().out
     assert said.splitlines()[-1] == f"next: python -m warp_ar.live {tmp_path / 'my desk'}"
+    assert "radius" not in said  # it is given
     scene = load_scene(tmp_path / "my desk")
     assert (scene.name, scene.marker) == ("my desk", sheet.SHEET)
     assert scene.probes[0].radius == 0.025
@@ -157,8 +158,9 @@ def test_tracker_follows_the_sheet():
     assert np.allclose(track.pose.translation, (0, 0, 0.5), atol=1e-3)
 
 
-def test_template_is_toml_with_the_reference_s_words(tmp_path):
+def test_template_is_toml_with_the_reference_s_words(tmp_path, capsys):
     assert init.main([str(tmp_path / "a"), "--source", "clip.mp4"]) == 0
+    assert "Write the ball's radius" in capsys.readouterr().out
     data = tomllib.loads((tmp_path / "a" / "scene.toml").read_text())
     assert data["source"]["path"].endswith("clip.mp4")
     assert json.dumps(data["probe"]["center"]) == json.dumps(list(map(float, sheet.ball_center(0.035))))

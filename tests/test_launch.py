@@ -16,7 +16,7 @@ import warp as wp
 
 import warp_ar.kernels
 from warp_ar.kernels import irradiance
-from warp_ar.kernels.launch import launch_rows
+from warp_ar.kernels.launch import launch_rows, takes_few_blocks
 
 ROWS = 13
 
@@ -35,6 +35,12 @@ def test_bands_touch_each_row_once(device: str, edges: tuple[int, ...]) -> None:
     np.testing.assert_array_equal(counts.numpy(), 2)
     launch_rows(count_rows_kernel, counts.shape, [1], [counts], rows=None, device=device)
     np.testing.assert_array_equal(counts.numpy(), 3)
+
+
+def test_layers_are_cleared_before_only_where_few_blocks_write_them(device: str) -> None:
+    """At 640x480 a CUDA device has a thread for each pixel, at 1080p it has not."""
+    assert not takes_few_blocks((480, 640), device)
+    assert takes_few_blocks((1080, 1920), device) == (device != "cpu")
 
 
 def test_tiles_from_several_threads() -> None:

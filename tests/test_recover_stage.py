@@ -10,7 +10,7 @@ import time
 import numpy as np
 import pytest
 
-from tests.recover_rig import scene  # noqa: F401
+from tests.recover_rig import scene, solve_here  # noqa: F401
 from tests.reference import recover as reference
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.kernels import recover as kernels
@@ -18,7 +18,6 @@ from warp_ar.kernels.recover_cells import CELL_COLUMNS, CELL_ROWS, Cell
 from warp_ar.light import recovery
 from warp_ar.light import surfaces as light_surfaces
 from warp_ar.light.config import CONFIG
-from warp_ar.light.solving_process import POOL
 from warp_ar.scene import Pose, load_scene
 from warp_ar.session import Session
 from warp_ar.stages.quality import PRESETS
@@ -26,9 +25,9 @@ from warp_ar.stages.recover import LATENCY, Recover
 
 
 @pytest.fixture(autouse=True)
-def solves_here():
-    """A process that another test has left would solve where nothing is counted."""
-    POOL.rest()
+def solves_here(monkeypatch):
+    """Estimates are counted here."""
+    solve_here(monkeypatch)
 
 
 def test_stage_is_left_out_where_the_quality_says_so(scene):

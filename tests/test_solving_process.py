@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info
 
+from tests.recover_rig import solve_here
 from warp_ar import Pipeline
 from warp_ar.engine.switcher import let_go
 from warp_ar.input.sources import open_source
@@ -149,17 +150,10 @@ def test_light_is_noted_once_where_a_process_dies():
         pool.close()
 
 
-def test_a_pool_that_rests_has_no_process_until_it_is_asked_again():
+def test_a_pool_starts_a_process_before_it_is_asked():
     pool = SolvingPool(1)
     try:
         assert not pool.ready
-        pool.prepare()
-        wait_until_ready(pool)
-        process = pool._all[0]._process
-        pool.rest()
-        assert process.returncode is not None
-        assert not pool.ready
-        assert not pool._all
         pool.prepare()
         wait_until_ready(pool)
         solver = Doubler()
@@ -251,7 +245,7 @@ def test_an_estimate_that_fails_leaves_the_light_and_the_next_one_is_made(monkey
         return dataclasses.replace(found, recovered=np.full_like(found.recovered, np.nan))
 
     monkeypatch.setattr(recover, "solve_by", faulty)
-    recover.POOL.rest()  # a process that another test has left would solve, where nothing is faulty
+    solve_here(monkeypatch)
     with Pipeline(scene, device="cpu", quality="low", estimates=estimates) as pipeline:
         status = pipeline.arrays["recover_status"]
         pipeline(frames[0].image, time_seconds=frames[0].time)

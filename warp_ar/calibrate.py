@@ -177,7 +177,9 @@ def _run_ball(options: argparse.Namespace) -> int:
         camera = scene.camera.scaled_to(*source.size)
         views = posed_frames(source, scene.marker, camera, options.frames)
     if not views:
-        raise UsageError(f"{spec}: no marker in the first {options.frames} frames; see [marker] in {options.scene}")
+        count = min(source.length or options.frames, options.frames)
+        looked = "the only frame" if count == 1 else f"the first {count} frames"
+        raise UsageError(f"{spec}: no marker in {looked}; see [marker] in {options.scene}")
     for guess in guesses(scene):
         say(f"{guess}; until then what follows is no better than that")
     views, code = views[:: -(-len(views) // 12)], EXIT_DONE

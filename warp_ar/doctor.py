@@ -8,20 +8,30 @@ if __name__ == "__main__":
     begin("warp_ar.doctor")
 
 import argparse
+import dataclasses
+import itertools
+import math
 import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from warp_ar.begin import importing
 from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, run_command
 from warp_ar.errors import UsageError, printable
 from warp_ar.input.checkup import FRAMES, check_up, source_of
 from warp_ar.input.finding import Finding, worst_first
-from warp_ar.scene import Scene, bundled_scenes, load_scene
+from warp_ar.scene import Camera, Pose, Scene, bundled_scenes, load_scene
 
 DEVICES = Path("/dev")
 """Where the system lists capture devices."""
+FEW_SIDES = 5
+"""Directions from which a table must be seen to tell whether it mirrors."""
+APART = 4.0
+"""Degrees between these."""
+MISLEADING = ("units.", "source.", "camera.", "marker.", "ball.outside", "ball.unfound", "ball.place", "ball.radius")
+"""Beginnings of names of findings with which pictures do not say what a table mirrors."""
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -91,6 +101,63 @@ def check_access(scene: Scene, source: str | int | Path | None) -> list[Finding]
     return []
 
 
+def look_for_polish(scene: Scene, source: str | int | Path | None, frames: int) -> str | None:
+    """A line that says how a table mirrors its surroundings, and what to write of it.
+
+    Args:
+        scene: With a card, a mirror ball and a plane.
+        source: A recording; what else it may be is not asked.
+        frames: How many to look at.
+
+    Returns:
+        None where they do not tell that it does, or the scene says it already.
+    """
+    planes = [proxy for proxy in scene.proxies if proxy.shape == "plane"]
+    asked = scene.probes and scene.has_marker and planes and not any(proxy.material for proxy in scene.proxies)
+    if not asked or source is None or not Path(str(source)).exists():
+        return None
+    with importing():
+        from warp_ar.kernels.color import decode_table
+        from warp_ar.light.polish import estimate_polish
+
+    camera, views, environment = _see_from_sides(scene, source, frames)
+    if environment is None or len(views) < FEW_SIDES:
+        return None
+    polish = estimate_polish(scene, camera, views, environment, decode_table(camera.transfer))
+    if polish is None:
+        return None
+    said = "roughness = {:.2g} ({:.2g} to {:.2g}), ".format(*polish.roughness)
+    if polish.reflectance is None:
+        said += "reflectance = 0.04, as lacquer has it: only lamps that clip in the ball are mirrored"
+    else:
+        said += "reflectance = {:.2g} ({:.2g} to {:.2g})".format(*polish.reflectance)
+    return f"table: it mirrors its surroundings, as {len(views)} views tell; [proxy.material] shows it: {said}"
+
+
+def _see_from_sides(scene: Scene, source: str | int | Path, frames: int) -> tuple[Camera, list[Any], Any]:
+    """The camera, views that differ in direction, and the environment as the ball shows it; None: it shows none."""
+    with importing():
+        import numpy as np
+
+        from warp_ar.session import Session
+        from warp_ar.stages.quality import PRESETS
+
+    quality = PRESETS["medium"].with_methods(recover="clipped")
+    bare = dataclasses.replace(scene, objects=(), lights=())
+    views: list[tuple[Any, Pose]] = []
+    environment = None
+    with Session(bare, source=source, quality=quality, outputs=("environment",)) as session:
+        camera = scene.camera.scaled_to(*session.source.size)
+        for frame, result in itertools.islice(session, frames):
+            if result.pose is None or result.environment is None or frame.image.dtype != np.uint8:
+                continue
+            environment = np.array(result.environment)
+            ahead = result.pose.rotation[2]
+            if all(ahead @ pose.rotation[2] < math.cos(math.radians(APART)) for _, pose in views):
+                views.append((np.array(frame.image), result.pose))
+    return camera, views, environment
+
+
 def _run(options: argparse.Namespace) -> int:
     if options.frames < 1:
         raise UsageError(f"--frames {options.frames}: expected a number of frames, 1 or more")
@@ -104,6 +171,8 @@ def _run(options: argparse.Namespace) -> int:
     checked = check_up(scene, None if access else source, frames=options.frames)
     found = worst_first([*found, *access, *checked])
     own = None if scene.path in bundled_scenes().values() else str(options.scene)
+    if not any(finding.name.startswith(MISLEADING) for finding in found):
+        told += [line for line in (look_for_polish(scene, source, options.frames),) if line]
     for line in told:
         print(line)
     for number, finding in enumerate(found, 1):

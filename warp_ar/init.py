@@ -29,6 +29,8 @@ CARDS = tuple(
     (f"card-{paper}.{kind}", paper, dpi) for paper in ("a4", "letter") for kind, dpi in (("pdf", 600), ("png", 300))
 )
 """Files of the card: name, paper, dots per inch."""
+DEFAULT_RADIUS = 0.035
+"""Of the ball, metres."""
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -41,7 +43,7 @@ def make_parser() -> argparse.ArgumentParser:
     text = "frames: a capture device's index, a video, a folder (default: 0)"
     parser.add_argument("--source", default="0", metavar="PATH|INDEX", help=text)
     parser.add_argument(
-        "--radius", type=float, default=0.035, metavar="X", help="the mirror ball's radius in metres (default: 0.035)"
+        "--radius", type=float, metavar="X", help=f"the mirror ball's radius in metres (default: {DEFAULT_RADIUS})"
     )
     return parser
 
@@ -86,12 +88,13 @@ def make_desk(folder: Path, source: str | int, radius: float) -> None:
 def _run(options: argparse.Namespace) -> int:
     folder, given = options.folder, options.source
     source = int(given) if given.isdecimal() else str(Path(given).absolute())
-    make_desk(folder, source, options.radius)
+    make_desk(folder, source, DEFAULT_RADIUS if options.radius is None else options.radius)
     shown = printable(folder)
     print(f"{shown}: {SCENE}, {MESH}, {', '.join(name for name, _, _ in CARDS)}")
     print(f"1. Print {shown}/card-a4.pdf (or card-letter.pdf) at 100 %; both rulers on it must be 100 mm.")
     print("2. Lay it flat, stand the mirror ball on its cross, and have all of it in the camera's picture.")
-    print(f"3. Write the ball's radius into {shown}/{SCENE}, [probe]; it says {options.radius:g} m.")
+    if options.radius is None:
+        print(f"3. Write the ball's radius into {shown}/{SCENE}, [probe]; it says {DEFAULT_RADIUS:g} m.")
     print(f"next: python -m warp_ar.live {shown}")
     return EXIT_DONE
 

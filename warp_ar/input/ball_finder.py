@@ -422,7 +422,7 @@ def _find_anywhere(image: Image, camera: Camera) -> BallOutline:
             best, told = (lift, sphere), strength
         if told > CERTAIN:
             break
-    ask = "give a rough circle: column, row, radius in pixels"
+    ask = "give a rough circle (--ball): column, row, radius in pixels"
     if best is None:
         raise UsageError(f"no ball was found in the picture; {ask}")
     lift, sphere = best

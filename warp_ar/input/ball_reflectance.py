@@ -168,11 +168,11 @@ def _mirrored_points(scene: Scene, camera: Camera, probe: Probe, pose: Pose) -> 
     outward = rays[met] + 2.0 * facing[met, None] * normal[met]
     distance, is_matt = _nearest(scene.proxies, hit, outward)
     points = hit + np.where(is_matt, distance, 0.0)[:, None] * outward
-    seen = is_matt & _are_seen(scene, camera, probe, pose, points)
+    seen = is_matt & are_seen(scene, camera, probe, pose, points)
     return pixels[seen], points[seen]
 
 
-def _are_seen(scene: Scene, camera: Camera, probe: Probe, pose: Pose, points: Array) -> NDArray[np.bool_]:
+def are_seen(scene: Scene, camera: Camera, probe: Probe, pose: Pose, points: Array) -> NDArray[np.bool_]:
     """Whether the camera sees points of planes beside the ball, (n,)."""
     eye = -pose.rotation.T @ pose.translation
     ahead = (points @ pose.rotation.T + pose.translation)[:, 2] > NEAR

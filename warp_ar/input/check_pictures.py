@@ -202,6 +202,9 @@ def why_unseen(marker: Marker, look: Look) -> Finding:
     if (board := board_instead(marker, [image])) is not None:
         return board
     name, seen = find_markers(image)
+    if marker.board is None and name == marker.dictionary and ids & {d.id for d in seen}:
+        text = f"{wanted} is in the picture, but no camera with fx {look.camera.fx:.0f} pixels sees a square like that"
+        return Finding("camera.focal", text, "python -m warp_ar.calibrate camera PICTURES")
     if seen:
         numbers = ", ".join(str(n) for n in sorted({d.id for d in seen})[:6])
         text = f"no {wanted} in {len(look.images)} frames; the picture shows {name} {numbers}"

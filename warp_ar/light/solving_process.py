@@ -192,14 +192,6 @@ class SolvingPool:
         with self._changed:
             return any(process.ready for process in self._all)
 
-    def rest(self) -> None:
-        """End the processes that nobody uses: the next who asks for one starts it anew."""
-        with self._changed:
-            idle, self._idle = self._idle, []
-            self._all = [process for process in self._all if process not in idle]
-        for process in idle:
-            process.close()
-
     def _start(self) -> None:
         with contextlib.suppress(OSError):  # no more processes: solved for here
             process = SolvingProcess()

@@ -53,7 +53,6 @@ class Fill(Stage):
         return {
             **{name: ArraySpec((self.features.others, *shape), wp.vec3) for name in self.wiring.writes[1:]},
             self.wiring.writes[0]: ArraySpec(shape, wp.vec3),
-            "fill_seen": ArraySpec((self.features.others + 1, *shape), wp.vec4),
             "fill_levels": ArraySpec((fill.fill_level_offsets(*shape)[-1],), wp.vec4),
             "fill_published": ArraySpec(shape, wp.vec3),
             "fill_difference": ArraySpec((height,), wp.float32),
@@ -82,25 +81,27 @@ class Fill(Stage):
 
         frame = find_picture(arrays), arrays["params"], arrays["probes"], arrays["ray_scene"]
         proxies = trace_variant(trace_config(self.request.scene), device).proxies
-        apart = not device.is_cpu
-        passes = self._look_first(arrays, frame, proxies) if apart else []
+        # What the frame shows of all directions, where it is known before what the balls show.
+        seen = None if device.is_cpu else wp.zeros((len(maps), height, 2 * height), dtype=wp.vec4, device=device)
+        passes = [] if seen is None else self._look_first(seen, frame, proxies)
         for ball, known in enumerate(maps):
-            passes += self._complete(arrays, ball, *known, most, None if apart else (frame, proxies))
+            found = (frame, proxies) if seen is None else seen[ball]
+            passes += self._complete(arrays, ball, *known, most, found)
         if self._on_cpu:
             passes.append(Pass(measure, rows=height))
         return [dataclasses.replace(one, enabled=lambda: not self._holds) for one in passes]
 
-    def _look_first(self, arrays: Arrays, frame: tuple[Any, ...], proxies: tuple[int, ...]) -> list[Pass]:
+    def _look_first(self, seen: Any, frame: tuple[Any, ...], proxies: tuple[int, ...]) -> list[Pass]:
         """On CUDA: what the frame shows of all directions, while the ball's own picture is still read."""
         reads = tuple(name for name in self.wiring.reads if name in (*frame_reads(self.features), "pose"))
         return [
             Pass(
                 lambda rows, ball=ball: fill_frame.see_frame(  # type: ignore[misc]
-                    *frame, arrays["fill_seen"][ball], proxies=proxies, ball=ball
+                    *frame, seen[ball], proxies=proxies, ball=ball
                 ),
                 reads=reads,
             )
-            for ball in range(self.features.others + 1)
+            for ball in range(len(seen))
         ]
 
     def _complete(
@@ -111,15 +112,15 @@ class Fill(Stage):
         confidence: Any,
         filled: Any,
         most: float,
-        frame: tuple[tuple[Any, ...], tuple[int, ...]] | None,
+        frame: Any,
     ) -> list[Pass]:
         """Passes that complete the map of one ball; balls take turns with the pyramid.
 
-        ``frame`` is what is looked up in between, and the kinds of proxy; None: it was before.
+        ``frame`` is what the frame shows, looked up before; or what is looked up in between, and the kinds of proxy.
         """
         shape = height, _ = radiance.shape
         levels = arrays["fill_levels"]
-        seen = arrays["fill_seen"][ball] if frame is None else None
+        seen = None if isinstance(frame, tuple) else frame
 
         def seed(rows: Rows | None) -> None:
             fill.seed_fill(radiance, confidence, levels, seen=seen, rows=rows)
@@ -131,7 +132,7 @@ class Fill(Stage):
             fill.finish_fill(levels, filled, rows=rows)
 
         passes = [Pass(seed, rows=height), Pass(push_pull), Pass(finish, rows=height)]
-        if frame is not None:
+        if isinstance(frame, tuple):
             scene, proxies = frame
 
             def see(rows: Rows | None) -> None:

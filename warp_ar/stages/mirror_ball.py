@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_ar.kernels import mirror_ball
-from warp_ar.kernels.launch import clears_first
+from warp_ar.kernels.launch import takes_few_blocks
 from warp_ar.kernels.receiver import RelightConfig, make_receiver
 from warp_ar.kernels.reflect import DistantLight
 from warp_ar.scene.kinds import trace_config
@@ -163,7 +163,7 @@ class MirrorBall(Stage):
 
         out = arrays["mirror_ball"]
 
-        cleared = clears_first(device)
+        cleared = takes_few_blocks(mirror_ball.launch_shape(out.shape, samples, device), device)
         first = [clearing(out)] if cleared else []
 
         def launch(rows: Rows | None) -> None:

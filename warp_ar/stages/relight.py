@@ -12,7 +12,7 @@ import warp as wp
 
 from warp_ar.kernels import receiver_cells, relight
 from warp_ar.kernels.cells import cell_shape, cell_stride
-from warp_ar.kernels.launch import clears_first, count_partials
+from warp_ar.kernels.launch import count_partials, takes_few_blocks
 from warp_ar.kernels.receiver import Receiver, ReceiverCells, RelightConfig, make_receiver
 from warp_ar.kernels.structs import PLANE
 from warp_ar.scene.kinds import trace_config
@@ -129,7 +129,7 @@ class Relight(Stage):
         added = arrays["added_light"]
         visibility = arrays["relight_visibility"] if config.edge_samples > 1 else None
 
-        cleared = clears_first(device)
+        cleared = takes_few_blocks(added.shape, device)
 
         def launch(rows: Rows | None) -> None:
             relight.relight(config, *inputs, added, visibility, cleared=cleared, rows=rows)

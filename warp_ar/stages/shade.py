@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_ar.kernels.launch import clears_first
+from warp_ar.kernels.launch import takes_few_blocks
 from warp_ar.kernels.near_field import NearLight
 from warp_ar.kernels.shade import make_object_light, shade
 from warp_ar.stages.base import (
@@ -97,7 +97,7 @@ class Shade(Stage):
         light = make_object_light(distant, arrays["light_array"] if config.lights else None, near)
         inputs = arrays["params"], arrays["rays"], arrays["ray_scene"], light, find_visible(arrays)
 
-        cleared = lists is not None and clears_first(device)
+        cleared = lists is not None and takes_few_blocks(arrays["virtual"].shape, device)
 
         def launch(rows: Rows | None) -> None:
             shade(variant, *inputs, arrays["virtual"], edge_lists=lists, cleared=cleared, rows=rows)
