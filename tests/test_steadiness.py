@@ -13,6 +13,7 @@ from warp_ar.light.stillness import Seen
 
 SHAPE = (4, 8)
 STILL = CONFIG.solver.still
+VIEW = np.array([0.0, -0.6, 0.8])
 
 
 def seen(level=1.0, told=True):
@@ -31,7 +32,7 @@ def estimate(value=1.0, power=None, cell=3):
 def test_light_that_stays_becomes_the_mean():
     steadiness, values = Steadiness(), [3.0, 5.0, 4.0, 8.0]
     for count, value in enumerate(values, 1):
-        found = steadiness.follow(estimate(value, power=10.0 * value), seen())
+        found = steadiness.follow(estimate(value, power=10.0 * value), seen(), VIEW)
         np.testing.assert_allclose(found.recovered, np.mean(values[:count]), rtol=1e-6)
         np.testing.assert_allclose(found.emitters[0].power, 10.0 * np.mean(values[:count]))
 
@@ -39,7 +40,9 @@ def test_light_that_stays_becomes_the_mean():
 def test_noise_is_averaged_out():
     rng, steadiness = np.random.default_rng(1), Steadiness()
     found = [
-        steadiness.follow(estimate(1.0 + 0.1 * rng.standard_normal()), seen(1.0 + 0.1 * STILL * rng.standard_normal()))
+        steadiness.follow(
+            estimate(1.0 + 0.1 * rng.standard_normal()), seen(1.0 + 0.1 * STILL * rng.standard_normal()), VIEW
+        )
         for _ in range(100)
     ]
     steps = np.abs(np.diff([one.recovered.mean() for one in found[CONFIG.solver.remembered :]]))
@@ -52,8 +55,17 @@ def test_noise_is_averaged_out():
 def test_light_that_changes_is_followed_at_once(level):
     steadiness = Steadiness()
     for _ in range(30):
-        steadiness.follow(estimate(1.0), seen())
-    assert steadiness.follow(estimate(5.0), seen(level)).recovered.max() == 5.0
+        steadiness.follow(estimate(1.0), seen(), VIEW)
+    assert steadiness.follow(estimate(5.0), seen(level), VIEW).recovered.max() == 5.0
+
+
+def test_a_ball_seen_from_elsewhere_is_seen_anew():
+    steadiness, aside = Steadiness(), np.array([1.0, 0.0, 0.0])
+    for _ in range(5):
+        steadiness.follow(estimate(1.0), seen(), VIEW)
+    trembled = steadiness.follow(estimate(7.0), seen(), VIEW + 0.2 * STILL * aside)
+    assert trembled.recovered.max() == pytest.approx(1.0 + 6.0 / 6.0)
+    assert steadiness.follow(estimate(7.0), seen(), VIEW + 1.2 * STILL * aside).recovered.max() == 7.0
 
 
 @pytest.mark.parametrize("rate", [0.001, 0.004, 0.01])
@@ -62,15 +74,15 @@ def test_light_that_changes_slowly_runs_ahead_by_no_more_than_counts(rate):
     steadiness = Steadiness()
     for step in range(200):
         level = np.exp(rate * step)
-        found = steadiness.follow(estimate(level), seen(level))
+        found = steadiness.follow(estimate(level), seen(level), VIEW)
         assert found.recovered.mean() > (1.0 - 1.1 * STILL) * level
 
 
 def test_another_emitter_is_another_light():
     steadiness = Steadiness()
-    steadiness.follow(estimate(1.0, power=1.0), seen())
-    assert steadiness.follow(estimate(2.0, power=2.0, cell=4), seen()).emitters[0].power[0] == 2.0
-    found = steadiness.follow(estimate(4.0), seen())
+    steadiness.follow(estimate(1.0, power=1.0), seen(), VIEW)
+    assert steadiness.follow(estimate(2.0, power=2.0, cell=4), seen(), VIEW).emitters[0].power[0] == 2.0
+    found = steadiness.follow(estimate(4.0), seen(), VIEW)
     assert found.emitters == ()
     assert found.recovered.max() == 4.0
 
@@ -78,15 +90,15 @@ def test_another_emitter_is_another_light():
 def test_cells_that_begin_or_cease_to_clip_are_as_they_are_now():
     steadiness, before, now = Steadiness(), estimate(4.0), estimate(2.0)
     before.recovered[0], now.recovered[1] = 0.0, 0.0
-    steadiness.follow(before, seen())
-    recovered = steadiness.follow(now, seen()).recovered
+    steadiness.follow(before, seen(), VIEW)
+    recovered = steadiness.follow(now, seen(), VIEW).recovered
     np.testing.assert_array_equal(recovered[:, 0, 0], [2.0, 0.0, 3.0, 3.0])
 
 
 def test_without_surfaces_nothing_is_averaged():
     steadiness = Steadiness()
-    steadiness.follow(estimate(1.0), seen())
-    assert steadiness.follow(estimate(2.0), seen(told=False)).recovered.max() == 2.0
+    steadiness.follow(estimate(1.0), seen(), VIEW)
+    assert steadiness.follow(estimate(2.0), seen(told=False), VIEW).recovered.max() == 2.0
 
 
 def shown(exact, bound=(0, 0, 0), missing=(1.0, 1.0, 1.0), points=400):

@@ -191,9 +191,15 @@ class Recovery:
                 cells["direction"].reshape(-1, 3).astype(float), self._center, self._radius, camera
             )
             problem = Problem(cells, transfer, mirrored, observations, self.surfaces, self._white, trace, origin)
-            return self._solve(problem, Seen.of(cells, observations))
+            view = np.zeros(3) if camera is None else (camera - self._center) / np.linalg.norm(camera - self._center)
+            estimate = self._solve(problem)
+        if self._unseen == 0:
+            self._held = estimate = self._steadiness.follow(estimate, Seen.of(cells, observations), view)
+        elif self._held is None:
+            self._steadiness = Steadiness()
+        return estimate
 
-    def _solve(self, problem: Problem, seen: Seen) -> Estimate:
+    def _solve(self, problem: Problem) -> Estimate:
         """``update``, by the thread that asks for it alone."""
         self._frames += 1
         card = check_card(problem.points, problem.kind, problem.light)
@@ -206,7 +212,8 @@ class Recovery:
         by_card = problem.member @ radiance_by_card
         if self.method == "white_card" or not (problem.parts or problem.may_hold_candidate.any()):
             factor = problem.card_factor(bounds, doubt_of(card.contrast))
-            return self._hold(seen, self._estimate(problem, by_card, bounds, "white_card", factor, card))
+            self._held = self._estimate(problem, by_card, bounds, "white_card", factor, card)
+            return self._held
         means = np.maximum(means, 0.05)
         self._channel = best = choose_channel(problem, self._channel)
         is_turn = self._search(problem, best, means[best])
@@ -240,12 +247,9 @@ class Recovery:
             self._evidence = dataclasses.replace(evidence, factor=min(evidence.factor, reaching))
         evidence = self._evidence
         if evidence.method == "shading":
-            return self._hold(seen, self._estimate(problem, recovered, bounds, *evidence.parts, card, tuple(emitters)))
-        return self._hold(seen, self._estimate(problem, by_card, bounds, *evidence.parts, card))
-
-    def _hold(self, seen: Seen, estimate: Estimate) -> Estimate:
-        """The mean of estimates, which stands until the next, or while the card is hidden."""
-        self._held = self._steadiness.follow(estimate, seen)
+            self._held = self._estimate(problem, recovered, bounds, *evidence.parts, card, tuple(emitters))
+        else:
+            self._held = self._estimate(problem, by_card, bounds, *evidence.parts, card)
         return self._held
 
     def _without_card(self, problem: Problem, card: CardCheck) -> Estimate:
@@ -257,7 +261,7 @@ class Recovery:
         self._unseen += 1
         if self._held is not None and self._unseen <= CONFIG.card.held:
             return self._held
-        self._held, self._candidates, self._evidence, self._steadiness = None, [], None, Steadiness()
+        self._held, self._candidates, self._evidence = None, [], None
         nothing = np.zeros((len(problem.solid_angle), 3))
         return self._estimate(problem, nothing, (True, True, True), "clipped", 0.0, card)
 

@@ -4,7 +4,8 @@ An estimate of one frame scatters as noise moves surfaces, decides over points a
 other regions. Over n estimates of the same light the mean scatters by n^-1/2 of that, and a new one moves it by 1 / n.
 
 Let m be the relative change, of surfaces or of the environment, between the light that the mean was made from, its own
-mean, and that which is seen now. A new estimate has the weight
+mean, and that which is seen now; or the angle, in radians, between the directions from which the ball is seen, if that
+is more: from elsewhere what clips lies in other cells, and the mean over them is neither. A new estimate has the weight
 
     w = max((m / still)^2, 1 / n), at most 1.
 
@@ -37,31 +38,35 @@ class Steadiness:
     def __init__(self) -> None:
         """Remember nothing."""
         self._seen: Seen | None = None
+        self._view = np.zeros(3)
         self._mean: Estimate | None = None
         self._count = 0
 
-    def follow(self, estimate: Estimate, seen: Seen) -> Estimate:
+    def follow(self, estimate: Estimate, seen: Seen, view: NDArray[np.float64]) -> Estimate:
         """The mean with one estimate more.
 
         Args:
             estimate: Of the frame.
             seen: What it was made from.
+            view: Direction from the ball to the camera, unit, (3,).
         """
-        weight = self._weight(estimate, seen)
+        weight = self._weight(estimate, seen, view)
         if weight >= 1.0 or self._mean is None or self._seen is None:
-            self._seen, self._mean, self._count = seen, estimate, 1
+            self._seen, self._mean, self._view, self._count = seen, estimate, view, 1
             return estimate
+        self._view = self._view + weight * (view - self._view)
         self._count = min(self._count + 1, CONFIG.solver.remembered)
         self._seen, self._mean = _mixed_seen(self._seen, seen, weight), _mixed(self._mean, estimate, weight)
         return self._mean
 
-    def _weight(self, estimate: Estimate, seen: Seen) -> float:
+    def _weight(self, estimate: Estimate, seen: Seen, view: NDArray[np.float64]) -> float:
         mean, before = self._mean, self._seen
         if mean is None or before is None or _powers(mean).keys() != _powers(estimate).keys():
             return 1.0
         change = seen.change(before)
         if change is None:
             return 1.0
+        change = max(change, float(np.linalg.norm(view - self._view)))
         return max((change / CONFIG.solver.still) ** 2, 1.0 / (self._count + 1))
 
 
