@@ -52,7 +52,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warp_ar.light.ball_shadow import Ball, reaching_factor
-from warp_ar.light.card import NO_CARD, CardCheck, check_card
+from warp_ar.light.card import NO_CARD, CardCheck, check_card, covered_card
 from warp_ar.light.channel import choose_channel, told_channel
 from warp_ar.light.config import CONFIG
 from warp_ar.light.emitters import EmitterSearch
@@ -207,6 +207,7 @@ class Recovery:
             return self._without_card(problem, card)
         self._solved += 1
         self._unseen = 0
+        problem.leave_out(covered_card(problem.points, problem.kind, problem.light))
         means, bounds = problem.card_means()
         radiance_by_card = problem.expected[problem.component][:, None] * means
         by_card = problem.member @ radiance_by_card
