@@ -9,7 +9,7 @@ import pytest
 
 from tests.recover_rig import DistantLight, lit_environment, scene  # noqa: F401
 from warp_ar.kernels.recover_cells import CELL_ROWS
-from warp_ar.light.card import check_card
+from warp_ar.light.card import check_card, covered_card
 from warp_ar.light.config import CONFIG, Kind
 from warp_ar.light.evidence import (
     allowed_factor,
@@ -46,6 +46,32 @@ def test_a_table_or_a_stool_is_no_card():
     assert not check_card(*printed(0.5, gradient=5.0)).holds
     points, kind, light = printed(0.5)
     assert not check_card(points, kind, light * np.random.default_rng(0).lognormal(0.0, 0.6, (64, 1))).holds
+
+
+@pytest.mark.parametrize("skin", [0.03, 0.15, 0.6])
+def test_a_hand_over_a_part_of_the_card_is_told(skin):
+    """Of a quarter of the card, whatever the brightness of what covers it; all but cells at its border."""
+    points, kind, light = printed(0.05)
+    under = points[:, 0] > 0.055
+    light[under] = skin
+    covered = covered_card(points, kind, light)
+    border = np.abs(points[:, 0] - 0.055) < 0.006
+    assert covered[under & ~border].all()
+    assert not covered[~under & ~border].any()
+
+
+@pytest.mark.parametrize("shade", [0.02, 0.2, 0.5])
+def test_a_shadow_over_a_part_of_the_card_covers_nothing(shade):
+    points, kind, light = printed(0.05, gradient=2.0)
+    light[points[:, 0] > 0.055] *= shade
+    assert not covered_card(points, kind, light)[np.abs(points[:, 0] - 0.055) > 0.006].any()
+
+
+def test_a_card_of_which_nothing_would_be_left_is_not_covered():
+    assert not covered_card(*printed(0.5)).any()
+    points, kind, light = printed(0.05)
+    few = np.concatenate([np.flatnonzero(kind == Kind.INK)[:3], np.flatnonzero(kind == Kind.CARD)])
+    assert not covered_card(points[few], kind[few], light[few]).any()
 
 
 def test_too_few_cells_are_no_card():

@@ -55,3 +55,28 @@ def check_card(points: Array, kind: NDArray[np.int64], light: Array) -> CardChec
     beside = paper[np.argsort(apart, axis=1, kind="stable")[:, :3]]
     ratio = np.median(value[beside], axis=1) / np.maximum(value[ink], 1e-4)
     return CardCheck(float(np.median(ratio)), float((ratio > config.darker).mean()))
+
+
+def covered_card(points: Array, kind: NDArray[np.int64], light: Array) -> NDArray[np.bool_]:
+    """Which points of paper and ink something covers, (n,); none where hardly any paper would be left.
+
+    A hand over a part of the card covers paper and the ink beside it, and is as bright where one is as where the other
+    is. A shadow darkens both, and their ratio stays.
+
+    Args:
+        points: As for ``check_card``.
+        kind: As for ``check_card``.
+        light: As for ``check_card``.
+    """
+    config = CONFIG.card
+    paper, ink = np.flatnonzero(kind == Kind.CARD), np.flatnonzero(kind == Kind.INK)
+    covered = np.zeros(len(kind), bool)
+    if min(len(paper), len(ink)) < config.least_cells:
+        return covered
+    value = light.mean(axis=1)
+    apart = np.linalg.norm(points[ink][:, None] - points[paper], axis=2)
+    of_ink = value[paper[np.argsort(apart, axis=1, kind="stable")[:, :3]]]
+    covered[ink] = np.median(of_ink, axis=1) < config.darker * value[ink]
+    of_paper = value[ink[np.argsort(apart.T, axis=1, kind="stable")[:, :3]]]
+    covered[paper] = value[paper] < config.darker * np.median(of_paper, axis=1)
+    return covered if np.count_nonzero(~covered[paper]) >= config.least_cells else np.zeros(len(kind), bool)

@@ -90,6 +90,9 @@ class PriorConfig:
 class SearchConfig:
     """How emitters are looked for."""
 
+    lead: float = 0.05
+    """Share of the points that are seen by which another channel must show more of them than the one that was searched
+    by: noise alone takes away, or adds, one in a hundred."""
     evidence: float = 7.0
     """Fall of the cost (twice a log likelihood) that a candidate must be worth."""
     even: float = 1.6
@@ -144,6 +147,8 @@ class SolverConfig:
     """Relative change, of surfaces or of the environment, below which the light is the same."""
     rest: int = 4
     """Most estimates in a row that are left out while the light is the same: a moving camera shows more."""
+    remembered: int = 12
+    """Estimates that count in a mean while the light is the same."""
     sudden: float = 0.25
     """Relative change that is solved for at once; what changes less may wait for one more estimate."""
 

@@ -142,6 +142,11 @@ class Problem:
         self.texture = float(np.median(scatter[told] / self.noise[told])) if len(told) else 1.0
         """How much more than ``noise`` surfaces beside the card scatter: at least 1."""
 
+    def leave_out(self, points: NDArray[np.bool_]) -> None:
+        """Take points out of the equations, (n,): they show something else than their surface, and are of no kind."""
+        self.exact[points] = self.bound[points] = False
+        self.kind = np.where(points, -1, self.kind)
+
     def _aim_transfer(
         self,
         cells: NDArray[Any],

@@ -52,7 +52,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warp_ar.light.ball_shadow import Ball, reaching_factor
-from warp_ar.light.card import NO_CARD, CardCheck, check_card
+from warp_ar.light.card import NO_CARD, CardCheck, check_card, covered_card
+from warp_ar.light.channel import choose_channel, told_channel
 from warp_ar.light.config import CONFIG
 from warp_ar.light.emitters import EmitterSearch
 from warp_ar.light.evidence import (
@@ -71,7 +72,8 @@ from warp_ar.light.evidence import (
 from warp_ar.light.fit import fit_channel
 from warp_ar.light.problem import Candidate, Problem, Trace, mirroring_points
 from warp_ar.light.solver import ONE_BLAS_THREAD
-from warp_ar.light.stillness import Stillness
+from warp_ar.light.steadiness import Steadiness
+from warp_ar.light.stillness import Seen, Stillness
 from warp_ar.light.surfaces import Surfaces
 
 Array = NDArray[np.float64]
@@ -91,6 +93,8 @@ class FoundEmitter:
     """Metres from there; infinite where none was found."""
     power: Array
     """Radiance times solid angle as seen from the ball, per channel, beyond what the map shows, (3,)."""
+    cell: int = -1
+    """Number of the cell that it stands in, where it was found in one."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,6 +153,8 @@ class Recovery:
         self._evidence: _Evidence | None = None
         self._held: Estimate | None = None
         self._unseen = 0
+        self._channel: int | None = None
+        self._steadiness = Steadiness()
 
     def rests(self, cells: NDArray[Any], observations: NDArray[Any]) -> bool:
         """Whether the last estimate still holds, as far as the light tells: then there is nothing to solve for.
@@ -185,7 +191,13 @@ class Recovery:
                 cells["direction"].reshape(-1, 3).astype(float), self._center, self._radius, camera
             )
             problem = Problem(cells, transfer, mirrored, observations, self.surfaces, self._white, trace, origin)
-            return self._solve(problem)
+            view = np.zeros(3) if camera is None else (camera - self._center) / np.linalg.norm(camera - self._center)
+            estimate = self._solve(problem)
+        if self._unseen == 0:
+            self._held = estimate = self._steadiness.follow(estimate, Seen.of(cells, observations), view)
+        elif self._held is None:
+            self._steadiness = Steadiness()
+        return estimate
 
     def _solve(self, problem: Problem) -> Estimate:
         """``update``, by the thread that asks for it alone."""
@@ -195,6 +207,7 @@ class Recovery:
             return self._without_card(problem, card)
         self._solved += 1
         self._unseen = 0
+        problem.leave_out(covered_card(problem.points, problem.kind, problem.light))
         means, bounds = problem.card_means()
         radiance_by_card = problem.expected[problem.component][:, None] * means
         by_card = problem.member @ radiance_by_card
@@ -203,8 +216,7 @@ class Recovery:
             self._held = self._estimate(problem, by_card, bounds, "white_card", factor, card)
             return self._held
         means = np.maximum(means, 0.05)
-        # The channel that surfaces show best.
-        best = int(np.argmax(problem.exact.sum(axis=0) + np.array([0.0, 0.5, 0.0])))
+        self._channel = best = choose_channel(problem, self._channel)
         is_turn = self._search(problem, best, means[best])
         solution = tie_channels(problem, _solve_channels(problem, best, means, bounds))
         doubt = doubt_of(card.contrast)
@@ -218,12 +230,16 @@ class Recovery:
             recovered += problem.patch(candidate.cell) * power
             emitters.append(
                 FoundEmitter(
-                    problem.origin[candidate.cell], problem.direction[candidate.cell], candidate.distance, power
+                    problem.origin[candidate.cell],
+                    problem.direction[candidate.cell],
+                    candidate.distance,
+                    power,
+                    candidate.cell,
                 )
             )
         emitters.sort(key=lambda emitter: -float(emitter.power.sum()))
         if is_turn or self._evidence is None:
-            c = _told_channel(problem)
+            c = told_channel(problem, best)
             start = fit_channel(problem, c, problem.start(means[c]), CONFIG.solver.iterations).z
             evidence = _weigh(problem, c, start, bounds, (recovered, by_card), self._blocks, doubt)
             if evidence.method == "white_card":
@@ -307,13 +323,6 @@ class _Evidence:
     @property
     def parts(self) -> tuple[str, float]:
         return self.method, self.factor
-
-
-def _told_channel(problem: Problem) -> int:
-    """Of the channels in which something is missing the one that surfaces show best; green of equals."""
-    missing = problem.solid_angle @ problem.missing
-    shown = problem.exact.sum(axis=0)
-    return max(range(3), key=lambda c: (missing[c] > 0.3 * missing.max(), shown[c], c == 1))
 
 
 def _weigh(
