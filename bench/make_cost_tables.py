@@ -100,19 +100,36 @@ def merge_errors(tables: Sequence[dict[str, Any]], lines: Sequence[dict[str, Any
     return merged
 
 
-def make_errors(runs: Runs) -> None:
-    """Errors of methods."""
-    asked: dict[str, tuple[str, Sequence[str]]] = {
-        f"errors_{scene}": (scene, ERROR_OPTIONS) for scene in bundled_scenes()
-    }
-    # Lights with a size are in no bundled scene; ``all`` brings a copy of one that has them.
-    asked["errors_sized"] = ("all", (*ERROR_OPTIONS, "--stage", "light_shadow"))
+def make_errors(runs: Runs, stage: str | None, scenes: Sequence[str]) -> None:
+    """Errors of methods; where one stage is asked for, the others' stay as they are.
+
+    Args:
+        runs: How they are made.
+        stage: Or another setting that is turned.
+        scenes: Names of the bundled scenes that call for it, if it is given.
+    """
+    options = (*ERROR_OPTIONS, *(("--stage", stage) if stage else ()))
+    names = scenes if stage else bundled_scenes()
+    asked: dict[str, tuple[str, Sequence[str]]] = {f"{stage or 'errors'}_{scene}": (scene, options) for scene in names}
+    if not stage:
+        # Lights with a size are in no bundled scene; ``all`` brings a copy of one that has them.
+        asked["errors_sized"] = ("all", (*ERROR_OPTIONS, "--stage", "light_shadow"))
     written = runs.every(asked)
     found = [json.loads(line) for files in written for line in files["tradeoff.jsonl"].splitlines()]
     lines = list({(line["kind"], *(line.get(key) for key in KEYS)): line for line in found}.values())
     merged = merge_errors([json.loads(files["cost_table.json"]) for files in written], lines)
     path = ROOT / "warp_ar" / "accuracy" / "cost_table.json"
+    if stage:
+        merged = renew_stage(json.loads(path.read_text(encoding="utf-8")), merged)
     path.write_text(json.dumps(merged, indent=1) + "\n", encoding="utf-8")
+
+
+def renew_stage(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any]:
+    """A cost table with the errors of another one's settings in it; it tells how both were made."""
+    tables = {table: old.get(table, {}) | new[table] for table in ("errors", "stage_errors")}
+    beaten = {name: own for name, own in old.get("dominated", {}).items() if name not in new["errors"]}
+    renewed = [*old.get("renewed", []), new["made"]]
+    return {**old, "renewed": renewed, **tables, "dominated": beaten | new["dominated"]}
 
 
 def make_presets(runs: Runs, only: str | None, scenes: Sequence[str]) -> None:
@@ -156,6 +173,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m bench.make_cost_tables", description="All cost tables anew.")
     steps_text = ",".join(STEPS)
     parser.add_argument("--only", default=steps_text, help=f"steps, separated by commas (default: {steps_text})")
+    parser.add_argument("--stage", metavar="NAME", help="errors of its methods only, on --scenes; those of others stay")
     parser.add_argument("--presets", metavar="A,B", help="errors of these presets only; those of others stay")
     parser.add_argument(
         "--scenes", default=(), type=lambda text: text.split(","), metavar="A,B", help="the same for scenes"
@@ -167,9 +185,11 @@ def main() -> int:
     asked = options.only.split(",")
     if not set(asked) <= set(STEPS):
         parser.error(f"--only {options.only}: expected some of {', '.join(STEPS)}")
+    if options.stage and not options.scenes:
+        parser.error("--stage: name the scenes that call for it (--scenes)")
     runs = Runs(options.device, options.keep)
     steps: dict[str, Callable[[], object]] = {
-        "errors": lambda: make_errors(runs),
+        "errors": lambda: make_errors(runs, options.stage, options.scenes),
         "presets": lambda: make_presets(runs, options.presets, options.scenes),
         "costs": lambda: make_costs(processor_time=options.processor_time),
         "budget": lambda: subprocess.run([sys.executable, "-m", "bench.record_costs"], cwd=ROOT, check=True),

@@ -13,7 +13,7 @@ method                    Kd                                                    
 ``paper``                 a grey constant                                            (1), the letter of [DH04]
 ``directional``           a grey constant                                            (1), linear and weighted
 ``relief``                luminance of the surroundings in the pixel's hue           (2)
-``reflectance``           what the camera sees over what the environment sends, (3)  (4)
+``reflectance``           what the camera sees over what the environment sends, (3)  N.L
 ========================  =========================================================  =============================
 
 ``flat`` is what plain alpha blending of a lit proxy does. The equations stand above the functions that hold them.
@@ -76,8 +76,6 @@ DEFAULT_REFLECTANCE = wp.constant(wp.float32(0.5))
 """Of a receiver that nothing is known about: the material of ``flat`` and ``paper``, the prior of ``reflectance``."""
 PRIOR_WEIGHT = wp.constant(wp.float32(0.002 * math.pi))
 """Irradiance at which the prior counts as much as the frame: that of a white receiver at half a code of 255."""
-RELIEF_LIMIT = wp.constant(wp.float32(0.6))
-"""Relative deviation from the surroundings from which structure is paint, not relief."""
 MAX_RELIEF = wp.constant(wp.float32(4.0))
 """Largest m: a glint of the receiver is no reason to add more than four times the light."""
 SURROUNDINGS = 1.0 / 8.0
@@ -177,6 +175,7 @@ def relief_factor(m: wp.float32, alpha: wp.float32) -> wp.float32:
 # which is (exactly) right for a Lambertian receiver, whatever its pattern. A prior of ``PRIOR_WEIGHT`` keeps (3) sane
 # where the environment is dark, and no reflectance exceeds 1; a clipped channel gives what its code says, a lower
 # bound. With *cells* (``kernels/receiver_cells.py``) E is the part of the environment that boxes and balls let through.
+# What shades the receiver beyond its proxy (relief, clutter) is in (3) as if it were paint.
 @wp.func
 def reflectance_of(radiance: wp.float32, irradiance: wp.float32) -> wp.float32:
     """Equation (3) with its prior, one channel; within 0..1 for whatever comes in."""
@@ -184,20 +183,6 @@ def reflectance_of(radiance: wp.float32, irradiance: wp.float32) -> wp.float32:
     if not rho > 0.0:  # NaN as well
         return 0.0
     return wp.min(rho, 1.0)
-
-
-# Equation (4). Shading by relief is in (3) as if it were paint. Moderate deviations e from the surroundings are taken
-# for relief (beyond ``RELIEF_LIMIT`` they are paint: print, other objects), as far as the environment has a direction,
-# and are turned to the virtual light:
-#
-#     response = N.L (1 + alpha e) / (1 + e),   e = directionality * biweight(m - 1) * (m - 1).                    (4)
-@wp.func
-def turned_relief(m: wp.float32, alpha: wp.float32, directionality: wp.float32) -> wp.float32:
-    """Factor on N.L in equation (4)."""
-    deviation = wp.clamp((m - 1.0) / RELIEF_LIMIT, -1.0, 1.0)
-    window = 1.0 - deviation * deviation
-    e = directionality * window * window * deviation * RELIEF_LIMIT
-    return (1.0 + alpha * e) / (1.0 + e)
 
 
 @wp.func
@@ -294,44 +279,43 @@ def make_find_matter(config: RelightConfig) -> wp.Function:
         if is_mirrored:
             coded = wp.cw_div(coded, mirror)
             radiance = wp.cw_div(radiance, mirror)
-        matter.key = receiver.key_lights[0].direction
-        matter.directionality = receiver.key_lights[0].directionality
-        if wp.static(reading is not None):
-            if wp.static(reading is not None and reading.values == "video"):
+        if wp.static(method == "reflectance"):
+            distant = irradiance_at(
+                receiver.irradiance_sh,
+                receiver.irradiance_map,
+                receiver.emitters,
+                receiver.others,
+                hit.point,
+                hit.normal,
+            )
+            if wp.static(config.ambient_visibility):
+                if not is_mirrored:
+                    left = look_up_ambient(scene, receiver, hit, row, col)
+                    if left[3] > 0.0:
+                        distant = wp.cw_mul(distant, wp.vec3(left[0], left[1], left[2]))
+            matter.kd = wp.vec3(
+                reflectance_of(radiance[0], distant[0]),
+                reflectance_of(radiance[1], distant[1]),
+                reflectance_of(radiance[2], distant[2]),
+            )
+        else:
+            matter.key = receiver.key_lights[0].direction
+            matter.directionality = receiver.key_lights[0].directionality
+            if wp.static(method == "relief"):
+                around = luminance(radiance)
+                if not is_mirrored:
+                    around = surrounding_luminance(
+                        receiver.table, receiver.cut_table, receiver.picture.decode_table, row, col, receiver.box
+                    )
+                    matter.m = luminance(coded) / around  # like with like: what is around is a mean of codes
+                hue = radiance + wp.vec3(_HUE_FLOOR, _HUE_FLOOR, _HUE_FLOOR)
+                matter.kd = wp.min(around / luminance(hue) * hue, wp.vec3(1.0, 1.0, 1.0))
+            elif wp.static(reading is not None and reading.values == "video"):
                 seen = receiver.picture
                 cut = cut_luma(seen.frame, seen.decode_table, seen.linear, row, col)
                 matter.m = wp.clamp((wp.float32(intensity(seen.frame[row, col])) + cut) / 255.0, 0.0, 1.0)
             else:
                 matter.m = luminance(coded)
-        else:
-            around = luminance(radiance)
-            if not is_mirrored:
-                around = surrounding_luminance(
-                    receiver.table, receiver.cut_table, receiver.picture.decode_table, row, col, receiver.box
-                )
-                matter.m = luminance(coded) / around  # like with like: what is around is a mean of codes
-            if wp.static(method == "relief"):
-                hue = radiance + wp.vec3(_HUE_FLOOR, _HUE_FLOOR, _HUE_FLOOR)
-                matter.kd = wp.min(around / luminance(hue) * hue, wp.vec3(1.0, 1.0, 1.0))
-            else:
-                distant = irradiance_at(
-                    receiver.irradiance_sh,
-                    receiver.irradiance_map,
-                    receiver.emitters,
-                    receiver.others,
-                    hit.point,
-                    hit.normal,
-                )
-                if wp.static(config.ambient_visibility):
-                    if not is_mirrored:
-                        left = look_up_ambient(scene, receiver, hit, row, col)
-                        if left[3] > 0.0:
-                            distant = wp.cw_mul(distant, wp.vec3(left[0], left[1], left[2]))
-                matter.kd = wp.vec3(
-                    reflectance_of(radiance[0], distant[0]),
-                    reflectance_of(radiance[1], distant[1]),
-                    reflectance_of(radiance[2], distant[2]),
-                )
         return matter
 
     return find_matter
@@ -341,14 +325,14 @@ def make_find_matter(config: RelightConfig) -> wp.Function:
 def make_respond(method: str) -> wp.Function:
     """``respond(matter, wi, n_dot_l) -> float32``: a point's response, by one of ``METHODS`` or ``READINGS``.
 
-    The one place where equations (1), (2) and (4) meet a light: at points, and on what emits. ``flat`` reads no matter.
+    The one place where equations (1) and (2) meet a light: at points, and on what emits. ``flat`` reads no matter.
     """
     reading = READINGS.get(method)
 
     @wp.func(module="unique")
     def respond(matter: Matter, wi: wp.vec3, n_dot_l: wp.float32) -> wp.float32:
         response = n_dot_l
-        if wp.static(method != "flat"):
+        if wp.static(method not in ("flat", "reflectance")):
             alpha = wp.dot(wi, matter.key)
             if wp.static(reading is not None):
                 if wp.static(reading is not None and reading.weighted):
@@ -357,10 +341,8 @@ def make_respond(method: str) -> wp.Function:
                     response = shader_response(n_dot_l, matter.m, alpha)
                 else:
                     response = text_response(n_dot_l, matter.m, alpha)
-            elif wp.static(method == "relief"):
-                response = n_dot_l * relief_factor(matter.m, alpha * matter.directionality)
             else:
-                response = n_dot_l * turned_relief(matter.m, alpha, matter.directionality)
+                response = n_dot_l * relief_factor(matter.m, alpha * matter.directionality)
         return response
 
     return respond
@@ -389,10 +371,10 @@ def make_receiver(
     Args:
         config: Method and forms of light.
         picture: (H, W) the camera's.
-        table: (H, W) uint32, the frame's summed-area table; needed by ``relief`` and ``reflectance``.
+        table: (H, W) uint32, the frame's summed-area table; needed by ``relief``.
         cut_table: (H, W) uint32, that of what 8 bits cut off; None for frames of 8 bits.
         probes: (p,) Probe; needed if ``config.probes``.
-        key_lights: (k,) KeyLight, brightest first; needed by all methods but ``flat``.
+        key_lights: (k,) KeyLight, brightest first; needed by the paper's blend and ``relief``.
         irradiance: Irradiance of the environment, nine coefficients or a latlong map as ``config.irradiance`` says;
             needed by ``reflectance``.
         emitters: (q,) Emitter, seen from the first probe; needed if ``config.emitters``.

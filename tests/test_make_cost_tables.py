@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bench.make_cost_tables import merge_presets
+from bench.make_cost_tables import merge_presets, renew_stage
 
 
 def test_what_is_measured_again_replaces_its_own_alone() -> None:
@@ -15,3 +15,23 @@ def test_what_is_measured_again_replaces_its_own_alone() -> None:
     twice = merge_presets(once, {"made": {"commit": "c"}, "errors": {"screen": {"high": 0.3, "paper": 0.5}}})
     assert list(twice["errors"]["screen"].items()) == [("paper", 0.5), ("low", 0.4), ("high", 0.3)]
     assert twice["renewed"] == [{"commit": "b"}, {"commit": "c"}]
+
+
+def test_a_stage_that_is_measured_again_replaces_its_own_alone() -> None:
+    old = {
+        "made": {"commit": "a"},
+        "errors": {"relight": {"flat": 0.3, "paper": 0.2}, "expose": {"plain": 0.1}},
+        "stage_errors": {"relight": {"flat": 0.8}, "expose": {"plain": 0.7}},
+        "dominated": {"relight": ["paper"], "expose": ["plain"]},
+    }
+    new = {
+        "made": {"commit": "b"},
+        "errors": {"relight": {"flat": 0.4}},
+        "stage_errors": {"relight": {"flat": 0.9}},
+        "dominated": {},
+    }
+    once = renew_stage(old, new)
+    assert once["errors"] == {"relight": {"flat": 0.4}, "expose": {"plain": 0.1}}
+    assert once["stage_errors"] == {"relight": {"flat": 0.9}, "expose": {"plain": 0.7}}
+    assert once["dominated"] == {"expose": ["plain"]}
+    assert (once["made"], once["renewed"]) == ({"commit": "a"}, [{"commit": "b"}])

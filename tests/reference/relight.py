@@ -59,12 +59,6 @@ def relief_factor(m, alpha):
     return np.maximum(1.0 + np.clip(alpha, -1.0, 1.0) * (np.minimum(m, 4.0) - 1.0), 0.0)
 
 
-def turned_relief(m, alpha, directionality):
-    x = np.clip((m - 1.0) / 0.6, -1.0, 1.0)
-    e = directionality * (1.0 - x * x) ** 2 * 0.6 * x
-    return (1.0 + alpha * e) / (1.0 + e)
-
-
 def reflectance(radiance, irradiance):
     weight = 0.002 * np.pi
     return np.clip((np.pi * radiance + 0.5 * weight) / (irradiance + weight), 0.0, 1.0)
@@ -90,9 +84,8 @@ def respond(method, frame, radiance, around, n_dot_l, alpha, directionality, sur
         if values == "video":
             m = (summed_area.intensity(frame) / 255.0)[..., None]
         return kd, response(n_dot_l, m, alpha * directionality if weighted else alpha)
-    relative = m / around[..., None]
-    if method == "relief":
-        hue = radiance + 0.01
-        kd = np.minimum(around[..., None] / (hue @ LUMINANCE)[..., None] * hue, 1.0)
-        return kd, n_dot_l * relief_factor(relative, alpha * directionality)
-    return reflectance(radiance, surroundings), n_dot_l * turned_relief(relative, alpha, directionality)
+    if method == "reflectance":
+        return reflectance(radiance, surroundings), n_dot_l
+    hue = radiance + 0.01
+    kd = np.minimum(around[..., None] / (hue @ LUMINANCE)[..., None] * hue, 1.0)
+    return kd, n_dot_l * relief_factor(m / around[..., None], alpha * directionality)

@@ -113,7 +113,7 @@ class Features:
     def _first_alone(self) -> str:
         """What is made from the first ball's light only, in words."""
         names = ["the light of a path-traced reference"]
-        if self.lit and self.relight_method != FLAT:
+        if self.lit and self.relight_method not in (FLAT, *MEASURED):
             names.append("the key light of receivers")
         if self.declipped_by_ball:
             names.append("the radiance above clipping that a shorter exposure shows")

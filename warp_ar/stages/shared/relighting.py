@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from warp_ar.kernels.receiver import RelightConfig
 from warp_ar.scene.kinds import trace_config
-from warp_ar.stages.features import LOCAL, Features
+from warp_ar.stages.features import LOCAL, MEASURED, Features
 from warp_ar.stages.shared.picture import frame_reads
 
 SUMMED = "summed_area"
@@ -17,11 +17,12 @@ def relight_reads(features: Features) -> tuple[str, ...]:
     """What the method of ``relight`` needs to know of the environment and the receiver."""
     method = features.relight_method
     reads = ["pose", "lights", "objects"]
+    measured = method in MEASURED
     if method != "flat":
-        reads += [*frame_reads(features), "key_lights"]
-    if method in ("relief", "reflectance", *LOCAL):
+        reads += frame_reads(features) if measured else [*frame_reads(features), "key_lights"]
+    if method == "relief":
         reads += [SUMMED, SUMMED_CUT] if features.request.linear else [SUMMED]
-    if method in ("reflectance", *LOCAL):
+    if measured:
         reads.append(features.irradiance)
         reads += ["emitters"] * features.emitters
         if features.others:
@@ -40,10 +41,10 @@ def relight_config(features: Features) -> RelightConfig:
         "sh" if features.irradiance == "irradiance_sh" else "map",
         bool(features.request.scene.probes),
         features.soft_lights,
-        method in ("reflectance", *LOCAL) and features.emitters,
+        method in MEASURED and features.emitters,
         features.ambient_visibility,
         features.bounced,
         features.request.quality.edge_samples,
-        several=method in ("reflectance", *LOCAL) and features.others > 0,
+        several=method in MEASURED and features.others > 0,
         area_samples=features.area_samples,
     )

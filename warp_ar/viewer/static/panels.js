@@ -75,7 +75,7 @@ const EFFECTS = {
   environment: ["Environment", "light captured from the mirror ball"],
   receiver: ["Shape of the desk", "receives light and shadow, hides what is behind it"],
   environment_shadow: ["Shadows of the environment", "under virtual objects"],
-  relief: ["Relief of the desk", "virtual light brings out its bumps"],
+  relief: ["Reflectance of the desk", "virtual light takes on its colours and patterns"],
   exposure: ["Exposure", "darkens as a camera would"],
 };
 
