@@ -25,12 +25,22 @@ from numpy.typing import NDArray
 
 from bench.bench_never_worse import irradiance
 from bench.table_world import latlong_directions
+from warp_ar import PRESETS, Pipeline
+from warp_ar.capture import make_scene
 from warp_ar.errors import WarpArError
-from warp_ar.photo_capture import capture_light
+from warp_ar.input.ball_finder import BallOutline
+from warp_ar.input.support import Support, plane_from_contact
+from warp_ar.photo_capture import Capture, capture_light
+from warp_ar.scene import Camera, Probe
+from warp_ar.stages.quality import DEFAULT_PRESET
 
 Array = NDArray[np.float64]
 REFLECTANCE = 0.85
 """Of the ball, as ``capture`` takes it: radiance of 1 / REFLECTANCE clips."""
+BALL = 0.04
+"""Its radius, metres: a guess, which no light depends on."""
+CONTACT = 0.93
+"""Radii below a ball's middle at which it is taken to touch its support."""
 SUFFIXES = (".jpg", ".jpeg", ".png")
 
 
@@ -49,6 +59,34 @@ class Row:
     """Of the photograph's light against that."""
     lower_bound: float
     """Share of the bracket's light that is a lower bound."""
+    default: float = 0.0
+    """Of the light that the program's default quality makes of the photograph."""
+    captured: float = 0.0
+    """Of the light that it has without recovery."""
+
+
+def support_below(outline: BallOutline, camera: Camera) -> Support:
+    """The plane that a ball is taken to stand on."""
+    x, y = outline.center
+    return plane_from_contact(outline.sphere, camera, (x, y + CONTACT * outline.radius), BALL)
+
+
+def run_program(found: Capture, device: str, **methods: str) -> NDArray[Any]:
+    """Light at the ball in a scene that shows the photograph and claims a card, (h, 2 h, 3)."""
+    assert found.support is not None
+    pose = found.support.pose
+    x, y, z = (float(v) for v in pose.inverse().apply(BALL * np.array(found.outline.sphere)))
+    probe = Probe((x, y, z), BALL, (REFLECTANCE,) * 3)
+    scene = make_scene(found, Path("light.exr"), BALL)
+    scene = dataclasses.replace(scene, captured=None, source=None, probes=(probe,), has_marker=True)
+    quality = PRESETS[DEFAULT_PRESET].with_methods(**methods) if methods else PRESETS[DEFAULT_PRESET]
+    pipeline = Pipeline(scene, device=device, quality=quality, outputs=("environment",))
+    try:
+        environment = pipeline(found.picture, time_seconds=0.0, pose=pose).environment
+        assert environment is not None
+        return environment
+    finally:
+        pipeline.close()
 
 
 def relative_error(found: Array, truth: Array) -> float:
@@ -99,16 +137,24 @@ def measure_set(folder: Path, device: str) -> list[Row]:
         for index, photo in enumerate(photos):
             name = f"{folder.name}/{photo.name}"
             try:
-                merged = capture_light(photos, shown=index, exposures=exposures, device=device, height=64).light
-                single = capture_light([photo], device=device, height=64).light
+                known: dict[str, Any] = {"support": support_below, "device": device, "height": 64}
+                merged = capture_light(photos, shown=index, exposures=exposures, **known).light
+                alone = capture_light([photo], **known)
             except WarpArError as error:
                 print(f"{name}: {error}", flush=True)
                 continue
-            rows.append(compare(name, single.radiance, merged.radiance, merged.lower_bound))
-            row = rows[-1]
+            row = compare(name, alone.light.radiance, merged.radiance, merged.lower_bound)
+            normals = latlong_directions(24, 48)[0].reshape(-1, 3)
+            truth = irradiance(merged.radiance, normals)
+            default, captured = (
+                relative_error(irradiance(run_program(alone, device, **methods), normals), truth)
+                for methods in ({}, {"recover": "clipped"})
+            )
+            rows.append(dataclasses.replace(row, default=default, captured=captured))
             print(
                 f"{name}: {row.error:.1%}, after one scale {row.scaled:.1%}; by clipping {row.clipping:.1%}, "
-                f"the rest {row.rest:.1%}; the bracket's lower bound {row.lower_bound:.1%}",
+                f"the rest {row.rest:.1%}; the bracket's lower bound {row.lower_bound:.1%}; "
+                f"default {default:.1%}, without recovery {captured:.1%}",
                 flush=True,
             )
     return rows
@@ -123,7 +169,7 @@ def summarise(sets: Mapping[str, Sequence[Row]]) -> dict[str, Any]:
     Returns:
         ``sets``, a dict of means each; then the means over them, None where there are none.
     """
-    keys = ("error", "scaled", "clipping")
+    keys = ("error", "scaled", "clipping", "default", "captured")
     means = {
         name: {key: float(np.mean([getattr(row, key) for row in rows])) for key in keys}
         for name, rows in sets.items()

@@ -60,4 +60,4 @@ def test_sets_count_once_each_and_none_is_no_mean() -> None:
     assert set(found["sets"]) == {"a", "c"}
     assert found["error"] == pytest.approx(0.2)
     assert found["clipping"] == pytest.approx(0.1)
-    assert summarise({"a": []}) == {"sets": {}, "error": None, "scaled": None, "clipping": None}
+    assert summarise({"a": []}) == {"sets": {}} | dict.fromkeys(("error", "scaled", "clipping", "default", "captured"))

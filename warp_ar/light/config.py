@@ -47,10 +47,10 @@ class SurfaceConfig:
     """Equations that share one error of transport that the model leaves out, by kind, however far apart."""
     texture: tuple[float, ...] = (0.0, 0.0, 0.03, 0.03)
     """Metres within which texture varies little, by kind: points that are closer share its error as well."""
-    reflectance: tuple[float, ...] = (0.85, 0.04, 0.35, 0.35)
-    """Expected reflectance, by kind; the scene knows the card's."""
-    reflectance_spread: tuple[float, ...] = (0.005, 0.4, 0.6, 0.6)
-    """Standard deviation of its logarithm."""
+    reflectance: tuple[float, ...] = (0.85, 0.045, 0.35, 0.35)
+    """Expected reflectance, by kind; the scene knows the card's. Black print: densities of 1 to 1.5."""
+    reflectance_spread: tuple[float, ...] = (0.005, 0.3, 0.6, 0.6)
+    """Standard deviation of its logarithm. Where the paper clips, ink is what tells the amount of light."""
     hue_spread: tuple[float, ...] = (0.005, 0.1, 0.4, 0.4)
     """Standard deviation of its logarithm about that in another channel: paper is white and ink grey."""
     tie: float = 0.06
