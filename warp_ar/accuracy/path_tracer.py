@@ -252,7 +252,7 @@ class PathTracer:
     def _begin_round(self, passes: int) -> int:
         """List the samples of some passes; how many there are."""
         with translating(self.device), wp.ScopedDevice(self.device):
-            return list_samples(self._shares, self._round, seed=self.seed, begun=self._passes, count=passes)
+            return int(list_samples(self._shares, self._round, seed=self.seed, begun=self._passes, count=passes))
 
     def _end_round(self, passes: int) -> None:
         """Take the samples of some passes into the moments."""
