@@ -17,6 +17,7 @@ from warp_ar.kernels.recover_cells import Cell, add_recovered, cell_shape, conde
 from warp_ar.kernels.saturation_boundaries import weigh_boundaries
 from warp_ar.light import recovery
 from warp_ar.light.config import Kind
+from warp_ar.light.estimate import Estimate
 from warp_ar.light.surfaces import find_surfaces
 from warp_ar.scene import load_scene
 from warp_ar.scene.kinds import trace_config
@@ -84,7 +85,7 @@ class Setup:
         """Apply recovered radiance."""
         add_recovered(self.radiance, self.confidence, self.missing, self.cells, self.recovered, self.recovered)
 
-    def solve(self) -> recovery.Estimate:
+    def solve(self) -> Estimate:
         """Solve on the host, warm after the first call."""
         arrays = (array.numpy() for array in (self.cells, self.transfer, self.mirrored, self.seen))
         return self.solver.update(*arrays)

@@ -16,7 +16,8 @@ from tests.hard_cases.rig import SIZE, look_at, make_quality, make_scene
 from tests.recover_rig import solve_here
 from warp_ar.engine.demand import Demand
 from warp_ar.engine.pipeline import Pipeline, Result
-from warp_ar.light.recovery import Estimate, Recovery
+from warp_ar.light.estimate import Estimate
+from warp_ar.light.recovery import Recovery
 from warp_ar.scene import Exposure, Light, Scene
 from warp_ar.stages.base import Reach, Wiring
 from warp_ar.stages.quality import PRESETS

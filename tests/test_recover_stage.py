@@ -18,6 +18,7 @@ from warp_ar.kernels.recover_cells import CELL_COLUMNS, CELL_ROWS, Cell
 from warp_ar.light import recovery
 from warp_ar.light import surfaces as light_surfaces
 from warp_ar.light.config import CONFIG
+from warp_ar.light.estimate import Estimate
 from warp_ar.scene import Pose, load_scene
 from warp_ar.session import Session
 from warp_ar.stages.quality import PRESETS
@@ -63,7 +64,7 @@ def spied_estimates(monkeypatch, seconds=0.0):
 
     def update(self, cells, *_):
         time.sleep(seconds)
-        return recovery.Estimate(np.full((*cells.shape, 3), next(numbers[self]), np.float32), (False,) * 3)
+        return Estimate(np.full((*cells.shape, 3), next(numbers[self]), np.float32), (False,) * 3)
 
     monkeypatch.setattr(recovery.Recovery, "update", update)
 

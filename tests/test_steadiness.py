@@ -7,7 +7,7 @@ import pytest
 
 from warp_ar.light.channel import choose_channel, told_channel
 from warp_ar.light.config import CONFIG
-from warp_ar.light.recovery import Estimate, FoundEmitter
+from warp_ar.light.estimate import Estimate, FoundEmitter
 from warp_ar.light.steadiness import Steadiness
 from warp_ar.light.stillness import Seen
 

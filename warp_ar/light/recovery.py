@@ -52,12 +52,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warp_ar.light.ball_shadow import Ball, reaching_factor
-from warp_ar.light.card import NO_CARD, CardCheck, check_card, covered_card
+from warp_ar.light.card import CardCheck, check_card, covered_card
 from warp_ar.light.channel import choose_channel, told_channel
 from warp_ar.light.config import CONFIG
 from warp_ar.light.emitters import EmitterSearch
+from warp_ar.light.estimate import Estimate, FoundEmitter
 from warp_ar.light.evidence import (
-    Interval,
     allowed_factor,
     blocks_of,
     doubt_of,
@@ -79,42 +79,6 @@ from warp_ar.light.surfaces import Surfaces
 Array = NDArray[np.float64]
 
 METHODS: Final = ("clipped", "white_card", "shading")
-
-
-@dataclasses.dataclass(frozen=True)
-class FoundEmitter:
-    """A source of light that was found by what it does."""
-
-    origin: Array
-    """Where on the ball the camera sees it mirrored, metres, (3,)."""
-    direction: Array
-    """Unit, from there, (3,)."""
-    distance: float
-    """Metres from there; infinite where none was found."""
-    power: Array
-    """Radiance times solid angle as seen from the ball, per channel, beyond what the map shows, (3,)."""
-    cell: int = -1
-    """Number of the cell that it stands in, where it was found in one."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Estimate:
-    """What clipping took, as far as one frame tells."""
-
-    recovered: NDArray[np.float32]
-    """Radiance that a wholly clipped texel lacks, (rows, columns, 3) of cells."""
-    lower_bound: tuple[bool, bool, bool]
-    """Channels in which the card clips or is not seen: there the total is a lower bound, or rests on priors."""
-    emitters: tuple[FoundEmitter, ...] = ()
-    """By falling power."""
-    method: str = "clipped"
-    """What the estimate rests on: that which was asked for, or what evidence was left for."""
-    factor: float = 0.0
-    """Share of the method's own solution that evidence allows, 0 to 1; ``recovered`` and ``emitters`` hold it."""
-    card: CardCheck = NO_CARD
-    """What speaks for the card being in the picture."""
-    irradiance: Interval | None = None
-    """Of light from all directions."""
 
 
 class Recovery:

@@ -19,17 +19,14 @@ Emitters that were found, lost or moved are other light: then the mean begins an
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from warp_ar.light.config import CONFIG
+from warp_ar.light.estimate import Estimate
 from warp_ar.light.evidence import Interval
 from warp_ar.light.stillness import Seen
-
-if TYPE_CHECKING:
-    from warp_ar.light.recovery import Estimate
 
 
 class Steadiness:

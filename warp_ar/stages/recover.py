@@ -20,6 +20,7 @@ from warp_ar.kernels.saturation_boundaries import weigh_boundaries
 from warp_ar.kernels.structs import Emitter
 from warp_ar.light import recovery
 from warp_ar.light.config import CONFIG
+from warp_ar.light.estimate import Estimate
 from warp_ar.light.solving_process import POOL, solve_by
 from warp_ar.light.surfaces import find_surfaces
 from warp_ar.scene.kinds import trace_config
@@ -48,7 +49,7 @@ class _Progress:
     """What is known on the host, from frame to frame."""
 
     solver: recovery.Recovery
-    estimate: recovery.Estimate | None = None
+    estimate: Estimate | None = None
     """The one that took effect last."""
     pending: Future[_Solved] | None = None
     """The one that is being solved for."""
@@ -69,7 +70,7 @@ class _Progress:
 
 @dataclasses.dataclass(frozen=True)
 class _Solution:
-    estimate: recovery.Estimate
+    estimate: Estimate
     cells: npt.NDArray[Any]
     """What it was estimated from: records of ``Cell``."""
 
@@ -488,7 +489,7 @@ class Recover(Stage):
         return report | reason
 
 
-def _is_finite(estimate: recovery.Estimate) -> bool:
+def _is_finite(estimate: Estimate) -> bool:
     """Whether all that an estimate puts into the map is a number."""
     powers = all(bool(np.isfinite(emitter.power).all()) for emitter in estimate.emitters)
     return powers and bool(np.isfinite(estimate.recovered).all())
