@@ -4,32 +4,30 @@ Emitters are looked for in one channel, where the card clips surfaces' reflectan
 estimate can be relied on is asked of one. It is that in which most points show what they receive. A point that clips
 says that from one side only, and where many do the card does not tell either, so they count against their channel.
 
-Noise decides over a point more or less, and another channel may see another light. So the channel that was taken is
-kept until another one leads by more than noise does.
+Noise decides over a point more or less, and another channel may see another light. So it is green, of which a camera
+has most and least noise, until another one leads by more than noise does; that is then kept in the same way.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from warp_ar.light.config import CONFIG
 from warp_ar.light.problem import Problem
 
-Array = NDArray[np.float64]
+GREEN = 1
 
 
-def choose_channel(problem: Problem, last: int | None) -> int:
-    """The channel that surfaces show best; green of equals.
+def choose_channel(problem: Problem, last: int = GREEN) -> int:
+    """The channel that surfaces show best.
 
     Args:
         problem: The equations.
-        last: The channel of the estimate before; None: there is none.
+        last: The channel of the estimate before.
     """
     points = problem.exact.sum(axis=0) - problem.bound.sum(axis=0)
-    best = int(np.argmax(points + np.array([0.0, 0.5, 0.0])))
-    lead = CONFIG.search.lead * len(problem.index)
-    return best if last is None or points[best] > points[last] + lead else last
+    best = int(np.argmax(points))
+    return best if points[best] > points[last] + CONFIG.search.lead * len(problem.index) else last
 
 
 def told_channel(problem: Problem, best: int) -> int:

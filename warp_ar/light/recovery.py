@@ -53,7 +53,7 @@ from numpy.typing import NDArray
 
 from warp_ar.light.ball_shadow import Ball, reaching_factor
 from warp_ar.light.card import CardCheck, check_card, covered_card
-from warp_ar.light.channel import choose_channel, told_channel
+from warp_ar.light.channel import GREEN, choose_channel, told_channel
 from warp_ar.light.config import CONFIG
 from warp_ar.light.emitters import EmitterSearch
 from warp_ar.light.estimate import Estimate, FoundEmitter
@@ -117,7 +117,7 @@ class Recovery:
         self._evidence: _Evidence | None = None
         self._held: Estimate | None = None
         self._unseen = 0
-        self._channel: int | None = None
+        self._channel = GREEN
         self._steadiness = Steadiness()
 
     def rests(self, cells: NDArray[Any], observations: NDArray[Any]) -> bool:
