@@ -90,9 +90,6 @@ class PriorConfig:
 class SearchConfig:
     """How emitters are looked for."""
 
-    lead: float = 0.05
-    """Share of the points that are seen by which another channel must show more of them than the one that was searched
-    by: noise alone takes away, or adds, one in a hundred."""
     evidence: float = 7.0
     """Fall of the cost (twice a log likelihood) that a candidate must be worth."""
     even: float = 1.6

@@ -53,7 +53,7 @@ from numpy.typing import NDArray
 
 from warp_ar.light.ball_shadow import Ball, reaching_factor
 from warp_ar.light.card import CardCheck, check_card, covered_card
-from warp_ar.light.channel import GREEN, choose_channel, told_channel
+from warp_ar.light.channel import choose_channel, told_channel
 from warp_ar.light.config import CONFIG
 from warp_ar.light.emitters import EmitterSearch
 from warp_ar.light.estimate import Estimate, FoundEmitter
@@ -117,7 +117,6 @@ class Recovery:
         self._evidence: _Evidence | None = None
         self._held: Estimate | None = None
         self._unseen = 0
-        self._channel = GREEN
         self._steadiness = Steadiness()
 
     def rests(self, cells: NDArray[Any], observations: NDArray[Any]) -> bool:
@@ -180,7 +179,7 @@ class Recovery:
             self._held = self._estimate(problem, by_card, bounds, "white_card", factor, card)
             return self._held
         means = np.maximum(means, 0.05)
-        self._channel = best = choose_channel(problem, self._channel)
+        best = choose_channel(problem)
         is_turn = self._search(problem, best, means[best])
         solution = tie_channels(problem, _solve_channels(problem, best, means, bounds))
         doubt = doubt_of(card.contrast)
