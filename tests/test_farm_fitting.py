@@ -21,7 +21,7 @@ GIB = 1 << 30
         (3.2, 32, 1, 3 * GIB, 10 * GIB, 3),  # by its memory
         (3.2, 2, 1, 1 * GIB, 78 * GIB, 1),
         (3.2, 32, 1, 20 * GIB, 10 * GIB, 1),  # one there must be; what it lacks it says itself
-        (0.5, 256, 1, 1 * GIB, 200 * GIB, fitting.MOST),
+        (0.1, 256, 1, 1 * GIB, 200 * GIB, fitting.MOST),
     ],
 )
 def test_as_many_as_cores_feed_and_memory_holds(cores_kept_busy, cores, gpus, bytes_used, free, expected):
@@ -36,6 +36,7 @@ def test_one_worker_is_tried_and_a_clip_that_cannot_be_is_passed_over(tmp_path):
     assert probe is not None
     assert probe.frames_per_second > 0.0
     assert probe.cores > 0.0
+    assert (probe.bytes, probe.free_bytes) == (0, 0), "there is no device's memory on CPU"
     assert probe_worker(make_jobs(tmp_path, clips[:1]), "cpu") is None
 
 
@@ -48,11 +49,17 @@ def test_no_more_workers_than_there_are_jobs(tmp_path, monkeypatch):
     assert jobs_at_once(cut) is None
     monkeypatch.setattr(fitting, "probe_worker", lambda jobs, device: Probe(40.0, 2.0, GIB, 78 * GIB))
     said = []
-    assert fit_workers(cut, ["cuda:0", "cuda:1"], 16, said.append) == 8
-    assert fit_workers(whole, ["cuda:0", "cuda:1"], 16, said.append) == 3
+    two = ["cuda:0", "cuda:1"]
+    assert fit_workers(cut, two, 16, said.append) == (8, 2 * fitting.MOST)
+    assert fit_workers(whole, two, 16, said.append) == (3, 3)
     assert "4 workers for each of 2 GPUs" in said[0]
+    # Six tenths of the memory hold nine; of a GPU that holds two at most, no more come.
+    monkeypatch.setattr(fitting, "probe_worker", lambda jobs, device: Probe(40.0, 2.0, 5 * GIB, 78 * GIB))
+    assert fit_workers(cut, two, 16, said.append) == (8, 18)
+    monkeypatch.setattr(fitting, "probe_worker", lambda jobs, device: Probe(40.0, 2.0, 5 * GIB, 12 * GIB))
+    assert fit_workers(cut, two, 16, said.append) == (4, 4)
     monkeypatch.setattr(fitting, "probe_worker", lambda jobs, device: pytest.fail("three clips keep three GPUs busy"))
-    assert fit_workers(whole, ["cuda:0", "cuda:1", "cuda:2"], 16, said.append) == 3
+    assert fit_workers(whole, [*two, "cuda:2"], 16, said.append) == (3, 3)
 
 
 @pytest.mark.parametrize(("workers", "gpus"), [(1, 1), (2, 2), (1, 4), (3, 1), (7, 2), (16, 2), (48, 8)])

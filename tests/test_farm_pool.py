@@ -25,7 +25,21 @@ from warp_ar.farm.records import Context
 )
 def test_cores_are_shared_out_evenly(monkeypatch, cores, workers, expected):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: cores, raising=False)
-    assert cores_of(workers) == expected
+    assert cores_of(["cpu"] * workers) == expected
+
+
+@pytest.mark.parametrize(
+    ("cores", "devices", "expected"),
+    [
+        ({0, 1, 2, 3}, "000", [[0, 1, 2, 3]] * 3),
+        ({0, 1, 2, 3}, "01010", [[0, 1], [2, 3], [0, 1], [2, 3], [0, 1]]),
+        ({2, 3, 5, 7, 9}, "1212", [[2, 3], [5, 7, 9], [2, 3], [5, 7, 9]]),
+        ({0, 1}, "01230", [[0], [1], [0], [1], [0]]),
+    ],
+)
+def test_workers_of_a_gpu_share_its_part_of_the_cores(monkeypatch, cores, devices, expected):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: cores, raising=False)
+    assert cores_of([f"cuda:{gpu}" for gpu in devices]) == expected
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="needs cores to keep to")
@@ -97,6 +111,10 @@ def test_workers_see_no_interrupt_even_as_they_begin(tmp_path):
                 held = next(int(line.split()[1], 16) for line in file if line.startswith("SigBlk"))
             assert held >> (signal.SIGINT - 1) & 1
             assert not held >> (signal.SIGTERM - 1) & 1
+        pool.add(["cpu"])
+        assert (pool.size, len(pool._workers), len(pool._cores)) == (3, 3, 3)
+        assert all(process.is_alive() for process, _ in pool._workers)
     finally:
         pool.close()
+    assert not any(process.is_alive() for process, _ in pool._workers)
     assert signal.pthread_sigmask(signal.SIG_BLOCK, []) == before

@@ -153,32 +153,36 @@ def work(options: argparse.Namespace, folder: Path) -> int:
             if getattr(options, "failed", False):
                 for key in list(manifest.failed):
                     manifest.add("again", key, reason="resumed with --failed")
-            pool = _make_pool(options, jobs, folder)
-            summary = Driver(jobs, folder, manifest, pool, mine, say).run()
+            pool, growth = _make_pool(options, jobs, folder)
+            summary = Driver(jobs, folder, manifest, pool, mine, say, growth).run()
         finally:
             manifest.close()
             clear_aside(folder)  # what workers that were killed left takes room, and is nobody's
     return _tell(folder, summary.failed)
 
 
-def _make_pool(options: argparse.Namespace, jobs: Any, folder: Path) -> Any:
+def _make_pool(options: argparse.Namespace, jobs: Any, folder: Path) -> tuple[Any, Any]:
+    """Workers, and what decides whether more come: on GPUs of this machine, where nobody has said how many."""
     from warp_ar.device import usable_cores
     from warp_ar.farm.fitting import fit_workers
+    from warp_ar.farm.growth import Growth
     from warp_ar.farm.pool import ProcessPool, devices_of
     from warp_ar.farm.records import Context
 
     context = Context(jobs, folder.absolute(), "cpu")
     if options.ray is None:
-        workers = options.workers
-        if workers is None and (devices := devices_of(options.device, None))[0] != "cpu":
-            workers = fit_workers(jobs, devices, usable_cores(), say)
-        return ProcessPool(context, devices_of(options.device, workers))
+        workers, most = options.workers, 0
+        gpus = devices_of(options.device, None)
+        if workers is None and gpus[0] != "cpu":
+            workers, most = fit_workers(jobs, gpus, usable_cores(), say)
+        processes = ProcessPool(context, devices_of(options.device, workers))
+        return processes, Growth(gpus, most, processes.add, say) if most > processes.size else None
     from warp_ar.farm.ray_pool import RayPool
 
     pool = RayPool(context, options.ray or None, options.workers)
     if page := pool.dashboard():
         say(f"Ray's page: http://{page}")
-    return pool
+    return pool, None
 
 
 def _tell(folder: Path, failed: dict[str, str]) -> int:
@@ -228,7 +232,7 @@ def plan(options: argparse.Namespace) -> int:
 
     jobs = parse_jobs(read_jobs(options.jobs), str(options.jobs))
     devices = devices_of(options.device, options.workers)
-    cores = cores_of(len(devices))
+    cores = cores_of(devices)
     with keeping_to(cores[0]):  # as a worker has them
         found = make_plan(jobs, devices[0], say, sorted({core for own in cores for core in own}))
     # Workers that share a core are no faster than one that has it.

@@ -15,6 +15,7 @@ from typing import Any
 
 from warp_ar.errors import reason
 from warp_ar.farm.draws import in_kindred_order
+from warp_ar.farm.growth import Growth
 from warp_ar.farm.jobs import Job, JobFile, job_of_clip, jobs_of_clip
 from warp_ar.farm.manifest import PROGRESS, Manifest, RunError, is_no_space, record_at
 from warp_ar.farm.pool import Event, Pool, is_from_outside, words_of_exit
@@ -27,6 +28,8 @@ INTERRUPTIONS = 10
 """Times that a job's worker may be ended from outside, which need not be the job's fault."""
 PROGRESS_SECONDS = 2.0
 """Between two looks at progress."""
+FRAMES_OF = ("segment", "variation")
+"""Kinds of jobs that light frames."""
 STARTS = 3
 """Times in a row that a worker may die before it is ready."""
 
@@ -55,13 +58,24 @@ class _Worker:
     """Seconds that they took."""
     deaths: int = 0
     """Before it was ready, in a row."""
+    lit: int = 0
+    """Frames of the jobs that it has finished since it was started."""
+    resting: bool = False
+    """Whether it gets no more jobs."""
 
 
 class Driver:
     """Works through a run with a pool of workers."""
 
     def __init__(
-        self, jobs: JobFile, folder: Path, manifest: Manifest, pool: Pool, version: str, say: Callable[[str], None]
+        self,
+        jobs: JobFile,
+        folder: Path,
+        manifest: Manifest,
+        pool: Pool,
+        version: str,
+        say: Callable[[str], None],
+        growth: Growth | None = None,
     ) -> None:
         """Find out what is open.
 
@@ -72,7 +86,9 @@ class Driver:
             pool: Workers.
             version: Of the program, which all workers must be of.
             say: Called with a line for people now and then.
+            growth: Decides whether more workers come; None: these are all.
         """
+        self._growth = growth
         self._jobs, self._folder, self._manifest, self._pool = jobs, folder, manifest, pool
         self._version, self._say = version, say
         self._workers = [_Worker() for _ in range(pool.size)]
@@ -212,7 +228,7 @@ class Driver:
         waiting: Job | None = None
         while True:
             for worker, state in enumerate(self._workers):
-                if not state.ready or state.job is not None:
+                if not state.ready or state.resting or state.job is not None:
                     continue
                 job, waiting = waiting or next_job(), None
                 if job is None:
@@ -227,9 +243,22 @@ class Driver:
                 continue
             for event in self._pool.wait(1.0):
                 self._hear(event)
+            self._grow()
             if time.monotonic() - self._lines_since > PROGRESS_SECONDS:
                 self._lines_since = time.monotonic()
                 self._write_progress()
+
+    def _grow(self) -> None:
+        """Have more workers come, or the last ones rest, by what all of them light."""
+        if self._growth is None:
+            return
+        active = [state for state in self._workers if not state.resting]
+        light = all(state.ready and state.job is not None and state.job.kind in FRAMES_OF for state in active)
+        enough = self._jobs_left() - len(self._running) > len(active)
+        more = self._growth.look([state.lit + state.frames for state in active] if light and enough else None)
+        self._workers += [_Worker() for _ in range(more)]
+        for state in active[more:] if more < 0 else ():
+            state.resting = True
 
     def _hear(self, event: Event) -> None:
         """Take what a worker says."""
@@ -249,7 +278,9 @@ class Driver:
                 if job is not None:
                     self._running.discard(job)
                     state.busy += time.monotonic() - state.since
-                    state.total += int(event.value.values.get("frames", 0))
+                    frames = int(event.value.values.get("frames", 0))
+                    state.total += frames
+                    state.lit += frames if job.kind in FRAMES_OF else 0
                     state.frames = 0
                     self._take(job, event.value)
             case "died":
@@ -266,7 +297,7 @@ class Driver:
                     f"worker {event.worker} died {STARTS} times before it was ready; see "
                     f"{self._folder / 'log' / f'worker-{event.worker}.log'}"
                 )
-        state.ready, state.frames = False, 0
+        state.ready, state.frames, state.lit = False, 0, 0
         if job is None:
             return
         self._running.discard(job)
@@ -293,13 +324,13 @@ class Driver:
                 return
             self._manifest.add("failed", key, reason=outcome.reason)
             self._say(f"{key} failed: {outcome.reason}")
-            if job.kind in ("segment", "variation"):
+            if job.kind in FRAMES_OF:
                 self._settle(job.clip, failed=True)
             return
         self._manifest.add("done", key, **outcome.values)
         if job.kind == "survey":
             self._open_clip(job.clip)
-        elif job.kind in ("segment", "variation"):
+        elif job.kind in FRAMES_OF:
             self._finished_now += 1
             self._settle(job.clip, failed=False)
 
@@ -312,7 +343,6 @@ class Driver:
             rate = (state.total + state.frames) / spent if spent > 0.0 else 0.0
             key = None if state.job is None else state.job.key(self._jobs)
             workers.append({"device": name, "job": key, "frames": state.frames, "fps": round(rate, 2)})
-        open_jobs = sum(self._open.values())
         told = {
             "program": "warp_ar",
             "time": time.time(),
@@ -321,8 +351,8 @@ class Driver:
             "clips": len(self._jobs.clips),
             "clips_surveyed": len(self._open),
             "jobs_known": self._known,
-            "jobs_open": open_jobs,
-            "seconds_left": self._seconds_left(open_jobs, now),
+            "jobs_open": sum(self._open.values()),
+            "seconds_left": self._seconds_left(now),
         }
         try:
             write_whole(self._folder / PROGRESS, json.dumps(told).encode())
@@ -331,10 +361,14 @@ class Driver:
                 return  # a job or the manifest says so
             self._say(f"{self._folder / PROGRESS} cannot be written: {reason(error)}")
 
-    def _seconds_left(self, open_jobs: int, now: float) -> float | None:
-        """By the pace of this driver, if other clips have as many jobs as those that are known; None: too early."""
+    def _jobs_left(self) -> float:
+        """That are open, if other clips have as many jobs as those that are known."""
         clips = len(self._open)
-        if not self._finished_now or not clips:
+        unknown = (len(self._jobs.clips) - clips) * self._known / clips if clips else 0.0
+        return sum(self._open.values()) + unknown
+
+    def _seconds_left(self, now: float) -> float | None:
+        """By the pace of this driver; None: too early."""
+        if not self._finished_now or not self._open:
             return None
-        unknown = (len(self._jobs.clips) - clips) * self._known / clips
-        return round((now - self._started) / self._finished_now * (open_jobs + unknown), 1)
+        return round((now - self._started) / self._finished_now * self._jobs_left(), 1)

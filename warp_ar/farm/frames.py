@@ -51,7 +51,7 @@ class VideoPart(VideoFile):
         end: Number behind the last.
         fps: Show frame n at n / fps instead of at its own time.
         gpu: Number of the GPU whose decoding unit is to be used, where it has one for this coding; None: none is.
-        converters: Threads that turn decoded pictures into RGB.
+        converters: Threads that turn decoded pictures into RGB; twice as many decode.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class VideoPart(VideoFile):
         *,
         converters: int = CONVERTERS,
     ) -> None:
-        self._gpu, self._converters = gpu, converters
+        self._gpu, self._converters, self._decoders = gpu, converters, 2 * converters
         super().__init__(path, fps=fps)
         self._index, self._first, self._end = index, first, end
         self.length = end - first

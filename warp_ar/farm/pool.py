@@ -1,15 +1,14 @@
 """Workers as processes of this machine: one per GPU, or per group of cores.
 
 A worker is told of jobs and tells of frames through a pipe; frames and results never pass through it. Should the driver
-die, however it dies, the pipe ends and the worker with it. Each keeps to its own cores, and BLAS to one thread, so that
-results do not depend on how many workers there are.
+die, however it dies, the pipe ends and the worker with it. Each keeps to its own cores, or to those of its GPU, and
+BLAS to one thread, so that results do not depend on how many workers there are.
 """
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
-import itertools
 import multiprocessing
 import multiprocessing.connection
 import multiprocessing.resource_tracker
@@ -82,15 +81,24 @@ def devices_of(device: str, workers: int | None) -> list[str]:
     return [found[n % len(found)] for n in range(workers or len(found))]
 
 
-def cores_of(workers: int) -> list[list[int]]:
-    """Cores of each worker: as evenly as they go, and shared where there are more workers than cores."""
+def cores_of(devices: Sequence[str]) -> list[list[int]]:
+    """Cores of each worker.
+
+    On CPU each has its own, as evenly as they go, and shared where there are more workers than cores. Workers of one
+    GPU share its part of them: where one waits for its GPU or for its encoder, another goes on.
+
+    Args:
+        devices: Of each worker.
+    """
     if not hasattr(os, "sched_getaffinity"):
-        return [[] for _ in range(workers)]
+        return [[] for _ in devices]
     cores = sorted(os.sched_getaffinity(0))
-    if workers >= len(cores):
-        return [[cores[n % len(cores)]] for n in range(workers)]
-    ends = [round(n * len(cores) / workers) for n in range(workers + 1)]
-    return [cores[a:b] for a, b in itertools.pairwise(ends)]
+    owners: list[Any] = list(range(len(devices))) if "cpu" in devices else list(devices)
+    place = {owner: n for n, owner in enumerate(dict.fromkeys(owners))}
+    if len(place) >= len(cores):
+        return [[cores[place[owner] % len(cores)]] for owner in owners]
+    ends = [round(n * len(cores) / len(place)) for n in range(len(place) + 1)]
+    return [cores[ends[place[owner]] : ends[place[owner] + 1]] for owner in owners]
 
 
 @contextlib.contextmanager
@@ -118,11 +126,19 @@ class ProcessPool:
             devices: Of each worker.
         """
         self.size, self.names = len(devices), list(devices)
-        self._context, self._cores = context, cores_of(len(devices))
+        self._context, self._cores = context, cores_of(devices)
         self._spawn = multiprocessing.get_context("spawn")
         self._workers: list[tuple[Any, Any]] = []
         for worker in range(self.size):
             self._workers.append(self._start(worker))
+
+    def add(self, devices: Sequence[str]) -> None:
+        """Start more workers, on these devices."""
+        self.names += devices
+        self._cores = cores_of(self.names)
+        for worker in range(self.size, len(self.names)):
+            self._workers.append(self._start(worker))
+        self.size = len(self.names)
 
     def _start(self, worker: int) -> tuple[Any, Any]:
         mine, theirs = self._spawn.Pipe()
@@ -214,7 +230,7 @@ def _serve(pipe: Any, context: Context, cores: Sequence[int], every: Sequence[in
     Args:
         pipe: To the driver.
         context: Of the run.
-        cores: Its own; empty: no worker has any of its own.
+        cores: That it keeps to; empty: no worker keeps to any.
         every: Of all workers: a survey may use them all, for others wait for what it finds.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the driver decides what an interrupt ends

@@ -60,6 +60,8 @@ class VideoFile(RecordedSource):
 
     _converters = 1
     """Threads that convert pictures to RGB beside the one that decodes; 1: that one does."""
+    _decoders = 0
+    """Threads of the decoder; 0: one more than there are cores, up to sixteen."""
 
     def __init__(
         self,
@@ -157,7 +159,7 @@ class VideoFile(RecordedSource):
     def _decoded(self, container: Any, first: int | None) -> Generator[Any, None, None]:
         """As ``_pictures``, each as its codec has it."""
         stream = container.streams.video[0]
-        stream.thread_type = "AUTO"
+        stream.thread_type, stream.codec_context.thread_count = "AUTO", self._decoders
         count, packets, damage = 0, 0, ""
         demuxer = container.demux(stream)
         while not damage:
