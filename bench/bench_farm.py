@@ -24,6 +24,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import dataclasses
+import itertools
 import os
 import shutil
 import statistics
@@ -49,6 +50,8 @@ from warp_ar.farm.jobs import parse_jobs, read_jobs
 
 PARTS = {"bounds": 0.1, "survey": 0.1, "gpus": 0.4, "cpu": 0.1, "long": 0.22, "variations": 0.18, "kills": 0.2}
 """Parts in their order, and their shares of the minutes."""
+LEAST_STEADY = 8.0
+"""Seconds of steady work that a number of workers is given, so that each of them does more than one job."""
 
 
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
@@ -60,6 +63,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--size", default="1920x1080", metavar="WxH", help="of the recordings (default: 1920x1080)")
     parser.add_argument("--quality", default="medium")
     parser.add_argument("--per-gpu", default="1,4,8", metavar="N,M", help="workers of a GPU to try (default: 1,4,8)")
+    parser.add_argument("--no-trial", dest="trial", action="store_false", help="those alone, not what a trial tells")
     parser.add_argument("--cpu-workers", default="1,2,4,8", metavar="N,M", help="of part cpu (default: 1,2,4,8)")
     parser.add_argument("--segment-frames", type=int, default=60, help="of parts gpus and cpu (default: 60)")
     parser.add_argument("--long-frames", type=int, default=54_000, help="asked of part long (default: 54000)")
@@ -96,10 +100,10 @@ def steady_run(
     limit = START_SECONDS + seconds
     seen = work(folder, workers, device, bench.say, gpus=gpus, cores=cores, limit=limit, steady=seconds)
     done = jobs_done(folder, "segment")
-    figures = rates(done, workers) | {
+    figures = rates(done, workers, seen) | {
         "workers": workers,
         "run_seconds": round(seen.seconds, 1),
-        "processor_cores": round(seen.processor_seconds / seen.seconds, 2),
+        "processor_cores_with_starts": round(seen.processor_seconds / seen.seconds, 2),
         "bytes_per_frame": round(sum(job.bytes for job in done) / max(sum(job.frames for job in done), 1)),
         **seen.gpu_figures(),
     }
@@ -107,6 +111,19 @@ def steady_run(
         figures["error"] = seen.errors[-500:]
     shutil.rmtree(folder)
     return figures
+
+
+def _numbers_to_try(bench: Bench, cores: int, gpus: int) -> list[int]:
+    """Workers of a GPU: what a trial tells, and those that were asked for."""
+    asked = numbers_of(bench.options.per_gpu)
+    jobs = parse_jobs(read_jobs(write_clips(bench, "trial.toml", 1, bench.options.segment_frames)), "trial.toml")
+    if not bench.options.trial or (trial := probe_worker(jobs, "cuda:0")) is None:
+        return asked
+    own, figures = workers_of_gpu(trial, cores, gpus), dataclasses.asdict(trial)
+    # Under a name of its own: `cores` are the machine's.
+    kept = round(figures.pop("cores"), 2)
+    bench.tell("trial of one worker", cores_kept_busy=kept, **figures, workers_of_a_gpu=own)
+    return [own, *(number for number in asked if number != own)]
 
 
 def run_gpus(bench: Bench) -> None:
@@ -117,32 +134,30 @@ def run_gpus(bench: Bench) -> None:
         return
     surveyed(bench)
     cores = sorted(os.sched_getaffinity(0))
-    jobs = parse_jobs(read_jobs(write_clips(bench, "trial.toml", 1, bench.options.segment_frames)), "trial.toml")
-    if (trial := probe_worker(jobs, "cuda:0")) is not None:
-        each = workers_of_gpu(trial, len(cores), count)
-        bench.tell("trial of one worker", **dataclasses.asdict(trial), workers_of_a_gpu=each)
     half = cores[: max(1, len(cores) // 2)] if count > 1 else cores
+    each = _numbers_to_try(bench, len(cores), count)
     cases: list[tuple[int, int, Sequence[int]]] = []
-    for per_gpu in numbers_of(bench.options.per_gpu):
+    for per_gpu in each:
         cases.append((1, per_gpu, half))
         if count > 1:
             cases.append((2, per_gpu, cores))
     if count > 1:
-        cases.append((1, 2 * numbers_of(bench.options.per_gpu)[-1], cores))
-    seconds = max(4.0, bench.left / (2 * len(cases)) - 8.0)
+        cases.append((1, 2 * each[-1], cores))
+    seconds = max(LEAST_STEADY, bench.left / (2 * len(cases)) - 8.0)
     found: dict[tuple[int, int, int], list[float]] = {}
-    for turn in range(2):
-        for gpus, per_gpu, own in cases:
-            if turn and bench.left < seconds + 8.0:
-                bench.say("no time is left for the second turn")
-                break
-            bench.say(f"{gpus} GPU, {per_gpu} workers each, {len(own)} cores, turn {turn + 1}")
-            name = f"gpus-{gpus}-{per_gpu}-{turn}"
-            figures = steady_run(bench, name, gpus * per_gpu, "cuda", seconds, gpus=range(gpus), cores=own)
-            bench.tell("gpus", gpus=gpus, per_gpu=per_gpu, used_cores=len(own), turn=turn + 1, figures=figures)
-            if "fps" in figures:
-                found.setdefault((gpus, per_gpu, len(own)), []).append(figures["fps"])
-    for per_gpu in numbers_of(bench.options.per_gpu):
+    took = 0.0
+    for turn, (gpus, per_gpu, own) in itertools.product(range(2), cases):
+        if bench.left < took:
+            bench.say("no time is left for more")
+            break
+        bench.say(f"{gpus} GPU, {per_gpu} workers each, {len(own)} cores, turn {turn + 1}")
+        name, start = f"gpus-{gpus}-{per_gpu}-{len(own)}-{turn}", time.monotonic()
+        figures = steady_run(bench, name, gpus * per_gpu, "cuda", seconds, gpus=range(gpus), cores=own)
+        bench.tell("gpus", gpus=gpus, per_gpu=per_gpu, used_cores=len(own), turn=turn + 1, figures=figures)
+        if "fps" in figures:
+            found.setdefault((gpus, per_gpu, len(own)), []).append(figures["fps"])
+        took = max(took, time.monotonic() - start)
+    for per_gpu in each:
         one, two = found.get((1, per_gpu, len(half)), []), found.get((2, per_gpu, len(cores)), [])
         ratios = [b / a for a, b in zip(one, two, strict=False)]
         if ratios:

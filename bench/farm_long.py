@@ -266,14 +266,17 @@ def _check_video(bench: Bench, length: int) -> None:
     times = [[float(int(tick - index.ticks[0]) * index.tick) for tick in index.ticks] for index in (mine, theirs)]
     parts = _parts(length)
     spawn = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(min(SEGMENTS, usable_cores()), mp_context=spawn) as pool:
+    jobs, surveyed_in = bench.folder / "long.toml", bench.folder / "long-surveyed"
+    with (
+        concurrent.futures.ProcessPoolExecutor(1, mp_context=spawn) as beside,
+        concurrent.futures.ProcessPoolExecutor(max(1, usable_cores() // 2), mp_context=spawn) as pool,
+    ):
+        compared = beside.submit(compare_encoded, jobs, surveyed_in, bench.one_device, video, parts)
         stamps = mine.ticks.tolist()
-        tasks = [pool.submit(count_decoded, video, stamps[first:end]) for first, end in parts]
+        pieces = [piece for first, end in parts for piece in _halves(first, end)]
+        tasks = [pool.submit(count_decoded, video, stamps[first:end]) for first, end in pieces]
         decoded = [task.result() for task in tasks]
-    jobs = bench.folder / "long.toml"
-    edges, inner, same = _in_a_process(
-        compare_encoded, jobs, bench.folder / "long-surveyed", bench.one_device, video, parts
-    )
+        edges, inner, same = compared.result()
     bench.tell(
         "the joined recording",
         frames=mine.length,
@@ -336,6 +339,12 @@ def _parts(length: int) -> list[tuple[int, int]]:
     """First frame and the one behind the last of each segment."""
     size = -(-length // SEGMENTS)
     return [(first, min(first + size, length)) for first in range(0, length, size)]
+
+
+def _halves(first: int, end: int) -> list[tuple[int, int]]:
+    """Both halves of a stretch; one of a single frame is whole."""
+    middle = (first + end) // 2
+    return [(first, middle), (middle, end)] if first < middle else [(first, end)]
 
 
 def _digest_files(bench: Bench) -> tuple[Path, Path]:

@@ -44,8 +44,17 @@ class Watched:
     """Of all workers, and of the processes that they have begun."""
     processor_seconds: float = 0.0
     """Of driver and workers, and of the processes that these have begun."""
+    spent: list[tuple[float, float]] = dataclasses.field(default_factory=list)
+    """Unix seconds, and processor time until then, one pair a sample."""
     gpus: dict[int, list[tuple[int, int]]] = dataclasses.field(default_factory=dict)
     """Share of the time in which a kernel ran in percent, and MB in use, of each GPU, one pair a sample."""
+
+    def cores_between(self, begin: float, end: float) -> float | None:
+        """Cores that were busy on average from one moment to another, Unix seconds; None where nothing was seen."""
+        seen = [sample for sample in self.spent if begin <= sample[0] <= end]
+        if len(seen) < 2:
+            return None
+        return (seen[-1][1] - seen[0][1]) / (seen[-1][0] - seen[0][0])
 
     def gpu_figures(self) -> dict[str, Any]:
         """Median load in the second half of the run, and most memory, of each GPU."""
@@ -239,6 +248,7 @@ def _watch(pid: int, folder: Path, seen: Watched, say: Callable[[str], None], en
             seen.worker_mb.append(max((size for process, size in sizes if process in mine), default=0.0))
             seen.workers_mb.append(sum(others))
         seen.processor_seconds = sum(spent.values())
+        seen.spent.append((time.time(), seen.processor_seconds))
         if time.monotonic() - told > TELL_SECONDS:
             told = time.monotonic()
             with contextlib.suppress(OSError, ValueError):
@@ -292,10 +302,15 @@ def jobs_done(folder: Path, kind: str) -> list[Done]:
     return found
 
 
-def rates(done: Sequence[Done], workers: int) -> dict[str, Any]:
+def rates(done: Sequence[Done], workers: int, seen: Watched | None = None) -> dict[str, Any]:
     """Frames a second of jobs: of the whole, and while all workers were past their first job and none had run out.
 
     A worker's first job loads kernels and allocates. Frames of a job are taken to be spread evenly over its time.
+
+    Args:
+        done: Jobs.
+        workers: That did them.
+        seen: What was seen of the run: then with the cores that were busy in that time, and what a frame took of them.
     """
     if not done:
         return {"frames": 0}
@@ -311,4 +326,9 @@ def rates(done: Sequence[Done], workers: int) -> dict[str, Any]:
         )
         if end > begin:
             figures |= {"fps": round(count / (end - begin), 2), "steady_seconds": round(end - begin, 2)}
+            if seen is not None and (busy := seen.cores_between(begin, end)) is not None:
+                figures |= {
+                    "steady_cores": round(busy, 2),
+                    "processor_ms_per_frame": round(1e3 * busy / figures["fps"], 1),
+                }
     return figures
