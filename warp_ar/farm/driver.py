@@ -241,9 +241,9 @@ class Driver:
                 if waiting is None:
                     return
                 continue
+            self._grow()  # here: where jobs are short, there is always one that has just ended
             for event in self._pool.wait(1.0):
                 self._hear(event)
-            self._grow()
             if time.monotonic() - self._lines_since > PROGRESS_SECONDS:
                 self._lines_since = time.monotonic()
                 self._write_progress()
