@@ -251,7 +251,8 @@ def test_what_killed_workers_left_is_gone_when_a_run_ends(finished, monkeypatch)
         (run / ".aside/good.segment-000000.1").mkdir(parents=True)
         raise RunError("the disk is full")
 
-    monkeypatch.setattr(cli, "_make_pool", lambda options, jobs, folder: types.SimpleNamespace(size=0, names=()))
+    pool = types.SimpleNamespace(size=0, names=())
+    monkeypatch.setattr(cli, "_make_pool", lambda options, jobs, folder: (pool, None))
     monkeypatch.setattr(Driver, "run", work)
     assert main(["resume", str(run)]) == 1
     assert not (run / ".aside").exists()
