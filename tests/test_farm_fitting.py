@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import concurrent.futures
+
 import pytest
 
 from tests.farm_rig import make_jobs, write_recording
@@ -38,6 +40,38 @@ def test_one_worker_is_tried_and_a_clip_that_cannot_be_is_passed_over(tmp_path):
     assert probe.cores > 0.0
     assert (probe.bytes, probe.free_bytes) == (0, 0), "there is no device's memory on CPU"
     assert probe_worker(make_jobs(tmp_path, clips[:1]), "cpu") is None
+
+
+def test_memory_is_what_goes_while_the_worker_is_kept(monkeypatch):
+    """A process beside it looks before the worker's begins, which takes some for itself, and before it lets go."""
+    free, done = [78 * GIB, 76 * GIB], []
+
+    class Here:
+        """An executor in this process."""
+
+        def __init__(self, *_, **__):
+            done.append("started")
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            pass
+
+        def submit(self, function, *arguments):
+            future = concurrent.futures.Future()
+            future.set_result(function(*arguments))
+            return future
+
+    def answer(name, value):
+        monkeypatch.setattr(fitting, name, lambda *_: (done.append(name), value())[1])
+
+    answer("_free_bytes", lambda: free.pop(0))
+    answer("_probe", lambda: (20.0, 2.6))
+    answer("_end_trial", lambda: None)
+    monkeypatch.setattr(fitting.concurrent.futures, "ProcessPoolExecutor", Here)
+    assert probe_worker(None, "cuda:0") == Probe(20.0, 2.6, 2 * GIB, 78 * GIB)
+    assert done[2:] == ["_free_bytes", "_probe", "_free_bytes", "_end_trial"]
 
 
 def test_no_more_workers_than_there_are_jobs(tmp_path, monkeypatch):
