@@ -42,9 +42,10 @@ def test_one_worker_is_tried_and_a_clip_that_cannot_be_is_passed_over(tmp_path):
     assert probe_worker(make_jobs(tmp_path, clips[:1]), "cpu") is None
 
 
-def test_memory_is_what_goes_while_the_worker_is_kept(monkeypatch):
-    """A process beside it looks before the worker's begins, which takes some for itself, and before it lets go."""
-    free, done = [78 * GIB, 76 * GIB], []
+def test_memory_is_the_most_that_goes_while_a_worker_is_tried(monkeypatch):
+    """A process beside it looks before the worker's begins, and until the trial is over."""
+    free, done = [78 * GIB, 77 * GIB, 75 * GIB, 76 * GIB], []
+    trial = concurrent.futures.Future()
 
     class Here:
         """An executor in this process."""
@@ -59,6 +60,9 @@ def test_memory_is_what_goes_while_the_worker_is_kept(monkeypatch):
             pass
 
         def submit(self, function, *arguments):
+            if function is fitting._probe:
+                function()
+                return trial
             future = concurrent.futures.Future()
             future.set_result(function(*arguments))
             return future
@@ -66,12 +70,19 @@ def test_memory_is_what_goes_while_the_worker_is_kept(monkeypatch):
     def answer(name, value):
         monkeypatch.setattr(fitting, name, lambda *_: (done.append(name), value())[1])
 
-    answer("_free_bytes", lambda: free.pop(0))
-    answer("_probe", lambda: (20.0, 2.6))
+    def look():
+        if len(free) == 1:
+            trial.set_result((20.0, 2.6))
+        return free.pop(0) if len(free) > 1 else free[0]
+
+    answer("_free_bytes", look)
+    answer("_probe", lambda: None)
+    monkeypatch.setattr(fitting, "LOOK_SECONDS", 0.0)
     answer("_end_trial", lambda: None)
     monkeypatch.setattr(fitting.concurrent.futures, "ProcessPoolExecutor", Here)
-    assert probe_worker(None, "cuda:0") == Probe(20.0, 2.6, 2 * GIB, 78 * GIB)
-    assert done[2:] == ["_free_bytes", "_probe", "_free_bytes", "_end_trial"]
+    assert probe_worker(None, "cuda:0") == Probe(20.0, 2.6, 3 * GIB, 78 * GIB)
+    assert [done[2], done[3], done[-1]] == ["_free_bytes", "_probe", "_end_trial"]
+    assert done.count("_free_bytes") >= 4, "before the trial, and while it runs"
 
 
 def test_no_more_workers_than_there_are_jobs(tmp_path, monkeypatch):

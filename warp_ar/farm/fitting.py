@@ -29,6 +29,8 @@ CLIPS = 3
 """That are tried before the probe gives up."""
 MOST = 32
 """Workers of a GPU."""
+LOOK_SECONDS = 0.05
+"""Between two looks at how much of a GPU's memory is free."""
 SPARE = 0.9
 """Share of a GPU's memory that workers may fill."""
 GROWN = 0.6
@@ -43,7 +45,7 @@ class Probe:
     cores: float
     """That it kept busy: processor time over time."""
     bytes: int
-    """Of the device's memory, all that its process took; 0 on CPU."""
+    """Of the device's memory, the most that its process took; 0 on CPU."""
     free_bytes: int
     """Of the device's memory before."""
 
@@ -88,12 +90,16 @@ def probe_worker(jobs: JobFile, device: str) -> Probe | None:
     ):
         try:
             free = beside.submit(_free_bytes, device).result()
-            seen = process.submit(_probe, jobs, device).result()
-            used = free - beside.submit(_free_bytes, device).result()
+            trial = process.submit(_probe, jobs, device)
+            least = free
+            while not trial.done():  # where one job's pipeline follows another's, both are there for a while
+                concurrent.futures.wait([trial], LOOK_SECONDS)
+                least = min(least, beside.submit(_free_bytes, device).result())
+            seen = trial.result()
             process.submit(_end_trial).result()
         except concurrent.futures.process.BrokenProcessPool:
             return None
-    return None if seen is None else Probe(*seen, max(used, 0), free)
+    return None if seen is None else Probe(*seen, free - least, free)
 
 
 def fit_workers(jobs: JobFile, devices: list[str], cores: int, say: Callable[[str], None]) -> tuple[int, int]:
