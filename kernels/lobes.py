@@ -122,18 +122,13 @@ def sample_levels(levels: wp.array[wp.vec3], direction: wp.vec3, level: wp.float
     at = latlong_from_direction(direction, height, 2 * height)
     v = at[0] / wp.float32(height)
     u = at[1] / wp.float32(2 * height)
-    fine = wp.vec3(0.0)
-    coarse = wp.vec3(0.0)
-    # A loop, so that there is one copy of what reads a level: rays read levels in several places of a kernel.
-    last = wp.where(fraction == 0.0, below, below + 1)
-    for one in range(below, last + 1):
-        fine = coarse
-        coarse = sample_packed(levels, offset, h, w, v * wp.float32(h), u * wp.float32(w))
-        offset += h * w
-        h = height >> wp.max(one - 1, 0)
-        w = 2 * height >> wp.max(one - 1, 0)
+    fine = sample_packed(levels, offset, h, w, v * wp.float32(h), u * wp.float32(w))
     if fraction == 0.0:
-        return coarse
+        return fine
+    offset += h * w
+    h = height >> wp.max(below - 1, 0)
+    w = 2 * height >> wp.max(below - 1, 0)
+    coarse = sample_packed(levels, offset, h, w, v * wp.float32(h), u * wp.float32(w))
     return fine * (1.0 - fraction) + coarse * fraction
 
 
