@@ -1,8 +1,9 @@
 """Many cameras in one process: what a further pipeline costs, frames a second of all, and how long each frame takes.
 
-A stream is a pipeline and a thread that hands it the frames of ``desk``, tracking included, and waits for each
-picture. ``latency_ms`` runs from the time at which the camera has a frame to the picture on the host. A camera that
-finds its stream busy drops the frame. All streams must show the same first pictures before anything is timed.
+A stream is a pipeline, a thread that hands it the frames of ``desk``, tracking included, and another that waits for
+each picture: a frame's marker is found while the one before is rendered. ``latency_ms`` runs from the time at which
+the camera has a frame to the picture on the host. A camera that finds two frames of its own under way drops what it
+takes until one of them is a picture. All streams must show the same first pictures before anything is timed.
 
 ``WARP_AR_BENCH`` may name rows, frames a second of each camera (0: the next frame is there when the last picture is)
 and numbers of streams, as in ``1080,60,1,4,16``; usual are ``240,0,1,2,4`` on CPU and ``1080,60,1,4,16,8x2`` on CUDA.
@@ -15,7 +16,9 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import math
 import os
+import queue
 import resource
 import statistics
 import subprocess
@@ -32,7 +35,7 @@ import warp as wp
 
 from bench.bench_frame import Clip, clip
 from bench.common import report
-from warp_ar.engine.pipeline import Pipeline
+from warp_ar.engine.pipeline import Pipeline, Result
 from warp_ar.stages.recover import EVERY_FRAME
 
 USUAL = {"cpu": "240,0,1,2,4", "cuda": "1080,60,1,4,16,8x2"}
@@ -41,6 +44,8 @@ WARM_UP = 12
 FRAMES = 60
 """Of each stream that are timed; ten seconds' worth of a camera's."""
 CLIP_RATE = 24.0
+UNDER_WAY = 2
+"""Frames of a camera that are handed over and are no picture as yet, at most."""
 LEAST_SIZE = 1 << 20
 TOGETHER = "WARP_AR_BENCH_TOGETHER"
 """Of a process among several: how many there are, and a folder in which they meet."""
@@ -55,30 +60,56 @@ class Stream:
     dropped: int = 0
     error: BaseException | None = None
 
-    def show(self, frames: Clip, index: int, rate: float) -> np.ndarray:
-        """The picture of a frame, by the camera's clock."""
+    def submit(self, frames: Clip, index: int, rate: float) -> Result:
+        """Hand over a frame, by the camera's clock."""
         image = frames.images[index % len(frames.images)]
-        return self.pipeline.submit(image, time_seconds=index / (rate or CLIP_RATE)).image
+        return self.pipeline.submit(image, time_seconds=index / (rate or CLIP_RATE))
+
+    def show(self, frames: Clip, index: int, rate: float) -> np.ndarray:
+        """The picture of a frame."""
+        return self.submit(frames, index, rate).image
 
     def run(self, frames: Clip, count: int, rate: float, begin: threading.Barrier) -> None:
         """Light so many frames after the warm-up; what fails is told by ``error``."""
+        room = threading.Semaphore(UNDER_WAY if rate else 1)
+        handed_over: queue.SimpleQueue[tuple[float, Result] | None] = queue.SimpleQueue()
+        taker = threading.Thread(target=self._take_pictures, args=(handed_over, room))
+        taker.start()
         try:
             begin.wait()
             start = time.perf_counter()
             index = 0
-            while index < count:
+            while True:
+                room.acquire()
+                if rate:  # what the camera took while there was no room is gone
+                    following = max(index, math.ceil((time.perf_counter() - start) * rate))
+                    self.dropped += min(following, count) - index
+                    index = following
+                if index >= count or self.error is not None:
+                    break
                 due = start + index / rate if rate else time.perf_counter()
                 time.sleep(max(due - time.perf_counter(), 0.0))
-                self.show(frames, WARM_UP + index, rate)
-                now = time.perf_counter()
-                self.latency_ms.append((now - due) * 1e3)
-                # While this picture was made the camera took others: it goes on with the next that is to come.
-                following = max(index + 1, int(np.ceil((now - start) * rate))) if rate else index + 1
-                self.dropped += min(following, count) - index - 1
-                index = following
+                handed_over.put((due, self.submit(frames, WARM_UP + index, rate)))
+                index += 1
         except BaseException as error:
             self.error = error
             begin.abort()
+        finally:
+            handed_over.put(None)
+            taker.join()
+
+    def _take_pictures(
+        self, handed_over: queue.SimpleQueue[tuple[float, Result] | None], room: threading.Semaphore
+    ) -> None:
+        """Wait for each picture and note when it came."""
+        while (item := handed_over.get()) is not None:
+            due, result = item
+            try:
+                _ = result.image
+            except BaseException as error:
+                self.error = error
+            self.latency_ms.append((time.perf_counter() - due) * 1e3)
+            room.release()
 
 
 def used_memory(device: Any) -> float:

@@ -229,6 +229,8 @@ def make_bounced(config: DistantLightConfig) -> wp.Function:
         origin = offset_origin(hit.point, geometric, wi, hit.error)
         other = closest_object(scene, origin, wi, FAR)
         proxy = closest_proxy(scene, origin, wi, other.t)
+        if is_rough and (proxy.shape >= 0 or other.shape < 0):
+            received = distant_irradiance(distant, hit.point, normal) / wp.pi
         if proxy.shape >= 0:
             # Light of the receiver, as far as a ray from there leaves the scene.
             up = proxy.geometric_normal
@@ -236,21 +238,17 @@ def make_bounced(config: DistantLightConfig) -> wp.Function:
                 up = -up
             leaving = frame_from_normal(up) * sample_cosine_hemisphere(wp.vec2(u[1], u[0]))
             start = offset_origin(proxy.point, up, leaving, proxy.error)
-            at = find_in_frame(params, picture, scene, distant.probes, proxy)
-            if at[0] >= 0.0:  # noqa: SIM108  (a conditional expression computes both)
-                received = look_up(picture, at[0], at[1])
-            else:
-                received = captured_along(distant, proxy.point, wi)
-            if is_rough:
-                if wp.static(config.diffuse != "none"):  # what is rough here has an irradiance
-                    received = distant_irradiance(distant, hit.point, normal) / wp.pi
+            if not is_rough:
+                at = find_in_frame(params, picture, scene, distant.probes, proxy)
+                if at[0] >= 0.0:  # noqa: SIM108  (a conditional expression computes both)
+                    received = look_up(picture, at[0], at[1])
+                else:
+                    received = captured_along(distant, proxy.point, wi)
             if occluded_by_objects(scene, start, leaving, FAR):
                 received = wp.cw_mul(received, FURTHER * (surface.diffuse + surface.reflectance))
         elif other.shape >= 0:
             received = shade_unoccluded(scene, distant, other, wi, RAY_SPREAD)
-        elif is_rough:
-            received = distant_irradiance(distant, hit.point, normal) / wp.pi
-        else:
+        elif not is_rough:
             if wp.static(config.specular):
                 floor = level_from_alpha(alpha, distant.level_height)
                 received = reflected_radiance(

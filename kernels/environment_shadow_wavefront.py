@@ -326,8 +326,14 @@ def make_reduce_partials_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
     return reduce_partials_kernel
 
 
+def takes_wavefront(config: EnvironmentShadowConfig, rows: int, columns: int) -> bool:
+    """Whether cells can be estimated pass after pass: one set of samples each, and not too many secondary rays."""
+    queue = rows * columns * config.secondary_count
+    return config.count <= CHUNK and config.count // config.partials <= WORD and queue <= MAX_QUEUE
+
+
 def make_wavefront(config: EnvironmentShadowConfig, rows: int, columns: int, device: wp.DeviceLike) -> Wavefront | None:
-    """Scratch of ``shade_wavefront``; None where a cell has more than a set of samples, or it would take too much.
+    """Scratch of ``shade_wavefront``; None where ``takes_wavefront`` says no.
 
     Args:
         config: As for ``shade_wavefront``; the samples of a partial sum are the bits of a word: 32 at most.
@@ -335,9 +341,9 @@ def make_wavefront(config: EnvironmentShadowConfig, rows: int, columns: int, dev
         columns: Cells in a row.
         device: Where.
     """
-    queue = rows * columns * config.secondary_count
-    if config.count > CHUNK or config.count // config.partials > WORD or queue > MAX_QUEUE:
+    if not takes_wavefront(config, rows, columns):
         return None
+    queue = rows * columns * config.secondary_count
     cells = config.partials, rows, columns
     wave = Wavefront()
     wave.occluded, wave.queue_starts = (wp.empty(cells, dtype=kind, device=device) for kind in (wp.uint32, wp.int32))

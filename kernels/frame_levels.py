@@ -245,9 +245,12 @@ def look_up_level(
     level = wp.clamp(wp.log2(wp.max(size, 1.0)), 0.0, wp.float32(LAST))
     below = wp.min(wp.int32(level), LAST - 1)
     fraction = level - wp.float32(below)
-    radiance = sample_frame_level(params, picture, layers, at[0], at[1], below)
-    if fraction > 0.0:
-        radiance += fraction * (sample_frame_level(params, picture, layers, at[0], at[1], below + 1) - radiance)
+    # A loop, so that there is one copy of what reads a level: a ray's own code is long enough.
+    last = wp.where(fraction > 0.0, below + 1, below)
+    radiance = wp.vec3(0.0)
+    for one in range(below, last + 1):
+        sampled = sample_frame_level(params, picture, layers, at[0], at[1], one)
+        radiance = wp.where(one == below, sampled, radiance + fraction * (sampled - radiance))
     return radiance
 
 
@@ -285,10 +288,9 @@ def look_up_covered(
     middle = 0.5 * (xx + yy)
     apart = wp.sqrt(0.25 * (xx - yy) * (xx - yy) + xy * xy)
     longer = wp.sqrt(middle + apart)
-    if longer <= 1.0:
-        return sample_frame_level(params, picture, layers, at[0], at[1], 0)
+    # What is narrower than a pixel comes out as one place of width 1, which is read from level 0 alone.
     shorter = wp.max(wp.sqrt(wp.max(middle - apart, 0.0)), 1.0)
-    taps = wp.min(wp.int32(wp.ceil(wp.min(longer / shorter, wp.float32(MOST_TAPS)))), MOST_TAPS)
+    taps = wp.clamp(wp.int32(wp.ceil(wp.min(longer / shorter, wp.float32(MOST_TAPS)))), 1, MOST_TAPS)
     # Along the eigenvector of the larger eigenvalue; of two forms the one that does not cancel.
     axis = wp.vec2(1.0, 0.0)
     if apart > 0.0:

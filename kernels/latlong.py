@@ -96,8 +96,37 @@ def sample_row(radiance: wp.array2d[wp.vec3], row: wp.int32, x: wp.float32) -> w
 @wp.func
 def sample_latlong(radiance: wp.array2d[wp.vec3], direction: wp.vec3) -> wp.vec3:
     """Bilinear sample, continuous across seam and poles for every size; exact for a constant map."""
-    at = latlong_from_direction(direction, radiance.shape[0], radiance.shape[1])
+    height = radiance.shape[0]
+    width = radiance.shape[1]
+    at = latlong_from_direction(direction, height, width)
     y = at[0] - 0.5
+    x = at[1] - 0.5
     row = wp.floor(y)
-    top = sample_row(radiance, wp.int32(row), at[1] - 0.5)
-    return top + (y - row) * (sample_row(radiance, wp.int32(row) + 1, at[1] - 0.5) - top)
+    left = wp.floor(x)
+    i = wp.int32(row)
+    j = wp.int32(left)
+    above_left = wp.vec2i(i, j)
+    above_right = wp.vec2i(i, j + 1)
+    below_left = wp.vec2i(i + 1, j)
+    below_right = wp.vec2i(i + 1, j + 1)
+    above = x - left
+    below = above
+    # Across the border one copy of the way round, for both rows.
+    if i < 0 or i + 1 >= height or j < 0 or j + 1 >= width:
+        part = wp.int32(0)
+        while part < 2:
+            first, second, t = beside_in_row(i + part, x, height, width)
+            if part == 0:
+                above_left = first
+                above_right = second
+                above = t
+            else:
+                below_left = first
+                below_right = second
+                below = t
+            part += 1
+    a = radiance[above_left[0], above_left[1]]
+    top = a + above * (radiance[above_right[0], above_right[1]] - a)
+    b = radiance[below_left[0], below_left[1]]
+    bottom = b + below * (radiance[below_right[0], below_right[1]] - b)
+    return top + (y - row) * (bottom - top)

@@ -122,6 +122,12 @@ class _Listed(Exception):
     """The kernels of a plan are known."""
 
 
+class _Module(SimpleNamespace):
+    """Stands for one of Warp's; a key of dictionaries, as those are."""
+
+    __hash__ = object.__hash__
+
+
 def test_who_interrupts_compiling_does_not_wait_for_all_of_it(monkeypatch) -> None:
     """Kernels whose turn has not come are left out; what is at work ends."""
     compiled, interrupted = [], threading.Event()
@@ -137,7 +143,7 @@ def test_who_interrupts_compiling_does_not_wait_for_all_of_it(monkeypatch) -> No
 
     monkeypatch.setattr(modules.wp, "compile_aot_module", compile_module)
     monkeypatch.setattr(modules, "usable_cores", lambda: 1)
-    variants = [(SimpleNamespace(number=number, name="", options={}), None) for number in range(20)]
+    variants = [(_Module(number=number, name="", options={}), None) for number in range(20)]
     with pytest.raises(KeyboardInterrupt):
         modules._compile(variants, SimpleNamespace(is_cpu=False), progress)
     assert len(compiled) <= 2

@@ -18,6 +18,8 @@ _ARENA_MAX = -8
 """``M_ARENA_MAX`` of glibc's ``malloc.h``."""
 _CUDA = threading.RLock()
 _TRANSLATION = threading.RLock()
+_OPENING: list[threading.Thread] = []
+"""The thread that makes a device's context, if one does."""
 
 
 def usable_cores() -> int:
@@ -115,6 +117,25 @@ def start_warp() -> None:
         wp.init()
 
 
+def open_ahead(name: str) -> None:
+    """Have a CUDA device's context made beside what this thread imports; ``resolve_device`` waits for it.
+
+    Args:
+        name: As for ``resolve_device``; where it is no CUDA device of this machine, nothing is done.
+    """
+    known = [str(device) for device in wp.get_devices() if device.is_cuda]
+    wanted = "cuda:0" if name in ("auto", "cuda") else name
+    if wanted not in known or _OPENING:
+        return
+
+    def open_context() -> None:
+        with contextlib.suppress(RuntimeError):  # who uses the device first meets it too, and says it
+            _ = wp.get_device(wanted).context
+
+    _OPENING.append(threading.Thread(target=open_context, name="warp_ar-open"))
+    _OPENING[-1].start()
+
+
 def resolve_device(name: str = "auto") -> Any:
     """Warp device for ``name``: ``auto`` (CUDA where present, else CPU), ``cpu``, ``cuda`` or ``cuda:N``.
 
@@ -122,6 +143,8 @@ def resolve_device(name: str = "auto") -> Any:
         UsageError: The name is no device of this machine.
     """
     start_warp()
+    for thread in _OPENING:
+        thread.join()
     if name == "auto":
         return wp.get_device("cuda:0") if wp.is_cuda_available() else wp.get_device("cpu")
     known = [str(device) for device in wp.get_devices()]

@@ -43,13 +43,14 @@ def hurry_compilers(device: str) -> None:
     """Start Warp; what can be done for its compilers beside the imports that follow, and before them, is."""
     import warp as wp
 
-    from warp_ar.device import start_warp
+    from warp_ar.device import open_ahead, start_warp
     from warp_ar.engine.modules import parse_headers_ahead
     from warp_ar.engine.nvrtc import compile_beside
     from warp_ar.engine.tiers import begin_quickly
     from warp_ar.engine.translation import take_shortcuts
 
     start_warp()
+    open_ahead(device)
     take_shortcuts()
     begin_quickly()
     compile_beside()

@@ -25,7 +25,8 @@ from typing import Any
 import warp as wp
 
 from warp_ar.device import compiling, exclusive, usable_cores
-from warp_ar.engine.nvrtc import Compilers, count_processes
+from warp_ar.engine import ahead
+from warp_ar.engine.nvrtc import HERE, Compilers, compiles_beside, count_processes
 from warp_ar.engine.tiers import QUICK_FLAGS, choose, compile_better, digest
 from warp_ar.kernels.launch import UNCHECKED
 
@@ -75,6 +76,25 @@ def load_modules(
             compile_better(_Headers([]).store)
 
 
+def begin_slowest(kernels: Iterable[wp.Kernel], device: Any) -> None:
+    """Have kernels compiled beside what follows, where it is a command's and they are not in the cache. CUDA only.
+
+    A library's pipeline may never light a frame.
+
+    Args:
+        kernels: Each the one of its module, launched in blocks of the usual size; the caller holds ``translating``.
+        device: Warp device.
+    """
+    kernels = list(kernels)
+    if device.is_cpu or not compiles_beside() or not wp.config.cache_kernels:
+        return
+    choose(kernels, device)
+    missing: list[tuple[Any, int | None]] = [
+        (kernel.module, None) for kernel in kernels if not _is_cached(kernel.module, None, device)
+    ]
+    ahead.begin([module for module, _ in _longest_first(missing)], device)
+
+
 def load_at_once(kernel: wp.Kernel, device: Any) -> None:
     """Compile a kernel that runs while a pipeline is built, unless it is in the cache, and load it.
 
@@ -114,8 +134,12 @@ def _compile(variants: list[tuple[Any, int | None]], device: Any, progress: Prog
     while _AHEAD:
         _AHEAD.pop().join()
     headers = _Headers({_flags(module) for module, _ in variants}) if device.is_cpu else None
-    compilers = Compilers(0 if device.is_cpu else count_processes(len(variants), cores))
-
+    total = len(variants)
+    begun = {variant: job for variant in variants if variant[1] is None and (job := ahead.take(variant[0])) is not None}
+    variants = [variant for variant in variants if variant not in begun]
+    free = max(cores - len(begun), 1)
+    processes = 0 if device.is_cpu else count_processes(len(variants), free)
+    compilers = Compilers(processes, max(HERE - len(begun), 0))
     variants = _by_flags(variants) if device.is_cpu else _longest_first(variants)
 
     def work(module: Any, size: int | None) -> None:
@@ -128,14 +152,15 @@ def _compile(variants: list[tuple[Any, int | None]], device: Any, progress: Prog
                 _compile_blocks(module, device, size)
 
     if progress is not None:
-        progress(0, len(variants))
+        progress(0, total)
     try:
-        with ThreadPoolExecutor(min(cores, len(variants)), "warp_ar-compile") as pool:
+        with ThreadPoolExecutor(max(min(free, len(variants)), 1), "warp_ar-compile") as pool:
             try:
-                for done, job in enumerate(as_completed([pool.submit(work, *variant) for variant in variants]), 1):
+                jobs = [*begun.values(), *(pool.submit(work, *variant) for variant in variants)]
+                for done, job in enumerate(as_completed(jobs), 1):
                     job.result()
                     if progress is not None:
-                        progress(done, len(variants))
+                        progress(done, total)
             except BaseException:
                 pool.shutdown(wait=False, cancel_futures=True)  # who interrupts this does not wait for all the others
                 raise

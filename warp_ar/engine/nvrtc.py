@@ -43,6 +43,27 @@ def compile_beside() -> None:
     _ENABLED.set()
 
 
+def compiles_beside() -> bool:
+    """Whether this process is a command's, which has modules compiled beside what it does."""
+    return _ENABLED.is_set()
+
+
+@contextlib.contextmanager
+def telling_when_translated(translated: threading.Event) -> Iterator[None]:
+    """Around what a thread has Warp compile for CUDA: the event is set when NVRTC's part begins.
+
+    Args:
+        translated: Another thread may translate from then on. It is set in any case, after an error too.
+    """
+    _hand_over()
+    _THREAD.translated = translated
+    try:
+        yield
+    finally:
+        _THREAD.translated = None
+        translated.set()
+
+
 def count_processes(modules: int, cores: int) -> int:
     """Processes to compile so many modules with, beside threads of this one.
 
@@ -59,13 +80,14 @@ def count_processes(modules: int, cores: int) -> int:
 class Compilers:
     """The processes, each started by the thread that uses it."""
 
-    def __init__(self, count: int) -> None:
+    def __init__(self, count: int, here: int = HERE) -> None:
         """Start none as yet.
 
         Args:
             count: Processes at most.
+            here: Threads that compile in this process, at least.
         """
-        self._left = count
+        self._left, self._most_here = count, here
         self._lock = threading.Lock()
         self._processes: list[subprocess.Popen[str]] = []
         self._here = 0
@@ -82,7 +104,7 @@ class Compilers:
 
     def _start(self) -> subprocess.Popen[str] | None:
         with self._lock:
-            if self._here < HERE or not self._left:
+            if self._here < self._most_here or not self._left:
                 self._here += 1
                 return None
             self._left -= 1
@@ -119,7 +141,7 @@ class Compilers:
 
 
 def _hand_over() -> None:
-    """Have Warp ask the thread's process, where it has one, before it compiles by itself."""
+    """Have Warp tell the thread's event and ask its process, where it has one, before it compiles by itself."""
     builder: Any = getattr(getattr(wp, "_src", None), "build", None)
     build = getattr(builder, "build_cuda", None)
     with _OWN:
@@ -138,6 +160,9 @@ def _hand_over() -> None:
             **options: Any,
         ) -> None:
             process = getattr(_THREAD, "process", None)
+            translated = getattr(_THREAD, "translated", None)
+            if translated is not None:
+                translated.set()
             job = {"source": cu_path, "arch": arch, "target": output_path, "options": options}
             if process is None or ltoirs or fatbins or not _ask(process, job):
                 if process is not None and _THREAD.owner.closed:

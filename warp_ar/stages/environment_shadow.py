@@ -79,6 +79,28 @@ def find_stride(method: Method, rows: int) -> int:
     return int(cell_stride(method.stride, rows, slowly=True))
 
 
+def shadow_cells(features: Features) -> tuple[int, int]:
+    """Rows and columns of cells, one estimate each."""
+    size, method = features.request.size, METHODS[EnvironmentShadow.method_for(features)]
+    rows, columns = cell_shape(size, find_stride(method, size[1]))
+    return rows, columns
+
+
+def shadow_config(features: Features, device: Any) -> EnvironmentShadowConfig:
+    """What the kernels are compiled for."""
+    method = METHODS[EnvironmentShadow.method_for(features)]
+    partials = 1 if device.is_cpu else count_partials(*shadow_cells(features))
+    return EnvironmentShadowConfig(
+        distant_variant(features, device),
+        method.count * (sample_slots(features) if lists_texels(features) else 1),
+        method.side,
+        method.bounce,
+        method.secondary,
+        features.emitters,
+        partials,
+    )
+
+
 class EnvironmentShadow(Stage):
     """A factor on the frame: the environment with the virtual objects over that without them."""
 
@@ -135,10 +157,18 @@ class EnvironmentShadow(Stage):
         """Far from objects the environment is as it was."""
         return None if reach.shadows else "no virtual object is near anything in the picture"
 
+    @classmethod
+    def slowest_kernels(cls, features: Features, device: Any) -> tuple[Any, ...]:
+        """The one that follows what objects send."""
+        config = shadow_config(features, device)
+        if device.is_cpu or not wavefront.takes_wavefront(config, *shadow_cells(features)):
+            return (environment_shadow.make_environment_shadow_kernel(config),)
+        return (wavefront.make_trace_secondary_kernel(config),)
+
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The ratio, and the estimates that it is averaged from."""
         width, height = self.request.size
-        cells = cell_shape(self.request.size, find_stride(METHODS[self.method], height))
+        cells = shadow_cells(self.features)
         specs = {
             "shadow_ratio": ArraySpec((height, width), wp.vec3, wp.vec3(1.0, 1.0, 1.0)),
             "environment_shadow_ratio": ArraySpec(cells, wp.vec4),
@@ -152,7 +182,7 @@ class EnvironmentShadow(Stage):
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Estimates, then their mean."""
-        config = self._config(arrays, device)
+        config = shadow_config(self.features, device)
         wave = None if device.is_cpu else wavefront.make_wavefront(config, *arrays[f"{self.name}_ratio"].shape, device)
         if wave is None:
             environment_shadow.make_environment_shadow_kernel(config)
@@ -214,20 +244,6 @@ class EnvironmentShadow(Stage):
             Pass(launcher(wavefront.trace_secondary), beside_last=True),
             Pass(launcher(wavefront.reduce_partials)),
         ]
-
-    def _config(self, arrays: Arrays, device: Any) -> EnvironmentShadowConfig:
-        """What the kernels are compiled for."""
-        method = METHODS[self.method]
-        partials = 1 if device.is_cpu else count_partials(*arrays["environment_shadow_ratio"].shape)
-        return EnvironmentShadowConfig(
-            distant_variant(self.features, device),
-            method.count * (sample_slots(self.features) if lists_texels(self.features) else 1),
-            method.side,
-            method.bounce,
-            method.secondary,
-            self.features.emitters,
-            partials,
-        )
 
     def _cells(self, arrays: Arrays) -> ShadowCells:
         """The stage's own arrays as its kernels read and write them."""

@@ -72,6 +72,28 @@ def lobe_widths(material: MeshMaterial) -> tuple[float, float]:
     return 0.0, 0.0
 
 
+def near_field_config(features: Features, device: Any) -> near_field.NearFieldConfig:
+    """What the kernels are compiled for."""
+    layers = features.layers
+    rays = RAYS[features.near_field]
+    materials = scene_materials(features.request.scene)
+    widths = [width for item in materials if reflects_glossily(item) for width in lobe_widths(item)]
+    sharp = [width < SHARP_ALPHA for width in widths]
+    # The forms themselves stay the scene's: they are what the kernel writes.
+    forms, variant = features.distant, distant_variant(features, device)
+    return near_field.NearFieldConfig(
+        dataclasses.replace(variant, diffuse=forms.diffuse, specular=forms.specular),
+        rays.samples,
+        0 if all(sharp) else rays.lobe,
+        rays.mirror if any(sharp) else 0,
+        SIDE,
+        "shadow_ratio" in layers,
+        "added_light" in layers,
+        # Of several balls each has a part of the samples only: they say what differs.
+        rays.known or features.others > 0,
+    )
+
+
 class NearField(Stage):
     """Light that reaches objects past each other, and what they mirror of the receiver and of each other."""
 
@@ -104,6 +126,11 @@ class NearField(Stage):
         """Without an object in the picture nothing shows its surroundings."""
         return None if reach.objects else OUT_OF_PICTURE
 
+    @classmethod
+    def slowest_kernels(cls, features: Features, device: Any) -> tuple[Any, ...]:
+        """The one that estimates."""
+        return (near_field.make_near_field_kernel(near_field_config(features, device)),)
+
     def arrays(self) -> Mapping[str, ArraySpec]:
         """Irradiance and what is mirrored, before and after averaging."""
         width, height = self.request.size
@@ -119,7 +146,7 @@ class NearField(Stage):
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Estimates, then their mean."""
-        config = self._config(device)
+        config = near_field_config(self.features, device)
         near_field.make_near_field_kernel(config)
         near_field.make_filter_kernel(config)
         params, scene, visible = arrays["params"], arrays["ray_scene"], find_visible(arrays)
@@ -166,24 +193,3 @@ class NearField(Stage):
 
         further = [functools.partial(shrink_further, level=level) for level in range(3, frame_levels.LAST_LEVEL + 1)]
         return [Pass(shrink, rows=frame_levels.level_size(height, width, 2)[0]), *(Pass(one) for one in further)]
-
-    def _config(self, device: Any) -> near_field.NearFieldConfig:
-        """What the kernels are compiled for."""
-        layers = self.features.layers
-        rays = RAYS[self.features.near_field]
-        materials = scene_materials(self.request.scene)
-        widths = [width for item in materials if reflects_glossily(item) for width in lobe_widths(item)]
-        sharp = [width < SHARP_ALPHA for width in widths]
-        # The forms themselves stay the scene's: they are what the kernel writes.
-        forms, variant = self.features.distant, distant_variant(self.features, device)
-        return near_field.NearFieldConfig(
-            dataclasses.replace(variant, diffuse=forms.diffuse, specular=forms.specular),
-            rays.samples,
-            0 if all(sharp) else rays.lobe,
-            rays.mirror if any(sharp) else 0,
-            SIDE,
-            "shadow_ratio" in layers,
-            "added_light" in layers,
-            # Of several balls each has a part of the samples only: they say what differs.
-            rays.known or self.features.others > 0,
-        )
