@@ -108,6 +108,7 @@ BETWEEN: Mapping[str, Mapping[str, tuple[str, str, float]]] = {
         "bounce3": ("none", "bounce", 4 / 9),
         "bounce64": ("none", "bounce", 1.15),
         "bounce128": ("none", "bounce", 2.3),
+        "bounce192": ("none", "bounce", 3.45),
         "bounce256": ("none", "bounce", 4.6),
     },
     "shade": {"few_rays": ("environment", "one_bounce", 1 / 2)},

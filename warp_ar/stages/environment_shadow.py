@@ -64,6 +64,7 @@ class EnvironmentShadow(Stage):
         "bounce": "64 rays, every second pixel, and reflected light by a ray for half of them",
         "bounce64": "the same, and reflected light by a ray for each of them",
         "bounce128": "the same with 128 rays",
+        "bounce192": "the same with 192 rays",
         "bounce256": "the same with 256 rays",
         "brute_force": "every texel of the environment at every pixel",
     }

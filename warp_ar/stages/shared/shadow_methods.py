@@ -36,6 +36,7 @@ METHODS: Mapping[str, Method] = {
     "bounce": Method(64, 4, 2, "traced", 0.5),
     "bounce64": Method(64, 4, 2, "traced"),
     "bounce128": Method(128, 4, 2, "traced"),
+    "bounce192": Method(192, 4, 2, "traced"),
     "bounce256": Method(256, 4, 2, "traced"),
     "brute_force": Method(REFERENCE_SIZE[0] * REFERENCE_SIZE[1], 1, 1, "traced"),
 }
