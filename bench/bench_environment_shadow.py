@@ -11,8 +11,8 @@ from bench.common import measure, report
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.input.sources import open_source
 from warp_ar.scene import load_scene
-from warp_ar.stages.environment_shadow import METHODS
 from warp_ar.stages.quality import PRESETS
+from warp_ar.stages.shared.shadow_methods import METHODS
 
 CASES = tuple((scene, method) for scene in ("torus", "mirror") for method in METHODS if method != "brute_force")
 

@@ -114,12 +114,18 @@ def make_environment_shadow_kernel(config: EnvironmentShadowConfig) -> wp.Kernel
         before = Before()
         # A set is in the order of its sequence: any first part of it is a smaller set.
         first = first_of_set(i, j, side, sets.samples.shape[0])
-        for block in range(wp.static(config.count // chunk)):
+        virtual_mask = mask_objects(scene, sets, first, point)
+        hides_any = virtual_mask != wp.uint64(0)
+        blocks = wp.int32(wp.static(config.count // chunk))  # a variable: not to be unrolled
+        for block in range(1, blocks):
+            if not hides_any:
+                hides_any = mask_objects(scene, sets, first + block * wp.static(chunk), point) != wp.uint64(0)
+        if not hides_any:
+            return
+        for block in range(blocks):
             at = first + block * wp.static(chunk)
-            virtual_mask = mask_objects(scene, sets, at, point)
-            if wp.static(config.count == chunk):
-                if virtual_mask == wp.uint64(0):
-                    return
+            if block > 0:
+                virtual_mask = mask_objects(scene, sets, at, point)
             physical = mask_physical(scene, distant, sets, at, point, own)
             # Most samples meet nothing: they are but a sum.
             met = virtual_mask | physical.proxies | physical.balls

@@ -106,11 +106,15 @@ BETWEEN: Mapping[str, Mapping[str, tuple[str, str, float]]] = {
         "bounce5": ("none", "bounce", 4 / 25),
         "bounce4": ("none", "bounce", 4 / 16),
         "bounce3": ("none", "bounce", 4 / 9),
+        "bounce64": ("none", "bounce", 1.15),
+        "bounce128": ("none", "bounce", 2.3),
+        "bounce192": ("none", "bounce", 3.45),
+        "bounce256": ("none", "bounce", 4.6),
     },
     "shade": {"few_rays": ("environment", "one_bounce", 1 / 2)},
 }
 """Methods that do the same work as another one more or less often: by setting and method two others, and the share of
-the way from the first to the second at which the method's work lies."""
+the way from the first to the second at which the method's work lies; above 1 it lies beyond the second."""
 WORDS: Mapping[str, tuple[str, Mapping[str, str]]] = {
     **_SHARED,
     **{stage.name: (stage.subject, stage.methods) for stage in _CHOICES},
@@ -280,7 +284,7 @@ def read_errors(cost_table: Mapping[str, Any]) -> dict[str, dict[str, float]]:
         for method in setting.methods:
             if method in between and method not in own and {between[method][0], between[method][1]} <= own.keys():
                 low, high, share = between[method]
-                found[method] = own[low] + (1.0 - (1.0 - share) ** 2) * (own[high] - own[low])
+                found[method] = own[low] + (1.0 - (1.0 - min(share, 1.0)) ** 2) * (own[high] - own[low])
                 continue
             last = own.get(method, last)
             if not isinstance(last, (int, float)) or not math.isfinite(last) or last < 0.0:

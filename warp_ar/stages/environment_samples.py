@@ -11,14 +11,9 @@ from warp_ar.kernels import environment_samples, pyramid
 from warp_ar.kernels.environment_samples import EnvironmentSample
 from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
-from warp_ar.stages.shared.environment_sets import (
-    REFERENCE_SIZE,
-    SAMPLES,
-    lists_texels,
-    sample_names,
-    sample_slots,
-)
+from warp_ar.stages.shared.environment_sets import lists_texels, sample_count, sample_names, sample_slots
 from warp_ar.stages.shared.settled import settled_environment
+from warp_ar.stages.shared.shadow_methods import REFERENCE_SIZE
 
 
 class EnvironmentSamples(Stage):
@@ -49,10 +44,11 @@ class EnvironmentSamples(Stage):
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The samples, and the sums that are inverted to draw them; for the reference a small map's texels as well."""
         height = self.request.quality.environment_height
+        count = sample_count(self.features)
         specs = {
-            "environment_samples": ArraySpec((SAMPLES,), EnvironmentSample, EnvironmentSample()),
-            "environment_samples_directions": ArraySpec((SAMPLES,), wp.vec3),
-            "environment_samples_flux": ArraySpec((SAMPLES,), wp.vec3),
+            "environment_samples": ArraySpec((count,), EnvironmentSample, EnvironmentSample()),
+            "environment_samples_directions": ArraySpec((count,), wp.vec3),
+            "environment_samples_flux": ArraySpec((count,), wp.vec3),
             "environment_samples_cumulative": ArraySpec((height, 2 * height), wp.float32),
             "environment_samples_rows": ArraySpec((height,), wp.vec2),
         }

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import warp as wp
 
@@ -35,40 +34,11 @@ from warp_ar.stages.shared.distant_light import (
     make_distant_light,
     make_other_balls,
 )
-from warp_ar.stages.shared.environment_sets import REFERENCE_SIZE, lists_texels, sample_names, sample_slots
+from warp_ar.stages.shared.environment_sets import lists_texels, sample_names, sample_slots
 from warp_ar.stages.shared.picture import find_picture, frame_reads
 from warp_ar.stages.shared.rows import GrowingRows
+from warp_ar.stages.shared.shadow_methods import METHODS, Method
 from warp_ar.stages.shared.variants import distant_variant
-
-
-@dataclasses.dataclass(frozen=True)
-class Method:
-    """How many rays, for how many pixels."""
-
-    count: int
-    """Samples of the environment per estimate."""
-    side: int
-    """Estimates along a tile."""
-    stride: int
-    """Pixels from one estimate to the next in frames of ``STRIDE_ROWS`` rows."""
-    bounce: Literal["estimated", "traced"]
-    """How what objects reflect onto the receiver is found."""
-    secondary: float = 1.0
-    """Share of the rays that look for it: light that takes rays to find is smooth, and half of them find it."""
-
-
-METHODS: Mapping[str, Method] = {
-    "coarse8": Method(32, 4, 8, "estimated"),
-    "coarse6": Method(32, 4, 6, "estimated"),
-    "coarse": Method(32, 4, 5, "estimated"),
-    "bounce5": Method(64, 4, 5, "traced", 0.5),
-    "bounce4": Method(64, 4, 4, "traced", 0.5),
-    "bounce3": Method(64, 4, 3, "traced", 0.5),
-    "bounce": Method(64, 4, 2, "traced", 0.5),
-    "brute_force": Method(REFERENCE_SIZE[0] * REFERENCE_SIZE[1], 1, 1, "traced"),
-}
-"""Cheapest first, after ``none``."""
-
 
 DRAWN = ("pose", "objects", "environment_samples", "probe_places")
 """What says where the samples are and what hides them."""
@@ -114,6 +84,10 @@ class EnvironmentShadow(Stage):
         "bounce4": "64 rays, every fourth pixel, and reflected light by a ray for half of them",
         "bounce3": "64 rays, every third pixel, and reflected light by a ray for half of them",
         "bounce": "64 rays, every second pixel, and reflected light by a ray for half of them",
+        "bounce64": "the same, and reflected light by a ray for each of them",
+        "bounce128": "the same with 128 rays",
+        "bounce192": "the same with 192 rays",
+        "bounce256": "the same with 256 rays",
         "brute_force": "every texel of the environment at every pixel",
     }
     summary: ClassVar[str] = "shadows of virtual objects on the receiver under the environment"

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from warp_ar.stages.features import Features
+from warp_ar.stages.shared.shadow_methods import METHODS
 
 SAMPLES = 1024
-"""Of all sets together: what an 8-bit picture of their mean can tell apart, four times over."""
-REFERENCE_SIZE = (32, 64)
-"""Texels of the map that the reference sums over."""
+"""Of all sets together, at least: what an 8-bit picture of their mean can tell apart, four times over."""
 
 
 def lists_texels(features: Features) -> bool:
     """Whether the reference asks for every texel of the environment, beside the samples that follow its light."""
     return features.request.quality.method("environment_shadow") == "brute_force"
+
+
+def sample_count(features: Features) -> int:
+    """Samples of all sets together: as many as one tile of shadows asks for."""
+    method = METHODS.get(features.request.quality.method("environment_shadow"))
+    return SAMPLES if method is None or lists_texels(features) else max(SAMPLES, method.count * method.side**2)
 
 
 def sample_slots(features: Features) -> int:
