@@ -119,17 +119,21 @@ def test_an_emitter_stands_where_its_cost_is_least(start, least):
             tried.append(candidate.distance)
             return SimpleNamespace(cost=50.0 * np.log(candidate.distance / least) ** 2)
 
-    cost = 50.0 * np.log(start / least) ** 2
-    place = Search()._at_its_distance(Candidate(7, start), cost, SimpleNamespace(z=None), 1e-6)
+    def place_from(distance, worth):
+        place = Candidate(7, distance)
+        return Search()._at_its_distance(place, Search().cost_at(place, None), SimpleNamespace(z=None), worth)
+
+    place = place_from(start, 1e-6)
     assert place.cell == 7
     assert min(tried) > CONFIG.search.nearest
+    # 50 log(d / least)^2 - 6 log d: there is more room farther off.
     if least > CONFIG.search.nearest:
-        assert place.distance == pytest.approx(least, rel=1e-3)
-    assert len(tried) < 10
+        assert place.distance == pytest.approx(least * np.exp(6.0 / 100.0), rel=1e-3)
+    assert len(tried) < 12
     distant = Candidate(7, np.inf)
-    assert Search()._at_its_distance(distant, cost, SimpleNamespace(z=None), 0.01) is distant
+    assert Search()._at_its_distance(distant, 0.0, SimpleNamespace(z=None), 0.01) is distant
     # What gains no more than is asked for stays where it is.
-    assert Search()._at_its_distance(Candidate(7, start), cost, SimpleNamespace(z=None), 1e3) == Candidate(7, start)
+    assert place_from(start, 1e3) == Candidate(7, start)
 
 
 def test_an_emitter_is_where_the_ball_mirrors_it_to_the_camera(device, scene):

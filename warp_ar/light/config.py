@@ -121,6 +121,8 @@ class SearchConfig:
     nearest: float = 0.25
     """Metres from the ball within which no emitter is looked for: it would stand in the picture, in front of the
     desk."""
+    farthest: float = 3.0
+    """Metres beyond which an emitter is taken for a distant one, in how much room there is for it."""
     angle: float = 0.12
     """Radians around a candidate's direction that share its light."""
     radius_share: float = 0.06

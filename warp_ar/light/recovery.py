@@ -180,7 +180,7 @@ class Recovery:
             return self._held
         means = np.maximum(means, 0.05)
         best = choose_channel(problem)
-        is_turn = self._search(problem, best, means[best])
+        is_turn = self._search(problem, means)
         solution = tie_channels(problem, _solve_channels(problem, best, means, bounds))
         doubt = doubt_of(card.contrast)
         recovered, powers = held_to_card(problem, solution, by_card, problem.card_cosines(), doubt)
@@ -229,7 +229,7 @@ class Recovery:
         nothing = np.zeros((len(problem.solid_angle), 3))
         return self._estimate(problem, nothing, (True, True, True), "clipped", 0.0, card)
 
-    def _search(self, problem: Problem, best: int, mean: float) -> bool:
+    def _search(self, problem: Problem, means: Array) -> bool:
         """Try candidates of former frames, one of them moved, and new ones where it is their turn to be looked for.
 
         Returns:
@@ -239,17 +239,17 @@ class Recovery:
         for candidate in self._candidates:
             if problem.may_hold_candidate[candidate.cell]:
                 problem.push(candidate)
-        search = EmitterSearch(problem, best)
+        search = EmitterSearch(problem, means)
         before = self._solved - 1
         settled = before >= CONFIG.solver.settled
         if before and problem.candidates and (not settled or before % 2 == 0):
-            search.move_candidate(mean)
-        start, left = problem.start(mean), config.most - len(problem.candidates)
+            search.move_candidate()
+        left = config.most - len(problem.candidates)
         if before == 0:
-            search.find_candidates(start, left)
+            search.find_candidates(left)
         elif before % (config.later_every if settled else config.every) == 1:
             candidates = config.candidates if before < config.first else config.later_candidates
-            search.find_candidates(start, min(left, 1), places=candidates, turn=before // config.every)
+            search.find_candidates(min(left, 1), places=candidates, turn=before // config.every)
         else:
             return False
         return True
