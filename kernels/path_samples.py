@@ -31,6 +31,7 @@ class Round:
     e: wp.array[wp.vec3]
     shows: wp.array[wp.float32]
     rays: wp.array[wp.int32]  # that were traced for it
+    taken: wp.array[wp.int32]  # (1) how many threads have taken; empty on CPU, where each thread has one of its own
 
 
 # A pass adds ``share`` samples to a pixel: after n passes it has floor(n share + u), u its own number from 0 to 1. So
@@ -99,6 +100,7 @@ def make_round(shape: tuple[int, int], device: wp.DeviceLike) -> Round:
     made = Round()
     made.counts = wp.zeros(shape[0] * shape[1], dtype=wp.int32, device=device)
     made.ends = wp.zeros(shape[0] * shape[1], dtype=wp.int32, device=device)
+    made.taken = wp.zeros(0 if made.counts.device.is_cpu else 1, dtype=wp.int32, device=device)
     _make_room(made, 1)
     return made
 
