@@ -19,7 +19,7 @@ import functools
 import warp as wp
 
 from warp_ar.kernels.materials import Surface
-from warp_ar.kernels.path_guides import draw_guide, guide_count, guide_density
+from warp_ar.kernels.path_guides import draw_guide, guide_count, guide_density, guided_bin
 from warp_ar.kernels.path_sampling import (
     NO_DENSITY,
     STREAMS,
@@ -88,6 +88,7 @@ class PathState:
     depth: wp.int32
     changes_only: wp.bool  # whether it carries the difference that virtual content makes
     without: wp.bool  # whether it meets no virtual content
+    tile: wp.int32  # of the frame, by what was learned for which the next direction is drawn; or -1
 
 
 @wp.struct
@@ -106,6 +107,9 @@ class PathPair:
     radiance: wp.vec3  # that it brings to the camera, or the difference that virtual content makes
     light: wp.vec3  # what the white surface would send without virtual content
     rays: wp.int32  # that were traced for it
+    guided: wp.int32  # bin of ``path_guides`` in which its first direction lies, or -1
+    drawn: wp.float32  # density of that direction
+    straight: wp.vec3  # ``radiance`` that does not come from there
 
 
 @wp.struct
@@ -139,7 +143,7 @@ def next_density(
     chance = guided_chance(scene, surface, path)
     density = (1.0 - chance) * surface_density(surface, hit.normal, wo, wi)
     if chance > 0.0:
-        density += chance * guide_density(scene.guides, scene.sky, hit.point, wi, path.changes_only)
+        density += chance * guide_density(scene.guides, scene.sky, hit.point, wi, path.changes_only, path.tile)
     return density
 
 
@@ -150,7 +154,9 @@ def draw_next(scene: LocalScene, hit: Hit, surface: Surface, wo: wp.vec3, path: 
     pick = random_triple(key, path.depth, PICK)
     chance = guided_chance(scene, surface, path)
     if pick[2] < chance:
-        return draw_guide(scene.guides, scene.sky, hit.point, pick[2] / chance, wp.vec2(u[0], u[1]), path.changes_only)
+        return draw_guide(
+            scene.guides, scene.sky, hit.point, pick[2] / chance, wp.vec2(u[0], u[1]), path.changes_only, path.tile
+        )
     return draw_reflected(surface, hit.normal, hit.geometric_normal, wo, pick[0], wp.vec2(u[0], u[1]))
 
 
@@ -222,6 +228,7 @@ def extend_path(
     following.direction = wi
     following.density = density
     following.depth += 1
+    following.tile = -1
     return following
 
 
@@ -450,6 +457,9 @@ def make_visit(trace: TraceConfig) -> wp.Function:
             surface = look_up_material(scene, facing, wo, reflectance)
         out = scatter(scene, facing.hit, surface, out, key)
         if is_white and out.next == RAY:
+            out.guided = guided_bin(scene.guides, facing.hit.point, out.path.direction)
+            out.drawn = out.path.density
+            out.straight = out.radiance
             out = begin_without(out)
         return out
 

@@ -16,6 +16,7 @@ import warp as wp
 
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
 from warp_ar.kernels.path_following import ENDED, SURFACE, PathPair, end_without, make_visit, meet
+from warp_ar.kernels.path_learning import tile_of
 from warp_ar.kernels.path_samples import Round
 from warp_ar.kernels.path_sampling import NO_DENSITY, PathKey, sky_radiance
 from warp_ar.kernels.path_vertices import (
@@ -77,6 +78,8 @@ def begin_path(origin: wp.vec3, direction: wp.vec3, asked: wp.int32, lobe: wp.bo
     pair.path.origin = origin
     pair.path.direction = direction
     pair.path.density = NO_DENSITY
+    pair.path.tile = -1
+    pair.guided = -1
     pair.lobe = lobe
     pair.only_light = asked == wp.static(IRRADIANCE)
     return pair
@@ -103,6 +106,8 @@ def see(
         if vertex.kind == PROXY and not is_turned(vertex, pair.path.direction):
             out.white = True
             out.glossy = is_glossy(scene, vertex)
+            if scene.guides.learned.shape[0] > 0:
+                out.path.tile = tile_of(samples_out.pixels[k], scene.radiance.shape[1])
             out.next = SURFACE
         elif vertex.kind == BALL and not pair.only_light:
             out.next = SURFACE
@@ -112,6 +117,7 @@ def see(
         samples_out.e[k] = wp.vec3(0.0, 0.0, 0.0)
         samples_out.shows[k] = wp.where(out.white, 1.0, 0.0)
         samples_out.rays[k] = 0
+        samples_out.bins[k] = -1
     return out
 
 
@@ -126,6 +132,11 @@ def write_sample(pair: PathPair, k: wp.int32, samples_out: Round):
     else:
         samples_out.g[k] = pair.radiance
         samples_out.e[k] = pair.light
+        samples_out.bins[k] = pair.guided
+        if pair.guided >= 0:
+            found = wp.abs(pair.radiance - pair.straight)
+            mean = (found[0] + found[1] + found[2]) / 3.0
+            samples_out.squares[k] = mean * mean * pair.drawn
 
 
 # Paths differ in length: of 32 samples side by side the longest has twice as many rays as they have in the mean. So a

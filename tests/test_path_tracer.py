@@ -351,22 +351,30 @@ def test_pixels_have_their_share_by_the_noise_around_them() -> None:
     error = np.full((60, 60, 3), 0.01, np.float32)
     error[:, 30:] = 0.04
     samples = np.full((60, 60), 16, np.int32)
-    shares = path_tracer.sample_shares(picture, error, samples)
+    proxies = np.ones((60, 60), np.float32)
+    shares = path_tracer.sample_shares(picture, error, samples, proxies)
     assert shares.mean() == pytest.approx(1.0, abs=1e-5)
     assert shares[30, 50] == pytest.approx(4.0 * shares[30, 10], rel=1e-5)
     one = error.copy()
     one[20, 10] = 0.5
-    others = path_tracer.sample_shares(picture, one, samples)
+    others = path_tracer.sample_shares(picture, one, samples, proxies)
     assert others[20, 11] > 2.0 * others[20, 20]
     assert others[20, 10] / others[20, 20] == pytest.approx(1.0, rel=1e-5)
+    # What lies beside it and shows another kind of surface has no say either.
+    edge = proxies.copy()
+    edge[:, 30:] = 0.0
+    parted = path_tracer.sample_shares(picture, error, samples, edge)
+    assert len(np.unique(parted[:, :30])) == len(np.unique(parted[:, 30:])) == 1
+    assert parted[0, 30] == pytest.approx(4.0 * parted[0, 29], rel=1e-5)
+    assert shares[30, 29] > 2.0 * shares[30, 10]
     # An error of twice as many samples is one of a greater variance; noise of what surely clips is none.
     samples[:, 30:] *= 2
-    more = path_tracer.sample_shares(picture, error, samples)
+    more = path_tracer.sample_shares(picture, error, samples, proxies)
     assert more[30, 50] == pytest.approx(4.0 * math.sqrt(2.0) * more[30, 10], rel=1e-5)
     picture[:, 30:] = 2.0
-    clipped = path_tracer.sample_shares(picture, error, samples)
+    clipped = path_tracer.sample_shares(picture, error, samples, proxies)
     assert clipped[30, 50] == clipped.min() > 0.1
-    assert (path_tracer.sample_shares(picture, np.zeros_like(error), samples) == 1.0).all()
+    assert (path_tracer.sample_shares(picture, np.zeros_like(error), samples, proxies) == 1.0).all()
 
 
 @pytest.mark.parametrize("known", [False, True], ids=["whole", "difference"])
