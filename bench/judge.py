@@ -1,6 +1,7 @@
 """What a quality loses against path tracing in the same light, and what both lose against the truth.
 
-    python -m bench.judge SCENE ... [--quality high,medium] [--frame N] [--samples N] [--width N] [--light FILE]
+    python -m bench.judge SCENE ... [--quality high,medium] [--frame N] [--samples N] [--error E] [--width N]
+        [--light FILE]
 
 SCENE is a bundled scene, or the scene file of a case of truth (``scene_VERSION.toml`` beside ``VERSION/NNNN.png``). The
 frames up to N run through the pipeline; its picture of that frame, averaged down, is compared with the reference that
@@ -12,6 +13,7 @@ follows paths in the light that the pipeline had. One JSON line per scene and qu
   flip_*     nothing and lost as mean FLIP; flip_half between two halves of the reference's samples: its noise
   truth_*    kept of the difference to the truth, by the pipeline and by the reference; ``truth_flip_*`` the same as
              mean FLIP where the truth differs from the camera's frame
+  taken      samples of the reference: those that were asked for, or fewer where ``--error`` ended them
   unsure     share of those blocks that are left out: noise of the reference may or may not clip there
 
 Differences are those of means over blocks of BLOCK x BLOCK pixels in linear light, encoded. Noise of the reference is
@@ -24,6 +26,7 @@ means are too dark, and such blocks do not judge.
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from pathlib import Path
 from typing import Any
@@ -35,13 +38,15 @@ import numpy.typing as npt
 from bench.common import KeptLines, commit
 from warp_ar.accuracy.known_frame import KnownFrame, light_up_to
 from warp_ar.accuracy.metrics import changed_region, flip_map
-from warp_ar.accuracy.path_tracer import TracedPicture
+from warp_ar.accuracy.path_tracer import PathTracer, TracedPicture
 from warp_ar.kernels.color import decode_table
 from warp_ar.scene import Scene, load_scene
 from warp_ar.session import with_light
 
 Image = npt.NDArray[np.uint8]
 
+STEPS = 64
+"""After a part in so many of the samples their error is looked at."""
 BLOCK = 3
 """Pixels to each side of a block."""
 CHANGED = 2.0
@@ -97,8 +102,17 @@ def unsure_blocks(halves: list[TracedPicture]) -> npt.NDArray[np.bool_]:
     return cut.reshape(rows, BLOCK, columns, BLOCK).any(axis=(1, 3))
 
 
-def judge(known: KnownFrame, truth: Image | None, width: int | None, samples: int, device: str) -> dict[str, Any]:
-    """Errors of one quality on one scene."""
+def render_half(tracer: PathTracer, samples: int, error: float | None) -> TracedPicture:
+    """One of two pictures whose mean has so many samples, or fewer where its relative standard error is ``error``."""
+    of_half = None if error is None else error * math.sqrt(2.0)
+    *_, picture = tracer.render(max(samples // 2, 1), error=of_half, step=max(samples // STEPS, 16))
+    return picture
+
+
+def judge(
+    known: KnownFrame, truth: Image | None, width: int | None, samples: int, device: str, error: float | None = None
+) -> dict[str, Any]:
+    """Errors of one quality on one scene, by samples until their relative standard error is ``error``."""
     camera = known.scene.camera
     width = camera.width if width is None else width
     size = (width, width * camera.height // camera.width)
@@ -106,8 +120,7 @@ def judge(known: KnownFrame, truth: Image | None, width: int | None, samples: in
     halves = []
     for seed in (0, 1):
         tracer = known.tracer(device=device, size=size, seed=seed)
-        tracer.sample(samples // 2)
-        halves.append(tracer.picture())
+        halves.append(render_half(tracer, samples, error))
     linear = 0.5 * (halves[0].radiance + halves[1].radiance)
     reference = encoded(linear, known)
     region = changed_region(frame, reference)
@@ -128,6 +141,7 @@ def judge(known: KnownFrame, truth: Image | None, width: int | None, samples: in
         "flip_lost": round(lost, 4),
         "flip_half": round(float(flip_map(halves[0].image, halves[1].image)[region].mean()), 4),
         "unsure": round(left_out, 4),
+        "taken": sum(half.samples for half in halves),
         "seconds": round(sum(half.seconds for half in halves), 1),
         "pipeline_ms": round(known.milliseconds, 1),
     }
@@ -162,6 +176,7 @@ def main() -> int:
     parser.add_argument("--quality", default="high,medium", help="several are separated by commas")
     parser.add_argument("--frame", type=int, default=6)
     parser.add_argument("--samples", type=int, default=512)
+    parser.add_argument("--error", type=float, help="relative standard error at which samples end (default: none)")
     parser.add_argument("--width", type=int, help="of the pictures that are compared (default: the camera's)")
     parser.add_argument("--light", help="captured light instead of the ball's")
     parser.add_argument("--device", default="auto")
@@ -171,7 +186,7 @@ def main() -> int:
     for name in options.scenes:
         scene = load_scene(Path(name) if "/" in name else name)
         key = {"scene": "/".join(Path(name).parts[-2:]), "frame": options.frame, "samples": options.samples}
-        key |= {"width": options.width, "light": "given" if options.light else "own"}
+        key |= {"until": options.error, "width": options.width, "light": "given" if options.light else "own"}
         if options.light is not None:
             scene = with_light(scene, options.light)
         for quality in options.quality.split(","):
@@ -179,7 +194,7 @@ def main() -> int:
                 continue
             known = light_up_to(scene, options.frame, quality=quality, device=options.device)
             truth = truth_of(scene, options.frame)
-            row = judge(known, truth, options.width, options.samples, options.device)
+            row = judge(known, truth, options.width, options.samples, options.device, options.error)
             lines.add({**key, "quality": quality, **row, "commit": commit()})
     return 0
 

@@ -1,14 +1,16 @@
 """Cases of truth by path tracing in their true light: what is left when light, pose and transport are right.
 
-    python -m bench.truth_score CASE ... [--versions object,light,both] [--frames 0,6,11] [--samples N] [--device D]
+    python -m bench.truth_score CASE ... [--versions object,light,both] [--frames 0,6,11] [--samples N] [--error E]
+        [--device D]
 
 CASE is a folder with ``case.json``, ``camera``, ``env`` and a folder and a scene file of each version. The pictures
 have the frames' own size, for the truth was clipped there: a highlight that clips is dimmer after averaging down. One
 JSON line per case and version; ``kept`` is the mean FLIP to the truth where the truth differs from the camera's frame,
 over that of the frame itself. Half of the samples have another seed, which tells the noise: ``kept_half`` is the same
 by one half, ``noise`` the difference between both, ``error`` the relative standard error where the picture changes.
-Samples go to pixels within MARGIN of those that count. With ``--keep FILE`` lines of single frames are kept there, and
-what it holds at these samples is not rendered again.
+Samples go to pixels within MARGIN of those that count. With ``--error E`` they end earlier where ``error`` is E;
+``taken`` is how many there were. With ``--keep FILE`` lines of single frames are kept there, and what it holds at these
+samples is not rendered again.
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.common import KeptLines, commit
-from bench.judge import encoded_by
+from bench.judge import encoded_by, render_half
 from warp_ar.accuracy.metrics import changed_region, flip_map
 from warp_ar.accuracy.path_tracer import PathTracer
 from warp_ar.kernels.color import decode_table
@@ -54,8 +56,10 @@ def leave_alone(tracer: PathTracer, pixels: npt.NDArray[np.bool_]) -> None:
     picture.rays.assign(rays)
 
 
-def score(case: Path, version: str, frame: int, samples: int, device: str) -> dict[str, float] | None:
-    """Errors of one frame; None if the case has no such frame."""
+def score(
+    case: Path, version: str, frame: int, samples: int, device: str, error: float | None = None
+) -> dict[str, float] | None:
+    """Errors of one frame by so many samples, or fewer for a standard error of ``error``; None: no such frame."""
     truth = read_image(case / version / f"{frame:04d}.png")
     camera = read_image(case / "camera" / f"{frame:04d}.png")
     if truth is None or camera is None:
@@ -72,8 +76,7 @@ def score(case: Path, version: str, frame: int, samples: int, device: str) -> di
     for seed in (0, 1):
         tracer = PathTracer(scene, light, camera, pose, device=device, seconds=frame / rate, seed=seed)
         leave_alone(tracer, aside)
-        tracer.sample(max(samples // 2, 1))
-        halves.append(tracer.picture())
+        halves.append(render_half(tracer, samples, error))
     table = decode_table(scene.camera.transfer)
     first, second = (half.radiance for half in halves)
     images = [encoded_by(radiance, table) for radiance in (0.5 * (first + second), first, second)]
@@ -85,6 +88,7 @@ def score(case: Path, version: str, frame: int, samples: int, device: str) -> di
         "kept_half": kept_half,
         "noise": float(flip_map(images[1], images[2])[region].mean()) / nothing,
         "error": float(np.hypot(*(half.relative_error for half in halves))) / 2.0,
+        "taken": sum(half.samples for half in halves),
     }
 
 
@@ -94,6 +98,7 @@ def main() -> int:
     parser.add_argument("--versions", default="object,light,both")
     parser.add_argument("--frames", default="0,6,11")
     parser.add_argument("--samples", type=int, default=512)
+    parser.add_argument("--error", type=float, help="relative standard error at which samples end (default: none)")
     parser.add_argument("--device", default="auto")
     parser.add_argument("--keep", type=Path, metavar="FILE", help="JSON lines: go on where a run was ended")
     options = parser.parse_args()
@@ -102,17 +107,17 @@ def main() -> int:
         for version in options.versions.split(","):
             start = time.perf_counter()
             frames = [int(number) for number in options.frames.split(",")]
-            key = {"case": Path(name).name, "version": version, "samples": options.samples}
+            key = {"case": Path(name).name, "version": version, "samples": options.samples, "until": options.error}
             rows = []
             for frame in frames:
                 if not lines.has(**key, frame=frame):
-                    row = score(Path(name), version, frame, options.samples, options.device)
+                    row = score(Path(name), version, frame, options.samples, options.device, options.error)
                     if row is not None:
                         lines.add({**key, "frame": frame, **row, "commit": commit()})
                 rows += [record for record in lines.records if record | key | {"frame": frame} == record]
             if not rows:
                 continue
-            names = ("nothing", "kept", "kept_half", "noise", "error")
+            names = ("nothing", "kept", "kept_half", "noise", "error", "taken")
             means: dict[str, Any] = {own: round(float(np.mean([row[own] for row in rows])), 4) for own in names}
             about = {**key, **means, "frames": len(rows)}
             about |= {"seconds": round(time.perf_counter() - start, 1), "commit": commit()}

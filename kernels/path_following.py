@@ -1,10 +1,11 @@
 """One path through the local scene: the light that arrives at its surfaces, and where it goes on.
 
-Where a path meets a surface, light that arrives there straight from the environment (a direction drawn by its light)
-and from every virtual light is added, and it goes on in a direction drawn by the surface (see ``path_sampling``). Both
-ways to reach the environment are combined by their densities, and so are both ways to reach the disk of a virtual
-light. A path ends by Russian roulette, with a chance that its weight makes up for. Nothing is clamped: the mean over
-paths has no error but noise.
+A path goes round one loop (``path_tracer``): what its ray meets (``meet``), then what happens at the surface
+(``visit``). There light that arrives straight from the environment (a direction drawn by its light) and from every
+virtual light is added, and it goes on in a direction drawn by the surface (see ``path_sampling``). Both ways to reach
+the environment are combined by their densities, and so are both ways to reach the disk of a virtual light. A path ends
+by Russian roulette, with a chance that its throughput makes up for. Nothing is clamped: the mean over paths has no
+error but noise.
 
 References:
     [Deb98] Debevec 1998, Rendering Synthetic Objects into Real Scenes.
@@ -18,10 +19,10 @@ import functools
 import warp as wp
 
 from warp_ar.kernels.materials import Surface
-from warp_ar.kernels.path_guides import draw_guide, guide_count, guide_density
+from warp_ar.kernels.path_guides import draw_guide, guide_count, guide_density, guided_bin
 from warp_ar.kernels.path_sampling import (
+    NO_DENSITY,
     STREAMS,
-    Drawn,
     PathKey,
     Sky,
     balance,
@@ -35,7 +36,6 @@ from warp_ar.kernels.path_sampling import (
     reflect_direct,
     sky_radiance,
     surface_density,
-    weigh_drawn,
 )
 from warp_ar.kernels.path_vertices import (
     NOTHING,
@@ -45,7 +45,6 @@ from warp_ar.kernels.path_vertices import (
     Vertex,
     from_viewer,
     is_glossy,
-    make_find_vertex,
     make_hidden_by_physical,
     make_look_up_material,
     make_see_in_frame,
@@ -72,38 +71,56 @@ FIRST_LIGHT = wp.constant(3)
 """Streams of random numbers at a vertex; each virtual light has its own, as far as they go."""
 
 
-@wp.struct
-class Carried:
-    """What a path brings to the camera."""
-
-    radiance: wp.vec3  # or the difference that virtual content makes
-    light: wp.vec3  # what a white first surface would send without virtual content
-    rays: wp.int32  # that were traced for it
+SURFACE = wp.constant(0)
+RAY = wp.constant(1)
+ENDED = wp.constant(2)
+"""What is next for a path."""
 
 
 @wp.struct
-class Path:
-    """Where a path is: at its surface number ``k``, or on the ray that leads to it."""
+class PathState:
+    """Where a path is: at its surface number ``depth``, or on the ray that leads to it."""
 
-    weight: wp.vec3
+    throughput: wp.vec3
     origin: wp.vec3  # of the ray
     direction: wp.vec3  # unit
     density: wp.float32  # with which the direction was drawn
-    k: wp.int32
+    depth: wp.int32
     changes_only: wp.bool  # whether it carries the difference that virtual content makes
     without: wp.bool  # whether it meets no virtual content
+    tile: wp.int32  # of the frame, by what was learned for which the next direction is drawn; or -1
 
 
 @wp.struct
-class SkyLight:
-    """Light of the environment from one direction, as a surface reflects it."""
+class PathPair:
+    """A path from the camera, and the one without virtual content for which it waits at times."""
 
-    reaches: wp.bool  # whether nothing physical is in the way
-    radiance: wp.vec3
-    origin: wp.vec3  # of the ray to it
-    direction: wp.vec3
-    distance: wp.float32
+    path: PathState  # the one that is followed
+    waiting: PathState  # while ``path`` is the one without virtual content
+    physical: wp.vec3  # what the one without brings
+    is_known: wp.bool  # whether it is of the ray on which ``path`` is
+    next: wp.int32  # SURFACE, RAY or ENDED
+    white: wp.bool  # whether the first surface is white, and what it sends without virtual content is asked for too
+    lobe: wp.bool  # whether it is not white but the gloss of its proxy alone
+    glossy: wp.bool  # whether there is one of either kind
+    only_light: wp.bool  # whether nothing else is asked for
+    radiance: wp.vec3  # that it brings to the camera, or the difference that virtual content makes
+    light: wp.vec3  # what the white surface would send without virtual content
     rays: wp.int32  # that were traced for it
+    guided: wp.int32  # bin of ``path_guides`` in which its first direction lies, or -1
+    drawn: wp.float32  # density of that direction
+    straight: wp.vec3  # ``radiance`` that does not come from there
+
+
+@wp.struct
+class DirectionSample:
+    """A direction at a surface: toward light, or in which the path goes on."""
+
+    direction: wp.vec3  # unit; zero where there is none
+    density: wp.float32  # per steradian; NO_DENSITY where no other way draws it
+    distance: wp.float32  # of what sends light
+    radiance: wp.vec3  # from there, or the irradiance of a surface that faces the light
+    per: wp.float32  # that this is divided by: the density, or 1
 
 
 # Toward objects. A difference begins where a path meets a virtual object, and most of what mirrors and metals throw
@@ -111,7 +128,7 @@ class SkyLight:
 # sphere of a virtual object or a ball, or to where one of these mirrors light (``path_guides``). The density of every
 # direction is then that of the mixture, (1 - q) p + q g.
 @wp.func
-def guided_chance(scene: LocalScene, surface: Surface, path: Path) -> wp.float32:
+def guided_chance(scene: LocalScene, surface: Surface, path: PathState) -> wp.float32:
     """Chance of a direction to be drawn toward an object or a ball."""
     if path.without or guide_count(scene.guides, path.changes_only) == 0 or surface.model == wp.static(int(MIRROR)):
         return 0.0
@@ -119,37 +136,36 @@ def guided_chance(scene: LocalScene, surface: Surface, path: Path) -> wp.float32
 
 
 @wp.func
-def next_density(scene: LocalScene, hit: Hit, surface: Surface, wo: wp.vec3, wi: wp.vec3, path: Path) -> wp.float32:
+def next_density(
+    scene: LocalScene, hit: Hit, surface: Surface, wo: wp.vec3, wi: wp.vec3, path: PathState
+) -> wp.float32:
     """Density with which ``draw_next`` gives a direction."""
     chance = guided_chance(scene, surface, path)
     density = (1.0 - chance) * surface_density(surface, hit.normal, wo, wi)
     if chance > 0.0:
-        density += chance * guide_density(scene.guides, scene.sky, hit.point, wi, path.changes_only)
+        density += chance * guide_density(scene.guides, scene.sky, hit.point, wi, path.changes_only, path.tile)
     return density
 
 
 @wp.func
-def draw_next(
-    scene: LocalScene, hit: Hit, surface: Surface, wo: wp.vec3, pick: wp.vec3, u: wp.vec2, path: Path
-) -> Drawn:
-    """Direction in which a path goes on, with its weight and density; ``pick``'s first and last number choose how."""
+def draw_next(scene: LocalScene, hit: Hit, surface: Surface, wo: wp.vec3, path: PathState, key: PathKey) -> wp.vec3:
+    """Direction in which a path goes on; zero where it leads into the surface."""
+    u = random_triple(key, path.depth, SCATTER)
+    pick = random_triple(key, path.depth, PICK)
     chance = guided_chance(scene, surface, path)
-    wi = wp.vec3(0.0, 0.0, 0.0)
     if pick[2] < chance:
-        wi = draw_guide(scene.guides, scene.sky, hit.point, pick[2] / chance, u, path.changes_only)
-    else:
-        wi = draw_reflected(surface, hit.normal, hit.geometric_normal, wo, pick[0], u)
-    if wp.dot(wi, hit.geometric_normal) <= 0.0:
-        return Drawn()
-    return weigh_drawn(surface, hit.normal, wo, wi, next_density(scene, hit, surface, wo, wi, path))
+        return draw_guide(
+            scene.guides, scene.sky, hit.point, pick[2] / chance, wp.vec2(u[0], u[1]), path.changes_only, path.tile
+        )
+    return draw_reflected(surface, hit.normal, hit.geometric_normal, wo, pick[0], wp.vec2(u[0], u[1]))
 
 
 @wp.func
-def survival(weight: wp.vec3, vertices: wp.int32) -> wp.float32:
+def survival(throughput: wp.vec3, vertices: wp.int32) -> wp.float32:
     """Chance of a path to go on after so many surfaces."""
     if vertices < SURE_VERTICES:
         return 1.0
-    return wp.min(wp.max(weight), MOST_SURVIVAL)
+    return wp.min(wp.max(throughput), MOST_SURVIVAL)
 
 
 @wp.func
@@ -159,6 +175,96 @@ def light_along(sky: Sky, origin: wp.vec3, direction: wp.vec3, vertex: Vertex, d
     if vertex.kind == NOTHING:
         light += sky_radiance(sky, direction, density)
     return light
+
+
+@wp.func
+def draw_toward_light(scene: LocalScene, hit: Hit, path: PathState, light: wp.int32, key: PathKey) -> DirectionSample:
+    """A direction toward virtual light number ``light``, or toward light of the environment where that is -1."""
+    out = DirectionSample()
+    stream = wp.where(light < 0, SKY, FIRST_LIGHT + light % (STREAMS - FIRST_LIGHT))
+    u = random_triple(key, path.depth, stream)
+    if light < 0:
+        sky = draw_sky(scene.sky, hit.point, wp.vec2(u[0], u[1]), u[2])
+        out.direction = sky.direction
+        out.density = sky.density
+        out.distance = sky.distance
+        out.radiance = sky.radiance
+        out.per = sky.density
+    else:
+        sample = sample_light(scene.lights[light], hit.point)
+        if wp.max(sample.irradiance_normal) > 0.0:
+            away = draw_on_light(scene.lights[light], sample, wp.vec2(u[0], u[1]))
+            out.direction = wp.vec3(away[0], away[1], away[2])
+            out.density = NO_DENSITY
+            if has_penumbra(scene.lights[light], sample):
+                cosine = sample.distance / away[3]
+                radius = scene.lights[light].radius
+                out.density = away[3] * away[3] / (wp.pi * radius * radius * cosine)
+            # Short of the light, so that a light on a surface is not hidden by that surface.
+            out.distance = away[3] - 2.0 * hit.error
+            out.radiance = sample.irradiance_normal
+            out.per = 1.0
+    return out
+
+
+@wp.func
+def extend_path(
+    path: PathState, start: wp.vec3, wi: wp.vec3, reflected: wp.vec3, density: wp.float32, key: PathKey
+) -> PathState:
+    """The path on its next ray, drawn with ``density`` (NO_DENSITY: a mirror's); without throughput where it ends."""
+    following = path
+    share = wp.vec3(0.0, 0.0, 0.0)
+    if density > 0.0:
+        share = reflected / density
+    elif density < 0.0:
+        share = reflected
+    following.throughput = wp.cw_mul(path.throughput, share)
+    chance = survival(following.throughput, path.depth)
+    if random_triple(key, path.depth, PICK)[1] < chance:
+        following.throughput = following.throughput / wp.max(chance, 1.0e-30)
+    else:
+        following.throughput = wp.vec3(0.0, 0.0, 0.0)
+    following.origin = start
+    following.direction = wi
+    following.density = density
+    following.depth += 1
+    following.tile = -1
+    return following
+
+
+@wp.func
+def bring(pair: PathPair, radiance: wp.vec3) -> PathPair:
+    """Radiance that the path which is followed meets where it is."""
+    out = pair
+    if pair.path.without:
+        out.physical += wp.cw_mul(pair.path.throughput, radiance)
+    else:
+        out.radiance += wp.cw_mul(pair.path.throughput, radiance)
+    return out
+
+
+@wp.func
+def begin_without(pair: PathPair) -> PathPair:
+    """The path waits for one that leaves virtual content out, which starts on the ray on which it is."""
+    out = pair
+    out.waiting = pair.path
+    out.physical = wp.vec3(0.0, 0.0, 0.0)
+    out.path.throughput = wp.vec3(1.0, 1.0, 1.0)
+    out.path.changes_only = False
+    out.path.without = True
+    return out
+
+
+@wp.func
+def end_without(pair: PathPair) -> PathPair:
+    """The path goes on that waited for one without virtual content."""
+    out = pair
+    out.path = pair.waiting
+    out.is_known = True
+    if pair.white and out.path.depth == 1:
+        out.light += wp.cw_mul(out.path.throughput, pair.physical)
+    out.next = wp.where(pair.only_light, ENDED, RAY)
+    return out
 
 
 @wp.struct
@@ -204,137 +310,84 @@ def white_surface(scene: LocalScene, vertex: Vertex, lobe: wp.bool) -> Surface:
     return surface
 
 
+# At a surface there are several directions: one toward the environment's light, one toward each virtual light, and that
+# in which the path goes on. Each is drawn in its own way. What the surface reflects of it, what is in the way, and with
+# which density it would have been drawn otherwise are found for one after another by the same code: a copy for each
+# would make the kernel larger, and NVRTC slower.
 @functools.cache
-def make_sky_light(trace: TraceConfig) -> wp.Function:
-    """``sky_light(scene, hit, surface, wo, path, key) -> SkyLight``: reflected, of one direction.
+def make_scatter(trace: TraceConfig) -> wp.Function:
+    """``scatter(scene, hit, surface, pair, key) -> PathPair``: light straight from its sources, and the next ray.
 
-    The direction is drawn by the environment's light; its share is that which balances with going on by ``draw_next``.
+    No such light at mirrors. Of a difference it is what virtual content changes of it. The two ways to draw a direction
+    to the environment, or to the disk of a light, are combined by the balance heuristic.
     """
     hidden_by_physical = make_hidden_by_physical(trace)
-
-    @wp.func(module="unique")
-    def sky_light(scene: LocalScene, hit: Hit, surface: Surface, wo: wp.vec3, path: Path, key: PathKey) -> SkyLight:
-        light = SkyLight()
-        u = random_triple(key, path.k, SKY)
-        sky = draw_sky(scene.sky, hit.point, wp.vec2(u[0], u[1]), u[2])
-        reflected = reflect_direct(surface, hit.normal, wo, sky.direction)
-        if wp.max(reflected) > 0.0 and wp.dot(hit.geometric_normal, sky.direction) > 0.0:
-            light.origin = offset_origin(hit.point, hit.geometric_normal, sky.direction, hit.error)
-            light.direction = sky.direction
-            light.distance = sky.distance
-            light.rays = 1
-            if not hidden_by_physical(scene, light.origin, sky.direction, sky.distance):
-                other = next_density(scene, hit, surface, wo, sky.direction, path)
-                light.reaches = True
-                light.radiance = balance(sky.density, other) / sky.density * wp.cw_mul(reflected, sky.radiance)
-        return light
-
-    return sky_light
-
-
-@functools.cache
-def make_virtual_light(trace: TraceConfig) -> wp.Function:
-    """``virtual_light(scene, hit, surface, wo, path, key) -> Carried``: reflected, of all virtual lights."""
-    hidden_by_physical = make_hidden_by_physical(trace)
     occluded_by_objects = make_trace(trace).occluded_by_objects
 
     @wp.func(module="unique")
-    def virtual_light(scene: LocalScene, hit: Hit, surface: Surface, wo: wp.vec3, path: Path, key: PathKey) -> Carried:
-        carried = Carried()
-        for index in range(scene.lights.shape[0]):
-            light = sample_light(scene.lights[index], hit.point)
-            if wp.max(light.irradiance_normal) > 0.0:
-                u = random_triple(key, path.k, FIRST_LIGHT + index % (STREAMS - FIRST_LIGHT))
-                away = draw_on_light(scene.lights[index], light, wp.vec2(u[0], u[1]))
-                wi = wp.vec3(away[0], away[1], away[2])
-                reflected = reflect_direct(surface, hit.normal, wo, wi)
-                if wp.max(reflected) > 0.0 and wp.dot(hit.geometric_normal, wi) > 0.0:
-                    start = offset_origin(hit.point, hit.geometric_normal, wi, hit.error)
-                    # Short of the light, so that a light on a surface is not hidden by that surface.
-                    reach = away[3] - 2.0 * hit.error
-                    carried.rays += 1
-                    if not hidden_by_physical(scene, start, wi, reach):
-                        if not occluded_by_objects(scene.rays, start, wi, reach):
-                            share = float(1.0)
-                            if has_penumbra(scene.lights[index], light):
-                                cosine = light.distance / away[3]
-                                radius = scene.lights[index].radius
-                                own = away[3] * away[3] / (wp.pi * radius * radius * cosine)
-                                share = balance(own, next_density(scene, hit, surface, wo, wi, path))
-                            carried.radiance += share * wp.cw_mul(reflected, light.irradiance_normal)
-        return carried
-
-    return virtual_light
-
-
-@wp.struct
-class Arrived:
-    """Light that arrives at a surface, as it reflects it."""
-
-    radiance: wp.vec3  # or the difference that virtual content makes; with what the surface itself sends
-    light: wp.vec3  # of the environment, without virtual content
-    rays: wp.int32  # that were traced for it
-
-
-@functools.cache
-def make_arrive(trace: TraceConfig) -> wp.Function:
-    """``arrive(scene, hit, surface, wo, path, only_light, key) -> Arrived``: straight from lights; 0 at mirrors."""
-    sky_light, virtual_light = make_sky_light(trace), make_virtual_light(trace)
-    occluded_by_objects = make_trace(trace).occluded_by_objects
-
-    @wp.func(module="unique")
-    def arrive(
-        scene: LocalScene, hit: Hit, surface: Surface, wo: wp.vec3, path: Path, only_light: wp.bool, key: PathKey
-    ) -> Arrived:
-        out = Arrived()
-        with_virtual = not (only_light or path.without)
+    def scatter(scene: LocalScene, hit: Hit, surface: Surface, pair: PathPair, key: PathKey) -> PathPair:
+        out = pair
+        path = pair.path
+        following = PathState()
+        wo = -path.direction
+        is_mirror = surface.model == wp.static(int(MIRROR))
+        with_virtual = not (pair.only_light or path.without)
+        of_sky = wp.vec3(0.0, 0.0, 0.0)  # without virtual content
+        changed = wp.vec3(0.0, 0.0, 0.0)  # of the environment, and what the surface sends itself
+        of_lights = wp.vec3(0.0, 0.0, 0.0)
+        lights = wp.int32(0)
         if with_virtual:
-            out.radiance = surface.emission
-        if surface.model != wp.static(int(MIRROR)):
-            sky = sky_light(scene, hit, surface, wo, path, key)
-            out.rays = sky.rays
-            if sky.reaches:
-                out.light = sky.radiance
-                if with_virtual:
-                    if occluded_by_objects(scene.rays, sky.origin, sky.direction, sky.distance):
-                        if path.changes_only:
-                            out.radiance -= sky.radiance
-                    elif not path.changes_only:
-                        out.radiance += sky.radiance
-            if with_virtual:
-                lit = virtual_light(scene, hit, surface, wo, path, key)
-                out.radiance += lit.radiance
-                out.rays += lit.rays
+            changed = surface.emission
+            lights = scene.lights.shape[0]
+        for index in range(wp.where(is_mirror, lights, -1), lights + 1):
+            is_next = index == lights
+            drawn = DirectionSample()
+            if is_next:
+                drawn.direction = draw_next(scene, hit, surface, wo, path, key)
+            else:
+                drawn = draw_toward_light(scene, hit, path, index, key)
+            wi = drawn.direction
+            reflected = wp.vec3(0.0, 0.0, 0.0)
+            if wp.dot(hit.geometric_normal, wi) > 0.0:
+                reflected = surface.reflectance
+                if not is_mirror:
+                    reflected = reflect_direct(surface, hit.normal, wo, wi)
+            reaches = wp.max(reflected) > 0.0
+            start = offset_origin(hit.point, hit.geometric_normal, wi, hit.error)
+            hidden = bool(False)
+            if reaches and not is_next:
+                out.rays += 1
+                reaches = not hidden_by_physical(scene, start, wi, drawn.distance)
+                if reaches and with_virtual:
+                    hidden = occluded_by_objects(scene.rays, start, wi, drawn.distance)
+            density = NO_DENSITY
+            if reaches and not is_mirror and (is_next or drawn.density >= 0.0):
+                density = next_density(scene, hit, surface, wo, wi, path)
+            if reaches and is_next:
+                following = extend_path(path, start, wi, reflected, density, key)
+            elif reaches:
+                arriving = balance(drawn.density, density) / drawn.per * wp.cw_mul(reflected, drawn.radiance)
+                if index < 0:
+                    of_sky = arriving
+                    if hidden and path.changes_only:
+                        changed -= arriving
+                    elif with_virtual and not (hidden or path.changes_only):
+                        changed += arriving
+                elif not hidden:
+                    of_lights += arriving
+        if path.without:
+            out = bring(out, of_sky)
+        else:
+            out = bring(out, changed + of_lights)
+            if pair.white and path.depth == 0:
+                out.light += wp.cw_mul(path.throughput, of_sky)
+        out.path = following
+        out.path.changes_only = path.changes_only
+        out.path.without = path.without
+        out.next = wp.where(wp.max(following.throughput) > 0.0, RAY, ENDED)
         return out
 
-    return arrive
-
-
-@wp.func
-def go_on(scene: LocalScene, hit: Hit, surface: Surface, wo: wp.vec3, path: Path, key: PathKey) -> Path:
-    """The path on its next ray; without weight where it ends."""
-    u = random_triple(key, path.k, SCATTER)
-    pick = random_triple(key, path.k, PICK)
-    drawn = draw_next(scene, hit, surface, wo, pick, wp.vec2(u[0], u[1]), path)
-    following = path
-    following.weight = wp.cw_mul(path.weight, drawn.weight)
-    chance = survival(following.weight, path.k)
-    following.weight = wp.where(pick[1] < chance, following.weight / wp.max(chance, 1.0e-30), wp.vec3(0.0, 0.0, 0.0))
-    following.origin = offset_origin(hit.point, hit.geometric_normal, drawn.direction, hit.error)
-    following.direction = drawn.direction
-    following.density = drawn.density
-    following.k += 1
-    return following
-
-
-@wp.func
-def start_without(path: Path) -> Path:
-    """The path that leaves virtual content out, on the ray on which ``path`` is."""
-    other = path
-    other.weight = wp.vec3(1.0, 1.0, 1.0)
-    other.changes_only = False
-    other.without = True
-    return other
+    return scatter
 
 
 # The frame. The camera has seen the physical surfaces, so a path that meets a proxy where the frame shows it knows the
@@ -351,112 +404,63 @@ def start_without(path: Path) -> Path:
 # That radiance is found by a path of its own, for which the other waits and which meets nothing virtual. Both go round
 # the same loop: threads of a warp do the same whichever of the two they follow, and what a path does at a surface
 # is compiled once.
-@functools.cache
-def make_follow_path(trace: TraceConfig) -> wp.Function:
-    """``follow_path(params, scene, first, direction, difference, white, lobe, only_light, key) -> Carried``.
+@wp.func
+def meet(scene: LocalScene, vertex: Vertex, pair: PathPair) -> PathPair:
+    """What a ray that left a surface brings, where it leads to ``vertex``: light, and whether its path goes on."""
+    out = pair
+    out.next = SURFACE
+    path = pair.path
+    begins = path.changes_only and vertex.kind == OBJECT
+    if begins and not pair.is_known:
+        out = begin_without(out)
+        out.next = RAY
+        return out
+    if not path.without:
+        out = bring(out, lights_in_the_way(scene.lights, path.origin, path.direction, vertex.hit.t, path.density))
+        if begins:
+            out.radiance -= wp.cw_mul(path.throughput, pair.physical)
+            out.path.changes_only = False
+        out.is_known = False
+    if not out.path.changes_only:
+        out = bring(out, light_along(scene.sky, path.origin, path.direction, vertex, path.density))
+    if vertex.kind == NOTHING or path.depth >= MOST_VERTICES:
+        out.next = ENDED
+    return out
 
-    What leaves the vertex ``first`` against a unit ``direction``: all radiance, or the difference that virtual content
-    makes. ``white``: the first surface is one, and what it sends without virtual content is found too; ``only_light``:
-    nothing else is. ``lobe``: it is not white but the gloss of its proxy alone.
-    """
-    find_vertex, arrive = make_find_vertex(trace), make_arrive(trace)
-    see_proxy, look_up_material = make_see_proxy(trace), make_look_up_material()
+
+@functools.cache
+def make_visit(trace: TraceConfig) -> wp.Function:
+    """``visit(params, scene, vertex, pair, key) -> PathPair``: what happens at the surface on which a path is."""
+    scatter, see_proxy, look_up_material = make_scatter(trace), make_see_proxy(trace), make_look_up_material()
 
     @wp.func(module="unique")
-    def follow_path(
-        params: FrameParams,
-        scene: LocalScene,
-        first: Vertex,
-        direction: wp.vec3,
-        difference: wp.bool,
-        white: wp.bool,
-        lobe: wp.bool,
-        only_light: wp.bool,
-        key: PathKey,
-    ) -> Carried:
-        carried = Carried()
-        vertex = first
-        path = Path()
-        path.weight = wp.vec3(1.0, 1.0, 1.0)
-        path.direction = direction
-        path.changes_only = difference
-        waiting = Path()  # while one without virtual content is followed
-        physical = wp.vec3(0.0, 0.0, 0.0)  # what that one brings
-        is_known = bool(False)  # whether it is of the ray on which ``path`` is
-        at_surface = bool(True)
-        while True:
-            ended = bool(False)
-            if at_surface:
-                is_white = white and path.k == 0
-                wo = -path.direction
-                reflectance = wp.vec3(1.0, 1.0, 1.0)
-                if vertex.kind == PROXY and not is_white:
-                    seen = see_proxy(params, scene, vertex)
-                    carried.rays += seen.rays
-                    reflectance = seen.reflectance
-                    if seen.shows and not path.changes_only:
-                        if path.without:
-                            physical += wp.cw_mul(path.weight, seen.radiance)
-                            ended = True
-                        else:
-                            carried.radiance += wp.cw_mul(path.weight, seen.radiance)
-                            path.changes_only = True
-                if not ended:
-                    vertex = from_viewer(vertex, wo)
-                    surface = Surface()
-                    if is_white:
-                        surface = white_surface(scene, vertex, lobe)
-                    else:
-                        surface = look_up_material(scene, vertex, wo, reflectance)
-                    lit = arrive(scene, vertex.hit, surface, wo, path, only_light, key)
-                    carried.rays += lit.rays
-                    if path.without:
-                        physical += wp.cw_mul(path.weight, lit.light)
-                    else:
-                        carried.radiance += wp.cw_mul(path.weight, lit.radiance)
-                        if is_white:
-                            carried.light += wp.cw_mul(path.weight, lit.light)
-                    path = go_on(scene, vertex.hit, surface, wo, path, key)
-                    ended = wp.max(path.weight) <= 0.0
-                    if is_white and not ended:
-                        waiting = path
-                        path = start_without(path)
-                        physical = wp.vec3(0.0, 0.0, 0.0)
-            at_surface = True
-            if not ended:
-                vertex = find_vertex(scene, path.origin, path.direction, not path.without)
-                carried.rays += 1
-                meets = path.changes_only and vertex.kind == OBJECT
-                if meets and not is_known:
-                    waiting = path
-                    path = start_without(path)
-                    physical = wp.vec3(0.0, 0.0, 0.0)
-                    at_surface = False
-                else:
-                    if not path.without:
-                        disks = lights_in_the_way(scene.lights, path.origin, path.direction, vertex.hit.t, path.density)
-                        carried.radiance += wp.cw_mul(path.weight, disks)
-                        if meets:
-                            carried.radiance -= wp.cw_mul(path.weight, physical)
-                            path.changes_only = False
-                        is_known = False
-                    if not path.changes_only:
-                        light = light_along(scene.sky, path.origin, path.direction, vertex, path.density)
-                        if path.without:
-                            physical += wp.cw_mul(path.weight, light)
-                        else:
-                            carried.radiance += wp.cw_mul(path.weight, light)
-                    ended = vertex.kind == NOTHING or path.k >= MOST_VERTICES
-            if ended:
-                if not path.without:
-                    return carried
-                path = waiting
-                is_known = True
-                at_surface = False
-                if white and path.k == 1:
-                    carried.light += wp.cw_mul(path.weight, physical)
-                if only_light:
-                    return carried
-        return carried
+    def visit(params: FrameParams, scene: LocalScene, vertex: Vertex, pair: PathPair, key: PathKey) -> PathPair:
+        out = pair
+        is_white = pair.white and pair.path.depth == 0
+        wo = -pair.path.direction
+        reflectance = wp.vec3(1.0, 1.0, 1.0)
+        if vertex.kind == PROXY and not is_white:
+            seen = see_proxy(params, scene, vertex)
+            out.rays += seen.rays
+            reflectance = seen.reflectance
+            if seen.shows and not pair.path.changes_only:
+                out = bring(out, seen.radiance)
+                if pair.path.without:
+                    out.next = ENDED
+                    return out
+                out.path.changes_only = True
+        facing = from_viewer(vertex, wo)
+        surface = Surface()
+        if is_white:
+            surface = white_surface(scene, facing, pair.lobe)
+        else:
+            surface = look_up_material(scene, facing, wo, reflectance)
+        out = scatter(scene, facing.hit, surface, out, key)
+        if is_white and out.next == RAY:
+            out.guided = guided_bin(scene.guides, facing.hit.point, out.path.direction)
+            out.drawn = out.path.density
+            out.straight = out.radiance
+            out = begin_without(out)
+        return out
 
-    return follow_path
+    return visit

@@ -43,6 +43,10 @@ LEAST_VERSINE = wp.constant(wp.float32(1.0e-6))
 LEAST_INCIDENCE = wp.constant(wp.float32(1.0e-2))
 """Cosine under which a place is met at least: its square has an error of 1e-6, and nearer to the rim, a part in 1e4 of
 the sphere's disk, the factor on densities loses its digits. What is mirrored there is left to the cones."""
+RINGS = wp.constant(16)
+SECTORS = wp.constant(16)
+BINS = wp.constant(256)
+"""Of a cone, for what is learned of it: rings of equal solid angle, sectors of each, and both."""
 STEPS = wp.constant(12)
 """Of the search for a place, at most."""
 POLISHED = 0.3
@@ -59,6 +63,7 @@ class Guides:
     mirrors: wp.array[wp.vec4]  # polished spheres: virtual objects, after these balls
     virtual_spheres: wp.int32  # how many of ``spheres`` are of virtual objects
     virtual_mirrors: wp.int32
+    learned: wp.array2d[wp.float32]  # (tiles, bins of all virtual spheres + 1) cumulative, from 0 to 1; may be empty
 
 
 def make_guides(
@@ -201,18 +206,47 @@ def draw_mirrored(sphere: wp.vec4, sky: Sky, point: wp.vec3, u: wp.vec2) -> wp.v
 
 
 @wp.func
-def guide_density(guides: Guides, sky: Sky, point: wp.vec3, direction: wp.vec3, changes_only: wp.bool) -> wp.float32:
+def bin_in_cone(sphere: wp.vec4, point: wp.vec3, direction: wp.vec3) -> wp.int32:
+    """The bin of a sphere's cone in which a direction lies; -1 outside."""
+    axis = wp.normalize(wp.vec3(sphere[0], sphere[1], sphere[2]) - point)
+    off = axis - direction
+    # |a - b|^2 / 2 is 1 - cos, without its cancellation.
+    part = 0.5 * wp.dot(off, off) / cone_versine(sphere, point)
+    if part > 1.0:
+        return -1
+    local = wp.transpose(frame_from_normal(axis)) * direction
+    turn = wp.atan2(local[1], local[0]) / (2.0 * wp.pi)
+    turn = wp.where(turn < 0.0, turn + 1.0, turn)
+    ring = wp.min(wp.int32(part * wp.float32(RINGS)), RINGS - 1)
+    return ring * SECTORS + wp.min(wp.int32(turn * wp.float32(SECTORS)), SECTORS - 1)
+
+
+@wp.func
+def guided_bin(guides: Guides, point: wp.vec3, direction: wp.vec3) -> wp.int32:
+    """The bin, of all those of virtual spheres, in which a direction lies first; -1 for none."""
+    for k in range(guides.virtual_spheres):
+        found = bin_in_cone(guides.spheres[k], point, direction)
+        if found >= 0:
+            return k * BINS + found
+    return -1
+
+
+@wp.func
+def guide_density(
+    guides: Guides, sky: Sky, point: wp.vec3, direction: wp.vec3, changes_only: wp.bool, tile: wp.int32
+) -> wp.float32:
     """Density with which ``draw_guide`` gives a direction."""
     count = guide_count(guides, changes_only)
     density = float(0.0)
     for k in range(count):
         sphere = guides.spheres[k]
-        versine = cone_versine(sphere, point)
-        axis = wp.normalize(wp.vec3(sphere[0], sphere[1], sphere[2]) - point)
-        off = axis - direction
-        # |a - b|^2 / 2 is 1 - cos, without its cancellation.
-        if 0.5 * wp.dot(off, off) <= versine:
-            density += 1.0 / (2.0 * wp.pi * versine)
+        found = bin_in_cone(sphere, point, direction)
+        if found >= 0:
+            share = float(1.0)
+            if tile >= 0:
+                step = k * BINS + found
+                share = wp.float32(count * BINS) * (guides.learned[tile, step + 1] - guides.learned[tile, step])
+            density += share / (2.0 * wp.pi * cone_versine(sphere, point))
     density = density / wp.float32(wp.max(count, 1))
     mirrors = mirror_count(guides, changes_only)
     if mirrors > 0:
@@ -225,18 +259,27 @@ def guide_density(guides: Guides, sky: Sky, point: wp.vec3, direction: wp.vec3, 
 
 @wp.func
 def draw_guide(
-    guides: Guides, sky: Sky, point: wp.vec3, pick: wp.float32, u: wp.vec2, changes_only: wp.bool
+    guides: Guides, sky: Sky, point: wp.vec3, pick: wp.float32, u: wp.vec2, changes_only: wp.bool, tile: wp.int32
 ) -> wp.vec3:
-    """Direction toward an object or a ball; zero where none was found."""
+    """Direction toward an object or a ball, by what was learned for a tile unless that is -1; zero where none is."""
     share = mirrored_share(guides, changes_only)
     if pick < share:
         mirrors = mirror_count(guides, changes_only)
         k = wp.min(wp.int32(pick / share * wp.float32(mirrors)), mirrors - 1)
         return draw_mirrored(guides.mirrors[k], sky, point, u)
     count = guide_count(guides, changes_only)
-    sphere = guides.spheres[wp.min(wp.int32((pick - share) / (1.0 - share) * wp.float32(count)), count - 1)]
-    versine = u[0] * cone_versine(sphere, point)
+    left = (pick - share) / (1.0 - share)
+    k = wp.min(wp.int32(left * wp.float32(count)), count - 1)
+    part = u[0]
+    turn = u[1]
+    if tile >= 0:
+        step = find_step(guides.learned[tile], left)
+        k = step / BINS
+        part = (wp.float32(step % BINS / SECTORS) + u[0]) / wp.float32(RINGS)
+        turn = (wp.float32(step % SECTORS) + u[1]) / wp.float32(SECTORS)
+    sphere = guides.spheres[k]
+    versine = part * cone_versine(sphere, point)
     sine = wp.sqrt(wp.max(versine * (2.0 - versine), 0.0))
-    phi = 2.0 * wp.pi * u[1]
+    phi = 2.0 * wp.pi * turn
     axis = wp.normalize(wp.vec3(sphere[0], sphere[1], sphere[2]) - point)
     return wp.normalize(frame_from_normal(axis) * wp.vec3(sine * wp.cos(phi), sine * wp.sin(phi), 1.0 - versine))

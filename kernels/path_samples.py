@@ -13,6 +13,7 @@ from __future__ import annotations
 import warp as wp
 
 from warp_ar.kernels.launch import launch_rows
+from warp_ar.kernels.path_learning import learn_sample
 from warp_ar.kernels.path_picture import Moments, add_sample
 from warp_ar.kernels.sampling import pcg3d_hash, uniform_from_bits
 
@@ -31,6 +32,9 @@ class Round:
     e: wp.array[wp.vec3]
     shows: wp.array[wp.float32]
     rays: wp.array[wp.int32]  # that were traced for it
+    bins: wp.array[wp.int32]  # of ``path_learning``, in which its path leaves the first surface; or -1
+    squares: wp.array[wp.float32]  # what it tells of this bin
+    taken: wp.array[wp.int32]  # (1) how many threads have taken; empty on CPU, where each thread has one of its own
 
 
 # A pass adds ``share`` samples to a pixel: after n passes it has floor(n share + u), u its own number from 0 to 1. So
@@ -83,8 +87,9 @@ def add_samples_kernel(
     samples: Round,
     # Out:
     moments_out: Moments,
+    squares_out: wp.array2d[wp.int64],
 ):
-    """Take each pixel's samples into its moments, one after another."""
+    """Take each pixel's samples into its moments, one after another, and learn directions by them."""
     i, j = wp.tid()
     i += row_start
     pixel = i * moments_out.samples.shape[1] + j
@@ -92,6 +97,7 @@ def add_samples_kernel(
     for k in range(end - samples.counts[pixel], end):
         moments_out.rays[i, j] = moments_out.rays[i, j] + samples.rays[k]
         add_sample(i, j, samples.z[k], samples.g[k], samples.e[k], samples.shows[k], moments_out)
+        learn_sample(pixel, moments_out.samples.shape[1], samples.bins[k], samples.squares[k], squares_out)
 
 
 def make_round(shape: tuple[int, int], device: wp.DeviceLike) -> Round:
@@ -99,6 +105,7 @@ def make_round(shape: tuple[int, int], device: wp.DeviceLike) -> Round:
     made = Round()
     made.counts = wp.zeros(shape[0] * shape[1], dtype=wp.int32, device=device)
     made.ends = wp.zeros(shape[0] * shape[1], dtype=wp.int32, device=device)
+    made.taken = wp.zeros(0 if made.counts.device.is_cpu else 1, dtype=wp.int32, device=device)
     _make_room(made, 1)
     return made
 
@@ -109,6 +116,8 @@ def _make_room(samples_out: Round, count: int) -> None:
     for name in ("z", "g", "e"):
         setattr(samples_out, name, wp.empty(count, dtype=wp.vec3, device=device))
     samples_out.shows = wp.empty(count, dtype=wp.float32, device=device)
+    samples_out.bins = wp.empty(count, dtype=wp.int32, device=device)
+    samples_out.squares = wp.empty(count, dtype=wp.float32, device=device)
     samples_out.pixels = wp.empty(count, dtype=wp.int32, device=device)
     samples_out.rays = wp.empty(count, dtype=wp.int32, device=device)
 
@@ -137,7 +146,7 @@ def list_samples(shares: wp.array2d[wp.float32], samples_out: Round, *, seed: in
     return total
 
 
-def add_samples(samples: Round, moments_out: Moments) -> None:
-    """Take the samples of a round into the moments of their pixels, (H, W)."""
-    shape, device = moments_out.samples.shape, moments_out.samples.device
-    launch_rows(add_samples_kernel, shape, [samples], [moments_out], rows=None, device=device)
+def add_samples(samples: Round, moments_out: Moments, squares_out: wp.array2d[wp.int64]) -> None:
+    """Take the samples of a round into the moments of their pixels, (H, W), and the sums of ``path_learning``."""
+    shape, device, outputs = moments_out.samples.shape, moments_out.samples.device, [moments_out, squares_out]
+    launch_rows(add_samples_kernel, shape, [samples], outputs, rows=None, device=device)

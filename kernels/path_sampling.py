@@ -113,15 +113,6 @@ class PathKey:
     seed: wp.uint32
 
 
-@wp.struct
-class Drawn:
-    """A direction that was drawn."""
-
-    direction: wp.vec3  # unit; zero where there is none
-    weight: wp.vec3  # reflected radiance per radiance from there: f cos / density
-    density: wp.float32  # per steradian, or NO_DENSITY
-
-
 @wp.func
 def random_triple(key: PathKey, vertex: wp.int32, stream: wp.int32) -> wp.vec3:
     """Three independent numbers in [0, 1), the same whenever they are asked for."""
@@ -307,21 +298,6 @@ def draw_reflected(
     if wp.dot(wi, geometric) <= 0.0:
         return wp.vec3(0.0, 0.0, 0.0)
     return wi
-
-
-@wp.func
-def weigh_drawn(surface: Surface, normal: wp.vec3, wo: wp.vec3, wi: wp.vec3, density: wp.float32) -> Drawn:
-    """What a direction that was drawn with ``density`` stands for; nothing where that is 0, but for mirrors."""
-    drawn = Drawn()
-    if surface.model == wp.static(int(MIRROR)):
-        drawn.direction = wi
-        drawn.weight = surface.reflectance
-        drawn.density = NO_DENSITY
-    elif density > 0.0:
-        drawn.direction = wi
-        drawn.weight = reflect_direct(surface, normal, wo, wi) / density
-        drawn.density = density
-    return drawn
 
 
 @wp.func

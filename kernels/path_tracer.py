@@ -15,7 +15,8 @@ import functools
 import warp as wp
 
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
-from warp_ar.kernels.path_following import make_follow_path
+from warp_ar.kernels.path_following import ENDED, SURFACE, PathPair, end_without, make_visit, meet
+from warp_ar.kernels.path_learning import tile_of
 from warp_ar.kernels.path_samples import Round
 from warp_ar.kernels.path_sampling import NO_DENSITY, PathKey, sky_radiance
 from warp_ar.kernels.path_vertices import (
@@ -40,77 +41,112 @@ WHOLE, DIFFERENCE, IRRADIANCE = 0, 1, 2
 reflectance known."""
 
 
-@wp.struct
-class PixelSample:
-    """What one path, or those of both lobes of a glossy surface, tell of a pixel; as ``add_sample`` takes it."""
-
-    z: wp.vec3
-    g: wp.vec3
-    e: wp.vec3
-    shows: wp.float32
-    rays: wp.int32  # that were traced for it
+MOST_THREADS = 2048
+"""For each of a CUDA device's multiprocessors: as many as it can hold, and more find no samples left."""
 
 
-@functools.cache
-def make_sample_pixel(trace: TraceConfig) -> wp.Function:
-    """``sample_pixel(params, scene, asked, vertex, direction, shown, key) -> PixelSample``.
-
-    ``vertex`` is what the camera's ray meets; ``shown`` what the frame holds there.
-    """
-    follow_path = make_follow_path(trace)
-
-    @wp.func(module="unique")
-    def sample_pixel(
-        params: FrameParams,
-        scene: LocalScene,
-        asked: wp.int32,
-        vertex: Vertex,
-        direction: wp.vec3,
-        shown: wp.vec3,
-        key: PathKey,
-    ) -> PixelSample:
-        out = PixelSample()
-        whole = asked == wp.static(WHOLE)
-        only_light = asked == wp.static(IRRADIANCE)
-        paths = wp.int32(0)
-        white = bool(False)
-        if whole and vertex.kind == NOTHING:
-            out.z = sky_radiance(scene.sky, direction, NO_DENSITY)
-        elif whole or vertex.kind == OBJECT:
-            paths = wp.where(only_light, 0, 1)
-        else:
-            out.z = shown
-            # A face that is seen from behind is not the surface that the camera sees.
-            if vertex.kind == PROXY and not is_turned(vertex, direction):
-                white = True
-                paths = wp.where(is_glossy(scene, vertex), 2, 1)
-                out.shows = 1.0
-            elif vertex.kind == BALL and not only_light:
-                paths = 1
-        difference = not whole and vertex.kind != OBJECT
-        # All kinds of path by one call: each would be a copy of what follows paths, by far the largest part.
-        for lobe in range(paths):
-            of_lobe = key
-            if lobe == 1:
-                of_lobe.seed = ~key.seed
-            one = follow_path(params, scene, vertex, direction, difference, white, lobe == 1, only_light, of_lobe)
-            out.rays += one.rays
-            if not white or (lobe == 1 and not only_light):
-                out.z += one.radiance
-            elif lobe == 0:
-                out.g = one.radiance
-                out.e = one.light
-            else:
-                out.g = one.light  # what the frame shows mirrored
-        return out
-
-    return sample_pixel
+@wp.func
+def sample_key(samples: Round, k: wp.int32, seed: wp.int32, first: wp.int32, done: wp.array2d[wp.int32]) -> PathKey:
+    """What makes the random numbers of sample ``k`` of a round its own."""
+    pixel = samples.pixels[k]
+    i = pixel / done.shape[1]
+    j = pixel % done.shape[1]
+    key = PathKey()
+    key.pixel = wp.uint32(pixel)
+    key.seed = wp.uint32(seed)
+    key.sample = wp.uint32(first + done[i, j] + k - (samples.ends[pixel] - samples.counts[pixel]))
+    return key
 
 
+@wp.func
+def camera_ray(params: FrameParams, rays: wp.array2d[wp.vec2], key: PathKey) -> wp.vec3:
+    """Direction through a random point of a pixel, unit."""
+    # A stream of its own: the vertices of the path use those from 0 on.
+    bits = pcg3d_hash(key.pixel, key.sample, ~key.seed)
+    pixel = wp.int32(key.pixel)
+    ray = rays[pixel / rays.shape[1], pixel % rays.shape[1]]
+    x = ray[0] + (uniform_from_bits(bits[0]) - 0.5) / params.focal[0]
+    y = ray[1] + (uniform_from_bits(bits[1]) - 0.5) / params.focal[1]
+    return wp.normalize(params.world_from_camera * wp.vec3(x, y, 1.0))
+
+
+@wp.func
+def begin_path(origin: wp.vec3, direction: wp.vec3, asked: wp.int32, lobe: wp.bool) -> PathPair:
+    """A path on the camera's ray."""
+    pair = PathPair()
+    pair.path.throughput = wp.vec3(1.0, 1.0, 1.0)
+    pair.path.origin = origin
+    pair.path.direction = direction
+    pair.path.density = NO_DENSITY
+    pair.path.tile = -1
+    pair.guided = -1
+    pair.lobe = lobe
+    pair.only_light = asked == wp.static(IRRADIANCE)
+    return pair
+
+
+@wp.func
+def see(
+    scene: LocalScene, asked: wp.int32, vertex: Vertex, pair: PathPair, k: wp.int32, samples_out: Round
+) -> PathPair:
+    """What the camera's ray meets: whether there is a path to follow; writes what needs none."""
+    out = pair
+    out.next = ENDED
+    whole = asked == wp.static(WHOLE)
+    z = wp.vec3(0.0, 0.0, 0.0)
+    if whole and vertex.kind == NOTHING:
+        z = sky_radiance(scene.sky, pair.path.direction, NO_DENSITY)
+    elif whole or vertex.kind == OBJECT:
+        out.next = wp.where(pair.only_light, ENDED, SURFACE)
+    else:
+        pixel = samples_out.pixels[k]
+        z = scene.radiance[pixel / scene.radiance.shape[1], pixel % scene.radiance.shape[1]]
+        out.path.changes_only = True
+        # A face that is seen from behind is not the surface that the camera sees.
+        if vertex.kind == PROXY and not is_turned(vertex, pair.path.direction):
+            out.white = True
+            out.glossy = is_glossy(scene, vertex)
+            if scene.guides.learned.shape[0] > 0:
+                out.path.tile = tile_of(samples_out.pixels[k], scene.radiance.shape[1])
+            out.next = SURFACE
+        elif vertex.kind == BALL and not pair.only_light:
+            out.next = SURFACE
+    if not pair.lobe:
+        samples_out.z[k] = z
+        samples_out.g[k] = wp.vec3(0.0, 0.0, 0.0)
+        samples_out.e[k] = wp.vec3(0.0, 0.0, 0.0)
+        samples_out.shows[k] = wp.where(out.white, 1.0, 0.0)
+        samples_out.rays[k] = 0
+        samples_out.bins[k] = -1
+    return out
+
+
+@wp.func
+def write_sample(pair: PathPair, k: wp.int32, samples_out: Round):
+    """Write what a path that has ended tells of its pixel, as ``add_sample`` takes it."""
+    samples_out.rays[k] = samples_out.rays[k] + pair.rays
+    if not pair.white or (pair.lobe and not pair.only_light):
+        samples_out.z[k] = samples_out.z[k] + pair.radiance
+    elif pair.lobe:
+        samples_out.g[k] = pair.light  # what the frame shows mirrored
+    else:
+        samples_out.g[k] = pair.radiance
+        samples_out.e[k] = pair.light
+        samples_out.bins[k] = pair.guided
+        if pair.guided >= 0:
+            found = wp.abs(pair.radiance - pair.straight)
+            mean = (found[0] + found[1] + found[2]) / 3.0
+            samples_out.squares[k] = mean * mean * pair.drawn
+
+
+# Paths differ in length: of 32 samples side by side the longest has twice as many rays as they have in the mean. So a
+# thread of a GPU that has ended a path takes the next sample from a counter, and goes on in the same loop beside those
+# that are still on their way: its camera's ray is a ray like theirs. Which thread takes which sample is left to chance,
+# what a sample gives is not.
 @functools.cache
 def make_trace_paths_kernel(trace: TraceConfig) -> wp.Kernel:
     """Kernel of ``trace_paths`` for the kinds of shape in ``trace``."""
-    find_vertex, sample_pixel = make_find_vertex(trace), make_sample_pixel(trace)
+    find_vertex, visit = make_find_vertex(trace), make_visit(trace)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def trace_paths_kernel(
@@ -122,33 +158,45 @@ def make_trace_paths_kernel(trace: TraceConfig) -> wp.Kernel:
         seed: wp.int32,
         first: wp.int32,
         done: wp.array2d[wp.int32],
+        count: wp.int32,
         # Out:
         samples_out: Round,
     ):
+        is_shared = samples_out.taken.shape[0] > 0
         k = wp.tid() + row_start
-        pixel = samples_out.pixels[k]
-        rays = scene.picture.rays
-        i = pixel / rays.shape[1]
-        j = pixel % rays.shape[1]
+        if is_shared:
+            k = wp.atomic_add(samples_out.taken, 0, 1)
+        begins = bool(True)
+        lobe = bool(False)
         key = PathKey()
-        key.pixel = wp.uint32(pixel)
-        key.seed = wp.uint32(seed)
-        key.sample = wp.uint32(first + done[i, j] + k - (samples_out.ends[pixel] - samples_out.counts[pixel]))
-        # A stream of its own: the vertices of the path use those from 0 on.
-        bits = pcg3d_hash(key.pixel, key.sample, ~key.seed)
-        x = rays[i, j][0] + (uniform_from_bits(bits[0]) - 0.5) / params[0].focal[0]
-        y = rays[i, j][1] + (uniform_from_bits(bits[1]) - 0.5) / params[0].focal[1]
-        direction = wp.normalize(params[0].world_from_camera * wp.vec3(x, y, 1.0))
-        vertex = find_vertex(scene, params[0].camera_position, direction, True)
-        shown = wp.vec3(0.0, 0.0, 0.0)
-        if asked != wp.static(WHOLE):
-            shown = scene.radiance[i, j]
-        one = sample_pixel(params[0], scene, asked, vertex, direction, shown, key)
-        samples_out.z[k] = one.z
-        samples_out.g[k] = one.g
-        samples_out.e[k] = one.e
-        samples_out.shows[k] = one.shows
-        samples_out.rays[k] = one.rays + 1
+        pair = PathPair()
+        while k < count:
+            if begins:
+                key = sample_key(samples_out, k, seed, first, done)
+                direction = camera_ray(params[0], scene.picture.rays, key)
+                pair = begin_path(params[0].camera_position, direction, asked, lobe)
+                if lobe:
+                    key.seed = ~key.seed
+                begins = False
+            vertex = find_vertex(scene, pair.path.origin, pair.path.direction, not pair.path.without)
+            pair.rays += 1
+            if pair.path.depth == 0:
+                pair = see(scene, asked, vertex, pair, k, samples_out)
+            else:
+                pair = meet(scene, vertex, pair)
+            if pair.next == SURFACE:
+                pair = visit(params[0], scene, vertex, pair, key)
+            if pair.next == ENDED and pair.path.without:
+                pair = end_without(pair)
+            if pair.next == ENDED:
+                write_sample(pair, k, samples_out)
+                begins = True
+                # The gloss of what the pixel shows has a path of its own.
+                lobe = pair.glossy and not lobe
+                if not lobe:
+                    k = count
+                    if is_shared:
+                        k = wp.atomic_add(samples_out.taken, 0, 1)
 
     return trace_paths_kernel
 
@@ -215,11 +263,15 @@ def trace_paths(
         asked: ``WHOLE``, ``DIFFERENCE`` or ``IRRADIANCE``; all but the first need the frame's radiance.
         seed: Of the random numbers.
         first: Number of a pixel's first sample among those of the seed.
-        part: First sample, and one past the last; None means all.
+        part: First sample, and one past the last, on CPU; None means all.
     """
-    inputs = [params, scene, asked, seed, first, done]
+    device, threads = done.device, count
+    if samples_out.taken.shape[0] > 0:
+        threads = min(count, MOST_THREADS * max(device.sm_count, 1))
+        samples_out.taken.zero_()
+    inputs = [params, scene, asked, seed, first, done, count]
     kernel = make_trace_paths_kernel(trace)
-    launch_rows(kernel, (count,), inputs, [samples_out], rows=part, device=done.device)
+    launch_rows(kernel, (threads,), inputs, [samples_out], rows=part, device=device)
 
 
 def find_shown(

@@ -11,15 +11,18 @@ import warp as wp
 from tests.test_path_tracer import look
 from warp_ar.kernels import structs
 from warp_ar.kernels.path_guides import (
+    BINS,
     Guides,
     cone_versine,
     draw_guide,
     draw_mirrored,
     guide_density,
+    guided_bin,
     make_guides,
     mirrored_density,
     place_on_sphere,
 )
+from warp_ar.kernels.path_learning import learn_directions, learn_sample, make_squares
 from warp_ar.kernels.path_sampling import NO_DENSITY, PathKey, Sky, make_sky, random_triple, sky_radiance
 from warp_ar.kernels.sampling import frame_from_normal
 from warp_ar.scene import Camera, LambertMaterial, MirrorMaterial, Object, Proxy, Scene
@@ -121,24 +124,30 @@ def test_the_place_that_mirrors_a_direction(device: str) -> None:
 
 
 @wp.kernel(enable_backward=False)
-def guide_kernel(guides: Guides, sky: Sky, point: wp.vec3, changes_only: wp.bool, found: wp.array2d[wp.float32]):
+def guide_kernel(
+    guides: Guides, sky: Sky, point: wp.vec3, changes_only: wp.bool, tile: wp.int32, found: wp.array2d[wp.float32]
+):
     i = wp.tid()
     key = PathKey()
     key.sample = wp.uint32(i)
     u = random_triple(key, 0, 0)
-    direction = draw_guide(guides, sky, point, u[2], wp.vec2(u[0], u[1]), changes_only)
+    direction = draw_guide(guides, sky, point, u[2], wp.vec2(u[0], u[1]), changes_only, tile)
     if wp.length(direction) > 0.0:
-        found[0, i] = (2.0 + direction[0] + direction[2]) / guide_density(guides, sky, point, direction, changes_only)
+        density = guide_density(guides, sky, point, direction, changes_only, tile)
+        found[0, i] = (2.0 + direction[0] + direction[2]) / density
+        found[2, i] = wp.float32(guided_bin(guides, point, direction))
     v = random_triple(key, 0, 1)
     z = 2.0 * v[0] - 1.0
     sine = wp.sqrt(1.0 - z * z)
     even = wp.vec3(sine * wp.cos(2.0 * wp.pi * v[1]), sine * wp.sin(2.0 * wp.pi * v[1]), z)
-    if guide_density(guides, sky, point, even, changes_only) > 0.0:
+    if guide_density(guides, sky, point, even, changes_only, tile) > 0.0:
         found[1, i] = 4.0 * wp.pi * (2.0 + even[0] + even[2])
 
 
-@pytest.mark.parametrize("changes_only", [False, True], ids=["all", "changes"])
-def test_guided_draws_follow_their_density(changes_only: bool, device: str) -> None:
+@pytest.mark.parametrize(
+    ("changes_only", "tile"), [(False, -1), (True, -1), (True, 1)], ids=["all", "changes", "learned"]
+)
+def test_guided_draws_follow_their_density(changes_only: bool, tile: int, device: str) -> None:
     objects = np.zeros(2, np.dtype(structs.Shape.numpy_dtype()))
     objects["kind"], objects["scale"] = (structs.SPHERE, structs.BOX), (1.0, 2.0)
     objects["position"] = (0.0, 0.0, 0.2), (0.3, 0.0, 0.1)
@@ -151,11 +160,20 @@ def test_guided_draws_follow_their_density(changes_only: bool, device: str) -> N
     guides = make_guides(objects, materials, balls, device)
     assert (len(guides.spheres), len(guides.mirrors)) == (3, 2)
     assert (guides.virtual_spheres, guides.virtual_mirrors) == (2, 1)
-    found = wp.zeros((2, COUNT), dtype=wp.float32, device=device)
-    inputs = [guides, make_sky(sunny(), device), wp.vec3(0.1, -0.2, 0.0), changes_only]
+    chance = np.random.default_rng(7).exponential(size=(2, 2 * int(BINS))) ** 2 + 0.05
+    sums = np.cumsum(chance / chance.sum(axis=1, keepdims=True), axis=1)
+    learned = np.concatenate([np.zeros((2, 1)), sums / sums[:, -1:]], axis=1)
+    guides.learned = wp.array(learned, dtype=wp.float32, device=device)
+    found = wp.zeros((3, COUNT), dtype=wp.float32, device=device)
+    inputs = [guides, make_sky(sunny(), device), wp.vec3(0.1, -0.2, 0.0), changes_only, tile]
     wp.launch(guide_kernel, COUNT, inputs=inputs, outputs=[found], device=device)
-    drawn, evenly = found.numpy().astype(np.float64)
+    drawn, evenly, bins = found.numpy().astype(np.float64)
     agree(drawn, evenly)
+    # Half of the directions are drawn by mirrored light, of one sphere; those of the other one by its bins alone.
+    if tile >= 0:
+        others = np.bincount(bins[bins >= BINS].astype(int), minlength=2 * int(BINS))[int(BINS) :]
+        expected = 0.5 * COUNT * np.diff(learned[1])[int(BINS) :]
+        assert ((others - expected) ** 2 / expected).mean() == pytest.approx(1.0, abs=0.5)
 
 
 def studio() -> np.ndarray:
@@ -191,3 +209,53 @@ def test_a_mirror_and_chalk_agree_with_another_renderer(mode: str, device: str) 
     assert row["z_max"] < 3.0, row
     assert row["z_rms"] < 1.4, row
     assert row["ratio"] == pytest.approx([1.0] * 3, abs=0.02)
+
+
+# Float32 sums of 256 chances.
+CHANCE_TOLERANCE = 2e-6
+
+
+def test_directions_are_learned(device: str) -> None:
+    """Chances grow as the root of what tiles around have in a bin; a quarter is even; a tile without any is even."""
+    squares = make_squares((20, 33), 1, device)
+    assert squares.shape == (15, int(BINS))
+    sums = np.zeros((3, 5, int(BINS)), np.int64)
+    sums[1, 1, 7], sums[1, 1, 200], sums[0, 2, 7] = 1 << 40, 1 << 42, 1 << 41
+    learned = wp.empty((15, int(BINS) + 1), dtype=wp.float32, device=device)
+    learn_directions(wp.array(sums.reshape(15, -1), dtype=wp.int64, device=device), learned, width=33)
+    cumulative = learned.numpy().astype(np.float64)
+    np.testing.assert_array_equal(cumulative[:, [0, -1]], [(0.0, 1.0)] * 15)
+    chances = np.diff(cumulative, axis=1).reshape(3, 5, -1)
+    padded = np.pad(sums.astype(np.float64), ((1, 1), (1, 1), (0, 0)))
+    around = sum(
+        (2 - abs(i)) * (2 - abs(j)) * padded[1 + i : 4 + i, 1 + j : 6 + j] for i in (-1, 0, 1) for j in (-1, 0, 1)
+    )
+    total = np.sqrt(around).sum(axis=2, keepdims=True)
+    expected = np.where(total > 0, 0.25 / BINS + 0.75 * np.sqrt(around) / np.maximum(total, 1.0), 1.0 / BINS)
+    np.testing.assert_allclose(chances, expected, atol=CHANCE_TOLERANCE)
+    assert (np.ptp(chances[2, 4]) < CHANCE_TOLERANCE).all()
+    assert chances[1, 1, 200] > chances[1, 1, 7] > 0.2
+
+
+@wp.kernel(enable_backward=False)
+def learn_kernel(
+    pixels: wp.array[wp.int32], bins: wp.array[wp.int32], values: wp.array[wp.float32], squares: wp.array2d[wp.int64]
+):
+    k = wp.tid()
+    learn_sample(pixels[k], 33, bins[k], values[k], squares)
+
+
+def test_what_samples_tell_is_summed_in_their_tile(device: str) -> None:
+    """Whatever the order; what is no number, and what tells of no bin, is left out."""
+    given = [(0, 3, 1.0), (7 * 33 + 7, 3, 0.5), (8 * 33 + 32, 0, 2.0), (5, -1, 1.0), (5, 4, math.nan), (8, 255, 1e30)]
+    pixels, bins, values = (np.array(column) for column in zip(*given, strict=True))
+    inputs = [
+        wp.array(pixels, dtype=wp.int32, device=device),
+        wp.array(bins, dtype=wp.int32, device=device),
+        wp.array(values, dtype=wp.float32, device=device),
+    ]
+    squares = make_squares((20, 33), 1, device)
+    wp.launch(learn_kernel, len(given), inputs=inputs, outputs=[squares], device=device)
+    expected = np.zeros((15, int(BINS)))
+    expected[0, 3], expected[9, 0], expected[1, 255] = 1.5, 2.0, 1e9
+    np.testing.assert_array_equal(squares.numpy(), 65536.0 * expected)

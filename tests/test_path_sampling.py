@@ -27,7 +27,6 @@ from warp_ar.kernels.path_sampling import (
     sky_tables,
     split_emitters,
     surface_density,
-    weigh_drawn,
 )
 from warp_ar.kernels.sampling import sample_cosine_hemisphere
 from warp_ar.kernels.shapes import FAR
@@ -107,9 +106,10 @@ def surface_kernel(
     key.sample = wp.uint32(i)
     u = random_triple(key, 0, 0)
     direction = draw_reflected(surface, normal, normal, wo, u[2], wp.vec2(u[0], u[1]))
-    drawn = weigh_drawn(surface, normal, wo, direction, surface_density(surface, normal, wo, direction))
-    estimates[0, i] = drawn.weight[0]
-    if wp.length(drawn.direction) == 0.0:
+    if wp.length(direction) > 0.0:
+        density = surface_density(surface, normal, wo, direction)
+        estimates[0, i] = reflect_direct(surface, normal, wo, direction)[0] / density
+    else:
         missing[i] = 1
     v = random_triple(key, 0, 1)
     sin_theta = wp.sqrt(v[0] * (2.0 - v[0]))

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
+import warp as wp
 
 from warp_ar.accuracy import path_tracer
 from warp_ar.accuracy.path_tracer import PathTracer, TracedPicture
@@ -302,6 +303,28 @@ def test_the_same_seed_gives_the_same_bits(device: str) -> None:
     assert (images[0].radiance != images[2].radiance).any()
 
 
+def test_threads_that_take_several_samples_give_the_same_bits(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whichever thread takes a sample, and whatever it took before; pixels of a polished desk have two paths each."""
+    frame = np.full((32, 48, 3), 0.5, np.float32)
+    found = []
+    for threads in (0, 1, 100):
+        tracer = PathTracer(polish(boxes(True), 0.2, 0.3), latlong_sky(), frame, ABOVE, device=device)
+        tracer.sample(1)
+        count = tracer._begin_round(2)
+        assert count > 1000
+        tracer._round.taken = wp.zeros(min(threads, 1), dtype=wp.int32, device=device)
+        monkeypatch.setattr(path_tracer.path_tracer, "MOST_THREADS", threads)
+        path_tracer.path_tracer.trace_paths(
+            tracer._trace, tracer._params, tracer._local, tracer._moments.samples, tracer._round,
+            count=count, asked=path_tracer.path_tracer.DIFFERENCE, seed=5, first=0,
+        )  # fmt: skip
+        if threads:
+            assert tracer._round.taken.numpy()[0] >= count
+        found.append([a.numpy()[:count] for a in (tracer._round.z, tracer._round.g, tracer._round.e)])
+    for other in found[1:]:
+        np.testing.assert_array_equal(other, found[0])
+
+
 @pytest.mark.parametrize("known", [False, True], ids=["whole", "difference"])
 def test_standard_errors_are_honest(known: bool, device: str) -> None:
     """The spread over seeds is what each picture says of itself."""
@@ -328,22 +351,30 @@ def test_pixels_have_their_share_by_the_noise_around_them() -> None:
     error = np.full((60, 60, 3), 0.01, np.float32)
     error[:, 30:] = 0.04
     samples = np.full((60, 60), 16, np.int32)
-    shares = path_tracer.sample_shares(picture, error, samples)
+    proxies = np.ones((60, 60), np.float32)
+    shares = path_tracer.sample_shares(picture, error, samples, proxies)
     assert shares.mean() == pytest.approx(1.0, abs=1e-5)
     assert shares[30, 50] == pytest.approx(4.0 * shares[30, 10], rel=1e-5)
     one = error.copy()
     one[20, 10] = 0.5
-    others = path_tracer.sample_shares(picture, one, samples)
+    others = path_tracer.sample_shares(picture, one, samples, proxies)
     assert others[20, 11] > 2.0 * others[20, 20]
     assert others[20, 10] / others[20, 20] == pytest.approx(1.0, rel=1e-5)
+    # What lies beside it and shows another kind of surface has no say either.
+    edge = proxies.copy()
+    edge[:, 30:] = 0.0
+    parted = path_tracer.sample_shares(picture, error, samples, edge)
+    assert len(np.unique(parted[:, :30])) == len(np.unique(parted[:, 30:])) == 1
+    assert parted[0, 30] == pytest.approx(4.0 * parted[0, 29], rel=1e-5)
+    assert shares[30, 29] > 2.0 * shares[30, 10]
     # An error of twice as many samples is one of a greater variance; noise of what surely clips is none.
     samples[:, 30:] *= 2
-    more = path_tracer.sample_shares(picture, error, samples)
+    more = path_tracer.sample_shares(picture, error, samples, proxies)
     assert more[30, 50] == pytest.approx(4.0 * math.sqrt(2.0) * more[30, 10], rel=1e-5)
     picture[:, 30:] = 2.0
-    clipped = path_tracer.sample_shares(picture, error, samples)
+    clipped = path_tracer.sample_shares(picture, error, samples, proxies)
     assert clipped[30, 50] == clipped.min() > 0.1
-    assert (path_tracer.sample_shares(picture, np.zeros_like(error), samples) == 1.0).all()
+    assert (path_tracer.sample_shares(picture, np.zeros_like(error), samples, proxies) == 1.0).all()
 
 
 @pytest.mark.parametrize("known", [False, True], ids=["whole", "difference"])

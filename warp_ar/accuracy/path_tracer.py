@@ -23,6 +23,7 @@ from warp_ar.errors import UsageError
 from warp_ar.kernels import path_tracer, structs
 from warp_ar.kernels.color import decode_table, encode_table
 from warp_ar.kernels.path_guides import make_guides
+from warp_ar.kernels.path_learning import learn_directions, make_squares
 from warp_ar.kernels.path_picture import finish_picture, make_moments, map_reflectance
 from warp_ar.kernels.path_samples import add_samples, list_samples, make_round
 from warp_ar.kernels.path_sampling import make_sky
@@ -50,9 +51,9 @@ DFG_SIZE = 32
 PART = 2048
 """Samples that a thread takes at a time, on CPU."""
 MOST_SAMPLES = 1 << 21
-"""Of a round, where a pass has no more: a GPU's memory holds 52 bytes for each."""
+"""Of a round, where a pass has no more: a GPU's memory holds 60 bytes for each."""
 FIRST_ROUND = 16
-"""Samples per pixel after which pixels get their shares; and again whenever there are twice as many."""
+"""Samples per pixel after which something is learned from them; and again whenever there are twice as many."""
 AROUND = 9
 """Width in pixels of the square whose noise tells a pixel's share."""
 LEAST_SHARE, MOST_SHARE = 0.25, 32.0
@@ -103,13 +104,28 @@ def _seen_noise(picture: FloatImage, error: FloatImage) -> npt.NDArray[np.float6
 
 # With n_i of N samples in pixel i the variance of the picture is the sum of v_i / n_i, least where n_i grows as the
 # root of v_i, the variance of one sample. It is that of the neighbours' samples: what the pixel's own gave has no say
-# in how many more it gets, for the mean of samples that go on until a bright one came would be biased.
-def sample_shares(picture: FloatImage, error: FloatImage, samples: npt.NDArray[np.int32]) -> FloatImage:
-    """Samples of each pixel in a pass, 1 in the mean, by the noise of the pixels around it, (H, W)."""
+# in how many more it gets, for the mean of samples that go on until a bright one came would be biased. Neighbours are
+# those that show the same kind of surface: an object's noise and that of the desk beside it are of different size.
+def sample_shares(
+    picture: FloatImage, error: FloatImage, samples: npt.NDArray[np.int32], proxies: FloatImage
+) -> FloatImage:
+    """Samples of each pixel in a pass, 1 in the mean, by the noise of the pixels around it.
+
+    Args:
+        picture: Linear radiance, (H, W, 3).
+        error: Its standard error, (H, W, 3).
+        samples: Of each pixel so far, (H, W).
+        proxies: Share of these that show a proxy, (H, W).
+    """
     variance = (_seen_noise(picture, error) ** 2).mean(axis=2) * samples
-    others = AROUND * AROUND - 1
-    sums = cv2.boxFilter(variance, -1, (AROUND, AROUND), normalize=False, borderType=cv2.BORDER_CONSTANT)
-    deviation = np.sqrt(np.maximum(sums - variance, 0.0) / others)
+    deviation = np.zeros(variance.shape)
+    for own in (proxies > 0.5, proxies <= 0.5):
+        counted = np.where(own, variance, 0.0)
+        sums, others = (
+            cv2.boxFilter(values, -1, (AROUND, AROUND), normalize=False, borderType=cv2.BORDER_CONSTANT) - values
+            for values in (counted, own.astype(np.float64))
+        )
+        deviation[own] = np.sqrt(np.maximum(sums, 0.0) / np.maximum(others, 1.0))[own]
     mean = deviation.mean()
     if not mean > 0.0:
         return np.ones(variance.shape, np.float32)
@@ -190,6 +206,8 @@ class PathTracer:
         shape = (self.camera.height, self.camera.width)
         self._moments = make_moments(shape, self.device)
         self._round = make_round(shape, self.device)
+        objects = self._local.guides.virtual_spheres if self._linear is not None else 0
+        self._squares = make_squares(shape, objects, self.device)
         self._shares = wp.ones(shape, dtype=wp.float32, device=self.device)
         self._radiance = wp.zeros(shape, dtype=wp.vec3, device=self.device)
         self._error = wp.zeros(shape, dtype=wp.vec3, device=self.device)
@@ -257,7 +275,7 @@ class PathTracer:
     def _end_round(self, passes: int) -> None:
         """Take the samples of some passes into the moments."""
         with translating(self.device), wp.ScopedDevice(self.device):
-            add_samples(self._round, self._moments)
+            add_samples(self._round, self._moments, self._squares)
         self._passes += passes
 
     def _follow(self, asked: int, first: int, count: int, at_once: int) -> Iterator[None]:
@@ -330,14 +348,24 @@ class PathTracer:
         self._passes = 0
 
     def _share(self) -> None:
-        """Give pixels their shares anew wherever there are ``FIRST_ROUND`` samples, twice as many, and so on."""
+        """Learn from the samples so far, wherever there are ``FIRST_ROUND``, twice as many, and so on.
+
+        That is which pixels get how many of those to come, and in which directions objects throw light onto surfaces.
+        """
         rounds, rest = divmod(self.samples, FIRST_ROUND)
         if rest or not rounds or rounds & (rounds - 1):
             return
+        moments, guides = self._moments, self._local.guides
         with exclusive(self.device), wp.ScopedDevice(self.device):
             self._finish()
-            found = (np.array(a.numpy()) for a in (self._radiance, self._error, self._moments.samples))
+            found = (np.array(a.numpy()) for a in (self._radiance, self._error, moments.samples, moments.proxies))
             self._shares = wp.array(sample_shares(*found), dtype=wp.float32, device=self.device)
+        tiles, bins = self._squares.shape
+        if bins:
+            with translating(self.device), wp.ScopedDevice(self.device):
+                if guides.learned is None:
+                    guides.learned = wp.empty((tiles, bins + 1), dtype=wp.float32, device=self.device)
+                learn_directions(self._squares, guides.learned, width=self.camera.width)
         self._passes = 0
 
     def _finish(self) -> None:
