@@ -178,7 +178,7 @@ class FrameInputs:
             return None, False
         gain, contrast = self._drift.gain, self._drift.contrast
         self._drift.saturation = self.saturation.levels
-        if not self._drift.observe(frame.image, pose, frame.seconds, frame.plate):
+        if not self._drift.observe(frame.image, pose, frame.plate):
             return None, False
         self._have_lights_shine()
         is_bent = contrast != self._drift.contrast
