@@ -317,7 +317,8 @@ class FrameInputs:
         if frame.index >= WATCHED and frame.index % PERIOD:
             return
         discs = ball_discs(self._probes, self._camera, frame.pose)
-        if self.saturation.observe(frame.image, discs, float(self.gain.mean()), frame.plate):
+        bent = self._drift is not None and self._drift.contrast > 0.0
+        if self.saturation.observe(frame.image, discs, float(self.gain.mean()), frame.plate, bent=bent):
             self._write_decode()
 
     def _place_probes(self, frame: SeenFrame) -> Iterable[str]:
