@@ -15,6 +15,7 @@ from warp_ar.scene import loads_scene
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 330.0
 VIEWS = 7
+MIDDLE = VIEWS // 2
 RAYS = 8
 """Per pixel of the table, for what it mirrors."""
 HALF = np.array([0.8, 0.7])
@@ -93,6 +94,8 @@ class Film:
     views: list
     """RGB and ``camera_from_world``."""
     about: str
+    there: np.ndarray | None = None
+    """The view in the middle with the block that the program is not told of; None without one."""
 
     def capture(self):
         """The environment as the ball shows it, nothing recovered."""
@@ -116,10 +119,28 @@ def room(rng):
     return cv2.GaussianBlur(radiance.astype(np.float32), (0, 0), 1.0)
 
 
-def film(seed, roughness, reflectance, *, environment=None, clutter=False, spoil: Spoil | None = None) -> Film:
+def _photograph(exposed, rng):
+    """sRGB codes of linear values, with a sensor's noise."""
+    exposed = exposed + 0.003 * np.sqrt(np.maximum(exposed, 0.0) + 0.02) * rng.standard_normal(exposed.shape)
+    exposed = np.clip(exposed, 0.0, 1.0)
+    codes = np.where(exposed <= 0.0031308, 12.92 * exposed, 1.055 * np.maximum(exposed, 1e-9) ** (1 / 2.4) - 0.055)
+    return np.round(255.0 * codes).astype(np.uint8)
+
+
+def film(
+    seed,
+    roughness,
+    reflectance,
+    *,
+    environment=None,
+    clutter=False,
+    spoil: Spoil | None = None,
+    standing: Callable[[np.ndarray], Block] | None = None,
+) -> Film:
     """Seven views, 44 degrees around a table with a card and a ball, by sRGB codes with a sensor's noise.
 
-    ``environment`` is ``FINE`` latlong radiance, turned as the seed says; None: a room.
+    ``environment`` is ``FINE`` latlong radiance, turned as the seed says; None: a room. ``standing`` gives a block by
+    the ball's centre: it stands in one more picture, and in no view.
     """
     rng = np.random.default_rng(seed)
     environment = room(rng) if environment is None else np.roll(environment, int(rng.integers(FINE[1])), axis=1)
@@ -137,7 +158,7 @@ def film(seed, roughness, reflectance, *, environment=None, clutter=False, spoil
     target = np.array([*(0.5 * ball[:2]), 0.02])
     pixels = np.stack([*np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))], -1).reshape(-1, 2)
     local = np.column_stack([(pixels - [(WIDTH - 1) / 2, (HEIGHT - 1) / 2]) / FOCAL, np.ones(len(pixels))])
-    views, exposure = [], 0.0
+    views, exposure, there = [], 0.0, None
     for number, step in enumerate(np.linspace(-1.0, 1.0, VIEWS)):
         up, around = np.radians(elevation + 7.0 * np.sin(3.0 * step)), azimuth + np.radians(22.0) * step
         away = np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
@@ -145,13 +166,17 @@ def film(seed, roughness, reflectance, *, environment=None, clutter=False, spoil
         x = np.cross(-away, [0.0, 0.0, 1.0]) / np.cos(up)
         rotation = np.stack([x, np.cross(-away, x), -away])
         rays = local @ rotation
-        linear = world.trace(eye, rays / np.linalg.norm(rays, axis=1, keepdims=True)).reshape(HEIGHT, WIDTH, 3)
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        linear = world.trace(eye, rays).reshape(HEIGHT, WIDTH, 3)
         exposure = exposure or float(rng.uniform(0.25, 0.7) / np.percentile(linear.mean(-1), 75))
         exposed = exposure * linear if spoil is None else spoil(exposure * linear, number)
-        exposed += 0.003 * np.sqrt(np.maximum(exposed, 0.0) + 0.02) * rng.standard_normal(exposed.shape)
-        exposed = np.clip(exposed, 0.0, 1.0)
-        codes = np.where(exposed <= 0.0031308, 12.92 * exposed, 1.055 * np.maximum(exposed, 1e-9) ** (1 / 2.4) - 0.055)
-        views.append((np.round(255.0 * codes).astype(np.uint8), Pose(rotation, -rotation @ eye)))
+        views.append((_photograph(exposed, rng), Pose(rotation, -rotation @ eye)))
+        if standing is not None and number == MIDDLE:
+            both = [*blocks, standing(ball)]
+            more = PolishedWorld(environment, (ball, radius, BALL_REFLECTS), both, [], table, card)
+            own = np.random.default_rng(seed)  # of its own: the views are those of a film without it
+            more.polish(roughness, reflectance, own)
+            there = _photograph(exposure * more.trace(eye, rays).reshape(HEIGHT, WIDTH, 3), own)
     scene = loads_scene(
         f"schema = 1\n[camera]\nwidth = {WIDTH}\nheight = {HEIGHT}\nfx = {FOCAL}\nfy = {FOCAL}\n"
         f'cx = {(WIDTH - 1) / 2}\ncy = {(HEIGHT - 1) / 2}\ntransfer = "srgb"\n'
@@ -159,4 +184,4 @@ def film(seed, roughness, reflectance, *, environment=None, clutter=False, spoil
         f"[probe]\ncenter = {ball.tolist()}\nradius = {radius}\nreflectance = {[BALL_REFLECTS] * 3}\n"
         f'[[proxy]]\nshape = "plane"\nsize = {(2.0 * HALF).tolist()}\n'
     )
-    return Film(scene, views, f"{seed}: texture {amplitude}, from {elevation:.0f} degrees")
+    return Film(scene, views, f"{seed}: texture {amplitude}, from {elevation:.0f} degrees", there)

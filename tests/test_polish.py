@@ -9,11 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.polished_table import HEIGHT, WIDTH, film
-from warp_ar.doctor import look_for_polish
+from tests.polished_table import HEIGHT, VIEWS, WIDTH, film
+from warp_ar import doctor
+from warp_ar.input import checkup
 from warp_ar.kernels.color import decode_table
 from warp_ar.light.polish import estimate_polish
-from warp_ar.scene import ProxyMaterial
+from warp_ar.scene import ProxyMaterial, dumps_scene, load_scene
 
 TABLE = decode_table("srgb")
 ROWS, COLUMNS = np.mgrid[-1 : 1 : HEIGHT * 1j, -1 : 1 : WIDTH * 1j]
@@ -59,18 +60,67 @@ def test_what_the_scene_says_is_not_asked():
     assert estimate(made) is None
 
 
-def test_doctor_says_what_to_write(tmp_path):
-    """Of the same film as pictures in a folder, by the poses that it finds itself; of a matt table, nothing."""
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    """Scenes with films as pictures in folders, of a polished table and of a matt one."""
+    found = {}
     for name, reflectance in (("polished", 0.04), ("matt", 0.0)):
-        made = film(6, 0.15, reflectance)
-        (tmp_path / name).mkdir()
+        made, folder = film(6, 0.15, reflectance), tmp_path_factory.mktemp(name)
+        (folder / "frames").mkdir()
         for number, (image, _) in enumerate(made.views):
-            cv2.imwrite(str(tmp_path / name / f"{number}.png"), image[..., ::-1])
-        line = look_for_polish(made.scene, tmp_path / name, 120)
-        if name == "matt":
-            assert line is None
-        else:
-            assert line is not None
-            assert "[proxy.material]" in line
-            assert float(re.search(r"reflectance = (\S+)", line)[1]) == pytest.approx(0.04, rel=0.5)
-    assert look_for_polish(made.scene, None, 120) is None
+            cv2.imwrite(str(folder / "frames" / f"{number}.png"), image[..., ::-1])
+        box = '[[proxy]]\nshape = "box"\nat = [0.0, 0.6, 0.01]\nsize = [0.02, 0.02, 0.02]\n\n'
+        text = dumps_scene(made.scene).replace("[[proxy]]", f"{box}[[proxy]] # the table")
+        (folder / "scene.toml").write_text(text + '[source]\npath = "frames"\n')
+        found[name] = folder
+    return found
+
+
+def test_doctor_says_and_writes_how_a_table_mirrors(folders, capsys):
+    """By the poses that it finds itself; the second time the scene says it already."""
+    path = folders["polished"] / "scene.toml"
+    doctor.main([str(path)])
+    said = capsys.readouterr().out
+    assert "[proxy.material]" in said
+    assert float(re.search(r"reflectance = (\S+)", said)[1]) == pytest.approx(0.04, rel=0.5)
+    assert all(proxy.material is None for proxy in load_scene(path).proxies)
+    doctor.main([str(path), "--write"])
+    box, table = load_scene(path).proxies
+    assert box.material is None
+    assert f"roughness = {table.material.roughness:g}" in said
+    assert f"reflectance = {table.material.reflectance[0]:g}" in said
+    assert "# the table" in path.read_text()
+    capsys.readouterr()
+    before = path.read_text()
+    doctor.main([str(path), "--write"])
+    assert "the scene has a [proxy.material]" in capsys.readouterr().err
+    assert path.read_text() == before
+
+
+def test_doctor_writes_nothing_of_a_matt_table(folders, capsys):
+    path = folders["matt"] / "scene.toml"
+    before = path.read_text()
+    doctor.main([str(path), "--write"])
+    said = capsys.readouterr()
+    assert "table:" not in said.out
+    assert "nothing is written" in said.err
+    assert path.read_text() == before
+
+
+def test_doctor_reads_the_frames_once_and_tells_how_far_it_is(folders, monkeypatch):
+    """What takes seconds says what it does, frame by frame and direction by direction."""
+    scene, opened, told = load_scene(folders["polished"] / "scene.toml"), [], []
+    scene = dataclasses.replace(scene, proxies=tuple(dataclasses.replace(p, material=None) for p in scene.proxies))
+    open_source = checkup.open_source
+
+    def count(*given, **more):
+        opened.append(given)
+        return open_source(*given, **more)
+
+    monkeypatch.setattr(checkup, "open_source", count)
+    _, look = checkup.check_and_look(scene, scene.source.path, tell=told.append)
+    assert doctor.look_for_polish(scene, look, told.append) is not None
+    assert len(opened) == 1
+    frames, sides = ([line for line in told if line.startswith(word)] for word in ("looking at frame", "gathering"))
+    assert frames[-1] == f"looking at frame {VIEWS} of {VIEWS}"
+    assert sides[-1] == f"gathering light from direction {VIEWS} of {VIEWS}"

@@ -9,20 +9,23 @@ if __name__ == "__main__":
 
 import argparse
 import dataclasses
-import itertools
 import math
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from rich.console import Console
+
 from warp_ar.begin import importing
-from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, run_command
+from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, run_command, say
 from warp_ar.errors import UsageError, printable
-from warp_ar.input.checkup import FRAMES, check_up, source_of
+from warp_ar.input.check_pictures import Look
+from warp_ar.input.checkup import FRAMES, check_and_look, source_of
 from warp_ar.input.finding import Finding, worst_first
-from warp_ar.scene import Camera, Pose, Scene, bundled_scenes, load_scene
+from warp_ar.scene import Pose, Scene, bundled_scenes, load_scene
+from warp_ar.scene.amend import amend_scene
 
 DEVICES = Path("/dev")
 """Where the system lists capture devices."""
@@ -32,6 +35,20 @@ APART = 4.0
 """Degrees between these."""
 MISLEADING = ("units.", "source.", "camera.", "marker.", "ball.outside", "ball.unfound", "ball.place", "ball.radius")
 """Beginnings of names of findings with which pictures do not say what a table mirrors."""
+STEP = 0.5
+"""Seconds from one direction to the next, as light is gathered: longer than the light of the last one counts."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TablePolish:
+    """How the scene's table mirrors, by its frames."""
+
+    values: dict[str, float]
+    """Of ``[proxy.material]``, rounded."""
+    proxy: int
+    """Number of the ``[[proxy]]``."""
+    lines: tuple[str, ...]
+    """The same for people."""
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -47,6 +64,8 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--frames", type=int, default=FRAMES, metavar="N", help=f"frames to look at (default: {FRAMES})"
     )
+    text = "write [proxy.material] into the scene file where the frames tell that the table mirrors; its comments stay"
+    parser.add_argument("--write", action="store_true", help=text)
     return parser
 
 
@@ -101,80 +120,113 @@ def check_access(scene: Scene, source: str | int | Path | None) -> list[Finding]
     return []
 
 
-def look_for_polish(scene: Scene, source: str | int | Path | None, frames: int) -> str | None:
-    """A line that says how a table mirrors its surroundings, and what to write of it.
+def look_for_polish(scene: Scene, look: Look, tell: Callable[[str], object] | None = None) -> TablePolish | None:
+    """How a table mirrors its surroundings, and what to write of it.
 
     Args:
         scene: With a card, a mirror ball and a plane.
-        source: A recording; what else it may be is not asked.
-        frames: How many to look at.
+        look: Its frames.
+        tell: Told, for people, what is looked at.
 
     Returns:
         None where they do not tell that it does, or the scene says it already.
     """
-    planes = [proxy for proxy in scene.proxies if proxy.shape == "plane"]
+    planes = [index for index, proxy in enumerate(scene.proxies) if proxy.shape == "plane"]
     asked = scene.probes and scene.has_marker and planes and not any(proxy.material for proxy in scene.proxies)
-    if not asked or source is None or not Path(str(source)).exists():
+    views = _sides(look.views) if asked else []
+    if len(views) < FEW_SIDES:
         return None
     with importing():
-        from warp_ar.kernels.color import decode_table
-        from warp_ar.light.polish import estimate_polish
+        from warp_ar.light.polish import USUAL, estimate_polish
 
-    camera, views, environment = _see_from_sides(scene, source, frames)
-    if environment is None or len(views) < FEW_SIDES:
-        return None
-    polish = estimate_polish(scene, camera, views, environment, decode_table(camera.transfer))
+    environment = _gather_light(scene, views, tell)
+    if tell is not None:
+        tell("looking whether the table mirrors its surroundings")
+    polish = estimate_polish(scene, look.camera, views, environment, look.table)
     if polish is None:
         return None
-    said = "roughness = {:.2g} ({:.2g} to {:.2g}), ".format(*polish.roughness)
-    if polish.reflectance is None:
-        said += "reflectance = 0.04, as lacquer has it: only lamps that clip in the ball are mirrored"
-    else:
-        said += "reflectance = {:.2g} ({:.2g} to {:.2g})".format(*polish.reflectance)
-    return f"table: it mirrors its surroundings, as {len(views)} views tell; [proxy.material] shows it: {said}"
+    roughness, reflectance = polish.roughness, polish.reflectance
+    values = {"roughness": roughness[0], "reflectance": USUAL if reflectance is None else reflectance[0]}
+    values = {name: float(f"{value:.2g}") for name, value in values.items()}
+    spread = "only lamps that clip in the ball are mirrored, so the reflectance is lacquer's"
+    if reflectance is not None:
+        spread = "reflectance {:.2g} to {:.2g}".format(*reflectance[1:])
+    spread = "roughness {:.2g} to {:.2g}, ".format(*roughness[1:]) + spread
+    lines = f"table: it mirrors its surroundings, as {len(views)} views tell ({spread}); below its [[proxy]]:"
+    written = [f"    {name} = {value:g}" for name, value in values.items()]
+    return TablePolish(values, planes[0], (lines, "    [proxy.material]", *written))
 
 
-def _see_from_sides(scene: Scene, source: str | int | Path, frames: int) -> tuple[Camera, list[Any], Any]:
-    """The camera, views that differ in direction, and the environment as the ball shows it; None: it shows none."""
+def _sides(views: Sequence[tuple[Any, Pose]]) -> list[tuple[Any, Pose]]:
+    """Views whose directions differ."""
+    found: list[tuple[Any, Pose]] = []
+    for image, pose in views:
+        ahead = pose.rotation[2]
+        if all(ahead @ other.rotation[2] < math.cos(math.radians(APART)) for _, other in found):
+            found.append((image, pose))
+    return found
+
+
+def _gather_light(scene: Scene, views: list[tuple[Any, Pose]], tell: Callable[[str], object] | None) -> Any:
+    """The environment as the ball shows it, nothing recovered."""
     with importing():
         import numpy as np
 
-        from warp_ar.session import Session
+        from warp_ar.engine.pipeline import Pipeline
         from warp_ar.stages.quality import PRESETS
 
     quality = PRESETS["medium"].with_methods(recover="clipped")
     bare = dataclasses.replace(scene, objects=(), lights=())
-    views: list[tuple[Any, Pose]] = []
-    environment = None
-    with Session(bare, source=source, quality=quality, outputs=("environment",)) as session:
-        camera = scene.camera.scaled_to(*session.source.size)
-        for frame, result in itertools.islice(session, frames):
-            if result.pose is None or result.environment is None or frame.image.dtype != np.uint8:
-                continue
-            environment = np.array(result.environment)
-            ahead = result.pose.rotation[2]
-            if all(ahead @ pose.rotation[2] < math.cos(math.radians(APART)) for _, pose in views):
-                views.append((np.array(frame.image), result.pose))
-    return camera, views, environment
+    height, width = views[0][0].shape[:2]
+    with Pipeline(bare, quality=quality, size=(width, height), outputs=("environment",)) as pipeline:
+        for number, (image, pose) in enumerate(views, 1):
+            if tell is not None:
+                tell(f"gathering light from direction {number} of {len(views)}")
+            result = pipeline(image, time_seconds=STEP * number, pose=pose)
+        return np.array(result.environment)
+
+
+def _write_polish(scene: Scene, polish: TablePolish | None, misled: bool) -> None:
+    """Write what frames tell of the table into the scene file; where nothing is written, say why."""
+    if polish is not None and scene.path is not None:
+        amend_scene(scene.path, "proxy", {"material": polish.values}, index=polish.proxy)
+        print(f"{printable(scene.path)}: its [[proxy]] has them now")
+    elif any(proxy.material for proxy in scene.proxies):
+        say("nothing is written: the scene has a [proxy.material]; remove it to have it told anew")
+    elif misled:
+        say("nothing is written: with what is wrong, frames do not say how the table mirrors")
+    else:
+        say("nothing is written: the frames do not tell that the table mirrors; see polished receivers in the docs")
 
 
 def _run(options: argparse.Namespace) -> int:
     if options.frames < 1:
         raise UsageError(f"--frames {options.frames}: expected a number of frames, 1 or more")
     scene = load_scene(options.scene)
+    bundled = scene.path in bundled_scenes().values()
+    if options.write and bundled:
+        raise UsageError(f"--write: {options.scene} comes with the program and is not written into; copy it first")
     told, found = check_machine()
     source = source_of(scene, options.source)
     if source is None:
         told.append("frames: the scene names none, so only its numbers are checked; give --source")
     access = check_access(scene, options.source)
-    # What may not be opened is not tried: its own message would say less.
-    checked = check_up(scene, None if access else source, frames=options.frames)
-    found = worst_first([*found, *access, *checked])
-    own = None if scene.path in bundled_scenes().values() else str(options.scene)
-    if not any(finding.name.startswith(MISLEADING) for finding in found):
-        told += [line for line in (look_for_polish(scene, source, options.frames),) if line]
+    polish = None
+    with Console(stderr=True).status("looking at the frames") as status:
+        # What may not be opened is not tried: its own message would say less.
+        given = None if access else source
+        checked, look = check_and_look(scene, given, frames=options.frames, tell=status.update)
+        found = worst_first([*found, *access, *checked])
+        misled = any(finding.name.startswith(MISLEADING) for finding in found)
+        if look is not None and not misled:
+            polish = look_for_polish(scene, look, status.update)
+    own = None if bundled else str(options.scene)
+    if polish is not None:
+        told += polish.lines
     for line in told:
         print(line)
+    if options.write:
+        _write_polish(scene, polish, misled)
     for number, finding in enumerate(found, 1):
         print(f"{number}. {printable(finding.text)} [{finding.name}]")
         print(f"   spoils: {finding.cost}")

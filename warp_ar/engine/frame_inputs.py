@@ -178,7 +178,7 @@ class FrameInputs:
             return None, False
         gain, contrast = self._drift.gain, self._drift.contrast
         self._drift.saturation = self.saturation.levels
-        if not self._drift.observe(frame.image, pose, frame.seconds, frame.plate):
+        if not self._drift.observe(frame.image, pose, frame.plate):
             return None, False
         self._have_lights_shine()
         is_bent = contrast != self._drift.contrast
@@ -317,7 +317,8 @@ class FrameInputs:
         if frame.index >= WATCHED and frame.index % PERIOD:
             return
         discs = ball_discs(self._probes, self._camera, frame.pose)
-        if self.saturation.observe(frame.image, discs, float(self.gain.mean()), frame.plate):
+        bent = self._drift is not None and self._drift.contrast > 0.0
+        if self.saturation.observe(frame.image, discs, float(self.gain.mean()), frame.plate, bent=bent):
             self._write_decode()
 
     def _place_probes(self, frame: SeenFrame) -> Iterable[str]:

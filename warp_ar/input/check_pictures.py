@@ -6,7 +6,7 @@ import collections
 import dataclasses
 import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, Final
 
 import cv2
@@ -79,7 +79,9 @@ class Look:
     """Linear value of each code, (256, 3)."""
 
 
-def take_look(scene: Scene, source: Source, frames: int, every: int = 1) -> Look:
+def take_look(
+    scene: Scene, source: Source, frames: int, every: int = 1, tell: Callable[[str], object] | None = None
+) -> Look:
     """Look at some of a source's first frames; of alternating exposures the longest.
 
     Args:
@@ -87,6 +89,7 @@ def take_look(scene: Scene, source: Source, frames: int, every: int = 1) -> Look
         source: Gives the frames.
         frames: How many are taken from it.
         every: Look at each so many of them.
+        tell: Told, for people, which frame is looked at.
 
     Raises:
         SceneError: The camera was calibrated for another aspect ratio.
@@ -96,8 +99,15 @@ def take_look(scene: Scene, source: Source, frames: int, every: int = 1) -> Look
         frame for frame in itertools.islice(source, frames) if frame.exposure_time in (None, *source.exposures[:1])
     )
     camera = scene.camera.scaled_to(*source.size)
-    some = itertools.islice(shown, 0, None, every)
-    return look_at(scene.marker, camera, ((frame.image, frame.time) for frame in some))
+    count = min(frames, source.length or frames)
+
+    def some() -> Iterator[tuple[Image, float]]:
+        for frame in itertools.islice(shown, 0, None, every):
+            if tell is not None:
+                tell(f"looking at frame {frame.index + 1} of {count}")
+            yield frame.image, frame.time
+
+    return look_at(scene.marker, camera, some())
 
 
 def look_at(marker: Marker, camera: Camera, frames: Iterable[tuple[Image, float]]) -> Look:

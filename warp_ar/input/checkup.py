@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Final
 
@@ -50,31 +50,57 @@ def check_up(
         frames: How many to look at.
         quick: Look at a few only, which takes about a second.
     """
+    return check_and_look(scene, source, frames=frames, quick=quick)[0]
+
+
+def check_and_look(
+    scene: Scene,
+    source: str | int | Path | None,
+    *,
+    frames: int = FRAMES,
+    quick: bool = False,
+    tell: Callable[[str], object] | None = None,
+) -> tuple[list[Finding], Look | None]:
+    """As ``check_up``, with what the frames show, so that they need not be read twice.
+
+    Args:
+        scene: The scene.
+        source: The frames; None: look at the scene's numbers alone.
+        frames: How many to look at.
+        quick: Look at a few only, which takes about a second.
+        tell: Told, for people, what is looked at: all of it takes seconds.
+
+    Returns:
+        The findings, and None in the look's place where no frames were read.
+    """
     found = check_scene(scene)
-    if source is not None:
-        found += _check_source(scene, source, None if quick else frames, 1 if quick else 4, found)
-    return worst_first(found)
+    if source is None:
+        return worst_first(found), None
+    try:
+        look = _read(scene, source, None if quick else frames, tell)
+    except SourceError as error:
+        unread = Finding("source.unreadable", str(error), "check [source], or give --source")
+        return worst_first([*found, unread]), None
+    except SceneError as error:
+        unread = Finding("camera.aspect", str(error), "python -m warp_ar.calibrate camera PICTURES")
+        return worst_first([*found, unread]), None
+    if tell is not None:
+        tell("looking at card, ball and light")
+    return worst_first([*found, *_check_look(scene, look, 1 if quick else 4, found)]), look
 
 
-def _check_source(
-    scene: Scene, source: str | int | Path, frames: int | None, views: int, before: list[Finding]
-) -> list[Finding]:
+def _read(scene: Scene, source: str | int | Path, frames: int | None, tell: Callable[[str], object] | None) -> Look:
+    """Frames of a source; for None as many as are looked at in a second, from all over its beginning."""
     own = scene.source
     exposures = own.exposures or () if own is not None else ()
-    try:
-        with open_source(source, exposures=exposures) as opened:
-            every = 1
-            if frames is None:
-                width, height = opened.size
-                spread = round(SPREAD * min(PIXELS / (width * height), 1.0))
-                every = max(min(spread, opened.length or spread) // QUICK_FRAMES, 1)
-                frames = every * QUICK_FRAMES
-            look = take_look(scene, opened, frames, every)
-    except SourceError as error:
-        return [Finding("source.unreadable", str(error), "check [source], or give --source")]
-    except SceneError as error:
-        return [Finding("camera.aspect", str(error), "python -m warp_ar.calibrate camera PICTURES")]
-    return _check_look(scene, look, views, before)
+    with open_source(source, exposures=exposures) as opened:
+        every = 1
+        if frames is None:
+            width, height = opened.size
+            spread = round(SPREAD * min(PIXELS / (width * height), 1.0))
+            every = max(min(spread, opened.length or spread) // QUICK_FRAMES, 1)
+            frames = every * QUICK_FRAMES
+        return take_look(scene, opened, frames, every, tell)
 
 
 def check_look(scene: Scene, look: Look, views: int = 4) -> list[Finding]:

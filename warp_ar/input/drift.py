@@ -60,8 +60,6 @@ PATIENCE = 4
 """Frames in a row in which points disagree, after which no drift is known any more."""
 DARK, BRIGHT = 12, 250
 """Codes between which a channel is taken to tell: beyond them are quantisation and clipping."""
-STEADY_SECONDS = 0.08
-"""Between frames that are looked at while nothing drifts."""
 CONTRASTS = np.linspace(0.0, 1.0, 5)
 """Contrasts that are tried."""
 MOST_PRINT = 30.0
@@ -97,7 +95,7 @@ class ExposureDrift:
         self._points, self._is_card, self._is_ink = still_points(scene)
         self._first = np.full((len(self._points), 3), np.nan)
         self._first_gain = np.ones_like(self._first)
-        self._moving, self._last, self._disagreed = False, -np.inf, 0
+        self._moving, self._disagreed = False, 0
         # A measured response is believed.
         name = str(camera.transfer)
         self._asks_contrast = name == "srgb" or name.startswith("gamma:")
@@ -117,21 +115,17 @@ class ExposureDrift:
         other._disagreements = list(self._disagreements)
         return other
 
-    def observe(self, image: NDArray[np.uint8], pose: Pose, seconds: float, plate: Plate | None = None) -> bool:
+    def observe(self, image: NDArray[np.uint8], pose: Pose, plate: Plate | None = None) -> bool:
         """Look at a frame.
 
         Args:
             image: uint8 RGB (height, width, 3).
             plate: The frame at its full depth, read in the place of ``image`` where there is one.
             pose: ``camera_from_world``.
-            seconds: When it was taken.
 
         Returns:
             Whether the gain or the contrast is another one now.
         """
-        if not self._moving and abs(seconds - self._last) < STEADY_SECONDS:
-            return False
-        self._last = seconds
         codes = codes_around(image, self._camera, pose, self._points, plate)
         before, contrast = self.gain, self.contrast
         if self._asks_contrast and not np.isfinite(self._first).any():

@@ -20,6 +20,10 @@ same: what it shows of a lit surface moves with its gain, and a plateau does not
 ball, neutral as above, stays within ``STILL`` codes over frames whose gains differ by ``MOVED`` and more, it is the
 level: a surface would have moved by some ten codes.
 
+Before anything drifts such a top is a level only where two more things say so: the camera lays a tone curve over what
+it shows, as cameras do that end early, and next to nothing in the whole picture is brighter. A lit wall in the ball is
+dimmed by it: the wall itself, or paper, is brighter beside it. It is taken back where it moves with the gain after all.
+
 A level that was seen holds for all frames after it, for the camera is the same. A frame whose codes heap up at 254 and
 255 anywhere in the picture takes it back for good.
 
@@ -104,6 +108,8 @@ class SaturationLevels:
         self._is_full = np.zeros(3, bool)
         self._tops: list[tuple[int, float]] = []
         self._stays: int | None = None
+        self._guess: bool | None = None
+        """Whether the levels are those of a top that need not stay; None: none was tried, and False: it did not."""
 
     def observe(
         self,
@@ -111,6 +117,8 @@ class SaturationLevels:
         balls: Sequence[tuple[float, float, float]],
         gain: float = 1.0,
         plate: Plate | None = None,
+        *,
+        bent: bool = False,
     ) -> bool:
         """Look at one picture; returns whether a level has changed.
 
@@ -120,6 +128,7 @@ class SaturationLevels:
             gain: Of the camera, against its first frame, where that is known to drift.
             plate: The frame at its full depth, whose codes are read in the place of ``image``'s in balls. Linear light
                 has none.
+            bent: Whether the camera is known to lay a tone curve over what it shows, and its gain is followed.
         """
         if self._is_full.all() and gain == 1.0:
             return False
@@ -128,12 +137,17 @@ class SaturationLevels:
         if plate is not None and plate.picture.dtype == np.uint16:
             exact = ball_codes(plate.picture, balls) / 257.0
         codes = ball_codes(image, balls) if exact is None else np.rint(exact).astype(np.uint8)
+        top = luma_top(codes)
         if self._stays is None:
-            self._stays = self._unmoved(codes, gain)
+            self._stays = self._unmoved(top, gain)
         if self._stays is not None:
             self.levels[:] = self._stays
             return bool((before != self.levels).any())
         found = luma_plateau(codes)
+        if found is not None:
+            self._guess = False
+        elif bent and top is not None and self._may_be_level(image, top):
+            found = top
         for c in range(3):
             part = np.ascontiguousarray(image[::2, ::2, c])
             heap = int(np.count_nonzero(part >= 254))
@@ -149,16 +163,27 @@ class SaturationLevels:
                 self.levels[c] = FULL
         return bool((before != self.levels).any())
 
-    def _unmoved(self, codes: NDArray[np.uint8], gain: float) -> int | None:
+    def _may_be_level(self, image: NDArray[np.uint8], top: int) -> bool:
+        """Whether the code around which luma crowds may be the level before a gain has moved."""
+        if self._guess is not None or (self.levels != FULL).any():
+            return False
+        brighter = float((image[::2, ::2] @ LUMA > top + RINGING // 2).mean())
+        self._guess = True if brighter <= HELD_HEAP else None
+        return bool(self._guess)
+
+    def _unmoved(self, top: int | None, gain: float) -> int | None:
         """The code at which luma ends whatever the gain, or None where that is not told yet."""
-        top = luma_top(codes)
         if top is None:
             return None
         self._tops = [*self._tops, (top, float(np.log(max(gain, 1e-6))))][-WATCHED:]
         level, moved = np.array(self._tops).T
-        if len(level) < MOVED_FRAMES or np.ptp(moved) < MOVED or np.ptp(level) > STILL:
+        if len(level) < MOVED_FRAMES or np.ptp(moved) < MOVED:
             return None
-        return int(np.median(level))
+        if np.ptp(level) <= STILL:
+            return int(np.median(level))
+        if self._guess:
+            self._guess, self.levels[:] = False, FULL
+        return None
 
 
 def _exact_level(codes: NDArray[np.float64], level: int) -> float:

@@ -23,7 +23,7 @@ def amend_scene(
     Args:
         path: The file.
         section: Such as ``probe``; of several of its kind, the one at ``index``.
-        values: Keys with numbers, texts, or lists of numbers.
+        values: Keys with numbers, texts, lists of numbers, or a section below: its own keys.
         index: Which of several.
         remove: Keys that the new ones stand for; what a new desk's file says of them goes with them.
 
@@ -45,7 +45,10 @@ def amend_scene(
     for key in gone:
         del table[key]
     for key, value in values.items():
-        table[key] = value
+        if isinstance(value, Mapping):
+            _set_below(table, key, value)
+        else:
+            table[key] = value
     made = tomlkit.dumps(document)
     for key in gone:
         made = made.replace("\n".join(["", *key_comment(section, key), ""]), "\n")
@@ -54,3 +57,18 @@ def amend_scene(
         write_whole(path, made.encode())
     except OSError as error:
         raise SinkError(f"{path}: cannot be written: {reason(error)}") from error
+
+
+def _set_below(table: Any, key: str, values: Mapping[str, Any]) -> None:
+    """Put a section below another, before the comment that stands above what follows in the file."""
+    body = table.value.body
+    follows: list[Any] = []
+    while body and body[-1][0] is None:
+        follows.insert(0, body.pop()[1])
+    below = tomlkit.table()
+    for name, value in values.items():
+        below[name] = value
+    table.add(tomlkit.nl())
+    table.append(key, below)
+    for item in follows:
+        table.add(item)
