@@ -136,6 +136,36 @@ def test_an_emitter_stands_where_its_cost_is_least(start, least):
     assert place_from(start, 1e3) == Candidate(7, start)
 
 
+@pytest.mark.parametrize(
+    ("falls", "is_added"), [((40.0, 6.0, 2.0), False), ((14.0, 9.0, 3.0), True), ((2.0, 9.0, 9.0), True)]
+)
+def test_two_channels_must_show_an_emitter(falls, is_added):
+    """What one says alone, however clearly, is no emitter; what two say is one, where the third clips."""
+    candidates = []
+
+    class Search(EmitterSearch):
+        def __init__(self):
+            self.evidence = CONFIG.search.evidence
+            self.problem = SimpleNamespace(
+                push=candidates.append, pop=candidates.pop, with_candidate=lambda z: z, candidates=candidates
+            )
+
+        def fit(self, z, iterations):
+            costs = 100.0 - np.array(falls) * len(candidates)
+            return SimpleNamespace(z=z, costs=costs, cost=costs.mean())
+
+        def gains(self, fits, columns):
+            return np.array(falls)[:, None]
+
+        def settled(self, candidate, cost, fits, least):
+            return candidate
+
+    search = Search()
+    added = search.add_candidate(search.fit([None] * 3, 1), [Candidate(7, np.inf)], np.zeros((1, 1)))
+    assert (added is not None) == is_added
+    assert candidates == [Candidate(7, np.inf)] * is_added
+
+
 def test_an_emitter_is_where_the_ball_mirrors_it_to_the_camera(device, scene):
     """The ball shows a near emitter from a point of its surface, not from its middle: two centimetres beside it
     here."""

@@ -1,6 +1,6 @@
 """Which channel of a picture tells what light is missing.
 
-Emitters are looked for in one channel, where the card clips surfaces' reflectances are taken from one, and how far an
+Emitters are looked for in all channels. Where the card clips, surfaces' reflectances are taken from one, and how far an
 estimate can be relied on is asked of one. It is that in which most points show what they receive. A point that clips
 says that from one side only, and where many do the card does not tell either, so they count against their channel.
 """

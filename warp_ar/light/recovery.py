@@ -30,9 +30,10 @@ alone. There is no more of it than some share of what the card shows (``held_to_
 **Emitter candidates** are chosen one by one, among all directions that may lack light and a grid of distances, by how
 far they lower the cost to second order, (b' W r)^2 / (b' W b - b' W Z H^-1 Z' W b); the best few are fitted in earnest,
 then moved to neighbouring cells and distances while that helps, along their direction to where the cost is least, and
-kept if the cost falls by more than ``evidence``. An emitter at the distance D lights x by cos D^2 / |p - x|^2: its
-shadows and the falling off of its light tell D. D counts from where the ball mirrors the emitter to the camera, which
-may lie a ball's radius beside its middle. An emitter that is known moves only for a larger gain: emitters stand still.
+kept if the costs of two channels fall by more than ``evidence``. An emitter at the distance D lights x by
+cos D^2 / |p - x|^2: its shadows and the falling off of its light tell D. D counts from where the ball mirrors the
+emitter to the camera, which may lie a ball's radius beside its middle. An emitter that is known moves only for a larger
+gain: emitters stand still.
 
 Every deviation is relative to an unknown, a mean or a reflectance. The derivative with respect to that unknown is kept:
 without it, the more parts and equations there are, the more all of them would shrink together.
