@@ -34,7 +34,6 @@ class Round:
     rays: wp.array[wp.int32]  # that were traced for it
     bins: wp.array[wp.int32]  # of ``path_learning``, in which its path leaves the first surface; or -1
     squares: wp.array[wp.float32]  # what it tells of this bin
-    taken: wp.array[wp.int32]  # (1) how many threads have taken; empty on CPU, where each thread has one of its own
 
 
 # A pass adds ``share`` samples to a pixel: after n passes it has floor(n share + u), u its own number from 0 to 1. So
@@ -105,7 +104,6 @@ def make_round(shape: tuple[int, int], device: wp.DeviceLike) -> Round:
     made = Round()
     made.counts = wp.zeros(shape[0] * shape[1], dtype=wp.int32, device=device)
     made.ends = wp.zeros(shape[0] * shape[1], dtype=wp.int32, device=device)
-    made.taken = wp.zeros(0 if made.counts.device.is_cpu else 1, dtype=wp.int32, device=device)
     _make_room(made, 1)
     return made
 

@@ -41,10 +41,6 @@ WHOLE, DIFFERENCE, IRRADIANCE = 0, 1, 2
 reflectance known."""
 
 
-MOST_THREADS = 2048
-"""For each of a CUDA device's multiprocessors: as many as it can hold, and more find no samples left."""
-
-
 @wp.func
 def sample_key(samples: Round, k: wp.int32, seed: wp.int32, first: wp.int32, done: wp.array2d[wp.int32]) -> PathKey:
     """What makes the random numbers of sample ``k`` of a round its own."""
@@ -139,10 +135,9 @@ def write_sample(pair: PathPair, k: wp.int32, samples_out: Round):
             samples_out.squares[k] = mean * mean * pair.drawn
 
 
-# Paths differ in length: of 32 samples side by side the longest has twice as many rays as they have in the mean. So a
-# thread of a GPU that has ended a path takes the next sample from a counter, and goes on in the same loop beside those
-# that are still on their way: its camera's ray is a ray like theirs. Which thread takes which sample is left to chance,
-# what a sample gives is not.
+# One loop for all rays of a sample, its camera's as well: so what finds a surface is in the kernel once. A warp of a
+# GPU waits for the longest of its 32 paths; threads that went on with samples of a shared counter were no faster
+# (docs/notes/2026-11-24-path-tracer.md).
 @functools.cache
 def make_trace_paths_kernel(trace: TraceConfig) -> wp.Kernel:
     """Kernel of ``trace_paths`` for the kinds of shape in ``trace``."""
@@ -158,19 +153,16 @@ def make_trace_paths_kernel(trace: TraceConfig) -> wp.Kernel:
         seed: wp.int32,
         first: wp.int32,
         done: wp.array2d[wp.int32],
-        count: wp.int32,
         # Out:
         samples_out: Round,
     ):
-        is_shared = samples_out.taken.shape[0] > 0
         k = wp.tid() + row_start
-        if is_shared:
-            k = wp.atomic_add(samples_out.taken, 0, 1)
         begins = bool(True)
+        is_done = bool(False)
         lobe = bool(False)
         key = PathKey()
         pair = PathPair()
-        while k < count:
+        while not is_done:
             if begins:
                 key = sample_key(samples_out, k, seed, first, done)
                 direction = camera_ray(params[0], scene.picture.rays, key)
@@ -193,10 +185,7 @@ def make_trace_paths_kernel(trace: TraceConfig) -> wp.Kernel:
                 begins = True
                 # The gloss of what the pixel shows has a path of its own.
                 lobe = pair.glossy and not lobe
-                if not lobe:
-                    k = count
-                    if is_shared:
-                        k = wp.atomic_add(samples_out.taken, 0, 1)
+                is_done = not lobe
 
     return trace_paths_kernel
 
@@ -265,13 +254,9 @@ def trace_paths(
         first: Number of a pixel's first sample among those of the seed.
         part: First sample, and one past the last, on CPU; None means all.
     """
-    device, threads = done.device, count
-    if samples_out.taken.shape[0] > 0:
-        threads = min(count, MOST_THREADS * max(device.sm_count, 1))
-        samples_out.taken.zero_()
-    inputs = [params, scene, asked, seed, first, done, count]
+    inputs = [params, scene, asked, seed, first, done]
     kernel = make_trace_paths_kernel(trace)
-    launch_rows(kernel, (threads,), inputs, [samples_out], rows=part, device=device)
+    launch_rows(kernel, (count,), inputs, [samples_out], rows=part, device=done.device)
 
 
 def find_shown(

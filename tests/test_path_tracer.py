@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-import warp as wp
 
 from warp_ar.accuracy import path_tracer
 from warp_ar.accuracy.path_tracer import PathTracer, TracedPicture
@@ -301,28 +300,6 @@ def test_the_same_seed_gives_the_same_bits(device: str) -> None:
     np.testing.assert_array_equal(images[0].radiance, images[1].radiance)
     np.testing.assert_array_equal(images[0].error, images[1].error)
     assert (images[0].radiance != images[2].radiance).any()
-
-
-def test_threads_that_take_several_samples_give_the_same_bits(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whichever thread takes a sample, and whatever it took before; pixels of a polished desk have two paths each."""
-    frame = np.full((32, 48, 3), 0.5, np.float32)
-    found = []
-    for threads in (0, 1, 100):
-        tracer = PathTracer(polish(boxes(True), 0.2, 0.3), latlong_sky(), frame, ABOVE, device=device)
-        tracer.sample(1)
-        count = tracer._begin_round(2)
-        assert count > 1000
-        tracer._round.taken = wp.zeros(min(threads, 1), dtype=wp.int32, device=device)
-        monkeypatch.setattr(path_tracer.path_tracer, "MOST_THREADS", threads)
-        path_tracer.path_tracer.trace_paths(
-            tracer._trace, tracer._params, tracer._local, tracer._moments.samples, tracer._round,
-            count=count, asked=path_tracer.path_tracer.DIFFERENCE, seed=5, first=0,
-        )  # fmt: skip
-        if threads:
-            assert tracer._round.taken.numpy()[0] >= count
-        found.append([a.numpy()[:count] for a in (tracer._round.z, tracer._round.g, tracer._round.e)])
-    for other in found[1:]:
-        np.testing.assert_array_equal(other, found[0])
 
 
 @pytest.mark.parametrize("known", [False, True], ids=["whole", "difference"])

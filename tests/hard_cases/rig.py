@@ -357,7 +357,10 @@ def _spec_of(name: str, features: Features) -> ArraySpec:
 
 
 def blind_camera() -> dict[str, Any]:
-    """What stages read of a camera that looks nowhere: no direction is projected into its picture."""
+    """What stages read of a camera that looks nowhere: no direction is projected into its picture.
+
+    One ball without extent, as all scenes with a captured environment have one: a GPU's stages read the first.
+    """
     return {
         "pose": None,
         "frame": wp.zeros((1, 1), dtype=wp.vec3ub),
@@ -365,7 +368,7 @@ def blind_camera() -> dict[str, Any]:
         "decode": wp.zeros(257, dtype=wp.vec3),
         "rays": wp.zeros((1, 1), dtype=wp.vec2),
         "params": wp.zeros(1, dtype=FrameParams),
-        "probes": wp.zeros(0, dtype=BallRecord),
+        "probes": wp.zeros(1, dtype=BallRecord),
         "ray_scene": RayScene(),
     }
 
