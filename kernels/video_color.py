@@ -5,9 +5,10 @@ bus, and no thread of the host converts. Files must not depend on who converted,
 those of libswscale with ``accurate_rnd`` and bilinear filters, as ``warp_ar.input.video_file`` and
 ``warp_ar.output.video_sink`` ask for them.
 
-To RGB. Chroma lies between two rows and two columns of pixels. Of the two nearest samples either way one has the weight
-3/4, the other 1/4; beyond the border the last one stands again. Columns are summed first, to 7 bits behind the binary
-point, then rows, to 9. With f of 13 bits behind the point,
+To RGB. Chroma lies between two rows of pixels, and between two columns or, as most video has it, at the left one. Of the
+two nearest samples one has the weight 3/4, the other 1/4; where it lies at the left one, a left pixel has its sample
+alone and a right one half of each of two. Beyond the border the last one stands again. Columns are summed first, to 7
+bits behind the binary point, then rows, to 9. With factors of 13 bits behind the point,
 
     r = floor(clamp((y - y_offset) y_scale + cr r_of_cr + 2^21, 0, 2^30 - 1) / 2^22),
 
@@ -29,9 +30,6 @@ import warp as wp
 from warp_ar.kernels.launch import launch
 
 wp.set_module_options({"enable_backward": False})
-
-LEAST_SIZE = 16
-"""Rows and columns below which FFmpeg's filters weigh samples at the border in another way."""
 
 _OF_CHROMA = {"bt709": (117489, 138438, 13975, 34925), "bt601": (104597, 132201, 25675, 53279)}
 """Red of Cr, blue of Cb, green of Cb and green of Cr, negative, of limited range: 16 bits behind the point."""
@@ -57,6 +55,8 @@ class YuvLayout:
     """Bytes from a sample of chroma to the next of its kind."""
     pitch: wp.int32
     """Bytes from a row of chroma to the next."""
+    left: wp.int32
+    """1: chroma lies at the left one of two columns; 0: between them."""
 
 
 @wp.struct
@@ -72,11 +72,19 @@ class RgbFactors:
     b_of_cb: wp.int32
 
 
-def yuv_layout(height: int, width: int, *, interleaved: bool = False) -> YuvLayout:
-    """A picture without gaps: luma, then Cb and Cr, one plane after the other or, ``interleaved``, in turn (NV12)."""
+def yuv_layout(height: int, width: int, *, interleaved: bool = False, left: bool = True) -> YuvLayout:
+    """A picture without gaps: luma, then Cb and Cr, one plane after the other or, ``interleaved``, in turn (NV12).
+
+    Args:
+        height: Rows of luma.
+        width: Columns of luma.
+        interleaved: Whether Cb and Cr lie in turn.
+        left: Whether chroma lies at the left one of two columns, else between them.
+    """
     layout = YuvLayout()
     layout.height, layout.width, layout.cb = height, width, height * width
     layout.cr = layout.cb + (1 if interleaved else height * width // 4)
+    layout.left = int(left)
     layout.step, layout.pitch = (2, width) if interleaved else (1, width // 2)
     return layout
 
@@ -119,14 +127,17 @@ def rgb_from_yuv_kernel(
     near_row, near_column = row / 2, column / 2
     far_row = wp.clamp(near_row - 1 + 2 * (row % 2), 0, layout.height / 2 - 1)
     far_column = wp.clamp(near_column - 1 + 2 * (column % 2), 0, layout.width / 2 - 1)
+    weight = 32  # of the far column, of 128
+    if layout.left == 1:
+        weight = 64 * (column % 2)
     near = near_row * layout.pitch
     far = far_row * layout.pitch
     left = near_column * layout.step
     right = far_column * layout.step
-    cb = 3072 * _column_sum(codes, layout.cb + near, left, right)
-    cb += 1024 * _column_sum(codes, layout.cb + far, left, right)
-    cr = 3072 * _column_sum(codes, layout.cr + near, left, right)
-    cr += 1024 * _column_sum(codes, layout.cr + far, left, right)
+    cb = 3072 * _column_sum(codes, layout.cb + near, left, right, weight)
+    cb += 1024 * _column_sum(codes, layout.cb + far, left, right, weight)
+    cr = 3072 * _column_sum(codes, layout.cr + near, left, right, weight)
+    cr += 1024 * _column_sum(codes, layout.cr + far, left, right, weight)
     cb = (cb + 512 - (128 << 19)) >> 10
     cr = (cr + 512 - (128 << 19)) >> 10
     luma = (wp.int32(codes[row * layout.width + column]) << 9) - factors.y_offset
@@ -139,9 +150,11 @@ def rgb_from_yuv_kernel(
 
 
 @wp.func
-def _column_sum(codes: wp.array[wp.uint8], start: wp.int32, near: wp.int32, far: wp.int32) -> wp.int32:
-    """Two samples of a row of chroma, 7 bits behind the binary point."""
-    return 96 * wp.int32(codes[start + near]) + 32 * wp.int32(codes[start + far])
+def _column_sum(
+    codes: wp.array[wp.uint8], start: wp.int32, near: wp.int32, far: wp.int32, weight: wp.int32
+) -> wp.int32:
+    """Two samples of a row of chroma, the far one with a weight of 128, 7 bits behind the binary point."""
+    return (128 - weight) * wp.int32(codes[start + near]) + weight * wp.int32(codes[start + far])
 
 
 @wp.func

@@ -11,8 +11,9 @@ import warp as wp
 from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
 
 from tests.farm_rig import desk_frames
+from warp_ar.farm.decoded_picture import LEAST_SIZE
 from warp_ar.input.video_file import rgb_from_video
-from warp_ar.kernels.video_color import LEAST_SIZE, rgb_factors, rgb_from_yuv, yuv_from_rgb, yuv_layout
+from warp_ar.kernels.video_color import rgb_factors, rgb_from_yuv, yuv_from_rgb, yuv_layout
 from warp_ar.output.video_sink import rgb_to_yuv
 
 SIZES = ((LEAST_SIZE, LEAST_SIZE), (66, 70), (240, 320))
@@ -55,7 +56,7 @@ def to_rgb(planes, matrix, full, interleaved, device):
     height, width = planes[0].shape
     with wp.ScopedDevice(device):
         rgb = wp.zeros((height, width), dtype=wp.vec3ub)
-        layout = yuv_layout(height, width, interleaved=interleaved)
+        layout = yuv_layout(height, width, interleaved=interleaved, left=False)
         rgb_from_yuv(wp.array(packed(planes, interleaved)), layout, rgb_factors(matrix, full_range=full), rgb)
         return rgb.numpy()
 
