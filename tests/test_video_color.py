@@ -10,8 +10,10 @@ import pytest
 import warp as wp
 from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
 
-from tests.farm_rig import desk_frames
-from warp_ar.farm.decoded_picture import LEAST_SIZE
+from tests.farm_rig import desk_frames, write_recording
+from warp_ar.farm import device_video
+from warp_ar.farm.decoded_picture import LEAST_SIZE, DecodedPicture, can_convert
+from warp_ar.farm.device_video import SLOTS, DeviceVideo
 from warp_ar.input.video_file import rgb_from_video
 from warp_ar.kernels.video_color import rgb_factors, rgb_from_yuv, yuv_from_rgb, yuv_layout
 from warp_ar.output.video_sink import rgb_to_yuv
@@ -52,11 +54,11 @@ def random_planes(size, seed, low=0, high=256):
     return [rng.integers(low, high, shape).astype(np.uint8) for shape in shapes]
 
 
-def to_rgb(planes, matrix, full, interleaved, device):
+def to_rgb(planes, matrix, full, interleaved, device, left=False):
     height, width = planes[0].shape
     with wp.ScopedDevice(device):
         rgb = wp.zeros((height, width), dtype=wp.vec3ub)
-        layout = yuv_layout(height, width, interleaved=interleaved, left=False)
+        layout = yuv_layout(height, width, interleaved=interleaved, left=left)
         rgb_from_yuv(wp.array(packed(planes, interleaved)), layout, rgb_factors(matrix, full_range=full), rgb)
         return rgb.numpy()
 
@@ -120,3 +122,76 @@ def test_grey_has_no_chroma(device):
     codes = to_yuv(np.full((32, 32, 3), 128, np.uint8), device)
     assert set(codes[: 32 * 32]) == {round(16 + 219 * 128 / 255)}
     assert set(codes[32 * 32 :]) == {128}
+
+
+def decoded_picture(tmp_path):
+    """A picture as H.264's decoder gives it: chroma at the left one of two columns."""
+    write_recording(tmp_path / "a.mp4", 2)
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        return next(container.decode(video=0))
+
+
+@pytest.mark.parametrize("interleaved", [False, True])
+def test_a_decoded_picture_has_its_chroma_at_the_left(tmp_path, interleaved, device):
+    picture = decoded_picture(tmp_path)
+    expected = rgb_from_video(VideoReformatter(), picture)
+    planes = planes_of(picture)
+    np.testing.assert_array_equal(to_rgb(planes, "bt601", False, interleaved, device, left=True), expected)
+    assert (to_rgb(planes, "bt601", False, interleaved, device) != expected).any()
+
+
+def test_where_chroma_lies_is_found_out(tmp_path, device):
+    decoded = DecodedPicture(decoded_picture(tmp_path))
+    height, width, _ = decoded.shape
+    video = DeviceVideo((width, height), wp.get_device(device))
+    planes = random_planes((height, width), 5)
+    between = picture_of(planes, "bt709", full=True)
+    in_turn = av.VideoFrame(width, height, "nv12")
+    in_turn.colorspace, in_turn.color_range = between.colorspace, between.color_range
+    for plane, values in zip(in_turn.planes, (planes[0], np.stack(planes[1:], -1).reshape(-1, width)), strict=True):
+        rows = np.zeros((plane.height, plane.line_size), np.uint8)
+        rows[:, :width] = values
+        plane.update(rows.tobytes())
+    for other, left in ((decoded, True), (DecodedPicture(between), False), (DecodedPicture(in_turn), False)):
+        assert can_convert(other.picture)
+        assert video.adapt(other)
+        assert video.left is left
+        np.testing.assert_array_equal(video.send(other).numpy(), rgb_from_video(VideoReformatter(), other.picture))
+        video.fetch(video.send(other))
+
+
+def test_a_picture_with_other_arithmetic_is_told(tmp_path, monkeypatch, device):
+    decoded = DecodedPicture(decoded_picture(tmp_path))
+    video = DeviceVideo((decoded.shape[1], decoded.shape[0]), wp.get_device(device))
+    assert video.adapt(decoded)
+    monkeypatch.setattr(device_video, "rgb_to_yuv", lambda *a: rgb_to_yuv(*a, pixel_format="yuvj420p"))
+    assert not video.adapt(decoded)
+
+
+@pytest.mark.parametrize(
+    ("kind", "size"),
+    [
+        ("yuv422p", (32, 32)),
+        ("yuv420p10le", (32, 32)),
+        ("rgb24", (32, 32)),
+        ("yuv420p", (8, 32)),
+        ("yuv420p", (33, 32)),
+    ],
+)
+def test_what_the_device_cannot_convert(kind, size):
+    assert can_convert(av.VideoFrame(32, 32, "yuv420p"))
+    assert not can_convert(av.VideoFrame(*size, kind))
+
+
+def test_codes_of_several_frames_are_kept_apart(tmp_path, device):
+    decoded = DecodedPicture(decoded_picture(tmp_path))
+    height, width, _ = decoded.shape
+    video = DeviceVideo((width, height), wp.get_device(device))
+    images = [np.full((height, width, 3), 20 * n, np.uint8) for n in range(SLOTS)]
+    lit = []
+    for image in images:
+        video.send(decoded)
+        lit.append(video.fetch(wp.array(image, dtype=wp.vec3ub, device=device)))
+    for image, picture in zip(images, lit, strict=True):
+        assert picture.shape == image.shape
+        np.testing.assert_array_equal(packed(planes_of(picture.copy()), False), ffmpeg_yuv(image))
