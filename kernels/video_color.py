@@ -41,16 +41,16 @@ _TO_CR = wp.constant(wp.vec3i(14392, -13073, -1320))
 
 @wp.struct
 class YuvLayout:
-    """Where the codes of a 4:2:0 picture lie in an array of bytes; luma lies first, row after row."""
+    """Where the codes of a 4:2:0 picture lie: those of luma in one array of bytes, those of chroma in another."""
 
     height: wp.int32
     """Rows of luma, an even number."""
     width: wp.int32
     """Columns of luma, an even number."""
-    cb: wp.int32
-    """Place of the first Cb."""
+    luma_pitch: wp.int32
+    """Bytes from a row of luma to the next."""
     cr: wp.int32
-    """Place of the first Cr."""
+    """Place of the first Cr; the first Cb is at 0."""
     step: wp.int32
     """Bytes from a sample of chroma to the next of its kind."""
     pitch: wp.int32
@@ -72,20 +72,23 @@ class RgbFactors:
     b_of_cb: wp.int32
 
 
-def yuv_layout(height: int, width: int, *, interleaved: bool = False, left: bool = True) -> YuvLayout:
-    """A picture without gaps: luma, then Cb and Cr, one plane after the other or, ``interleaved``, in turn (NV12).
+def yuv_layout(
+    height: int, width: int, *, interleaved: bool = False, left: bool = True, pitch: int | None = None
+) -> YuvLayout:
+    """Cb and Cr one plane after the other or, ``interleaved``, in turn (NV12).
 
     Args:
         height: Rows of luma.
         width: Columns of luma.
         interleaved: Whether Cb and Cr lie in turn.
         left: Whether chroma lies at the left one of two columns, else between them.
+        pitch: Bytes from a row to the next, of luma and of chroma in turn; None: rows have no gaps.
     """
     layout = YuvLayout()
-    layout.height, layout.width, layout.cb = height, width, height * width
-    layout.cr = layout.cb + (1 if interleaved else height * width // 4)
-    layout.left = int(left)
-    layout.step, layout.pitch = (2, width) if interleaved else (1, width // 2)
+    layout.height, layout.width, layout.left = height, width, int(left)
+    layout.luma_pitch = pitch or width
+    layout.cr = 1 if interleaved else height * width // 4
+    layout.step, layout.pitch = (2, pitch or width) if interleaved else (1, width // 2)
     return layout
 
 
@@ -117,7 +120,8 @@ def code_of(bits: wp.int64) -> wp.uint8:
 @wp.kernel
 def rgb_from_yuv_kernel(
     # In:
-    codes: wp.array[wp.uint8],
+    luma: wp.array[wp.uint8],
+    chroma: wp.array[wp.uint8],
     layout: YuvLayout,
     factors: RgbFactors,
     # Out:
@@ -134,14 +138,14 @@ def rgb_from_yuv_kernel(
     far = far_row * layout.pitch
     left = near_column * layout.step
     right = far_column * layout.step
-    cb = 3072 * _column_sum(codes, layout.cb + near, left, right, weight)
-    cb += 1024 * _column_sum(codes, layout.cb + far, left, right, weight)
-    cr = 3072 * _column_sum(codes, layout.cr + near, left, right, weight)
-    cr += 1024 * _column_sum(codes, layout.cr + far, left, right, weight)
+    cb = 3072 * _column_sum(chroma, near, left, right, weight)
+    cb += 1024 * _column_sum(chroma, far, left, right, weight)
+    cr = 3072 * _column_sum(chroma, layout.cr + near, left, right, weight)
+    cr += 1024 * _column_sum(chroma, layout.cr + far, left, right, weight)
     cb = (cb + 512 - (128 << 19)) >> 10
     cr = (cr + 512 - (128 << 19)) >> 10
-    luma = (wp.int32(codes[row * layout.width + column]) << 9) - factors.y_offset
-    y = wp.int64(luma) * wp.int64(factors.y_scale) + wp.int64(1 << 21)
+    level = (wp.int32(luma[row * layout.luma_pitch + column]) << 9) - factors.y_offset
+    y = wp.int64(level) * wp.int64(factors.y_scale) + wp.int64(1 << 21)
     rgb_out[row, column] = wp.vec3ub(
         code_of(y + wp.int64(cr) * wp.int64(factors.r_of_cr)),
         code_of(y + wp.int64(cr) * wp.int64(factors.g_of_cr) + wp.int64(cb) * wp.int64(factors.g_of_cb)),
@@ -199,21 +203,23 @@ def yuv_from_rgb_kernel(
     rgb: wp.array2d[wp.vec3ub],
     layout: YuvLayout,
     # Out:
-    codes_out: wp.array[wp.uint8],
+    luma_out: wp.array[wp.uint8],
+    chroma_out: wp.array[wp.uint8],
 ):
     pair_row, pair_column = wp.tid()
     row, column = 2 * pair_row, 2 * pair_column
     for k in range(4):
         at_row, at_column = row + k / 2, column + k % 2
-        codes_out[at_row * layout.width + at_column] = _luma_code(rgb[at_row, at_column])
+        luma_out[at_row * layout.luma_pitch + at_column] = _luma_code(rgb[at_row, at_column])
     place = pair_row * layout.pitch + pair_column * layout.step
-    codes_out[layout.cb + place] = _chroma_code(rgb, row, column, _TO_CB)
-    codes_out[layout.cr + place] = _chroma_code(rgb, row, column, _TO_CR)
+    chroma_out[place] = _chroma_code(rgb, row, column, _TO_CB)
+    chroma_out[layout.cr + place] = _chroma_code(rgb, row, column, _TO_CR)
 
 
 def rgb_from_yuv(
     # In:
-    codes: wp.array[wp.uint8],
+    luma: wp.array[wp.uint8],
+    chroma: wp.array[wp.uint8],
     layout: YuvLayout,
     factors: RgbFactors,
     # Out:
@@ -224,7 +230,7 @@ def rgb_from_yuv(
 ) -> None:
     """RGB of a 4:2:0 picture of ``layout``, as FFmpeg converts it."""
     given = {"device": device, "stream": stream}
-    launch(rgb_from_yuv_kernel, rgb_out.shape, [codes, layout, factors], [rgb_out], **given)
+    launch(rgb_from_yuv_kernel, rgb_out.shape, [luma, chroma, layout, factors], [rgb_out], **given)
 
 
 def yuv_from_rgb(
@@ -232,11 +238,12 @@ def yuv_from_rgb(
     rgb: wp.array2d[wp.vec3ub],
     layout: YuvLayout,
     # Out:
-    codes_out: wp.array[wp.uint8],
+    luma_out: wp.array[wp.uint8],
+    chroma_out: wp.array[wp.uint8],
     *,
     device: wp.DeviceLike = None,
     stream: wp.Stream | None = None,
 ) -> None:
     """A 4:2:0 picture of ``layout``, BT.709 of limited range with chroma at the left, as FFmpeg converts it."""
     given = {"device": device, "stream": stream}
-    launch(yuv_from_rgb_kernel, (layout.height // 2, layout.width // 2), [rgb, layout], [codes_out], **given)
+    launch(yuv_from_rgb_kernel, (layout.height // 2, layout.width // 2), [rgb, layout], [luma_out, chroma_out], **given)

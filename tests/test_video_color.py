@@ -59,7 +59,9 @@ def to_rgb(planes, matrix, full, interleaved, device, left=False):
     with wp.ScopedDevice(device):
         rgb = wp.zeros((height, width), dtype=wp.vec3ub)
         layout = yuv_layout(height, width, interleaved=interleaved, left=left)
-        rgb_from_yuv(wp.array(packed(planes, interleaved)), layout, rgb_factors(matrix, full_range=full), rgb)
+        codes = wp.array(packed(planes, interleaved))
+        factors = rgb_factors(matrix, full_range=full)
+        rgb_from_yuv(codes[: height * width], codes[height * width :], layout, factors, rgb)
         return rgb.numpy()
 
 
@@ -67,7 +69,8 @@ def to_yuv(image, device):
     height, width = image.shape[:2]
     with wp.ScopedDevice(device):
         codes = wp.zeros(height * width * 3 // 2, dtype=wp.uint8)
-        yuv_from_rgb(wp.array(image, dtype=wp.vec3ub), yuv_layout(height, width), codes)
+        planes = codes[: height * width], codes[height * width :]
+        yuv_from_rgb(wp.array(image, dtype=wp.vec3ub), yuv_layout(height, width), *planes)
         return codes.numpy()
 
 
@@ -154,7 +157,7 @@ def test_where_chroma_lies_is_found_out(tmp_path, device):
         plane.update(rows.tobytes())
     for other, left in ((decoded, True), (DecodedPicture(between), False), (DecodedPicture(in_turn), False)):
         assert can_convert(other.picture)
-        assert video.adapt(other)
+        assert video.adapt(other, rgb_from_video(VideoReformatter(), other.picture))
         assert video.left is left
         np.testing.assert_array_equal(video.send(other).numpy(), rgb_from_video(VideoReformatter(), other.picture))
         video.fetch(video.send(other))
@@ -163,9 +166,11 @@ def test_where_chroma_lies_is_found_out(tmp_path, device):
 def test_a_picture_with_other_arithmetic_is_told(tmp_path, monkeypatch, device):
     decoded = DecodedPicture(decoded_picture(tmp_path))
     video = DeviceVideo((decoded.shape[1], decoded.shape[0]), wp.get_device(device))
-    assert video.adapt(decoded)
+    expected = rgb_from_video(VideoReformatter(), decoded.picture)
+    assert video.adapt(decoded, expected)
+    assert not video.adapt(decoded, expected ^ 1)
     monkeypatch.setattr(device_video, "rgb_to_yuv", lambda *a: rgb_to_yuv(*a, pixel_format="yuvj420p"))
-    assert not video.adapt(decoded)
+    assert not video.adapt(decoded, expected)
 
 
 @pytest.mark.parametrize(

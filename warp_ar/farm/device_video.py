@@ -16,19 +16,20 @@ import av
 import numpy as np
 import numpy.typing as npt
 import warp as wp
-from av.video.reformatter import ColorRange, VideoReformatter
+from av.video.reformatter import ColorRange
 
 from warp_ar.device import exclusive, translating, wait_for
-from warp_ar.farm.decoded_picture import INTERLEAVED, DecodedPicture, matrix_of
+from warp_ar.farm.decoded_picture import INTERLEAVED, ON_DEVICE, DecodedPicture, matrix_of
 from warp_ar.farm.lit_picture import LitPicture
-from warp_ar.input.video_file import rgb_from_video
-from warp_ar.kernels.video_color import rgb_factors, rgb_from_yuv, yuv_from_rgb, yuv_layout
+from warp_ar.kernels.video_color import RgbFactors, rgb_factors, rgb_from_yuv, yuv_from_rgb, yuv_layout
 from warp_ar.output.video_sink import rgb_to_yuv
 
 Codes = npt.NDArray[np.uint8]
 
 SLOTS = 3
 """Frames whose codes are kept: one that is lit, one that is encoded, one between."""
+_DEFAULT_STREAM = 1
+"""CUDA's handle of the stream that FFmpeg decodes on."""
 
 
 class _Slot:
@@ -42,11 +43,14 @@ class _Slot:
         self.sent, self.fetched = self.sent_array.numpy(), self.fetched_array.numpy()
         self.done = wp.Event(device) if pinned else None
         self.used = False
+        self.kept: Any = None
+        """What kernels still read."""
 
     def wait(self) -> None:
         """Wait until the codes that were fetched last are there."""
         if self.used and self.done is not None:
             wait_for(self.done)
+            self.kept = None
 
 
 class DeviceVideo:
@@ -63,9 +67,11 @@ class DeviceVideo:
         self._device = device
         count = self._width * self._height * 3 // 2
         with translating(device), wp.ScopedDevice(device):
-            self._stream = wp.get_stream(device) if device.is_cuda else None
+            self._stream: Any = wp.get_stream(device) if device.is_cuda else None
             self._slots = [_Slot(count, device) for _ in range(SLOTS)]
             self._codes, self._lit_codes = (wp.zeros(count, dtype=wp.uint8) for _ in range(2))
+            luma = self._width * self._height
+            self._planes, self._lit_planes = ((codes[:luma], codes[luma:]) for codes in (self._codes, self._lit_codes))
             self._rgb = wp.zeros((self._height, self._width), dtype=wp.vec3ub)
             self._layouts = {
                 (interleaved, left): yuv_layout(self._height, self._width, interleaved=interleaved, left=left)
@@ -82,17 +88,35 @@ class DeviceVideo:
         picture = decoded.picture
         slot = self._slots[self._count % SLOTS]
         slot.wait()
-        interleaved = picture.format.name == INTERLEAVED
         full = picture.format.name == "yuvj420p" or picture.color_range == ColorRange.JPEG
         matrix = matrix_of(picture)
         assert matrix is not None
+        factors = rgb_factors(matrix, full_range=full)
+        if picture.format.name == ON_DEVICE:
+            self._convert_there(picture, slot, factors)
+            return self._rgb
+        interleaved = picture.format.name == INTERLEAVED
         _copy_planes(picture, slot.sent, interleaved=interleaved)
         with exclusive(self._device):
             wp.copy(self._codes, slot.sent_array, stream=self._stream)
-            factors = rgb_factors(matrix, full_range=full)
             layout = self._layouts[interleaved, self.left]
-            rgb_from_yuv(self._codes, layout, factors, self._rgb, device=self._device, stream=self._stream)
+            rgb_from_yuv(*self._planes, layout, factors, self._rgb, device=self._device, stream=self._stream)
         return self._rgb
+
+    def _convert_there(self, picture: Any, slot: _Slot, factors: RgbFactors) -> None:
+        """Convert a picture that its decoder left on this device, of Cb and Cr in turn."""
+        luma, chroma = (wp.from_dlpack(plane.__dlpack__(), dtype=wp.uint8) for plane in picture.planes)
+        pitch = luma.strides[0]
+        flat = [
+            wp.array(ptr=plane.ptr, dtype=wp.uint8, shape=(pitch * plane.shape[0],), device=self._device)
+            for plane in (luma, chroma)
+        ]
+        with exclusive(self._device):
+            # It was decoded on the default stream, and must last until it has been read.
+            self._stream.wait_stream(wp.Stream(self._device, cuda_stream=_DEFAULT_STREAM))
+            layout = yuv_layout(self._height, self._width, interleaved=True, left=self.left, pitch=pitch)
+            rgb_from_yuv(*flat, layout, factors, self._rgb, device=self._device, stream=self._stream)
+        slot.kept = picture, luma, chroma
 
     def send_rgb(self, image: npt.NDArray[np.uint8]) -> Any:
         """As ``send``, of a picture that the host has converted."""
@@ -108,20 +132,24 @@ class DeviceVideo:
         slot = self._slots[self._count % SLOTS]
         self._count += 1
         with exclusive(self._device):
-            yuv_from_rgb(image, self._layouts[False, True], self._lit_codes, device=self._device, stream=self._stream)
+            layout = self._layouts[False, True]
+            yuv_from_rgb(image, layout, *self._lit_planes, device=self._device, stream=self._stream)
             wp.copy(slot.fetched_array, self._lit_codes, stream=self._stream)
             if self._stream is not None:
                 self._stream.record_event(slot.done)
         slot.used = True
         return LitPicture((self._height, self._width, 3), slot.fetched, slot.wait)
 
-    def adapt(self, decoded: DecodedPicture) -> bool:
+    def adapt(self, decoded: DecodedPicture, expected: npt.NDArray[np.uint8]) -> bool:
         """Find out where a picture's chroma lies, which PyAV does not tell, by trying.
 
+        Args:
+            decoded: The picture.
+            expected: Its RGB as the host converts it.
+
         Returns:
-            Whether it becomes the same RGB as on the host, to the bit, and that the same codes.
+            Whether it becomes the same RGB here, to the bit, and that the codes that the host makes of it.
         """
-        expected = rgb_from_video(VideoReformatter(), decoded.picture)
         for self.left in (True, False):
             rgb = self.send(decoded)
             codes = self.fetch(rgb)
@@ -138,10 +166,10 @@ class DeviceVideo:
         source.pts, source.time_base = 0, tick
         converter = rgb_to_yuv(self._width, self._height, tick)
         converter.push(source)
-        pair = [np.empty(self._width * self._height * 3 // 2, np.uint8) for _ in range(2)]
-        for codes, made in zip(pair, (picture, converter.pull()), strict=True):
+        expected, mine = (np.empty(self._width * self._height * 3 // 2, np.uint8) for _ in range(2))
+        for codes, made in ((expected, converter.pull()), (mine, picture)):
             _copy_planes(made, codes, interleaved=False)
-        return bool(np.array_equal(*pair))
+        return bool(np.array_equal(expected, mine))
 
 
 def _copy_planes(picture: Any, codes_out: Codes, *, interleaved: bool) -> None:

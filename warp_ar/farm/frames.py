@@ -78,7 +78,8 @@ class VideoPart(VideoFile):
     def _open(self, **how: Any) -> Any:
         """As ``VideoFile``'s; what the GPU's unit cannot begin is decoded by the processor, with the same pictures."""
         if self._gpu is not None:
-            unit = HWAccel("cuda", device=str(self._gpu), allow_software_fallback=True)
+            own = self._decoded_only
+            unit = HWAccel("cuda", device=str(self._gpu), allow_software_fallback=True, is_hw_owned=own)
             with contextlib.suppress(SourceError, NotImplementedError):
                 return super()._open(**how, hwaccel=unit)
             self._gpu = None

@@ -6,26 +6,30 @@ import collections
 import contextlib
 import dataclasses
 import gc
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
+from av.video.reformatter import VideoReformatter
 
 from warp_ar.closing import Closing
-from warp_ar.device import resolve_device
+from warp_ar.device import resolve_device, share_context
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.engine.result import Result
 from warp_ar.errors import UsageError
 from warp_ar.farm.decoded_picture import DecodedPicture
-from warp_ar.farm.device_video import DeviceVideo, LitPicture
+from warp_ar.farm.device_video import DeviceVideo
 from warp_ar.farm.frames import CONVERTERS, open_part
 from warp_ar.farm.jobs import Job, JobFile, lit_range, scene_of, source_of
+from warp_ar.farm.lit_picture import LitPicture
 from warp_ar.farm.survey import Survey, keep_depth, lit_scene
 from warp_ar.input.own_markers import own_markers
 from warp_ar.input.plate import Plate
 from warp_ar.input.source import Frame, RecordedSource
+from warp_ar.input.video_file import rgb_from_video
 from warp_ar.scene import Pose, Scene
 from warp_ar.scene.kinds import skeleton
 
@@ -139,7 +143,7 @@ class Lighter(Closing):
         Raises:
             WarpArError: The recording or the scene cannot be used.
         """
-        if coded and outputs == ("image",) and self._jobs.settings.light != "preroll" and self._converts(job):
+        if coded and outputs == ("image",) and self._may_convert(job):
             frames = self._light_coded(job, scene, every, keep_rgb=keep_rgb)
         else:
             frames = self._light(job, scene, outputs, every)
@@ -177,36 +181,66 @@ class Lighter(Closing):
                 call = pipeline.submit if outputs == ("image",) else pipeline
                 yield Lit(frame, pose, call(frame.deepest, time_seconds=frame.time, pose=pose), pipeline)
 
+    def _may_convert(self, job: Job) -> bool:
+        """Whether the device may convert a job's pictures.
+
+        Not where light is gathered from them, or markers that something rides on are looked for: that is done with the
+        host's picture.
+        """
+        follows = self._jobs.settings.light != "preroll"
+        return self._device_converts and follows and not own_markers(scene_of(self._jobs, job.clip))
+
     def _light_coded(self, job: Job, scene: Scene | None, every: int, *, keep_rgb: bool) -> Iterator[Lit]:
         """As ``_light``, of pictures whose codes go to the device, and to the encoder from there."""
         survey = self.survey(job.clip)
         own = lit_scene(self._jobs, job.clip, survey) if scene is None else scene
+        gpu = self._jobs.settings.gpu_of(self._device)
+        if gpu is not None:
+            share_context(gpu)
         with contextlib.closing(self._open(job.clip, job.first, job.end, decoded=True)) as source:
-            keeps_light = len(survey.keys) > 0
-            pipeline = self._pipeline_for(own, source.size, ("image",), follows=keeps_light, linear=False)
-            pipeline.restart(saturation=survey.saturation)
-            self._key = None
-            video = self._video_of(source.size)
-            for frame in source:
-                if (frame.index - job.first) % every:
-                    continue
-                decoded: Any = frame.image
-                picture = video.send(decoded) if isinstance(decoded, DecodedPicture) else video.send_rgb(decoded)
-                pose, result = survey.pose(frame.index), None
-                if pose is not None:
-                    self._follow(pipeline, survey, job.clip, frame.index)
-                    result = pipeline(picture, time_seconds=frame.time, pose=pose)
-                    picture = result.image_array
-                kept = np.array(picture.numpy()) if keep_rgb else None
-                yield Lit(frame, pose, result, pipeline, video.fetch(picture), kept)
+            frames = iter(source)
+            first = next(frames)
+            video = self._video_for(job, first, gpu)
+            if video is not None:
+                pipeline = self._pipeline_for(own, source.size, ("image",), follows=len(survey.keys) > 0, linear=False)
+                pipeline.restart(saturation=survey.saturation)
+                self._key = None
+                for frame in itertools.chain([first], frames):
+                    if not (frame.index - job.first) % every:
+                        yield self._light_codes(frame, survey, job.clip, pipeline, video, keep_rgb=keep_rgb)
+                return
+        yield from self._light(job, scene, ("image",), every)
 
-    def _converts(self, job: Job) -> bool:
-        """Whether the device converts a job's pictures as the host does; looked at in its first."""
-        if not self._device_converts or own_markers(scene_of(self._jobs, job.clip)):
-            return False  # markers that something rides on are looked for in the host's picture
-        with contextlib.closing(self._open(job.clip, job.first, job.first + 1, decoded=True)) as source:
-            decoded: Any = next(iter(source)).image
-        return isinstance(decoded, DecodedPicture) and self._video_of(source.size).adapt(decoded)
+    def _light_codes(
+        self, frame: Frame, survey: Survey, clip: int, pipeline: Pipeline, video: DeviceVideo, *, keep_rgb: bool
+    ) -> Lit:
+        decoded: Any = frame.image
+        picture = video.send(decoded) if isinstance(decoded, DecodedPicture) else video.send_rgb(decoded)
+        pose, result = survey.pose(frame.index), None
+        if pose is not None:
+            self._follow(pipeline, survey, clip, frame.index)
+            result = pipeline(picture, time_seconds=frame.time, pose=pose)
+            picture = result.image_array
+        kept = np.array(picture.numpy()) if keep_rgb else None
+        return Lit(frame, pose, result, pipeline, video.fetch(picture), kept)
+
+    def _video_for(self, job: Job, first: Frame, gpu: int | None) -> DeviceVideo | None:
+        """What converts a job's pictures, by its first one; None: the device does not convert it as the host does."""
+        decoded: Any = first.image
+        if not isinstance(decoded, DecodedPicture):
+            return None
+        plain = decoded if gpu is None else self._first_of(job)
+        height, width, _ = decoded.shape
+        video = self._video_of((width, height))
+        return video if video.adapt(decoded, rgb_from_video(VideoReformatter(), plain.picture)) else None
+
+    def _first_of(self, job: Job) -> DecodedPicture:
+        """A job's first picture, decoded by the processor."""
+        path, fps = source_of(self._jobs, job.clip)
+        index, end = self.survey(job.clip).index, job.first + 1
+        with contextlib.closing(open_part(path, index, job.first, end, fps, decoded=True)) as source:
+            first: Any = next(iter(source)).image
+        return cast(DecodedPicture, first)
 
     def _video_of(self, size: tuple[int, int]) -> DeviceVideo:
         if size not in self._videos:
