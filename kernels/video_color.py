@@ -25,6 +25,8 @@ References:
 
 from __future__ import annotations
 
+import functools
+
 import warp as wp
 
 from warp_ar.kernels.launch import launch
@@ -92,6 +94,7 @@ def yuv_layout(
     return layout
 
 
+@functools.cache
 def rgb_factors(matrix: str, *, full_range: bool) -> RgbFactors:
     """Factors of a matrix, ``bt709`` or ``bt601``, for codes of full or of limited range."""
     scale, offset, chroma = 65536 * 255 // 219, 16 << 9, _OF_CHROMA[matrix]

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.farm_rig import TICK, make_jobs, write_recording
+from tests.farm_rig import TICK, desk_frames, make_jobs, write_recording
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SourceError, UsageError
 from warp_ar.farm import device_video
@@ -127,6 +127,19 @@ def test_pictures_that_the_device_would_convert_in_another_way_go_to_the_host(fo
         for number, lit in enumerate(lighter.light(Job("segment", 0, 0, 0, COUNT), coded=True)):
             assert lit.coded is None
             np.testing.assert_array_equal(lit.image, whole[number])
+
+
+def test_pictures_of_a_folder_have_no_codes_for_the_device(folder):
+    (folder / "pictures").mkdir()
+    for number, image in enumerate(desk_frames(3)):
+        cv2.imwrite(str(folder / f"pictures/{number}.png"), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    jobs = make_jobs(folder, [{"scene": "scene.toml", "path": "pictures"}])
+    assert do_survey(jobs, folder / "of-pictures").state == "done"
+    with Lighter(jobs, folder / "of-pictures", "cpu", device_converts=True) as lighter:
+        coded = list(lighter.light(Job("segment", 0, 0, 0, 3), coded=True))
+        plain = [lit.image.copy() for lit in lighter.light(Job("segment", 0, 0, 0, 3))]
+        assert [lit.coded for lit in coded] == [None] * 3
+        np.testing.assert_array_equal(coded[-1].image, plain[-1])
 
 
 @pytest.mark.parametrize("quality", ["low", "medium"])
