@@ -16,7 +16,7 @@ import numpy.typing as npt
 from av.video.reformatter import VideoReformatter
 
 from warp_ar.closing import Closing
-from warp_ar.device import resolve_device, share_context
+from warp_ar.device import exclusive, resolve_device, share_context
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.engine.result import Result
 from warp_ar.errors import UsageError
@@ -221,7 +221,10 @@ class Lighter(Closing):
             self._follow(pipeline, survey, clip, frame.index)
             result = pipeline(picture, time_seconds=frame.time, pose=pose)
             picture = result.image_array
-        kept = np.array(picture.numpy()) if keep_rgb else None
+        kept = None
+        if keep_rgb:
+            with exclusive(picture.device):
+                kept = np.array(picture.numpy())
         return Lit(frame, pose, result, pipeline, video.fetch(picture), kept)
 
     def _video_for(self, job: Job, first: Frame, gpu: int | None) -> DeviceVideo | None:
