@@ -90,23 +90,22 @@ def encoded(pictures, path):
     return path.read_bytes()
 
 
-def test_what_the_device_converts_is_what_the_host_does(folder, tmp_path):
-    jobs, run = surveyed(folder, light="follow")
-    whole = lit_whole(jobs, run)
-    # One without a marker passes as it came.
-    with Lighter(jobs, run, "cpu", device_converts=True) as lighter:
-        lighter.survey(0).poses[4] = np.nan
+@pytest.mark.parametrize("decode", ["cpu", "gpu"])
+def test_what_the_device_converts_is_what_the_host_does(folder, tmp_path, decode, device):
+    _, run = surveyed(folder, light="follow")
+    jobs = make_jobs(folder, [{"scene": "scene.toml", "path": "a.mp4"}], run={"quality": "low", "decode": decode})
+    with Lighter(jobs, run, device) as lighter:
+        whole = lit(lighter, 0, COUNT)
+    with open_source(folder / "a.mp4") as source:
+        whole[4] = list(source)[4].image
+    with Lighter(jobs, run, device, device_converts=True) as lighter:
+        lighter.survey(0).poses[4] = np.nan  # without a marker a picture passes as it came
         coded = list(lighter_codes(lighter, keep_rgb=True))
         assert len(coded) == COUNT
-        with open_source(folder / "a.mp4") as source:
-            whole[4] = list(source)[4].image
         for number, (_, image) in enumerate(coded):
             np.testing.assert_array_equal(image, whole[number], err_msg=f"frame {number}")
-        files = [
-            encoded((picture for picture, _ in lighter_codes(lighter)), tmp_path / "device.mp4"),
-            encoded(whole, tmp_path / "host.mp4"),
-        ]
-    assert files[0] == files[1]
+        ours = encoded((picture for picture, _ in lighter_codes(lighter)), tmp_path / "device.mp4")
+    assert ours == encoded(whole, tmp_path / "host.mp4")
 
 
 def lighter_codes(lighter, **how):

@@ -16,8 +16,6 @@ from warp_ar.errors import UsageError
 
 _ARENA_MAX = -8
 """``M_ARENA_MAX`` of glibc's ``malloc.h``."""
-_SLEEP = 4
-"""``CU_CTX_SCHED_BLOCKING_SYNC`` of CUDA's ``cuda.h``."""
 _CUDA = threading.RLock()
 _TRANSLATION = threading.RLock()
 _OPENING: list[threading.Thread] = []
@@ -154,15 +152,6 @@ def resolve_device(name: str = "auto") -> Any:
     if wanted not in known:
         raise UsageError(f"device {name!r} is not here; this machine has auto, {', '.join(known)}")
     return wp.get_device(wanted)
-
-
-def share_context(gpu: int) -> None:
-    """Let FFmpeg use the context of a CUDA device that Warp uses: kernels then read what it has decoded there.
-
-    FFmpeg refuses a context unless threads that wait in it sleep. Where the driver cannot be asked, it stays as it is.
-    """
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL("libcuda.so.1").cuDevicePrimaryCtxSetFlags_v2(gpu, _SLEEP)
 
 
 def release_memory() -> None:

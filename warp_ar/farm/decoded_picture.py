@@ -12,8 +12,6 @@ LEAST_SIZE = 16
 """Rows and columns below which FFmpeg's filters weigh samples at the border in another way than the device."""
 INTERLEAVED = "nv12"
 """Format in which Cb and Cr lie in turn."""
-ON_DEVICE = "cuda"
-"""Format of a picture that a GPU's unit decoded and keeps."""
 _PLANAR = ("yuv420p", "yuvj420p")
 _MATRICES = {int(Colorspace.ITU709): "bt709", int(Colorspace.ITU601): "bt601"}
 
@@ -30,8 +28,7 @@ class DecodedPicture:
 def can_convert(picture: Any) -> bool:
     """Whether a device can convert PyAV's picture to RGB as the host does."""
     size = picture.height, picture.width
-    kind = picture.format if picture.format.name != ON_DEVICE else picture.sw_format
-    known = kind.name in (*_PLANAR, INTERLEAVED) and matrix_of(picture) is not None
+    known = picture.format.name in (*_PLANAR, INTERLEAVED) and matrix_of(picture) is not None
     return known and not picture.rotation and min(size) >= LEAST_SIZE and not any(n % 2 for n in size)
 
 

@@ -19,17 +19,15 @@ import warp as wp
 from av.video.reformatter import ColorRange
 
 from warp_ar.device import exclusive, translating, wait_for
-from warp_ar.farm.decoded_picture import INTERLEAVED, ON_DEVICE, DecodedPicture, matrix_of
+from warp_ar.farm.decoded_picture import INTERLEAVED, DecodedPicture, matrix_of
 from warp_ar.farm.lit_picture import LitPicture
-from warp_ar.kernels.video_color import RgbFactors, rgb_factors, rgb_from_yuv, yuv_from_rgb, yuv_layout
+from warp_ar.kernels.video_color import rgb_factors, rgb_from_yuv, yuv_from_rgb, yuv_layout
 from warp_ar.output.video_sink import rgb_to_yuv
 
 Codes = npt.NDArray[np.uint8]
 
 SLOTS = 3
 """Frames whose codes are kept: one that is lit, one that is encoded, one between."""
-_DEFAULT_STREAM = 1
-"""CUDA's handle of the stream that FFmpeg decodes on."""
 
 
 class _Slot:
@@ -43,14 +41,11 @@ class _Slot:
         self.sent, self.fetched = self.sent_array.numpy(), self.fetched_array.numpy()
         self.done = wp.Event(device) if pinned else None
         self.used = False
-        self.kept: Any = None
-        """What kernels still read."""
 
     def wait(self) -> None:
         """Wait until the codes that were fetched last are there."""
         if self.used and self.done is not None:
             wait_for(self.done)
-            self.kept = None
 
 
 class DeviceVideo:
@@ -92,9 +87,6 @@ class DeviceVideo:
         matrix = matrix_of(picture)
         assert matrix is not None
         factors = rgb_factors(matrix, full_range=full)
-        if picture.format.name == ON_DEVICE:
-            self._convert_there(picture, slot, factors)
-            return self._rgb
         interleaved = picture.format.name == INTERLEAVED
         _copy_planes(picture, slot.sent, interleaved=interleaved)
         with exclusive(self._device):
@@ -102,21 +94,6 @@ class DeviceVideo:
             layout = self._layouts[interleaved, self.left]
             rgb_from_yuv(*self._planes, layout, factors, self._rgb, device=self._device, stream=self._stream)
         return self._rgb
-
-    def _convert_there(self, picture: Any, slot: _Slot, factors: RgbFactors) -> None:
-        """Convert a picture that its decoder left on this device, of Cb and Cr in turn."""
-        luma, chroma = (wp.from_dlpack(plane.__dlpack__(), dtype=wp.uint8) for plane in picture.planes)
-        pitch = luma.strides[0]
-        flat = [
-            wp.array(ptr=plane.ptr, dtype=wp.uint8, shape=(pitch * plane.shape[0],), device=self._device)
-            for plane in (luma, chroma)
-        ]
-        with exclusive(self._device):
-            # It was decoded on the default stream, and must last until it has been read.
-            self._stream.wait_stream(wp.Stream(self._device, cuda_stream=_DEFAULT_STREAM))
-            layout = yuv_layout(self._height, self._width, interleaved=True, left=self.left, pitch=pitch)
-            rgb_from_yuv(*flat, layout, factors, self._rgb, device=self._device, stream=self._stream)
-        slot.kept = picture, luma, chroma
 
     def send_rgb(self, image: npt.NDArray[np.uint8]) -> Any:
         """As ``send``, of a picture that the host has converted."""

@@ -78,8 +78,7 @@ class VideoPart(VideoFile):
     def _open(self, **how: Any) -> Any:
         """As ``VideoFile``'s; what the GPU's unit cannot begin is decoded by the processor, with the same pictures."""
         if self._gpu is not None:
-            own = self._decoded_only
-            unit = HWAccel("cuda", device=str(self._gpu), allow_software_fallback=True, is_hw_owned=own)
+            unit = HWAccel("cuda", device=str(self._gpu), allow_software_fallback=True)
             with contextlib.suppress(SourceError, NotImplementedError):
                 return super()._open(**how, hwaccel=unit)
             self._gpu = None

@@ -9,14 +9,14 @@ import gc
 import itertools
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from av.video.reformatter import VideoReformatter
 
 from warp_ar.closing import Closing
-from warp_ar.device import exclusive, resolve_device, share_context
+from warp_ar.device import exclusive, resolve_device
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.engine.result import Result
 from warp_ar.errors import UsageError
@@ -194,13 +194,10 @@ class Lighter(Closing):
         """As ``_light``, of pictures whose codes go to the device, and to the encoder from there."""
         survey = self.survey(job.clip)
         own = lit_scene(self._jobs, job.clip, survey) if scene is None else scene
-        gpu = self._jobs.settings.gpu_of(self._device)
-        if gpu is not None:
-            share_context(gpu)
         with contextlib.closing(self._open(job.clip, job.first, job.end, decoded=True)) as source:
             frames = iter(source)
             first = next(frames)
-            video = self._video_for(job, first, gpu)
+            video = self._video_for(first)
             if video is not None:
                 pipeline = self._pipeline_for(own, source.size, ("image",), follows=len(survey.keys) > 0, linear=False)
                 pipeline.restart(saturation=survey.saturation)
@@ -227,23 +224,14 @@ class Lighter(Closing):
                 kept = np.array(picture.numpy())
         return Lit(frame, pose, result, pipeline, video.fetch(picture), kept)
 
-    def _video_for(self, job: Job, first: Frame, gpu: int | None) -> DeviceVideo | None:
+    def _video_for(self, first: Frame) -> DeviceVideo | None:
         """What converts a job's pictures, by its first one; None: the device does not convert it as the host does."""
         decoded: Any = first.image
         if not isinstance(decoded, DecodedPicture):
             return None
-        plain = decoded if gpu is None else self._first_of(job)
         height, width, _ = decoded.shape
         video = self._video_of((width, height))
-        return video if video.adapt(decoded, rgb_from_video(VideoReformatter(), plain.picture)) else None
-
-    def _first_of(self, job: Job) -> DecodedPicture:
-        """A job's first picture, decoded by the processor."""
-        path, fps = source_of(self._jobs, job.clip)
-        index, end = self.survey(job.clip).index, job.first + 1
-        with contextlib.closing(open_part(path, index, job.first, end, fps, decoded=True)) as source:
-            first: Any = next(iter(source)).image
-        return cast(DecodedPicture, first)
+        return video if video.adapt(decoded, rgb_from_video(VideoReformatter(), decoded.picture)) else None
 
     def _video_of(self, size: tuple[int, int]) -> DeviceVideo:
         if size not in self._videos:
