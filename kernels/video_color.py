@@ -49,8 +49,6 @@ class YuvLayout:
     """Rows of luma, an even number."""
     width: wp.int32
     """Columns of luma, an even number."""
-    luma_pitch: wp.int32
-    """Bytes from a row of luma to the next."""
     cr: wp.int32
     """Place of the first Cr; the first Cb is at 0."""
     step: wp.int32
@@ -74,23 +72,19 @@ class RgbFactors:
     b_of_cb: wp.int32
 
 
-def yuv_layout(
-    height: int, width: int, *, interleaved: bool = False, left: bool = True, pitch: int | None = None
-) -> YuvLayout:
-    """Cb and Cr one plane after the other or, ``interleaved``, in turn (NV12).
+def yuv_layout(height: int, width: int, *, interleaved: bool = False, left: bool = True) -> YuvLayout:
+    """Rows without gaps; Cb and Cr one plane after the other or, ``interleaved``, in turn (NV12).
 
     Args:
         height: Rows of luma.
         width: Columns of luma.
         interleaved: Whether Cb and Cr lie in turn.
         left: Whether chroma lies at the left one of two columns, else between them.
-        pitch: Bytes from a row to the next, of luma and of chroma in turn; None: rows have no gaps.
     """
     layout = YuvLayout()
     layout.height, layout.width, layout.left = height, width, int(left)
-    layout.luma_pitch = pitch or width
     layout.cr = 1 if interleaved else height * width // 4
-    layout.step, layout.pitch = (2, pitch or width) if interleaved else (1, width // 2)
+    layout.step, layout.pitch = (2, width) if interleaved else (1, width // 2)
     return layout
 
 
@@ -147,7 +141,7 @@ def rgb_from_yuv_kernel(
     cr += 1024 * _column_sum(chroma, layout.cr + far, left, right, weight)
     cb = (cb + 512 - (128 << 19)) >> 10
     cr = (cr + 512 - (128 << 19)) >> 10
-    level = (wp.int32(luma[row * layout.luma_pitch + column]) << 9) - factors.y_offset
+    level = (wp.int32(luma[row * layout.width + column]) << 9) - factors.y_offset
     y = wp.int64(level) * wp.int64(factors.y_scale) + wp.int64(1 << 21)
     rgb_out[row, column] = wp.vec3ub(
         code_of(y + wp.int64(cr) * wp.int64(factors.r_of_cr)),
@@ -213,7 +207,7 @@ def yuv_from_rgb_kernel(
     row, column = 2 * pair_row, 2 * pair_column
     for k in range(4):
         at_row, at_column = row + k / 2, column + k % 2
-        luma_out[at_row * layout.luma_pitch + at_column] = _luma_code(rgb[at_row, at_column])
+        luma_out[at_row * layout.width + at_column] = _luma_code(rgb[at_row, at_column])
     place = pair_row * layout.pitch + pair_column * layout.step
     chroma_out[place] = _chroma_code(rgb, row, column, _TO_CB)
     chroma_out[layout.cr + place] = _chroma_code(rgb, row, column, _TO_CR)

@@ -196,9 +196,9 @@ class Lighter(Closing):
         own = lit_scene(self._jobs, job.clip, survey) if scene is None else scene
         with contextlib.closing(self._open(job.clip, job.first, job.end, decoded=True)) as source:
             frames = iter(source)
-            first = next(frames)
-            video = self._video_for(first)
-            if video is not None:
+            first = next(frames, None)
+            video = None if first is None else self._video_for(first)
+            if first is not None and video is not None:
                 pipeline = self._pipeline_for(own, source.size, ("image",), follows=len(survey.keys) > 0, linear=False)
                 pipeline.restart(saturation=survey.saturation)
                 self._key = None
