@@ -1,19 +1,19 @@
 """Codes of video as RGB and back: 4:2:0 Y'CbCr of 8 bits in FFmpeg's fixed-point arithmetic, to the bit.
 
-A decoder gives Y'CbCr of 12 bits a pixel, an encoder takes it. Where the device converts, half as many bytes go over the
-bus, and no thread of the host converts. Files must not depend on who converted, so sums, shifts and truncations are
+A decoder gives Y'CbCr of 12 bits a pixel, an encoder takes it. Where the device converts, half as many bytes go over
+the bus, and no thread of the host converts. Files must not depend on who converted, so sums, shifts and truncations are
 those of libswscale with ``accurate_rnd`` and bilinear filters, as ``warp_ar.input.video_file`` and
 ``warp_ar.output.video_sink`` ask for them.
 
-To RGB. Chroma lies between two rows of pixels, and between two columns or, as most video has it, at the left one. Of the
-two nearest samples one has the weight 3/4, the other 1/4; where it lies at the left one, a left pixel has its sample
-alone and a right one half of each of two. Beyond the border the last one stands again. Columns are summed first, to 7
-bits behind the binary point, then rows, to 9. With factors of 13 bits behind the point,
+To RGB. Chroma lies between two rows of pixels, and between two columns or, as most video has it, at the left one. Of
+the two nearest samples one has the weight 3/4, the other 1/4; where it lies at the left one, a left pixel has its
+sample alone and a right one half of each of two. Beyond the border the last one stands again. Columns are summed first,
+to 7 bits behind the binary point, then rows, to 9. With factors of 13 bits behind the point,
 
     r = floor(clamp((y - y_offset) y_scale + cr r_of_cr + 2^21, 0, 2^30 - 1) / 2^22),
 
-and g and b alike. The sum has 32 bits and wraps around, as FFmpeg's: of codes that no camera writes (luma and chroma of
-255) b is 0.
+and g and b alike. The sum has 32 bits and wraps around, as FFmpeg's: of codes that no camera writes (luma and chroma
+of 255) b is 0.
 
 From RGB, BT.709 of limited range, by factors of 15 bits behind the point. Chroma of each pixel is cut to 6 bits; columns
 are summed by (1/4, 1/2, 1/4) about the left pixel of each pair and cut to 7 bits, rows by (1/8, 3/8, 3/8, 1/8) and
@@ -124,6 +124,7 @@ def rgb_from_yuv_kernel(
     # Out:
     rgb_out: wp.array2d[wp.vec3ub],
 ):
+    """Convert a pixel to RGB."""
     row, column = wp.tid()
     near_row, near_column = row / 2, column / 2
     far_row = wp.clamp(near_row - 1 + 2 * (row % 2), 0, layout.height / 2 - 1)
@@ -203,6 +204,7 @@ def yuv_from_rgb_kernel(
     luma_out: wp.array[wp.uint8],
     chroma_out: wp.array[wp.uint8],
 ):
+    """Convert two by two pixels to Y'CbCr."""
     pair_row, pair_column = wp.tid()
     row, column = 2 * pair_row, 2 * pair_column
     for k in range(4):
