@@ -15,9 +15,9 @@ to 7 bits behind the binary point, then rows, to 9. With factors of 13 bits behi
 and g and b alike. The sum has 32 bits and wraps around, as FFmpeg's: of codes that no camera writes (luma and chroma
 of 255) b is 0.
 
-From RGB, BT.709 of limited range, by factors of 15 bits behind the point. Chroma of each pixel is cut to 6 bits; columns
-are summed by (1/4, 1/2, 1/4) about the left pixel of each pair and cut to 7 bits, rows by (1/8, 3/8, 3/8, 1/8) and
-rounded to a code. Luma is cut to 6 bits and rounded to a code.
+From RGB, BT.709 of limited range, by factors of 15 bits behind the point. Chroma of each pixel is cut to 6 bits;
+columns are summed by (1/4, 1/2, 1/4) about the left pixel of each pair and cut to 7 bits, rows by (1/8, 3/8, 3/8, 1/8)
+and rounded to a code. Luma is cut to 6 bits and rounded to a code.
 
 References:
     ITU-R BT.601-7 and BT.709-6: matrices and ranges.
