@@ -26,12 +26,11 @@ import contextlib
 import dataclasses
 import itertools
 import os
-import re
 import shutil
 import statistics
 import tempfile
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +47,7 @@ from bench.farm_survey import run_survey
 from bench.farm_variations import run_variations
 from warp_ar.farm.fitting import probe_worker, workers_of_gpu
 from warp_ar.farm.jobs import parse_jobs, read_jobs
+from warp_ar.farm.pool import by_siblings
 
 PARTS = {"bounds": 0.1, "survey": 0.1, "gpus": 0.4, "cpu": 0.1, "long": 0.22, "variations": 0.18, "kills": 0.2}
 """Parts in their order, and their shares of the minutes."""
@@ -112,22 +112,6 @@ def steady_run(
         figures["error"] = seen.errors[-500:]
     shutil.rmtree(folder)
     return figures
-
-
-def by_siblings(cores: Iterable[int]) -> list[int]:
-    """Cores in such an order that threads of one of the processor's are beside each other, as far as Linux tells.
-
-    Half of a list in which they are not is more than half of a machine.
-    """
-
-    def place(core: int) -> tuple[int, int]:
-        path = Path(f"/sys/devices/system/cpu/cpu{core}/topology/thread_siblings_list")
-        try:
-            return int(re.split("[,-]", path.read_text(encoding="ascii"))[0]), core
-        except (OSError, ValueError):
-            return core, core
-
-    return sorted(cores, key=place)
 
 
 def _numbers_to_try(bench: Bench, cores: int, gpus: int) -> list[int]:

@@ -24,7 +24,8 @@ from warp_ar.device import usable_cores
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.farm.frames import index_frames, open_part
 from warp_ar.farm.jobs import Job, parse_jobs, read_jobs
-from warp_ar.farm.lighting import Lighter
+from warp_ar.farm.lighting import Lighter, Lit
+from warp_ar.farm.lit_picture import LitPicture
 from warp_ar.farm.part_video import PartSink
 from warp_ar.farm.records import Context
 from warp_ar.farm.work import Work
@@ -90,6 +91,7 @@ def run_bounds(bench: Bench) -> None:
     with av.open(str(video)) as container:
         pictures = list(itertools.islice(container.decode(video=0), limit + WARM))
     steps["convert to RGB"] = _timed((rgb_from_video(reformatter, picture) for picture in pictures), limit)
+    steps["encode codes"] = _encode(bench.folder / "encoded.mp4", [_codes_of(picture) for picture in pictures], limit)
     del pictures
     scene = load_scene(bench.folder / "desk.toml")
     tracker = Tracker(scene.marker, scene.camera)
@@ -133,7 +135,16 @@ def _decode_by_unit(bench: Bench, video: Path, images: list[np.ndarray], steps: 
     bench.tell("pictures by the GPU's unit", compared=len(same), unlike=same.count(False))
 
 
-def _encode(path: Path, images: list[np.ndarray], limit: int) -> tuple[float, float]:
+def _codes_of(picture: Any) -> LitPicture:
+    """A decoded picture as one that a device has lit."""
+    planes = [
+        np.frombuffer(plane, np.uint8).reshape(plane.height, plane.line_size)[:, : plane.width].ravel()
+        for plane in picture.planes
+    ]
+    return LitPicture((picture.height, picture.width, 3), np.concatenate(planes), lambda: None)
+
+
+def _encode(path: Path, images: Sequence[Any], limit: int) -> tuple[float, float]:
     start, spent = 0.0, 0.0
     sink = PartSink(path, list(range(len(images))), TICK, RATE)
     for number, image in enumerate(images[: limit + WARM]):
@@ -148,7 +159,7 @@ def _encode(path: Path, images: list[np.ndarray], limit: int) -> tuple[float, fl
 
 
 def _light(bench: Bench, steps: dict[str, tuple[float, float]], limit: int) -> dict[str, float]:
-    """Frames from the file to the host's picture, none written; returns the kernels' milliseconds on a CUDA device."""
+    """Frames from the file to what the encoder takes; returns the kernels' milliseconds on a CUDA device."""
     source = surveyed(bench)
     jobs = parse_jobs(read_jobs(write_clips(bench, "light.toml", 1, limit)), "light.toml")
     folder = bench.folder / "light"
@@ -156,10 +167,10 @@ def _light(bench: Bench, steps: dict[str, tuple[float, float]], limit: int) -> d
     device = bench.one_device
     kernels: dict[str, float] = {}
     with Lighter(jobs, folder, device) as lighter:
-        for lit in lighter.light(Job("segment", 0, 0, 0, WARM)):
-            _ = lit.image
+        for lit in lighter.light(Job("segment", 0, 0, 0, WARM), coded=True):
+            _picture_of(lit)
         job = Job("segment", 0, 0, 0, limit + WARM)
-        steps["light"] = _timed((lit.image for lit in lighter.light(job)), limit)
+        steps["light"] = _timed((_picture_of(lit) for lit in lighter.light(job, coded=True)), limit)
         if device != "cpu":
             kernels = {
                 "same light": _kernels(lit.pipeline, device, ("frame", "pose", "clock")),
@@ -167,6 +178,11 @@ def _light(bench: Bench, steps: dict[str, tuple[float, float]], limit: int) -> d
             }
     shutil.rmtree(folder)
     return kernels
+
+
+def _picture_of(lit: Lit) -> Any:
+    """What a sink is given of a lit frame."""
+    return lit.image if lit.coded is None else lit.coded.copy()
 
 
 def _kernels(pipeline: Pipeline, device: str, changed: Sequence[str]) -> float:

@@ -12,6 +12,7 @@ from av.video.reformatter import VideoReformatter
 
 from tests.farm_rig import CLIPS, TICK, desk_frames, write_recording
 from warp_ar.errors import SourceError
+from warp_ar.farm.decoded_picture import DecodedPicture
 from warp_ar.farm.frames import index_frames, open_part, shown_ticks
 from warp_ar.input.video_file import rgb_from_video
 
@@ -96,3 +97,16 @@ def test_pictures_as_a_decoding_unit_gives_them_become_the_same_colours(tmp_path
             assert (other.colorspace, other.color_range) == (picture.colorspace, picture.color_range)
             expected = rgb_from_video(VideoReformatter(), picture)
             np.testing.assert_array_equal(rgb_from_video(VideoReformatter(), other), expected)
+
+
+def test_pictures_stay_as_they_were_decoded_where_that_is_asked_for(tmp_path):
+    write_recording(tmp_path / "a.mp4", 12, ticks=UNEVEN)
+    index = index_frames(tmp_path / "a.mp4", None)
+    plain = read(tmp_path / "a.mp4", 3, 9)
+    with open_part(tmp_path / "a.mp4", index, 3, 9, None, decoded=True) as source:
+        decoded = list(source)
+    for a, b in zip(plain, decoded, strict=True):
+        assert (a.index, a.time) == (b.index, b.time)
+        assert isinstance(b.image, DecodedPicture)
+        assert b.image.shape == a.image.shape
+        np.testing.assert_array_equal(rgb_from_video(VideoReformatter(), b.image.picture), a.image)

@@ -8,6 +8,7 @@ import signal
 import pytest
 
 from warp_ar.errors import UsageError
+from warp_ar.farm import pool
 from warp_ar.farm.pool import ProcessPool, Teller, cores_of, devices_of, is_from_outside, keeping_to, words_of_exit
 from warp_ar.farm.ray_pool import _knock
 from warp_ar.farm.records import Context
@@ -25,7 +26,14 @@ from warp_ar.farm.records import Context
 )
 def test_cores_are_shared_out_evenly(monkeypatch, cores, workers, expected):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: cores, raising=False)
+    monkeypatch.setattr(pool, "_first_sibling", lambda core: core)
     assert cores_of(["cpu"] * workers) == expected
+
+
+def test_threads_of_a_core_are_in_one_part(monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
+    monkeypatch.setattr(pool, "_first_sibling", lambda core: core % 4)
+    assert cores_of(["cuda:0", "cuda:1"]) == [[0, 4, 1, 5], [2, 6, 3, 7]]
 
 
 @pytest.mark.parametrize(
@@ -39,6 +47,7 @@ def test_cores_are_shared_out_evenly(monkeypatch, cores, workers, expected):
 )
 def test_workers_of_a_gpu_share_its_part_of_the_cores(monkeypatch, cores, devices, expected):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: cores, raising=False)
+    monkeypatch.setattr(pool, "_first_sibling", lambda core: core)
     assert cores_of([f"cuda:{gpu}" for gpu in devices]) == expected
 
 

@@ -7,18 +7,20 @@ import dataclasses
 import fractions
 from collections.abc import Generator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import av
 import numpy as np
 import numpy.typing as npt
 from av.codec.hwaccel import HWAccel
+from av.video.reformatter import VideoReformatter
 
 from warp_ar.errors import SourceError, reason
+from warp_ar.farm.decoded_picture import DecodedPicture, can_convert
 from warp_ar.input.frame_folder import FrameFolder
 from warp_ar.input.source import DEFAULT_FPS, Frame, RecordedSource
 from warp_ar.input.sources import open_source
-from warp_ar.input.video_file import VideoFile
+from warp_ar.input.video_file import Taken, VideoFile
 
 CONVERTERS = 2
 """Threads of a worker that turn decoded pictures into RGB."""
@@ -52,6 +54,7 @@ class VideoPart(VideoFile):
         fps: Show frame n at n / fps instead of at its own time.
         gpu: Number of the GPU whose decoding unit is to be used, where it has one for this coding; None: none is.
         converters: Threads that turn decoded pictures into RGB; twice as many decode.
+        decoded: Whether frames have a ``DecodedPicture`` for their image where a device can convert it.
     """
 
     def __init__(
@@ -64,8 +67,10 @@ class VideoPart(VideoFile):
         gpu: int | None = None,
         *,
         converters: int = CONVERTERS,
+        decoded: bool = False,
     ) -> None:
-        self._gpu, self._converters, self._decoders = gpu, converters, 2 * converters
+        self._gpu, self._decoded_only = gpu, decoded
+        self._converters, self._decoders = 1 if decoded else converters, 2 * converters
         super().__init__(path, fps=fps)
         self._index, self._first, self._end = index, first, end
         self.length = end - first
@@ -78,6 +83,12 @@ class VideoPart(VideoFile):
                 return super()._open(**how, hwaccel=unit)
             self._gpu = None
         return super()._open(**how)
+
+    def _taken(self, reformatter: VideoReformatter, picture: Any) -> Taken:
+        """As ``VideoFile``'s, or the picture as it is."""
+        if self._decoded_only and can_convert(picture):
+            return cast(Any, DecodedPicture(picture)), picture.time, None
+        return super()._taken(reformatter, picture)
 
     def _decode(self) -> Generator[Frame, None, None]:
         ticks, tick = self._index.ticks, self._index.tick
@@ -177,12 +188,13 @@ def open_part(
     gpu: int | None = None,
     *,
     converters: int = CONVERTERS,
+    decoded: bool = False,
 ) -> RecordedSource:
     """Frames ``first`` to ``end`` of a recording; arguments as ``VideoPart``."""
     with open_source(path, fps=fps) as source:
         is_video = isinstance(source, VideoFile)
     if is_video:
-        return VideoPart(path, index, first, end, fps, gpu, converters=converters)
+        return VideoPart(path, index, first, end, fps, gpu, converters=converters, decoded=decoded)
     return FolderPart(path, first, end, fps or DEFAULT_FPS)
 
 

@@ -6,21 +6,30 @@ import collections
 import contextlib
 import dataclasses
 import gc
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from av.video.reformatter import VideoReformatter
 
 from warp_ar.closing import Closing
+from warp_ar.device import exclusive, resolve_device
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.engine.result import Result
+from warp_ar.errors import UsageError
+from warp_ar.farm.decoded_picture import DecodedPicture
+from warp_ar.farm.device_video import DeviceVideo
 from warp_ar.farm.frames import CONVERTERS, open_part
 from warp_ar.farm.jobs import Job, JobFile, lit_range, scene_of, source_of
+from warp_ar.farm.lit_picture import LitPicture
 from warp_ar.farm.survey import Survey, keep_depth, lit_scene
+from warp_ar.input.own_markers import own_markers
 from warp_ar.input.plate import Plate
 from warp_ar.input.source import Frame, RecordedSource
+from warp_ar.input.video_file import rgb_from_video
 from warp_ar.scene import Pose, Scene
 from warp_ar.scene.kinds import skeleton
 
@@ -40,10 +49,22 @@ class Lit:
     result: Result | None
     """None where the marker was lost."""
     pipeline: Pipeline
+    coded: LitPicture | None = None
+    """The picture for the encoder, where the device made its codes; None: it is ``image``."""
+    kept: Image | None = None
+    """The picture in RGB, where the device made its codes and RGB was asked for too."""
 
     @property
     def image(self) -> Image:
-        """The picture, uint8 RGB (height, width, 3)."""
+        """The picture, uint8 RGB (height, width, 3).
+
+        Raises:
+            UsageError: The device made its codes, and RGB was not asked for.
+        """
+        if self.coded is not None:
+            if self.kept is None:
+                raise UsageError("the picture's RGB stayed on the device; light with keep_rgb=True")
+            return self.kept
         return self.frame.image if self.result is None else self.result.image
 
     @property
@@ -59,7 +80,15 @@ class Lit:
 class Lighter(Closing):
     """Lights segments and variations; one for each worker."""
 
-    def __init__(self, jobs: JobFile, folder: Path, device: str, *, converters: int = CONVERTERS) -> None:
+    def __init__(
+        self,
+        jobs: JobFile,
+        folder: Path,
+        device: str,
+        *,
+        converters: int = CONVERTERS,
+        device_converts: bool | None = None,
+    ) -> None:
         """Light nothing yet.
 
         Args:
@@ -67,9 +96,13 @@ class Lighter(Closing):
             folder: Of the run.
             device: ``cpu`` or ``cuda:N``.
             converters: Threads that turn decoded pictures into RGB.
+            device_converts: Whether the device turns pictures of video into RGB and back; None: a GPU does.
         """
+        self._device_converts = device != "cpu" if device_converts is None else device_converts
         self._jobs, self._folder, self._device, self._converters = jobs, folder, device, converters
         self._pipelines: collections.OrderedDict[Any, Pipeline] = collections.OrderedDict()
+        self._videos: dict[tuple[int, int], DeviceVideo] = {}
+        """By size of the pictures."""
         self._survey: tuple[int, Survey] | None = None
         self._key: tuple[int, int, Any] | None = None
 
@@ -78,6 +111,7 @@ class Lighter(Closing):
         for pipeline in self._pipelines.values():
             pipeline.close()
         self._pipelines.clear()
+        self._videos.clear()
 
     def survey(self, clip: int) -> Survey:
         """What the survey of a clip found."""
@@ -86,7 +120,14 @@ class Lighter(Closing):
         return self._survey[1]
 
     def light(
-        self, job: Job, scene: Scene | None = None, *, outputs: tuple[str, ...] = ("image",), every: int = 1
+        self,
+        job: Job,
+        scene: Scene | None = None,
+        *,
+        outputs: tuple[str, ...] = ("image",),
+        every: int = 1,
+        coded: bool = False,
+        keep_rgb: bool = False,
     ) -> Iterator[Lit]:
         """Light the frames of a job; of pictures alone the next is begun before one is handed out.
 
@@ -95,11 +136,17 @@ class Lighter(Closing):
             scene: What to show; None: the clip's own scene.
             outputs: Outputs of the pipeline.
             every: One of so many frames is lit.
+            coded: Whether the device may make the encoder's codes of pictures, where it has those of the recording:
+                a ``Lit`` then has ``coded``, to be copied before the next but one is asked for.
+            keep_rgb: Whether those have ``image`` as well.
 
         Raises:
             WarpArError: The recording or the scene cannot be used.
         """
-        frames = self._light(job, scene, outputs, every)
+        if coded and outputs == ("image",) and self._may_convert(job):
+            frames = self._light_coded(job, scene, every, keep_rgb=keep_rgb)
+        else:
+            frames = self._light(job, scene, outputs, every)
         if outputs != ("image",):
             yield from frames
             return
@@ -134,11 +181,68 @@ class Lighter(Closing):
                 call = pipeline.submit if outputs == ("image",) else pipeline
                 yield Lit(frame, pose, call(frame.deepest, time_seconds=frame.time, pose=pose), pipeline)
 
-    def _open(self, clip: int, first: int, end: int) -> RecordedSource:
+    def _may_convert(self, job: Job) -> bool:
+        """Whether the device may convert a job's pictures.
+
+        Not where light is gathered from them, or markers that something rides on are looked for: that is done with the
+        host's picture.
+        """
+        follows = self._jobs.settings.light != "preroll"
+        return self._device_converts and follows and not own_markers(scene_of(self._jobs, job.clip))
+
+    def _light_coded(self, job: Job, scene: Scene | None, every: int, *, keep_rgb: bool) -> Iterator[Lit]:
+        """As ``_light``, of pictures whose codes go to the device, and to the encoder from there."""
+        survey = self.survey(job.clip)
+        own = lit_scene(self._jobs, job.clip, survey) if scene is None else scene
+        with contextlib.closing(self._open(job.clip, job.first, job.end, decoded=True)) as source:
+            frames = iter(source)
+            first = next(frames, None)
+            video = None if first is None else self._video_for(first)
+            if first is not None and video is not None:
+                pipeline = self._pipeline_for(own, source.size, ("image",), follows=len(survey.keys) > 0, linear=False)
+                pipeline.restart(saturation=survey.saturation)
+                self._key = None
+                for frame in itertools.chain([first], frames):
+                    if not (frame.index - job.first) % every:
+                        yield self._light_codes(frame, survey, job.clip, pipeline, video, keep_rgb=keep_rgb)
+                return
+        yield from self._light(job, scene, ("image",), every)
+
+    def _light_codes(
+        self, frame: Frame, survey: Survey, clip: int, pipeline: Pipeline, video: DeviceVideo, *, keep_rgb: bool
+    ) -> Lit:
+        decoded: Any = frame.image
+        picture = video.send(decoded) if isinstance(decoded, DecodedPicture) else video.send_rgb(decoded)
+        pose, result = survey.pose(frame.index), None
+        if pose is not None:
+            self._follow(pipeline, survey, clip, frame.index)
+            result = pipeline(picture, time_seconds=frame.time, pose=pose)
+            picture = result.image_array
+        kept = None
+        if keep_rgb:
+            with exclusive(picture.device):
+                kept = np.array(picture.numpy())
+        return Lit(frame, pose, result, pipeline, video.fetch(picture), kept)
+
+    def _video_for(self, first: Frame) -> DeviceVideo | None:
+        """What converts a job's pictures, by its first one; None: the device does not convert it as the host does."""
+        decoded: Any = first.image
+        if not isinstance(decoded, DecodedPicture):
+            return None
+        height, width, _ = decoded.shape
+        video = self._video_of((width, height))
+        return video if video.adapt(decoded, rgb_from_video(VideoReformatter(), decoded.picture)) else None
+
+    def _video_of(self, size: tuple[int, int]) -> DeviceVideo:
+        if size not in self._videos:
+            self._videos[size] = DeviceVideo(size, resolve_device(self._device))
+        return self._videos[size]
+
+    def _open(self, clip: int, first: int, end: int, *, decoded: bool = False) -> RecordedSource:
         """Frames of a clip."""
         path, fps = source_of(self._jobs, clip)
-        gpu = self._jobs.settings.gpu_of(self._device)
-        return open_part(path, self.survey(clip).index, first, end, fps, gpu, converters=self._converters)
+        gpu, index = self._jobs.settings.gpu_of(self._device), self.survey(clip).index
+        return open_part(path, index, first, end, fps, gpu, converters=self._converters, decoded=decoded)
 
     def _follow(self, pipeline: Pipeline, survey: Survey, clip: int, frame: int) -> None:
         """Give a pipeline the light that holds for a frame."""

@@ -19,6 +19,7 @@ import av
 import numpy.typing as npt
 
 from warp_ar.errors import SinkError, SourceError, reason
+from warp_ar.farm.lit_picture import LitPicture
 from warp_ar.output.encoders import Encoding, find_encoding, last_packets
 from warp_ar.output.sink import ThreadedSink, check_image, check_radiance
 from warp_ar.output.video_sink import (
@@ -92,8 +93,15 @@ class PartSink(ThreadedSink):
         self._path, self._ticks, self._tick, self._fps = path, ticks, tick, fps
         self._container: Any = None
 
+    def write(self, image: Any) -> None:
+        """Take the next frame: an array, or a ``LitPicture``, whose codes are encoded as they are."""
+        super().write(image)
+
     def _check(self, image: Any) -> None:
-        if self._encoding.coding == "8bit":
+        if isinstance(image, LitPicture):
+            if self._encoding.coding != "8bit":
+                raise SinkError(f"{self.description}: a picture of 8 bits among those of {self._encoding.coding}")
+        elif self._encoding.coding == "8bit":
             check_image(image)
         else:
             check_radiance(image)
@@ -110,19 +118,24 @@ class PartSink(ThreadedSink):
         self._stream.time_base = self._stream.codec_context.time_base = self._tick
         self._converter = rgb_to_yuv(width, height, self._tick, encoding.coding, encoding.pixel_format)
 
-    def _store(self, index: int, image: npt.NDArray[Any]) -> None:
-        image = of_even_size(image)
+    def _store(self, index: int, image: npt.NDArray[Any] | av.VideoFrame) -> None:
+        is_coded, coding = isinstance(image, av.VideoFrame), self._encoding.coding
         try:
-            if self._container is None:
-                self._start(image.shape[1], image.shape[0])
-            coding = self._encoding.coding
-            if coding == "8bit":
-                picture = av.VideoFrame.from_ndarray(image, format="rgb24")
+            if isinstance(image, av.VideoFrame):
+                picture = image
             else:
-                picture = yuv_picture(signal_of(image, coding, self._transfer), coding)
+                image = of_even_size(image)
+                if coding == "8bit":
+                    picture = av.VideoFrame.from_ndarray(image, format="rgb24")
+                else:
+                    picture = yuv_picture(signal_of(image, coding, self._transfer), coding)
+            if self._container is None:
+                self._start(picture.width, picture.height)
             picture.pts, picture.time_base = int(self._ticks[index] - self._ticks[0]), self._tick
-            self._converter.push(picture)
-            self._container.mux(self._stream.encode(self._converter.pull()))
+            if not is_coded:
+                self._converter.push(picture)
+                picture = self._converter.pull()
+            self._container.mux(self._stream.encode(picture))
         except (av.FFmpegError, OSError) as error:
             raise SinkError(f"{self._path}: frame {index} cannot be written: {reason(error)}") from error
 

@@ -14,11 +14,12 @@ import multiprocessing.connection
 import multiprocessing.resource_tracker
 import os
 import queue
+import re
 import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -81,18 +82,36 @@ def devices_of(device: str, workers: int | None) -> list[str]:
     return [found[n % len(found)] for n in range(workers or len(found))]
 
 
+def by_siblings(cores: Iterable[int]) -> list[int]:
+    """Cores in such an order that threads of one of the processor's are beside each other, as far as Linux tells.
+
+    Half of a list in which they are not is more than half of a machine.
+    """
+    return sorted(cores, key=lambda core: (_first_sibling(core), core))
+
+
+def _first_sibling(core: int) -> int:
+    """The first thread of the processor's core that a core is a thread of."""
+    path = Path(f"/sys/devices/system/cpu/cpu{core}/topology/thread_siblings_list")
+    try:
+        return int(re.split("[,-]", path.read_text(encoding="ascii"))[0])
+    except (OSError, ValueError):
+        return core
+
+
 def cores_of(devices: Sequence[str]) -> list[list[int]]:
     """Cores of each worker.
 
     On CPU each has its own, as evenly as they go, and shared where there are more workers than cores. Workers of one
-    GPU share its part of them: where one waits for its GPU or for its encoder, another goes on.
+    GPU share its part of them: where one waits for its GPU or for its encoder, another goes on. Where a
+    core of the processor has several threads, they are in one part, as far as that goes.
 
     Args:
         devices: Of each worker.
     """
     if not hasattr(os, "sched_getaffinity"):
         return [[] for _ in devices]
-    cores = sorted(os.sched_getaffinity(0))
+    cores = by_siblings(os.sched_getaffinity(0))
     owners: list[Any] = list(range(len(devices))) if "cpu" in devices else list(devices)
     place = {owner: n for n, owner in enumerate(dict.fromkeys(owners))}
     if len(place) >= len(cores):

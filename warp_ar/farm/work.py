@@ -126,11 +126,14 @@ class Work(Closing):
             digests = None
             if self.context.jobs.settings.digests:
                 digests = stack.enter_context(open((part / PART).with_suffix(DIGESTS), "w", encoding="ascii"))
-            for lit in self._lighter.light(job, outputs=outputs):
-                picture = lit.image if coding == "8bit" else lit.radiance
-                sink.write(picture)
+            keep_rgb, coded = digests is not None, coding == "8bit"
+            for lit in self._lighter.light(job, outputs=outputs, coded=coded, keep_rgb=keep_rgb):
+                if lit.coded is not None:
+                    sink.write(lit.coded)
+                else:
+                    sink.write(lit.image if coded else lit.radiance)
                 if digests is not None:
-                    digests.write(digest_of(picture) + "\n")
+                    digests.write(digest_of(lit.image if coded else lit.radiance) + "\n")
                 count += 1
                 tell(count)
         return {"frames": count}

@@ -16,6 +16,7 @@ from warp_ar.light.config import CONFIG
 from warp_ar.scene.geometry import rotation_matrix
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
+from warp_ar.stages.shared.host_copies import HostCopies
 
 
 class Captured(Stage):
@@ -62,10 +63,14 @@ class Captured(Stage):
             for name, value in fields.items():
                 record[name] = value
 
+        copies = HostCopies({name: arrays[name] for name in self.arrays()}, device)
+
         def copy(rows: Rows | None) -> None:
-            arrays["environment"].assign(self._radiance)
+            values = {"environment": self._radiance}
             if self.features.emitters:
-                arrays["emitters"].assign(self._emitters)
+                values["emitters"] = self._emitters
+            # Pinned, so that the host does not wait until the device has rendered the frame before.
+            copies.send(values, wp.get_stream(device) if device.is_cuda else None)
 
         return [Pass(copy, on_host=True)]
 
