@@ -73,9 +73,7 @@ class KnownFrame:
         Raises:
             UsageError: The scene has no mirror ball, or the frame shows no proxy well enough.
         """
-        light = place_emitters(
-            self.light, self.scene, self.image, self.pose, device=device, seconds=self.seconds
-        )
+        light = place_emitters(self.light, self.scene, self.image, self.pose, device=device, seconds=self.seconds)
         return dataclasses.replace(self, light=light)
 
 

@@ -107,9 +107,7 @@ def place_emitters(
         size = (scene.camera.width, scene.camera.height)
 
     def cost(tried: Light) -> float:
-        tracer = PathTracer(
-            scene, tried, frame, pose, device=device, size=size, seconds=seconds, light_samples=SAMPLES
-        )
+        tracer = PathTracer(scene, tried, frame, pose, device=device, size=size, seconds=seconds, light_samples=SAMPLES)
         return reflectance_scatter(tracer)
 
     if not placed.emitters:
