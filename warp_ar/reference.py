@@ -91,6 +91,8 @@ def trace(options: argparse.Namespace) -> int:
         scene = calibrated(scene, options.calibration, options.source)
     if options.light is not None:
         scene = with_light(scene, options.light)
+    if options.save_light is not None:
+        _check_axes(scene)
     writes = {f"--{name}": getattr(options, name.replace("-", "_")) for name in ("output", "compare", "save-light")}
     writes = {name: path for name, path in writes.items() if path is not None}
     check_places({"the scene": _read_by(scene, options)}, writes)
@@ -119,6 +121,13 @@ def trace(options: argparse.Namespace) -> int:
         say(text)
     print(summary(known, picture, str(tracer.device)))
     return EXIT_DONE
+
+
+def _check_axes(scene: Scene) -> None:
+    """Complain where a saved light, in the scene's axes and values, would be turned or scaled again when it is read."""
+    given = scene.captured
+    if given is not None and (given.rotate != (0.0, 0.0, 0.0) or given.scale != 1.0):
+        raise UsageError("--save-light: [light] has scale or rotate, which would be applied again; leave them out")
 
 
 def places_found(light: Light) -> str:

@@ -466,7 +466,7 @@ class PathTracer:
             return np.array(self._local.shown.numpy())
 
     def reflectance(self) -> FloatImage:
-        """Reflectance of the proxy that each pixel shows, as the frame and the light tell it; 0 elsewhere, (H, W, 3)."""
+        """Reflectance of the proxy that each pixel shows, as frame and light tell it; 0 elsewhere, (H, W, 3)."""
         self.prepare()
         with exclusive(self.device):
             return np.array(self._local.reflectance.numpy())
