@@ -70,6 +70,16 @@ def test_light_from_afar_stays_there(device: str) -> None:
         assert distances(place_emitters(lamp_light(None), SCENE, frame, POSE, device=device)) == [None]
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("darkest", [0.5, 0.7])
+def test_paint_that_is_darker_to_one_side_is_no_lamp(axis: int, darkest: float, device: str) -> None:
+    """Hard case: under light from afar, a desk that falls off as under a near lamp."""
+    far = lamp_light(None)
+    paint = np.linspace(1.0, darkest, 120 if axis == 0 else 160, dtype=np.float32)
+    paint = paint[:, None, None] if axis == 0 else paint[None, :, None]
+    assert distances(place_emitters(far, SCENE, photograph(far) * paint, POSE, device=device)) == [None]
+
+
 def test_grain_does_not_hide_a_lamp(device: str) -> None:
     grain = np.exp(GRAIN * np.random.default_rng(4).standard_normal((120, 160, 1))).astype(np.float32)
     frame = np.minimum(photograph(lamp_light(0.5)) * grain, 0.9)

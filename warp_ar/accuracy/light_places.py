@@ -42,6 +42,9 @@ MOST = 3
 """Emitters that are placed at most."""
 NEAREST, FARTHEST = 0.25, 2.0
 """Metres: nearer ones would stand in the picture, and farther ones are as good as distant."""
+BOUND = 0.9 * FARTHEST
+"""Metres beyond which nothing is placed: what does best where the search ends has no place, such as paint that is
+darker toward one side under light from afar."""
 STEPS = 6
 """Of the search between two distances that were tried."""
 GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
@@ -115,7 +118,7 @@ def place_emitters(
     least = cost(placed)
     for number in range(min(len(placed.emitters), MOST)):
         tried, its_cost = _placed(placed, number, cost)
-        if its_cost < (1.0 - WORTH) * least:
+        if its_cost < (1.0 - WORTH) * least and (tried.emitters[number].distance or FARTHEST) < BOUND:
             placed, least = tried, its_cost
     return placed
 
