@@ -105,16 +105,16 @@ def place_emitters(
     origin = scene.probes[0].center
     found = light.emitters or find_emitters(light.radiance, np.zeros_like(light.radiance), 0.0)
     placed = dataclasses.replace(light, emitters=tuple(dataclasses.replace(one, origin=origin) for one in found))
+    if not placed.emitters:
+        return placed
     size = (WIDTH, round(WIDTH * scene.camera.height / scene.camera.width))
-    if not placed.emitters or size[0] * scene.camera.height != size[1] * scene.camera.width:
+    if size[0] * scene.camera.height != size[1] * scene.camera.width:
         size = (scene.camera.width, scene.camera.height)
 
     def cost(tried: Light) -> float:
         tracer = PathTracer(scene, tried, frame, pose, device=device, size=size, seconds=seconds, light_samples=SAMPLES)
         return reflectance_scatter(tracer)
 
-    if not placed.emitters:
-        return placed
     least = cost(placed)
     for number in range(min(len(placed.emitters), MOST)):
         tried, its_cost = _placed(placed, number, cost)
