@@ -1,7 +1,7 @@
 """Cases of truth by path tracing in their true light: what is left when light, pose and transport are right.
 
     python -m bench.truth_score CASE ... [--versions object,light,both] [--frames 0,6,11] [--samples N] [--error E]
-        [--device D]
+        [--places] [--device D]
 
 CASE is a folder with ``case.json``, ``camera``, ``env`` and a folder and a scene file of each version. The pictures
 have the frames' own size, for the truth was clipped there: a highlight that clips is dimmer after averaging down. One
@@ -10,7 +10,8 @@ over that of the frame itself. Half of the samples have another seed, which tell
 by one half, ``noise`` the difference between both, ``error`` the relative standard error where the picture changes.
 Samples go to pixels within MARGIN of those that count. With ``--error E`` they end earlier where ``error`` is E;
 ``taken`` is how many there were. With ``--keep FILE`` lines of single frames are kept there, and what it holds at these
-samples is not rendered again.
+samples is not rendered again. With ``--places`` the distances of the light's emitters are looked for in the frame
+(``accuracy/light_places.py``); without it all light is distant, as it was where lamps stand near.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ import numpy.typing as npt
 
 from bench.common import KeptLines, commit
 from bench.judge import encoded_by, render_half
+from warp_ar.accuracy.light_places import place_emitters
 from warp_ar.accuracy.metrics import changed_region, flip_map
 from warp_ar.accuracy.path_tracer import PathTracer
 from warp_ar.kernels.color import decode_table
@@ -57,7 +59,14 @@ def leave_alone(tracer: PathTracer, pixels: npt.NDArray[np.bool_]) -> None:
 
 
 def score(
-    case: Path, version: str, frame: int, samples: int, device: str, error: float | None = None
+    case: Path,
+    version: str,
+    frame: int,
+    samples: int,
+    device: str,
+    error: float | None = None,
+    *,
+    places: bool = False,
 ) -> dict[str, float] | None:
     """Errors of one frame by so many samples, or fewer for a standard error of ``error``; None: no such frame."""
     truth = read_image(case / version / f"{frame:04d}.png")
@@ -70,6 +79,8 @@ def score(
     light = np.maximum(np.load(case / "env" / f"{frame:04d}.npy").astype(np.float32), 0.0)
     pose = Pose(np.array(entry["R"]), np.array(entry["t"]))
     rate = scene.source.fps if scene.source is not None and scene.source.fps is not None else 30.0
+    if places:
+        light = place_emitters(light, scene, camera, pose, device=device, seconds=frame / rate)
     region = changed_region(camera, truth)
     aside = ~cv2.dilate(region.astype(np.uint8), np.ones((2 * MARGIN + 1,) * 2)).astype(bool)
     halves = []
@@ -99,6 +110,7 @@ def main() -> int:
     parser.add_argument("--frames", default="0,6,11")
     parser.add_argument("--samples", type=int, default=512)
     parser.add_argument("--error", type=float, help="relative standard error at which samples end (default: none)")
+    parser.add_argument("--places", action="store_true", help="look for the distances of the light's emitters")
     parser.add_argument("--device", default="auto")
     parser.add_argument("--keep", type=Path, metavar="FILE", help="JSON lines: go on where a run was ended")
     options = parser.parse_args()
@@ -108,10 +120,14 @@ def main() -> int:
             start = time.perf_counter()
             frames = [int(number) for number in options.frames.split(",")]
             key = {"case": Path(name).name, "version": version, "samples": options.samples, "until": options.error}
+            key |= {"places": options.places}
             rows = []
             for frame in frames:
                 if not lines.has(**key, frame=frame):
-                    row = score(Path(name), version, frame, options.samples, options.device, options.error)
+                    row = score(
+                        Path(name), version, frame, options.samples, options.device, options.error,
+                        places=options.places,
+                    )  # fmt: skip
                     if row is not None:
                         lines.add({**key, "frame": frame, **row, "commit": commit()})
                 rows += [record for record in lines.records if record | key | {"frame": frame} == record]

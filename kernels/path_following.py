@@ -310,6 +310,54 @@ def white_surface(scene: LocalScene, vertex: Vertex, lobe: wp.bool) -> Surface:
     return surface
 
 
+@wp.func
+def reflected_from(surface: Surface, hit: Hit, wo: wp.vec3, wi: wp.vec3) -> wp.vec3:
+    """What a surface reflects of light from ``wi``, cosine included; of a mirror its reflectance. 0 from below."""
+    reflected = wp.vec3(0.0, 0.0, 0.0)
+    if wp.dot(hit.geometric_normal, wi) > 0.0:
+        reflected = surface.reflectance
+        if surface.model != wp.static(int(MIRROR)):
+            reflected = reflect_direct(surface, hit.normal, wo, wi)
+    return reflected
+
+
+@wp.struct
+class DirectLight:
+    """Light that reaches a surface straight from its sources, as the surface reflects it."""
+
+    of_sky: wp.vec3  # of the environment, without virtual content
+    changed: wp.vec3  # of the environment as virtual content leaves it, or its change, and what the surface sends itself
+    of_lights: wp.vec3  # of virtual lights
+
+
+@wp.func
+def add_direct(
+    direct: DirectLight, arriving: wp.vec3, is_sky: wp.bool, hidden: wp.bool, path: PathState, with_virtual: wp.bool
+) -> DirectLight:
+    """One source more: the environment or a virtual light, nothing physical in the way; ``hidden`` by an object."""
+    out = direct
+    if is_sky:
+        out.of_sky = arriving
+        if hidden and path.changes_only:
+            out.changed -= arriving
+        elif with_virtual and not (hidden or path.changes_only):
+            out.changed += arriving
+    elif not hidden:
+        out.of_lights += arriving
+    return out
+
+
+@wp.func
+def bring_direct(pair: PathPair, direct: DirectLight) -> PathPair:
+    """What of it the path that is followed asks for."""
+    if pair.path.without:
+        return bring(pair, direct.of_sky)
+    out = bring(pair, direct.changed + direct.of_lights)
+    if pair.white and pair.path.depth == 0:
+        out.light += wp.cw_mul(pair.path.throughput, direct.of_sky)
+    return out
+
+
 # At a surface there are several directions: one toward the environment's light, one toward each virtual light, and that
 # in which the path goes on. Each is drawn in its own way. What the surface reflects of it, what is in the way, and with
 # which density it would have been drawn otherwise are found for one after another by the same code: a copy for each
@@ -332,12 +380,10 @@ def make_scatter(trace: TraceConfig) -> wp.Function:
         wo = -path.direction
         is_mirror = surface.model == wp.static(int(MIRROR))
         with_virtual = not (pair.only_light or path.without)
-        of_sky = wp.vec3(0.0, 0.0, 0.0)  # without virtual content
-        changed = wp.vec3(0.0, 0.0, 0.0)  # of the environment, and what the surface sends itself
-        of_lights = wp.vec3(0.0, 0.0, 0.0)
+        direct = DirectLight()
         lights = wp.int32(0)
         if with_virtual:
-            changed = surface.emission
+            direct.changed = surface.emission
             lights = scene.lights.shape[0]
         for index in range(wp.where(is_mirror, lights, -1), lights + 1):
             is_next = index == lights
@@ -347,11 +393,7 @@ def make_scatter(trace: TraceConfig) -> wp.Function:
             else:
                 drawn = draw_toward_light(scene, hit, path, index, key)
             wi = drawn.direction
-            reflected = wp.vec3(0.0, 0.0, 0.0)
-            if wp.dot(hit.geometric_normal, wi) > 0.0:
-                reflected = surface.reflectance
-                if not is_mirror:
-                    reflected = reflect_direct(surface, hit.normal, wo, wi)
+            reflected = reflected_from(surface, hit, wo, wi)
             reaches = wp.max(reflected) > 0.0
             start = offset_origin(hit.point, hit.geometric_normal, wi, hit.error)
             hidden = bool(False)
@@ -367,20 +409,8 @@ def make_scatter(trace: TraceConfig) -> wp.Function:
                 following = extend_path(path, start, wi, reflected, density, key)
             elif reaches:
                 arriving = balance(drawn.density, density) / drawn.per * wp.cw_mul(reflected, drawn.radiance)
-                if index < 0:
-                    of_sky = arriving
-                    if hidden and path.changes_only:
-                        changed -= arriving
-                    elif with_virtual and not (hidden or path.changes_only):
-                        changed += arriving
-                elif not hidden:
-                    of_lights += arriving
-        if path.without:
-            out = bring(out, of_sky)
-        else:
-            out = bring(out, changed + of_lights)
-            if pair.white and path.depth == 0:
-                out.light += wp.cw_mul(path.throughput, of_sky)
+                direct = add_direct(direct, arriving, index < 0, hidden, path, with_virtual)
+        out = bring_direct(out, direct)
         out.path = following
         out.path.changes_only = path.changes_only
         out.path.without = path.without

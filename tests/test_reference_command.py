@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,9 @@ import pytest
 
 from warp_ar.accuracy.path_tracer import PathTracer, TracedPicture
 from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE
+from warp_ar.light.captured import Light, has_places
 from warp_ar.reference import MAGNIFIED, main
+from warp_ar.scene import CapturedLight, dumps_scene, load_scene
 
 QUICK = ["torus", "--quality", "low", "--size", "64x48", "--samples", "8", "--device", "cpu"]
 
@@ -53,12 +56,37 @@ def test_it_stops_at_an_error(capsys: pytest.CaptureFixture[str]) -> None:
     assert "64x48, 16 samples a pixel" in capsys.readouterr().out
 
 
+def test_places_of_a_given_light_are_told_and_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    given, saved = tmp_path / "given.exr", tmp_path / "deep" / "placed.exr"
+    radiance = np.full((32, 64, 3), 0.2, np.float32)
+    radiance[6, 40] = 200.0
+    Light(radiance, np.ones((32, 64), np.float32)).save(given)
+    options = [*QUICK, "--light", str(given), "--places", "--save-light", str(saved)]
+    assert main(options) == EXIT_DONE
+    told = capsys.readouterr().err
+    assert "emitters:" in told
+    light = Light.load(saved)
+    assert len(light.emitters) == 1
+    assert has_places(saved) == (light.emitters[0].distance is not None) == (" m toward " in told)
+    assert light.radiance.max() > 50.0
+
+
+def test_a_light_that_is_turned_is_not_saved(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    given, scene = tmp_path / "given.exr", tmp_path / "scene.toml"
+    Light(np.ones((32, 64, 3), np.float32), np.ones((32, 64), np.float32)).save(given)
+    turned = dataclasses.replace(load_scene("torus"), captured=CapturedLight(given, rotate=(0.0, 0.0, 90.0)))
+    scene.write_text(dumps_scene(turned))
+    assert main([str(scene), *QUICK[1:], "--save-light", str(tmp_path / "placed.exr")]) == EXIT_USAGE
+    assert "would be applied again" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
         (["--samples", "0"], "--samples 0: expected 1 or more"),
         (["--error", "-1"], "--error -1: expected a number above 0"),
         (["--output", "x.jpg"], "--output x.jpg ends in '.jpg'; use .png, .exr"),
+        (["--save-light", "x.png"], "--save-light x.png ends in '.png'; use .exr"),
         (["--compare", "x.exr"], "--compare x.exr ends in '.exr'; use .png"),
         (["--size", "64"], "--size 64: expected width x height"),
         (["--size", "64x64"], "another aspect ratio"),

@@ -31,6 +31,7 @@ from warp_ar.command_line import EXIT_DONE, Parser, run_command, say
 from warp_ar.errors import SinkError, SourceError, UsageError, reason
 from warp_ar.exr_file import write_exr
 from warp_ar.files import write_whole
+from warp_ar.light.captured import Light
 from warp_ar.output.places import check_places, check_replaceable, files_of
 from warp_ar.output.sink import make_folder
 from warp_ar.scene import Scene, load_scene
@@ -65,6 +66,10 @@ def make_parser() -> argparse.ArgumentParser:
     add("--quality", default="high", metavar="NAME", help=text)
     add("--source", metavar="PATH|INDEX", help="frames from here, not the scene's own")
     add("--light", metavar="FILE", help="captured light (OpenEXR) instead of what a mirror ball shows")
+    text = "look in the frame for how far the emitters of --light or of the scene's light file stand"
+    add("--places", action="store_true", help=text)
+    text = "write the light, with the distances that --places found: live --light reads them"
+    add("--save-light", type=Path, metavar="FILE.exr", help=text)
     add("--calibration", metavar="FILE|exif", help="camera calibration instead of the scene's numbers")
     add("--size", metavar="WxH", help="of the picture; frames are averaged down to it (default: the frames')")
     add("--device", default="auto", metavar="auto|cpu|cuda:0", help="where the kernels run (default: auto)")
@@ -86,7 +91,9 @@ def trace(options: argparse.Namespace) -> int:
         scene = calibrated(scene, options.calibration, options.source)
     if options.light is not None:
         scene = with_light(scene, options.light)
-    writes = {f"--{name}": getattr(options, name) for name in ("output", "compare")}
+    if options.save_light is not None:
+        _check_axes(scene)
+    writes = {f"--{name}": getattr(options, name.replace("-", "_")) for name in ("output", "compare", "save-light")}
     writes = {name: path for name, path in writes.items() if path is not None}
     check_places({"the scene": _read_by(scene, options)}, writes)
     replaced = [check_replaceable(path, overwrite=options.overwrite) for path in writes.values()]
@@ -94,6 +101,11 @@ def trace(options: argparse.Namespace) -> int:
         make_folder(path.parent)
     console = Console(stderr=True)
     known = light_up_to(scene, options.frame, quality=options.quality, device=options.device, source=options.source)
+    if options.places:
+        known = known.placed(device=options.device)
+        say(places_found(known.light))
+    if options.save_light is not None:
+        known.light.save(options.save_light)
     tracer = known.tracer(device=options.device, size=size, seed=options.seed)
     pictures: list[TracedPicture] = []
     try:
@@ -109,6 +121,23 @@ def trace(options: argparse.Namespace) -> int:
         say(text)
     print(summary(known, picture, str(tracer.device)))
     return EXIT_DONE
+
+
+def _check_axes(scene: Scene) -> None:
+    """Complain where a saved light, in the scene's axes and values, would be turned or scaled again when it is read."""
+    given = scene.captured
+    if given is not None and (given.rotate != (0.0, 0.0, 0.0) or given.scale != 1.0):
+        raise UsageError("--save-light: [light] has scale or rotate, which would be applied again; leave them out")
+
+
+def places_found(light: Light) -> str:
+    """Which emitters of a light have a distance, in one line."""
+    found = [
+        f"{emitter.distance:.2f} m toward {', '.join(f'{value:.2f}' for value in emitter.direction)}"
+        for emitter in light.emitters
+        if emitter.distance is not None
+    ]
+    return f"emitters: {'; '.join(found)}" if found else "emitters: the frame tells of none how far it stands"
 
 
 def _write_all(options: argparse.Namespace, known: KnownFrame, picture: TracedPicture) -> None:
@@ -127,6 +156,8 @@ def _check(options: argparse.Namespace) -> tuple[int, int] | None:
         raise UsageError(f"--error {options.error:g}: expected a number above 0, such as 0.01")
     if options.output is not None and options.output.suffix.lower() not in SUFFIXES:
         raise UsageError(f"--output {options.output} ends in {options.output.suffix!r}; use {', '.join(SUFFIXES)}")
+    if options.save_light is not None and options.save_light.suffix.lower() != ".exr":
+        raise UsageError(f"--save-light {options.save_light} ends in {options.save_light.suffix!r}; use .exr")
     if options.compare is not None and options.compare.suffix.lower() != ".png":
         raise UsageError(f"--compare {options.compare} ends in {options.compare.suffix!r}; use .png")
     if options.size is None:

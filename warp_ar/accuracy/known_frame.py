@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from warp_ar.accuracy.light_places import place_emitters
 from warp_ar.accuracy.path_tracer import LIGHT_SAMPLES, Image, PathTracer
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.engine.result import Result
@@ -65,6 +66,15 @@ class KnownFrame:
             seed=seed,
             light_samples=light_samples,
         )
+
+    def placed(self, *, device: str = "auto") -> KnownFrame:
+        """The same with the distances of its light's emitters, where none is known, as far as the frame tells them.
+
+        Raises:
+            UsageError: The scene has no mirror ball, or the frame shows no proxy well enough.
+        """
+        light = place_emitters(self.light, self.scene, self.image, self.pose, device=device, seconds=self.seconds)
+        return dataclasses.replace(self, light=light)
 
 
 @functools.cache

@@ -465,6 +465,22 @@ class PathTracer:
         with exclusive(self.device):
             return np.array(self._local.shown.numpy())
 
+    def reflectance(self) -> FloatImage:
+        """Reflectance of the proxy that each pixel shows, as frame and light tell it; 0 elsewhere, (H, W, 3)."""
+        self.prepare()
+        with exclusive(self.device):
+            return np.array(self._local.reflectance.numpy())
+
+    def frame(self) -> FloatImage:
+        """The frame, linear and at the picture's size, (H, W, 3).
+
+        Raises:
+            UsageError: There is none.
+        """
+        if self._linear is None:
+            raise UsageError("this path tracer has no frame")
+        return self._linear
+
     def rays(self) -> int:
         """Rays that were traced for the samples so far."""
         with exclusive(self.device):
