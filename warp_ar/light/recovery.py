@@ -271,7 +271,8 @@ class Recovery:
         spread = self._evidence.spread if self._evidence is not None else None
         interval = irradiance_interval(problem, recovered, factor, bounds, spread)
         cells = (factor * recovered).reshape(*problem.shape, 3).astype(np.float32)
-        return Estimate(cells, bounds, emitters, method, factor, card, interval)
+        r, g, b = (0.0 if bounds[c] or factor == 0.0 else problem.card_share(c, is_bound=False) for c in range(3))
+        return Estimate(cells, bounds, emitters, method, factor, card, (r, g, b), interval)
 
 
 @dataclasses.dataclass(frozen=True)
