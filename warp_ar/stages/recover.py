@@ -197,6 +197,11 @@ class Recover(Stage):
         self._stream = None if device.is_cpu else wp.Stream(device)
         self._frames_stream = None if device.is_cpu else wp.get_stream(device)
 
+        looks = (
+            Pass(self._look_at_card, enabled=lambda: self._asks or self._follows),
+            Pass(self._note_card, enabled=lambda: self._asks),
+            Pass(self._follow, enabled=lambda: self._follows),
+        )
         passes = [
             Pass(self._take, on_host=True, enabled=lambda: self._arrives),
             # What clips is known before the map is filled.
@@ -204,10 +209,9 @@ class Recover(Stage):
             Pass(self._condense, rows=arrays["recover_cells_now"].shape[0], enabled=lambda: self._asks),
             Pass(self._observe, rows=points, enabled=lambda: self._asks),
             Pass(self._transfer, rows=points, enabled=lambda: self._asks),
-            Pass(self._look_at_card, enabled=lambda: self._asks or self._follows),
-            Pass(self._note_card, enabled=lambda: self._asks),
+            *(looks[:2] if self._card else ()),
             Pass(self._ask, on_host=True, enabled=lambda: self._asks),
-            Pass(self._follow, enabled=lambda: self._follows),
+            *(looks[2:] if self._card else ()),
             Pass(self._apply_level),
             Pass(self._add, rows=arrays["recover_cells"].shape[0]),
         ]
@@ -285,13 +289,11 @@ class Recover(Stage):
     def _look_at_card(self, rows: Rows | None) -> None:
         arrays = self._arrays
         sum_upward(arrays["filled_radiance"], arrays["recover_upward_rows"], arrays["recover_upward_now"])
-        if self._card:
-            self._observe_points(arrays["recover_points"][: self._card], arrays["recover_card_now"], None)
+        self._observe_points(arrays["recover_points"][: self._card], arrays["recover_card_now"], None)
 
     def _note_card(self, rows: Rows | None) -> None:
-        copy(self._arrays["recover_upward_asked"], self._arrays["recover_upward_now"])
-        if self._card:
-            copy(self._arrays["recover_card_asked"], self._arrays["recover_card_now"])
+        for part in ("card", "upward"):
+            copy(self._arrays[f"recover_{part}_asked"], self._arrays[f"recover_{part}_now"])
 
     def _follow(self, rows: Rows | None) -> None:
         arrays = self._arrays
