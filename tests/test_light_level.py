@@ -74,7 +74,7 @@ def test_a_hand_over_a_part_of_the_card_is_no_light(device):
 
 
 @pytest.mark.parametrize(
-    "name, value", [("visible", 0.5), ("clipped", 0.5), ("radiance", 0.001)], ids=["hidden", "clipped", "dark"]
+    ("name", "value"), [("visible", 0.5), ("clipped", 0.5), ("radiance", 0.001)], ids=["hidden", "clipped", "dark"]
 )
 def test_a_card_that_does_not_tell_leaves_the_level(device, name, value):
     silent = card(0.1)

@@ -490,7 +490,10 @@ class Recover(Stage):
             record["origin"], record["direction"] = emitter.origin, emitter.direction
             record["distance"], record["power"] = emitter.distance, emitter.power * ratio
         values = {"recover_recovered": recovered, "recover_cells": solution.cells, "recover_found": records}
-        values |= {"recover_share": np.float32(solution.estimate.card_share), "recover_level": np.ones(3, np.float32)}
+        values |= {
+            "recover_share": np.array(solution.estimate.card_share, np.float32),
+            "recover_level": np.ones(3, np.float32),
+        }
         self._effects.send(values, self._frames_stream)
         for part in ("card", "upward"):
             asked, then = (self._arrays[f"recover_{part}_{when}"] for when in ("asked", "then"))
