@@ -37,8 +37,8 @@ AGREEING = wp.constant(wp.float32(0.7))
 """Share of them whose light must have changed alike,"""
 SPREAD = wp.constant(wp.float32(0.1))
 """within this, relatively."""
-MOST = wp.constant(wp.float32(4.0))
-"""Highest level: a new estimate comes within a fifth of a second."""
+MOST = wp.constant(wp.float32(1.5))
+"""Highest level: what makes a card brighter by more is rather a lamp that was switched on, somewhere else."""
 DARK = wp.constant(wp.float32(0.0016))
 """Radiance below which a point says nothing: quantisation."""
 

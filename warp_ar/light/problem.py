@@ -21,6 +21,12 @@ Trace = Callable[[NDArray[np.float32]], Array]
 """Irradiance at every surface point per unit intensity of emitters (q, 4: position, radius), (n, q)."""
 
 
+ALONE = 2.5
+"""Angles of a candidate's patch within which nothing else clips around a lamp that stands alone, but for"""
+MOST_OF = 0.8
+"""what is left of all that clips there beside this share."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Candidate:
     """A candidate for an emitter."""
@@ -48,23 +54,25 @@ def mirroring_points(directions: Array, center: Array, radius: float, camera: Ar
 
 
 def candidate_directions(cells: NDArray[Any]) -> Array:
-    """Where what clips around each cell stands, unit, (m, 3): the mean direction of the patch that a candidate lights.
+    """Where what clips in each cell stands, unit, (m, 3).
 
-    A lamp of a few degrees lies across cells; each alone has the direction of its own part.
+    A lamp of a few degrees lies across cells, each of which alone has the direction of its own part. Where hardly
+    anything clips around a patch of that size, the patch is one lamp and all its cells have its direction; inside a
+    window they keep their own.
 
     Args:
         cells: Records of ``kernels.recover_cells.Cell``, (rows, columns).
     """
     direction = cells["direction"].reshape(-1, 3).astype(float)
     lost = cells["missing"].reshape(-1, 3).astype(float).sum(axis=1) * cells["solid_angle"].ravel()
-    weight = np.where((cells["modelled"].ravel() > 0.5) | (cells["hidden"].ravel() > 0.0), 0.0, lost)
-    emitting = np.flatnonzero(weight > 0.0)
-    found = direction.copy()
-    if len(emitting):
-        own = direction[emitting]
-        total = ((own @ own.T > np.cos(CONFIG.search.angle)) * weight[emitting]) @ own
-        found[emitting] = total / np.linalg.norm(total, axis=1, keepdims=True)
-    return found
+    emitting = np.flatnonzero((lost > 0.0) & (cells["modelled"].ravel() <= 0.5) & (cells["hidden"].ravel() <= 0.0))
+    own, weight, angle = direction[emitting], lost[emitting], CONFIG.search.angle
+    cosine = own @ own.T
+    near, around = (cosine > np.cos(angle)) * weight, (cosine > np.cos(ALONE * angle)) * weight
+    alone = near.sum(axis=1) > MOST_OF * around.sum(axis=1)
+    total = near[alone] @ own
+    direction[emitting[alone]] = total / np.linalg.norm(total, axis=1, keepdims=True)
+    return direction
 
 
 class Problem:

@@ -43,6 +43,8 @@ solved for beside them. They are fixed, so that the same frames give the same pi
 time, the frame waits, unless the request is for real time."""
 REST = 3.0
 """In real time: time between two estimates, over that which the last one took, at least."""
+CARD_STEP = 2
+"""One of so many of the card's points, which come first, is looked at in each frame."""
 WHEN = ("now", "asked", "then")
 """In the frame; in the one that the estimate which is being solved for is of; in that of the one in effect."""
 MOST_EMITTERS = CONFIG.search.candidates * len(CONFIG.search.distances)
@@ -221,7 +223,7 @@ class Recover(Stage):
         return passes
 
     def _card_points(self) -> int:
-        """Number of points by which the light's level is followed, the first of all; 0 where it is not.
+        """Number of points by which the light's level is followed, on the card; 0 where it is not.
 
         Where a camera meters by itself its own gain is told by the same points.
         """
@@ -229,7 +231,7 @@ class Recover(Stage):
         if source is not None and source.metering == "automatic":
             return 0
         kinds = self._surfaces.kinds[self._surfaces.surface]
-        return int(np.count_nonzero((kinds == Kind.CARD) | (kinds == Kind.INK)))
+        return int(np.count_nonzero((kinds == Kind.CARD) | (kinds == Kind.INK))) // CARD_STEP
 
     def _new_solver(self) -> recovery.Recovery:
         """One that has learnt nothing yet."""
@@ -289,7 +291,8 @@ class Recover(Stage):
     def _look_at_card(self, rows: Rows | None) -> None:
         arrays = self._arrays
         sum_upward(arrays["filled_radiance"], arrays["recover_upward_rows"], arrays["recover_upward_now"])
-        self._observe_points(arrays["recover_points"][: self._card], arrays["recover_card_now"], None)
+        points = arrays["recover_points"][: len(arrays["recover_card_now"]) * CARD_STEP : CARD_STEP]
+        self._observe_points(points, arrays["recover_card_now"], None)
 
     def _note_card(self, rows: Rows | None) -> None:
         for part in ("card", "upward"):
