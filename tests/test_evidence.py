@@ -145,6 +145,7 @@ def test_cosines_of_light_at_the_card():
     problem.kind = np.array([Kind.CARD, Kind.CARD, Kind.PLANE])
     problem.points = np.array([[-0.1, 0.0, 0.0], [0.1, 0.0, 0.0], [9.0, 9.0, 9.0]])
     problem.direction = np.array([[1.0, 0.0, 0.0], [0.6, 0.0, 0.8]])
+    problem.aim = problem.direction
     problem.origin = np.array([[0.0, 0.0, 0.3], [0.0, 0.0, 0.3]])
     problem.candidates = [Candidate(1, np.inf), Candidate(0, 0.4)]
     cells, candidates = problem.card_cosines()

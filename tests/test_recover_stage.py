@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import contextlib
+import dataclasses
 import itertools
 import time
 
@@ -20,6 +21,7 @@ from warp_ar.light import surfaces as light_surfaces
 from warp_ar.light.config import CONFIG
 from warp_ar.light.estimate import Estimate
 from warp_ar.scene import Pose, load_scene
+from warp_ar.scene.description import SourceSpec
 from warp_ar.session import Session
 from warp_ar.stages.quality import PRESETS
 from warp_ar.stages.recover import LATENCY, Recover
@@ -248,3 +250,31 @@ def test_light_of_a_path_traced_environment_comes_back(shared):
     assert errors["clipped"] > CLIPPED_ERROR
     assert errors["white_card"] < errors["clipped"]
     assert errors["shading"] < SHADING_ERROR
+
+
+@pytest.mark.parametrize("metering", ["fixed", "automatic"])
+def test_light_between_estimates_follows_the_card(scene, device, monkeypatch, metering):
+    """Until the next estimate; a camera that meters by itself changes the card for reasons of its own."""
+
+    def update(self, cells, *_):
+        return Estimate(np.ones((*cells.shape, 3), np.float32), (False,) * 3, card_share=(0.5, 0.5, 0.25))
+
+    monkeypatch.setattr(recovery.Recovery, "update", update)
+    quality = PRESETS["low"].with_methods(recover="white_card")
+    source = SourceSpec(camera=0, metering=metering)
+    pose = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
+    levels = []
+    with Pipeline(
+        dataclasses.replace(scene, source=source), device=device, quality=quality, outputs=("environment",)
+    ) as pipeline:
+        for index, shown in enumerate([100, 100, 100, 80, 60, 60, 100]):
+            image = np.full((240, 320, 3), 100, np.uint8)
+            image[80:160, 120:200] = shown
+            image[:40] = 255
+            pipeline(image, time_seconds=index / 30, pose=pose)
+            levels.append(pipeline.arrays["recover_level"].numpy().copy())
+            found, levelled = (pipeline.arrays[f"recover_{name}"].numpy() for name in ("recovered", "levelled"))
+            assert levelled == pytest.approx(found * levels[-1])
+    # 1 - (1 - ratio) / share
+    expected = np.array([[1, 1, 1]] * 3 + [[0.6, 0.6, 0.2]] + [[0.2, 0.2, 0.0]] * 2 + [[1, 1, 1]])
+    assert np.array(levels) == pytest.approx(expected if metering == "fixed" else 1.0, abs=1e-4)

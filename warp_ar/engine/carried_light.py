@@ -54,8 +54,9 @@ class CarriedLight:
         for name in (*captured, "others_filled"):
             if name in arrays:
                 arrays.touch(name)
-        if "emitters" in arrays and isinstance(arrays["emitters"], wp.array):
-            emitters = arrays["emitters"]
+        name = "recover_found" if "recover_found" in arrays else "emitters"
+        if name in arrays and isinstance(arrays[name], wp.array):
+            emitters = arrays[name]
             records = np.array(emitters.numpy()).view(np.dtype(Emitter.numpy_dtype()))
             records["power"] *= ratio
             emitters.assign(records)

@@ -43,5 +43,7 @@ class Estimate:
     """Share of the method's own solution that evidence allows, 0 to 1; ``recovered`` and ``emitters`` hold it."""
     card: CardCheck = NO_CARD
     """What speaks for the card being in the picture."""
+    card_share: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Of the card's light that the map as captured does not show, by channel; 0 where the card does not tell."""
     irradiance: Interval | None = None
     """Of light from all directions."""

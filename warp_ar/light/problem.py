@@ -21,6 +21,12 @@ Trace = Callable[[NDArray[np.float32]], Array]
 """Irradiance at every surface point per unit intensity of emitters (q, 4: position, radius), (n, q)."""
 
 
+ALONE = 2.5
+"""Angles of a candidate's patch within which nothing else clips around a lamp that stands alone, but for"""
+MOST_OF = 0.8
+"""what is left of all that clips there beside this share."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Candidate:
     """A candidate for an emitter."""
@@ -47,6 +53,28 @@ def mirroring_points(directions: Array, center: Array, radius: float, camera: Ar
     return np.asarray(center + radius * halfway / np.maximum(np.linalg.norm(halfway, axis=1, keepdims=True), 1e-3))
 
 
+def candidate_directions(cells: NDArray[Any]) -> Array:
+    """Where what clips in each cell stands, unit, (m, 3).
+
+    A lamp of a few degrees lies across cells, each of which alone has the direction of its own part. Where hardly
+    anything clips around a patch of that size, the patch is one lamp and all its cells have its direction; inside a
+    window they keep their own.
+
+    Args:
+        cells: Records of ``kernels.recover_cells.Cell``, (rows, columns).
+    """
+    direction = cells["direction"].reshape(-1, 3).astype(float)
+    lost = cells["missing"].reshape(-1, 3).astype(float).sum(axis=1) * cells["solid_angle"].ravel()
+    emitting = np.flatnonzero((lost > 0.0) & (cells["modelled"].ravel() <= 0.5) & (cells["hidden"].ravel() <= 0.0))
+    own, weight, angle = direction[emitting], lost[emitting], CONFIG.search.angle
+    cosine = own @ own.T
+    near, around = (cosine > np.cos(angle)) * weight, (cosine > np.cos(ALONE * angle)) * weight
+    alone = near.sum(axis=1) > MOST_OF * around.sum(axis=1)
+    total = near[alone] @ own
+    direction[emitting[alone]] = total / np.linalg.norm(total, axis=1, keepdims=True)
+    return direction
+
+
 class Problem:
     """The equations of one frame."""
 
@@ -59,6 +87,7 @@ class Problem:
         surfaces: Surfaces,
         white: float,
         trace: Trace | None,
+        aim: Array,
         origin: Array,
     ) -> None:
         """Set up both sides.
@@ -71,10 +100,11 @@ class Problem:
             surfaces: The points.
             white: Reflectance of the card's paper.
             trace: Traces emitters at finite distances; None: all light is distant.
-            origin: From ``mirroring_points``, (rows * columns, 3).
+            aim: From ``candidate_directions``, (rows * columns, 3).
+            origin: From ``mirroring_points`` for these, (rows * columns, 3).
         """
         self.shape = cells.shape
-        self.trace, self.origin = trace, origin
+        self.trace, self.aim, self.origin = trace, aim, origin
         self._traced: dict[Candidate, Array] = {}
         self.candidates: list[Candidate] = []
         clipped = self._read_cells(cells)
@@ -267,7 +297,7 @@ class Problem:
         if self.trace is not None and near:
             new = [k for k in near if candidates[k] not in self._traced]
             if new:
-                at = self.origin[cells[new]] + distances[new, None] * self.direction[cells[new]]
+                at = self.origin[cells[new]] + distances[new, None] * self.aim[cells[new]]
                 emitters = np.column_stack([at, CONFIG.search.radius_share * distances[new]]).astype(np.float32)
                 traced = self.trace(emitters)[self.index] * distances[new] ** 2
                 self._traced.update((candidates[k], column) for k, column in zip(new, traced.T, strict=True))
@@ -296,7 +326,7 @@ class Problem:
     def near_emitters(self, unknowns: Array) -> list[tuple[Array, Array]]:
         """Places of candidates that are not at infinity, metres (3,), and their intensities, (3,)."""
         return [
-            (self.origin[one.cell] + one.distance * self.direction[one.cell], power * one.distance**2)
+            (self.origin[one.cell] + one.distance * self.aim[one.cell], power * one.distance**2)
             for one, power in zip(self.candidates, unknowns[self.parts :], strict=True)
             if np.isfinite(one.distance)
         ]
@@ -318,7 +348,7 @@ class Problem:
         middle = self.points[self.kind == Kind.CARD].mean(axis=0)
         cosines = []
         for one in self.candidates:
-            ray = self.direction[one.cell]
+            ray = self.aim[one.cell]
             if np.isfinite(one.distance):
                 ray = self.origin[one.cell] + one.distance * ray - middle
             cosines.append(ray[2] / np.linalg.norm(ray))

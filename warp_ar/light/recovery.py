@@ -71,7 +71,7 @@ from warp_ar.light.evidence import (
     spread_directions,
 )
 from warp_ar.light.fit import fit_channel
-from warp_ar.light.problem import Candidate, Problem, Trace, mirroring_points
+from warp_ar.light.problem import Candidate, Problem, Trace, candidate_directions, mirroring_points
 from warp_ar.light.solver import ONE_BLAS_THREAD
 from warp_ar.light.steadiness import Steadiness
 from warp_ar.light.stillness import Seen, Stillness
@@ -151,10 +151,9 @@ class Recovery:
             camera: Where the camera stands, metres, (3,); None: emitters are as seen from the ball's centre.
         """
         with ONE_BLAS_THREAD:
-            origin = mirroring_points(
-                cells["direction"].reshape(-1, 3).astype(float), self._center, self._radius, camera
-            )
-            problem = Problem(cells, transfer, mirrored, observations, self.surfaces, self._white, trace, origin)
+            aim = candidate_directions(cells)
+            origin = mirroring_points(aim, self._center, self._radius, camera)
+            problem = Problem(cells, transfer, mirrored, observations, self.surfaces, self._white, trace, aim, origin)
             view = np.zeros(3) if camera is None else (camera - self._center) / np.linalg.norm(camera - self._center)
             estimate = self._solve(problem)
         if self._unseen == 0:
@@ -195,7 +194,7 @@ class Recovery:
             emitters.append(
                 FoundEmitter(
                     problem.origin[candidate.cell],
-                    problem.direction[candidate.cell],
+                    problem.aim[candidate.cell],
                     candidate.distance,
                     power,
                     candidate.cell,
@@ -272,7 +271,8 @@ class Recovery:
         spread = self._evidence.spread if self._evidence is not None else None
         interval = irradiance_interval(problem, recovered, factor, bounds, spread)
         cells = (factor * recovered).reshape(*problem.shape, 3).astype(np.float32)
-        return Estimate(cells, bounds, emitters, method, factor, card, interval)
+        r, g, b = (0.0 if bounds[c] or factor == 0.0 else problem.card_share(c, is_bound=False) for c in range(3))
+        return Estimate(cells, bounds, emitters, method, factor, card, (r, g, b), interval)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,11 +15,13 @@ import warp as wp
 
 from warp_ar.kernels import change, relocate
 from warp_ar.kernels import recover as kernels
+from warp_ar.kernels.launch import copy
+from warp_ar.kernels.light_level import apply_level, follow_level, sum_upward
 from warp_ar.kernels.recover_cells import Cell, add_recovered, cell_shape, condense_cells
 from warp_ar.kernels.saturation_boundaries import weigh_boundaries
 from warp_ar.kernels.structs import Emitter
 from warp_ar.light import recovery
-from warp_ar.light.config import CONFIG
+from warp_ar.light.config import CONFIG, Kind
 from warp_ar.light.estimate import Estimate
 from warp_ar.light.solving_process import POOL, solve_by
 from warp_ar.light.surfaces import find_surfaces
@@ -41,6 +43,10 @@ solved for beside them. They are fixed, so that the same frames give the same pi
 time, the frame waits, unless the request is for real time."""
 REST = 3.0
 """In real time: time between two estimates, over that which the last one took, at least."""
+CARD_STEP = 2
+"""One of so many of the card's points, which come first, is looked at in each frame."""
+WHEN = ("now", "asked", "then")
+"""In the frame; in the one that the estimate which is being solved for is of; in that of the one in effect."""
 MOST_EMITTERS = CONFIG.search.candidates * len(CONFIG.search.distances)
 
 
@@ -109,7 +115,10 @@ class Recover(Stage):
         measured=0.00016,
         rows=(1, 3, 4, 5, 6, 7, 12, 13, 14, 17, 18),
     )
-    remembers: ClassVar[tuple[str, ...]] = ("recover_recovered", "recover_cells", "emitters")
+    remembers: ClassVar[tuple[str, ...]] = (
+        *("recover_recovered", "recover_cells", "recover_found", "recover_share", "recover_level"),
+        *(f"recover_{part}_{when}" for part in ("card", "upward") for when in ("asked", "then")),
+    )
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
@@ -133,7 +142,7 @@ class Recover(Stage):
         shape = (height, 2 * height)
         cells = cell_shape(*shape)
         self._surfaces = find_surfaces(self.request.scene, card_only=self.method == "white_card")
-        points = len(self._surfaces.points)
+        points, self._card = len(self._surfaces.points), self._card_points()
         others = self.features.others
         types: dict[str, tuple[tuple[int, ...], Any]] = {"others_environment": (shape, wp.vec3)}
         types["others_emitters"] = (CONFIG.search.most,), Emitter
@@ -148,7 +157,14 @@ class Recover(Stage):
             },
             "environment": ArraySpec(shape, wp.vec3),
             **{name: ArraySpec((CONFIG.search.most,), Emitter) for name in self.wiring.writes if name == "emitters"},
+            **{f"recover_card_{when}": ArraySpec((self._card,), kernels.Observation) for when in WHEN},
+            **{f"recover_upward_{when}": ArraySpec((3,), wp.float32) for when in WHEN},
+            "recover_upward_rows": ArraySpec((height // 2,), wp.vec3),
+            "recover_share": ArraySpec((3,), wp.float32),
+            "recover_level": ArraySpec((3,), wp.float32, 1.0),
             "recover_recovered": ArraySpec(cells, wp.vec3),
+            "recover_found": ArraySpec((CONFIG.search.most,), Emitter),
+            "recover_levelled": ArraySpec(cells, wp.vec3),
             "recover_missing": ArraySpec(shape, wp.vec3),
             "recover_cells": ArraySpec(cells, Cell),
             "recover_cells_now": ArraySpec(cells, Cell),
@@ -169,12 +185,12 @@ class Recover(Stage):
         self._arrays, self._device = arrays, device
         arrays["recover_points"].assign(self._surfaces.points)
         self._progress = _Progress(self._new_solver())
-        self._asks = self._arrives = self._news = False
+        self._asks = self._arrives = self._news = self._follows = False
         self._worker: ThreadPoolExecutor | None = None
         points = len(self._surfaces.points)
         arrays.add("recover_status", self.status)
         equations = ("recover_cells_now", "recover_transfer", "recover_mirrored", "recover_observations", "params")
-        effects = ("recover_recovered", "recover_cells", *(name for name in self.wiring.writes if name == "emitters"))
+        effects = ("recover_recovered", "recover_cells", "recover_found", "recover_share", "recover_level")
         self._equations = HostCopies({name: arrays[name] for name in equations}, device)
         self._effects = HostCopies({name: arrays[name] for name in effects}, device)
         sides = {name: arrays[name] for name in ("recover_emitters", "recover_emitter_transfer")}
@@ -183,6 +199,11 @@ class Recover(Stage):
         self._stream = None if device.is_cpu else wp.Stream(device)
         self._frames_stream = None if device.is_cpu else wp.get_stream(device)
 
+        looks = (
+            Pass(self._look_at_card, enabled=lambda: self._asks or self._follows),
+            Pass(self._note_card, enabled=lambda: self._asks),
+            Pass(self._follow, enabled=lambda: self._follows),
+        )
         passes = [
             Pass(self._take, on_host=True, enabled=lambda: self._arrives),
             # What clips is known before the map is filled.
@@ -190,13 +211,27 @@ class Recover(Stage):
             Pass(self._condense, rows=arrays["recover_cells_now"].shape[0], enabled=lambda: self._asks),
             Pass(self._observe, rows=points, enabled=lambda: self._asks),
             Pass(self._transfer, rows=points, enabled=lambda: self._asks),
+            *(looks[:2] if self._card else ()),
             Pass(self._ask, on_host=True, enabled=lambda: self._asks),
+            *(looks[2:] if self._card else ()),
+            Pass(self._apply_level),
             Pass(self._add, rows=arrays["recover_cells"].shape[0]),
         ]
         passes += [one for ball in range(self.features.others) for one in self._relocate(ball)]
         if device.is_cpu:
             passes.append(Pass(self._measure, rows=self.request.quality.environment_height))
         return passes
+
+    def _card_points(self) -> int:
+        """Number of points by which the light's level is followed, on the card; 0 where it is not.
+
+        Where a camera meters by itself its own gain is told by the same points.
+        """
+        source = self.request.scene.source
+        if source is not None and source.metering == "automatic":
+            return 0
+        kinds = self._surfaces.kinds[self._surfaces.surface]
+        return int(np.count_nonzero((kinds == Kind.CARD) | (kinds == Kind.INK))) // CARD_STEP
 
     def _new_solver(self) -> recovery.Recovery:
         """One that has learnt nothing yet."""
@@ -214,7 +249,7 @@ class Recover(Stage):
         filled, missing, sent = arrays["others_filled"][ball], arrays["recover_others_missing"], arrays["recover_sent"]
         clipped, confidence = (arrays[f"{KEPT}_{part}"][ball] for part in ("clipped", "confidence"))
         own = arrays["params"], arrays["probes"][ball + 1 : ball + 2], missing
-        found = arrays["recover_cells"], arrays["recover_recovered"]
+        found = arrays["recover_cells"], arrays["recover_levelled"]
         other, cells = (filled, missing, confidence), found[0]
         send = functools.partial(relocate.send_recovered, missing, confidence, *found, sent)
         share = functools.partial(relocate.share_recovered, other, *first, emitters, cells, sent, out)
@@ -251,6 +286,35 @@ class Recover(Stage):
         )
 
     def _observe(self, rows: Rows | None) -> None:
+        self._observe_points(self._arrays["recover_points"], self._arrays["recover_observations"], rows)
+
+    def _look_at_card(self, rows: Rows | None) -> None:
+        arrays = self._arrays
+        sum_upward(arrays["filled_radiance"], arrays["recover_upward_rows"], arrays["recover_upward_now"])
+        points = arrays["recover_points"][: len(arrays["recover_card_now"]) * CARD_STEP : CARD_STEP]
+        self._observe_points(points, arrays["recover_card_now"], None)
+
+    def _note_card(self, rows: Rows | None) -> None:
+        for part in ("card", "upward"):
+            copy(self._arrays[f"recover_{part}_asked"], self._arrays[f"recover_{part}_now"])
+
+    def _follow(self, rows: Rows | None) -> None:
+        arrays = self._arrays
+        follow_level(
+            arrays["recover_card_now"],
+            arrays["recover_card_then"],
+            (arrays["recover_upward_now"], arrays["recover_upward_then"]),
+            arrays["recover_share"],
+            arrays["recover_level"],
+        )
+
+    def _apply_level(self, rows: Rows | None) -> None:
+        arrays = self._arrays
+        found = arrays["recover_found"] if "emitters" in self.wiring.writes else arrays["recover_found"][:0]
+        shown = arrays["emitters"] if "emitters" in self.wiring.writes else found
+        apply_level(arrays["recover_recovered"], found, arrays["recover_level"], arrays["recover_levelled"], shown)
+
+    def _observe_points(self, points: Any, observations: Any, rows: Rows | None) -> None:
         arrays, linear = self._arrays, "linear_frame" in self.wiring.reads
         kernels.observe_surfaces(
             arrays["linear_frame" if linear else "frame"],
@@ -258,8 +322,8 @@ class Recover(Stage):
             arrays["params"],
             arrays["probes"],
             arrays["ray_scene"],
-            arrays["recover_points"],
-            arrays["recover_observations"],
+            points,
+            observations,
             proxies=self._proxies,
             rows=rows,
         )
@@ -286,7 +350,7 @@ class Recover(Stage):
             arrays["environment_confidence"],
             arrays["recover_missing"],
             arrays["recover_cells"],
-            arrays["recover_recovered"],
+            arrays["recover_levelled"],
             arrays["environment"],
             rows=rows,
         )
@@ -319,10 +383,11 @@ class Recover(Stage):
         self._asks = self._asks and not self._arrays["ball_covered"]()
         if self._asks:
             now.waited, now.last = 0, seconds
+        self._follows = self._card > 0 and not self._arrays["ball_covered"]()
 
     def rest(self) -> None:
         """No estimate is begun or takes effect; the first frame that needs one begins it at once."""
-        self._asks = self._arrives = False
+        self._asks = self._arrives = self._follows = False
         self._progress.rested = True
 
     def _ask(self, rows: Rows | None) -> None:
@@ -423,14 +488,20 @@ class Recover(Stage):
         # In camera values of the frame that it was begun in; the camera's gain may have changed since.
         ratio = (self._arrays["gain"]() / now.gain).astype(np.float32)
         recovered = solution.estimate.recovered * ratio
-        values = {"recover_recovered": recovered, "recover_cells": solution.cells}
-        if "emitters" in self.wiring.writes:
-            records = np.zeros(CONFIG.search.most, np.dtype(Emitter.numpy_dtype()))
-            for record, emitter in zip(records, solution.estimate.emitters, strict=False):
-                record["origin"], record["direction"] = emitter.origin, emitter.direction
-                record["distance"], record["power"] = emitter.distance, emitter.power * ratio
-            values["emitters"] = records
+        records = np.zeros(CONFIG.search.most, np.dtype(Emitter.numpy_dtype()))
+        for record, emitter in zip(records, solution.estimate.emitters, strict=False):
+            record["origin"], record["direction"] = emitter.origin, emitter.direction
+            record["distance"], record["power"] = emitter.distance, emitter.power * ratio
+        values = {"recover_recovered": recovered, "recover_cells": solution.cells, "recover_found": records}
+        values |= {
+            "recover_share": np.array(solution.estimate.card_share, np.float32),
+            "recover_level": np.ones(3, np.float32),
+        }
         self._effects.send(values, self._frames_stream)
+        for part in ("card", "upward"):
+            asked, then = (self._arrays[f"recover_{part}_{when}"] for when in ("asked", "then"))
+            if len(then):
+                wp.copy(then, asked, stream=self._frames_stream)
 
     def close(self) -> None:
         """See the worker end: what it solves, the arrays that go now are its, and another stage may wait for it."""
