@@ -4,7 +4,7 @@ The walk is that of ``wp.mesh_query_ray`` [AL09]: from the nearer child to the f
 triangle there is less to do. Warp picks the ray's axes by indices, which puts vectors into local memory, divides anew
 to shear each triangle, and reads a list to find its corners. Here axes and shear are found once for a ray, and corners
 are read where they lie: corner k of face f is point 3 f + k (``warp_ar.scene.ray_mesh``). So kernels that trace also
-have fewer registers to spill. Nodes are read by functions of Warp's (``bvh.h``) that no release promises to keep.
+have fewer registers to spill. Of Warp's insides it knows ``Mesh``, ``BVH`` and its packed nodes.
 
 The test of a triangle is Warp's: watertight [WBW13], edge functions by Kahan's product of differences, whose sign is
 exact. Directions along an axis take 1e-30 for zero: 1 / 0 times a distance of 0 would be no number.
@@ -19,6 +19,9 @@ from __future__ import annotations
 import warp as wp
 
 wp.set_module_options({"enable_backward": False})
+
+STACK = 32
+"""Nodes that wait at most, as in Warp's own walk: a tree by surface area has hardly more levels."""
 
 _WALK = """
     #if defined(__CUDA_ARCH__)
@@ -52,15 +55,22 @@ _WALK = """
     }}
     const float shear_x = dx / dz, shear_y = dy / dz, scale = 1.0f / dz;
 
+    // A node in one word: its two numbers, children or the ends of a list of triangles, and which of the two they are.
+    const auto pack = [](const wp::BVHPackedNodeHalf& lower, const wp::BVHPackedNodeHalf& upper) {{
+        return (wp::uint64(lower.b) << 62) | (wp::uint64(upper.i) << 31) | wp::uint64(lower.i);
+    }};
+    const int root = *mesh.bvh.root;
+
     float t_near = t_max;
     {found}
-    wp::uint64 stack[BVH_QUERY_STACK_SIZE];
+    wp::uint64 stack[{stack}];
     int waiting = 0;
-    wp::uint64 node = wp::bvh_query_node_load(mesh.bvh, *mesh.bvh.root);
+    wp::uint64 node = pack(
+        wp::bvh_load_node(mesh.bvh.node_lowers, root), wp::bvh_load_node(mesh.bvh.node_uppers, root));
     while (true) {{
-        if (wp::bvh_query_node_is_leaf(node)) {{
-            const int end = wp::bvh_query_node_upper_payload(node);
-            for (int at = wp::bvh_query_node_lower_payload(node); at < end; ++at) {{
+        const int first = (wp::int32)(node & 0x7fffffffu), second = (wp::int32)((node >> 31) & 0x7fffffffu);
+        if (node >> 62) {{
+            for (int at = first; at < second; ++at) {{
                 const int face = WP_AR_LOAD(mesh.bvh.primitive_indices + at);
                 const float* corner = points + 9 * face;
                 const float az = WP_AR_LOAD(corner + kz) - oz;
@@ -86,7 +96,6 @@ _WALK = """
                 }}
             }}
         }} else {{
-            const int first = wp::bvh_query_node_lower_payload(node), second = wp::bvh_query_node_upper_payload(node);
             const wp::BVHPackedNodeHalf first_lower = wp::bvh_load_node(mesh.bvh.node_lowers, first);
             const wp::BVHPackedNodeHalf first_upper = wp::bvh_load_node(mesh.bvh.node_uppers, first);
             const wp::BVHPackedNodeHalf second_lower = wp::bvh_load_node(mesh.bvh.node_lowers, second);
@@ -99,11 +108,11 @@ _WALK = """
                 origin, inverse, wp::vec3(second_lower.x, second_lower.y, second_lower.z),
                 wp::vec3(second_upper.x, second_upper.y, second_upper.z), t1) && t1 < t_near;
             if (meets_first || meets_second) {{
-                const wp::uint64 one = wp::bvh_query_node_pack(first_lower, first_upper);
-                const wp::uint64 two = wp::bvh_query_node_pack(second_lower, second_upper);
+                const wp::uint64 one = pack(first_lower, first_upper);
+                const wp::uint64 two = pack(second_lower, second_upper);
                 const bool first_next = meets_first && (!meets_second || t0 < t1);
                 node = first_next ? one : two;
-                if (meets_first && meets_second && waiting < BVH_QUERY_STACK_SIZE)
+                if (meets_first && meets_second && waiting < {stack})
                     stack[waiting++] = first_next ? two : one;
                 continue;
             }}
@@ -123,6 +132,7 @@ _CLOSEST = """
 
 @wp.func_native(
     _WALK.format(
+        stack=STACK,
         found="float u_near = 0.0f, v_near = 0.0f; int face_near = -1;",
         meet=_CLOSEST,
         missed="wp::vec4(t_near, u_near, v_near, (float&)face_near)",
@@ -132,6 +142,6 @@ def find_closest_face(mesh_id: wp.uint64, origin: wp.vec3, direction: wp.vec3, t
     """T of the closest triangle before ``t_max``, its first two barycentric weights, the bits of its number or -1."""
 
 
-@wp.func_native(_WALK.format(found="", meet="return true;", missed="false"))
+@wp.func_native(_WALK.format(stack=STACK, found="", meet="return true;", missed="false"))
 def meets_any_face(mesh_id: wp.uint64, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
     """Whether a ray meets a triangle before ``t_max``."""
