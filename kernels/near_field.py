@@ -25,9 +25,9 @@ small part of the sum, and L may be all that is hidden. Hence
     | N + s M + (1 - s) (|M| / |B|) L |,    |.| the brightness: share = 1 - (1 - s) |M| / |B|.
 
 Both are averaged over one tile's worth of neighbours on the same object whose normals agree, as ``environment_shadow``
-does; mirrors are not. Where a pixel has rays enough of its own, what a lobe holds is averaged over normals within the
-lobe's own width: those of a thin tube turn by ten degrees from pixel to pixel, and a mean over them would hold what
-twice that angle shows.
+does; mirrors are not. Where a pixel has rays enough of its own, neighbours count less for what a lobe holds the more
+their normals differ: exp(-theta^2 / (2 alpha^2)), alpha the lobe's width, as 1 - cos theta = theta^2 / 2. Normals of a
+thin tube turn by ten degrees from pixel to pixel, and a mean over them would hold what twice that angle shows.
 """
 
 from __future__ import annotations
@@ -69,11 +69,11 @@ LANES = 4
 NO_RAY = wp.constant(wp.float32(-1.0))
 """Share of a pixel whose rays all ran into its surface: it knows nothing of its lobe."""
 SAME_NORMAL = wp.constant(wp.float32(math.cos(math.radians(20.0))))
-"""Cosine of the angle up to which neighbours' normals are those of one surface, and the least that a lobe asks for."""
+"""Cosine of the angle up to which neighbours' normals are those of one surface."""
 
 
 OWN_RAYS = 4
-"""Rays into a lobe from which on a pixel asks neighbours only within the lobe's width."""
+"""Rays into a lobe from which on neighbours count by how much their normals differ."""
 
 
 @wp.struct
@@ -286,12 +286,12 @@ def make_filter_kernel(config: NearFieldConfig) -> wp.Kernel:
             return
         normal = hits[i, j].normal
         alpha = float(0.0)
-        same_lobe = SAME_NORMAL
+        falling = float(0.0)  # of weights with 1 less the cosine between normals
         if wp.static(config.distant.specular):
             alpha = alpha_at(scene, hits[i, j], params[0].camera_position)
             if wp.static(config.lobe_count >= OWN_RAYS):
-                if estimate.reflected[i, j][3] != NO_RAY:
-                    same_lobe = wp.max(wp.cos(alpha), same_lobe)
+                if alpha >= SHARP and estimate.reflected[i, j][3] != NO_RAY:
+                    falling = 1.0 / (alpha * alpha)
         light = wp.vec3(0.0)
         glossy = wp.vec4(0.0)
         weights = float(0.0)
@@ -311,7 +311,8 @@ def make_filter_kernel(config: NearFieldConfig) -> wp.Kernel:
                         if wp.static(config.distant.diffuse != "none"):
                             light += weight * estimate.irradiance[i + a, j + b]
                         if wp.static(config.distant.specular):
-                            if likeness > same_lobe and estimate.reflected[i + a, j + b][3] != NO_RAY:
+                            if estimate.reflected[i + a, j + b][3] != NO_RAY:
+                                weight *= wp.exp(-falling * wp.max(1.0 - likeness, 0.0))
                                 lobes += weight
                                 glossy += weight * estimate.reflected[i + a, j + b]
                                 distant += weight * estimate.transmitted[i + a, j + b]
