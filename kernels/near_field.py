@@ -25,7 +25,9 @@ small part of the sum, and L may be all that is hidden. Hence
     | N + s M + (1 - s) (|M| / |B|) L |,    |.| the brightness: share = 1 - (1 - s) |M| / |B|.
 
 Both are averaged over one tile's worth of neighbours on the same object whose normals agree, as ``environment_shadow``
-does; mirrors are not.
+does; mirrors are not. Where a pixel has rays enough of its own, neighbours count less for what a lobe holds the more
+their normals differ: exp(-theta^2 / (2 alpha^2)), alpha the lobe's width, as 1 - cos theta = theta^2 / 2. Normals of a
+thin tube turn by ten degrees from pixel to pixel, and a mean over them would hold what twice that angle shows.
 """
 
 from __future__ import annotations
@@ -68,6 +70,10 @@ NO_RAY = wp.constant(wp.float32(-1.0))
 """Share of a pixel whose rays all ran into its surface: it knows nothing of its lobe."""
 SAME_NORMAL = wp.constant(wp.float32(math.cos(math.radians(20.0))))
 """Cosine of the angle up to which neighbours' normals are those of one surface."""
+
+
+OWN_RAYS = 4
+"""Rays into a lobe from which on neighbours count by how much their normals differ."""
 
 
 @wp.struct
@@ -211,11 +217,11 @@ def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
 
 
 @functools.cache
-def make_is_sharp(config: NearFieldConfig) -> wp.Function:
-    """``is_sharp(scene, hit, origin) -> bool``: whether what a pixel shows from ``origin`` is a mirror."""
+def make_alpha_at(config: NearFieldConfig) -> wp.Function:
+    """``alpha_at(scene, hit, origin) -> float32``: width of the lobe of what a pixel shows from ``origin``."""
 
     @wp.func(module="unique")
-    def is_sharp(scene: RayScene, hit: Hit, origin: wp.vec3) -> wp.bool:
+    def alpha_at(scene: RayScene, hit: Hit, origin: wp.vec3) -> wp.float32:
         material = scene.materials[scene.objects[hit.shape].material]
         roughness = material.roughness
         if wp.static(config.distant.textures):
@@ -223,9 +229,9 @@ def make_is_sharp(config: NearFieldConfig) -> wp.Function:
             direction = wp.normalize(hit.point - origin)
             cos_o = wp.max(wp.abs(wp.dot(hit.normal, direction)), 1.0e-3)
             roughness = roughness_at(scene, material, surface_point(scene, hit, cos_o, scene.pixel_spread))
-        return lobe_alpha(material.model, roughness, material.shininess) < SHARP
+        return lobe_alpha(material.model, roughness, material.shininess)
 
-    return is_sharp
+    return alpha_at
 
 
 @wp.func
@@ -251,7 +257,7 @@ def fill_lobe(near: wp.vec4, transmitted: wp.vec4) -> wp.vec4:
 def make_filter_kernel(config: NearFieldConfig) -> wp.Kernel:
     """Kernel of ``filter_near_field``."""
     side = config.side
-    is_sharp = make_is_sharp(config)
+    alpha_at = make_alpha_at(config)
 
     @wp.kernel(module="unique", enable_backward=False)
     def filter_near_field_kernel(
@@ -279,6 +285,13 @@ def make_filter_kernel(config: NearFieldConfig) -> wp.Kernel:
         if found < 0:
             return
         normal = hits[i, j].normal
+        alpha = float(0.0)
+        falling = float(0.0)  # of weights with 1 less the cosine between normals
+        if wp.static(config.distant.specular):
+            alpha = alpha_at(scene, hits[i, j], params[0].camera_position)
+            if wp.static(config.lobe_count >= OWN_RAYS):
+                if alpha >= SHARP and estimate.reflected[i, j][3] != NO_RAY:
+                    falling = 1.0 / (alpha * alpha)
         light = wp.vec3(0.0)
         glossy = wp.vec4(0.0)
         weights = float(0.0)
@@ -288,7 +301,10 @@ def make_filter_kernel(config: NearFieldConfig) -> wp.Kernel:
         for a in range(-reach, reach + 1):
             for b in range(-reach, reach + 1):
                 if inside_rect(i + a, j + b, rect):
-                    if objects[i + a, j + b] == found and wp.dot(hits[i + a, j + b].normal, normal) > SAME_NORMAL:
+                    likeness = float(-1.0)
+                    if objects[i + a, j + b] == found:
+                        likeness = wp.dot(hits[i + a, j + b].normal, normal)
+                    if likeness > SAME_NORMAL:
                         weight = wp.where(a == reach or a == -reach, 0.5, 1.0)
                         weight *= wp.where(b == reach or b == -reach, 0.5, 1.0)
                         weights += weight
@@ -296,13 +312,14 @@ def make_filter_kernel(config: NearFieldConfig) -> wp.Kernel:
                             light += weight * estimate.irradiance[i + a, j + b]
                         if wp.static(config.distant.specular):
                             if estimate.reflected[i + a, j + b][3] != NO_RAY:
+                                weight *= wp.exp(-falling * wp.max(1.0 - likeness, 0.0))
                                 lobes += weight
                                 glossy += weight * estimate.reflected[i + a, j + b]
                                 distant += weight * estimate.transmitted[i + a, j + b]
         if wp.static(config.distant.diffuse != "none"):
             near_out.irradiance[i, j] = wp.max(light / weights, wp.vec3(0.0))
         if wp.static(config.distant.specular):
-            if is_sharp(scene, hits[i, j], params[0].camera_position):
+            if alpha < SHARP:
                 near_out.reflected[i, j] = estimate.reflected[i, j]
                 return
             share = wp.max(lobes, MIN_LIGHT)

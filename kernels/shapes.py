@@ -1,8 +1,8 @@
 """Where a ray meets one shape: a sphere, a box, a plane or a mesh, in the shape's own coordinates.
 
-Spheres, boxes and planes are intersected analytically, meshes through a BVH in local space: Warp's own on CUDA, one of
-eight children per node on CPU (``kernels/wide_bvh.py``). Ray parameters ``t`` are in multiples of the direction's
-length, which need not be 1; every test accepts 0 < t < t_max.
+Spheres, boxes and planes are intersected analytically, meshes through a BVH in local space: Warp's own on CUDA
+(``kernels/mesh_walk.py``), one of eight children per node on CPU (``kernels/wide_bvh.py``). Ray parameters ``t`` are in
+multiples of the direction's length, which need not be 1; every test accepts 0 < t < t_max.
 
 References:
     [WBW13] Woop, Benthin, Wald, "Watertight Ray/Triangle Intersection", JCGT 2(1), 2013.
@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import warp as wp
 
+from warp_ar.kernels.mesh_walk import find_closest_face, meets_any_face
 from warp_ar.kernels.structs import BOX, MESH, Shape
 from warp_ar.kernels.wide_bvh import walk_any, walk_closest
 
@@ -156,7 +157,7 @@ def enter_mesh(half: wp.vec3, origin: wp.vec3, direction: wp.vec3) -> wp.float32
     return wp.max((b - reach) / a, 0.0)
 
 
-# No ray may slip through the shared edge of two triangles. Warp's own test of a triangle is watertight [WBW13], its
+# No ray may slip through the shared edge of two triangles. The test of a triangle is watertight [WBW13], Warp's
 # test of a node's box is not: it neither widens the interval by the rounding of its products [Ize13] nor leaves a
 # margin around triangles, and so loses rays that run through edges which are box faces as well.
 # ``warp_ar.scene.ray_mesh.make_ray_mesh`` therefore builds the BVH over boxes that are larger by 2^-18 of the mesh's
@@ -171,20 +172,16 @@ def intersect_mesh(shape: Shape, origin: wp.vec3, direction: wp.vec3, t_max: wp.
     start = enter_mesh(shape.extent, origin, direction)
     if start < t_max:
         entry = origin + start * direction
+        near = wp.vec4(0.0)  # no ternary: in a kernel it takes both walks
         if shape.tree != wp.uint64(0):
             near = walk_closest(shape.tree, entry, direction, t_max - start)
-            contact.face = wp.cast(near[3], wp.int32)
-            if contact.face >= 0:
-                contact.t = start + near[0]
-                contact.u = near[1]
-                contact.v = near[2]
         else:
-            query = wp.mesh_query_ray(shape.mesh, entry, direction, t_max - start)
-            if query.result:
-                contact.t = start + query.t
-                contact.face = query.face
-                contact.u = query.u
-                contact.v = query.v
+            near = find_closest_face(shape.mesh, entry, direction, t_max - start)
+        contact.face = wp.cast(near[3], wp.int32)
+        if contact.face >= 0:
+            contact.t = start + near[0]
+            contact.u = near[1]
+            contact.v = near[2]
     return contact
 
 
@@ -197,7 +194,7 @@ def meets_mesh(shape: Shape, origin: wp.vec3, direction: wp.vec3, t_max: wp.floa
     entry = origin + start * direction
     if shape.tree != wp.uint64(0):
         return walk_any(shape.tree, entry, direction, t_max - start)
-    return wp.mesh_query_ray_anyhit(shape.mesh, entry, direction, t_max - start)
+    return meets_any_face(shape.mesh, entry, direction, t_max - start)
 
 
 @wp.func

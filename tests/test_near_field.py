@@ -371,16 +371,20 @@ def test_share_follows_the_light(device):
         np.testing.assert_allclose(out[..., 3], 1 - left, rtol=1e-6)
 
 
-def average(found, normals, irradiance, mirrored, models=(LAMBERT, LAMBERT), rect=None, passed=None):
-    """Filter estimates as given, (h, w); object k has material k."""
+def average(
+    found, normals, irradiance, mirrored, models=(LAMBERT, LAMBERT), rect=None, passed=None, lobes=4, **surface
+):
+    """Filter estimates as given, (h, w); object k has material k, of model k and this surface."""
     height, width = found.shape
     forms = DistantLightConfig(
         TraceConfig((SPHERE,), (DESK["kind"],)), tuple(sorted(set(models))), False, "sh", True, False
     )
-    config = near_field.NearFieldConfig(forms, COUNT, 4, 1, SIDE, False, False)
+    config = near_field.NearFieldConfig(forms, COUNT, lobes, 1, SIDE, False, False)
     scene = RayScene()
     scene.objects = records(Shape, *[{**sphere(BALL, RADIUS), "material": k} for k in range(len(models))])
-    scene.materials = records(Material, *[{"model": model, **dict.fromkeys(TEXTURES, -1)} for model in models])
+    scene.materials = records(
+        Material, *[{"model": model, **dict.fromkeys(TEXTURES, -1), **surface} for model in models]
+    )
     hits = np.zeros(found.shape, np.dtype(Hit.numpy_dtype()))
     hits["normal"] = normals
     estimate, near = near_light((height, width)), near_light((height, width))
@@ -426,6 +430,31 @@ def test_a_tile_of_estimates_averages_to_their_mean(device):
         _, mirrored = average(np.zeros((16, 16), int), (0, 0, 1), light.repeat(3, -1), light.repeat(4, -1), (model,))
         inner = np.s_[SIDE:-SIDE, SIDE:-SIDE]
         np.testing.assert_allclose(mirrored[..., 0][inner], expected[inner], rtol=1e-5)
+
+
+def test_a_lobe_is_averaged_over_normals_by_its_own_width(device):
+    """On a thin tube neighbours count by their normals, unless a pixel has too few rays or none that left it."""
+    turned = np.radians(5.0 * np.arange(16))
+    normals = np.stack([np.sin(turned), np.zeros(16), np.cos(turned)], axis=-1) * np.ones((16, 1, 1))
+    column = np.arange(16.0) * np.ones((16, 1))
+    shown = (column**2)[..., None].repeat(4, -1)
+    nothing = np.zeros((16, 16, 3))
+    inner = np.s_[SIDE:-SIDE, SIDE:-SIDE]
+    away = np.arange(-2, 3)
+    window = np.array((0.5, 1.0, 1.0, 1.0, 0.5))
+    for shininess, lobes in ((256.0, 4), (16.0, 4), (256.0, 1)):
+        _, mirrored = average(
+            np.zeros((16, 16), int), normals, nothing, shown, (PHONG,), lobes=lobes, shininess=shininess
+        )
+        # The width is the root of 1 / shininess.
+        weights = window * (np.exp(-shininess * (1.0 - np.cos(np.radians(5.0 * away)))) if lobes == 4 else 1.0)
+        more = np.average(away**2, weights=weights)
+        np.testing.assert_allclose(mirrored[..., 0][inner], (column**2)[inner] + more, rtol=1e-4)
+    shown[8, 8, 3] = near_field.NO_RAY
+    _, mirrored = average(np.zeros((16, 16), int), normals, nothing, shown, (PHONG,), shininess=256.0)
+    weights = np.outer(window, window)
+    weights[2, 2] = 0.0
+    np.testing.assert_allclose(mirrored[8, 8, 0], np.average((column**2)[6:11, 6:11], weights=weights), rtol=1e-5)
 
 
 def test_garbage_in_the_environment_stays_finite(device):
