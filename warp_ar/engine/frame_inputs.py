@@ -295,6 +295,8 @@ class FrameInputs:
             return False
         if reset:
             self._cover.forget()
+        if self._cover.rests(frame.seconds):
+            return self._cover.is_covered
         discs = ball_discs(self._probes, self._camera, frame.pose)
         return self._cover.observe(frame.image, discs, frame.pose, frame.seconds, self.gain, frame.plate)
 

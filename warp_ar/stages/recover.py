@@ -332,11 +332,11 @@ class Recover(Stage):
         self._equations.fetch(self._stream, self._frames_stream)
         now = self._progress
         now.gain = self._arrays["gain"]()
-        if self._real_time:
+        if self._has_process:
             POOL.prepare()
         # In this process a solution holds the interpreter's lock, which frames beside it wait for. Where a frame waits
         # for it, a process that is there already is used; to start one takes longer than most clips.
-        aside = POOL.ready if self._waits else self._real_time and not self._at_once()
+        aside = POOL.ready if self._waits else self._has_process and not self._at_once()
         now.pending = self._worker.submit(self._solve, now.solver, aside)
         if self._at_once():
             self._take(None)
@@ -345,6 +345,15 @@ class Recover(Stage):
     def _real_time(self) -> bool:
         """Whether no frame waits for an estimate."""
         return self.request.estimates == "real_time"
+
+    @property
+    def _has_process(self) -> bool:
+        """Whether estimates after a stream's first are solved for in a process beside this one.
+
+        On CUDA frames are bound by the interpreter's lock. On CPU frames take all cores, and a process would have to
+        take one from them. What it finds is the same to the bit.
+        """
+        return self._real_time or not (self._waits or self._device.is_cpu)
 
     @property
     def _waits(self) -> bool:
