@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import functools
+import itertools
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -33,9 +34,11 @@ from warp_ar.scene import Camera, Pose, Scene
 from warp_ar.scene.kinds import shape_kind
 from warp_ar.scene.pixel_rays import pixel_rays
 from warp_ar.scene.ray_scene import HostScene
-from warp_ar.scene.screen_extents import Outline, Rect, screen_rects
+from warp_ar.scene.screen_extents import EMPTY, Outline, Rect, screen_rects
 from warp_ar.stages.base import Arrays, Reach, Rows
 
+_ALL_RECTS = ("object", "light", "direct", "shadow", "ball")
+"""As the frame's values hold them, one behind the other."""
 RECTS = ("object", "light", "shadow", "ball")
 """Parts of the screen to whose rows passes keep; the frame's values hold them whole."""
 
@@ -119,9 +122,14 @@ class FrameInputs:
         self._bent = 0.0
         self._probes = scene.probes
         self.rects: dict[str, Rect] = dict.fromkeys(RECTS, (0, shape[0], 0, shape[1]))
+        self._written_rects: dict[str, Rect] = dict.fromkeys(_ALL_RECTS, EMPTY)
         # Views of every field, (1, ...): NumPy takes longer to find a field than to write it.
         values = self.block.host("params")
         self._params = {name: values[name] for name in values.dtype.names}
+        self._all_rects = values.view(np.uint8)[values.dtype.fields[f"{_ALL_RECTS[0]}_rect"][1] :].view(np.int32)
+        self._looked_at: tuple[Any, ...] | None = None
+        """From where at what, when rectangles were written last."""
+        self._shines = True
         self._add(scene, device)
         self._params["focal"][0] = (camera.fx, camera.fy)
         self._params["principal"][0] = (camera.cx, camera.cy)
@@ -339,23 +347,27 @@ class FrameInputs:
         if scene.write_proxies(block.host("proxies"), places):
             yield "pose"  # all that asks where the receiver is asks where the camera is
         if lights or frame.index == 0:
+            self._shines = scene.has_area_lights or bool(block.host("lights")["intensity"].any())
             yield "lights"
         if objects or frame.index == 0:
             yield "objects"
 
     def _move(self, pose: Pose) -> bool:
         """Put the camera at ``pose``, find what virtual objects and lights can reach; whether it moved."""
-        params = self._params
-        position, rotation = params["camera_position"], params["world_from_camera"]
+        outlines = self._outlines()
+        looked_at = (pose.rotation.tobytes(), pose.translation.tobytes(), *outlines.values())
+        if looked_at == self._looked_at:
+            return False
+        self._looked_at = looked_at
+        position, rotation = self._params["camera_position"], self._params["world_from_camera"]
         before = position.tobytes(), rotation.tobytes()
         inverse = pose.inverse()
         position[0], rotation[0] = inverse.translation, inverse.rotation
-        outlines = self._outlines()
         rects = dict(zip(outlines, screen_rects(list(outlines.values()), pose, self._camera), strict=True))
         rects.setdefault("light", rects["direct"])
         self.rects.update(rects)
-        for name, rect in rects.items():
-            params[f"{name}_rect"][0] = rect
+        self._written_rects.update(rects)
+        self._all_rects[:] = list(itertools.chain(*self._written_rects.values()))
         return before != (position.tobytes(), rotation.tobytes())
 
     def _outlines(self) -> dict[str, Outline]:
@@ -378,9 +390,8 @@ class FrameInputs:
         """What of this frame virtual objects and lights can reach."""
         rects = (self.rects[name] for name in RECTS)
         objects, light, shadows, balls = (rect[0] < rect[1] and rect[2] < rect[3] for rect in rects)
-        shines = self.host_scene.has_area_lights or bool(self.block.host("lights")["intensity"].any())
         falls = bool(self.host_scene.light_outline().polygons)
-        return Reach(objects=objects, shines=shines, falls=falls, light=light, shadows=shadows, balls=balls)
+        return Reach(objects=objects, shines=self._shines, falls=falls, light=light, shadows=shadows, balls=balls)
 
     def radiance(self, plate: Plate) -> npt.NDArray[np.float32]:
         """A plate as linear radiance, by what frames have told of the camera's tone curve; an array of its own."""

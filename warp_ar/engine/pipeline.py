@@ -446,8 +446,7 @@ class Pipeline(Closing):
             self._finish()
         if exposure != self.bracket.reference:
             return self._take_short(image, host_image, exposure, now, pose)
-        frame, state = self._look(image if host_image is None else host_image, now, pose)
-        frame = dataclasses.replace(frame, plate=plate)
+        frame, state = self._look(image if host_image is None else host_image, now, pose, plate)
         if handed_over:
             return Result(frame.pose, state, self._hand_over(frame))
         rendered = self._render(self._send(frame))
@@ -518,7 +517,9 @@ class Pipeline(Closing):
         timings[TRACK] = StageTiming(before + (time.perf_counter() - start) * 1e3, False)
         return places
 
-    def _look(self, image: Any, now: float, given: Pose | Track | None) -> tuple[SeenFrame, TrackState | None]:
+    def _look(
+        self, image: Any, now: float, given: Pose | Track | None, plate: Plate | None
+    ) -> tuple[SeenFrame, TrackState | None]:
         """Find the marker, go on with the clock."""
         timings: dict[str, StageTiming] = {}
         pose, state = self._track(image, now, given, timings)
@@ -527,7 +528,7 @@ class Pipeline(Closing):
         seconds, step = now - (self._start_time or 0.0), max(now - self._lit_time, 0.0)
         self._last_time = self._lit_time = now
         self._index += 1
-        return SeenFrame(image, None, pose, lost, self._index - 1, now, seconds, step, timings, places), state
+        return SeenFrame(image, None, pose, lost, self._index - 1, now, seconds, step, timings, places, plate), state
 
     def _render(self, frame: SeenFrame) -> Rendered:
         """Run the stages on a frame."""

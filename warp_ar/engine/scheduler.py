@@ -85,7 +85,7 @@ class Scheduler:
         self._stages: list[Step] = []
         self._first_launches: list[Note] = []
         self._fills: dict[str, Any] = {}
-        self._seen: dict[str, tuple[int, ...]] = {}
+        self._seen: dict[str, Any] = {}
         self._translated: set[int] = set()
         self._patterns: dict[Any, list[Segment]] = {}
         self._graphs: dict[tuple[int, ...], Any] = {}
@@ -105,6 +105,8 @@ class Scheduler:
         self._late = {stage.name for stage, _ in self._stages if type(stage).changed is not Stage.changed}
         """Stages that may find that they changed nothing: their readers then rest."""
         self._changing = {stage.name for stage, passes in self._stages if any(step.enabled for step in passes)}
+        self._versions = {stage.name: arrays.versions_of(stage.wiring.reads) for stage, _ in self._stages}
+        self._left_out: dict[str, StageTiming] = {}
 
     def _build(self) -> None:
         """Allocate the arrays of the plan's stages, and build their passes."""
@@ -262,23 +264,27 @@ class Scheduler:
     def _look(self) -> None:
         """Find out what this frame needs."""
         reach = self.arrays["reach"]() if "reach" in self.arrays else Reach()
-        self._unneeded, clearing = self._demand.look(reach)
-        for stage, _ in self._stages:
-            if stage.name in self._unneeded:
-                stage.rest()
+        before, (self._unneeded, clearing) = self._unneeded, self._demand.look(reach)
+        if self._unneeded is not before:
+            reasons = self._unneeded if self._culling else {}
+            self._left_out = {name: StageTiming(0.0, True, reason) for name, reason in reasons.items()}
+        if self._unneeded:
+            for stage, _ in self._stages:
+                if stage.name in self._unneeded:
+                    stage.rest()
         for name in clearing:
             self._seen.pop(name, None)
 
     def _timing_of_skipped(self, stage: Stage) -> StageTiming:
-        reason = self._unneeded.get(stage.name) if self._culling else None
-        return SKIPPED if reason is None else StageTiming(0.0, True, reason)
+        return self._left_out.get(stage.name, SKIPPED)
 
-    def _due(self, stage: Stage) -> tuple[int, ...] | None:
+    def _due(self, stage: Stage) -> Any:
         """Versions of what ``stage`` reads, or None if it has already seen them or this frame does not need it."""
-        if self._culling and stage.name in self._unneeded:
+        name = stage.name
+        if self._culling and name in self._unneeded:
             return None
-        versions = self.arrays.versions(stage.wiring.reads)
-        return None if self._seen.get(stage.name) == versions else versions
+        versions = self._versions[name]()
+        return None if self._seen.get(name) == versions else versions
 
     def _begin(self, stage: Stage, passes: list[Pass]) -> list[Pass]:
         """Passes of a stage that take part in this frame."""
@@ -289,7 +295,11 @@ class Scheduler:
         return [step for step in passes if step.enabled is None or step.enabled()]
 
     def _publish(self, stage: Stage) -> None:
-        if stage.name in self._unneeded and stage.name in self._late:
+        if stage.name not in self._late:
+            for name in stage.wiring.writes:
+                self.arrays.touch(name)
+            return
+        if stage.name in self._unneeded:
             return  # what readers may miss is decided in frames that have readers, whether others are left out or not
         for name in stage.wiring.writes:
             if stage.changed(name) or self.arrays.version(name) == 0:
