@@ -35,6 +35,7 @@ from warp_ar.input.exposures import BracketPlan, brightened, find_exposure, plan
 from warp_ar.input.own_markers import OwnMarkers, Places, own_markers
 from warp_ar.input.plate import Plate, as_plate, check_plate, codes8
 from warp_ar.input.tracking import Track, Tracker, TrackState
+from warp_ar.kernels.printed_edges import fit_edges_kernel
 from warp_ar.light.captured import has_places
 from warp_ar.scene import Pose, Scene
 from warp_ar.scene.finite import check_finite
@@ -180,7 +181,9 @@ class Pipeline(Closing):
             watches_ball=self.plan.features.recovered and not self.plan.request.exposures,
             linear=deep,
         )
-        self._scheduler = Scheduler(self.plan, self._arrays, self.device, bands=bands, profile=profile, culling=culling)
+        more: dict[str, Any] = {"bands": bands, "profile": profile, "culling": culling}
+        tracking = [fit_edges_kernel] if self._tracker is not None or self._own_markers else []
+        self._scheduler = Scheduler(self.plan, self._arrays, self.device, on_host=tracking, **more)
         self._scheduler.launch_first(self.inputs.first_launches)
         short = self.plan.needs("short_frames")
         self._short = ShortFrames(self.plan.features, self._arrays, self.device) if short else None
@@ -496,6 +499,7 @@ class Pipeline(Closing):
             return pose.pose, pose.state
         if self._tracker is None or pose is not None:
             return pose, None
+        self._scheduler.prepare()
         if isinstance(image, wp.array):
             with exclusive(self.device):
                 image = image.numpy()

@@ -59,6 +59,7 @@ class Scheduler:
         bands: int | None = None,
         profile: bool = False,
         culling: bool = True,
+        on_host: Iterable[wp.Kernel] = (),
     ) -> None:
         """Allocate what the stages declared and build their passes.
 
@@ -69,8 +70,10 @@ class Scheduler:
             bands: Bands per CPU pass; None means one or two per core that this process may use.
             profile: On CUDA wait for every frame and time each stage on the device; stages then run one by one.
             culling: Whether stages that can change no pixel of a frame are left out of it.
+            on_host: Kernels that the CPU runs for others than stages: they are compiled with the stages'.
         """
         self.plan = plan
+        self._on_host = on_host
         self.arrays = arrays
         self.device = device
         cores = usable_cores()
@@ -195,7 +198,7 @@ class Scheduler:
         kernels = [kernel for kernel, size in launched if self._has_usual_blocks(kernel, size)]
         blocks = [(kernel, size) for kernel, size in launched if not self._has_usual_blocks(kernel, size)]
         own = [serve_kernel] if self._threads > 1 and self.device.is_cpu else []
-        load_modules([*own, *kernels, *host_kernels], self.device, progress, blocks=blocks)
+        load_modules([*own, *kernels, *host_kernels], self.device, progress, blocks=blocks, on_host=self._on_host)
         with wp.ScopedDevice(self.device), translating(self.device):
             for note in self._first_launches:
                 note.do()
