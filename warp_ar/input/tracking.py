@@ -46,6 +46,13 @@ Image = NDArray[np.uint8]
 _ENVIRONMENT = 0.6
 """Half width of the search around the last marker, beyond the marker itself, in its own sizes."""
 
+_NEAR = 0.5
+"""Distance of a marker from where it is expected, over the least size at which it is, within which no other is looked
+for."""
+
+_SHARP_AGAIN = 8
+"""Frames after which a marker that looked blurred is looked for as a sharp one again."""
+
 _REACH = (4.0, 3.0, 2.5, 2.5)
 """Half width of the sampled window in pixels, per Gauss-Newton step; a cell that is narrower limits it further."""
 
@@ -184,6 +191,7 @@ class Tracker:
         self._quality = 0.0
         self._evidence = 0.0
         self._rival = False
+        self._blurred = 0  # frames in which the marker is not looked for as a sharp one
 
     def track(self, image: Image, time: float) -> Track:
         """Find the marker in the next frame.
@@ -263,7 +271,7 @@ class Tracker:
             fit = self._fit_guess(guess) if len(self._pattern.markers) > 1 else None
             if fit is not None and fit.support >= _ENOUGH:
                 return fit
-            fit = self._fit_detections(self._detect(gray, origin, self._smallest(guess)), guess)
+            fit = self._fit_detections(self._detect_expected(gray, origin, guess), guess)
             if fit is None or not fit.edges:
                 # Perhaps only partly hidden or cut off, so that corners are missing or wrong: its edges may still be
                 # there.
@@ -292,9 +300,27 @@ class Tracker:
         sides = [self._project(guess.apply(c))[0] for c in self._pattern.markers.values()]
         return 0.6 * min(float(np.linalg.norm(s - np.roll(s, 1, 0), axis=1).mean()) for s in sides)
 
-    def _detect(self, gray: Image, origin: tuple[int, int] = (0, 0), smallest: float = 10.0) -> list[Detection]:
+    def _detect_expected(self, gray: Image, origin: tuple[int, int], guess: Pose) -> list[Detection]:
+        """The followed markers where they are expected; one marker first as a sharp one, if it lately was.
+
+        A marker that the narrow threshold sees, both see in the same place; one that it does not see may be blurred.
+        """
+        smallest = self._smallest(guess)
+        if len(self._pattern.markers) == 1 and self._blurred == 0:
+            found = self._detect(gray, origin, smallest, sharp=True)
+            expected = self._outline(guess)
+            if any(np.linalg.norm(d.corners - expected, axis=1).mean() < _NEAR * smallest for d in found):
+                return found
+            self._blurred = _SHARP_AGAIN
+        self._blurred = max(self._blurred - 1, 0)
+        return self._detect(gray, origin, smallest)
+
+    def _detect(
+        self, gray: Image, origin: tuple[int, int] = (0, 0), smallest: float = 10.0, *, sharp: bool = False
+    ) -> list[Detection]:
         """The followed markers in a part of the image that starts at pixel ``origin``, in pixels of the whole."""
-        found = [d for d in self._detector.detect(gray, max(smallest, 10.0)) if d.id in self._pattern.markers]
+        detected = self._detector.detect(gray, max(smallest, 10.0), sharp=sharp)
+        found = [d for d in detected if d.id in self._pattern.markers]
         return [Detection(d.id, d.corners + np.asarray(origin, np.float32)) for d in found]
 
     def _fit_detections(self, found: list[Detection], guess: Pose | None) -> _Fit | None:
@@ -416,11 +442,20 @@ class Tracker:
 
     def _judge(self, fit: _Fit) -> float:
         """Quality from what supports the pose and how well it is determined."""
-        deviations = np.sqrt(np.maximum(np.diag(np.linalg.pinv(fit.information)), 0.0))
+        deviations = np.sqrt(np.maximum(np.diag(_inverse(fit.information)), 0.0))
         turn = float(np.degrees(np.linalg.norm(deviations[:3])))
         shift = float(np.linalg.norm(deviations[3:]) / np.linalg.norm(fit.pose.translation)) * 100
         quality = min(1.0, fit.support / 0.9) / (1.0 + turn**2 + shift**2)
         return float(np.clip(quality * (0.5 if self._rival else 1.0), 0.0, 1.0))
+
+
+def _inverse(information: Array) -> Array:
+    """Covariance of a pose; where some motion of it is not seen at all, of the others."""
+    try:
+        inverse = np.linalg.inv(information)
+    except np.linalg.LinAlgError:
+        return np.linalg.pinv(information)
+    return inverse if inverse.diagonal().min() > 0.0 else np.linalg.pinv(information)
 
 
 def _holds(fit: _Fit | None) -> TypeGuard[_Fit]:
