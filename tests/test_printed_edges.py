@@ -1,4 +1,4 @@
-"""Edges of a print: the native fit against its NumPy twin, on pictures that are sharp, blurred, half hidden or small."""
+"""Edges of a print: the native fit against its NumPy twin, on sharp, blurred, half hidden and small ones."""
 
 from __future__ import annotations
 
@@ -15,9 +15,7 @@ from warp_ar.input.marker_pattern import make_pattern
 from warp_ar.scene import Camera, GridBoard, Marker, Pose
 
 PIXELS = 2e-4
-"""Between two fits of one picture: samples are interpolated in float32, which moves an edge of the least contrast by
-some 1e-5 pixel; one more or one less step of Gauss-Newton, whose bound a rounding may decide, by a tenth of that bound
-at the least contrast only. Measured at most 3e-5."""
+"""Between two fits of one picture: samples are interpolated in float32. Measured at most 3e-5."""
 RELATIVE = 1e-3
 """Of errors, supports, costs and information, which fall with the square of residuals of 0.01 pixel."""
 REACHES = (4.0, 3.0, 2.5, 2.5)
@@ -101,7 +99,8 @@ def test_part_of_a_picture_is_read_alone():
         CAMERA, width=gray.shape[1], height=gray.shape[0], cx=CAMERA.cx - columns.start, cy=CAMERA.cy - rows.start
     )
     expected, part = reference.fit_edges(gray, pattern, camera, truth, REACHES), fitter.fit([truth], REACHES)[0]
-    assert expected is not None and part["fitted"]
+    assert expected is not None
+    assert part["fitted"]
     assert part["support"] < 0.8 * first["support"]
     assert part["support"] == pytest.approx(expected.support, rel=RELATIVE)
 
