@@ -45,7 +45,7 @@ class Demand:
             the same object for as long as they are the same.
         """
         if self._last is not None and self._last[0] == reach:
-            return self._last[1], ()
+            return self._last[1], frozenset()
         wanted = set(self._outputs)
         resting: dict[str, str] = {}
         clearing: set[str] = set()
