@@ -50,7 +50,7 @@ class SeenFrame:
     image: Any
     """As it was given, or a copy of one's own."""
     slot: Slot | None
-    """Its way to the device, where that has begun."""
+    """Where it is sent to the device from, where copying it there has begun."""
     pose: Pose | None
     lost: bool
     index: int
@@ -115,6 +115,7 @@ class FrameInputs:
         watches_ball = watches_ball and scene.has_marker and bool(scene.probes)
         self._cover = BallCover(scene, camera) if watches_ball else None
         self._reflectance = ReflectanceWatch(scene, camera, self.decode) if watches_ball else None
+        self._coming: Slot | None = None
         self.covered = False
         """Whether something covers a ball in the frame: it then tells nothing of the light."""
         self._saturation_is_known = False
@@ -265,7 +266,7 @@ class FrameInputs:
         self._arrays.touch("exposure")
 
     def write(self, frame: SeenFrame, *, reset: bool) -> None:
-        """Make ``frame`` the one that stages read: its values, then its picture.
+        """Make ``frame`` the one that stages read: its values, then its picture, which the device must ``receive``.
 
         Args:
             frame: A frame whose marker is not lost.
@@ -412,10 +413,17 @@ class FrameInputs:
         self._linear_clip.assign(frame.plate.clip_levels(str(self._camera.transfer), self.saturation.levels))
         return True
 
+    def receive(self) -> None:
+        """Have what is launched from now on see the picture that was written, where it is on its way to the device."""
+        slot, self._coming = self._coming, None
+        if slot is not None and self.transfers is not None:
+            self.transfers.send(slot)
+            self.transfers.receive(slot, self.frame)
+
     def _take_picture(self, frame: SeenFrame) -> bool:
         """Copy the picture; False if it is the one that is there: then nothing that reads it needs to run."""
-        if frame.slot is not None and self.transfers is not None:
-            self.transfers.receive(frame.slot, self.frame)
+        if frame.slot is not None:
+            self._coming = frame.slot  # received as late as can be: it is being copied meanwhile
         elif isinstance(frame.image, wp.array):
             wp.copy(self.frame, frame.image)
         else:

@@ -256,12 +256,16 @@ class Scheduler:
         finally:
             self._alone, self.clock = before
 
-    def run(self) -> Mapping[str, StageTiming]:
-        """Run the stages that this frame needs and whose inputs changed since they ran; returns the time of each."""
+    def run(self, receive: Callable[[], None] | None = None) -> Mapping[str, StageTiming]:
+        """Run the stages that this frame needs and whose inputs changed since they ran; returns the time of each.
+
+        Args:
+            receive: Called on CUDA before anything is launched, once it is known what will be.
+        """
         self.prepare()
         self._look()
         if not self.device.is_cpu:
-            return self._run_captured()
+            return self._run_captured(receive)
         return self._run_eager() if self._crew is None or self._alone else self._run_side_by_side(self._crew)
 
     def _look(self) -> None:
@@ -383,7 +387,7 @@ class Scheduler:
             step.launch(rows)
         self._translated.add(id(step))
 
-    def _run_captured(self) -> dict[str, StageTiming]:
+    def _run_captured(self, receive: Callable[[], None] | None) -> dict[str, StageTiming]:
         due: list[Step] = []
         pattern: list[Any] = []
         timings: dict[str, StageTiming] = {}
@@ -397,11 +401,13 @@ class Scheduler:
             pattern.append((stage.name, *map(id, chosen)) if stage.name in self._changing else stage.name)
             self._seen[stage.name] = versions
             self._publish(stage)
-        if not due:
-            return timings
         key = tuple(pattern)
         if key not in self._patterns:
             self._patterns[key] = _segments(due)
+        if receive is not None:
+            receive()
+        if not due:
+            return timings
         start = self.clock()
         for segment in self._patterns[key]:
             if segment.on_host:
