@@ -74,7 +74,7 @@ def hosts_side(monkeypatch: pytest.MonkeyPatch) -> tuple[Callable[[tuple[int, in
     """Transfers without a device: what they copy there is copied at once, and noted."""
     done: list[str] = []
     empty, zeros, copy = wp.empty, wp.zeros, wp.copy
-    names = iter("up down".split())
+    names = iter(["up", "down"])
 
     def noted_copy(target: Any, source: Any, stream: Any) -> None:
         done.append(f"{stream.name} copy")

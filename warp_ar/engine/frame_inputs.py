@@ -6,6 +6,7 @@ import copy
 import dataclasses
 import functools
 import itertools
+import struct
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -37,13 +38,15 @@ from warp_ar.scene.ray_scene import HostScene
 from warp_ar.scene.screen_extents import EMPTY, Outline, Rect, screen_rects
 from warp_ar.stages.base import Arrays, Reach, Rows
 
+_CLOCK = struct.Struct("<2f2i")
+"""Of the frame's values, one behind the other: ``time``, ``time_step``, ``frame_index``, ``environment_reset``."""
 _ALL_RECTS = ("object", "light", "direct", "shadow", "ball")
 """As the frame's values hold them, one behind the other."""
 RECTS = ("object", "light", "shadow", "ball")
 """Parts of the screen to whose rows passes keep; the frame's values hold them whole."""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(slots=True)
 class SeenFrame:
     """A frame that has been looked at, not rendered."""
 
@@ -128,6 +131,7 @@ class FrameInputs:
         values = self.block.host("params")
         self._params = {name: values[name] for name in values.dtype.names}
         self._all_rects = values.view(np.uint8)[values.dtype.fields[f"{_ALL_RECTS[0]}_rect"][1] :].view(np.int32)
+        self._clock = values.view(np.uint8)[values.dtype.fields["time"][1] :].data
         self._looked_at: tuple[Any, ...] | None = None
         """From where at what, when rectangles were written last."""
         self._shines = True
@@ -277,13 +281,9 @@ class FrameInputs:
         if not self.covered:
             self._note_saturation(frame)  # before lights are written, which shine by it
         touched += self._place(frame)
-        params = self._params
         if (frame.pose is not None and self._move(frame.pose)) or self._arrays.version("pose") == 0:
             touched.append("pose")
-        params["time"][0] = frame.seconds
-        params["time_step"][0] = frame.step
-        params["frame_index"][0] = frame.index
-        params["environment_reset"][0] = reset
+        _CLOCK.pack_into(self._clock, 0, frame.seconds, frame.step, frame.index, reset)
         self.block.upload()
         if self._take_picture(frame):
             touched.append("frame")

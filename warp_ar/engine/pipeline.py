@@ -463,22 +463,22 @@ class Pipeline(Closing):
         """Begin a frame's way to the device, where that is another and the frame is not there."""
         if self.inputs.transfers is None or frame.lost or isinstance(frame.image, wp.array):
             return frame
-        return dataclasses.replace(frame, slot=self.inputs.transfers.begin(frame.image))
+        frame.slot = self.inputs.transfers.begin(frame.image)
+        return frame
 
     def _hand_over(self, frame: SeenFrame) -> Future[Rendered]:
         """Have a frame of the host rendered: on CUDA launched by this thread, on CPU by another."""
         while len(self._ahead) >= AHEAD:
             self._ahead.popleft().result()
-        transfers, sent = self.inputs.transfers, self._send(frame)
+        transfers, frame = self.inputs.transfers, self._send(frame)
         if frame.lost or not self._launches_here:
-            if transfers is not None and sent.slot is not None:
-                transfers.send(sent.slot)
-            # The caller may write its picture anew before it is rendered, unless nobody may.
-            image = frame.image.copy() if frame.image.flags.writeable else frame.image
-            sent = dataclasses.replace(sent, image=image)
+            if transfers is not None and frame.slot is not None:
+                transfers.send(frame.slot)
+            if frame.image.flags.writeable:
+                frame.image = frame.image.copy()  # the caller may write its picture anew before it is rendered
 
         def render() -> Rendered:
-            return self._keep(self._render(sent))
+            return self._keep(self._render(frame))
 
         if self._launches_here:
             self._ahead.append(done_at_once(render))

@@ -312,8 +312,10 @@ class Scheduler:
             if stage.changed(name) or self.arrays.version(name) == 0:
                 self.arrays.touch(name)
 
-    def _run_eager(self) -> dict[str, StageTiming]:
+    def _run_eager(self, receive: Callable[[], None] | None = None) -> dict[str, StageTiming]:
         """Stage after stage, on this thread."""
+        if receive is not None:
+            receive()
         timings: dict[str, StageTiming] = {}
         for stage, passes in self._stages:
             versions = self._due(stage)

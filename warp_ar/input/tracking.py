@@ -265,8 +265,7 @@ class Tracker:
     def _measure(self, image: Image, guess: Pose | None) -> _Fit | None:
         """The pose in this image alone; ``guess`` only says where to look, and which of two like poses to prefer."""
         if guess is not None:
-            box = self._around(self._outline(guess))
-            gray, origin = self._show(image, box), (box[1].start, box[0].start)
+            gray, origin = self._show_around(image, guess)
             # A board has no second pose to confuse it with, and dozens of markers to decode: its edges come first.
             fit = self._fit_guess(guess) if len(self._pattern.markers) > 1 else None
             if fit is not None and fit.support >= _ENOUGH:
@@ -280,7 +279,17 @@ class Tracker:
                 return fit
         found = self._detect(self._show(image))
         self._rival = len(found) > len({d.id for d in found})
-        return self._fit_detections(found, guess)
+        fit = self._fit_detections(found, guess)
+        if fit is None or not fit.edges or self._rival or len(self._pattern.markers) > 1:
+            return fit
+        # Found as it will be in the next frame, so that a marker that stands still does so from the first frame on.
+        found = self._detect_expected(*self._show_around(image, fit.pose), fit.pose)
+        return self._fit_detections(found, fit.pose) or fit
+
+    def _show_around(self, image: Image, guess: Pose) -> tuple[Image, tuple[int, int]]:
+        """The part of the image around where the marker is expected, in grey, and at which pixel it starts."""
+        box = self._around(self._outline(guess))
+        return self._show(image, box), (box[1].start, box[0].start)
 
     def _show(self, image: Image, box: Box | None = None) -> Image:
         """A part of the image in grey, all of it where none is named: what is detected in and fitted to."""
