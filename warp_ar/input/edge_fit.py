@@ -91,8 +91,7 @@ class EdgeFitter:
             reaches: Half width of the sampled window in pixels per Gauss-Newton step, ``MOST_REACHES`` or fewer.
 
         Returns:
-            Records of ``EdgeFit``, one for each, and the information of each beside it, (6, 6), by ``information``;
-            they hold until the next call.
+            Records of ``EdgeFit``, one for each; they hold until the next call, as does ``information``.
         """
         if self._launch is None:
             self._launch = printed_edges.record_fit_edges(*self._given)
@@ -106,4 +105,4 @@ class EdgeFitter:
 
     def information(self, index: int) -> Array:
         """Inverse covariance (6, 6) of rotation vector and translation of a pose of the last call, a copy."""
-        return self._information[index].copy()
+        return np.array(self._information[index])

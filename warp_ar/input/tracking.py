@@ -24,6 +24,7 @@ References:
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import enum
 from collections.abc import Sequence
@@ -432,8 +433,9 @@ class Tracker:
                 fits.append(None)
                 continue
             pose = Pose(found["rotation"].copy(), found["translation"].copy())
-            values = (float(found[name]) for name in ("error", "support", "cost", "pattern"))
-            fits.append(_Fit(pose, self._fitter.information(index), *values, edges=True))
+            error, support, cost, pattern = (float(found[name]) for name in ("error", "support", "cost", "pattern"))
+            information = self._fitter.information(index)
+            fits.append(_Fit(pose, information, error, support, cost, pattern, edges=True))
         return fits
 
     def _steadied(self, fit: _Fit, guess: Pose | None, time: float) -> Pose:
@@ -460,11 +462,11 @@ class Tracker:
 
 def _inverse(information: Array) -> Array:
     """Covariance of a pose; where some motion of it is not seen at all, of the others."""
-    try:
-        inverse = np.linalg.inv(information)
-    except np.linalg.LinAlgError:
-        return np.linalg.pinv(information)
-    return inverse if inverse.diagonal().min() > 0.0 else np.linalg.pinv(information)
+    with contextlib.suppress(np.linalg.LinAlgError):
+        inverse = np.asarray(np.linalg.inv(information), float)
+        if inverse.diagonal().min() > 0.0:
+            return inverse
+    return np.asarray(np.linalg.pinv(information), float)
 
 
 def _holds(fit: _Fit | None) -> TypeGuard[_Fit]:
