@@ -60,6 +60,8 @@ _PERCENTILE = wp.constant(wp.float64(0.05))
 _EPSILON = wp.constant(wp.float64(2.220446049250313e-16))
 
 vec8d = wp.types.vector(8, wp.float64)
+vec9d = wp.types.vector(UNKNOWNS, wp.float64)
+mat99d = wp.types.matrix((UNKNOWNS, UNKNOWNS), wp.float64)
 
 
 @wp.struct
@@ -111,9 +113,9 @@ class EdgeFit:
 
 @wp.struct
 class Scratch:
-    """Room for each pose's equations: rows of ``UNKNOWNS``, and the normal ones with their right sides."""
+    """Room for each pose's equations: rows, and the normal ones with their right sides."""
 
-    design: wp.array3d[wp.float64]  # (poses, m, 9)
+    design: wp.array2d[vec9d]  # (poses, m)
     work: wp.array3d[wp.float64]  # (poses, 4, max(m, c)): contrasts or residuals, offsets, weights, what is sorted
     normal: wp.array3d[wp.float64]  # (poses, 9, 10)
 
@@ -256,7 +258,7 @@ def solve_system(system: wp.array2d[wp.float64], size: wp.int32) -> wp.int32:
 
 @wp.func
 def add_equations(
-    design: wp.array2d[wp.float64],
+    design: wp.array[vec9d],
     offsets: wp.array[wp.float64],
     weights: wp.array[wp.float64],
     count: wp.int32,
@@ -264,20 +266,19 @@ def add_equations(
 ):
     """Normal equations of weighted rows. The shift of edges is a fraction of a pixel: that is its prior, without which
     a print without inner edges could not tell it from distance."""
-    for i in range(_UNKNOWNS):
-        for j in range(_UNKNOWNS + 1):
-            normal[i, j] = _ZERO
+    products = mat99d()
+    right = vec9d()
     for k in range(count):
-        for i in range(_UNKNOWNS):
-            weighted = weights[k] * design[k, i]
-            for j in range(i, _UNKNOWNS):
-                normal[i, j] = normal[i, j] + weighted * design[k, j]
-            normal[i, _UNKNOWNS] = normal[i, _UNKNOWNS] + weighted * offsets[k]
+        row = design[k]
+        weighted = weights[k] * row
+        products += wp.outer(weighted, row)
+        right += offsets[k] * weighted
     for i in range(_UNKNOWNS):
+        for j in range(_UNKNOWNS):
+            normal[i, j] = products[i, j]
         if i >= 6:
-            normal[i, i] = normal[i, i] + _ONE
-        for j in range(i):
-            normal[i, j] = normal[j, i]
+            normal[i, i] = products[i, i] + _ONE
+        normal[i, _UNKNOWNS] = right[i]
 
 
 @wp.func
@@ -302,7 +303,7 @@ def measure_edges(
     asked: Asked,
     fit: EdgeFit,
     reach: wp.float64,
-    design: wp.array2d[wp.float64],
+    design: wp.array[vec9d],
     work: wp.array2d[wp.float64],
 ) -> wp.int32:
     """One row of equations for each edge that is seen, and how far it lies from where it is expected.
@@ -367,12 +368,17 @@ def measure_edges(
                 offsets[i] = wp.min(wp.max(half * ((_TWO * white - area) / contrast - _ONE), -half), half)
             pull = nx * found.dx + ny * found.dy
             turning = wp.cross(arm, pull)
-            for j in range(3):
-                design[i, j] = turning[j]
-                design[i, 3 + j] = pull[j]
-            design[i, 6] = _ONE
-            design[i, 7] = nx * nx - ny * ny
-            design[i, 8] = _TWO * nx * ny
+            design[i] = vec9d(
+                turning[0],
+                turning[1],
+                turning[2],
+                pull[0],
+                pull[1],
+                pull[2],
+                _ONE,
+                nx * nx - ny * ny,
+                _TWO * nx * ny,
+            )
     if inside < _MIN_EDGES:
         return 0
     least = wp.max(_CONTRAST * median_value(sorted_out, inside), _LEAST_CONTRAST)
@@ -380,15 +386,14 @@ def measure_edges(
     for i in range(m):
         if contrasts[i] > least:
             offsets[seen] = offsets[i]
-            for j in range(_UNKNOWNS):
-                design[seen, j] = design[i, j]
+            design[seen] = design[i]
             seen += 1
     return seen
 
 
 @wp.func
 def solve_robustly(
-    design: wp.array2d[wp.float64], work: wp.array2d[wp.float64], count: wp.int32, normal: wp.array2d[wp.float64]
+    design: wp.array[vec9d], work: wp.array2d[wp.float64], count: wp.int32, normal: wp.array2d[wp.float64]
 ) -> wp.float64:
     """Reweighted least squares; the solution is left in the last column of ``normal``.
 
@@ -406,10 +411,11 @@ def solve_robustly(
         add_equations(design, offsets, weights, count, normal)
         if solve_system(normal, _UNKNOWNS) == 0:
             return -_ONE
+        solution = vec9d()
+        for j in range(_UNKNOWNS):
+            solution[j] = normal[j, _UNKNOWNS]
         for k in range(count):
-            residual = offsets[k]
-            for j in range(_UNKNOWNS):
-                residual -= design[k, j] * normal[j, _UNKNOWNS]
+            residual = offsets[k] - wp.dot(design[k], solution)
             residuals[k] = residual
             sorted_out[k] = wp.abs(residual)
         spread = wp.max(_DEVIATION * select_value(sorted_out, count, count / 2), _NOISE_FLOOR)
@@ -519,12 +525,12 @@ def fit_edges_kernel(
             fit.rotation = turned(turn, fit.rotation)
             shift = wp.vec3d(normal[3, _UNKNOWNS], normal[4, _UNKNOWNS], normal[5, _UNKNOWNS])
             fit.translation = fit.translation + shift
+            motion = vec9d()
+            for j in range(6):
+                motion[j] = normal[j, _UNKNOWNS]
             moved = _ZERO
             for k in range(count):
-                along = _ZERO
-                for j in range(6):
-                    along += design[k, j] * normal[j, _UNKNOWNS]
-                moved = wp.max(moved, wp.abs(along))
+                moved = wp.max(moved, wp.abs(wp.dot(design[k], motion)))
             if reach == reaches[call.reaches - 1] or (reach <= reaches[1] and moved < _DONE):
                 step = call.reaches
     if spread >= _ZERO:
@@ -592,10 +598,10 @@ def record_fit_edges(
     m = printed.points.shape[0]
     scratch = Scratch()
     shapes = {
-        "design": (MOST_POSES, m, UNKNOWNS),
         "work": (MOST_POSES, 4, max(m, printed.cells.shape[0])),
         "normal": (MOST_POSES, UNKNOWNS, UNKNOWNS + 1),
     }
+    scratch.design = wp.zeros((MOST_POSES, m), dtype=vec9d, device="cpu")
     for name, shape in shapes.items():
         setattr(scratch, name, wp.zeros(shape, dtype=wp.float64, device="cpu"))
     inputs = [gray, linear, printed, lens, asked, reaches]
