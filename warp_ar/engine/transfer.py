@@ -226,10 +226,11 @@ class Transfers:
             # The next picture is sent there on the same stream, so after this one even if nobody waited for it.
             weakref.finalize(holder, self._free.append, buffer)
             kept = np.asarray(holder)
-        if slot.downloaded is not None:
-            self._compute.wait_event(slot.downloaded)
-        wp.copy(slot.image, image, stream=self._compute)
-        self._compute.record_event(buffer.rendered)
+        with exclusive(self._device):  # kernels of other pipelines may be captured on the same stream
+            if slot.downloaded is not None:
+                self._compute.wait_event(slot.downloaded)
+            wp.copy(slot.image, image, stream=self._compute)
+            self._compute.record_event(buffer.rendered)
         self._down.wait_event(buffer.rendered)
         wp.copy(buffer.array, slot.image, stream=self._down)
         self._down.record_event(buffer.done)
