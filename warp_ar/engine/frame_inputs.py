@@ -276,6 +276,7 @@ class FrameInputs:
             frame: A frame whose marker is not lost.
             reset: Whether what was accumulated of the environment is to be forgotten.
         """
+        self._coming = None  # of a frame that failed before it was received
         touched = ["clock", *self._place_probes(frame)]
         self.covered = self._is_covered(frame, reset=reset)
         if not self.covered:

@@ -474,8 +474,11 @@ class Pipeline(Closing):
         if frame.lost or not self._launches_here:
             if transfers is not None and frame.slot is not None:
                 transfers.send(frame.slot)
-            if frame.image.flags.writeable:
-                frame.image = frame.image.copy()  # the caller may write its picture anew before it is rendered
+            # The caller may write its picture anew before it is rendered, unless nobody may.
+            if frame.slot is not None and "image" in self._arrays:
+                frame.image = frame.slot.host  # no other comes there before this one is rendered: see ``AHEAD``
+            elif frame.image.flags.writeable:
+                frame.image = frame.image.copy()
 
         def render() -> Rendered:
             return self._keep(self._render(frame))

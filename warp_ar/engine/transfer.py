@@ -92,14 +92,10 @@ class _Copier:
         self._begun, self._done = threading.Lock(), threading.Lock()
         self._begun.acquire()
         self._done.acquire()
-        self._thread = threading.Thread(target=self._work, name="warp_ar-copy", daemon=True)
+        held = self._jobs, self._begun, self._done  # and not this object: the thread ends with it
+        self._thread = threading.Thread(target=_copy, args=held, name="warp_ar-copy", daemon=True)
         self._thread.start()
-
-    def _work(self) -> None:
-        while (job := self._jobs.get()) is not None:
-            self._begun.release()
-            np.copyto(*job)
-            self._done.release()
+        weakref.finalize(self, self._jobs.put, None)
 
     def begin(self, target: Image, source: Image) -> None:
         """Have a part copied."""
@@ -117,6 +113,15 @@ class _Copier:
         """End the thread."""
         self._jobs.put(None)
         self._thread.join()
+
+
+def _copy(jobs: queue.SimpleQueue[tuple[Image, Image] | None], begun: threading.Lock, done: threading.Lock) -> None:
+    """The life of a copying thread."""
+    while (job := jobs.get()) is not None:
+        begun.release()
+        np.copyto(*job)
+        del job  # the caller's picture is not held until the next one comes
+        done.release()
 
 
 class Transfers:
