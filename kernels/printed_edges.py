@@ -264,8 +264,11 @@ def add_equations(
     count: wp.int32,
     normal: wp.array2d[wp.float64],
 ):
-    """Normal equations of weighted rows. The shift of edges is a fraction of a pixel: that is its prior, without which
-    a print without inner edges could not tell it from distance."""
+    """Normal equations of weighted rows.
+
+    The shift of edges is a fraction of a pixel: that is its prior, without which a print without inner edges could not
+    tell it from distance.
+    """
     products = mat99d()
     right = vec9d()
     for k in range(count):
@@ -591,8 +594,8 @@ def record_fit_edges(
         asked: One record of ``Asked``.
         reaches: Half width of the sampled window in pixels, float64, per Gauss-Newton step; with none only the print
             is correlated.
-        fits_out: ``MOST_POSES`` records of ``EdgeFit``: the pose to begin with, then the one that fits. Where ``fitted``
-            is 0 the pose is of no use.
+        fits_out: ``MOST_POSES`` records of ``EdgeFit``: the pose to begin with, then the one that fits. Where
+            ``fitted`` is 0 the pose is of no use.
         information_out: (``MOST_POSES``, 6, 6) inverse covariance of rotation vector and translation.
     """
     m = printed.points.shape[0]
