@@ -66,6 +66,19 @@ def test_an_idle_stage_clears_once_and_rests_with_what_only_it_reads() -> None:
     assert demand.look(EMPTY)[1] == {"shade"}, "it has written since"
 
 
+def test_frames_of_one_reach_have_one_answer() -> None:
+    """The same object, so that nothing need be made of it anew; until arrays are taken to hold something again."""
+    demand = Demand(STEPS, ("image",))  # type: ignore[arg-type]
+    cleared = demand.look(EMPTY)[0]
+    resting = demand.look(EMPTY)[0]
+    assert cleared == {}
+    assert demand.look(Reach(objects=False))[0] is resting
+    assert demand.look(NOTHING)[1] == {"relight"}
+    assert demand.look(EMPTY)[0] == resting
+    demand.forget()
+    assert demand.look(EMPTY) == ({}, {"shade"})
+
+
 def test_what_accumulates_over_frames_runs_though_nothing_reads_it() -> None:
     demand = Demand(STEPS, ("image",))  # type: ignore[arg-type]
     demand.look(NOTHING)

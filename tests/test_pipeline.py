@@ -7,6 +7,7 @@ import dataclasses
 import math
 import os
 import re
+from collections.abc import Callable
 
 import numpy as np
 import numpy.typing as npt
@@ -211,7 +212,7 @@ def test_calls_updates_and_hand_overs_wait_for_what_was_submitted(frames: Frames
 def test_an_error_while_rendering_is_raised_with_its_result(frames: Frames) -> None:
     with Pipeline(make_scene(), device="cpu", quality="low") as pipeline:
 
-        def fail() -> None:
+        def fail(receive: Callable[[], None]) -> None:
             raise RuntimeError("broken stage")
 
         pipeline._scheduler.run = fail  # type: ignore[assignment]

@@ -14,15 +14,18 @@ import pytest
 from tests.recover_rig import scene, solve_here  # noqa: F401
 from tests.reference import recover as reference
 from warp_ar.engine.pipeline import Pipeline
+from warp_ar.input.sources import open_source
 from warp_ar.kernels import recover as kernels
 from warp_ar.kernels.recover_cells import CELL_COLUMNS, CELL_ROWS, Cell
 from warp_ar.light import recovery
 from warp_ar.light import surfaces as light_surfaces
 from warp_ar.light.config import CONFIG
 from warp_ar.light.estimate import Estimate
+from warp_ar.light.solving_process import SolvingPool, SolvingProcess
 from warp_ar.scene import Pose, load_scene
 from warp_ar.scene.description import SourceSpec
 from warp_ar.session import Session
+from warp_ar.stages import recover as recover_stage
 from warp_ar.stages.quality import PRESETS
 from warp_ar.stages.recover import LATENCY, Recover
 
@@ -103,6 +106,30 @@ def test_an_estimate_that_is_waited_for_lights_its_own_frame(scene, device, monk
     spied_estimates(monkeypatch, 0.05)
     expected = [1, 2, *[3] * 6, *[4] * 6, 5, 5]
     assert shown_estimates(scene, device, len(expected), estimates="synchronous") == expected
+
+
+def test_a_process_beside_delayed_frames_gives_the_same_light(scene, monkeypatch):
+    """As on CUDA, where frames are bound by the interpreter's lock: what takes effect, and when, are the same."""
+    first = load_scene("desk")
+    with contextlib.closing(open_source(first.source.path)) as source:
+        images = [frame.image.copy() for frame in itertools.islice(source, 20)]
+    quality, shown, solved = PRESETS["low"].with_methods(recover="shading"), [], []
+    solve = SolvingProcess.solve
+    monkeypatch.setattr(SolvingProcess, "solve", lambda *given: solved.append(1) or solve(*given))
+    for beside in (False, True):
+        monkeypatch.setattr(Recover, "_has_process", beside)
+        with contextlib.closing(SolvingPool(1)) as pool:
+            monkeypatch.setattr(recover_stage, "POOL", pool)
+            arguments = {"device": "cpu", "quality": quality, "outputs": ("environment",), "estimates": "delayed"}
+            with Pipeline(first, **arguments) as pipeline:
+                light = []
+                for index, image in enumerate(images):
+                    light.append(pipeline(image, time_seconds=index / 24.0).environment)
+                    while beside and not pool.ready:
+                        time.sleep(0.01)
+            shown.append(light)
+        assert bool(solved) == beside
+    np.testing.assert_array_equal(shown[0], shown[1])
 
 
 def what_is_seen(surroundings=0.4, table=0.3):

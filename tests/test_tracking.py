@@ -12,7 +12,7 @@ import pytest
 
 from warp_ar.errors import UsageError
 from warp_ar.input.markers import MarkerDetector, find_dictionary, make_board
-from warp_ar.input.tracking import Tracker, TrackState, _median
+from warp_ar.input.tracking import Tracker, TrackState
 from warp_ar.scene import Camera, CharucoBoard, GridBoard, Marker, Pose
 
 RENDERED_DEGREES, RENDERED_MM = 0.15, 0.4
@@ -589,9 +589,3 @@ def test_wrong_image():
     ):
         with pytest.raises(UsageError, match=r"\(480, 640, 3\)"):
             tracker.track(image, 0.0)
-
-
-@pytest.mark.parametrize("count", [1, 2, 3, 16, 17, 184])
-def test_the_middle_of_values_is_numpys(count):
-    values = np.random.default_rng(count).normal(size=count)
-    assert _median(values) == np.median(values)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -48,7 +50,72 @@ def test_what_is_on_its_way_arrives_before_its_memory_goes(monkeypatch: pytest.M
     waited: list[str] = []
     monkeypatch.setattr(transfer, "wait_for", waited.append)
     transfers = Transfers.__new__(Transfers)
-    transfers._pool = None
+    transfers._copiers = []
     transfers._slots = [SimpleNamespace(downloaded=event) for event in ("first", "second", None)]
     transfers.close()
     assert waited == ["first", "second"]
+
+
+class _Stream:
+    """What is put on a stream, in order."""
+
+    def __init__(self, done: list[str], name: str) -> None:
+        self.done, self.name = done, name
+
+    def record_event(self, event: object) -> None:
+        self.done.append(f"{self.name} record")
+
+    def wait_event(self, event: object) -> None:
+        self.done.append(f"{self.name} wait")
+
+
+@pytest.fixture
+def hosts_side(monkeypatch: pytest.MonkeyPatch) -> tuple[Callable[[tuple[int, int]], Transfers], list[str]]:
+    """Transfers without a device: what they copy there is copied at once, and noted."""
+    done: list[str] = []
+    empty, zeros, copy = wp.empty, wp.zeros, wp.copy
+    names = iter(["up", "down"])
+
+    def noted_copy(target: Any, source: Any, stream: Any) -> None:
+        done.append(f"{stream.name} copy")
+        copy(target, source)
+
+    monkeypatch.setattr(wp, "zeros", lambda *given, pinned=False, **more: zeros(*given, **more))
+    monkeypatch.setattr(wp, "empty", lambda *given, pinned=False, **more: empty(*given, **more))
+    monkeypatch.setattr(wp, "Event", lambda *_, **__: SimpleNamespace())
+    monkeypatch.setattr(wp, "Stream", lambda device: _Stream(done, next(names)))
+    monkeypatch.setattr(wp, "get_stream", lambda device: _Stream(done, "compute"))
+    monkeypatch.setattr(wp, "copy", noted_copy)
+    monkeypatch.setattr(transfer, "wait_for", lambda event: None)
+    return lambda size: Transfers(size, wp.get_device("cpu")), done
+
+
+@pytest.mark.parametrize("size", [(48, 64), (1080, 1920)])
+def test_a_frame_is_sent_once_it_is_copied_whole(hosts_side, size: tuple[int, int]) -> None:
+    """By threads where it is large; once sent it may be written anew, and is not sent again."""
+    make, done = hosts_side
+    transfers, frame = make(size), wp.zeros(size, dtype=wp.vec3ub, device="cpu")
+    images = np.random.default_rng(1).integers(0, 256, (2 * transfer.SLOTS, *size, 3), np.uint8)
+    for image in images:
+        given = image.copy()
+        slot = transfers.begin(given)
+        done.clear()
+        transfers.send(slot)
+        given[...] = 0
+        assert done == ["up record", "up copy", "up record"]
+        transfers.send(slot)
+        assert len(done) == 3
+        transfers.receive(slot, frame)
+        np.testing.assert_array_equal(frame.numpy(), image)
+    transfers.close()
+
+
+def test_a_frame_that_was_begun_and_not_sent_holds_nobody_up(hosts_side) -> None:
+    """What comes between may fail: the next frame is begun all the same, and is whole."""
+    transfers, size = hosts_side[0]((1080, 1920)), (1080, 1920)
+    first, second = np.random.default_rng(2).integers(0, 256, (2, *size, 3), np.uint8)
+    transfers.begin(first)
+    slot = transfers.begin(second)
+    transfers.send(slot)
+    np.testing.assert_array_equal(slot.host, second)
+    transfers.close()

@@ -26,10 +26,13 @@ class Demand:
         """
         self._stages, self._outputs = stages, outputs
         self._clear: set[str] = set()
+        self._last: tuple[Reach, Mapping[str, str]] | None = None
+        """What was found last, where the next frame of the same reach is the same."""
 
     def forget(self) -> None:
         """Take it that no stage's arrays are clear."""
         self._clear.clear()
+        self._last = None
 
     def look(self, reach: Reach) -> tuple[Mapping[str, str], Collection[str]]:
         """Look at one frame.
@@ -38,8 +41,11 @@ class Demand:
             reach: What of the frame virtual objects and lights can reach.
 
         Returns:
-            Reasons of the stages that rest, by name, and names of those that run to clear their arrays.
+            Reasons of the stages that rest, by name, and names of those that run to clear their arrays. The reasons are
+            the same object for as long as they are the same.
         """
+        if self._last is not None and self._last[0] == reach:
+            return self._last[1], frozenset()
         wanted = set(self._outputs)
         resting: dict[str, str] = {}
         clearing: set[str] = set()
@@ -57,4 +63,6 @@ class Demand:
                 self._clear.add(name)
                 clearing.add(name)
             wanted |= set(stage.reads_for(reach))
+        # What is cleared in this frame rests in the next.
+        self._last = None if clearing else (reach, resting)
         return resting, clearing

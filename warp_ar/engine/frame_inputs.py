@@ -5,6 +5,8 @@ from __future__ import annotations
 import copy
 import dataclasses
 import functools
+import itertools
+import struct
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -33,21 +35,25 @@ from warp_ar.scene import Camera, Pose, Scene
 from warp_ar.scene.kinds import shape_kind
 from warp_ar.scene.pixel_rays import pixel_rays
 from warp_ar.scene.ray_scene import HostScene
-from warp_ar.scene.screen_extents import Outline, Rect, screen_rects
+from warp_ar.scene.screen_extents import EMPTY, Outline, Rect, screen_rects
 from warp_ar.stages.base import Arrays, Reach, Rows
 
+_CLOCK = struct.Struct("<2f2i")
+"""Of the frame's values, one behind the other: ``time``, ``time_step``, ``frame_index``, ``environment_reset``."""
+_ALL_RECTS = ("object", "light", "direct", "shadow", "ball")
+"""As the frame's values hold them, one behind the other."""
 RECTS = ("object", "light", "shadow", "ball")
 """Parts of the screen to whose rows passes keep; the frame's values hold them whole."""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(slots=True)
 class SeenFrame:
     """A frame that has been looked at, not rendered."""
 
     image: Any
     """As it was given, or a copy of one's own."""
     slot: Slot | None
-    """Its way to the device, where that has begun."""
+    """Where it is sent to the device from, where copying it there has begun."""
     pose: Pose | None
     lost: bool
     index: int
@@ -112,6 +118,7 @@ class FrameInputs:
         watches_ball = watches_ball and scene.has_marker and bool(scene.probes)
         self._cover = BallCover(scene, camera) if watches_ball else None
         self._reflectance = ReflectanceWatch(scene, camera, self.decode) if watches_ball else None
+        self._coming: Slot | None = None
         self.covered = False
         """Whether something covers a ball in the frame: it then tells nothing of the light."""
         self._saturation_is_known = False
@@ -119,9 +126,15 @@ class FrameInputs:
         self._bent = 0.0
         self._probes = scene.probes
         self.rects: dict[str, Rect] = dict.fromkeys(RECTS, (0, shape[0], 0, shape[1]))
+        self._written_rects: dict[str, Rect] = dict.fromkeys(_ALL_RECTS, EMPTY)
         # Views of every field, (1, ...): NumPy takes longer to find a field than to write it.
         values = self.block.host("params")
         self._params = {name: values[name] for name in values.dtype.names}
+        self._all_rects = values.view(np.uint8)[values.dtype.fields[f"{_ALL_RECTS[0]}_rect"][1] :].view(np.int32)
+        self._clock = values.view(np.uint8)[values.dtype.fields["time"][1] :].data
+        self._looked_at: tuple[Any, ...] | None = None
+        """From where at what, when rectangles were written last."""
+        self._shines = True
         self._add(scene, device)
         self._params["focal"][0] = (camera.fx, camera.fy)
         self._params["principal"][0] = (camera.cx, camera.cy)
@@ -257,24 +270,21 @@ class FrameInputs:
         self._arrays.touch("exposure")
 
     def write(self, frame: SeenFrame, *, reset: bool) -> None:
-        """Make ``frame`` the one that stages read: its values, then its picture.
+        """Make ``frame`` the one that stages read: its values, then its picture, which the device must ``receive``.
 
         Args:
             frame: A frame whose marker is not lost.
             reset: Whether what was accumulated of the environment is to be forgotten.
         """
+        self._coming = None  # of a frame that failed before it was received
         touched = ["clock", *self._place_probes(frame)]
         self.covered = self._is_covered(frame, reset=reset)
         if not self.covered:
             self._note_saturation(frame)  # before lights are written, which shine by it
         touched += self._place(frame)
-        params = self._params
         if (frame.pose is not None and self._move(frame.pose)) or self._arrays.version("pose") == 0:
             touched.append("pose")
-        params["time"][0] = frame.seconds
-        params["time_step"][0] = frame.step
-        params["frame_index"][0] = frame.index
-        params["environment_reset"][0] = reset
+        _CLOCK.pack_into(self._clock, 0, frame.seconds, frame.step, frame.index, reset)
         self.block.upload()
         if self._take_picture(frame):
             touched.append("frame")
@@ -295,6 +305,8 @@ class FrameInputs:
             return False
         if reset:
             self._cover.forget()
+        if self._cover.rests(frame.seconds):
+            return self._cover.is_covered
         discs = ball_discs(self._probes, self._camera, frame.pose)
         return self._cover.observe(frame.image, discs, frame.pose, frame.seconds, self.gain, frame.plate)
 
@@ -337,23 +349,27 @@ class FrameInputs:
         if scene.write_proxies(block.host("proxies"), places):
             yield "pose"  # all that asks where the receiver is asks where the camera is
         if lights or frame.index == 0:
+            self._shines = scene.has_area_lights or bool(block.host("lights")["intensity"].any())
             yield "lights"
         if objects or frame.index == 0:
             yield "objects"
 
     def _move(self, pose: Pose) -> bool:
         """Put the camera at ``pose``, find what virtual objects and lights can reach; whether it moved."""
-        params = self._params
-        position, rotation = params["camera_position"], params["world_from_camera"]
+        outlines = self._outlines()
+        looked_at = (pose.rotation.tobytes(), pose.translation.tobytes(), *outlines.values())
+        if looked_at == self._looked_at:
+            return False
+        self._looked_at = looked_at
+        position, rotation = self._params["camera_position"], self._params["world_from_camera"]
         before = position.tobytes(), rotation.tobytes()
         inverse = pose.inverse()
         position[0], rotation[0] = inverse.translation, inverse.rotation
-        outlines = self._outlines()
         rects = dict(zip(outlines, screen_rects(list(outlines.values()), pose, self._camera), strict=True))
         rects.setdefault("light", rects["direct"])
         self.rects.update(rects)
-        for name, rect in rects.items():
-            params[f"{name}_rect"][0] = rect
+        self._written_rects.update(rects)
+        self._all_rects[:] = list(itertools.chain(*self._written_rects.values()))
         return before != (position.tobytes(), rotation.tobytes())
 
     def _outlines(self) -> dict[str, Outline]:
@@ -376,9 +392,8 @@ class FrameInputs:
         """What of this frame virtual objects and lights can reach."""
         rects = (self.rects[name] for name in RECTS)
         objects, light, shadows, balls = (rect[0] < rect[1] and rect[2] < rect[3] for rect in rects)
-        shines = self.host_scene.has_area_lights or bool(self.block.host("lights")["intensity"].any())
         falls = bool(self.host_scene.light_outline().polygons)
-        return Reach(objects=objects, shines=shines, falls=falls, light=light, shadows=shadows, balls=balls)
+        return Reach(objects=objects, shines=self._shines, falls=falls, light=light, shadows=shadows, balls=balls)
 
     def radiance(self, plate: Plate) -> npt.NDArray[np.float32]:
         """A plate as linear radiance, by what frames have told of the camera's tone curve; an array of its own."""
@@ -399,10 +414,17 @@ class FrameInputs:
         self._linear_clip.assign(frame.plate.clip_levels(str(self._camera.transfer), self.saturation.levels))
         return True
 
+    def receive(self) -> None:
+        """Have what is launched from now on see the picture that was written, where it is on its way to the device."""
+        slot, self._coming = self._coming, None
+        if slot is not None and self.transfers is not None:
+            self.transfers.send(slot)
+            self.transfers.receive(slot, self.frame)
+
     def _take_picture(self, frame: SeenFrame) -> bool:
         """Copy the picture; False if it is the one that is there: then nothing that reads it needs to run."""
-        if frame.slot is not None and self.transfers is not None:
-            self.transfers.receive(frame.slot, self.frame)
+        if frame.slot is not None:
+            self._coming = frame.slot  # received as late as can be: it is being copied meanwhile
         elif isinstance(frame.image, wp.array):
             wp.copy(self.frame, frame.image)
         else:

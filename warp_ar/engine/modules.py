@@ -17,7 +17,7 @@ import shutil
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
@@ -51,6 +51,7 @@ def load_modules(
     progress: Progress | None = None,
     *,
     blocks: Iterable[tuple[wp.Kernel, int]] = (),
+    on_host: Iterable[wp.Kernel] = (),
 ) -> None:
     """Compile the modules of ``kernels`` where they are not in the cache, and load them.
 
@@ -59,21 +60,49 @@ def load_modules(
         device: Warp device.
         progress: Told after each module; on the caller's thread.
         blocks: Kernels that CUDA runs in blocks of another size than its usual one, and that size.
+        on_host: Kernels that the CPU runs, whatever the device.
     """
-    kernels, blocks = list(kernels), list(blocks)
+    kernels, blocks, on_host = list(kernels), list(blocks), list(on_host)
+    if device.is_cpu:
+        kernels, on_host = [*on_host, *kernels], []
     found: dict[tuple[Any, int | None], None] = dict.fromkeys((kernel.module, None) for kernel in kernels)
     found |= dict.fromkeys(((kernel.module, size) for kernel, size in blocks))
     with compiling():
         choose([*kernels, *(kernel for kernel, _ in blocks)], device)
-        missing = [variant for variant in found if not _is_cached(*variant, device)]
-        if missing:
-            # The last stages have the longest kernels: begun last they would keep one thread busy alone.
-            _compile(missing[::-1], device, progress)
+        with _loading_on_host(on_host):
+            _compile_missing(found, device, progress)
         for module, size in found:
             with exclusive(device):
                 _load(module, device, size)
         if device.is_cpu:
             compile_better(_Headers([]).store)
+
+
+def _compile_missing(found: Iterable[tuple[Any, int | None]], device: Any, progress: Progress | None) -> None:
+    missing = [variant for variant in found if not _is_cached(*variant, device)]
+    if missing:
+        # The last stages have the longest kernels: begun last they would keep one thread busy alone.
+        _compile(missing[::-1], device, progress)
+
+
+@contextlib.contextmanager
+def _loading_on_host(kernels: list[wp.Kernel]) -> Iterator[None]:
+    """Have kernels loaded on the CPU beside what is done meanwhile, and compiled where they are not in the cache."""
+    if not kernels:
+        yield
+        return
+
+    def load() -> None:
+        headers = _Headers({_flags(kernel.module) for kernel in kernels})
+        for kernel in kernels:
+            with headers.shared(_flags(kernel.module)):
+                _load(kernel.module, wp.get_device("cpu"))
+        headers.close()
+
+    with ThreadPoolExecutor(1, "warp_ar-load") as pool:
+        loading = pool.submit(load)
+        yield
+        loading.result()
 
 
 def begin_slowest(kernels: Iterable[wp.Kernel], device: Any) -> None:

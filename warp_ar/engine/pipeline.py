@@ -26,7 +26,7 @@ from warp_ar.engine.frame_inputs import FrameInputs, SeenFrame
 from warp_ar.engine.graph import make_plan
 from warp_ar.engine.layers import LayerArrays, layer_arrays, neutral_layers
 from warp_ar.engine.modules import Progress, begin_slowest
-from warp_ar.engine.result import TRACK, Rendered, Result
+from warp_ar.engine.result import TRACK, Rendered, Result, done_at_once
 from warp_ar.engine.scheduler import Scheduler, StageTiming
 from warp_ar.engine.short_frames import ShortFrames
 from warp_ar.engine.transfer import Image
@@ -35,6 +35,7 @@ from warp_ar.input.exposures import BracketPlan, brightened, find_exposure, plan
 from warp_ar.input.own_markers import OwnMarkers, Places, own_markers
 from warp_ar.input.plate import Plate, as_plate, check_plate, codes8
 from warp_ar.input.tracking import Track, Tracker, TrackState
+from warp_ar.kernels.printed_edges import fit_edges_kernel
 from warp_ar.light.captured import has_places
 from warp_ar.scene import Pose, Scene
 from warp_ar.scene.finite import check_finite
@@ -180,8 +181,13 @@ class Pipeline(Closing):
             watches_ball=self.plan.features.recovered and not self.plan.request.exposures,
             linear=deep,
         )
-        self._scheduler = Scheduler(self.plan, self._arrays, self.device, bands=bands, profile=profile, culling=culling)
+        more: dict[str, Any] = {"bands": bands, "profile": profile, "culling": culling}
+        tracking = [fit_edges_kernel] if self._tracker is not None or self._own_markers else []
+        self._scheduler = Scheduler(self.plan, self._arrays, self.device, on_host=tracking, **more)
         self._scheduler.launch_first(self.inputs.first_launches)
+        waits = profile or self.plan.request.asks_for_layers or self.plan.request.estimates == "synchronous"
+        self._launches_here = self.inputs.transfers is not None and "image" in self._arrays and not waits
+        """Whether the caller's thread launches submitted frames: that waits for nothing on the device."""
         short = self.plan.needs("short_frames")
         self._short = ShortFrames(self.plan.features, self._arrays, self.device) if short else None
 
@@ -375,9 +381,10 @@ class Pipeline(Closing):
     ) -> Result:
         """Light one frame without waiting for it; arguments as those of a call.
 
-        This thread looks for the marker and hands the frame over; another renders it, and on CUDA sends its picture
-        ahead. With the next frame submitted before this one's image is read, tracking, both ways over the bus and the
-        kernels run side by side. The device's own arrays of a result still hold only until the next frame is rendered.
+        This thread looks for the marker. On CUDA it launches the frame while others copy the picture to where it is
+        sent from, and its picture is sent ahead; on CPU another thread renders it. With the next frame submitted before
+        this one's image is read, tracking, both ways over the bus and the kernels run side by side. The device's own
+        arrays of a result still hold only until the next frame is rendered.
         An image that may not be written (``flags.writeable``) is taken to stay as it is, and not copied.
         """
         return self._begin(image, time_seconds, pose, exposure_time, ahead=True)
@@ -446,8 +453,7 @@ class Pipeline(Closing):
             self._finish()
         if exposure != self.bracket.reference:
             return self._take_short(image, host_image, exposure, now, pose)
-        frame, state = self._look(image if host_image is None else host_image, now, pose)
-        frame = dataclasses.replace(frame, plate=plate)
+        frame, state = self._look(image if host_image is None else host_image, now, pose, plate)
         if handed_over:
             return Result(frame.pose, state, self._hand_over(frame))
         rendered = self._render(self._send(frame))
@@ -457,19 +463,32 @@ class Pipeline(Closing):
         """Begin a frame's way to the device, where that is another and the frame is not there."""
         if self.inputs.transfers is None or frame.lost or isinstance(frame.image, wp.array):
             return frame
-        return dataclasses.replace(frame, slot=self.inputs.transfers.upload(frame.image))
+        frame.slot = self.inputs.transfers.begin(frame.image)
+        return frame
 
     def _hand_over(self, frame: SeenFrame) -> Future[Rendered]:
-        """Have another thread render a frame of the host."""
+        """Have a frame of the host rendered: on CUDA launched by this thread, on CPU by another."""
         while len(self._ahead) >= AHEAD:
             self._ahead.popleft().result()
-        if self._renderer is None:
-            self._renderer = ThreadPoolExecutor(1, "warp_ar-render")
-        sent = self._send(frame)
-        if sent.slot is None or "image" not in self._arrays:
+        transfers, frame = self.inputs.transfers, self._send(frame)
+        if frame.lost or not self._launches_here:
+            if transfers is not None and frame.slot is not None:
+                transfers.send(frame.slot)
             # The caller may write its picture anew before it is rendered, unless nobody may.
-            sent = dataclasses.replace(sent, image=frame.image.copy() if frame.image.flags.writeable else frame.image)
-        self._ahead.append(self._renderer.submit(lambda: self._keep(self._render(sent))))
+            if frame.slot is not None and "image" in self._arrays:
+                frame.image = frame.slot.host  # no other comes there before this one is rendered: see ``AHEAD``
+            elif frame.image.flags.writeable:
+                frame.image = frame.image.copy()
+
+        def render() -> Rendered:
+            return self._keep(self._render(frame))
+
+        if self._launches_here:
+            self._ahead.append(done_at_once(render))
+        else:
+            if self._renderer is None:
+                self._renderer = ThreadPoolExecutor(1, "warp_ar-render")
+            self._ahead.append(self._renderer.submit(render))
         return self._ahead[-1]
 
     def _finish(self) -> None:
@@ -497,6 +516,7 @@ class Pipeline(Closing):
             return pose.pose, pose.state
         if self._tracker is None or pose is not None:
             return pose, None
+        self._scheduler.prepare()
         if isinstance(image, wp.array):
             with exclusive(self.device):
                 image = image.numpy()
@@ -518,7 +538,9 @@ class Pipeline(Closing):
         timings[TRACK] = StageTiming(before + (time.perf_counter() - start) * 1e3, False)
         return places
 
-    def _look(self, image: Any, now: float, given: Pose | Track | None) -> tuple[SeenFrame, TrackState | None]:
+    def _look(
+        self, image: Any, now: float, given: Pose | Track | None, plate: Plate | None
+    ) -> tuple[SeenFrame, TrackState | None]:
         """Find the marker, go on with the clock."""
         timings: dict[str, StageTiming] = {}
         pose, state = self._track(image, now, given, timings)
@@ -527,7 +549,7 @@ class Pipeline(Closing):
         seconds, step = now - (self._start_time or 0.0), max(now - self._lit_time, 0.0)
         self._last_time = self._lit_time = now
         self._index += 1
-        return SeenFrame(image, None, pose, lost, self._index - 1, now, seconds, step, timings, places), state
+        return SeenFrame(image, None, pose, lost, self._index - 1, now, seconds, step, timings, places, plate), state
 
     def _render(self, frame: SeenFrame) -> Rendered:
         """Run the stages on a frame."""
@@ -543,7 +565,7 @@ class Pipeline(Closing):
                 if ratio is not None:
                     self._light.scale(ratio)
                 self.inputs.write(frame, reset=not self._light.known)
-                timings = {**timings, **self._scheduler.run()}
+                timings = {**timings, **self._scheduler.run(self.inputs.receive)}
             self._light.known = True
         # A lost marker says nothing about where objects are: the frame passes as it came, the last light is kept.
         self._shown = frame.image if frame.lost or "image" not in self._arrays else self._arrays["image"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from typing import Any
 
@@ -63,6 +63,16 @@ class Rendered:
         future: Future[Rendered] = Future()
         future.set_result(self)
         return future
+
+
+def done_at_once(work: Callable[[], Rendered]) -> Future[Rendered]:
+    """A future of what this thread does now; an error is left to who asks for the result."""
+    future: Future[Rendered] = Future()
+    try:
+        future.set_result(work())
+    except Exception as error:
+        future.set_exception(error)
+    return future
 
 
 @dataclasses.dataclass(frozen=True)

@@ -59,6 +59,7 @@ class Scheduler:
         bands: int | None = None,
         profile: bool = False,
         culling: bool = True,
+        on_host: Iterable[wp.Kernel] = (),
     ) -> None:
         """Allocate what the stages declared and build their passes.
 
@@ -69,8 +70,10 @@ class Scheduler:
             bands: Bands per CPU pass; None means one or two per core that this process may use.
             profile: On CUDA wait for every frame and time each stage on the device; stages then run one by one.
             culling: Whether stages that can change no pixel of a frame are left out of it.
+            on_host: Kernels that the CPU runs for others than stages: they are compiled with the stages'.
         """
         self.plan = plan
+        self._on_host = on_host
         self.arrays = arrays
         self.device = device
         cores = usable_cores()
@@ -85,7 +88,7 @@ class Scheduler:
         self._stages: list[Step] = []
         self._first_launches: list[Note] = []
         self._fills: dict[str, Any] = {}
-        self._seen: dict[str, tuple[int, ...]] = {}
+        self._seen: dict[str, Any] = {}
         self._translated: set[int] = set()
         self._patterns: dict[Any, list[Segment]] = {}
         self._graphs: dict[tuple[int, ...], Any] = {}
@@ -105,6 +108,8 @@ class Scheduler:
         self._late = {stage.name for stage, _ in self._stages if type(stage).changed is not Stage.changed}
         """Stages that may find that they changed nothing: their readers then rest."""
         self._changing = {stage.name for stage, passes in self._stages if any(step.enabled for step in passes)}
+        self._versions = {stage.name: arrays.versions_of(stage.wiring.reads) for stage, _ in self._stages}
+        self._left_out: dict[str, StageTiming] = {}
 
     def _build(self) -> None:
         """Allocate the arrays of the plan's stages, and build their passes."""
@@ -193,7 +198,7 @@ class Scheduler:
         kernels = [kernel for kernel, size in launched if self._has_usual_blocks(kernel, size)]
         blocks = [(kernel, size) for kernel, size in launched if not self._has_usual_blocks(kernel, size)]
         own = [serve_kernel] if self._threads > 1 and self.device.is_cpu else []
-        load_modules([*own, *kernels, *host_kernels], self.device, progress, blocks=blocks)
+        load_modules([*own, *kernels, *host_kernels], self.device, progress, blocks=blocks, on_host=self._on_host)
         with wp.ScopedDevice(self.device), translating(self.device):
             for note in self._first_launches:
                 note.do()
@@ -251,34 +256,42 @@ class Scheduler:
         finally:
             self._alone, self.clock = before
 
-    def run(self) -> Mapping[str, StageTiming]:
-        """Run the stages that this frame needs and whose inputs changed since they ran; returns the time of each."""
+    def run(self, receive: Callable[[], None] | None = None) -> Mapping[str, StageTiming]:
+        """Run the stages that this frame needs and whose inputs changed since they ran; returns the time of each.
+
+        Args:
+            receive: Called on CUDA before anything is launched, once it is known what will be.
+        """
         self.prepare()
         self._look()
         if not self.device.is_cpu:
-            return self._run_captured()
+            return self._run_captured(receive)
         return self._run_eager() if self._crew is None or self._alone else self._run_side_by_side(self._crew)
 
     def _look(self) -> None:
         """Find out what this frame needs."""
         reach = self.arrays["reach"]() if "reach" in self.arrays else Reach()
-        self._unneeded, clearing = self._demand.look(reach)
-        for stage, _ in self._stages:
-            if stage.name in self._unneeded:
-                stage.rest()
+        before, (self._unneeded, clearing) = self._unneeded, self._demand.look(reach)
+        if self._unneeded is not before:
+            reasons = self._unneeded if self._culling else {}
+            self._left_out = {name: StageTiming(0.0, True, reason) for name, reason in reasons.items()}
+        if self._unneeded:
+            for stage, _ in self._stages:
+                if stage.name in self._unneeded:
+                    stage.rest()
         for name in clearing:
             self._seen.pop(name, None)
 
     def _timing_of_skipped(self, stage: Stage) -> StageTiming:
-        reason = self._unneeded.get(stage.name) if self._culling else None
-        return SKIPPED if reason is None else StageTiming(0.0, True, reason)
+        return self._left_out.get(stage.name, SKIPPED)
 
-    def _due(self, stage: Stage) -> tuple[int, ...] | None:
+    def _due(self, stage: Stage) -> Any:
         """Versions of what ``stage`` reads, or None if it has already seen them or this frame does not need it."""
-        if self._culling and stage.name in self._unneeded:
+        name = stage.name
+        if self._culling and name in self._unneeded:
             return None
-        versions = self.arrays.versions(stage.wiring.reads)
-        return None if self._seen.get(stage.name) == versions else versions
+        versions = self._versions[name]()
+        return None if self._seen.get(name) == versions else versions
 
     def _begin(self, stage: Stage, passes: list[Pass]) -> list[Pass]:
         """Passes of a stage that take part in this frame."""
@@ -289,14 +302,20 @@ class Scheduler:
         return [step for step in passes if step.enabled is None or step.enabled()]
 
     def _publish(self, stage: Stage) -> None:
-        if stage.name in self._unneeded and stage.name in self._late:
+        if stage.name not in self._late:
+            for name in stage.wiring.writes:
+                self.arrays.touch(name)
+            return
+        if stage.name in self._unneeded:
             return  # what readers may miss is decided in frames that have readers, whether others are left out or not
         for name in stage.wiring.writes:
             if stage.changed(name) or self.arrays.version(name) == 0:
                 self.arrays.touch(name)
 
-    def _run_eager(self) -> dict[str, StageTiming]:
+    def _run_eager(self, receive: Callable[[], None] | None = None) -> dict[str, StageTiming]:
         """Stage after stage, on this thread."""
+        if receive is not None:
+            receive()
         timings: dict[str, StageTiming] = {}
         for stage, passes in self._stages:
             versions = self._due(stage)
@@ -370,7 +389,7 @@ class Scheduler:
             step.launch(rows)
         self._translated.add(id(step))
 
-    def _run_captured(self) -> dict[str, StageTiming]:
+    def _run_captured(self, receive: Callable[[], None] | None) -> dict[str, StageTiming]:
         due: list[Step] = []
         pattern: list[Any] = []
         timings: dict[str, StageTiming] = {}
@@ -384,11 +403,13 @@ class Scheduler:
             pattern.append((stage.name, *map(id, chosen)) if stage.name in self._changing else stage.name)
             self._seen[stage.name] = versions
             self._publish(stage)
-        if not due:
-            return timings
         key = tuple(pattern)
         if key not in self._patterns:
             self._patterns[key] = _segments(due)
+        if receive is not None:
+            receive()
+        if not due:
+            return timings
         start = self.clock()
         for segment in self._patterns[key]:
             if segment.on_host:

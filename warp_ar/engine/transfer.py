@@ -12,8 +12,9 @@ from __future__ import annotations
 
 import collections
 import itertools
+import queue
+import threading
 import weakref
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -35,7 +36,7 @@ COPY_THREADS = 4
 
 COPY_BYTES = 3_000_000
 """That each of them copies at least: to hand a part over, and to hear that it is done, takes turns with other threads
-at the interpreter. At 1080p two threads bring more frames a second than one or three."""
+at the interpreter. Of a frame that is smaller than two such parts the caller's thread copies all."""
 
 MARKED = 16
 """Frames whose times on the device are remembered."""
@@ -63,6 +64,8 @@ class Slot:
         self.consumed = wp.Event(device)
         self.downloaded: Any = None
         """Event after the last picture from here, or from a later slot."""
+        self.sent = True
+        """Whether the picture that was copied to here has been sent on its way."""
 
 
 class Buffer:
@@ -81,6 +84,46 @@ class _Holder:
         self.__array_interface__ = host.__array_interface__
 
 
+class _Copier:
+    """A thread that copies parts of frames, and lets go of the interpreter's lock meanwhile."""
+
+    def __init__(self) -> None:
+        self._jobs: queue.SimpleQueue[tuple[Image, Image] | None] = queue.SimpleQueue()
+        self._begun, self._done = threading.Lock(), threading.Lock()
+        self._begun.acquire()
+        self._done.acquire()
+        held = self._jobs, self._begun, self._done  # and not this object: the thread ends with it
+        self._thread = threading.Thread(target=_copy, args=held, name="warp_ar-copy", daemon=True)
+        self._thread.start()
+        weakref.finalize(self, self._jobs.put, None)
+
+    def begin(self, target: Image, source: Image) -> None:
+        """Have a part copied."""
+        self._jobs.put((target, source))
+
+    def wait_for_begin(self) -> None:
+        """Let it have the interpreter's lock until it needs it no more."""
+        self._begun.acquire()
+
+    def wait(self) -> None:
+        """Wait until the part that was begun is copied."""
+        self._done.acquire()
+
+    def close(self) -> None:
+        """End the thread."""
+        self._jobs.put(None)
+        self._thread.join()
+
+
+def _copy(jobs: queue.SimpleQueue[tuple[Image, Image] | None], begun: threading.Lock, done: threading.Lock) -> None:
+    """The life of a copying thread."""
+    while (job := jobs.get()) is not None:
+        begun.release()
+        np.copyto(*job)
+        del job  # the caller's picture is not held until the next one comes
+        done.release()
+
+
 class Transfers:
     """Moves frames of one size to and from one CUDA device."""
 
@@ -97,8 +140,8 @@ class Transfers:
         self._slots = [Slot(shape, device) for _ in range(SLOTS)]
         self._uploads = self._downloads = 0
         self._parts = split_rows(*shape)
-        helpers = len(self._parts) - 1
-        self._pool = ThreadPoolExecutor(helpers, "warp_ar-copy") if helpers else None
+        self._copiers = [_Copier() for _ in self._parts] if len(self._parts) > 1 else []
+        self._are_copying = False
         self._marks = [Marks(device) for _ in range(MARKED)]
         self._marking = self._marks[0]
         self._free = collections.deque(Buffer(shape, device, pinned=True) for _ in range(SLOTS))
@@ -106,21 +149,51 @@ class Transfers:
 
     def close(self) -> None:
         """Stop the copying threads; what is on its way to the host arrives before the slots that it lies in go."""
-        if self._pool is not None:
-            self._pool.shutdown()
+        for copier in self._copiers:
+            copier.close()
         for slot in self._slots:
             if slot.downloaded is not None:
                 wait_for(slot.downloaded)
 
-    def _copy(self, target: Image, source: Image) -> None:
-        if self._pool is None:
-            np.copyto(target, source)
+    def begin(self, image: Image) -> Slot:
+        """Begin to copy a host picture to where it is sent from; ``send`` must follow before the caller writes it anew.
+
+        Returns:
+            What to ``send`` and to ``receive`` it from, before ``SLOTS`` more are begun.
+        """
+        slot = self._slots[self._uploads % SLOTS]
+        if self._uploads >= SLOTS:
+            wait_for(slot.marks.arrived)
+            self._up.wait_event(slot.consumed)
+        self._wait_for_copies()
+        marks = slot.marks = self._marks[self._uploads % MARKED]
+        marks.frame, slot.sent = self._uploads, False
+        self._uploads += 1
+        if not self._copiers:
+            np.copyto(slot.host, image)
+            return slot
+        for copier, part in zip(self._copiers, self._parts, strict=True):
+            copier.begin(slot.host[part], image[part])
+        for copier in self._copiers:
+            copier.wait_for_begin()
+        self._are_copying = True
+        return slot
+
+    def _wait_for_copies(self) -> None:
+        if self._are_copying:
+            for copier in self._copiers:
+                copier.wait()
+            self._are_copying = False
+
+    def send(self, slot: Slot) -> None:
+        """Send a picture on its way once it has been copied, unless it was; then the caller may write it anew."""
+        if slot.sent:
             return
-        own, *handed_over = self._parts
-        others = [self._pool.submit(np.copyto, target[part], source[part]) for part in handed_over]
-        np.copyto(target[own], source[own])
-        for other in others:
-            other.result()
+        self._wait_for_copies()
+        marks, slot.sent = slot.marks, True
+        self._up.record_event(marks.sent)
+        wp.copy(slot.frame, slot.pinned, stream=self._up)
+        self._up.record_event(marks.arrived)
 
     def upload(self, image: Image) -> Slot:
         """Send a host picture on its way; when this returns, the caller may write it anew.
@@ -128,21 +201,12 @@ class Transfers:
         Returns:
             What to ``receive`` it from, before ``SLOTS`` more are sent.
         """
-        slot = self._slots[self._uploads % SLOTS]
-        if self._uploads >= SLOTS:
-            wait_for(slot.marks.arrived)
-            self._up.wait_event(slot.consumed)
-        marks = slot.marks = self._marks[self._uploads % MARKED]
-        marks.frame = self._uploads
-        self._uploads += 1
-        self._copy(slot.host, image)
-        self._up.record_event(marks.sent)
-        wp.copy(slot.frame, slot.pinned, stream=self._up)
-        self._up.record_event(marks.arrived)
+        slot = self.begin(image)
+        self.send(slot)
         return slot
 
     def receive(self, slot: Slot, frame_out: Any) -> None:
-        """Have kernels that are launched from now on see an uploaded picture in ``frame_out``."""
+        """Have kernels that are launched from now on see a picture that was sent in ``frame_out``."""
         self._compute.wait_event(slot.marks.arrived)
         self._compute.record_event(slot.marks.started)
         self._marking = slot.marks
@@ -167,10 +231,11 @@ class Transfers:
             # The next picture is sent there on the same stream, so after this one even if nobody waited for it.
             weakref.finalize(holder, self._free.append, buffer)
             kept = np.asarray(holder)
-        if slot.downloaded is not None:
-            self._compute.wait_event(slot.downloaded)
-        wp.copy(slot.image, image, stream=self._compute)
-        self._compute.record_event(buffer.rendered)
+        with exclusive(self._device):  # kernels of other pipelines may be captured on the same stream
+            if slot.downloaded is not None:
+                self._compute.wait_event(slot.downloaded)
+            wp.copy(slot.image, image, stream=self._compute)
+            self._compute.record_event(buffer.rendered)
         self._down.wait_event(buffer.rendered)
         wp.copy(buffer.array, slot.image, stream=self._down)
         self._down.record_event(buffer.done)

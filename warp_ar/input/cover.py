@@ -52,6 +52,9 @@ PATIENCE = 1.5
 """Seconds after which what covers a ball is taken for a part of the scene."""
 MEMORY = 0.3
 """Time constant in seconds with which remembered codes follow frames."""
+DISC_SECONDS = 0.008
+"""Between two looks at the balls' discs: cameras of up to 120 frames a second have each frame looked at. What moves by
+a metre in a second goes 8 mm meanwhile."""
 LOOK_SECONDS = 0.1
 """Between two looks at the points while no ball's disc changes: they take four times as long as the discs."""
 RINGS = (1.2, 1.7, 2.4, 3.4, 5.0)
@@ -85,6 +88,10 @@ class BallCover:
         self._logarithms: Array = np.zeros(0)
         self._gain: Array | None = None
         self._cell_row, self._cell_column = _cells_in_disc()
+        # Of four samples of each cell, the place among all of a disc's, (4, cells).
+        side = 2 * CELLS
+        first = 2 * self._cell_row * side + 2 * self._cell_column
+        self._samples = first + np.array([[0], [side], [1], [side + 1]])
         self.forget()
 
     def forget(self) -> None:
@@ -93,6 +100,19 @@ class BallCover:
         self._discs: list[Array] = []
         self._last = self._looked = self._since = 0.0
         self._covered = False
+
+    def rests(self, seconds: float) -> bool:
+        """Whether the last look was so short a time ago that what it found still holds.
+
+        Args:
+            seconds: When the frame was taken.
+        """
+        return self._shown is not None and 0.0 < abs(seconds - self._last) < DISC_SECONDS
+
+    @property
+    def is_covered(self) -> bool:
+        """Whether a ball was covered at the last look."""
+        return self._covered
 
     def observe(
         self,
@@ -118,9 +138,10 @@ class BallCover:
         """
         own = [self._cells(image, disc, gain, plate) for disc in discs]
         known = self._shown is not None and len(own) == len(self._discs)
-        rests = known and not self._covered and not any(map(self._has_changed, self._discs, own))
+        changes = list(map(np.subtract, own, self._discs)) if known else []
+        rests = known and not self._covered and not any(map(_has_changed, changes))
         if rests and abs(seconds - self._looked) < LOOK_SECONDS:
-            self._follow_discs(own, seconds)
+            self._follow_discs(own, changes, seconds)
             return False
         shown = self._logarithm(codes_around(image, self._camera, pose, self._points, plate), gain)
         if not known:
@@ -128,33 +149,28 @@ class BallCover:
             self._last = self._looked = seconds
             return False
         was = self._covered
-        self._covered = not rests and self._is_covered(shown, own, discs, pose)
+        self._covered = not rests and self._is_covered(shown, changes, discs, pose)
         if self._covered and not was:
             self._since = seconds
         if self._covered and abs(seconds - self._since) > PATIENCE:
             self._shown, self._discs, self._covered = shown, own, False
         if not self._covered:
             assert self._shown is not None
-            self._shown = _follow(self._shown, shown, _rate(seconds - self._looked))
-            self._follow_discs(own, seconds)
+            self._shown = _follow(self._shown, shown, shown - self._shown, _rate(seconds - self._looked))
+            changes = list(map(np.subtract, own, self._discs))
+            self._follow_discs(own, changes, seconds)
         self._last = self._looked = seconds
         return self._covered
 
-    def _follow_discs(self, own: list[Array], seconds: float) -> None:
+    def _follow_discs(self, own: list[Array], changes: list[Array], seconds: float) -> None:
         rate = _rate(seconds - self._last)
-        self._discs = [_follow(before, now, rate) for before, now in zip(self._discs, own, strict=True)]
+        self._discs = [_follow(*disc, rate) for disc in zip(self._discs, own, changes, strict=True)]
         self._last = seconds
 
-    def _has_changed(self, before: Array, now: Array) -> bool:
-        """Whether a ball's disc shows something else; a cell that is not seen in both is as it was."""
-        change = np.abs(now - before)
-        most = np.maximum(np.maximum(change[0], change[1]), change[2])
-        return bool(np.count_nonzero(most > CHANGED) / len(most) >= DISC_SHARE)
-
     def _is_covered(
-        self, shown: Array, own: list[Array], discs: Sequence[tuple[float, float, float]], pose: Pose
+        self, shown: Array, changes: list[Array], discs: Sequence[tuple[float, float, float]], pose: Pose
     ) -> bool:
-        """Whether a ball is, by what points and discs show now and what they are remembered to show."""
+        """Whether a ball is, by what points show now and are remembered to show, and what of discs has changed."""
         assert self._shown is not None
         change = shown - self._shown
         seen = ~np.isnan(change).any(axis=1)
@@ -169,12 +185,12 @@ class BallCover:
         local = self._points[seen] @ pose.rotation.T + pose.translation
         zero = np.zeros(3)
         at = cv2.projectPoints(local, zero, zero, self._camera.matrix(), np.array(self._camera.distortion))[0][:, 0]
-        for (x, y, radius), before, now in zip(discs, self._discs, own, strict=True):
+        for (x, y, radius), of_disc in zip(discs, changes, strict=True):
             away = np.hypot(at[:, 0] - x, at[:, 1] - y) / radius
             near = (away > BESIDE[0]) & (away < BESIDE[1])
             if near.sum() < LEAST_NEAR or is_other[near].mean() < NEAR_SHARE:
                 continue
-            if self._has_changed(before, now):
+            if _has_changed(of_disc):
                 return True
         return False
 
@@ -188,30 +204,27 @@ class BallCover:
         if not (abs(x) < 1e5 and abs(y) < 1e5 and radius < 1e4):
             return np.full((3, len(self._cell_row)), np.nan)
         # Half a cell of blur by sampling four places in each.
-        steps = 2.0 * radius / CELLS * _STEPS
-        columns = np.round(x - radius + steps).astype(np.int64)
-        rows = np.round(y - radius + steps).astype(np.int64)
+        corner = np.array([[x - radius], [y - radius]])
+        columns, rows = np.rint(corner + 2.0 * radius / CELLS * _STEPS).astype(np.int64)
         height, width = picture.shape[:2]
-        whole = rows[0] >= 0 and columns[0] >= 0 and rows[-1] < height and columns[-1] < width
-        if whole:
-            shown = picture[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-            rows, columns = rows - rows[0], columns - columns[0]
-            seen = None
-        else:
+        seen = None
+        if rows[0] < 0 or columns[0] < 0 or rows[-1] >= height or columns[-1] >= width:
             seen = _pairs((rows >= 0) & (rows < height))[self._cell_row]
             seen &= _pairs((columns >= 0) & (columns < width))[self._cell_column]
-            shown, rows, columns = picture, rows.clip(0, height - 1), columns.clip(0, width - 1)
-        # By indices first: ``take`` would copy all of a part of a picture.
-        grid = shown[rows].take(columns, axis=1)
-        grid = grid.astype(np.float64 if grid.dtype.kind == "f" else np.int64)
-        halves = grid[::2] + grid[1::2]
-        sums = (halves[:, ::2] + halves[:, 1::2])[self._cell_row, self._cell_column]
-        if plate is None:
-            found: Array = self._table_of_sums(gain)[sums.T + _CHANNELS]
-        elif picture.dtype == np.uint16:
-            found = self._logarithm(sums / (4.0 * 257.0), gain).T
+            rows, columns = rows.clip(0, height - 1), columns.clip(0, width - 1)
+        at = ((3 * width * rows)[:, None] + 3 * columns).take(self._samples)
+        samples = picture.reshape(-1).take(at + _CHANNEL)
+        if samples.dtype.kind == "f":
+            samples = samples.astype(np.float64)
+            sums: NDArray[Any] = (samples[:, 0] + samples[:, 1]) + (samples[:, 2] + samples[:, 3])
         else:
-            found = np.log(np.maximum(0.25 * sums, 0.0) / gain + DARK).T
+            sums = samples.sum(axis=1, dtype=np.int64)
+        if plate is None:
+            found: Array = self._table_of_sums(gain).take(sums + _CHANNELS)
+        elif picture.dtype == np.uint16:
+            found = self._logarithm(sums.T / (4.0 * 257.0), gain).T
+        else:
+            found = np.log(np.maximum(0.25 * sums.T, 0.0) / gain + DARK).T
         if seen is not None:
             found[:, ~seen] = np.nan
         return found
@@ -234,6 +247,8 @@ class BallCover:
 
 _STEPS = np.arange(2 * CELLS) * 0.5 + 0.25
 """Where samples lie along a disc, in cells."""
+_CHANNEL = np.arange(3)[:, None, None]
+"""Where a channel's code lies in a pixel."""
 _CHANNELS = np.arange(3)[:, None] * (4 * 255 + 1)
 """Where a channel's sums begin in a table of all."""
 
@@ -255,9 +270,15 @@ def _rate(seconds: float) -> float:
     return float(1.0 - np.exp(-abs(seconds) / MEMORY))
 
 
-def _follow(before: Array, now: Array, rate: float) -> Array:
-    """What is remembered, drawn toward what is seen now, where that is seen."""
-    followed = before + rate * (now - before)
+def _has_changed(change: Array) -> bool:
+    """Whether a ball's disc shows something else, (3, cells); a cell that is not seen in both is as it was."""
+    most = np.abs(change).max(axis=0)
+    return bool(np.count_nonzero(most > CHANGED) / len(most) >= DISC_SHARE)
+
+
+def _follow(before: Array, now: Array, change: Array, rate: float) -> Array:
+    """What is remembered, drawn toward what is seen now, where that is seen; ``change`` is ``now - before``."""
+    followed = before + rate * change
     if np.isnan(followed).any():
         followed = np.where(np.isnan(before), now, followed)
         followed = np.where(np.isnan(followed), before, followed)

@@ -24,6 +24,7 @@ References:
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import enum
 from collections.abc import Sequence
@@ -34,9 +35,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warp_ar.errors import UsageError
+from warp_ar.input.edge_fit import Box, EdgeFitter
 from warp_ar.input.marker_pattern import make_pattern
 from warp_ar.input.markers import Detection, MarkerDetector
-from warp_ar.kernels.color import decode_table
+from warp_ar.kernels.printed_edges import CORRELATED, NOISE_FLOOR
 from warp_ar.scene import Camera, Marker, Pose
 
 Array = NDArray[np.float64]
@@ -45,38 +47,18 @@ Image = NDArray[np.uint8]
 _ENVIRONMENT = 0.6
 """Half width of the search around the last marker, beyond the marker itself, in its own sizes."""
 
-_TAPS = 9
-"""Samples across an edge."""
+_NEAR = 0.5
+"""Distance of a marker from where it is expected, over the least size at which it is, within which no other is looked
+for."""
 
-_PLACES = np.linspace(-1.0, 1.0, _TAPS)
-"""Where they lie in the window."""
-
-_WEIGHTS = np.full(_TAPS, 2.0 / (_TAPS - 1))
-"""Trapezoid rule over [-1, 1]; each end's level is the mean of its two outermost samples."""
-_WEIGHTS[[0, -1]] /= 2
+_SHARP_AGAIN = 8
+"""Frames after which a marker that looked blurred is looked for as a sharp one again."""
 
 _REACH = (4.0, 3.0, 2.5, 2.5)
 """Half width of the sampled window in pixels, per Gauss-Newton step; a cell that is narrower limits it further."""
 
 _LOST_REACH = (9.0, 6.0, 4.0, 3.0, 2.5)
 """The same where the pose is only a prediction from earlier frames."""
-
-_MIN_REACH = 1.0
-"""Pixels: an edge with less environment than this to its neighbours is not measured; the blur of one would reach the
-other."""
-
-_DONE = 0.05
-"""Pixels: a Gauss-Newton step that moves no edge further is the last; it converges fast enough that the next would move
-a tenth of it."""
-
-_MIN_EDGES = 16
-"""Fewest measured edge points for a refinement: nine unknowns, and something left to vote."""
-
-_NOISE_FLOOR = 0.03
-"""Pixels: smallest standard deviation that an edge point is ever given credit for (sampling, lens model, print)."""
-
-_CORRELATED = 2.0
-"""Neighbouring edge points share pixels, so that many of them count as one."""
 
 _CORNER_NOISE = 0.5
 """Pixels: standard deviation of a detected corner where edges are too small to refine."""
@@ -199,8 +181,7 @@ class Tracker:
         self._matrix = np.asarray(camera.matrix(), float)
         self._distortion = np.asarray(camera.distortion, float).ravel()
         self._hold, self._steady = hold, steady
-        self._linear = decode_table(camera.transfer).mean(1)
-        self._decoded: tuple[Image, NDArray[np.float32]] | None = None
+        self._fitter = EdgeFitter(self._pattern, camera)
         self.reset()
 
     def reset(self) -> None:
@@ -211,6 +192,7 @@ class Tracker:
         self._quality = 0.0
         self._evidence = 0.0
         self._rival = False
+        self._blurred = 0  # frames in which the marker is not looked for as a sharp one
 
     def track(self, image: Image, time: float) -> Track:
         """Find the marker in the next frame.
@@ -240,7 +222,7 @@ class Tracker:
 
     def detect(self, image: Image) -> list[Detection]:
         """The followed markers in a whole picture, uint8 RGB or grey; they depend on the picture, not on the camera."""
-        return self._detect(_gray(image), (0, 0))
+        return self._detect(self._show(image))
 
     def error_of(self, image: Image, found: list[Detection]) -> float:
         """How well the print fits where it was found, whatever earlier frames say.
@@ -252,7 +234,8 @@ class Tracker:
         Returns:
             What ``track`` of a new tracker says: root mean square distance in pixels; infinite where no pose fits.
         """
-        fit = self._fit_detections(_gray(image), (0, 0), found, None)
+        self._show(image)
+        fit = self._fit_detections(found, None)
         return np.inf if fit is None else fit.error
 
     def _without(self, guess: Pose | None, time: float) -> Track:
@@ -283,23 +266,36 @@ class Tracker:
     def _measure(self, image: Image, guess: Pose | None) -> _Fit | None:
         """The pose in this image alone; ``guess`` only says where to look, and which of two like poses to prefer."""
         if guess is not None:
-            box = self._around(self._outline(guess))
-            gray, origin = _gray(image[box]), (box[1].start, box[0].start)
+            gray, origin = self._show_around(image, guess)
             # A board has no second pose to confuse it with, and dozens of markers to decode: its edges come first.
-            fit = self._fit_guess(gray, origin, guess) if len(self._pattern.markers) > 1 else None
+            fit = self._fit_guess(guess) if len(self._pattern.markers) > 1 else None
             if fit is not None and fit.support >= _ENOUGH:
                 return fit
-            fit = self._fit_detections(gray, origin, self._detect(gray, origin, self._smallest(guess)), guess)
+            fit = self._fit_detections(self._detect_expected(gray, origin, guess), guess)
             if fit is None or not fit.edges:
                 # Perhaps only partly hidden or cut off, so that corners are missing or wrong: its edges may still be
                 # there.
-                fit = self._fit_guess(gray, origin, guess) or fit
+                fit = self._fit_guess(guess) or fit
             if fit is not None:
                 return fit
-        gray = _gray(image)
-        found = self._detect(gray, (0, 0))
+        found = self._detect(self._show(image))
         self._rival = len(found) > len({d.id for d in found})
-        return self._fit_detections(gray, (0, 0), found, guess)
+        fit = self._fit_detections(found, guess)
+        if fit is None or not fit.edges or self._rival or len(self._pattern.markers) > 1:
+            return fit
+        # Found as it will be in the next frame, so that a marker that stands still does so from the first frame on.
+        found = self._detect_expected(*self._show_around(image, fit.pose), fit.pose)
+        return self._fit_detections(found, fit.pose) or fit
+
+    def _show_around(self, image: Image, guess: Pose) -> tuple[Image, tuple[int, int]]:
+        """The part of the image around where the marker is expected, in grey, and at which pixel it starts."""
+        box = self._around(self._outline(guess))
+        return self._show(image, box), (box[1].start, box[0].start)
+
+    def _show(self, image: Image, box: Box | None = None) -> Image:
+        """A part of the image in grey, all of it where none is named: what is detected in and fitted to."""
+        h, w = self._shape
+        return self._fitter.show(image, (slice(0, h), slice(0, w)) if box is None else box)
 
     def _around(self, outline: NDArray[np.float32]) -> tuple[slice, slice]:
         """Rows and columns of the image around a marker's outline, never empty."""
@@ -314,14 +310,30 @@ class Tracker:
         sides = [self._project(guess.apply(c))[0] for c in self._pattern.markers.values()]
         return 0.6 * min(float(np.linalg.norm(s - np.roll(s, 1, 0), axis=1).mean()) for s in sides)
 
-    def _detect(self, gray: Image, origin: tuple[int, int], smallest: float = 10.0) -> list[Detection]:
+    def _detect_expected(self, gray: Image, origin: tuple[int, int], guess: Pose) -> list[Detection]:
+        """The followed markers where they are expected; one marker first as a sharp one, if it lately was.
+
+        A marker that the narrow threshold sees, both see in the same place; one that it does not see may be blurred.
+        """
+        smallest = self._smallest(guess)
+        if len(self._pattern.markers) == 1 and self._blurred == 0:
+            found = self._detect(gray, origin, smallest, sharp=True)
+            expected = self._outline(guess)
+            if any(np.linalg.norm(d.corners - expected, axis=1).mean() < _NEAR * smallest for d in found):
+                return found
+            self._blurred = _SHARP_AGAIN
+        self._blurred = max(self._blurred - 1, 0)
+        return self._detect(gray, origin, smallest)
+
+    def _detect(
+        self, gray: Image, origin: tuple[int, int] = (0, 0), smallest: float = 10.0, *, sharp: bool = False
+    ) -> list[Detection]:
         """The followed markers in a part of the image that starts at pixel ``origin``, in pixels of the whole."""
-        found = [d for d in self._detector.detect(gray, max(smallest, 10.0)) if d.id in self._pattern.markers]
+        detected = self._detector.detect(gray, max(smallest, 10.0), sharp=sharp)
+        found = [d for d in detected if d.id in self._pattern.markers]
         return [Detection(d.id, d.corners + np.asarray(origin, np.float32)) for d in found]
 
-    def _fit_detections(
-        self, gray: Image, origin: tuple[int, int], found: list[Detection], guess: Pose | None
-    ) -> _Fit | None:
+    def _fit_detections(self, found: list[Detection], guess: Pose | None) -> _Fit | None:
         found = self._chosen(found, guess)
         if not found:
             return None
@@ -330,13 +342,9 @@ class Tracker:
         candidates = self._plane_poses(points, corners)
         if not candidates:
             return None
-        (first, error), *rest = candidates
-        fits = [self._refined(gray, origin, first, points, corners)]
-        fits += [
-            self._refined(gray, origin, p, points, corners)
-            for p, e in rest
-            if e < max(_ALIKE * error, error + _ALIKE_PIXELS)
-        ]
+        most = max(_ALIKE * candidates[0][1], candidates[0][1] + _ALIKE_PIXELS)
+        alike = [pose for pose, error in candidates if error < most or pose is candidates[0][0]]
+        fits = self._refined(alike, points, corners)
         good = [fit for fit in fits if fit.pattern >= _PATTERN]
         return self._preferred(good, guess) if good else None
 
@@ -386,8 +394,8 @@ class Tracker:
             self._evidence = 0.0
             return min(fits, key=lambda f: f.cost)
         near, far = sorted(fits, key=lambda f: float(np.linalg.norm(_difference(f.pose, guess)[:3])))
-        noise = max(min(near.cost, far.cost), _NOISE_FLOOR**2)
-        independent = 0.5 * len(self._pattern.points) / _CORRELATED
+        noise = max(min(near.cost, far.cost), NOISE_FLOOR**2)
+        independent = 0.5 * len(self._pattern.points) / CORRELATED
         against = float(np.clip(independent * (near.cost - far.cost) / noise, -_FRAME_EVIDENCE, _FRAME_EVIDENCE))
         self._evidence = max(self._evidence + against, 0.0)
         if self._evidence < _FLIP_EVIDENCE:
@@ -395,87 +403,40 @@ class Tracker:
         self._evidence = 0.0
         return far
 
-    def _refined(self, gray: Image, origin: tuple[int, int], pose: Pose, points: Array, corners: Array) -> _Fit:
-        """The pose fitted to the edges, or to the corners where the edges are too small to be measured."""
-        fit = self._fit_edges(gray, origin, pose, _REACH)
-        if _holds(fit):
-            return fit
+    def _refined(self, poses: list[Pose], points: Array, corners: Array) -> list[_Fit]:
+        """Poses fitted to the edges, or to the corners where the edges are too small to be measured."""
+        fits = []
+        for pose, fit in zip(poses, self._fit_edges(poses, _REACH), strict=True):
+            fits.append(fit if _holds(fit) else self._fit_corners(pose, points, corners))
+        return fits
+
+    def _fit_corners(self, pose: Pose, points: Array, corners: Array) -> _Fit:
+        """A pose as corners that were detected have it."""
         camera = pose.apply(points)
         pixels, jacobian = self._project(camera)
         residual = pixels - corners
         rows = _pose_rows(jacobian, camera - pose.translation).reshape(-1, 6)
         information = rows.T @ rows / _CORNER_NOISE**2
         cost = float((residual**2).mean())
-        pattern = self._correlation(self._linear_part(gray), origin, pose)
+        pattern = float(self._fitter.fit([pose], ())[0]["pattern"])
         return _Fit(pose, information, float(np.sqrt(2 * cost)), 0.5, cost, pattern, edges=False)
 
-    def _fit_guess(self, gray: Image, origin: tuple[int, int], guess: Pose) -> _Fit | None:
-        fit = self._fit_edges(gray, origin, guess, _LOST_REACH)
+    def _fit_guess(self, guess: Pose) -> _Fit | None:
+        fit = self._fit_edges([guess], _LOST_REACH)[0]
         return fit if _holds(fit) else None
 
-    def _fit_edges(self, gray: Image, origin: tuple[int, int], pose: Pose, reaches: Sequence[float]) -> _Fit | None:
-        """Gauss-Newton on the printed edges from ``pose``; None where too few are seen."""
-        pattern, part = self._pattern, self._linear_part(gray)
-        for reach in reaches:
-            camera = pose.apply(pattern.points)
-            if camera[:, 2].min() <= 1e-6:
-                return None
-            pixels, jacobian = self._project(camera)
-            normal, width = self._print_lines(pose, jacobian)
-            half = np.minimum(0.45 * width * pattern.clearances, reach)
-            seen, offset = _edge_offsets(part, (pixels - origin).T, normal, half)
-            if seen is None:
-                return None
-            facing = np.ascontiguousarray(normal[:, seen].T)
-            rows = (facing[:, None, :] @ _pose_rows(jacobian[seen], camera[seen] - pose.translation))[:, 0]
-            solved = _solve(rows, offset, facing)
-            if solved is None:
-                return None
-            step, residual, keep, information = solved
-            pose = _moved(pose, step)
-            if reach == reaches[-1] or (reach <= reaches[1] and np.abs(rows @ step).max() < _DONE):
-                break
-        if pose.apply(pattern.outline)[:, 2].min() <= 0 or pose.rotation[:, 2] @ pose.translation >= 0:
-            return None
-        error = float(np.sqrt((keep * residual**2).sum() / keep.sum()))
-        support = float(keep.sum() / len(pattern.points))
-        cost = float(np.minimum(residual**2, 1.0).mean())
-        return _Fit(pose, information, error, support, cost, self._correlation(part, origin, pose), edges=True)
-
-    def _print_lines(self, pose: Pose, jacobian: Array) -> tuple[Array, Array]:
-        """Of printed edges in the picture: normals from black to white, (2, n); pixels per metre along them, (n,)."""
-        pattern = self._pattern
-        along = (jacobian @ (pattern.tangents @ pose.rotation.T)[..., None])[..., 0].T
-        across = (jacobian @ (pattern.normals @ pose.rotation.T)[..., None])[..., 0].T
-        length = np.maximum(np.sqrt(along[0] * along[0] + along[1] * along[1]), 1e-9)
-        x, y = -along[1] / length, along[0] / length
-        width = x * across[0] + y * across[1]
-        sign = np.sign(width)
-        return np.stack([x * sign, y * sign]), np.abs(width)
-
-    def _linear_part(self, gray: Image) -> NDArray[np.float32]:
-        """A part of an image in linear light, decoded once for all poses that are tried on it."""
-        decoded = self._decoded
-        if decoded is None or decoded[0] is not gray:
-            self._decoded = decoded = gray, np.asarray(cv2.LUT(gray, self._linear), np.float32)
-        return decoded[1]
-
-    def _correlation(self, part: NDArray[np.float32], origin: tuple[int, int], pose: Pose) -> float:
-        """Correlation, -1 to 1, of the brightness at cell centres with the print; 0 where it cannot be seen."""
-        camera = pose.apply(self._pattern.cells)
-        if camera[:, 2].min() <= 1e-6:
-            return 0.0
-        at = (self._project(camera)[0] - origin).astype(np.float32)
-        h, w = part.shape
-        inside = ((at >= 0) & (at <= (w - 1, h - 1))).all(1)
-        if inside.sum() < 8:
-            return 0.0
-        values = cv2.remap(part, at[inside, 0], at[inside, 1], cv2.INTER_LINEAR).ravel().astype(float)
-        # Lamps' reflections and sparkle must not outvote the print.
-        values = np.clip(values, *np.percentile(values, (5, 95)))
-        a, b = values - values.mean(), self._pattern.white[inside] - self._pattern.white[inside].mean()
-        scale = np.sqrt((a @ a) * (b @ b))
-        return float(a @ b / scale) if scale > 1e-9 else 0.0
+    def _fit_edges(self, poses: list[Pose], reaches: Sequence[float]) -> list[_Fit | None]:
+        """Gauss-Newton on the printed edges from each pose; None where too few are seen."""
+        fits: list[_Fit | None] = []
+        for index, found in enumerate(self._fitter.fit(poses, reaches)):
+            if not found["fitted"]:
+                fits.append(None)
+                continue
+            pose = Pose(found["rotation"].copy(), found["translation"].copy())
+            error, support, cost, pattern = (float(found[name]) for name in ("error", "support", "cost", "pattern"))
+            information = self._fitter.information(index)
+            fits.append(_Fit(pose, information, error, support, cost, pattern, edges=True))
+        return fits
 
     def _steadied(self, fit: _Fit, guess: Pose | None, time: float) -> Pose:
         """The measured pose, averaged with the last one as far as both agree within the measurement's own noise.
@@ -492,62 +453,24 @@ class Tracker:
 
     def _judge(self, fit: _Fit) -> float:
         """Quality from what supports the pose and how well it is determined."""
-        deviations = np.sqrt(np.maximum(np.diag(np.linalg.pinv(fit.information)), 0.0))
+        deviations = np.sqrt(np.maximum(np.diag(_inverse(fit.information)), 0.0))
         turn = float(np.degrees(np.linalg.norm(deviations[:3])))
         shift = float(np.linalg.norm(deviations[3:]) / np.linalg.norm(fit.pose.translation)) * 100
         quality = min(1.0, fit.support / 0.9) / (1.0 + turn**2 + shift**2)
         return float(np.clip(quality * (0.5 if self._rival else 1.0), 0.0, 1.0))
 
 
+def _inverse(information: Array) -> Array:
+    """Covariance of a pose; where some motion of it is not seen at all, of the others."""
+    with contextlib.suppress(np.linalg.LinAlgError):
+        inverse = np.asarray(np.linalg.inv(information), float)
+        if inverse.diagonal().min() > 0.0:
+            return inverse
+    return np.asarray(np.linalg.pinv(information), float)
+
+
 def _holds(fit: _Fit | None) -> TypeGuard[_Fit]:
     return fit is not None and fit.support >= _SUPPORT and fit.pattern >= _PATTERN
-
-
-def _gray(image: Image) -> Image:
-    gray = np.ascontiguousarray(image) if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    return np.asarray(gray, np.uint8)
-
-
-def _edge_offsets(
-    part: NDArray[np.float32], at: Array, normal: Array, half: Array
-) -> tuple[NDArray[np.bool_], Array] | tuple[None, Array]:
-    """How far edges lie from where they are expected.
-
-    Args:
-        part: Linear light.
-        at: Pixels of it at which edges are expected, (2, n).
-        normal: Theirs, from black to white, (2, n).
-        half: Half width of the window that is sampled along each, pixels, (n,).
-
-    Returns:
-        Which of them are seen, (n,), and of those the distances along their normals, pixels; None where too few are.
-    """
-    h, w = part.shape
-    along = half[:, None] * _PLACES
-    x, y = (at[axis][:, None] + along * normal[axis][:, None] for axis in (0, 1))
-    inside = (np.minimum(x[:, 0], x[:, -1]) >= 0) & (np.maximum(x[:, 0], x[:, -1]) <= w - 1) & (half >= _MIN_REACH)
-    inside &= (np.minimum(y[:, 0], y[:, -1]) >= 0) & (np.maximum(y[:, 0], y[:, -1]) <= h - 1)
-    if np.count_nonzero(inside) < _MIN_EDGES:
-        return None, half
-    places = x.astype(np.float32), y.astype(np.float32)
-    values = cv2.remap(part, *places, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(float)
-    black, white = 0.5 * (values[:, 0] + values[:, 1]), 0.5 * (values[:, -2] + values[:, -1])
-    contrast = white - black
-    seen = inside & (contrast > max(0.3 * _median(contrast[inside]), 1e-4))
-    if np.count_nonzero(seen) < _MIN_EDGES:
-        return None, half
-    area = (2 * white - values @ _WEIGHTS)[seen] / contrast[seen]  # the weights sum to 2
-    reach = half[seen]
-    return seen, np.minimum(np.maximum(reach * (area - 1.0), -reach), reach)
-
-
-def _median(values: Array) -> float:
-    """The middle of finite values, as NumPy's, which takes four times as long for a few hundred."""
-    middle = len(values) // 2
-    if len(values) % 2:
-        return float(np.partition(values, middle)[middle])
-    low, high = np.partition(values, (middle - 1, middle))[middle - 1 : middle + 1]
-    return 0.5 * float(low + high)
 
 
 def _pose_rows(jacobian: Array, arm: Array) -> Array:
@@ -560,38 +483,3 @@ def _pose_rows(jacobian: Array, arm: Array) -> Array:
     rows = np.empty((len(arm), 2, 6))
     rows[..., 0], rows[..., 1], rows[..., 2], rows[..., 3:] = y * c - z * b, z * a - x * c, x * b - y * a, jacobian
     return rows
-
-
-_PRIOR = np.diag([0.0] * 6 + [1.0] * 3)
-"""The shift of edges is a fraction of a pixel; without inner edges it cannot be told from distance."""
-
-
-def _solve(rows: Array, offset: Array, normals: Array) -> tuple[Array, Array, Array, Array] | None:
-    """Robust least squares of ``rows @ step + n'S n = offset``: n the ``normals``, (k, 2), S the shift of edges.
-
-    Returns:
-        Pose step (6,), residuals after it, weights 0 to 1, and the information (6, 6) of the pose with the shift
-        marginalised; None if singular.
-    """
-    x, y = normals.T
-    design = np.empty((len(rows), 9))
-    design[:, :6], design[:, 6], design[:, 7], design[:, 8] = rows, 1.0, x * x - y * y, 2.0 * x * y
-    weights: Array = np.ones(len(rows))
-    solution: Array = np.zeros(9)
-    for _ in range(3):
-        weighted = design * weights[:, None]
-        normal = weighted.T @ design + _PRIOR
-        try:
-            solution = np.asarray(np.linalg.solve(normal, weighted.T @ offset), float)
-        except np.linalg.LinAlgError:
-            return None
-        residual = offset - design @ solution
-        spread = max(
-            1.4826 * float(np.partition(np.abs(residual), len(residual) // 2)[len(residual) // 2]), _NOISE_FLOOR
-        )
-        # Tukey's weight: an edge that is covered, or lies under a reflection, must not pull at all.
-        weights = np.square(np.maximum(1 - np.square(residual / (4.7 * spread)), 0.0))
-    normal = (design * weights[:, None]).T @ design + _PRIOR
-    shared = normal[:6, 6:] @ np.linalg.solve(normal[6:, 6:], normal[6:, :6])
-    information = (normal[:6, :6] - shared) / (_CORRELATED * spread**2)
-    return (solution[:6], residual, weights, information) if np.isfinite(solution).all() else None

@@ -1,4 +1,4 @@
-"""Estimates of recovery in processes of their own, for pictures that are shown as they are made.
+"""Estimates of recovery in processes of their own, for pictures that are shown as they are made, and on CUDA.
 
 A solution is 20 to 100 ms of small NumPy products that hold Python's lock; threads of the same process that
 launch kernels or look for markers then wait for it at each of their calls. In a process beside them it costs the frames

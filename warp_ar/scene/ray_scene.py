@@ -70,6 +70,7 @@ class HostScene:
         self._place_objects()
         self._lights = np.zeros(len(scene.lights), _dtype(structs.Light))
         self._lit: Outline | None = None
+        self._mirrors: tuple[Outline, Outline] | None = None
         self._bounced: Outline | None = None
         self._placed = b""  # the objects that the polygons below are of
         self._outline = Outline(())
@@ -306,7 +307,7 @@ class HostScene:
                 _place(record, item, fixed["rotation"], fixed["position"], places)
         changed = _update(records_out, self._proxies)
         if changed:
-            self._lit = self._shaded = None
+            self._lit = self._shaded = self._mirrors = None
         return changed
 
     def place_probes(self, pose: Pose, places: Mapping[scenes.Marker, Pose | None] = _NOWHERE) -> bool:
@@ -390,8 +391,10 @@ class HostScene:
         """Where mirror balls are, and ``receivers`` that mirror."""
         if not receivers:
             return self._balls
-        faces = [face for record in _present(self._proxies[self._glossy]) for face in box_faces(record)]
-        return Outline([*self._balls.polygons, *faces])
+        if self._mirrors is None or self._mirrors[0] is not self._balls:
+            faces = [face for record in _present(self._proxies[self._glossy]) for face in box_faces(record)]
+            self._mirrors = self._balls, Outline([*self._balls.polygons, *faces])
+        return self._mirrors[1]
 
     def shadow_outline(self) -> Outline:
         """Where virtual objects can change the environment on proxies."""
@@ -474,8 +477,7 @@ def _vectors(parts: Iterable[npt.NDArray[np.float32]], length: int, dtype: Any, 
 
 def _update(records_out: npt.NDArray[Any], records: npt.NDArray[Any]) -> bool:
     # By bytes, those between the fields included: NumPy takes ten times as long to compare records field by field.
-    written, wanted = records_out.view(np.uint8), records.view(np.uint8)
-    if np.array_equal(written, wanted):
+    if records_out.tobytes() == records.tobytes():
         return False
-    written[...] = wanted
+    records_out.view(np.uint8)[...] = records.view(np.uint8)
     return True

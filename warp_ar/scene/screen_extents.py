@@ -247,18 +247,19 @@ def screen_rects(outlines: Sequence[Outline], pose: Pose, camera: scenes.Camera)
         camera: The camera of the frames.
     """
     rects = [EMPTY] * len(outlines)
-    parts = {index: outline.corners for index, outline in enumerate(outlines) if outline.polygons}
-    if not parts:
+    parts = _join(tuple(outlines))
+    if parts is None:
         return rects
-    points = pose.apply(np.concatenate(list(parts.values())))
-    if points[:, 2].min() < _nearest(points):
-        clipped = {index: _in_front(outlines[index], pose) for index in parts}
-        parts = {index: part for index, part in clipped.items() if len(part)}
-        if not parts:
+    points, starts, places = pose.apply(parts.corners), parts.starts, parts.places
+    nearest = points[:, 2].min()
+    # All that is asked of the depth of most frames; where that is not enough, points are looked at.
+    if nearest < 2e-6 * (parts.radius + float(np.abs(pose.translation).sum())) and nearest < _nearest(points):
+        clipped = {index: _in_front(outlines[index], pose) for index in places}
+        left = {index: part for index, part in clipped.items() if len(part)}
+        if not left:
             return rects
-        points = np.concatenate(list(parts.values()))
+        points, starts, places = np.concatenate(list(left.values())), _starts(left.values()), tuple(left)
     projected = points[:, :2] / points[:, 2:]
-    starts = list(itertools.accumulate(map(len, parts.values()), initial=0))[:-1]
     low, high = np.minimum.reduceat(projected, starts), np.maximum.reduceat(projected, starts)
     x_low, x_high, y_low, y_high = _ray_bounds(camera)
     edges = (
@@ -267,10 +268,40 @@ def screen_rects(outlines: Sequence[Outline], pose: Pose, camera: scenes.Camera)
         x_high.searchsorted(low[:, 0]),
         x_low.searchsorted(high[:, 0], "right"),
     )
-    for index, top, bottom, left, right in zip(parts, *(edge.tolist() for edge in edges), strict=True):
-        if top < bottom and left < right:
-            rects[index] = top, bottom, left, right
+    for index, rect in zip(places, zip(*(edge.tolist() for edge in edges), strict=True), strict=True):
+        top, bottom, first, last = rect
+        if top < bottom and first < last:
+            rects[index] = rect
     return rects
+
+
+@dataclasses.dataclass(frozen=True)
+class _Joined:
+    """Several outlines one behind the other."""
+
+    corners: FloatArray
+    """Of all, (n, 3)."""
+    starts: list[int]
+    """Where those of each that has any begin."""
+    places: tuple[int, ...]
+    """Which of the outlines these are."""
+    radius: float
+    """No corner is farther from the origin."""
+
+
+@functools.lru_cache(maxsize=16)
+def _join(outlines: tuple[Outline, ...]) -> _Joined | None:
+    """Outlines stay the same for many frames, and to join them takes as long as to look at them."""
+    parts = {index: outline.corners for index, outline in enumerate(outlines) if outline.polygons}
+    if not parts:
+        return None
+    corners = np.concatenate(list(parts.values()))
+    radius = float(np.linalg.norm(corners, axis=1).max())
+    return _Joined(corners, _starts(parts.values()), tuple(parts), radius)
+
+
+def _starts(parts: Iterable[FloatArray]) -> list[int]:
+    return list(itertools.accumulate(map(len, parts), initial=0))[:-1]
 
 
 def _nearest(points: FloatArray) -> float:

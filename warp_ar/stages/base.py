@@ -12,7 +12,9 @@ from __future__ import annotations
 
 import abc
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping
+import functools
+import operator
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, ClassVar
 
 from warp_ar.stages.features import Features
@@ -162,6 +164,12 @@ class Arrays(Mapping[str, Any]):
         """Versions of several."""
         return tuple(map(self._versions.__getitem__, names))
 
+    def versions_of(self, names: Sequence[str]) -> Callable[[], Any]:
+        """What gives the versions of several, in a form that is only compared; made once, asked in every frame."""
+        if not names:
+            return tuple
+        return functools.partial(operator.itemgetter(*names), self._versions)
+
 
 NO_BALL = "the scene has no mirror ball, so the environment is unknown"
 NO_OBJECT = "the scene has no virtual object"
@@ -248,7 +256,7 @@ class Stage(abc.ABC):
         """Why what the stage writes is as if it did nothing in a frame; None where it may do something.
 
         Its passes then write just that, whatever the stage reads. What it says may change only when something that it
-        reads does.
+        reads does, and is the same for the same ``reach``.
         """
         return None
 

@@ -397,12 +397,14 @@ class Recover(Stage):
         self._equations.fetch(self._stream, self._frames_stream)
         now = self._progress
         now.gain = self._arrays["gain"]()
-        if self._real_time:
+        if self._has_process:
             POOL.prepare()
         # In this process a solution holds the interpreter's lock, which frames beside it wait for. Where a frame waits
         # for it, a process that is there already is used; to start one takes longer than most clips.
-        aside = POOL.ready if self._waits else self._real_time and not self._at_once()
-        now.pending = self._worker.submit(self._solve, now.solver, aside)
+        aside = POOL.ready if self._waits else self._has_process and not self._at_once()
+        # On CPU the frame's values are no copy: the next frame writes where the camera is, beside the worker.
+        camera = _camera_of(self._equations.fetched()) if self._device.is_cpu else None
+        now.pending = self._worker.submit(self._solve, now.solver, aside, camera)
         if self._at_once():
             self._take(None)
 
@@ -410,6 +412,15 @@ class Recover(Stage):
     def _real_time(self) -> bool:
         """Whether no frame waits for an estimate."""
         return self.request.estimates == "real_time"
+
+    @property
+    def _has_process(self) -> bool:
+        """Whether estimates after a stream's first are solved for in a process beside this one.
+
+        On CUDA frames are bound by the interpreter's lock. On CPU frames take all cores, and a process would have to
+        take one from them. What it finds is the same to the bit.
+        """
+        return self._real_time or not (self._waits or self._device.is_cpu)
 
     @property
     def _waits(self) -> bool:
@@ -420,8 +431,8 @@ class Recover(Stage):
         """Whether this frame's estimate, if it begins one, takes effect in it: a stream's first do."""
         return self._waits or self._progress.frames <= EVERY_FRAME
 
-    def _solve(self, solver: recovery.Recovery, aside: bool) -> _Solved:
-        """In the worker, or, if ``aside``, in a process beside it.
+    def _solve(self, solver: recovery.Recovery, aside: bool, camera: npt.NDArray[np.float64] | None) -> _Solved:
+        """In the worker, or, if ``aside``, in a process beside it; ``camera`` is where it stands, if that is known.
 
         Nothing writes the equations before this is done: it takes effect before the next begins.
 
@@ -436,7 +447,7 @@ class Recover(Stage):
             sides["recover_transfer"],
             sides["recover_mirrored"],
             sides["recover_observations"],
-            sides["params"]["camera_position"][0].astype(float),
+            _camera_of(sides) if camera is None else camera,
         )
         if aside:
             solver, estimate = POOL.solve(solver, given, self._trace)
@@ -558,6 +569,11 @@ class Recover(Stage):
                 axes = getattr(estimate.irradiance, name)
                 report[f"irradiance_{name}"] = [[round(float(x), 4) for x in axis] for axis in axes]
         return report | reason
+
+
+def _camera_of(sides: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[np.float64]:
+    """Where the camera stood when the equations were written, metres, (3,)."""
+    return np.asarray(sides["params"]["camera_position"][0], np.float64).copy()
 
 
 def _is_finite(estimate: Estimate) -> bool:
