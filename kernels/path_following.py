@@ -326,7 +326,7 @@ class DirectLight:
     """Light that reaches a surface straight from its sources, as the surface reflects it."""
 
     of_sky: wp.vec3  # of the environment, without virtual content
-    changed: wp.vec3  # of the environment as virtual content leaves it, or its change, and what the surface sends itself
+    changed: wp.vec3  # of the environment as virtual content leaves it, or its change, and the surface's own light
     of_lights: wp.vec3  # of virtual lights
 
 
