@@ -24,7 +24,7 @@ def listed(monkeypatch):
     """Kernels that a plan would have compiled, each with its size of block."""
     found: list[tuple[wp.Kernel, int]] = []
 
-    def note(kernels, device, progress=None, *, blocks=()):
+    def note(kernels, device, progress=None, *, blocks=(), on_host=()):
         found.extend([(kernel, BLOCK) for kernel in kernels])
         found.extend(blocks)
         raise _Listed
