@@ -378,8 +378,9 @@ def test_hidden_by_a_proxy(device, kind):
     mesh = None
     if kind == "mesh":
         box = trimesh.creation.box(2 * half)
-        vertices, faces = np.float32(box.vertices), np.int32(box.faces).ravel()
-        mesh = wp.Mesh(wp.array(vertices, dtype=wp.vec3), wp.array(faces, dtype=wp.int32))
+        # Corners one after another, as ``structs.Shape.mesh`` has them.
+        vertices = np.float32(box.vertices[box.faces]).reshape(-1, 3)
+        mesh = wp.Mesh(wp.array(vertices, dtype=wp.vec3), wp.array(np.arange(len(vertices)), dtype=wp.int32))
         shape |= {"kind": MESH, "mesh": mesh.id}
     frame = encode(
         reference.render(view, [BALL], lambda d: np.full_like(d, 0.5) / REFLECTANCE, lambda d: np.full_like(d, 0.5))
