@@ -6,8 +6,9 @@ Parts, each of which keeps to its share of the minutes:
 
 - ``bounds``: what a frame costs in each step of a worker, alone and on one stream: decoding, conversion, tracking,
   kernels, encoding; and a whole worker beside them;
-- ``gpus``: frames a second of segments with one GPU and half of the cores, and with two and all of them, in turn; one
-  and several workers per GPU. On a machine of one GPU only the first;
+- ``gpus``: frames a second of segments with one GPU and half of the cores, the same while a second run has the other
+  GPU and half, and with two and all of them, in turn; one and several workers per GPU. On a machine of one GPU only
+  the first;
 - ``cpu``: the same on the processor alone, for several numbers of workers;
 - ``long``: a recording through 8 segments while workers and driver are killed: each job once, memory over time, and
   every picture equal to those of one run. As many of the asked frames as fit its minutes; the figures say how many.
@@ -31,6 +32,7 @@ import statistics
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -127,49 +129,107 @@ def _numbers_to_try(bench: Bench, cores: int, gpus: int) -> list[int]:
     return [own, *(number for number in asked if number != own)]
 
 
+@dataclasses.dataclass(frozen=True)
+class GpuCase:
+    """One way to spread workers over the GPUs of a host."""
+
+    gpus: int
+    """Of one run."""
+    per_gpu: int
+    """Workers of each."""
+    cores: tuple[int, ...]
+    """That one run keeps to."""
+    neighbour: tuple[int, ...] = ()
+    """Cores on which a second such run works on the second GPU at the same time; empty: there is none."""
+
+    def __str__(self) -> str:
+        beside = ", the other half at the same work" if self.neighbour else ""
+        return f"{self.gpus} GPU, {self.per_gpu} workers each, {len(self.cores)} cores{beside}"
+
+
+def _gpu_cases(each: Sequence[int], cores: Sequence[int], count: int) -> list[GpuCase]:
+    """For each number of workers of a GPU: one GPU, the same while the host's other half is as busy, and two."""
+    whole = tuple(cores)
+    half = whole[: max(1, len(whole) // 2)] if count > 1 else whole
+    cases = []
+    for per_gpu in each:
+        cases.append(GpuCase(1, per_gpu, half))
+        if count > 1:
+            cases += [GpuCase(2, per_gpu, whole), GpuCase(1, per_gpu, half, whole[len(half) :])]
+    if count > 1:
+        cases.append(GpuCase(1, 2 * each[-1], whole))
+    return cases
+
+
+def _measure_gpu_case(bench: Bench, name: str, case: GpuCase, seconds: float) -> dict[str, Any]:
+    """Figures of one run; where it has a neighbour, with the frames a second of both (``fps_each``) and their mean."""
+    workers = case.gpus * case.per_gpu
+    if not case.neighbour:
+        return steady_run(bench, name, workers, "cuda", seconds, gpus=range(case.gpus), cores=case.cores)
+    with ThreadPoolExecutor(2) as pool:
+        runs = [
+            pool.submit(steady_run, bench, f"{name}-{gpu}", workers, "cuda", seconds, gpus=[gpu], cores=cores)
+            for gpu, cores in enumerate((case.cores, case.neighbour))
+        ]
+        both = [run.result() for run in runs]
+    figures = both[0]
+    if all("fps" in one for one in both):
+        figures["fps_each"] = [one["fps"] for one in both]
+        figures["fps"] = statistics.mean(figures["fps_each"])
+    return figures
+
+
 def run_gpus(bench: Bench) -> None:
-    """One GPU and two, in turn."""
+    """One GPU and two, in turn; one GPU also while the host's other half does the same."""
     count = len(wp.get_cuda_devices())
     if not count or bench.device == "cpu":
         bench.tell("gpus", left_out="there is no CUDA device")
         return
     surveyed(bench)
     cores = by_siblings(os.sched_getaffinity(0))
-    half = cores[: max(1, len(cores) // 2)] if count > 1 else cores
     each = _numbers_to_try(bench, len(cores), count)
-    cases: list[tuple[int, int, Sequence[int]]] = []
-    for per_gpu in each:
-        cases.append((1, per_gpu, half))
-        if count > 1:
-            cases.append((2, per_gpu, cores))
-    if count > 1:
-        cases.append((1, 2 * each[-1], cores))
+    cases = _gpu_cases(each, cores, count)
     seconds = max(LEAST_STEADY, bench.left / (2 * len(cases)) - 8.0)
-    found: dict[tuple[int, int, int], list[float]] = {}
+    found: dict[GpuCase, list[float]] = {}
     took = 0.0
-    for turn, (gpus, per_gpu, own) in itertools.product(range(2), cases):
+    for turn, case in itertools.product(range(2), cases):
         if bench.left < took:
             bench.say("no time is left for more")
             break
-        bench.say(f"{gpus} GPU, {per_gpu} workers each, {len(own)} cores, turn {turn + 1}")
-        name, start = f"gpus-{gpus}-{per_gpu}-{len(own)}-{turn}", time.monotonic()
-        figures = steady_run(bench, name, gpus * per_gpu, "cuda", seconds, gpus=range(gpus), cores=own)
-        bench.tell("gpus", gpus=gpus, per_gpu=per_gpu, used_cores=len(own), turn=turn + 1, figures=figures)
+        bench.say(f"{case}, turn {turn + 1}")
+        start = time.monotonic()
+        figures = _measure_gpu_case(bench, f"gpus-{cases.index(case)}-{turn}", case, seconds)
+        bench.tell(
+            "gpus",
+            gpus=case.gpus,
+            per_gpu=case.per_gpu,
+            used_cores=len(case.cores),
+            neighbour=bool(case.neighbour),
+            turn=turn + 1,
+            figures=figures,
+        )
         if "fps" in figures:
-            found.setdefault((gpus, per_gpu, len(own)), []).append(figures["fps"])
+            found.setdefault(case, []).append(figures["fps"])
         took = max(took, time.monotonic() - start)
-    for per_gpu in each:
-        one, two = found.get((1, per_gpu, len(half)), []), found.get((2, per_gpu, len(cores)), [])
-        ratios = [b / a for a, b in zip(one, two, strict=False)]
-        if ratios:
-            bench.tell(
-                f"two GPUs over one, {per_gpu} workers each",
-                ratio=round(statistics.median(ratios), 3),
-                ratios=[round(ratio, 3) for ratio in ratios],
-                asked=1.9,
-                one_fps=one,
-                two_fps=two,
-            )
+    for two, one in itertools.product(cases, cases):
+        if two.gpus == 2 and one.gpus == 1 and one.per_gpu == two.per_gpu and len(one.cores) < len(two.cores):
+            _tell_ratio(bench, one, found.get(one, []), found.get(two, []))
+
+
+def _tell_ratio(bench: Bench, case: GpuCase, one: list[float], two: list[float]) -> None:
+    """What two GPUs make over one."""
+    ratios = [b / a for a, b in zip(one, two, strict=False)]
+    if not ratios:
+        return
+    beside = ", which has a neighbour at the same work" if case.neighbour else ""
+    bench.tell(
+        f"two GPUs over one{beside}, {case.per_gpu} workers each",
+        ratio=round(statistics.median(ratios), 3),
+        ratios=[round(ratio, 3) for ratio in ratios],
+        asked=1.9,
+        one_fps=one,
+        two_fps=two,
+    )
 
 
 def run_cpu(bench: Bench) -> None:
