@@ -106,6 +106,23 @@ def test_frames_sent_ahead_are_the_same(frames: Frames, device: str) -> None:
             np.testing.assert_array_equal(result.image, image)
 
 
+def test_frames_written_where_they_are_sent_from_are_the_same(frames: Frames, device: str) -> None:
+    """Each in memory of its own while it is under way."""
+    many = frames * 3
+    with (
+        Pipeline(make_scene(), device=device, quality="low") as first,
+        Pipeline(make_scene(), device=device, quality="low") as second,
+    ):
+        expected, ahead = [result.image for result in run(first, many)], []
+        for index, image in enumerate(many):
+            frame = second.new_frame()
+            assert (frame.shape, frame.dtype) == (image.shape, np.uint8)
+            frame[...] = image
+            ahead.append(second.submit(frame, time_seconds=index / 30))
+        for result, image in zip(ahead, expected, strict=True):
+            np.testing.assert_array_equal(result.image, image)
+
+
 def test_a_track_of_the_callers_is_that_of_the_pipelines_own(frames: Frames, device: str) -> None:
     """One in which the marker is lost, too: the frame passes as it came."""
     scene = make_scene()

@@ -23,8 +23,9 @@ def test_parts_are_a_whole_frame(height: int, width: int, parts: int) -> None:
     assert parts == 1 or min(3 * width * (part.stop - part.start) for part in rows) >= COPY_BYTES
 
 
+@pytest.mark.parametrize("given", [False, True])
 @pytest.mark.parametrize("size", [(48, 64), (1080, 1920)])
-def test_pictures_come_back_as_they_went(device: str, size: tuple[int, int]) -> None:
+def test_pictures_come_back_as_they_went(device: str, size: tuple[int, int], given: bool) -> None:
     """More pictures than there is pinned memory for, all kept, each with its bits; what was sent is written anew."""
     if wp.get_device(device).is_cpu:
         pytest.skip("on the CPU nothing is sent")
@@ -33,15 +34,47 @@ def test_pictures_come_back_as_they_went(device: str, size: tuple[int, int]) -> 
     images = np.random.default_rng(1).integers(0, 256, (KEPT + 3, *size, 3), np.uint8)
     source, pictures = np.empty_like(images[0]), []
     for image in images:
+        source = transfers.new_frame() if given else source
         source[...] = image
         slot = transfers.upload(source)
-        source[...] = 0
+        if not given:
+            source[...] = 0
         transfers.receive(slot, frame)
         pictures.append(transfers.download(frame))
     for image, picture in zip(images, pictures, strict=True):
         np.testing.assert_array_equal(picture.result(), image)
         assert all(milliseconds > 0.0 for milliseconds in picture.steps().values())
         assert set(picture.steps()) == {"upload", "kernels", "download"}
+    transfers.close()
+
+
+def test_a_new_frame_is_sent_from_where_it_lies(hosts_side) -> None:
+    """Nothing is copied on the host; it is held until it has been sent, and given again when nobody refers to it."""
+    (make, done), size = hosts_side, (1080, 1920)
+    transfers, frame = make(size), wp.zeros(size, dtype=wp.vec3ub, device="cpu")
+    values = np.random.default_rng(3).integers(0, 256, (*size, 3), np.uint8)
+    first = transfers.new_frame()
+    first[...] = values
+    slot = transfers.begin(first)
+    assert np.shares_memory(slot.host, first)
+    assert not np.shares_memory(slot.own.host, first)
+    done.clear()
+    transfers.send(slot)
+    assert done == ["up record", "up copy", "up record"]
+    transfers.receive(slot, frame)
+    np.testing.assert_array_equal(frame.numpy(), values)
+
+    place = first.ctypes.data
+    del first
+    others = [transfers.new_frame() for _ in range(2)]
+    assert place not in [other.ctypes.data for other in others]  # it may be on its way
+    for _ in range(transfer.SLOTS):
+        transfers.send(transfers.begin(values))
+    assert transfers.new_frame().ctypes.data == place
+    # Memory that was given counts as such in whatever array it comes; other memory is copied.
+    other = others[0].reshape(-1).reshape(others[0].shape)
+    assert transfers.begin(other).given is other
+    assert transfers.begin(values).given is None
     transfers.close()
 
 

@@ -371,6 +371,24 @@ class Pipeline(Closing):
         """
         return self._begin(image, time_seconds, pose, exposure_time, ahead=False)
 
+    def new_frame(self) -> Image:
+        """Memory for a frame to ``submit``, for a source to write the frame into.
+
+        On CUDA it is pinned: the frame is sent from there, where any other is copied to such memory first. Once it has
+        been submitted it must stay as it is; ask for another for the next frame. It is given again when nobody refers
+        to it any more, so that there are as many as are held at once.
+
+        Returns:
+            uint8 (height, width, 3), of any values.
+
+        Raises:
+            UsageError: The pipeline is closed, or another process's.
+        """
+        self._check_usable()
+        if self.inputs.transfers is not None:
+            return self.inputs.transfers.new_frame()
+        return np.empty((self.size[1], self.size[0], 3), np.uint8)
+
     def submit(
         self,
         image: npt.NDArray[np.uint8] | Any,
@@ -385,7 +403,8 @@ class Pipeline(Closing):
         sent from, and its picture is sent ahead; on CPU another thread renders it. With the next frame submitted before
         this one's image is read, tracking, both ways over the bus and the kernels run side by side. The device's own
         arrays of a result still hold only until the next frame is rendered.
-        An image that may not be written (``flags.writeable``) is taken to stay as it is, and not copied.
+        An image that may not be written (``flags.writeable``) is taken to stay as it is, and not copied on CPU; on CUDA
+        one that ``new_frame`` gave is not.
         """
         return self._begin(image, time_seconds, pose, exposure_time, ahead=True)
 

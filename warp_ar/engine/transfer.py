@@ -5,7 +5,8 @@ A frame goes into pinned memory (host), to the device (copy engine), through the
 engines move a second and the kernels work on a third. Kernels read and write arrays of their own, at addresses that a
 captured graph may keep; they are copied to and from the slots on the device, which takes a hundredth of the way over
 the bus. A picture stays in the pinned memory that it came into until nobody refers to it any more: to copy it again
-takes the host longer than all the rest.
+takes the host longer than all the rest. So it is with frames: who writes them where ``new_frame`` says has no copy to
+wait for.
 """
 
 from __future__ import annotations
@@ -57,8 +58,12 @@ class Slot:
     """Of the frame that was uploaded last."""
 
     def __init__(self, shape: tuple[int, int], device: Any) -> None:
-        self.pinned = wp.zeros(shape, dtype=wp.vec3ub, device="cpu", pinned=True)
-        self.host = self.pinned.numpy()
+        self.own = Pinned(shape)
+        """Memory for a frame that lies elsewhere."""
+        self.source = self.own
+        """What is sent."""
+        self.given: Image | None = None
+        """The caller's picture, while it is sent from where it lies."""
         self.frame = wp.zeros(shape, dtype=wp.vec3ub, device=device)
         self.image = wp.zeros(shape, dtype=wp.vec3ub, device=device)
         self.consumed = wp.Event(device)
@@ -67,21 +72,43 @@ class Slot:
         self.sent = True
         """Whether the picture that was copied to here has been sent on its way."""
 
+    @property
+    def host(self) -> Image:
+        """The picture that is sent."""
+        return self.source.host if self.given is None else self.given
 
-class Buffer:
+
+class Pinned:
+    """Memory of the host that the device reads and writes beside what the host does."""
+
+    def __init__(self, shape: tuple[int, int], *, pinned: bool = True) -> None:
+        self.array = wp.empty(shape, dtype=wp.vec3ub, device="cpu", pinned=pinned)
+        self.host: Image = self.array.numpy()
+
+    def lend(self, free: collections.deque[Any]) -> Image:
+        """The memory as an array; when nobody refers to it any more this is among those that are free again."""
+        holder = _Holder(self.host)
+        weakref.finalize(holder, free.append, self)
+        return np.asarray(holder)
+
+
+class Buffer(Pinned):
     """Memory of the host that a picture comes into, and when it was rendered and was there."""
 
     def __init__(self, shape: tuple[int, int], device: Any, *, pinned: bool) -> None:
-        self.array = wp.empty(shape, dtype=wp.vec3ub, device="cpu", pinned=pinned)
-        self.host = self.array.numpy()
+        super().__init__(shape, pinned=pinned)
         self.rendered, self.done = (wp.Event(device, enable_timing=True) for _ in range(2))
 
 
 class _Holder:
-    """What arrays over one buffer of pictures refer to: it goes when the last of them does."""
+    """What arrays over one piece of memory refer to: it goes when the last of them does."""
 
     def __init__(self, host: Image) -> None:
         self.__array_interface__ = host.__array_interface__
+
+
+def _address(image: Image) -> int:
+    return int(image.__array_interface__["data"][0])
 
 
 class _Copier:
@@ -146,6 +173,9 @@ class Transfers:
         self._marking = self._marks[0]
         self._free = collections.deque(Buffer(shape, device, pinned=True) for _ in range(SLOTS))
         self._buffers = SLOTS
+        self._frames: dict[int, Pinned] = {}
+        """Memory that ``new_frame`` has given, by its address."""
+        self._free_frames: collections.deque[Pinned] = collections.deque()
 
     def close(self) -> None:
         """Stop the copying threads; what is on its way to the host arrives before the slots that it lies in go."""
@@ -155,8 +185,24 @@ class Transfers:
             if slot.downloaded is not None:
                 wait_for(slot.downloaded)
 
+    def new_frame(self) -> Image:
+        """Memory for a frame that is sent from where it lies: it must stay as it is once it has been begun.
+
+        Returns:
+            uint8 (height, width, 3), of any values; when nobody refers to it any more it is given again.
+        """
+        try:
+            memory = self._free_frames.popleft()
+        except IndexError:
+            with exclusive(self._device):
+                memory = Pinned(self._shape)
+            self._frames[_address(memory.host)] = memory
+        return memory.lend(self._free_frames)
+
     def begin(self, image: Image) -> Slot:
         """Begin to copy a host picture to where it is sent from; ``send`` must follow before the caller writes it anew.
+
+        A picture that ``new_frame`` gave is there, and is held until it has been sent.
 
         Returns:
             What to ``send`` and to ``receive`` it from, before ``SLOTS`` more are begun.
@@ -169,6 +215,10 @@ class Transfers:
         marks = slot.marks = self._marks[self._uploads % MARKED]
         marks.frame, slot.sent = self._uploads, False
         self._uploads += 1
+        given = self._frames.get(_address(image))
+        slot.source, slot.given = (slot.own, None) if given is None else (given, image)
+        if given is not None:
+            return slot
         if not self._copiers:
             np.copyto(slot.host, image)
             return slot
@@ -192,7 +242,7 @@ class Transfers:
         self._wait_for_copies()
         marks, slot.sent = slot.marks, True
         self._up.record_event(marks.sent)
-        wp.copy(slot.frame, slot.pinned, stream=self._up)
+        wp.copy(slot.frame, slot.source.array, stream=self._up)
         self._up.record_event(marks.arrived)
 
     def upload(self, image: Image) -> Slot:
@@ -227,10 +277,8 @@ class Transfers:
             buffer = Buffer(self._shape, self._device, pinned=False)
             kept: Image = buffer.host
         else:
-            holder = _Holder(buffer.host)
             # The next picture is sent there on the same stream, so after this one even if nobody waited for it.
-            weakref.finalize(holder, self._free.append, buffer)
-            kept = np.asarray(holder)
+            kept = buffer.lend(self._free)
         with exclusive(self._device):  # kernels of other pipelines may be captured on the same stream
             if slot.downloaded is not None:
                 self._compute.wait_event(slot.downloaded)
