@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -42,6 +43,25 @@ def test_frames_after_a_change_are_those_of_the_new_scene_and_quality() -> None:
         assert times == sorted(times)
         assert "shade" not in result.stages
         np.testing.assert_array_equal(held.image.shape, result.image.shape)
+
+
+def test_the_first_frame_is_handed_out_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From the second on the next one is begun before; all come in order, each once."""
+    with Session(scene(), device="cpu", quality="low") as session:
+        begun: list[float] = []
+        submit = session.pipeline.submit
+
+        def noted(image: object, *, time_seconds: float, **more: object):
+            begun.append(time_seconds)
+            return submit(image, time_seconds=time_seconds, **more)
+
+        monkeypatch.setattr(session.pipeline, "submit", noted)
+        handed_out, under_way = [], []
+        for frame, _ in itertools.islice(session, 4):
+            handed_out.append(frame.time)
+            under_way.append(len(begun))
+    assert under_way == [1, 3, 4, 5]
+    assert handed_out == begun[:4]
 
 
 def test_what_cannot_be_shown_changes_nothing() -> None:

@@ -240,14 +240,17 @@ class Session(Closing):
                 yield frame, self.pipeline(frame.deepest, time_seconds=frame.time, exposure_time=frame.exposure_time)
             return
         # One frame ahead of what is handed out: the next is decoded and its marker found while this one is rendered,
-        # and reading a picture does not hold up the next frame. A camera's frames are not held back.
+        # and reading a picture does not hold up the next frame. The first is handed out at once: somebody waits for it.
+        # A camera's frames are not held back.
         ready: list[tuple[Frame, Result]] = []
+        ahead = 0
         try:
             for frame in self._frames():
                 result = self.pipeline.submit(frame.deepest, time_seconds=frame.time, exposure_time=frame.exposure_time)
                 ready.append((frame, result))
-                if len(ready) > 1:
+                if len(ready) > ahead:
                     yield ready.pop(0)
+                ahead = 1
         except WarpArError:
             yield from ready
             raise
