@@ -1,7 +1,8 @@
 """Many cameras in one process: what a further pipeline costs, frames a second of all, and how long each frame takes.
 
 A stream is a pipeline, a thread that hands it the frames of ``desk``, tracking included, and another that waits for
-each picture: a frame's marker is found while the one before is rendered. ``latency_ms`` runs from the time at which
+each picture: a frame's marker is found while the one before is rendered. Frames lie in memory of the pipeline's, where
+a source would have written them. ``latency_ms`` runs from the time at which
 the camera has a frame to the picture on the host. A camera that finds two frames of its own under way drops what it
 takes until one of them is a picture. All streams must show the same first pictures before anything is timed.
 
@@ -33,7 +34,7 @@ import cv2
 import numpy as np
 import warp as wp
 
-from bench.bench_frame import Clip, clip
+from bench.bench_frame import Clip, clip, written_there
 from bench.common import report
 from warp_ar.engine.pipeline import Pipeline, Result
 from warp_ar.stages.recover import EVERY_FRAME
@@ -56,20 +57,22 @@ class Stream:
     """One camera: its pipeline, and what was measured of its frames."""
 
     pipeline: Pipeline
+    frames: Clip
+    """What the camera shows."""
     latency_ms: list[float] = dataclasses.field(default_factory=list)
     dropped: int = 0
     error: BaseException | None = None
 
-    def submit(self, frames: Clip, index: int, rate: float) -> Result:
+    def submit(self, index: int, rate: float) -> Result:
         """Hand over a frame, by the camera's clock."""
-        image = frames.images[index % len(frames.images)]
+        image = self.frames.images[index % len(self.frames.images)]
         return self.pipeline.submit(image, time_seconds=index / (rate or CLIP_RATE))
 
-    def show(self, frames: Clip, index: int, rate: float) -> np.ndarray:
+    def show(self, index: int, rate: float) -> np.ndarray:
         """The picture of a frame."""
-        return self.submit(frames, index, rate).image
+        return self.submit(index, rate).image
 
-    def run(self, frames: Clip, count: int, rate: float, begin: threading.Barrier) -> None:
+    def run(self, count: int, rate: float, begin: threading.Barrier) -> None:
         """Light so many frames after the warm-up; what fails is told by ``error``."""
         room = threading.Semaphore(UNDER_WAY if rate else 1)
         handed_over: queue.SimpleQueue[tuple[float, Result] | None] = queue.SimpleQueue()
@@ -89,7 +92,7 @@ class Stream:
                     break
                 due = start + index / rate if rate else time.perf_counter()
                 time.sleep(max(due - time.perf_counter(), 0.0))
-                handed_over.put((due, self.submit(frames, WARM_UP + index, rate)))
+                handed_over.put((due, self.submit(WARM_UP + index, rate)))
                 index += 1
         except BaseException as error:
             self.error = error
@@ -132,27 +135,29 @@ def open_streams(
     for _ in range(count):
         wp.synchronize_device(device)
         begin, busy, before = time.perf_counter(), time.process_time(), used_memory(device)
-        stream = Stream(close.enter_context(Pipeline(frames.scene, device=str(device), estimates="real_time")))
-        picture = stream.show(frames, 0, 0.0)
+        pipeline = close.enter_context(Pipeline(frames.scene, device=str(device), estimates="real_time"))
+        stream = Stream(pipeline, frames)
+        picture = stream.show(0, 0.0)
         spent = time.perf_counter() - begin, time.process_time() - busy
         costs.append((spent[0] * 1e3, spent[1] * 1e3, used_memory(device) - before))
         first = picture.copy() if first is None else first
         np.testing.assert_array_equal(picture, first)
+        stream.frames = written_there(pipeline, frames)
         streams.append(stream)
     return streams, costs
 
 
-def time_streams(streams: list[Stream], frames: Clip, rate: float) -> tuple[float, float]:
+def time_streams(streams: list[Stream], rate: float) -> tuple[float, float]:
     """Run all side by side; returns seconds by the clock and of all threads."""
     count = round(10 * rate) if rate else FRAMES
     for index in range(1, WARM_UP):
-        pictures = [stream.show(frames, index, rate) for stream in streams]
+        pictures = [stream.show(index, rate) for stream in streams]
         if index < EVERY_FRAME:  # later ones take what was estimated beside them when it is there
             for picture in pictures:
                 np.testing.assert_array_equal(picture, pictures[0])
     barrier = threading.Barrier(len(streams) + 1)
     wait_for_others()
-    threads = [threading.Thread(target=stream.run, args=(frames, count, rate, barrier)) for stream in streams]
+    threads = [threading.Thread(target=stream.run, args=(count, rate, barrier)) for stream in streams]
     for thread in threads:
         thread.start()
     with contextlib.suppress(threading.BrokenBarrierError):  # whoever broke it says why
@@ -226,7 +231,7 @@ def main(device: str) -> None:
     for count in counts:
         with contextlib.ExitStack() as close:
             streams, costs = open_streams(frames, count, target, close)
-            wall, busy = time_streams(streams, frames, float(rate))
+            wall, busy = time_streams(streams, float(rate))
         latency = [value for stream in streams for value in stream.latency_ms]
         start_ms, start_busy, megabytes = np.median(costs[1:] or costs, axis=0).tolist()
         report(

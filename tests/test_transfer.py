@@ -78,6 +78,22 @@ def test_a_new_frame_is_sent_from_where_it_lies(hosts_side) -> None:
     transfers.close()
 
 
+def test_frames_that_are_kept_come_in_ordinary_memory_in_the_end(hosts_side, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is sent as any picture is; once others have gone there is pinned memory again."""
+    size = (48, 64)
+    monkeypatch.setattr(transfer, "FRAME_BYTES", 3 * 3 * 48 * 64)
+    transfers = hosts_side[0](size)
+    frames = [transfers.new_frame() for _ in range(4)]
+    assert [frame.shape for frame in frames] == [(*size, 3)] * 4
+    assert [transfers.begin(frame).given is None for frame in frames] == [False, False, False, True]
+    del frames[:2]
+    for _ in range(transfer.SLOTS):
+        transfers.send(transfers.begin(np.zeros((*size, 3), np.uint8)))
+    frames.append(transfers.new_frame())
+    assert transfers.begin(frames[-1]).given is frames[-1]
+    transfers.close()
+
+
 def test_what_is_on_its_way_arrives_before_its_memory_goes(monkeypatch: pytest.MonkeyPatch) -> None:
     """A pipeline may be let go while its last pictures are copied from slots that go with it."""
     waited: list[str] = []

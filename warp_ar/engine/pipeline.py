@@ -376,7 +376,7 @@ class Pipeline(Closing):
 
         On CUDA it is pinned: the frame is sent from there, where any other is copied to such memory first. Once it has
         been submitted it must stay as it is; ask for another for the next frame. It is given again when nobody refers
-        to it any more, so that there are as many as are held at once.
+        to it any more. Who holds more than 512 MB of them gets ordinary memory.
 
         Returns:
             uint8 (height, width, 3), of any values.

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import collections
 import itertools
+import math
 import queue
 import threading
 import weakref
@@ -38,6 +39,9 @@ COPY_THREADS = 4
 COPY_BYTES = 3_000_000
 """That each of them copies at least: to hand a part over, and to hear that it is done, takes turns with other threads
 at the interpreter. Of a frame that is smaller than two such parts the caller's thread copies all."""
+
+FRAME_BYTES = 1 << 29
+"""Of the frames that ``new_frame`` gives, together; who keeps more gets ordinary memory, which is copied when sent."""
 
 MARKED = 16
 """Frames whose times on the device are remembered."""
@@ -194,6 +198,8 @@ class Transfers:
         try:
             memory = self._free_frames.popleft()
         except IndexError:
+            if 3 * math.prod(self._shape) * len(self._frames) >= FRAME_BYTES:
+                return np.empty((*self._shape, 3), np.uint8)
             with exclusive(self._device):
                 memory = Pinned(self._shape)
             self._frames[_address(memory.host)] = memory
