@@ -376,6 +376,10 @@ def test_colours_made_in_planes_are_those_made_in_turn(kind: str, size: tuple[in
                 interpolation=TO_RGB,
             )
             np.testing.assert_array_equal(rgb_from_video(VideoReformatter(), picture), expected.to_ndarray())
+            memory = np.zeros((size[1], size[0], 3), np.uint8)
+            written = rgb_from_video(VideoReformatter(), picture, lambda height, width, given=memory: given)
+            np.testing.assert_array_equal(written, expected.to_ndarray())
+            assert np.shares_memory(written, memory) == (size[1] % 2 == 0)
 
 
 def test_full_range_video(tmp_path: pathlib.Path) -> None:

@@ -8,6 +8,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
+
 from warp_ar.accuracy.budget import AutoPipeline
 from warp_ar.closing import Closing
 from warp_ar.engine.modules import Progress
@@ -154,6 +157,8 @@ class Session(Closing):
                 self.pipeline = AutoPipeline(self.scene, budget_ms=budget, device=device, **given)
             else:
                 self.pipeline = self._open(Target(self.scene, resolve_quality(quality), **given), device)
+                if self.pipeline.device.is_cuda:
+                    self.source.memory = self._new_frame
         except BaseException:
             self.source.close()
             raise
@@ -174,6 +179,11 @@ class Session(Closing):
             linear=linear,
         )
         return self._switcher.open(target)
+
+    def _new_frame(self) -> npt.NDArray[np.uint8]:
+        """Where the source writes a frame, so that it need not be copied to be sent."""
+        assert isinstance(self.pipeline, Pipeline)
+        return self.pipeline.new_frame()
 
     def close(self) -> None:
         """Let the source and the pipeline's threads go."""

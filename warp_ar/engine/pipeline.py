@@ -379,12 +379,8 @@ class Pipeline(Closing):
         to it any more. Who holds more than 512 MB of them gets ordinary memory.
 
         Returns:
-            uint8 (height, width, 3), of any values.
-
-        Raises:
-            UsageError: The pipeline is closed, or another process's.
+            uint8 (height, width, 3), of any values; also of a pipeline that has been closed meanwhile.
         """
-        self._check_usable()
         if self.inputs.transfers is not None:
             return self.inputs.transfers.new_frame()
         return np.empty((self.size[1], self.size[0], 3), np.uint8)

@@ -108,6 +108,7 @@ class Scheduler:
         self._late = {stage.name for stage, _ in self._stages if type(stage).changed is not Stage.changed}
         """Stages that may find that they changed nothing: their readers then rest."""
         self._changing = {stage.name for stage, passes in self._stages if any(step.enabled for step in passes)}
+        self._beginning = {stage.name for stage, _ in self._stages if type(stage).begin is not Stage.begin}
         self._versions = {stage.name: arrays.versions_of(stage.wiring.reads) for stage, _ in self._stages}
         self._left_out: dict[str, StageTiming] = {}
 
@@ -295,7 +296,7 @@ class Scheduler:
 
     def _begin(self, stage: Stage, passes: list[Pass]) -> list[Pass]:
         """Passes of a stage that take part in this frame."""
-        if stage.name not in self._unneeded:
+        if stage.name in self._beginning and stage.name not in self._unneeded:
             stage.begin()
         if stage.name not in self._changing:
             return passes
@@ -303,8 +304,7 @@ class Scheduler:
 
     def _publish(self, stage: Stage) -> None:
         if stage.name not in self._late:
-            for name in stage.wiring.writes:
-                self.arrays.touch(name)
+            self.arrays.touch_all(stage.wiring.writes)
             return
         if stage.name in self._unneeded:
             return  # what readers may miss is decided in frames that have readers, whether others are left out or not
@@ -393,15 +393,21 @@ class Scheduler:
         due: list[Step] = []
         pattern: list[Any] = []
         timings: dict[str, StageTiming] = {}
-        for stage, passes in self._stages:
+        changing, seen = self._changing, self._seen
+        for whole in self._stages:
+            stage, passes = whole
             versions = self._due(stage)
             if versions is None:
                 timings[stage.name] = self._timing_of_skipped(stage)
                 continue
             chosen = self._begin(stage, passes)
-            due.append((stage, chosen))
-            pattern.append((stage.name, *map(id, chosen)) if stage.name in self._changing else stage.name)
-            self._seen[stage.name] = versions
+            if stage.name in changing:
+                due.append((stage, chosen))
+                pattern.append((stage.name, *map(id, chosen)))
+            else:
+                due.append(whole)
+                pattern.append(stage.name)
+            seen[stage.name] = versions
             self._publish(stage)
         key = tuple(pattern)
         if key not in self._patterns:

@@ -219,11 +219,17 @@ class CaptureDevice(LiveSource):
         while not self._stop.is_set():
             ok, picture = self._capture.read()
             if ok and picture is not None and picture.size:
-                return rgb8(picture[..., 2::-1] if picture.ndim == 3 else picture, self._name)
+                return self._in_rgb(picture)
             if time.monotonic() > deadline:
                 return None
             self._stop.wait(0.01)
         return None
+
+    def _in_rgb(self, picture: npt.NDArray[Any]) -> Image:
+        """A picture as the capture gives it, in RGB of 8 bits."""
+        if picture.dtype == np.uint8 and picture.ndim == 3 and picture.shape[2] == 3:
+            return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB, self._memory_for(*picture.shape[:2])), np.uint8)
+        return rgb8(picture[..., 2::-1] if picture.ndim == 3 else picture, self._name)
 
     def _run(self) -> None:
         error = None

@@ -174,7 +174,7 @@ class NetworkStream(LiveSource):
                 except av.InvalidDataError:
                     continue  # a damaged packet: the next whole picture mends it
                 for picture in pictures:
-                    yield rgb_from_video(reformatter, picture)
+                    yield rgb_from_video(reformatter, picture, self._memory_for)
                     last = time.monotonic()
 
     def close(self) -> None:

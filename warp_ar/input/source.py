@@ -15,7 +15,7 @@ import math
 import pathlib
 import weakref
 from abc import abstractmethod
-from collections.abc import Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
@@ -86,6 +86,10 @@ class Source(Closing):
     keeps_depth: bool = False
     """Whether frames come with their plates; to be set before they are read."""
 
+    memory: Callable[[], Image] | None = None
+    """Gives memory, uint8 (height, width, 3), into which whoever reads the frames has them written, such as
+    ``Pipeline.new_frame``; sources that make pictures anew write them there. None: into memory of their own."""
+
     exposures: tuple[float, ...] = ()
     """All exposure times of its frames in seconds, longest first; empty where it does not tell."""
 
@@ -93,6 +97,11 @@ class Source(Closing):
     def dropped(self) -> int:
         """Frames that were skipped because a newer one had come; 0 unless live."""
         return 0
+
+    def _memory_for(self, height: int, width: int) -> Image | None:
+        """Where to write a picture of that size; None: into memory of its own."""
+        given = None if self.memory is None else self.memory()
+        return given if given is not None and given.shape == (height, width, 3) else None
 
     @abstractmethod
     def __iter__(self) -> Iterator[Frame]:

@@ -195,7 +195,7 @@ class VideoFile(RecordedSource):
         """8-bit RGB of a picture, its time stamp, and its plate if that is kept."""
         if self.deep != "light":
             plate = plate_from_video(reformatter, picture) if self.deep and self.keeps_depth else None
-            return rgb_from_video(reformatter, picture), picture.time, plate
+            return rgb_from_video(reformatter, picture, self._memory_for), picture.time, plate
         plate = plate_from_video(reformatter, picture)
         image = codes8(plate, "srgb") if plate.codes is None else plate.codes
         return image, picture.time, plate if self.keeps_depth else None
@@ -231,23 +231,36 @@ def _convert_beside(
         raise damage
 
 
-def rgb_from_video(reformatter: VideoReformatter, picture: Any) -> Image:
-    """Upright 8-bit RGB of a decoded picture, with the picture's own colour matrix and range."""
+def rgb_from_video(
+    reformatter: VideoReformatter, picture: Any, memory: Callable[[int, int], Image | None] | None = None
+) -> Image:
+    """Upright 8-bit RGB of a decoded picture, with the picture's own colour matrix and range.
+
+    Args:
+        reformatter: The thread's.
+        picture: Of PyAV.
+        memory: Gives memory for a picture of a height and width, or None: it is then made anew.
+    """
     matrix = None
     if picture.colorspace not in {int(known) for known in Colorspace}:
         matrix = Colorspace.ITU709 if picture.height >= HD_HEIGHT else Colorspace.ITU601
     in_planes = picture.format.name in _IN_PLANES and picture.height % 2 == 0
     wanted = "gbrp" if in_planes else "rgb24"
     converted = reformatter.reformat(picture, format=wanted, src_colorspace=matrix, interpolation=TO_RGB, threads=1)
-    rgb = _interleaved(converted) if in_planes else converted.to_ndarray()
+    turns = round(picture.rotation / 90)
+    if in_planes:
+        out = memory(picture.height, picture.width) if memory is not None and turns == 0 else None
+        rgb = _interleaved(converted, out)
+    else:
+        rgb = np.asarray(converted.to_ndarray(), np.uint8)
     # Both count the angle counterclockwise.
-    return np.ascontiguousarray(np.rot90(rgb, round(picture.rotation / 90)))
+    return np.ascontiguousarray(np.rot90(rgb, turns))
 
 
-def _interleaved(picture: Any) -> Image:
-    """RGB of a picture that has green, blue and red in planes of their own."""
+def _interleaved(picture: Any, out: Image | None) -> Image:
+    """RGB of a picture that has green, blue and red in planes of their own, in ``out`` or anew."""
     green, blue, red = (
         np.frombuffer(plane, np.uint8).reshape(plane.height, plane.line_size)[:, : plane.width]
         for plane in picture.planes
     )
-    return np.asarray(cv2.merge([red, green, blue]), np.uint8)
+    return np.asarray(cv2.merge([red, green, blue], out), np.uint8)

@@ -156,6 +156,12 @@ class Arrays(Mapping[str, Any]):
         """Say that the contents of ``name`` changed."""
         self._versions[name] += 1
 
+    def touch_all(self, names: Iterable[str]) -> None:
+        """The same of several."""
+        versions = self._versions
+        for name in names:
+            versions[name] += 1
+
     def version(self, name: str) -> int:
         """Version of ``name``: 0 until it is first written."""
         return self._versions[name]
