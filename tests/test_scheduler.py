@@ -20,7 +20,7 @@ import warp as wp
 
 from warp_ar.engine import graph
 from warp_ar.engine.graph import Plan, make_plan
-from warp_ar.engine.scheduler import Scheduler, _in_launch_order
+from warp_ar.engine.scheduler import Scheduler, _in_launch_order, _segments
 from warp_ar.kernels.launch import copy, launch, launch_rows
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Stage, Wiring
 from warp_ar.stages.features import Features
@@ -455,3 +455,25 @@ def test_a_pass_may_run_beside_the_one_before(monkeypatch: pytest.MonkeyPatch) -
     assert (found["a0"], found["a1"], found["a2"]) == (set(), set(), {"a0", "a1"})
     assert found["b0"] == {"a2"}
     assert found["d0"] == {"a2", "c0", "c1"}
+
+
+def test_what_is_done_beforehand_leaves_the_graph_whole() -> None:
+    """The same graph serves frames with it and without; a step of the host between launches cuts it."""
+    first, second = (types.SimpleNamespace(name=name) for name in ("first", "second"))
+    launch_first, before, weigh, ask, rest = (
+        Pass(lambda rows: None),
+        Pass(lambda rows: None, on_host=True, beforehand=True),
+        Pass(lambda rows: None),
+        Pass(lambda rows: None, on_host=True),
+        Pass(lambda rows: None),
+    )
+    with_it, without = (
+        _segments([(first, [launch_first]), (second, [*taken, weigh, rest])]) for taken in ([before], [])
+    )
+    assert [(segment.on_host, segment.part) for segment in with_it] == [
+        (True, [(second, [before])]),
+        (False, [(first, [launch_first]), (second, [weigh, rest])]),
+    ]
+    assert [segment.key for segment in with_it[1:]] == [segment.key for segment in without]
+    cut = _segments([(first, [launch_first]), (second, [weigh, ask, rest])])
+    assert [segment.on_host for segment in cut] == [False, True, False]

@@ -534,6 +534,7 @@ def _in_launch_order(part: list[Step]) -> list[Step]:
 def _segments(due: list[Step]) -> list[Segment]:
     """Stages in order, cut into stretches that are captured as one and stretches that run on the host."""
     steps = [(step.on_host, stage, step) for stage, passes in due for step in passes]
+    steps.sort(key=lambda one: not one[2].beforehand)
     parts = [
         (on_host, [(stage, [step for _, _, step in own]) for stage, own in itertools.groupby(stretch, lambda s: s[1])])
         for on_host, stretch in itertools.groupby(steps, lambda s: s[0])

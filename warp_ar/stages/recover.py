@@ -205,7 +205,7 @@ class Recover(Stage):
             Pass(self._follow, enabled=lambda: self._follows),
         )
         passes = [
-            Pass(self._take, on_host=True, enabled=lambda: self._arrives),
+            Pass(self._take, on_host=True, enabled=lambda: self._arrives, beforehand=True),
             # What clips is known before the map is filled.
             Pass(self._weigh, rows=self.request.quality.environment_height, reads=("environment_clipped", "pose")),
             Pass(self._condense, rows=arrays["recover_cells_now"].shape[0], enabled=lambda: self._asks),
