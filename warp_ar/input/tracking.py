@@ -47,6 +47,12 @@ Image = NDArray[np.uint8]
 _ENVIRONMENT = 0.6
 """Half width of the search around the last marker, beyond the marker itself, in its own sizes."""
 
+_CLOSE = 0.25
+"""The same where a sharp marker is looked for first: half the pixels. It takes a marker from the same pixels."""
+
+_INSIDE = 12.0
+"""Pixels by which all corners of a marker must lie within that part: edges are sampled beyond them."""
+
 _NEAR = 0.5
 """Distance of a marker from where it is expected, over the least size at which it is, within which no other is looked
 for."""
@@ -222,7 +228,7 @@ class Tracker:
 
     def detect(self, image: Image) -> list[Detection]:
         """The followed markers in a whole picture, uint8 RGB or grey; they depend on the picture, not on the camera."""
-        return self._detect(self._show(image))
+        return self._detect(image)
 
     def error_of(self, image: Image, found: list[Detection]) -> float:
         """How well the print fits where it was found, whatever earlier frames say.
@@ -266,41 +272,37 @@ class Tracker:
     def _measure(self, image: Image, guess: Pose | None) -> _Fit | None:
         """The pose in this image alone; ``guess`` only says where to look, and which of two like poses to prefer."""
         if guess is not None:
-            gray, origin = self._show_around(image, guess)
             # A board has no second pose to confuse it with, and dozens of markers to decode: its edges come first.
-            fit = self._fit_guess(guess) if len(self._pattern.markers) > 1 else None
-            if fit is not None and fit.support >= _ENOUGH:
-                return fit
-            fit = self._fit_detections(self._detect_expected(gray, origin, guess), guess)
+            if len(self._pattern.markers) > 1:
+                self._show(image, self._around(self._outline(guess)))
+                fit = self._fit_guess(guess)
+                if fit is not None and fit.support >= _ENOUGH:
+                    return fit
+            fit = self._fit_detections(self._find_expected(image, guess), guess)
             if fit is None or not fit.edges:
                 # Perhaps only partly hidden or cut off, so that corners are missing or wrong: its edges may still be
                 # there.
+                self._show(image, self._around(self._outline(guess)))
                 fit = self._fit_guess(guess) or fit
             if fit is not None:
                 return fit
-        found = self._detect(self._show(image))
+        found = self._detect(image)
         self._rival = len(found) > len({d.id for d in found})
         fit = self._fit_detections(found, guess)
         if fit is None or not fit.edges or self._rival or len(self._pattern.markers) > 1:
             return fit
         # Found as it will be in the next frame, so that a marker that stands still does so from the first frame on.
-        found = self._detect_expected(*self._show_around(image, fit.pose), fit.pose)
-        return self._fit_detections(found, fit.pose) or fit
-
-    def _show_around(self, image: Image, guess: Pose) -> tuple[Image, tuple[int, int]]:
-        """The part of the image around where the marker is expected, in grey, and at which pixel it starts."""
-        box = self._around(self._outline(guess))
-        return self._show(image, box), (box[1].start, box[0].start)
+        return self._fit_detections(self._find_expected(image, fit.pose), fit.pose) or fit
 
     def _show(self, image: Image, box: Box | None = None) -> Image:
         """A part of the image in grey, all of it where none is named: what is detected in and fitted to."""
         h, w = self._shape
         return self._fitter.show(image, (slice(0, h), slice(0, w)) if box is None else box)
 
-    def _around(self, outline: NDArray[np.float32]) -> tuple[slice, slice]:
+    def _around(self, outline: NDArray[np.float32], environment: float = _ENVIRONMENT) -> Box:
         """Rows and columns of the image around a marker's outline, never empty."""
         low, high = outline.min(0), outline.max(0)
-        environment = _ENVIRONMENT * float((high - low).max()) + 16
+        environment = environment * float((high - low).max()) + 16
         h, w = self._shape
         (x0, y0), (x1, y1) = np.clip(low - environment, 0, (w - 32, h - 32)), np.clip(high + environment, 32, (w, h))
         return slice(int(y0), int(np.ceil(y1))), slice(int(x0), int(np.ceil(x1)))
@@ -310,28 +312,30 @@ class Tracker:
         sides = [self._project(guess.apply(c))[0] for c in self._pattern.markers.values()]
         return 0.6 * min(float(np.linalg.norm(s - np.roll(s, 1, 0), axis=1).mean()) for s in sides)
 
-    def _detect_expected(self, gray: Image, origin: tuple[int, int], guess: Pose) -> list[Detection]:
+    def _find_expected(self, image: Image, guess: Pose) -> list[Detection]:
         """The followed markers where they are expected; one marker first as a sharp one, if it lately was.
 
         A marker that the narrow threshold sees, both see in the same place; one that it does not see may be blurred.
         """
-        smallest = self._smallest(guess)
+        smallest, expected = self._smallest(guess), self._outline(guess)
         if len(self._pattern.markers) == 1 and self._blurred == 0:
-            found = self._detect(gray, origin, smallest, sharp=True)
-            expected = self._outline(guess)
-            if any(np.linalg.norm(d.corners - expected, axis=1).mean() < _NEAR * smallest for d in found):
-                return found
+            for environment in (_CLOSE, _ENVIRONMENT):
+                box = self._around(expected, environment)
+                found = self._detect(image, box, smallest, sharp=True)
+                near = [d for d in found if np.linalg.norm(d.corners - expected, axis=1).mean() < _NEAR * smallest]
+                if near and (environment == _ENVIRONMENT or all(_is_inside(d.corners, box) for d in near)):
+                    return found
             self._blurred = _SHARP_AGAIN
         self._blurred = max(self._blurred - 1, 0)
-        return self._detect(gray, origin, smallest)
+        return self._detect(image, self._around(expected), smallest)
 
     def _detect(
-        self, gray: Image, origin: tuple[int, int] = (0, 0), smallest: float = 10.0, *, sharp: bool = False
+        self, image: Image, box: Box | None = None, smallest: float = 10.0, *, sharp: bool = False
     ) -> list[Detection]:
-        """The followed markers in a part of the image that starts at pixel ``origin``, in pixels of the whole."""
-        detected = self._detector.detect(gray, max(smallest, 10.0), sharp=sharp)
-        found = [d for d in detected if d.id in self._pattern.markers]
-        return [Detection(d.id, d.corners + np.asarray(origin, np.float32)) for d in found]
+        """The followed markers in a part of the image, all of it where none is named, in pixels of the whole."""
+        detected = self._detector.detect(self._show(image, box), max(smallest, 10.0), sharp=sharp)
+        origin = np.array((0, 0) if box is None else (box[1].start, box[0].start), np.float32)
+        return [Detection(d.id, d.corners + origin) for d in detected if d.id in self._pattern.markers]
 
     def _fit_detections(self, found: list[Detection], guess: Pose | None) -> _Fit | None:
         found = self._chosen(found, guess)
@@ -467,6 +471,16 @@ def _inverse(information: Array) -> Array:
         if inverse.diagonal().min() > 0.0:
             return inverse
     return np.asarray(np.linalg.pinv(information), float)
+
+
+def _is_inside(corners: NDArray[np.float32], box: Box) -> bool:
+    """Whether corners lie well within a part of the image."""
+    rows, columns = box
+    low, high = corners.min(0), corners.max(0)
+    return bool(
+        (low >= (columns.start + _INSIDE, rows.start + _INSIDE)).all()
+        and (high <= (columns.stop - _INSIDE, rows.stop - _INSIDE)).all()
+    )
 
 
 def _holds(fit: _Fit | None) -> TypeGuard[_Fit]:
