@@ -7,6 +7,7 @@ import ctypes
 import os
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -18,6 +19,10 @@ _ARENA_MAX = -8
 """``M_ARENA_MAX`` of glibc's ``malloc.h``."""
 _CUDA = threading.RLock()
 _TRANSLATION = threading.RLock()
+ASK_EVERY = 1e-4
+"""Seconds between two looks at an event that is waited for."""
+LONGEST_ASKING = 0.25
+"""Seconds after which CUDA itself is made to wait."""
 _OPENING: list[threading.Thread] = []
 """The thread that makes a device's context, if one does."""
 
@@ -79,18 +84,38 @@ def capturing() -> Iterator[None]:
             now.changed.notify_all()
 
 
-def wait_for(event: Any) -> None:
-    """Wait until an event that has been recorded has come to pass on its CUDA device."""
+@contextlib.contextmanager
+def _asking() -> Iterator[None]:
+    """Held around what CUDA forbids while a graph is captured."""
     now = _CAPTURES
     with now.changed:
         now.changed.wait_for(lambda: not now.capturing)
         now.waiting += 1
     try:
-        wp.synchronize_event(event)
+        yield
     finally:
         with now.changed:
             now.waiting -= 1
             now.changed.notify_all()
+
+
+def wait_for(event: Any) -> None:
+    """Wait until an event that has been recorded has come to pass on its CUDA device.
+
+    CUDA's own way keeps a core busy for as long as it waits: with 16 cameras on 16 cores, for 2.4 of a frame's 8 ms.
+
+    Raises:
+        RuntimeError: What was launched has failed.
+    """
+    stop = time.perf_counter() + LONGEST_ASKING
+    while True:
+        with _asking():
+            if event.is_complete:
+                return
+            if time.perf_counter() > stop:  # an event that never comes is not complete either: this says why
+                wp.synchronize_event(event)
+                return
+        time.sleep(ASK_EVERY)
 
 
 @contextlib.contextmanager
