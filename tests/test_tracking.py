@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from warp_ar.errors import UsageError
+from warp_ar.input import tracking
 from warp_ar.input.markers import MarkerDetector, find_dictionary, make_board
 from warp_ar.input.tracking import Tracker, TrackState
 from warp_ar.scene import Camera, CharucoBoard, GridBoard, Marker, Pose
@@ -20,6 +21,8 @@ RENDERED_DEGREES, RENDERED_MM = 0.15, 0.4
 measured up to 0.1 (tilt of a nearly frontal marker) and 0.3."""
 TRUTH_DEGREES, TRUTH_MM = 0.1, 0.5
 """Mean over a path-traced clip, whose pixels carry sparkle and clipped whites; measured at most 0.07 and 0.2."""
+ROUNDED = 1e-3
+"""Pixels that corners in float32 may move a pose by where they are counted from another origin; measured 3e-5."""
 STEADY_PIXELS = 0.05
 """How far steadying may move the outline of a moving marker from where it was measured."""
 REAL_CORNERS = 2.0
@@ -519,6 +522,31 @@ def test_still_marker_stands_still():
         np.std([t.track(i, k / 30).pose.translation for k, i in enumerate(images)][8:], axis=0) for t in (raw, steady)
     ]
     assert np.linalg.norm(jitter[1]) < 0.5 * np.linalg.norm(jitter[0])
+
+
+@pytest.mark.parametrize(("step", "parts"), [(0.004, 1), (0.03, 3)])
+def test_a_marker_is_looked_for_where_it_is_expected_first(monkeypatch, step, parts):
+    """It is found in the same place, to the bit but for rounding, as in the larger part that is looked at otherwise."""
+    marker, close, wide = Marker(), Tracker(Marker(), CAMERA), Tracker(Marker(), CAMERA)
+    sizes: list[int] = []
+    detect = close._detect
+
+    def noted(image, box, smallest, **more):
+        rows, columns = box
+        sizes.append((rows.stop - rows.start) * (columns.stop - columns.start))
+        return detect(image, box, smallest, **more)
+
+    for k in range(4):  # it stands still, and moves in the last frame
+        image = render((marker, look(30, at=(step if k == 3 else 0.0, 0.0), distance=0.5)), seed=k)
+        with monkeypatch.context() as patched:
+            patched.setattr(tracking, "_CLOSE", tracking._ENVIRONMENT)
+            expected = wide.track(image, k / 30)
+        if k == 3:
+            monkeypatch.setattr(close, "_detect", noted)
+        found = close.track(image, k / 30)
+        np.testing.assert_allclose(found.corners, expected.corners, atol=ROUNDED, rtol=0.0)
+    assert len(sizes) == parts
+    assert parts == 1 or sizes[0] < 0.6 * sizes[1]
 
 
 def test_moving_marker_does_not_lag():
