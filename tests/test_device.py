@@ -81,3 +81,59 @@ def test_a_context_is_made_beside_and_waited_for(cuda, monkeypatch, name) -> Non
 def test_no_context_is_made_of_what_is_no_cuda_device_here(cuda, name) -> None:
     device.open_ahead(name)
     assert not device._OPENING
+
+
+class _Event:
+    """An event of a CUDA device that comes to pass at some look, or never."""
+
+    def __init__(self, looks: int | None) -> None:
+        self.looks, self.asked, self.captured = looks, 0, 0
+
+    @property
+    def is_complete(self) -> bool:
+        self.captured += device._CAPTURES.capturing
+        self.asked += 1
+        return self.looks is not None and self.asked > self.looks
+
+
+def test_who_waits_for_an_event_sleeps_between_two_looks(monkeypatch) -> None:
+    slept: list[float] = []
+    monkeypatch.setattr(device.time, "sleep", slept.append)
+    event = _Event(3)
+    device.wait_for(event)
+    assert (event.asked, slept) == (4, [device.ASK_EVERY] * 3)
+
+
+def test_an_event_that_never_comes_is_left_to_cuda(monkeypatch) -> None:
+    """A launch has failed: its events are never complete, and CUDA says what it was."""
+
+    def fail(event: _Event) -> None:
+        raise RuntimeError("an illegal memory access was encountered")
+
+    monkeypatch.setattr(device, "LONGEST_ASKING", 0.02)
+    monkeypatch.setattr(device.wp, "synchronize_event", fail)
+    with pytest.raises(RuntimeError, match="illegal"):
+        device.wait_for(_Event(None))
+
+
+def test_nobody_looks_at_an_event_while_a_graph_is_captured() -> None:
+    event, capturing, may_end = _Event(0), threading.Event(), threading.Event()
+
+    def capture() -> None:
+        with device.capturing():
+            capturing.set()
+            assert may_end.wait(60.0)
+
+    thread = threading.Thread(target=capture)
+    thread.start()
+    assert capturing.wait(60.0)
+    waiting = threading.Thread(target=device.wait_for, args=(event,))
+    waiting.start()
+    waiting.join(0.1)
+    assert waiting.is_alive()
+    assert event.asked == 0
+    may_end.set()
+    for one in (thread, waiting):
+        one.join(60.0)
+        assert not one.is_alive()
+    assert (event.asked, event.captured) == (1, 0)
