@@ -111,3 +111,20 @@ def test_imports_that_take_long_are_told_on_a_terminal(monkeypatch, shown, slow,
             time.sleep(0.005)
     assert told.getvalue() == said
     assert signal.getsignal(signal.SIGINT) is before
+
+
+@pytest.mark.parametrize(("given", "expected"), [(None, "1"), ("3", "3")])
+def test_commands_have_one_thread_of_blas_unless_told_otherwise(monkeypatch, given, expected):
+    """Set before NumPy is imported, which reads it once."""
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    if given is not None:
+        monkeypatch.setenv("OPENBLAS_NUM_THREADS", given)
+    code = (
+        "import os, sys, types\n"
+        "sys.modules['a_command'] = types.SimpleNamespace(main=lambda: print(os.getenv('OPENBLAS_NUM_THREADS')) or 0)\n"
+        "from warp_ar.begin import begin\n"
+        "assert 'numpy' not in sys.modules\n"
+        "begin('a_command')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == [expected]
