@@ -133,6 +133,7 @@ class _Channel:
             self.prior_u, self.spread_u = other[-count:], np.array(surfaces.hue_spread)[problem.kinds]
         self.sigma = np.hypot(problem.noise[self.surface], surfaces.mirror_trust * problem.mirrored_share[rows])
         self.shared = problem.shared[rows]
+        self.tied = np.concatenate([*problem.ties.T])
         self._set_priors()
 
     def _set_priors(self) -> None:
@@ -210,8 +211,8 @@ class _Channel:
         gradient[:u_at] = scaled.T @ (self.prior_target / self.deviation)
         a, b = u_at + problem.ties.T
         hessian[a, b] = hessian[b, a] = -self.tie_weight
-        own_ties = np.concatenate([a, b]) - u_at
-        hessian[diagonal, diagonal] = np.bincount(own_ties, np.tile(self.tie_weight, 2), minlength=count)
+        both = np.concatenate([self.tie_weight, self.tie_weight])
+        hessian[diagonal, diagonal] = np.bincount(self.tied, both, minlength=count)
         # Log-normal prior of 1 / reflectance, about the last estimate.
         hessian[diagonal, diagonal] += 1.0 / (u * self.spread_u) ** 2
         gradient[u_at:] += np.maximum(1.0 + np.log(self.prior_u / u), 0.2) / (u * self.spread_u**2)

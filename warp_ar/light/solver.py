@@ -72,8 +72,10 @@ def solve_nonnegative(hessian: Array, gradient: Array, start: Array | None = Non
     for _ in range(60):
         x[:] = 0.0
         index = np.flatnonzero(free)
-        if len(index):
-            x[index] = np.linalg.solve(hessian[np.ix_(index, index)], gradient[index])
+        if len(index) == len(x):
+            x[:] = np.linalg.solve(hessian, gradient)
+        elif len(index):
+            x[index] = np.linalg.solve(hessian[index[:, None], index], gradient[index])
         negative = free & (x < 0.0)
         if negative.any():
             free &= ~negative
