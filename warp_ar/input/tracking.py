@@ -27,6 +27,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import enum
+import math
 from collections.abc import Sequence
 from typing import TypeGuard
 
@@ -52,6 +53,9 @@ _CLOSE = 0.25
 
 _INSIDE = 12.0
 """Pixels by which all corners of a marker must lie within that part: edges are sampled beyond them."""
+
+_BEFORE = np.array([3, 0, 1, 2])
+"""The corner before each of a marker's."""
 
 _NEAR = 0.5
 """Distance of a marker from where it is expected, over the least size at which it is, within which no other is looked
@@ -309,8 +313,10 @@ class Tracker:
 
     def _smallest(self, guess: Pose) -> float:
         """Edge length in pixels below which nothing is a marker where one is expected at ``guess``."""
-        sides = [self._project(guess.apply(c))[0] for c in self._pattern.markers.values()]
-        return 0.6 * min(float(np.linalg.norm(s - np.roll(s, 1, 0), axis=1).mean()) for s in sides)
+        corners = np.concatenate([guess.apply(c) for c in self._pattern.markers.values()])
+        pixels = self._project(corners)[0].reshape(-1, 4, 2)
+        sides = pixels - pixels[:, _BEFORE]
+        return 0.6 * float(np.sqrt((sides**2).sum(axis=2)).mean(axis=1).min())
 
     def _find_expected(self, image: Image, guess: Pose) -> list[Detection]:
         """The followed markers where they are expected; one marker first as a sharp one, if it lately was.
@@ -457,11 +463,11 @@ class Tracker:
 
     def _judge(self, fit: _Fit) -> float:
         """Quality from what supports the pose and how well it is determined."""
-        deviations = np.sqrt(np.maximum(np.diag(_inverse(fit.information)), 0.0))
-        turn = float(np.degrees(np.linalg.norm(deviations[:3])))
-        shift = float(np.linalg.norm(deviations[3:]) / np.linalg.norm(fit.pose.translation)) * 100
+        variances = [max(value, 0.0) for value in _inverse(fit.information).diagonal().tolist()]
+        turn = math.degrees(math.sqrt(sum(variances[:3])))
+        shift = 100.0 * math.sqrt(sum(variances[3:])) / math.hypot(*fit.pose.translation.tolist())
         quality = min(1.0, fit.support / 0.9) / (1.0 + turn**2 + shift**2)
-        return float(np.clip(quality * (0.5 if self._rival else 1.0), 0.0, 1.0))
+        return min(max(quality * (0.5 if self._rival else 1.0), 0.0), 1.0)
 
 
 def _inverse(information: Array) -> Array:
