@@ -7,8 +7,8 @@ the camera has a frame to the picture on the host. A camera that finds two frame
 takes until one of them is a picture. All streams must show the same first pictures before anything is timed.
 
 ``WARP_AR_BENCH`` may name rows, frames a second of each camera (0: the next frame is there when the last picture is)
-and numbers of streams, as in ``1080,60,1,4,16``; usual are ``240,0,1,2,4`` on CPU and ``1080,60,1,4,16,8x2`` on CUDA.
-``8x2`` are 8 processes of 2 streams each, begun together, with one thread of OpenCV and of NumPy's BLAS for each
+and numbers of streams, as in ``1080,60,1,4,16``; usual are ``240,0,1,2,4`` on CPU and ``1080,60,1,4,16,8x2,16x1`` on
+CUDA. ``8x2`` are 8 processes of 2 streams each, begun together, with one thread of OpenCV and of NumPy's BLAS for each
 stream; of their latencies the median of medians and the worst 99th percentile are told.
 """
 
@@ -39,7 +39,7 @@ from bench.common import report
 from warp_ar.engine.pipeline import Pipeline, Result
 from warp_ar.stages.recover import EVERY_FRAME
 
-USUAL = {"cpu": "240,0,1,2,4", "cuda": "1080,60,1,4,16,8x2"}
+USUAL = {"cpu": "240,0,1,2,4", "cuda": "1080,60,1,4,16,8x2,16x1"}
 SIZES = {240: (320, 240), 480: (640, 480), 1080: (1920, 1080), 2160: (3840, 2160)}
 WARM_UP = 12
 FRAMES = 60
