@@ -162,6 +162,61 @@ def test_a_pool_starts_a_process_before_it_is_asked():
         pool.close()
 
 
+def test_a_pool_says_whether_a_process_is_about_to_be_ready():
+    pool = SolvingPool(1)
+    try:
+        assert not pool.starting
+        pool.prepare()
+        assert pool.starting
+        wait_until_ready(pool)
+        assert not pool.starting
+    finally:
+        pool.close()
+    assert not pool.starting
+
+
+def test_a_process_that_ends_as_it_starts_is_waited_for_no_longer(monkeypatch):
+    start = solving_process.start_process
+    monkeypatch.setattr(solving_process, "start_process", lambda name: start("tests.no_such_module"))
+    pool = SolvingPool(1)
+    try:
+        pool.prepare()
+        pool._all[0]._greeting.join(60.0)
+        assert not pool.starting
+        assert not pool.ready
+        assert pool.solve(Doubler(), sides(), trace)[1][1] == 1
+    finally:
+        pool.close()
+
+
+def test_who_finds_all_at_work_waits_for_one_and_for_none_that_is_just_started(process):
+    """A process takes seconds to be ready, and an estimate of this one holds up the frames."""
+    tracing, held = threading.Event(), threading.Event()
+
+    def slow(emitters):
+        tracing.set()
+        assert held.wait(60.0)
+        return trace(emitters)
+
+    pool = SolvingPool(2)
+    pool._all, pool._idle = [process], [process]
+    solvers = Doubler(), Doubler()
+    with ThreadPoolExecutor(2) as others:
+        first = others.submit(pool.solve, solvers[0], sides(), slow)
+        assert tracing.wait(60.0)
+        second = others.submit(pool.solve, solvers[1], sides(), trace)
+        deadline = time.monotonic() + 60.0
+        while not pool._changed._waiters and time.monotonic() < deadline:
+            time.sleep(0.01)
+        assert len(pool._all) == 2
+        held.set()
+        assert first.result(60.0)[0] is not solvers[0]
+        assert second.result(60.0)[0] is not solvers[1]
+    pool._all.remove(process)
+    pool._idle.remove(process)
+    pool.close()
+
+
 def wait_until_ready(pool):
     deadline = time.monotonic() + 60.0
     while not pool.ready and time.monotonic() < deadline:
@@ -311,6 +366,7 @@ def test_frames_in_real_time_begin_alike_and_take_what_is_there(monkeypatch):
         assert held.wait(60.0)
         return solver, solve_by(solver, sides, trace)
 
+    monkeypatch.setattr(solving_process.SolvingPool, "starting", False)
     monkeypatch.setattr(recover.POOL, "solve", slow)
     monkeypatch.setattr(recover, "REST", -1.0)  # however long the first ones took
     with (
@@ -332,6 +388,24 @@ def test_frames_in_real_time_begin_alike_and_take_what_is_there(monkeypatch):
         assert stage._progress.took > 0.0
 
 
+def test_a_live_camera_begins_no_estimate_while_a_process_is_about_to_be_ready(monkeypatch):
+    """This process would solve it, and hold the frames up; the frame after it is ready begins one."""
+    scene = load_scene("desk")
+    with open_source(scene.source.path) as source:
+        frames = list(itertools.islice(source, 14))
+    begun, starting = [], [True]
+    ask = recover.Recover._ask
+    monkeypatch.setattr(recover.Recover, "_ask", lambda self, rows: begun.append(index) or ask(self, rows))
+    monkeypatch.setattr(solving_process.SolvingPool, "starting", property(lambda pool: starting[0]))
+    monkeypatch.setattr(recover.POOL, "solve", lambda solver, given, trace: (solver, solve_by(solver, given, trace)))
+    monkeypatch.setattr(recover, "REST", -1.0)
+    with Pipeline(scene, device="cpu", quality="low", estimates="real_time") as live:
+        for index, frame in enumerate(frames):
+            starting[0] = index < 12
+            live(frame.image, time_seconds=frame.time)
+    assert begun == [0, 1, 2, 12]
+
+
 def test_an_estimate_outlives_the_pipeline_that_began_it(monkeypatch):
     """Another pipeline goes on with it: what it traces with goes no sooner than it is done."""
     scene = load_scene("desk")
@@ -344,6 +418,7 @@ def test_an_estimate_outlives_the_pipeline_that_began_it(monkeypatch):
         trace(np.array([[0.1, 0.1, 0.5, 1.0]], np.float32))
         return solver, solve_by(solver, sides, trace)
 
+    monkeypatch.setattr(solving_process.SolvingPool, "starting", False)
     monkeypatch.setattr(recover.POOL, "solve", slow)
     monkeypatch.setattr(recover, "REST", -1.0)  # however long the first ones took
     before = Pipeline(scene, device="cpu", quality="low", estimates="real_time")

@@ -130,6 +130,11 @@ class SolvingProcess:
         with contextlib.suppress(EOFError, OSError):
             self.ready = read_message(self._process.stdout) == "ready"
 
+    @property
+    def starting(self) -> bool:
+        """Whether it has not said yet that it is ready, and may."""
+        return self._greeting.is_alive()
+
     def solve(self, solver: Solver, sides: tuple[Any, ...], trace: Callable[[Any], Any] | None) -> tuple[Any, Any]:
         """The solver with what it learnt, and its solution; arguments as ``SolvingPool.solve``.
 
@@ -192,6 +197,12 @@ class SolvingPool:
         with self._changed:
             return any(process.ready for process in self._all)
 
+    @property
+    def starting(self) -> bool:
+        """Whether none is ready, and one is about to be: a second or two after it was started."""
+        with self._changed:
+            return not any(process.ready for process in self._all) and any(one.starting for one in self._all)
+
     def _start(self) -> None:
         with contextlib.suppress(OSError):  # no more processes: solved for here
             process = SolvingProcess()
@@ -237,12 +248,14 @@ class SolvingPool:
         with self._changed:
             if not self._idle and len(self._all) < self._most and not self._closed:
                 self._start()
-            while self._all and not self._idle and not self._closed:
-                self._changed.wait()
-            for process in self._idle:
-                if process.ready:
-                    self._idle.remove(process)
-                    return process
+            while not self._closed:
+                ready = [process for process in self._idle if process.ready]
+                if ready:
+                    self._idle.remove(ready[0])
+                    return ready[0]
+                if not any(process.ready for process in self._all):
+                    return None
+                self._changed.wait()  # for one that is at work: sooner than one that was just started
             return None
 
     def _drop(self, process: SolvingProcess) -> None:

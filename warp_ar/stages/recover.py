@@ -380,6 +380,8 @@ class Recover(Stage):
         self._asks = now.frames <= EVERY_FRAME or (since > interval and (rested or now.waited >= EVERY_FRAME))
         if self._real_time and now.pending is not None and not self._arrives:
             self._asks = False
+        if self._real_time and self._asks and now.frames > EVERY_FRAME and POOL.starting:
+            self._asks = False  # solved for here, beside the frames, it would hold the interpreter's lock
         self._asks = self._asks and not self._arrays["ball_covered"]()
         if self._asks:
             now.waited, now.last = 0, seconds
