@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -62,6 +63,26 @@ def test_the_first_frame_is_handed_out_at_once(monkeypatch: pytest.MonkeyPatch) 
             under_way.append(len(begun))
     assert under_way == [1, 3, 4, 5]
     assert handed_out == begun[:4]
+
+
+def test_a_cameras_frames_are_submitted_on_cuda_and_not_held_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On CPU they are not: it would copy each."""
+    for is_cpu in (True, False):
+        with Session(scene(), device="cpu", quality="low") as session:
+            session.source.live = True
+            monkeypatch.setattr(session.pipeline, "device", SimpleNamespace(is_cpu=is_cpu, is_cuda=False))
+            begun: list[bool] = []
+            begin = session.pipeline._begin
+
+            def noted(*given: object, ahead: bool, begin=begin, begun=begun):
+                begun.append(ahead)
+                return begin(*given, ahead=ahead)
+
+            monkeypatch.setattr(session.pipeline, "_begin", noted)
+            under_way = [len(begun) for _ in itertools.islice(session, 3)]
+            monkeypatch.undo()
+        assert under_way == [1, 2, 3]
+        assert begun == [not is_cpu] * 3
 
 
 def test_what_cannot_be_shown_changes_nothing() -> None:

@@ -243,15 +243,16 @@ class Session(Closing):
             yield frame
 
     def __iter__(self) -> Iterator[tuple[Frame, Result]]:
-        pipeline = self.pipeline
+        pipeline, live = self.pipeline, self.source.live
         kept = pipeline.device.is_cpu or set(pipeline.plan.request.outputs) <= {"image", "pose"}
-        if not self.ahead or self.source.live or not kept or not isinstance(pipeline, Pipeline):
+        called = live and pipeline.device.is_cpu  # which is to have no copy of the frame
+        if not self.ahead or called or not kept or not isinstance(pipeline, Pipeline):
             for frame in self._frames():
                 yield frame, self.pipeline(frame.deepest, time_seconds=frame.time, exposure_time=frame.exposure_time)
             return
         # One frame ahead of what is handed out: the next is decoded and its marker found while this one is rendered,
         # and reading a picture does not hold up the next frame. The first is handed out at once: somebody waits for it.
-        # A camera's frames are not held back.
+        # So is each of a camera's: they are submitted because the picture then comes into memory that it stays in.
         ready: list[tuple[Frame, Result]] = []
         ahead = 0
         try:
@@ -260,7 +261,7 @@ class Session(Closing):
                 ready.append((frame, result))
                 if len(ready) > ahead:
                     yield ready.pop(0)
-                ahead = 1
+                ahead = 0 if live else 1
         except WarpArError:
             yield from ready
             raise
