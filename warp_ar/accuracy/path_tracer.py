@@ -28,6 +28,7 @@ from warp_ar.kernels.path_picture import finish_picture, make_moments, map_refle
 from warp_ar.kernels.path_samples import add_samples, list_samples, make_round
 from warp_ar.kernels.path_sampling import make_sky
 from warp_ar.kernels.path_vertices import LocalScene
+from warp_ar.kernels.path_wavefront import MOST_SLOTS, Wave, make_wave
 from warp_ar.kernels.split_sum import integrate_dfg
 from warp_ar.light.captured import Light
 from warp_ar.scene import Pose, Scene
@@ -50,8 +51,8 @@ DFG_SIZE = 32
 """Rows and columns of the table of directional albedo."""
 PART = 2048
 """Samples that a thread takes at a time, on CPU."""
-MOST_SAMPLES = 1 << 21
-"""Of a round, where a pass has no more: a GPU's memory holds 60 bytes for each."""
+MOST_SAMPLES = {"cpu": 1 << 21, "cuda": 1 << 23}
+"""Of a round, where a pass has no more: memory holds 60 bytes for each."""
 FIRST_ROUND = 16
 """Samples per pixel after which something is learned from them; and again whenever there are twice as many."""
 AROUND = 9
@@ -206,6 +207,10 @@ class PathTracer:
         shape = (self.camera.height, self.camera.width)
         self._moments = make_moments(shape, self.device)
         self._round = make_round(shape, self.device)
+        self._wave: Wave | None = None
+        if not self.device.is_cpu:
+            slots = min(MOST_SLOTS, self.camera.width * self.camera.height)
+            self._wave = make_wave(slots, len(self.scene.lights), self.device)
         objects = self._local.guides.virtual_spheres if self._linear is not None else 0
         self._squares = make_squares(shape, objects, self.device)
         self._shares = wp.ones(shape, dtype=wp.float32, device=self.device)
@@ -213,6 +218,9 @@ class PathTracer:
         self._error = wp.zeros(shape, dtype=wp.vec3, device=self.device)
         self._image = wp.zeros(shape, dtype=wp.vec3ub, device=self.device)
         self._encode = wp.array(encode_table(self.camera.transfer), dtype=wp.vec3, device=self.device)
+
+    def _kind(self) -> str:
+        return "cpu" if self.device.is_cpu else "cuda"
 
     def _make_local(self, radiance: FloatImage, emitters: npt.NDArray[Any], seconds: float) -> Any:
         """The scene as paths meet it."""
@@ -287,7 +295,7 @@ class PathTracer:
         def trace(part: tuple[int, int] | None) -> None:
             path_tracer.trace_paths(
                 self._trace, self._params, self._local, self._moments.samples, self._round,
-                count=count, asked=asked, seed=self.seed, first=first, part=part,
+                count=count, asked=asked, seed=self.seed, first=first, part=part, wave=self._wave,
             )  # fmt: skip
 
         if not self.device.is_cpu:
@@ -308,7 +316,7 @@ class PathTracer:
 
     def _add(self, asked: int, count: int, first: int) -> None:
         """Make so many passes, as many of them in a round as it has room for."""
-        most = max(1, MOST_SAMPLES // (self.camera.width * self.camera.height))
+        most = max(1, MOST_SAMPLES[self._kind()] // (self.camera.width * self.camera.height))
         while count > 0:
             passes = min(count, most)
             samples = self._begin_round(passes)
