@@ -371,6 +371,16 @@ def with_virtual_content(pair: PathPair) -> wp.bool:
 
 
 @wp.func
+def lights_at(scene: LocalScene, pair: PathPair) -> wp.int32:
+    """How many virtual lights the path that is followed asks for at its surface: all, or none."""
+    # What they send a white surface by way of others is followed from the lights (``path_photons``).
+    followed = scene.lights_followed and pair.white and not pair.lobe and pair.path.depth > 0
+    if followed or not with_virtual_content(pair):
+        return 0
+    return scene.lights.shape[0]
+
+
+@wp.func
 def leave_surface(scene: LocalScene, hit: Hit, pair: PathPair, direct: DirectLight, following: PathState) -> PathPair:
     """The path goes from a surface to its next ray, with the light that the surface reflects of what reaches it."""
     out = bring_direct(pair, direct)
@@ -409,10 +419,9 @@ def make_scatter(trace: TraceConfig) -> wp.Function:
         is_mirror = surface.model == wp.static(int(MIRROR))
         with_virtual = with_virtual_content(pair)
         direct = DirectLight()
-        lights = wp.int32(0)
+        lights = lights_at(scene, pair)
         if with_virtual:
             direct.changed = surface.emission
-            lights = scene.lights.shape[0]
         for index in range(wp.where(is_mirror, lights, -1), lights + 1):
             is_next = index == lights
             drawn = DirectionSample()

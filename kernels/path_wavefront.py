@@ -42,6 +42,7 @@ from warp_ar.kernels.path_following import (
     extend_path,
     is_first_white,
     leave_surface,
+    lights_at,
     make_see_proxy,
     meet,
     next_density,
@@ -309,7 +310,7 @@ def make_shade_kernel() -> wp.Kernel:
         following = PathState()
         is_mirror = surface.model == wp.static(int(MIRROR))
         sources = wave.reach.shape[0]
-        asked = wp.where(is_mirror, 0, wp.where(with_virtual_content(pair), sources, 1))
+        asked = wp.where(is_mirror, 0, 1 + lights_at(scene, pair))
         for source in range(sources):
             wave.reach[source, slot] = NOT_ASKED
         for index in range(asked + 1):
