@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import functools
 
+import numpy as np
 import warp as wp
 
 from warp_ar.kernels.launch import MOST_REGISTERS, launch
@@ -100,12 +101,12 @@ class Wave:
 
     stages: wp.array[wp.int32]  # (S) what is next: SURFACE, RAY, ENDED, EMPTY or IDLE
     samples: wp.array[wp.int32]  # (S) the sample of the round that is followed
-    keys: wp.array[PathKey]  # (S)
-    pairs: wp.array[PathPair]  # (S)
-    vertices: wp.array[Vertex]  # (S) what the ray met
+    keys: wp.array2d[wp.uint32]  # (words, S) of PathKey
+    pairs: wp.array2d[wp.uint32]  # (words, S) of PathPair
+    vertices: wp.array2d[wp.uint32]  # (words, S) of Vertex: what the ray met
     reflectances: wp.array[wp.vec3]  # (S) of a proxy there
     emissions: wp.array[wp.vec3]  # (S) radiance that the surface sends by itself
-    following: wp.array[PathState]  # (S) the path on its next ray
+    following: wp.array2d[wp.uint32]  # (words, S) of PathState: the path on its next ray
     starts: wp.array2d[wp.vec3]  # (L, S) where a ray toward light starts
     toward: wp.array2d[wp.vec3]  # (L, S) its direction, unit
     distances: wp.array2d[wp.float32]  # (L, S) how far it goes
@@ -136,6 +137,73 @@ def take_place(counts: wp.array[wp.int32], index: wp.int32) -> wp.int32:
     """Adds 1 to a count, and returns what it was."""
 
 
+_LOAD = """
+    // Word after word of neighbouring slots lie side by side.
+    unsigned copy[sizeof({name}) / 4];
+    const unsigned* word = (const unsigned*)words.data + slot;
+    #pragma unroll
+    for (unsigned k = 0; k < sizeof({name}) / 4; ++k)
+        copy[k] = word[(size_t)k * words.shape[1]];
+    #if defined(__CUDA_ARCH__)
+    memcpy(&record, copy, sizeof({name}));
+    #else
+    __builtin_memcpy(&record, copy, sizeof({name}));
+    #endif
+"""
+_STORE = """
+    unsigned copy[sizeof({name}) / 4];
+    #if defined(__CUDA_ARCH__)
+    memcpy(copy, &record, sizeof({name}));
+    #else
+    __builtin_memcpy(copy, &record, sizeof({name}));
+    #endif
+    unsigned* word = (unsigned*)words.data + slot;
+    #pragma unroll
+    for (unsigned k = 0; k < sizeof({name}) / 4; ++k)
+        word[(size_t)k * words.shape[1]] = copy[k];
+"""
+
+
+@wp.func_native(_LOAD.format(name=PathPair.native_name))
+def load_pair(words: wp.array2d[wp.uint32], slot: wp.int32, record: wp.ref[PathPair]):
+    """Read the pair of a slot."""
+
+
+@wp.func_native(_STORE.format(name=PathPair.native_name))
+def store_pair(words: wp.array2d[wp.uint32], slot: wp.int32, record: wp.ref[PathPair]):
+    """Write the pair of a slot."""
+
+
+@wp.func_native(_LOAD.format(name=PathState.native_name))
+def load_state(words: wp.array2d[wp.uint32], slot: wp.int32, record: wp.ref[PathState]):
+    """Read the path of a slot on its next ray."""
+
+
+@wp.func_native(_STORE.format(name=PathState.native_name))
+def store_state(words: wp.array2d[wp.uint32], slot: wp.int32, record: wp.ref[PathState]):
+    """Write the path of a slot on its next ray."""
+
+
+@wp.func_native(_LOAD.format(name=Vertex.native_name))
+def load_vertex(words: wp.array2d[wp.uint32], slot: wp.int32, record: wp.ref[Vertex]):
+    """Read what the ray of a slot met."""
+
+
+@wp.func_native(_STORE.format(name=Vertex.native_name))
+def store_vertex(words: wp.array2d[wp.uint32], slot: wp.int32, record: wp.ref[Vertex]):
+    """Write what the ray of a slot met."""
+
+
+@wp.func_native(_LOAD.format(name=PathKey.native_name))
+def load_key(words: wp.array2d[wp.uint32], slot: wp.int32, record: wp.ref[PathKey]):
+    """Read what makes the random numbers of a slot's path."""
+
+
+@wp.func_native(_STORE.format(name=PathKey.native_name))
+def store_key(words: wp.array2d[wp.uint32], slot: wp.int32, record: wp.ref[PathKey]):
+    """Write what makes the random numbers of a slot's path."""
+
+
 @wp.kernel(enable_backward=False, module="unique")
 def advance_kernel(
     # In:
@@ -158,7 +226,7 @@ def advance_kernel(
     begins = stage == EMPTY
     lobe = bool(False)
     if not begins:
-        pair = wave.pairs[slot]
+        load_pair(wave.pairs, slot, pair)
         if stage == SURFACE:
             with_virtual = with_virtual_content(pair)
             direct = DirectLight()
@@ -171,7 +239,11 @@ def advance_kernel(
                 if reach >= REACHES:
                     arriving = wave.arriving[source, slot]
                     direct = add_direct(direct, arriving, source == 0, reach == HIDDEN, pair.path, with_virtual)
-            pair = leave_surface(scene, wave.vertices[slot].hit, pair, direct, wave.following[slot])
+            vertex = Vertex()
+            load_vertex(wave.vertices, slot, vertex)
+            following = PathState()
+            load_state(wave.following, slot, following)
+            pair = leave_surface(scene, vertex.hit, pair, direct, following)
         if pair.next == ENDED and pair.path.without:
             pair = end_without(pair)
         if pair.next == ENDED:
@@ -192,9 +264,10 @@ def advance_kernel(
         pair = begin_path(params[0].camera_position, direction, asked, lobe)
         if lobe:
             key.seed = ~key.seed
-        wave.keys[slot] = key
-    wave.pairs[slot] = pair
-    wave.stages[slot] = RAY
+        store_key(wave.keys, slot, key)
+    if stage != RAY:
+        store_pair(wave.pairs, slot, pair)
+        wave.stages[slot] = RAY
     wave.rays[take_place(wave.counts, RAYS)] = slot
 
 
@@ -214,8 +287,10 @@ def make_find_kernel(trace: TraceConfig) -> wp.Kernel:
         if place >= wave.counts[RAYS]:
             return
         slot = wave.rays[place]
-        path = wave.pairs[slot].path
-        wave.vertices[slot] = find_vertex(scene, path.origin, path.direction, not path.without)
+        pair = PathPair()
+        load_pair(wave.pairs, slot, pair)
+        vertex = find_vertex(scene, pair.path.origin, pair.path.direction, not pair.path.without)
+        store_vertex(wave.vertices, slot, vertex)
 
     return find_kernel
 
@@ -233,14 +308,16 @@ def meet_kernel(
     if place >= wave.counts[RAYS]:
         return
     slot = wave.rays[place]
-    pair = wave.pairs[slot]
-    vertex = wave.vertices[slot]
+    pair = PathPair()
+    load_pair(wave.pairs, slot, pair)
+    vertex = Vertex()
+    load_vertex(wave.vertices, slot, vertex)
     pair.rays += 1
     if pair.path.depth == 0:
         pair = see(scene, asked, vertex, pair, wave.samples[slot], samples_out)
     else:
         pair = meet(scene, vertex, pair)
-    wave.pairs[slot] = pair
+    store_pair(wave.pairs, slot, pair)
     wave.stages[slot] = pair.next
     if pair.next == SURFACE:
         if vertex.kind != PROXY:
@@ -268,9 +345,13 @@ def make_look_kernel(trace: TraceConfig) -> wp.Kernel:
         if place >= wave.counts[LOOKS]:
             return
         slot = wave.looks[place]
-        seen = see_proxy(params[0], scene, wave.vertices[slot])
-        pair = take_seen(wave.pairs[slot], seen)
-        wave.pairs[slot] = pair
+        vertex = Vertex()
+        load_vertex(wave.vertices, slot, vertex)
+        seen = see_proxy(params[0], scene, vertex)
+        pair = PathPair()
+        load_pair(wave.pairs, slot, pair)
+        pair = take_seen(pair, seen)
+        store_pair(wave.pairs, slot, pair)
         wave.stages[slot] = pair.next
         if pair.next == SURFACE:
             wave.reflectances[slot] = seen.reflectance
@@ -295,11 +376,15 @@ def make_shade_kernel() -> wp.Kernel:
         if place >= wave.counts[PROXIES] and place < wave.shades.shape[0] - wave.counts[OBJECTS]:
             return
         slot = wave.shades[place]
-        pair = wave.pairs[slot]
+        pair = PathPair()
+        load_pair(wave.pairs, slot, pair)
         path = pair.path
-        key = wave.keys[slot]
+        key = PathKey()
+        load_key(wave.keys, slot, key)
+        vertex = Vertex()
+        load_vertex(wave.vertices, slot, vertex)
         wo = -path.direction
-        facing = from_viewer(wave.vertices[slot], wo)
+        facing = from_viewer(vertex, wo)
         hit = facing.hit
         surface = Surface()
         if is_first_white(pair):
@@ -336,7 +421,7 @@ def make_shade_kernel() -> wp.Kernel:
                     wave.toward[index, slot] = wi
                     wave.distances[index, slot] = drawn.distance
                     wave.tests[index, take_place(wave.counts, TESTS + index)] = slot
-        wave.following[slot] = following
+        store_state(wave.following, slot, following)
 
     return shade_kernel
 
@@ -364,9 +449,12 @@ def make_test_kernel(trace: TraceConfig) -> wp.Kernel:
         reach = REACHES
         if hidden_by_physical(scene, start, wi, distance):
             reach = BLOCKED
-        elif with_virtual_content(wave.pairs[slot]):
-            if occluded_by_objects(scene.rays, start, wi, distance):
-                reach = HIDDEN
+        else:
+            pair = PathPair()
+            load_pair(wave.pairs, slot, pair)
+            if with_virtual_content(pair):
+                if occluded_by_objects(scene.rays, start, wi, distance):
+                    reach = HIDDEN
         wave.reach[source, slot] = reach
 
     return test_kernel
@@ -381,9 +469,11 @@ def make_wave(slots: int, lights: int, device: wp.DeviceLike) -> Wave:
         device: Where.
     """
     wave, sources = Wave(), lights + 1
-    kinds = {"keys": PathKey, "pairs": PathPair, "vertices": Vertex, "reflectances": wp.vec3, "emissions": wp.vec3}
-    kinds |= {"following": PathState, **dict.fromkeys(("stages", "samples", "rays", "looks", "shades"), wp.int32)}
-    for name, kind in kinds.items():
+    for name, kind in {"keys": PathKey, "pairs": PathPair, "vertices": Vertex, "following": PathState}.items():
+        words = np.dtype(kind.numpy_dtype()).itemsize // 4
+        setattr(wave, name, wp.empty((words, slots), dtype=wp.uint32, device=device))
+    kinds = {"reflectances": wp.vec3, "emissions": wp.vec3}
+    for name, kind in (kinds | dict.fromkeys(("stages", "samples", "rays", "looks", "shades"), wp.int32)).items():
         setattr(wave, name, wp.empty(slots, dtype=kind, device=device))
     kinds = {"starts": wp.vec3, "toward": wp.vec3, "distances": wp.float32, "arriving": wp.vec3}
     for name, kind in (kinds | {"reach": wp.int32, "tests": wp.int32}).items():
