@@ -55,7 +55,7 @@ PART = 2048
 """Samples that a thread takes at a time, on CPU."""
 MOST_SAMPLES = {"cpu": 1 << 21, "cuda": 1 << 23}
 """Of a round, where a pass has no more: memory holds 60 bytes for each."""
-PATHS_OF_LIGHTS = 0.5
+PATHS_OF_LIGHTS = 0.25
 """Paths from virtual lights per pixel and pass."""
 FIRST_ROUND = 16
 """Samples per pixel after which something is learned from them; and again whenever there are twice as many."""
