@@ -2,10 +2,10 @@
 
 What polished metal throws of a lamp onto a matt surface comes by few directions, which a path from the camera finds by
 chance. A path from the lamp cannot miss them: it meets the metal, goes on as the metal reflects, and wherever it then
-meets a proxy that the camera sees, it adds to the pixel there [Arv86], [PBRT]. So the white surfaces of ``path_picture``
-leave out virtual lights beyond themselves (``lights_at``), and have from here what they would have summed: with W the
-power that a path from a light has as it meets a white surface at distance r and depth z from the camera, under the
-cosines c and c' of the surface toward camera and light, s' that of the normal for shading,
+meets a proxy that the camera sees, it adds to the pixel there [Arv86], [PBRT]. So the white surfaces of
+``path_picture`` leave out virtual lights beyond themselves (``lights_at``), and have from here what they would have
+summed: with W the power that a path from a light has as it meets a white surface at distance r and depth z from the
+camera, under the cosines c and c' of the surface toward camera and light, s' that of the normal for shading,
 
     L = 1 / N  sum over N paths of  W / pi  s' / c'  c r / z^3  fx fy
 
@@ -35,7 +35,6 @@ import warp as wp
 
 from warp_ar.kernels.camera import project
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
-from warp_ar.kernels.materials import Surface
 from warp_ar.kernels.path_following import (
     MOST_VERTICES,
     PICK,
@@ -288,9 +287,7 @@ def make_follow_lights_kernel(trace: TraceConfig) -> wp.Kernel:
                 surface = look_up_material(scene, facing, toward, reflectance)
                 u = random_triple(key, depth, SCATTER)
                 pick = random_triple(key, depth, PICK)
-                on = draw_reflected(
-                    surface, hit.normal, hit.geometric_normal, toward, pick[0], wp.vec2(u[0], u[1])
-                )
+                on = draw_reflected(surface, hit.normal, hit.geometric_normal, toward, pick[0], wp.vec2(u[0], u[1]))
                 is_mirror = surface.model == wp.static(int(MIRROR))
                 share = wp.vec3(0.0, 0.0, 0.0)
                 if is_mirror and depth > 0 and wp.max(wp.abs(on)) > 0.0:

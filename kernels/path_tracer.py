@@ -37,6 +37,7 @@ __all__ = ["DIFFERENCE", "IRRADIANCE", "WHOLE", "find_shown", "trace_paths"]
 
 wp.set_module_options({"enable_backward": False})
 
+
 # One loop for all rays of a sample, its camera's as well: so what finds a surface is in the kernel once. A warp of a
 # GPU waits for the longest of its 32 paths; threads that went on with samples of a shared counter were no faster
 # (docs/notes/2026-11-24-path-tracer.md).

@@ -28,6 +28,7 @@ import numpy as np
 import warp as wp
 
 from warp_ar.kernels.launch import MOST_REGISTERS, launch
+from warp_ar.kernels.materials import Surface
 from warp_ar.kernels.path_following import (
     ENDED,
     RAY,
@@ -52,11 +53,10 @@ from warp_ar.kernels.path_following import (
     white_surface,
     with_virtual_content,
 )
+from warp_ar.kernels.path_samples import Round
 from warp_ar.kernels.path_sampling import NO_DENSITY, PathKey, balance
 from warp_ar.kernels.path_starts import begin_path, camera_ray, sample_key, see, write_sample
-from warp_ar.kernels.path_samples import Round
 from warp_ar.kernels.path_vertices import (
-    OBJECT,
     PROXY,
     LocalScene,
     Vertex,
@@ -66,7 +66,6 @@ from warp_ar.kernels.path_vertices import (
     make_look_up_material,
 )
 from warp_ar.kernels.structs import MIRROR, FrameParams
-from warp_ar.kernels.materials import Surface
 from warp_ar.kernels.trace import TraceConfig, make_trace, offset_origin
 
 wp.set_module_options({"enable_backward": False})
@@ -89,7 +88,7 @@ REACHES = wp.constant(2)
 HIDDEN = wp.constant(3)
 """Light on its way to a surface: reflected toward nowhere, met by something physical, by nothing, by an object."""
 
-MOST_SLOTS = 1 << 20
+MOST_SLOTS = 1 << 22
 """Paths that are followed side by side at most; each takes half a kilobyte."""
 ROUNDS_AHEAD = 8
 """Rounds of all kernels that are launched before it is asked whether any path is left."""
@@ -215,60 +214,61 @@ def advance_kernel(
     done: wp.array2d[wp.int32],
     count: wp.int32,
     # Out:
-    wave: Wave,
+    wave_out: Wave,
     samples_out: Round,
 ):
+    """Bring paths from their surfaces onto their next rays, and let slots whose paths have ended take other samples."""
     slot = wp.tid()
-    stage = wave.stages[slot]
+    stage = wave_out.stages[slot]
     if stage == IDLE:
         return
     pair = PathPair()
     begins = stage == EMPTY
     lobe = bool(False)
     if not begins:
-        load_pair(wave.pairs, slot, pair)
+        load_pair(wave_out.pairs, slot, pair)
         if stage == SURFACE:
             with_virtual = with_virtual_content(pair)
             direct = DirectLight()
             if with_virtual:
-                direct.changed = wave.emissions[slot]
-            for source in range(wave.reach.shape[0]):
-                reach = wave.reach[source, slot]
+                direct.changed = wave_out.emissions[slot]
+            for source in range(wave_out.reach.shape[0]):
+                reach = wave_out.reach[source, slot]
                 if reach != NOT_ASKED:
                     pair.rays += 1
                 if reach >= REACHES:
-                    arriving = wave.arriving[source, slot]
+                    arriving = wave_out.arriving[source, slot]
                     direct = add_direct(direct, arriving, source == 0, reach == HIDDEN, pair.path, with_virtual)
             vertex = Vertex()
-            load_vertex(wave.vertices, slot, vertex)
+            load_vertex(wave_out.vertices, slot, vertex)
             following = PathState()
-            load_state(wave.following, slot, following)
+            load_state(wave_out.following, slot, following)
             pair = leave_surface(scene, vertex.hit, pair, direct, following)
         if pair.next == ENDED and pair.path.without:
             pair = end_without(pair)
         if pair.next == ENDED:
-            write_sample(pair, wave.samples[slot], samples_out)
+            write_sample(pair, wave_out.samples[slot], samples_out)
             begins = True
             # The gloss of what the pixel shows has a path of its own.
             lobe = pair.glossy and not pair.lobe
     if begins:
-        k = wave.samples[slot]
+        k = wave_out.samples[slot]
         if not lobe:
-            k = take_place(wave.taken, 0)
+            k = take_place(wave_out.taken, 0)
             if k >= count:
-                wave.stages[slot] = IDLE
+                wave_out.stages[slot] = IDLE
                 return
-            wave.samples[slot] = k
+            wave_out.samples[slot] = k
         key = sample_key(samples_out, k, seed, first, done)
         direction = camera_ray(params[0], scene.picture.rays, key)
         pair = begin_path(params[0].camera_position, direction, asked, lobe)
         if lobe:
             key.seed = ~key.seed
-        store_key(wave.keys, slot, key)
+        store_key(wave_out.keys, slot, key)
     if stage != RAY:
-        store_pair(wave.pairs, slot, pair)
-        wave.stages[slot] = RAY
-    wave.rays[take_place(wave.counts, RAYS)] = slot
+        store_pair(wave_out.pairs, slot, pair)
+        wave_out.stages[slot] = RAY
+    wave_out.rays[take_place(wave_out.counts, RAYS)] = slot
 
 
 @functools.cache
@@ -281,16 +281,16 @@ def make_find_kernel(trace: TraceConfig) -> wp.Kernel:
         # In:
         scene: LocalScene,
         # Out:
-        wave: Wave,
+        wave_out: Wave,
     ):
         place = wp.tid()
-        if place >= wave.counts[RAYS]:
+        if place >= wave_out.counts[RAYS]:
             return
-        slot = wave.rays[place]
+        slot = wave_out.rays[place]
         pair = PathPair()
-        load_pair(wave.pairs, slot, pair)
+        load_pair(wave_out.pairs, slot, pair)
         vertex = find_vertex(scene, pair.path.origin, pair.path.direction, not pair.path.without)
-        store_vertex(wave.vertices, slot, vertex)
+        store_vertex(wave_out.vertices, slot, vertex)
 
     return find_kernel
 
@@ -301,31 +301,32 @@ def meet_kernel(
     scene: LocalScene,
     asked: wp.int32,
     # Out:
-    wave: Wave,
+    wave_out: Wave,
     samples_out: Round,
 ):
+    """Light that rays bring from what they met, and which queue is next for their paths."""
     place = wp.tid()
-    if place >= wave.counts[RAYS]:
+    if place >= wave_out.counts[RAYS]:
         return
-    slot = wave.rays[place]
+    slot = wave_out.rays[place]
     pair = PathPair()
-    load_pair(wave.pairs, slot, pair)
+    load_pair(wave_out.pairs, slot, pair)
     vertex = Vertex()
-    load_vertex(wave.vertices, slot, vertex)
+    load_vertex(wave_out.vertices, slot, vertex)
     pair.rays += 1
     if pair.path.depth == 0:
-        pair = see(scene, asked, vertex, pair, wave.samples[slot], samples_out)
+        pair = see(scene, asked, vertex, pair, wave_out.samples[slot], samples_out)
     else:
         pair = meet(scene, vertex, pair)
-    store_pair(wave.pairs, slot, pair)
-    wave.stages[slot] = pair.next
+    store_pair(wave_out.pairs, slot, pair)
+    wave_out.stages[slot] = pair.next
     if pair.next == SURFACE:
         if vertex.kind != PROXY:
-            wave.shades[wave.shades.shape[0] - 1 - take_place(wave.counts, OBJECTS)] = slot
+            wave_out.shades[wave_out.shades.shape[0] - 1 - take_place(wave_out.counts, OBJECTS)] = slot
         elif is_first_white(pair):
-            wave.shades[take_place(wave.counts, PROXIES)] = slot
+            wave_out.shades[take_place(wave_out.counts, PROXIES)] = slot
         else:
-            wave.looks[take_place(wave.counts, LOOKS)] = slot
+            wave_out.looks[take_place(wave_out.counts, LOOKS)] = slot
 
 
 @functools.cache
@@ -339,23 +340,23 @@ def make_look_kernel(trace: TraceConfig) -> wp.Kernel:
         params: wp.array[FrameParams],
         scene: LocalScene,
         # Out:
-        wave: Wave,
+        wave_out: Wave,
     ):
         place = wp.tid()
-        if place >= wave.counts[LOOKS]:
+        if place >= wave_out.counts[LOOKS]:
             return
-        slot = wave.looks[place]
+        slot = wave_out.looks[place]
         vertex = Vertex()
-        load_vertex(wave.vertices, slot, vertex)
+        load_vertex(wave_out.vertices, slot, vertex)
         seen = see_proxy(params[0], scene, vertex)
         pair = PathPair()
-        load_pair(wave.pairs, slot, pair)
+        load_pair(wave_out.pairs, slot, pair)
         pair = take_seen(pair, seen)
-        store_pair(wave.pairs, slot, pair)
-        wave.stages[slot] = pair.next
+        store_pair(wave_out.pairs, slot, pair)
+        wave_out.stages[slot] = pair.next
         if pair.next == SURFACE:
-            wave.reflectances[slot] = seen.reflectance
-            wave.shades[take_place(wave.counts, PROXIES)] = slot
+            wave_out.reflectances[slot] = seen.reflectance
+            wave_out.shades[take_place(wave_out.counts, PROXIES)] = slot
 
     return look_kernel
 
@@ -370,19 +371,19 @@ def make_shade_kernel() -> wp.Kernel:
         # In:
         scene: LocalScene,
         # Out:
-        wave: Wave,
+        wave_out: Wave,
     ):
         place = wp.tid()
-        if place >= wave.counts[PROXIES] and place < wave.shades.shape[0] - wave.counts[OBJECTS]:
+        if place >= wave_out.counts[PROXIES] and place < wave_out.shades.shape[0] - wave_out.counts[OBJECTS]:
             return
-        slot = wave.shades[place]
+        slot = wave_out.shades[place]
         pair = PathPair()
-        load_pair(wave.pairs, slot, pair)
+        load_pair(wave_out.pairs, slot, pair)
         path = pair.path
         key = PathKey()
-        load_key(wave.keys, slot, key)
+        load_key(wave_out.keys, slot, key)
         vertex = Vertex()
-        load_vertex(wave.vertices, slot, vertex)
+        load_vertex(wave_out.vertices, slot, vertex)
         wo = -path.direction
         facing = from_viewer(vertex, wo)
         hit = facing.hit
@@ -390,14 +391,14 @@ def make_shade_kernel() -> wp.Kernel:
         if is_first_white(pair):
             surface = white_surface(scene, facing, pair.lobe)
         else:
-            surface = look_up_material(scene, facing, wo, wave.reflectances[slot])
-        wave.emissions[slot] = surface.emission
+            surface = look_up_material(scene, facing, wo, wave_out.reflectances[slot])
+        wave_out.emissions[slot] = surface.emission
         following = PathState()
         is_mirror = surface.model == wp.static(int(MIRROR))
-        sources = wave.reach.shape[0]
+        sources = wave_out.reach.shape[0]
         asked = wp.where(is_mirror, 0, 1 + lights_at(scene, pair))
         for source in range(sources):
-            wave.reach[source, slot] = NOT_ASKED
+            wave_out.reach[source, slot] = NOT_ASKED
         for index in range(asked + 1):
             is_next = index == asked
             drawn = DirectionSample()
@@ -416,12 +417,12 @@ def make_shade_kernel() -> wp.Kernel:
                     following = extend_path(path, start, wi, reflected, density, key)
                 else:
                     share = balance(drawn.density, density) / drawn.per
-                    wave.arriving[index, slot] = share * wp.cw_mul(reflected, drawn.radiance)
-                    wave.starts[index, slot] = start
-                    wave.toward[index, slot] = wi
-                    wave.distances[index, slot] = drawn.distance
-                    wave.tests[index, take_place(wave.counts, TESTS + index)] = slot
-        store_state(wave.following, slot, following)
+                    wave_out.arriving[index, slot] = share * wp.cw_mul(reflected, drawn.radiance)
+                    wave_out.starts[index, slot] = start
+                    wave_out.toward[index, slot] = wi
+                    wave_out.distances[index, slot] = drawn.distance
+                    wave_out.tests[index, take_place(wave_out.counts, TESTS + index)] = slot
+        store_state(wave_out.following, slot, following)
 
     return shade_kernel
 
@@ -437,25 +438,25 @@ def make_test_kernel(trace: TraceConfig) -> wp.Kernel:
         # In:
         scene: LocalScene,
         # Out:
-        wave: Wave,
+        wave_out: Wave,
     ):
         source, place = wp.tid()
-        if place >= wave.counts[TESTS + source]:
+        if place >= wave_out.counts[TESTS + source]:
             return
-        slot = wave.tests[source, place]
-        start = wave.starts[source, slot]
-        wi = wave.toward[source, slot]
-        distance = wave.distances[source, slot]
+        slot = wave_out.tests[source, place]
+        start = wave_out.starts[source, slot]
+        wi = wave_out.toward[source, slot]
+        distance = wave_out.distances[source, slot]
         reach = REACHES
         if hidden_by_physical(scene, start, wi, distance):
             reach = BLOCKED
         else:
             pair = PathPair()
-            load_pair(wave.pairs, slot, pair)
+            load_pair(wave_out.pairs, slot, pair)
             if with_virtual_content(pair):
                 if occluded_by_objects(scene.rays, start, wi, distance):
                     reach = HIDDEN
-        wave.reach[source, slot] = reach
+        wave_out.reach[source, slot] = reach
 
     return test_kernel
 

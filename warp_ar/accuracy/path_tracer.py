@@ -53,8 +53,12 @@ DFG_SIZE = 32
 """Rows and columns of the table of directional albedo."""
 PART = 2048
 """Samples that a thread takes at a time, on CPU."""
-MOST_SAMPLES = {"cpu": 1 << 21, "cuda": 1 << 23}
-"""Of a round, where a pass has no more: memory holds 60 bytes for each."""
+MOST_SAMPLES = 1 << 21
+"""Of a round on a CPU, where a pass has no more."""
+MOST_CUDA_SAMPLES = 1 << 25
+"""Of a round on a GPU, where a pass has no more, and memory has ``SAMPLE_BYTES`` free for each."""
+SAMPLE_BYTES = 512
+"""Four times what a sample and its share of the paths that are followed side by side take."""
 PATHS_OF_LIGHTS = 0.25
 """Paths from virtual lights per pixel and pass."""
 FIRST_ROUND = 16
@@ -214,9 +218,6 @@ class PathTracer:
         self._moments = make_moments(shape, self.device)
         self._round = make_round(shape, self.device)
         self._wave: Wave | None = None
-        if not self.device.is_cpu:
-            slots = min(MOST_SLOTS, self.camera.width * self.camera.height)
-            self._wave = make_wave(slots, len(self.scene.lights), self.device)
         objects = self._local.guides.virtual_spheres if self._linear is not None else 0
         self._squares = make_squares(shape, objects, self.device)
         self._shares = wp.ones(shape, dtype=wp.float32, device=self.device)
@@ -226,9 +227,6 @@ class PathTracer:
         self._error = wp.zeros(shape, dtype=wp.vec3, device=self.device)
         self._image = wp.zeros(shape, dtype=wp.vec3ub, device=self.device)
         self._encode = wp.array(encode_table(self.camera.transfer), dtype=wp.vec3, device=self.device)
-
-    def _kind(self) -> str:
-        return "cpu" if self.device.is_cpu else "cuda"
 
     def _make_local(self, radiance: FloatImage, emitters: npt.NDArray[Any], seconds: float) -> Any:
         """The scene as paths meet it."""
@@ -302,6 +300,7 @@ class PathTracer:
 
         ``first`` is the number of a pixel's first sample in the moments.
         """
+        self._make_wave(count)
 
         def trace(part: tuple[int, int] | None) -> None:
             path_tracer.trace_paths(
@@ -348,13 +347,28 @@ class PathTracer:
                 list(pool.map(trace, parts[start : start + at_once]))
                 yield
 
+    def _most_samples(self) -> int:
+        """Of a round."""
+        if self.device.is_cpu:
+            return MOST_SAMPLES
+        return int(min(MOST_CUDA_SAMPLES, self.device.free_memory // SAMPLE_BYTES))
+
+    def _make_wave(self, count: int) -> None:
+        """On a GPU, room for the paths that are followed side by side in a round of so many samples."""
+        slots = min(MOST_SLOTS, count)
+        if self.device.is_cpu or (self._wave is not None and self._wave.stages.shape[0] >= slots):
+            return
+        self._wave = None
+        with translating(self.device), wp.ScopedDevice(self.device):
+            self._wave = make_wave(max(slots, 1), len(self.scene.lights), self.device)
+
     def _brings_lights(self, asked: int) -> bool:
         """Whether a pass has paths from virtual lights as well."""
         return self._follows_lights and asked == path_tracer.DIFFERENCE
 
     def _add(self, asked: int, count: int, first: int) -> None:
         """Make so many passes, as many of them in a round as it has room for."""
-        most = max(1, MOST_SAMPLES[self._kind()] // (self.camera.width * self.camera.height))
+        most = max(1, self._most_samples() // (self.camera.width * self.camera.height))
         while count > 0:
             passes = min(count, most)
             samples = self._begin_round(passes)
