@@ -371,11 +371,18 @@ def with_virtual_content(pair: PathPair) -> wp.bool:
 
 
 @wp.func
-def lights_at(scene: LocalScene, pair: PathPair) -> wp.int32:
+def is_polished(kind: wp.int32, surface: Surface) -> wp.bool:
+    """Whether a surface is of a virtual object that throws light by a lobe, which paths from the camera rarely meet."""
+    matt = surface.model == wp.static(int(LAMBERT)) or surface.model == wp.static(int(MIRROR))
+    return kind == OBJECT and not matt
+
+
+@wp.func
+def lights_at(scene: LocalScene, kind: wp.int32, surface: Surface, pair: PathPair) -> wp.int32:
     """How many virtual lights the path that is followed asks for at its surface: all, or none."""
-    # What they send a white surface by way of others is followed from the lights (``path_photons``).
+    # What they send a white surface by way of a polished one is followed from the lights (``path_photons``).
     followed = scene.lights_followed and pair.white and not pair.lobe and pair.path.depth > 0
-    if followed or not with_virtual_content(pair):
+    if (followed and is_polished(kind, surface)) or not with_virtual_content(pair):
         return 0
     return scene.lights.shape[0]
 
@@ -402,7 +409,7 @@ def leave_surface(scene: LocalScene, hit: Hit, pair: PathPair, direct: DirectLig
 # would make the kernel larger, and NVRTC slower.
 @functools.cache
 def make_scatter(trace: TraceConfig) -> wp.Function:
-    """``scatter(scene, hit, surface, pair, key) -> PathPair``: light straight from its sources, and the next ray.
+    """``scatter(scene, kind, hit, surface, pair, key) -> PathPair``: light straight from its sources, and the next ray.
 
     No such light at mirrors. Of a difference it is what virtual content changes of it. The two ways to draw a direction
     to the environment, or to the disk of a light, are combined by the balance heuristic.
@@ -411,7 +418,9 @@ def make_scatter(trace: TraceConfig) -> wp.Function:
     occluded_by_objects = make_trace(trace).occluded_by_objects
 
     @wp.func(module="unique")
-    def scatter(scene: LocalScene, hit: Hit, surface: Surface, pair: PathPair, key: PathKey) -> PathPair:
+    def scatter(
+        scene: LocalScene, kind: wp.int32, hit: Hit, surface: Surface, pair: PathPair, key: PathKey
+    ) -> PathPair:
         out = pair
         path = pair.path
         following = PathState()
@@ -419,7 +428,7 @@ def make_scatter(trace: TraceConfig) -> wp.Function:
         is_mirror = surface.model == wp.static(int(MIRROR))
         with_virtual = with_virtual_content(pair)
         direct = DirectLight()
-        lights = lights_at(scene, pair)
+        lights = lights_at(scene, kind, surface, pair)
         if with_virtual:
             direct.changed = surface.emission
         for index in range(wp.where(is_mirror, lights, -1), lights + 1):
@@ -527,6 +536,6 @@ def make_visit(trace: TraceConfig) -> wp.Function:
             surface = white_surface(scene, facing, pair.lobe)
         else:
             surface = look_up_material(scene, facing, wo, reflectance)
-        return scatter(scene, facing.hit, surface, out, key)
+        return scatter(scene, facing.kind, facing.hit, surface, out, key)
 
     return visit

@@ -3,9 +3,10 @@
 What polished metal throws of a lamp onto a matt surface comes by few directions, which a path from the camera finds by
 chance. A path from the lamp cannot miss them: it meets the metal, goes on as the metal reflects, and wherever it then
 meets a proxy that the camera sees, it adds to the pixel there [Arv86], [PBRT]. So the white surfaces of
-``path_picture`` leave out virtual lights beyond themselves (``lights_at``), and have from here what they would have
-summed: with W the power that a path from a light has as it meets a white surface at distance r and depth z from the
-camera, under the cosines c and c' of the surface toward camera and light, s' that of the normal for shading,
+``path_picture`` leave out virtual lights at polished objects (``lights_at``), and have from here what they would have
+summed, by paths that meet such an object first: with W the power that a path from a light has as it meets a white
+surface at distance r and depth z from the camera, under the cosines c and c' of the surface toward camera and light, s'
+that of the normal for shading,
 
     L = 1 / N  sum over N paths of  W / pi  s' / c'  c r / z^3  fx fy
 
@@ -31,6 +32,8 @@ from __future__ import annotations
 
 import functools
 
+import numpy as np
+import numpy.typing as npt
 import warp as wp
 
 from warp_ar.kernels.camera import project
@@ -39,6 +42,7 @@ from warp_ar.kernels.path_following import (
     MOST_VERTICES,
     PICK,
     SCATTER,
+    is_polished,
     make_see_proxy,
     reflected_from,
     survival,
@@ -47,6 +51,7 @@ from warp_ar.kernels.path_guides import cone_versine
 from warp_ar.kernels.path_sampling import PathKey, draw_reflected, random_triple, surface_density
 from warp_ar.kernels.path_vertices import (
     NOTHING,
+    OBJECT,
     PROXY,
     LocalScene,
     Vertex,
@@ -58,13 +63,11 @@ from warp_ar.kernels.path_vertices import (
 )
 from warp_ar.kernels.sampling import frame_from_normal
 from warp_ar.kernels.shadow import sample_light
-from warp_ar.kernels.structs import DIRECTIONAL, MIRROR, SPOT, FrameParams, Light
+from warp_ar.kernels.structs import DIRECTIONAL, LAMBERT, MIRROR, FrameParams, Light
 from warp_ar.kernels.trace import TraceConfig, make_trace, offset_origin
 
 wp.set_module_options({"enable_backward": False})
 
-AT_OBJECTS = wp.constant(wp.float32(0.5))
-"""Share of paths that start toward a virtual object; the others start evenly in all directions of the light."""
 START = wp.constant(2)
 """Stream of random numbers by which a path starts."""
 UNIT = wp.constant(wp.float32(16777216.0))
@@ -95,18 +98,20 @@ def add_whole(sums: wp.array[wp.int64], index: wp.int32, value: wp.int64):
     """Add to a sum to which other threads add as well, on every device."""
 
 
-def follows_lights(lights: wp.array) -> bool:
-    """Whether light of these virtual lights is followed from them: records of ``structs.Light``, one or more."""
-    return len(lights) > 0 and not (lights["radius"] > 0.0).any() and not (lights["kind"] == int(DIRECTIONAL)).any()
+def follows_lights(
+    lights: npt.NDArray[np.void], objects: npt.NDArray[np.void], materials: npt.NDArray[np.void]
+) -> bool:
+    """Whether light of virtual lights is followed from them: of all, which have a place and no size, or of none.
 
-
-@wp.func
-def spread_versine(light: Light) -> wp.float32:
-    """1 - cosine of the half angle of a cone that holds all directions of a light."""
-    if light.kind == wp.static(int(SPOT)):
-        sine = wp.sin(0.5 * wp.min(light.outer_angle, wp.pi))
-        return wp.max(2.0 * sine * sine, 1.0e-6)
-    return 2.0
+    Args:
+        lights: Records of ``structs.Light``.
+        objects: Records of ``structs.Shape``, one of which must be polished.
+        materials: Records of ``structs.Material``.
+    """
+    models = {int(model) for model in materials["model"]} if len(objects) else set()
+    polished = bool(models - {int(LAMBERT), int(MIRROR)})
+    sized = bool((lights["radius"] > 0.0).any() or (lights["kind"] == int(DIRECTIONAL)).any())
+    return len(lights) > 0 and polished and not sized
 
 
 @wp.func
@@ -114,14 +119,6 @@ def versine_between(a: wp.vec3, b: wp.vec3) -> wp.float32:
     """1 - cosine between unit vectors, without its cancellation."""
     off = a - b
     return 0.5 * wp.dot(off, off)
-
-
-@wp.func
-def axis_of(light: Light) -> wp.vec3:
-    """Where a light shines: of a point light any direction."""
-    if light.kind == wp.static(int(SPOT)):
-        return light.direction
-    return wp.vec3(0.0, 0.0, 1.0)
 
 
 @wp.func
@@ -143,38 +140,25 @@ def toward_sphere(sphere: wp.vec4, point: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def aims_at_objects(scene: LocalScene) -> wp.float32:
-    """Chance of a path to start toward an object."""
-    return wp.where(scene.guides.virtual_spheres > 0, AT_OBJECTS, 0.0)
-
-
-@wp.func
 def draw_start(scene: LocalScene, light: Light, u: wp.vec3) -> wp.vec3:
-    """Direction in which a path leaves a light."""
-    chance = aims_at_objects(scene)
-    if u[2] < chance:
-        count = scene.guides.virtual_spheres
-        k = wp.min(wp.int32(u[2] / chance * wp.float32(count)), count - 1)
-        sphere = scene.guides.spheres[k]
-        at = light.position
-        return draw_in_cone(toward_sphere(sphere, at), cone_versine(sphere, at), wp.vec2(u[0], u[1]))
-    return draw_in_cone(axis_of(light), spread_versine(light), wp.vec2(u[0], u[1]))
+    """Direction in which a path leaves a light: toward a virtual object."""
+    count = scene.guides.virtual_spheres
+    k = wp.min(wp.int32(u[2] * wp.float32(count)), count - 1)
+    sphere = scene.guides.spheres[k]
+    at = light.position
+    return draw_in_cone(toward_sphere(sphere, at), cone_versine(sphere, at), wp.vec2(u[0], u[1]))
 
 
 @wp.func
 def start_density(scene: LocalScene, light: Light, direction: wp.vec3) -> wp.float32:
     """Density with which ``draw_start`` gives a direction, per steradian."""
-    chance = aims_at_objects(scene)
     density = float(0.0)
     count = scene.guides.virtual_spheres
     for k in range(count):
         sphere = scene.guides.spheres[k]
         most = cone_versine(sphere, light.position)
         if versine_between(toward_sphere(sphere, light.position), direction) <= most:
-            density += chance / (2.0 * wp.pi * most * wp.float32(count))
-    most = spread_versine(light)
-    if versine_between(axis_of(light), direction) <= most:
-        density += (1.0 - chance) / (2.0 * wp.pi * most)
+            density += 1.0 / (2.0 * wp.pi * most * wp.float32(count))
     return density
 
 
@@ -254,7 +238,7 @@ def make_follow_lights_kernel(trace: TraceConfig) -> wp.Kernel:
         while depth < MOST_VERTICES:
             vertex = find_vertex(scene, origin, direction, True)
             rays += 1
-            goes_on = vertex.kind != NOTHING
+            goes_on = vertex.kind == OBJECT or (depth > 0 and vertex.kind != NOTHING)
             toward = -direction
             if depth == 0 and goes_on:
                 sample = sample_light(light, vertex.hit.point)
@@ -289,10 +273,11 @@ def make_follow_lights_kernel(trace: TraceConfig) -> wp.Kernel:
                 pick = random_triple(key, depth, PICK)
                 on = draw_reflected(surface, hit.normal, hit.geometric_normal, toward, pick[0], wp.vec2(u[0], u[1]))
                 is_mirror = surface.model == wp.static(int(MIRROR))
+                begins = depth > 0 or is_polished(vertex.kind, surface)
                 share = wp.vec3(0.0, 0.0, 0.0)
-                if is_mirror and depth > 0 and wp.max(wp.abs(on)) > 0.0:
+                if is_mirror and begins and wp.max(wp.abs(on)) > 0.0:
                     share = surface.reflectance
-                elif not is_mirror:
+                elif begins and not is_mirror:
                     density = surface_density(surface, hit.normal, toward, on)
                     arriving = wp.dot(hit.geometric_normal, toward)
                     if density > 0.0 and arriving > 0.0:

@@ -396,7 +396,7 @@ def make_shade_kernel() -> wp.Kernel:
         following = PathState()
         is_mirror = surface.model == wp.static(int(MIRROR))
         sources = wave_out.reach.shape[0]
-        asked = wp.where(is_mirror, 0, 1 + lights_at(scene, pair))
+        asked = wp.where(is_mirror, 0, 1 + lights_at(scene, facing.kind, surface, pair))
         for source in range(sources):
             wave_out.reach[source, slot] = NOT_ASKED
         for index in range(asked + 1):

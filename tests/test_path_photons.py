@@ -13,30 +13,56 @@ import pytest
 from tests.test_path_tracer import ABOVE, ERRORS, WHITE, boxes, latlong_sky, look, polish
 from warp_ar.accuracy import path_tracer
 from warp_ar.accuracy.path_tracer import PathTracer, TracedPicture
+from warp_ar.kernels.path_photons import UNIT
 from warp_ar.kernels.receiver import DEFAULT_REFLECTANCE, PRIOR_WEIGHT
-from warp_ar.scene import Camera, LambertMaterial, Light, Object, Pose, Proxy, Scene
+from warp_ar.scene import Camera, LambertMaterial, Light, MetallicRoughnessMaterial, Object, PhongMaterial, Proxy, Scene
 
-FRAME = np.full((32, 48, 3), 0.5, np.float32)
+# Dim, so that what virtual lights bring is more than its noise.
+SKY = 0.04 * latlong_sky()
+FRAME = np.full((32, 48, 3), 0.02, np.float32)
 POINT = Light("point", 0.25, at=(0.1, -0.1, 0.35))
 SPOT = Light("spot", 0.4, at=(0.1, -0.1, 0.35), target=(0.05, 0.05, 0.0), inner_angle=15.0, outer_angle=35.0)
 
 
 def lit(*lights: Light, lens: tuple[float, ...] = (0.0,) * 4) -> Scene:
-    """``boxes`` with other lights, and a lens."""
+    """``boxes`` with other lights, plastic instead of what is matt, and a lens."""
     scene = boxes(True)
-    return dataclasses.replace(scene, lights=lights, camera=dataclasses.replace(scene.camera, distortion=lens))
+    matt, metal = scene.objects
+    plastic = dataclasses.replace(matt, material=MetallicRoughnessMaterial((0.9, 0.6, 0.7), 0.0, 0.5))
+    camera = dataclasses.replace(scene.camera, distortion=lens)
+    return dataclasses.replace(scene, lights=lights, objects=(plastic, metal), camera=camera)
 
 
-def picture_of(
+def tracer_of(
     scene: Scene, device: str, samples: int, seed: int, monkeypatch: pytest.MonkeyPatch, *, follows: bool = True
-) -> TracedPicture:
+) -> PathTracer:
     with monkeypatch.context() as patch:
         if not follows:
-            patch.setattr(path_tracer, "follows_lights", lambda lights: False)
-        tracer = PathTracer(scene, latlong_sky(), FRAME, ABOVE, device=device, seed=seed)
+            patch.setattr(path_tracer, "follows_lights", lambda *given: False)
+        tracer = PathTracer(scene, SKY, FRAME, ABOVE, device=device, seed=seed)
         tracer.sample(samples)
         assert (tracer._followed > 0) == follows
-        return tracer.picture()
+        return tracer
+
+
+def picture_of(scene: Scene, device: str, samples: int, seed: int, monkeypatch: pytest.MonkeyPatch) -> TracedPicture:
+    return tracer_of(scene, device, samples, seed, monkeypatch).picture()
+
+
+def change_of(tracer: PathTracer) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Change of a white surface in every pixel and its standard error: without what the frame's reflectance adds."""
+    shape = tracer._moments.change.shape
+    change, products = (np.array(a.numpy(), np.float64) for a in (tracer._moments.change, tracer._moments.change_change))
+    samples = tracer._moments.samples.numpy()[..., None].astype(np.float64)
+    variance = products / (samples * (samples - 1.0))
+    if tracer._followed:
+        image = tracer._image_of_lights
+        sums, squares = (a.numpy().reshape(*shape, 3) / float(UNIT) for a in (image.sums, image.squares))
+        pixels = shape[0] * shape[1]
+        paths = tracer._followed * math.ceil(path_tracer.PATHS_OF_LIGHTS * pixels)
+        change += sums * pixels / paths
+        variance += (squares - sums**2 / paths) * (pixels / paths) ** 2
+    return change, np.sqrt(variance)
 
 
 CASES = {
@@ -50,32 +76,34 @@ CASES = {
 
 @pytest.mark.parametrize("name", CASES)
 def test_both_ways_have_the_same_mean(name: str, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = CASES[name]
-    followed = picture_of(scene, device, 192, 1, monkeypatch)
-    camera = picture_of(scene, device, 384, 2, monkeypatch, follows=False)
-    off = (followed.radiance - camera.radiance).astype(np.float64)
-    noise = np.hypot(followed.error, camera.error).astype(np.float64)
+    """Blocks of pixels, and all of them; what is followed is many times the noise by which they are told apart."""
+    followed = tracer_of(CASES[name], device, 192, 1, monkeypatch)
+    camera = tracer_of(CASES[name], device, 384, 2, monkeypatch, follows=False)
+    (found, error), (expected, other) = change_of(followed), change_of(camera)
+    off, noise = found - expected, np.hypot(error, other)
     for i in range(0, 32, 8):
         for j in range(0, 48, 8):
             block = np.s_[i : i + 8, j : j + 8]
-            error = np.sqrt((noise[block] ** 2).sum(axis=(0, 1)))
-            assert (np.abs(off[block].sum(axis=(0, 1))) <= ERRORS * error + 1e-4).all(), (i, j, off[block].sum())
-    assert abs(off.sum()) <= ERRORS * math.sqrt((noise**2).sum())
-
-
-def test_without_it_light_would_be_missed(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is followed is many times the noise by which both ways are told apart."""
-    monkeypatch.setattr(path_tracer, "PATHS_OF_LIGHTS", 1e-9)  # one path in all
-    scene = CASES["point"]
-    left = picture_of(scene, device, 384, 1, monkeypatch)
-    camera = picture_of(scene, device, 384, 2, monkeypatch, follows=False)
-    noise = math.sqrt((np.hypot(left.error, camera.error).astype(np.float64) ** 2).sum())
-    assert (left.radiance.astype(np.float64) - camera.radiance).sum() < -2.0 * ERRORS * noise
+            spread = np.sqrt((noise[block] ** 2).sum(axis=(0, 1)))
+            assert (np.abs(off[block].sum(axis=(0, 1))) <= ERRORS * spread + 1e-4).all(), (i, j, off[block].sum())
+    whole = math.sqrt((noise**2).sum())
+    assert abs(off.sum()) <= ERRORS * whole
+    brought = (found - np.array(followed._moments.change.numpy(), np.float64)).sum()
+    assert brought > 2.0 * ERRORS * whole
+    # So does the picture, which sums it up.
+    pictures = followed.picture(), camera.picture()
+    spread = np.hypot(pictures[0].error, pictures[1].error).astype(np.float64)
+    total = float((pictures[0].radiance - pictures[1].radiance).astype(np.float64).sum())
+    assert abs(total) <= ERRORS * math.sqrt((spread**2).sum())
 
 
 def wall(light: bool) -> Scene:
-    """A white wall on a plane, and a light before it: its face is at x = 0, 0.2 wide and 0.1 high."""
-    box = Object("box", size=(0.02, 0.2, 0.1), at=(-0.01, 0.0, 0.05), material=LambertMaterial((0.8, 0.8, 0.8)))
+    """A white wall on a plane, and a light before it: its face is at x = 0, 0.2 wide and 0.1 high.
+
+    Its material could have a lobe, so that its light is followed, and has none.
+    """
+    matt = PhongMaterial((0.8, 0.8, 0.8), (0.0, 0.0, 0.0), 10.0)
+    box = Object("box", size=(0.02, 0.2, 0.1), at=(-0.01, 0.0, 0.05), material=matt)
     lights = (Light("point", 1.0, color=(1.0, 0.5, 0.25), at=(0.3, 0.02, 0.05)),) if light else ()
     camera = Camera(24, 18, 120.0, 120.0, 11.5, 8.5)
     return Scene(camera, objects=(box,), proxies=(Proxy("plane", size=(2.0, 2.0)),), lights=lights)
@@ -142,7 +170,7 @@ def test_the_same_seed_gives_the_same_bits(device: str) -> None:
     """However many samples are added at a time, and whichever thread adds to a pixel first."""
     images = []
     for counts in ((40,), (3, 13, 5, 19), (40,)):
-        tracer = PathTracer(CASES["point"], latlong_sky(), FRAME, ABOVE, device=device, seed=3)
+        tracer = PathTracer(CASES["point"], SKY, FRAME, ABOVE, device=device, seed=3)
         for count in counts:
             tracer.sample(count)
         images.append(tracer.picture())
@@ -152,8 +180,8 @@ def test_the_same_seed_gives_the_same_bits(device: str) -> None:
 
 
 def test_passes_in_parts_are_the_same(device: str) -> None:
-    whole = PathTracer(CASES["spot"], latlong_sky(), FRAME, ABOVE, device=device, seed=3)
-    parted = PathTracer(CASES["spot"], latlong_sky(), FRAME, ABOVE, device=device, seed=3)
+    whole = PathTracer(CASES["spot"], SKY, FRAME, ABOVE, device=device, seed=3)
+    parted = PathTracer(CASES["spot"], SKY, FRAME, ABOVE, device=device, seed=3)
     while parted.samples < 3:
         parted.sample_for(0.0)
     whole.sample(parted.samples)
@@ -172,9 +200,12 @@ def test_passes_in_parts_are_the_same(device: str) -> None:
     ids=["none", "point", "disk", "directional"],
 )
 def test_which_lights_are_followed(lights: tuple[Light, ...], follows: bool) -> None:
-    """Those of a place and no size, where a frame tells what the white surfaces are that their light falls on."""
+    """Those of a place and no size, where something polished throws their light onto what a frame shows."""
     more: Any = {"device": "cpu", "light_samples": 5}
-    tracer = PathTracer(lit(*lights), latlong_sky(), FRAME, ABOVE, **more)
+    tracer = PathTracer(lit(*lights), SKY, FRAME, ABOVE, **more)
     assert tracer._follows_lights == follows
-    pose: Pose = ABOVE
-    assert not PathTracer(lit(*lights), latlong_sky(), None, pose, **more)._follows_lights
+    assert not PathTracer(lit(*lights), SKY, None, ABOVE, **more)._follows_lights
+    matt = Object("sphere", radius=0.04, at=(0.08, 0.0, 0.04), material=LambertMaterial((0.7, 0.2, 0.3)))
+    for objects in ((), (matt,)):
+        scene = dataclasses.replace(lit(*lights), objects=objects)
+        assert not PathTracer(scene, SKY, FRAME, ABOVE, **more)._follows_lights
