@@ -25,9 +25,13 @@ SPOT = Light("spot", 0.4, at=(0.1, -0.1, 0.35), target=(0.05, 0.05, 0.0), inner_
 
 
 def lit(*lights: Light, lens: tuple[float, ...] = (0.0,) * 4) -> Scene:
-    """``boxes`` with other lights, plastic instead of what is matt, and a lens."""
+    """``boxes`` with other lights, a lens, plastic instead of what is matt, and rougher metal.
+
+    Of what that throws paths from the camera know their error.
+    """
     scene = boxes(True)
     matt, metal = scene.objects
+    metal = dataclasses.replace(metal, material=MetallicRoughnessMaterial((1.0, 1.0, 1.0), 1.0, 0.5))
     plastic = dataclasses.replace(matt, material=MetallicRoughnessMaterial((0.9, 0.6, 0.7), 0.0, 0.5))
     camera = dataclasses.replace(scene.camera, distortion=lens)
     return dataclasses.replace(scene, lights=lights, objects=(plastic, metal), camera=camera)
@@ -52,7 +56,9 @@ def picture_of(scene: Scene, device: str, samples: int, seed: int, monkeypatch: 
 def change_of(tracer: PathTracer) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Change of a white surface in every pixel and its standard error: without what the frame's reflectance adds."""
     shape = tracer._moments.change.shape
-    change, products = (np.array(a.numpy(), np.float64) for a in (tracer._moments.change, tracer._moments.change_change))
+    change, products = (
+        np.array(a.numpy(), np.float64) for a in (tracer._moments.change, tracer._moments.change_change)
+    )
     samples = tracer._moments.samples.numpy()[..., None].astype(np.float64)
     variance = products / (samples * (samples - 1.0))
     if tracer._followed:
@@ -124,18 +130,18 @@ def by_the_wall(x: npt.NDArray[np.float64], y: npt.NDArray[np.float64]) -> npt.N
     return np.asarray((sent * shape).sum(axis=(-1, -2)) * (0.2 * 0.1 / count**2))
 
 
-def test_a_wall_sends_light_on(device: str) -> None:
+def test_a_wall_sends_light_on(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """What a matt wall throws onto the plane, by an integral in float64; the plane is too dark to throw it back."""
+    monkeypatch.setattr(path_tracer, "PATHS_OF_LIGHTS", 4.0)
     pose = look((0.3, 0.0, 0.5), (0.06, 0.0, 0.0))
     dark = 0.002
     # What the white sky and the frame tell of it: white paint would be 1 there.
     rho = (math.pi * dark + PRIOR_WEIGHT * DEFAULT_REFLECTANCE) / (math.pi + PRIOR_WEIGHT)
     frame = np.full((18, 24, 3), dark, np.float32)
-    pictures = []
-    for light in (True, False):
-        tracer = PathTracer(wall(light), WHITE, frame, pose, device=device, seed=3)
+    tracers = [PathTracer(wall(light), WHITE, frame, pose, device=device, seed=3) for light in (True, False)]
+    for tracer in tracers:
         tracer.sample(256)
-        pictures.append(tracer.picture())
+    pictures = [tracer.picture() for tracer in tracers]
     found = (pictures[0].radiance - pictures[1].radiance).astype(np.float64)
     noise = np.hypot(pictures[0].error, pictures[1].error).astype(np.float64)
     u, v = np.meshgrid((np.arange(24) - 11.5) / 120.0, (np.arange(18) - 8.5) / 120.0)
@@ -154,6 +160,10 @@ def test_a_wall_sends_light_on(device: str) -> None:
     off = (found - expected)[clear].sum(axis=0)
     assert (np.abs(off) < ERRORS * np.sqrt((noise[clear] ** 2).sum(axis=0)) + 0.01 * expected[clear].sum(axis=0)).all()
     assert (sent_on[clear].sum(axis=0) > 0.25 * expected[clear].sum(axis=0)).all()
+    # What is followed alone, on white.
+    brought = change_of(tracers[0])[0] - np.array(tracers[0]._moments.change.numpy(), np.float64)
+    integral = (by_the_wall(x, y) / math.pi)[clear].sum() * color
+    assert brought[clear].sum(axis=0) == pytest.approx(integral, rel=0.02)
 
 
 def test_its_standard_error_is_honest(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
