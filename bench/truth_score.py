@@ -1,7 +1,7 @@
 """Cases of truth by path tracing in their true light: what is left when light, pose and transport are right.
 
     python -m bench.truth_score CASE ... [--versions object,light,both] [--frames 0,6,11] [--samples N] [--error E]
-        [--places] [--card] [--device D]
+        [--places] [--device D]
 
 CASE is a folder with ``case.json``, ``camera``, ``env`` and a folder and a scene file of each version. The pictures
 have the frames' own size, for the truth was clipped there: a highlight that clips is dimmer after averaging down. One
@@ -11,8 +11,7 @@ by one half, ``noise`` the difference between both, ``error`` the relative stand
 Samples go to pixels within MARGIN of those that count. With ``--error E`` they end earlier where ``error`` is E;
 ``taken`` is how many there were. With ``--keep FILE`` lines of single frames are kept there, and what it holds at these
 samples is not rendered again. With ``--places`` the distances of the light's emitters are looked for in the frame
-(``accuracy/light_places.py``); without it all light is distant, as it was where lamps stand near. With ``--card`` the
-surfaces' reflectance is held to that of the card's paper (``accuracy/card_level.py``); ``level`` is by how much.
+(``accuracy/light_places.py``); without it all light is distant, as it was where lamps stand near.
 """
 
 from __future__ import annotations
@@ -30,7 +29,6 @@ import numpy.typing as npt
 
 from bench.common import KeptLines, commit
 from bench.judge import encoded_by, render_half
-from warp_ar.accuracy.card_level import card_level
 from warp_ar.accuracy.light_places import place_emitters
 from warp_ar.accuracy.metrics import changed_region, flip_map
 from warp_ar.accuracy.path_tracer import PathTracer
@@ -69,7 +67,6 @@ def score(
     error: float | None = None,
     *,
     places: bool = False,
-    card: bool = False,
 ) -> dict[str, float] | None:
     """Errors of one frame by so many samples, or fewer for a standard error of ``error``; None: no such frame."""
     truth = read_image(case / version / f"{frame:04d}.png")
@@ -84,15 +81,11 @@ def score(
     rate = scene.source.fps if scene.source is not None and scene.source.fps is not None else 30.0
     if places:
         light = place_emitters(light, scene, camera, pose, device=device, seconds=frame / rate)
-    level = (1.0, 1.0, 1.0)
-    if card:
-        given = PathTracer(scene, light, camera, pose, device=device, seconds=frame / rate)
-        level = card_level(given) or level
     region = changed_region(camera, truth)
     aside = ~cv2.dilate(region.astype(np.uint8), np.ones((2 * MARGIN + 1,) * 2)).astype(bool)
     halves = []
     for seed in (0, 1):
-        tracer = PathTracer(scene, light, camera, pose, device=device, seconds=frame / rate, seed=seed, level=level)
+        tracer = PathTracer(scene, light, camera, pose, device=device, seconds=frame / rate, seed=seed)
         leave_alone(tracer, aside)
         halves.append(render_half(tracer, samples, error))
     table = decode_table(scene.camera.transfer)
@@ -107,7 +100,6 @@ def score(
         "noise": float(flip_map(images[1], images[2])[region].mean()) / nothing,
         "error": float(np.hypot(*(half.relative_error for half in halves))) / 2.0,
         "taken": sum(half.samples for half in halves),
-        "level": round(float(np.mean(level)), 4),
     }
 
 
@@ -119,7 +111,6 @@ def main() -> int:
     parser.add_argument("--samples", type=int, default=512)
     parser.add_argument("--error", type=float, help="relative standard error at which samples end (default: none)")
     parser.add_argument("--places", action="store_true", help="look for the distances of the light's emitters")
-    parser.add_argument("--card", action="store_true", help="hold the surfaces to the card's paper (card_level)")
     parser.add_argument("--device", default="auto")
     parser.add_argument("--keep", type=Path, metavar="FILE", help="JSON lines: go on where a run was ended")
     options = parser.parse_args()
@@ -129,20 +120,20 @@ def main() -> int:
             start = time.perf_counter()
             frames = [int(number) for number in options.frames.split(",")]
             key = {"case": Path(name).name, "version": version, "samples": options.samples, "until": options.error}
-            key |= {"places": options.places, "card": options.card}
+            key |= {"places": options.places}
             rows = []
             for frame in frames:
                 if not lines.has(**key, frame=frame):
                     row = score(
                         Path(name), version, frame, options.samples, options.device, options.error,
-                        places=options.places, card=options.card,
+                        places=options.places,
                     )  # fmt: skip
                     if row is not None:
                         lines.add({**key, "frame": frame, **row, "commit": commit()})
                 rows += [record for record in lines.records if record | key | {"frame": frame} == record]
             if not rows:
                 continue
-            names = ("nothing", "kept", "kept_half", "noise", "error", "taken", "level")
+            names = ("nothing", "kept", "kept_half", "noise", "error", "taken")
             means: dict[str, Any] = {own: round(float(np.mean([row[own] for row in rows])), 4) for own in names}
             about = {**key, **means, "frames": len(rows)}
             about |= {"seconds": round(time.perf_counter() - start, 1), "commit": commit()}

@@ -95,7 +95,6 @@ def map_reflectance_kernel(
     mirrored: wp.array2d[wp.vec3],
     proxies: wp.array2d[wp.float32],
     samples: wp.array2d[wp.int32],
-    level: wp.vec3,
     # Out:
     matt_out: wp.array2d[wp.vec3],
     reflectance_out: wp.array2d[wp.vec3],
@@ -130,7 +129,7 @@ def map_reflectance_kernel(
             for c in range(3):
                 if total[c] > 0.0:
                     total[c] += variance[c] / total[c]
-            reflectance = reflectance_under(left, wp.cw_mul(level, total) / count)
+            reflectance = reflectance_under(left, total / count)
     reflectance_out[i, j] = reflectance
 
 
@@ -170,7 +169,6 @@ def finish_picture_kernel(
     moments: Moments,
     image: LightImage,
     followed: wp.float32,
-    level: wp.vec3,
     exposure: wp.float32,
     # Out:
     radiance_out: wp.array2d[wp.vec3],
@@ -189,12 +187,12 @@ def finish_picture_kernel(
     of_lights = wp.vec3(0.0, 0.0, 0.0)  # variance of what was followed from lights
     if moments.proxies[i, j] > 0.0:
         g = moments.change[i, j]
-        e = wp.cw_mul(level, moments.light[i, j])
+        e = moments.light[i, j]
         gg = moments.change_change[i, j]
-        ee = wp.cw_mul(wp.cw_mul(level, level), moments.light_light[i, j])
+        ee = moments.light_light[i, j]
         zg = moments.fixed_change[i, j]
-        ze = wp.cw_mul(level, moments.fixed_light[i, j])
-        ge = wp.cw_mul(level, moments.change_light[i, j])
+        ze = moments.fixed_light[i, j]
+        ge = moments.change_light[i, j]
         rho = reflectance_under(radiance[i, j], e / moments.proxies[i, j])
         for c in range(3):
             slope = float(0.0)
@@ -246,7 +244,7 @@ def map_reflectance(scene: LocalScene, moments: Moments, reflectance_out: wp.arr
     """
     shape, device = reflectance_out.shape, reflectance_out.device
     inputs = [scene.radiance, scene.shown, moments.light, moments.light_light]
-    inputs += [moments.change, moments.proxies, moments.samples, scene.level]
+    inputs += [moments.change, moments.proxies, moments.samples]
     outputs = [None if scene.gloss is None else scene.matt, reflectance_out]
     launch_rows(map_reflectance_kernel, shape, inputs, outputs, rows=None, device=device)
 
@@ -279,5 +277,5 @@ def finish_picture(
         exposure: Factor on the radiance that is encoded.
     """
     outputs = [radiance_out, error_out, sampled_out, image_out]
-    inputs = [scene.matt, encode_table, moments, image, followed, scene.level, exposure]
+    inputs = [scene.matt, encode_table, moments, image, followed, exposure]
     launch_rows(finish_picture_kernel, image_out.shape, inputs, outputs, rows=None, device=image_out.device)

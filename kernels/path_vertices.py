@@ -59,7 +59,6 @@ class LocalScene:
     matt: wp.array2d[wp.vec3]  # the frame less what proxies mirror in it; ``radiance`` itself where none does
     reflectance: wp.array2d[wp.vec3]  # of what each pixel shows
     shown: wp.array2d[wp.int32]  # the proxy that each pixel shows, or -1
-    level: wp.vec3  # light that proxies receive without virtual content over what paths bring of it
 
 
 @wp.struct

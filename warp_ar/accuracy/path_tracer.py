@@ -162,7 +162,6 @@ class PathTracer:
         seed: int = 0,
         reflectances: tuple[tuple[float, float, float], ...] | None = None,
         light_samples: int = LIGHT_SAMPLES,
-        level: tuple[float, float, float] = (1.0, 1.0, 1.0),
     ) -> None:
         """Put everything on the device.
 
@@ -180,20 +179,15 @@ class PathTracer:
             seed: Of the random numbers, 0 or more.
             reflectances: RGB of each proxy, without a frame; 0.5 where left out.
             light_samples: Per pixel, by which the reflectance of proxies is found; more than FIRST_LIGHT_SAMPLES.
-            level: Light that physical surfaces receive over what paths bring of it, per channel: by it their
-                reflectance is lower (``card_level``).
 
         Raises:
-            UsageError: The frame, the light, the seed, the reflectances or the level do not fit.
+            UsageError: The frame, the light, the seed or the reflectances do not fit.
             SceneError: The camera cannot be scaled to ``size``.
         """
         if not 0 <= seed < 2**31:
             raise UsageError(f"seed = {seed}: expected 0 to {2**31 - 1}")
-        if not (min(level) > 0.0 and np.isfinite(level).all()):
-            raise UsageError(f"level = {level}: expected three numbers above 0")
         self.camera = scene.camera if size is None else scene.camera.scaled_to(*size)
         self.scene = dataclasses.replace(scene, camera=self.camera)
-        self.pose = pose
         self.device = resolve_device(device)
         self.seed, self.samples = seed, 0
         self.light_samples = light_samples
@@ -214,7 +208,6 @@ class PathTracer:
         with translating(self.device), wp.ScopedDevice(self.device):
             self._host = HostScene(self.scene, self.device)
             self._local = self._make_local(_environment(light), _near_emitters(light), seconds)
-            self._local.level = wp.vec3(*level)
             self._params = wp.array(self._camera_values(pose), dtype=structs.FrameParams, device=self.device)
             self._set_reflectances(reflectances)
             self._allocate()
@@ -545,22 +538,6 @@ class PathTracer:
             radiance, error, image = (np.array(a.numpy()) for a in (self._radiance, self._error, self._image))
         relative = _relative_error(radiance, error, self._linear)
         return TracedPicture(radiance, error, image, self.samples, self._seconds, relative)
-
-    def pixels_of(self, points: npt.NDArray[np.float64]) -> npt.NDArray[np.intp]:
-        """Row and column of the pixel in which each of (n, 3) points of the world lies, also beyond the picture's edge.
-
-        Points behind the camera are at -1, -1. (n, 2).
-        """
-        camera = self.camera
-        matrix = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
-        local = points @ np.asarray(self.pose.rotation).T + np.asarray(self.pose.translation)
-        front = local[:, 2] > 0.0
-        local[~front] = (0.0, 0.0, 1.0)
-        lens = np.resize(np.asarray([*camera.distortion, *([0.0] * 8)], np.float64), 8)
-        at, _ = cv2.projectPoints(local, np.zeros(3), np.zeros(3), matrix, lens)
-        pixels = np.floor(np.clip(at.reshape(-1, 2)[:, ::-1], -1e6, 1e6) + 0.5).astype(np.intp)
-        pixels[~front] = -1
-        return pixels
 
     def shown(self) -> npt.NDArray[np.int32]:
         """Index of the proxy that alone the frame shows in every pixel, -1 for none or several surfaces, (H, W)."""
