@@ -58,7 +58,9 @@ MOST_SAMPLES = 1 << 21
 MOST_CUDA_SAMPLES = 1 << 25
 """Of a round on a GPU, where a pass has no more, and memory has ``SAMPLE_BYTES`` free for each."""
 SAMPLE_BYTES = 512
-"""Four times what a sample and its share of the paths that are followed side by side take."""
+"""That must be free for each: several times what it takes."""
+SLOT_BYTES = 2048
+"""That must be free for each path of those that are followed side by side: four times what it takes."""
 PATHS_OF_LIGHTS = 0.25
 """Paths from virtual lights per pixel and pass."""
 FIRST_ROUND = 16
@@ -357,12 +359,16 @@ class PathTracer:
 
     def _make_wave(self, count: int) -> None:
         """On a GPU, room for the paths that are followed side by side in a round of so many samples."""
-        slots = min(MOST_SLOTS, count)
-        if self.device.is_cpu or (self._wave is not None and self._wave.stages.shape[0] >= slots):
+        if self.device.is_cpu:
+            return
+        there = 0 if self._wave is None else self._wave.stages.shape[0]
+        # Fewer where memory has little: what a path waits for is a slot.
+        slots = max(min(MOST_SLOTS, count, int(self.device.free_memory) // SLOT_BYTES), 1)
+        if slots <= there:
             return
         self._wave = None
         with translating(self.device), wp.ScopedDevice(self.device):
-            self._wave = make_wave(max(slots, 1), len(self.scene.lights), self.device)
+            self._wave = make_wave(slots, len(self.scene.lights), self.device)
 
     def _brings_lights(self, asked: int) -> bool:
         """Whether a pass has paths from virtual lights as well."""
