@@ -348,13 +348,58 @@ def add_direct(
 
 
 @wp.func
+def is_first_white(pair: PathPair) -> wp.bool:
+    """Whether a path is at the first surface of a pixel that tells how much light arrives."""
+    return pair.white and pair.path.depth == 0
+
+
+@wp.func
 def bring_direct(pair: PathPair, direct: DirectLight) -> PathPair:
     """What of it the path that is followed asks for."""
     if pair.path.without:
         return bring(pair, direct.of_sky)
     out = bring(pair, direct.changed + direct.of_lights)
-    if pair.white and pair.path.depth == 0:
+    if is_first_white(pair):
         out.light += wp.cw_mul(pair.path.throughput, direct.of_sky)
+    return out
+
+
+@wp.func
+def with_virtual_content(pair: PathPair) -> wp.bool:
+    """Whether the path that is followed meets virtual lights and what objects send."""
+    return not (pair.only_light or pair.path.without)
+
+
+@wp.func
+def is_polished(kind: wp.int32, surface: Surface) -> wp.bool:
+    """Whether a surface is of a virtual object that throws light by a lobe, which paths from the camera rarely meet."""
+    matt = surface.model == wp.static(int(LAMBERT)) or surface.model == wp.static(int(MIRROR))
+    return kind == OBJECT and not matt
+
+
+@wp.func
+def lights_at(scene: LocalScene, kind: wp.int32, surface: Surface, pair: PathPair) -> wp.int32:
+    """How many virtual lights the path that is followed asks for at its surface: all, or none."""
+    # What they send a white surface by way of a polished one is followed from the lights (``path_photons``).
+    followed = scene.lights_followed and pair.white and not pair.lobe and pair.path.depth > 0
+    if (followed and is_polished(kind, surface)) or not with_virtual_content(pair):
+        return 0
+    return scene.lights.shape[0]
+
+
+@wp.func
+def leave_surface(scene: LocalScene, hit: Hit, pair: PathPair, direct: DirectLight, following: PathState) -> PathPair:
+    """The path goes from a surface to its next ray, with the light that the surface reflects of what reaches it."""
+    out = bring_direct(pair, direct)
+    out.path = following
+    out.path.changes_only = pair.path.changes_only
+    out.path.without = pair.path.without
+    out.next = wp.where(wp.max(following.throughput) > 0.0, RAY, ENDED)
+    if is_first_white(pair) and out.next == RAY:
+        out.guided = guided_bin(scene.guides, hit.point, out.path.direction)
+        out.drawn = out.path.density
+        out.straight = out.radiance
+        out = begin_without(out)
     return out
 
 
@@ -364,7 +409,7 @@ def bring_direct(pair: PathPair, direct: DirectLight) -> PathPair:
 # would make the kernel larger, and NVRTC slower.
 @functools.cache
 def make_scatter(trace: TraceConfig) -> wp.Function:
-    """``scatter(scene, hit, surface, pair, key) -> PathPair``: light straight from its sources, and the next ray.
+    """``scatter(scene, kind, hit, surface, pair, key) -> PathPair``: light straight from its sources, and the next ray.
 
     No such light at mirrors. Of a difference it is what virtual content changes of it. The two ways to draw a direction
     to the environment, or to the disk of a light, are combined by the balance heuristic.
@@ -373,18 +418,19 @@ def make_scatter(trace: TraceConfig) -> wp.Function:
     occluded_by_objects = make_trace(trace).occluded_by_objects
 
     @wp.func(module="unique")
-    def scatter(scene: LocalScene, hit: Hit, surface: Surface, pair: PathPair, key: PathKey) -> PathPair:
+    def scatter(
+        scene: LocalScene, kind: wp.int32, hit: Hit, surface: Surface, pair: PathPair, key: PathKey
+    ) -> PathPair:
         out = pair
         path = pair.path
         following = PathState()
         wo = -path.direction
         is_mirror = surface.model == wp.static(int(MIRROR))
-        with_virtual = not (pair.only_light or path.without)
+        with_virtual = with_virtual_content(pair)
         direct = DirectLight()
-        lights = wp.int32(0)
+        lights = lights_at(scene, kind, surface, pair)
         if with_virtual:
             direct.changed = surface.emission
-            lights = scene.lights.shape[0]
         for index in range(wp.where(is_mirror, lights, -1), lights + 1):
             is_next = index == lights
             drawn = DirectionSample()
@@ -410,12 +456,7 @@ def make_scatter(trace: TraceConfig) -> wp.Function:
             elif reaches:
                 arriving = balance(drawn.density, density) / drawn.per * wp.cw_mul(reflected, drawn.radiance)
                 direct = add_direct(direct, arriving, index < 0, hidden, path, with_virtual)
-        out = bring_direct(out, direct)
-        out.path = following
-        out.path.changes_only = path.changes_only
-        out.path.without = path.without
-        out.next = wp.where(wp.max(following.throughput) > 0.0, RAY, ENDED)
-        return out
+        return leave_surface(scene, hit, out, direct, following)
 
     return scatter
 
@@ -458,6 +499,20 @@ def meet(scene: LocalScene, vertex: Vertex, pair: PathPair) -> PathPair:
     return out
 
 
+@wp.func
+def take_seen(pair: PathPair, seen: SeenProxy) -> PathPair:
+    """What the frame tells of the proxy on which a path is: it ends there if nothing virtual is asked for."""
+    out = pair
+    out.rays += seen.rays
+    if seen.shows and not pair.path.changes_only:
+        out = bring(out, seen.radiance)
+        if pair.path.without:
+            out.next = ENDED
+        else:
+            out.path.changes_only = True
+    return out
+
+
 @functools.cache
 def make_visit(trace: TraceConfig) -> wp.Function:
     """``visit(params, scene, vertex, pair, key) -> PathPair``: what happens at the surface on which a path is."""
@@ -466,31 +521,21 @@ def make_visit(trace: TraceConfig) -> wp.Function:
     @wp.func(module="unique")
     def visit(params: FrameParams, scene: LocalScene, vertex: Vertex, pair: PathPair, key: PathKey) -> PathPair:
         out = pair
-        is_white = pair.white and pair.path.depth == 0
+        is_white = is_first_white(pair)
         wo = -pair.path.direction
         reflectance = wp.vec3(1.0, 1.0, 1.0)
         if vertex.kind == PROXY and not is_white:
             seen = see_proxy(params, scene, vertex)
-            out.rays += seen.rays
             reflectance = seen.reflectance
-            if seen.shows and not pair.path.changes_only:
-                out = bring(out, seen.radiance)
-                if pair.path.without:
-                    out.next = ENDED
-                    return out
-                out.path.changes_only = True
+            out = take_seen(out, seen)
+            if out.next == ENDED:
+                return out
         facing = from_viewer(vertex, wo)
         surface = Surface()
         if is_white:
             surface = white_surface(scene, facing, pair.lobe)
         else:
             surface = look_up_material(scene, facing, wo, reflectance)
-        out = scatter(scene, facing.hit, surface, out, key)
-        if is_white and out.next == RAY:
-            out.guided = guided_bin(scene.guides, facing.hit.point, out.path.direction)
-            out.drawn = out.path.density
-            out.straight = out.radiance
-            out = begin_without(out)
-        return out
+        return scatter(scene, facing.kind, facing.hit, surface, out, key)
 
     return visit

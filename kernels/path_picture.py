@@ -13,6 +13,7 @@ import warp as wp
 
 from warp_ar.kernels.color import encode
 from warp_ar.kernels.launch import launch_rows
+from warp_ar.kernels.path_photons import UNIT, LightImage
 from warp_ar.kernels.path_vertices import LocalScene
 from warp_ar.kernels.receiver import reflectance_of
 
@@ -132,10 +133,21 @@ def map_reflectance_kernel(
     reflectance_out[i, j] = reflectance
 
 
+@wp.func
+def light_of_pixel(image: LightImage, place: wp.int32, followed: wp.float32) -> wp.vec2:
+    """What a pixel has of paths from lights, ``followed`` of them per pixel, and the variance of that; one channel."""
+    total = wp.float32(image.sums[place]) / UNIT
+    squares = wp.float32(image.squares[place]) / UNIT
+    paths = followed * wp.float32(image.sums.shape[0] / 3)
+    return wp.vec2(total / followed, wp.max(squares - total * total / paths, 0.0) / (followed * followed))
+
+
 # In a pixel that shows a proxy E and the difference come from the same directions, so that much of their noise cancels
 # in the ratio: with the means over samples of g and e, and L0 the frame there,
 #
-#     picture = z + rho g,    rho = L0 / e.
+#     picture = z + rho g,    rho = L0 / e,
+#
+# g together with what ``path_photons`` brings where it follows light from its lights.
 #
 # A ratio of means is biased: to first order in 1 / n, the number of samples,
 #
@@ -155,10 +167,13 @@ def finish_picture_kernel(
     radiance: wp.array2d[wp.vec3],
     encode_table: wp.array[wp.vec3],
     moments: Moments,
+    image: LightImage,
+    followed: wp.float32,
     exposure: wp.float32,
     # Out:
     radiance_out: wp.array2d[wp.vec3],
     error_out: wp.array2d[wp.vec3],
+    sampled_out: wp.array2d[wp.vec3],
     image_out: wp.array2d[wp.vec3ub],
 ):
     """The picture and its standard error, from the moments of every pixel's samples."""
@@ -169,6 +184,7 @@ def finish_picture_kernel(
     zz = moments.fixed_fixed[i, j]
     picture = z
     variance = zz
+    of_lights = wp.vec3(0.0, 0.0, 0.0)  # variance of what was followed from lights
     if moments.proxies[i, j] > 0.0:
         g = moments.change[i, j]
         e = moments.light[i, j]
@@ -181,13 +197,17 @@ def finish_picture_kernel(
         for c in range(3):
             slope = float(0.0)
             factor = rho[c]
-            change = g[c]
+            brought = wp.vec2(0.0, 0.0)
+            if followed > 0.0:
+                brought = light_of_pixel(image, 3 * (i * radiance.shape[1] + j) + c, followed)
+            change = g[c] + brought[0]
             if rho[c] < 1.0 and e[c] > 0.0:
                 pairs = wp.max(count * (count - 1.0), 1.0)
-                change = g[c] + ge[c] / (pairs * e[c])
+                change += ge[c] / (pairs * e[c])
                 light = e[c] + ee[c] / (pairs * e[c])
                 factor = rho[c] * e[c] / light
                 slope = factor * change / light
+            of_lights[c] = factor * factor * brought[1]
             picture[c] = z[c] + factor * change
             variance[c] = (
                 zz[c]
@@ -197,10 +217,14 @@ def finish_picture_kernel(
             )
     radiance_out[i, j] = wp.max(picture, wp.vec3(0.0, 0.0, 0.0))
     error = wp.vec3(0.0, 0.0, 0.0)
+    sampled = wp.vec3(0.0, 0.0, 0.0)
     for c in range(3):
         if count > 1.0:
-            error[c] = wp.sqrt(wp.max(variance[c], 0.0) / (count * (count - 1.0)))
+            square = wp.max(variance[c], 0.0) / (count * (count - 1.0))
+            sampled[c] = wp.sqrt(square)
+            error[c] = wp.sqrt(square + of_lights[c])
     error_out[i, j] = error
+    sampled_out[i, j] = sampled
     image_out[i, j] = encode(encode_table, exposure * radiance_out[i, j])
 
 
@@ -228,11 +252,14 @@ def map_reflectance(scene: LocalScene, moments: Moments, reflectance_out: wp.arr
 def finish_picture(
     scene: LocalScene,
     moments: Moments,
+    image: LightImage,
     encode_table: wp.array[wp.vec3],
     radiance_out: wp.array2d[wp.vec3],
     error_out: wp.array2d[wp.vec3],
+    sampled_out: wp.array2d[wp.vec3],
     image_out: wp.array2d[wp.vec3ub],
     *,
+    followed: float = 0.0,
     exposure: float = 1.0,
 ) -> None:
     """Write what the moments say.
@@ -240,12 +267,15 @@ def finish_picture(
     Args:
         scene: Whose frame is read where proxies are shown, without what they mirror.
         moments: (H, W).
+        image: What paths from virtual lights brought, for as many pixels.
         encode_table: Of ``color.encode_table``.
         radiance_out: (H, W) linear radiance in camera values, not clipped.
         error_out: (H, W) its standard error, per channel.
+        sampled_out: (H, W) what it would be without that of ``image``.
         image_out: (H, W) encoded.
+        followed: Paths from virtual lights per pixel, 0 if none were.
         exposure: Factor on the radiance that is encoded.
     """
-    outputs = [radiance_out, error_out, image_out]
-    inputs = [scene.matt, encode_table, moments, exposure]
+    outputs = [radiance_out, error_out, sampled_out, image_out]
+    inputs = [scene.matt, encode_table, moments, image, followed, exposure]
     launch_rows(finish_picture_kernel, image_out.shape, inputs, outputs, rows=None, device=image_out.device)

@@ -47,6 +47,7 @@ class LocalScene:
 
     rays: RayScene
     lights: wp.array[Light]
+    lights_followed: wp.bool  # whether their light is followed from them, where white surfaces have it from others
     probes: wp.array[Probe]
     sky: Sky
     guides: Guides

@@ -8,6 +8,7 @@ pipeline's methods are to be judged by.
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -24,10 +25,12 @@ from warp_ar.kernels import path_tracer, structs
 from warp_ar.kernels.color import decode_table, encode_table
 from warp_ar.kernels.path_guides import make_guides
 from warp_ar.kernels.path_learning import learn_directions, make_squares
+from warp_ar.kernels.path_photons import follow_lights, follows_lights, make_light_image
 from warp_ar.kernels.path_picture import finish_picture, make_moments, map_reflectance
 from warp_ar.kernels.path_samples import add_samples, list_samples, make_round
 from warp_ar.kernels.path_sampling import make_sky
 from warp_ar.kernels.path_vertices import LocalScene
+from warp_ar.kernels.path_wavefront import MOST_SLOTS, Wave, make_wave
 from warp_ar.kernels.split_sum import integrate_dfg
 from warp_ar.light.captured import Light
 from warp_ar.scene import Pose, Scene
@@ -51,7 +54,15 @@ DFG_SIZE = 32
 PART = 2048
 """Samples that a thread takes at a time, on CPU."""
 MOST_SAMPLES = 1 << 21
-"""Of a round, where a pass has no more: a GPU's memory holds 60 bytes for each."""
+"""Of a round on a CPU, where a pass has no more."""
+MOST_CUDA_SAMPLES = 1 << 25
+"""Of a round on a GPU, where a pass has no more, and memory has ``SAMPLE_BYTES`` free for each."""
+SAMPLE_BYTES = 512
+"""That must be free for each: several times what it takes."""
+SLOT_BYTES = 2048
+"""That must be free for each path of those that are followed side by side: four times what it takes."""
+PATHS_OF_LIGHTS = 0.25
+"""Paths from virtual lights per pixel and pass."""
 FIRST_ROUND = 16
 """Samples per pixel after which something is learned from them; and again whenever there are twice as many."""
 AROUND = 9
@@ -185,8 +196,10 @@ class PathTracer:
         scale = scene.exposure.scale
         self.exposure = scale if isinstance(scale, float) else 1.0
         self._seconds = 0.0
+        self._followed = 0
+        """Passes of paths from virtual lights that were made."""
         self._parts: Iterator[bool] | None = None
-        self._compiled = False
+        self._compiled: set[Callable[..., None]] = set()
         self._passes = 0
         """Made with the shares that are there."""
         self._prepared = frame is None
@@ -206,9 +219,12 @@ class PathTracer:
         shape = (self.camera.height, self.camera.width)
         self._moments = make_moments(shape, self.device)
         self._round = make_round(shape, self.device)
+        self._wave: Wave | None = None
         objects = self._local.guides.virtual_spheres if self._linear is not None else 0
         self._squares = make_squares(shape, objects, self.device)
         self._shares = wp.ones(shape, dtype=wp.float32, device=self.device)
+        self._image_of_lights = make_light_image(shape if self._follows_lights else (0, 0), self.device)
+        self._sampled = wp.zeros(shape, dtype=wp.vec3, device=self.device)
         self._radiance = wp.zeros(shape, dtype=wp.vec3, device=self.device)
         self._error = wp.zeros(shape, dtype=wp.vec3, device=self.device)
         self._image = wp.zeros(shape, dtype=wp.vec3ub, device=self.device)
@@ -222,9 +238,14 @@ class PathTracer:
         lights = np.zeros(len(self.scene.lights), np.dtype(structs.Light.numpy_dtype()))
         self._host.write_objects(objects, seconds)
         self._host.write_lights(lights, seconds)
+        # Without a frame the first surface's reflectance is a factor of its paths, not of what they sum to.
+        self._follows_lights = self._linear is not None and follows_lights(
+            lights, objects, self._host.ray_scene.materials.numpy()
+        )
         local.rays = self._host.ray_scene
         local.rays.objects = wp.array(objects, dtype=structs.Shape, device=device)
         local.lights = wp.array(lights, dtype=structs.Light, device=device)
+        local.lights_followed = self._follows_lights
         balls = np.zeros(len(self.scene.probes), np.dtype(structs.Probe.numpy_dtype()))
         for ball, probe in zip(balls, self.scene.probes, strict=True):
             ball["center"], ball["radius"], ball["reflectance"] = probe.center, probe.radius, probe.reflectance
@@ -279,42 +300,92 @@ class PathTracer:
         self._passes += passes
 
     def _follow(self, asked: int, first: int, count: int, at_once: int) -> Iterator[None]:
-        """Trace a round of ``count`` samples: on CPU ``at_once`` parts of it by all cores, then others, on CUDA all.
+        """Trace a round of ``count`` samples, in parts as ``_in_parts`` has it.
 
         ``first`` is the number of a pixel's first sample in the moments.
         """
+        self._make_wave(count)
 
         def trace(part: tuple[int, int] | None) -> None:
             path_tracer.trace_paths(
                 self._trace, self._params, self._local, self._moments.samples, self._round,
-                count=count, asked=asked, seed=self.seed, first=first, part=part,
+                count=count, asked=asked, seed=self.seed, first=first, part=part, wave=self._wave,
             )  # fmt: skip
 
+        yield from self._in_parts(path_tracer.trace_paths, trace, count, at_once)
+
+    def _follow_lights(self, at_once: int) -> Iterator[None]:
+        """Follow the paths of a pass from virtual lights, in parts as ``_in_parts`` has it."""
+        count = math.ceil(PATHS_OF_LIGHTS * self.camera.width * self.camera.height)
+
+        def trace(part: tuple[int, int] | None) -> None:
+            follow_lights(
+                self._trace, self._params, self._local, self._image_of_lights,
+                count=count, seed=self.seed, number=self._followed, part=part,
+            )  # fmt: skip
+
+        yield from self._in_parts(follow_lights, trace, count, at_once)
+        self._followed += 1
+
+    def _in_parts(
+        self,
+        launcher: Callable[..., None],
+        trace: Callable[[tuple[int, int] | None], None],
+        count: int,
+        at_once: int,
+    ) -> Iterator[None]:
+        """On CPU ``at_once`` parts of ``count`` threads by all cores, then others; on CUDA all of them."""
         if not self.device.is_cpu:
             with translating(self.device), wp.ScopedDevice(self.device):
                 trace(None)
             yield
             return
         parts = [(start, min(start + PART, count)) for start in range(0, count, PART)]
-        if parts and not self._compiled:
+        if parts and launcher not in self._compiled:
             with translating(self.device):
                 trace(parts.pop(0))  # compiles, before threads would each do so
-            self._compiled = True
+            self._compiled.add(launcher)
             yield
         with ThreadPoolExecutor(usable_cores(), "warp_ar-paths") as pool:
             for start in range(0, len(parts), at_once):
                 list(pool.map(trace, parts[start : start + at_once]))
                 yield
 
+    def _most_samples(self) -> int:
+        """Of a round."""
+        if self.device.is_cpu:
+            return MOST_SAMPLES
+        return int(min(MOST_CUDA_SAMPLES, self.device.free_memory // SAMPLE_BYTES))
+
+    def _make_wave(self, count: int) -> None:
+        """On a GPU, room for the paths that are followed side by side in a round of so many samples."""
+        if self.device.is_cpu:
+            return
+        there = 0 if self._wave is None else self._wave.stages.shape[0]
+        # Fewer where memory has little: what a path waits for is a slot.
+        slots = max(min(MOST_SLOTS, count, int(self.device.free_memory) // SLOT_BYTES), 1)
+        if slots <= there:
+            return
+        self._wave = None
+        with translating(self.device), wp.ScopedDevice(self.device):
+            self._wave = make_wave(slots, len(self.scene.lights), self.device)
+
+    def _brings_lights(self, asked: int) -> bool:
+        """Whether a pass has paths from virtual lights as well."""
+        return self._follows_lights and asked == path_tracer.DIFFERENCE
+
     def _add(self, asked: int, count: int, first: int) -> None:
         """Make so many passes, as many of them in a round as it has room for."""
-        most = max(1, MOST_SAMPLES // (self.camera.width * self.camera.height))
+        most = max(1, self._most_samples() // (self.camera.width * self.camera.height))
         while count > 0:
             passes = min(count, most)
             samples = self._begin_round(passes)
             for _ in self._follow(asked, first, samples, at_once=max(samples, 1)):
                 pass
             self._end_round(passes)
+            for _ in range(passes if self._brings_lights(asked) else 0):
+                for _ in self._follow_lights(at_once=1 << 30):
+                    pass
             count -= passes
 
     def prepare(self) -> None:
@@ -358,7 +429,7 @@ class PathTracer:
         moments, guides = self._moments, self._local.guides
         with exclusive(self.device), wp.ScopedDevice(self.device):
             self._finish()
-            found = (np.array(a.numpy()) for a in (self._radiance, self._error, moments.samples, moments.proxies))
+            found = (np.array(a.numpy()) for a in (self._radiance, self._sampled, moments.samples, moments.proxies))
             self._shares = wp.array(sample_shares(*found), dtype=wp.float32, device=self.device)
         tiles, bins = self._squares.shape
         if bins:
@@ -370,8 +441,18 @@ class PathTracer:
 
     def _finish(self) -> None:
         """Write picture and error of the samples so far."""
+        per_pixel = math.ceil(PATHS_OF_LIGHTS * self.camera.width * self.camera.height)
         finish_picture(
-            self._local, self._moments, self._encode, self._radiance, self._error, self._image, exposure=self.exposure
+            self._local,
+            self._moments,
+            self._image_of_lights,
+            self._encode,
+            self._radiance,
+            self._error,
+            self._sampled,
+            self._image,
+            followed=self._followed * per_pixel / (self.camera.width * self.camera.height),
+            exposure=self.exposure,
         )
 
     def sample(self, count: int) -> None:
@@ -444,6 +525,11 @@ class PathTracer:
                 wp.synchronize_device(self.device)
             yield
         self._end_round(1)
+        if self._brings_lights(asked):
+            for _ in self._follow_lights(at_once=usable_cores()):
+                with exclusive(self.device):
+                    wp.synchronize_device(self.device)
+                yield
 
     def picture(self) -> TracedPicture:
         """What the samples so far give.
@@ -484,7 +570,8 @@ class PathTracer:
     def rays(self) -> int:
         """Rays that were traced for the samples so far."""
         with exclusive(self.device):
-            return int(self._moments.rays.numpy().astype(np.int64).sum())
+            rays = self._moments.rays.numpy().astype(np.int64).sum() + self._image_of_lights.rays.numpy().sum()
+        return int(rays)
 
     def render(
         self,
