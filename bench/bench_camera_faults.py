@@ -1,8 +1,8 @@
 """Errors of light and picture for each fault of a simulated camera, alone and all together.
 
 Frames of ``../shared/truth`` go through the camera; so does the picture with the virtual objects really there, with
-which the program's is compared. Clipped pixels of those frames are taken to be ``BEYOND`` before the lens, so that a
-lower exposure leaves them clipped, as it leaves a lamp.
+which the program's is compared. What clips in the ball of those frames is, before the lens, what the ball mirrors of
+the case's environment, so that a lower exposure shows as much of it as it would; elsewhere it is ``BEYOND``.
 ``WARP_AR_FAULT_CASES`` names the cases, ``WARP_AR_FAULTS`` the faults, ``WARP_AR_FAULT_SEEDS`` those of the noise, over
 which figures are means: by one alone it is partly chance what a codec leaves.
 """
@@ -10,6 +10,7 @@ which figures are means: by one alone it is partly chance what a codec leaves.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import os
 import tempfile
@@ -28,17 +29,51 @@ from warp_ar.session import Session
 TRUTH = Path(__file__).resolve().parents[2] / "shared" / "truth"
 QUALITY = "medium"
 BEYOND = 4.0
-"""Linear value of what clips."""
+"""Linear value of what clips, unless it is known."""
+WITHIN = (np.arange(4) + 0.5) / 4 - 0.5
+"""Places within a pixel, along either side, at which it is looked up what the ball mirrors."""
 
 
 def read(path: Path) -> Any:
     return cv2.imread(str(path))[..., ::-1]
 
 
-def light_of(path: Path) -> Any:
-    """Linear values of a frame before the camera."""
+def light_of(path: Path, mirrored: Any = None) -> Any:
+    """Linear values of a frame before the camera, what clips by ``mirrored`` where that is a number."""
     codes = read(path)
-    return np.where(codes >= 254, BEYOND, decode_srgb(codes))
+    beyond = BEYOND if mirrored is None else np.where(np.isnan(mirrored), BEYOND, np.maximum(mirrored, 1.0))
+    return np.where(codes >= 254, beyond, decode_srgb(codes))
+
+
+def mirrored_light(case: Path, frame: int) -> Any:
+    """What the ball mirrors of the environment, linear; NaN beside the ball.
+
+    Where a frame of a quarter of the exposure does not clip (``dark_25``), this is within 1 % of it in the median.
+    """
+    about = json.loads((case / "case.json").read_text())
+    known = [int(path.stem) for path in (case / "env").glob("*.npy")]
+    environment = np.load(case / "env" / f"{min(known, key=lambda number: abs(number - frame)):04d}.npy").astype(float)
+    camera, pose, probe = about["camera"], about["poses"][frame], about["probe"]
+    rotation, radius = np.array(pose["R"]), probe["radius"]
+    center = rotation @ np.array(probe["center"]) + np.array(pose["t"])
+    total = np.zeros((camera["height"], camera["width"], 3))
+    count = np.zeros((camera["height"], camera["width"], 1))
+    for down, right in itertools.product(WITHIN, WITHIN):
+        y, x = np.mgrid[: camera["height"], : camera["width"]]
+        slopes = (x + right - camera["cx"]) / camera["fx"], (y + down - camera["cy"]) / camera["fy"], np.ones(x.shape)
+        ray = np.stack(slopes, -1)
+        ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+        along = ray @ center
+        inside = along**2 - center @ center + radius**2
+        normal = (ray * (along - np.sqrt(np.maximum(inside, 0.0)))[..., None] - center) / radius
+        away = (ray - 2.0 * (ray * normal).sum(-1, keepdims=True) * normal) @ rotation
+        rows = len(environment)
+        row = (np.arccos(np.clip(away[..., 2], -1.0, 1.0)) / np.pi * rows).astype(int)
+        column = ((np.arctan2(away[..., 1], away[..., 0]) / np.pi + 1.0) * rows).astype(int)
+        meets = (inside > 0.0)[..., None]
+        total += np.where(meets, environment[np.minimum(row, rows - 1), column % (2 * rows)], 0.0)
+        count += meets
+    return np.where(count > 0, total / np.maximum(count, 1) * np.array(probe["reflectance"]), np.nan)
 
 
 def irradiance(radiance: Any) -> Any:
@@ -58,10 +93,11 @@ def score(case: Path, version: str, faults: Faults, device: str) -> dict[str, fl
     names = sorted(path.name for path in (case / "camera").glob("*.png"))
     phase = np.linspace(0.0, 1.0, len(names))
     truths = sorted(path.name for path in (case / version).glob("*.png"))
-    clean = {name: light_of(case / "camera" / name) for name in names}
+    mirrored = {name: mirrored_light(case, index) for index, name in enumerate(names)}
+    clean = {name: light_of(case / "camera" / name, mirrored[name]) for name in names}
     frames = expose([clean[name] for name in names], faults)
     # The same clip with the objects there, so that its noise, codec and drift are the same camera's.
-    there = [light_of(case / version / name) if name in truths else clean[name] for name in names]
+    there = [light_of(case / version / name, mirrored[name]) if name in truths else clean[name] for name in names]
     wanted = dict(zip(names, expose(there, faults, phase=phase), strict=True))
     scene = load_scene(case / f"scene_{version}.toml")
     scene = dataclasses.replace(scene, source=SourceSpec(path=case / "camera", metering="automatic"))

@@ -14,6 +14,11 @@ the tracked pose make large differences of both signs in single texels; a change
 neighbourhood one way, and stays. So the signed mean of x - m is taken over sectors of ``SECTOR_SIZE`` texels squared,
 and what counts is its smaller value in two successive frames of one sign: one corrupt frame is worth no haste, and is
 forgotten as fast as it came.
+
+A texel that clips in a channel says no more than that its radiance is x at least. Where a camera's gain drifts, the
+frames of a lower gain have shown more: m, scaled by the gain since, lies above x. There x counts as m, and the share
+that clips as the one that is known: the light does not fall because the exposure rises. Without a drift no m lies above
+what clips.
 """
 
 from __future__ import annotations
@@ -42,6 +47,23 @@ MOST_CHANGE = wp.constant(wp.float32(0.15))
 """Relative change of a sector's mean at which haste begins and is full."""
 DARK = wp.constant(wp.float32(0.01))
 """Radiance below which changes count as noise."""
+LEAST_EXCESS = wp.constant(wp.float32(0.02))
+MOST_EXCESS = wp.constant(wp.float32(0.1))
+"""Excess of what is known over what clips, relative, at which it begins to count and counts in full."""
+ALL_CLIPPED = wp.constant(wp.float32(0.9))
+"""Share of a texel from which on it is taken to clip as a whole: elsewhere noise lies to both sides."""
+
+
+@wp.func
+def known_beyond_clipping(x: wp.vec3, m: wp.vec3, clipped: wp.vec3) -> wp.vec3:
+    """How far a texel's channels clip below what is known of them, 0 to 1."""
+    beyond = wp.vec3(0.0, 0.0, 0.0)
+    for channel in range(3):
+        excess = m[channel] - x[channel]
+        if excess > 0.0 and clipped[channel] > ALL_CLIPPED:
+            beyond[channel] = smooth_ramp(LEAST_EXCESS, MOST_EXCESS, excess / wp.max(x[channel], DARK))
+            beyond[channel] *= smooth_ramp(ALL_CLIPPED, 1.0, clipped[channel])
+    return beyond
 
 
 @wp.kernel(enable_backward=False)
@@ -68,10 +90,11 @@ def measure_change_kernel(
     for item in range(lane, rows * columns, lanes):
         i = first_row + item // columns
         j = first_column + item % columns
-        x = view.radiance[i, j]
         m = environment.radiance[i, j]
+        seen = view.radiance[i, j]
+        x = seen + wp.cw_mul(known_beyond_clipping(seen, m, view.clipped[i, j]), m - seen)
         certainty = usable_confidence(m, environment.confidence[i, j])
-        weight = wp.min(light_confidence(x, view.confidence[i, j]), certainty)
+        weight = wp.min(light_confidence(seen, view.confidence[i, j]), certainty)
         if weight > 0.0:
             weight *= texel_solid_angle(i, height, width)
             new = brightness(x)
@@ -143,8 +166,9 @@ def accumulate_environment_kernel(
         a = 1.0
         if k > 0.0:
             a = rate * c / (rate * c + (1.0 - rate) * k)
-        m = m + a * (x - m)
-        share = share + a * (clipped[i, j] - share)
+        beyond = known_beyond_clipping(x, m, clipped[i, j])
+        m = m + a * wp.cw_mul(wp.vec3(1.0, 1.0, 1.0) - beyond, x - m)
+        share = share + a * wp.cw_mul(wp.vec3(1.0, 1.0, 1.0) - beyond, clipped[i, j] - share)
     k = k * wp.exp(-time_step / FORGET_TIME)
     environment_out.radiance[i, j] = m
     environment_out.confidence[i, j] = k + a * (c - k)

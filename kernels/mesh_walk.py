@@ -7,7 +7,8 @@ are read where they lie: corner k of face f is point 3 f + k (``warp_ar.scene.ra
 have fewer registers to spill. Of Warp's insides it knows ``Mesh``, ``BVH`` and its packed nodes.
 
 The test of a triangle is Warp's: watertight [WBW13], edge functions by Kahan's product of differences, whose sign is
-exact. Directions along an axis take 1e-30 for zero: 1 / 0 times a distance of 0 would be no number.
+exact. Directions along an axis take 1e-30 for zero: 1 / 0 times a distance of 0 would be no number. Boxes with a margin
+(``make_ray_mesh``) are never touched so by a ray that meets what is in them; others may be.
 
 References:
     [AL09] Aila, Laine, "Understanding the Efficiency of Ray Traversal on GPUs", HPG 2009.
@@ -21,7 +22,7 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 STACK = 32
-"""Nodes that wait at most, as in Warp's own walk: a tree by surface area has hardly more levels."""
+"""Nodes that can wait. Above a leaf one waits for each level at most, and Warp's builder ends trees at the 31st."""
 
 _WALK = """
     #if defined(__CUDA_ARCH__)

@@ -55,6 +55,34 @@ def test_accumulation_matches_twin(device):
     check_error("accumulate", light.radiance.numpy(), twin.environment)
 
 
+@pytest.mark.parametrize("share", [0.0, 0.95, 1.0])
+def test_what_clips_below_what_is_known_matches_twin(device, share):
+    """A frame that shows much, and frames of a higher exposure, which clip at less."""
+    rng = np.random.default_rng(2)
+    light, twin = Light(24, 48), reference.Accumulator(24, 48)
+    for frame in range(6):
+        x = np.float32(rng.uniform(0.9, 1.0, (24, 48, 3)) * (1.0 if frame else 1.5))
+        clipped = np.full(x.shape, share if frame else 0.2, np.float32)
+        light.step(x, 1.0, clipped, 0.05)
+        twin.step(x.astype(float), np.ones(x.shape[:2]), clipped.astype(float), 0.05)
+    np.testing.assert_allclose(light.radiance.numpy(), twin.environment, atol=SUMS)
+    np.testing.assert_allclose(light.clipped.numpy(), twin.clipped, atol=SUMS)
+
+
+def test_a_higher_exposure_takes_nothing_from_what_is_known(device):
+    """What clips is at least as bright as that: in the channels that clip, what was seen before stays."""
+    light = Light()
+    light.step((3.0, 0.4, 3.0), clipped=(0.0, 0.0, 1.0))
+    for _ in range(60):
+        light.step((1.0, 0.4, 1.0), clipped=(1.0, 0.0, 0.0))
+    np.testing.assert_array_equal(light.radiance.numpy()[..., 0], np.float32(3.0))
+    np.testing.assert_array_equal(light.clipped.numpy()[..., 0], 0.0)
+    np.testing.assert_allclose(light.radiance.numpy()[..., 2], 1.0, atol=1e-3)
+    for _ in range(60):
+        light.step((0.5, 0.4, 0.5))
+    np.testing.assert_allclose(light.radiance.numpy()[..., 0], 0.5, atol=1e-3)
+
+
 def test_first_sight_is_taken_whole(device):
     light = Light()
     assert (light.step(0.7, 0.1, time_step=0.0) == np.float32(0.7)).all()

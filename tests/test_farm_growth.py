@@ -184,3 +184,35 @@ def test_the_driver_gives_jobs_to_those_that_came_and_none_to_those_that_rest(tm
     assert {len(frames) for frames in asked} == {2, 4}
     assert None in growth.asked, "a survey, a beginning and an end are not looked at"
     assert max(map(max, asked)) > min(map(min, asked))
+
+
+def test_workers_are_looked_at_while_one_joins(tmp_path):
+    """In a run of short clips there is a join every few seconds."""
+    jobs = make_jobs(tmp_path, [{"name": name} for name in "abcd"], run={"segment_frames": 1})
+    folder = tmp_path / "run"
+    folder.mkdir()
+    manifest = Manifest(folder, write=True)
+    doing: dict[int, str] = {}
+
+    class Noting(GrowingWorkers):
+        def give(self, worker, job, arguments):
+            doing[worker] = job.kind
+            super().give(worker, job, arguments)
+
+        def wait(self, seconds):
+            events, self.events = self.events[:1], self.events[1:]
+            return events
+
+    class Looking(Planned):
+        def look(self, frames):
+            self.asked.append((set(doing.values()), frames))
+            return 0
+
+    growth = Looking(None, [])
+    try:
+        Driver(jobs, folder, manifest, Noting(jobs, folder, size=2), VERSION, pytest.fail, growth).run()
+    finally:
+        manifest.close()
+    looked_at = [kinds for kinds, frames in growth.asked if frames is not None]
+    assert {"segment", "join"} in looked_at
+    assert not any("survey" in kinds for kinds in looked_at)

@@ -2,54 +2,51 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import pytest
 import warp as wp
 
-from tests.test_wide_bvh import MESHES, T_TOLERANCE, rays_toward
-from warp_ar.kernels.mesh_walk import find_closest_face, meets_any_face
-from warp_ar.scene.geometry import Mesh
-from warp_ar.scene.ray_mesh import make_ray_mesh
+from tests.mesh_rays_rig import (
+    MESHES,
+    T_MAX,
+    T_TOLERANCE,
+    check_senseless,
+    check_t_max,
+    launch_walk,
+    make_walk_kernel,
+    ray_mesh,
+    rays_toward,
+)
+from warp_ar.kernels.mesh_walk import STACK, find_closest_face, meets_any_face
+from warp_ar.scene.ray_mesh import BVH_CONSTRUCTOR, BVH_LEAF_SIZE
 
 UV_TOLERANCE = 2e-5
 """Weights of a triangle that a ray grazes are products of differences over a small one."""
+CHAIN = 90
+"""Triangles of which each is half as large as the one before: a tree by area takes off one or two after another."""
+LARGEST = 2.0**30
+"""Side of the first; products of the last one's sides are still in float32's range."""
 
 
-@wp.kernel(enable_backward=False)
-def walk_kernel(
-    # In:
-    mesh: wp.uint64,
-    origins: wp.array[wp.vec3],
-    directions: wp.array[wp.vec3],
-    t_max: wp.float32,
-    # Out:
-    warp_out: wp.array[wp.vec4],
-    warp_any_out: wp.array[wp.int32],
-    ours_out: wp.array[wp.vec4],
-    ours_any_out: wp.array[wp.int32],
-):
-    i = wp.tid()
-    query = wp.mesh_query_ray(mesh, origins[i], directions[i], t_max)
-    warp_out[i] = wp.vec4(t_max, 0.0, 0.0, -1.0)
-    if query.result:
-        warp_out[i] = wp.vec4(query.t, query.u, query.v, wp.float32(query.face))
-    warp_any_out[i] = wp.where(wp.mesh_query_ray_anyhit(mesh, origins[i], directions[i], t_max), 1, 0)
-    near = find_closest_face(mesh, origins[i], directions[i], t_max)
-    ours_out[i] = wp.vec4(near[0], near[1], near[2], wp.float32(wp.cast(near[3], wp.int32)))
-    ours_any_out[i] = wp.where(meets_any_face(mesh, origins[i], directions[i], t_max), 1, 0)
-
-
-def walk(corners, origins, directions, device, t_max=1e3):
+def walk_through(mesh, origins, directions, device, t_max=T_MAX):
     """Closest hits (t, u, v, face) and whether there is any: by Warp's queries, by ours; NumPy."""
-    faces = np.arange(3 * len(corners), dtype=np.int32).reshape(-1, 3)
-    made = make_ray_mesh(Mesh(corners.reshape(-1, 3), faces, corners.reshape(-1, 3)), wp.get_device(device))
-    count = len(origins)
-    with wp.ScopedDevice(device), np.errstate(invalid="ignore", over="ignore"):
-        rays = [np.asarray(origins - made.center, np.float32), np.asarray(directions, np.float32)]
-        out = [wp.zeros(count, dtype=dtype) for dtype in (wp.vec4, wp.int32, wp.vec4, wp.int32)]
-        inputs = [made.mesh.id, *(wp.array(values, dtype=wp.vec3) for values in rays), t_max]
-        wp.launch(walk_kernel, count, inputs, out)
-        return [array.numpy() for array in out]
+    kernel = make_walk_kernel(find_closest_face, meets_any_face)
+    return launch_walk(kernel, mesh, mesh.id, origins, directions, device, t_max)
+
+
+def walk(device, corners, origins, directions, t_max=T_MAX):
+    """The same, of triangles as the program makes them ready."""
+    made = ray_mesh(corners, device)
+    return walk_through(made.mesh, np.asarray(origins) - made.center, directions, device, t_max)
+
+
+def bare_mesh(corners, device):
+    """Triangles by the tree that CUDA devices have, on any device, and without a margin."""
+    points = wp.array(np.asarray(corners, np.float32).reshape(-1, 3), dtype=wp.vec3, device=device)
+    indices = wp.array(np.arange(3 * len(corners), dtype=np.int32), dtype=wp.int32, device=device)
+    return wp.Mesh(points=points, indices=indices, bvh_constructor=BVH_CONSTRUCTOR, bvh_leaf_size=BVH_LEAF_SIZE)
 
 
 @pytest.mark.parametrize("name", MESHES)
@@ -57,7 +54,7 @@ def test_rays_find_what_warp_finds(name, device):
     """Where triangles are equally near, another of them may be found; at a corner Warp goes on in float64."""
     corners = MESHES[name]
     origins, directions = rays_toward(corners, 20_000)
-    warp, warp_any, ours, ours_any = walk(corners, origins, directions, device)
+    warp, warp_any, ours, ours_any = walk(device, corners, origins, directions)
     found = warp[:, 3] >= 0
     np.testing.assert_allclose(ours[found, 0], warp[found, 0], rtol=T_TOLERANCE)
     np.testing.assert_array_equal(ours_any, ours[:, 3] >= 0)
@@ -81,30 +78,69 @@ def test_no_ray_slips_through_a_closed_mesh(device):
     weights[::3] = (1, 0, 0)
     weights[1::3] = (0.5, 0.5, 0)
     directions = np.einsum("nk,nkc->nc", weights, chosen) - origins
-    _, _, ours, ours_any = walk(corners, origins.astype(np.float32), directions.astype(np.float32), device)
+    _, _, ours, ours_any = walk(device, corners, origins.astype(np.float32), directions.astype(np.float32))
     assert (ours_any == 1).all()
     assert (ours[:, 3] >= 0).all()
 
 
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("zero", [0.0, -0.0, 1e-42, -1e-42])
+def test_no_ray_slips_between_boxes_that_touch(axis, zero, device):
+    """A ray along an axis, in the plane in which two boxes without a margin touch, is in one of the two.
+
+    1 / 0 times a distance of 0 would be no number, and the ray in neither.
+    """
+    square = np.array([[[0, 0, 1], [1, 0, 1], [1, 1, 1]], [[0, 0, 1], [1, 1, 1], [0, 1, 1]]])
+    corners = np.concatenate([square, square - [1, 0, 0]])
+    origins = np.array([[0.0, 0.3, 0.0], [0.0, 0.5, 0.0], [0.0, 0.9, -2.0]])
+    directions = np.array([[zero, 0.0, 1.0]] * 3)
+    corners, origins, directions = (np.roll(values, axis, axis=-1) for values in (corners, origins, directions))
+    _, _, ours, ours_any = walk_through(bare_mesh(corners, device), origins, directions, device)
+    np.testing.assert_array_equal(ours[:, 0], [1.0, 1.0, 3.0])
+    assert (ours_any == 1).all()
+
+
+@functools.cache
+def make_depth_kernel():
+    """Levels of a mesh's tree, as its builder counted them."""
+
+    @wp.func_native("return wp::mesh_get(mesh_id).bvh.max_depth;")
+    def depth_of(mesh_id: wp.uint64) -> wp.int32: ...
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def read_depth_kernel(mesh: wp.uint64, depth_out: wp.array[wp.int32]):
+        depth_out[0] = depth_of(mesh)
+
+    return read_depth_kernel
+
+
+def test_the_deepest_tree_fits_the_stack(device):
+    """Warp ends a tree where its own stack would end, so as many nodes wait here: each triangle is found all the same.
+
+    A ray passes through the boxes of all triangles and misses all of them but one.
+    """
+    scale = LARGEST * 0.5 ** np.arange(CHAIN)[:, None, None]
+    corners = scale * np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [0.0, 1.0, 1.5]])
+    origins, directions = np.zeros((1, 3)), np.array([[0.9, 0.9, 1.4]])
+    depth = wp.zeros(1, dtype=wp.int32, device=device)
+    for number in range(CHAIN):
+        mirrored = corners.copy()
+        mirrored[number, 0] = scale[number, 0] * np.array([1.0, 1.0, 1.5])
+        mesh = bare_mesh(mirrored, device)
+        wp.launch(make_depth_kernel(), 1, [mesh.id], [depth], device=device)
+        assert int(depth.numpy()[0]) == STACK - 1
+        _, _, ours, ours_any = walk_through(mesh, origins, directions, device, 4.0 * LARGEST)
+        assert ours[0, 3] == number
+        assert ours_any[0] == 1
+
+
 def test_t_max_ends_rays(device):
     """Nothing at t_max or beyond is met; what lies just before is."""
-    corners = np.array([[[-1, -1, 2], [1, -1, 2], [0, 1, 2]]], np.float32)
-    for t_max, met in ((2.0, False), (np.nextafter(np.float32(2), np.float32(3)), True), (1.0, False), (3.0, True)):
-        _, _, ours, ours_any = walk(corners, [(0, 0, 0)], [(0, 0, 1)], device, t_max)
-        assert bool(ours_any[0]) == met
-        assert (ours[0, 3] >= 0) == met
-        assert ours[0, 0] == (2.0 if met else np.float32(t_max))
+    check_t_max(functools.partial(walk, device))
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e38, 1e-38, 0.0])
 @pytest.mark.parametrize("where", ["origin", "direction"])
 def test_rays_of_no_sense_end(value, where, device):
     """Whatever they are, they come to an end, and t is never NaN."""
-    corners = MESHES["soup"]
-    origins, directions = rays_toward(corners, 300)
-    for axes in ([0], [1], [2], [0, 1, 2]):
-        broken = {"origin": origins.copy(), "direction": directions.copy()}
-        broken[where][:, axes] = value
-        _, _, ours, _ = walk(corners, broken["origin"], broken["direction"], device)
-        assert not np.isnan(ours[:, 0]).any()
-        assert ((ours[:, 0] >= 0) & (ours[:, 0] <= 1e3)).all()
+    check_senseless(functools.partial(walk, device), value, where)

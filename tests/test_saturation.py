@@ -8,7 +8,7 @@ import pytest
 import warp as wp
 
 from warp_ar.input.plate import Plate, codes8
-from warp_ar.input.saturation import FULL, SaturationLevels, ball_codes, ball_discs
+from warp_ar.input.saturation import FULL, SaturationLevels, ball_codes, ball_discs, luma_top
 from warp_ar.kernels.color import camera_table, decode_table, is_saturated, saturation_codes
 from warp_ar.scene import Camera, Probe
 from warp_ar.scene.pose import Pose
@@ -195,3 +195,13 @@ def test_what_was_taken_for_the_end_and_moves_with_the_gain_is_taken_back():
         told.append(seen.levels[0])
     assert told[0] < FULL
     assert told[-1] == FULL
+
+
+@pytest.mark.parametrize("level", [210, 238, 245])
+@pytest.mark.parametrize("spread", [0.0, 1.0])
+def test_a_top_is_where_its_crowd_is(level, spread):
+    """Also where it is narrower than the window in which it is looked for."""
+    rng = np.random.default_rng(4)
+    crowd = np.rint(level + spread * rng.normal(size=(400, 1))) + np.zeros(3)
+    others = rng.uniform(20.0, 200.0, size=(2000, 3))
+    assert luma_top(np.concatenate([crowd, others]).astype(np.uint8)) == level

@@ -9,6 +9,8 @@ import pytest
 from tests.simulated_camera import ALL, ALONE, Faults, decode_srgb, expose
 
 GREY = np.full((96, 128, 3), 0.2)
+MIRRORED = 0.05
+"""Relative: codes of a frame of a quarter of the exposure lie 1 to 2 % apart, and it has a path tracer's noise."""
 
 
 def one(light, **faults):
@@ -86,3 +88,15 @@ def test_every_fault_changes_the_picture():
         assert any((a != b).any() for a, b in zip(expose([light] * 7, faults), plain, strict=True)) == (name != "none")
     used = {f.name for f in dataclasses.fields(Faults) if getattr(ALL, f.name) != f.default}
     assert used == {f.name for f in dataclasses.fields(Faults)} - {"seed"}
+
+
+def test_what_clips_in_the_ball_is_what_a_shorter_exposure_shows(shared):
+    """Frames of a quarter of the exposure tell as far as four times what clips."""
+    bench = pytest.importorskip("bench.bench_camera_faults", reason="needs flip-evaluator and the benches")
+    case = shared / "truth" / "plastic_bunny_sunset"
+    light = bench.light_of(case / "camera" / "0006.png", bench.mirrored_light(case, 6))
+    dark = bench.read(case / "dark_25" / "0006.png")
+    told = (light > 1.0) & (dark < 254) & (light < bench.BEYOND)
+    ratio = light[told] / (4.0 * decode_srgb(dark[told]))
+    assert told.sum() > 500
+    assert np.abs(np.quantile(ratio, [0.05, 0.5, 0.95]) - 1.0).max() < MIRRORED

@@ -4,57 +4,32 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import warp as wp
 
+from tests.mesh_rays_rig import (
+    MESHES,
+    T_MAX,
+    T_TOLERANCE,
+    check_senseless,
+    check_t_max,
+    launch_walk,
+    make_walk_kernel,
+    ray_mesh,
+    rays_toward,
+)
 from warp_ar.kernels import wide_bvh
 from warp_ar.kernels.wide_bvh import BLOCK, LEAF_BLOCKS, MOST_DEPTH, NODE_BLOCKS, STACK, WIDTH, build_wide_bvh
-from warp_ar.scene.geometry import Mesh
-from warp_ar.scene.ray_mesh import BOX_MARGIN, make_ray_mesh
-from warp_ar.scene.shapes import torus_mesh
+from warp_ar.scene.ray_mesh import BOX_MARGIN
 
 MARGIN = 1e-4
-T_TOLERANCE = 1e-5
-"""Where a ray meets a corner Warp goes on in float64; what a rounding of edge functions then does to t."""
 
 
-@wp.kernel(enable_backward=False)
-def walk_kernel(
-    # In:
-    mesh: wp.uint64,
-    tree: wp.uint64,
-    origins: wp.array[wp.vec3],
-    directions: wp.array[wp.vec3],
-    t_max: wp.float32,
-    # Out:
-    warp_out: wp.array[wp.vec4],
-    warp_any_out: wp.array[wp.int32],
-    wide_out: wp.array[wp.vec4],
-    wide_any_out: wp.array[wp.int32],
-):
-    i = wp.tid()
-    query = wp.mesh_query_ray(mesh, origins[i], directions[i], t_max)
-    warp_out[i] = wp.vec4(t_max, 0.0, 0.0, -1.0)
-    if query.result:
-        warp_out[i] = wp.vec4(query.t, query.u, query.v, wp.float32(query.face))
-    warp_any_out[i] = wp.where(wp.mesh_query_ray_anyhit(mesh, origins[i], directions[i], t_max), 1, 0)
-    near = wide_bvh.walk_closest(tree, origins[i], directions[i], t_max)
-    wide_out[i] = wp.vec4(near[0], near[1], near[2], wp.float32(wp.cast(near[3], wp.int32)))
-    wide_any_out[i] = wp.where(wide_bvh.walk_any(tree, origins[i], directions[i], t_max), 1, 0)
-
-
-def walk(corners, origins, directions, t_max=1e3, **building):
+def walk(corners, origins, directions, t_max=T_MAX, **building):
     """Closest hits (t, u, v, face) and whether there is any: by Warp's tree, by ours; NumPy."""
-    faces = np.arange(3 * len(corners), dtype=np.int32).reshape(-1, 3)
-    made = make_ray_mesh(Mesh(corners.reshape(-1, 3), faces, corners.reshape(-1, 3)), wp.get_device("cpu"))
-    count = len(origins)
-    with wp.ScopedDevice("cpu"), np.errstate(invalid="ignore", over="ignore"):
-        moved = made.mesh.points.numpy().reshape(-1, 3, 3)
-        tree = build_wide_bvh(moved, BOX_MARGIN * np.linalg.norm(made.half), **building) if building else made.tree
-        rays = [np.asarray(origins - made.center, np.float32), np.asarray(directions, np.float32)]
-        out = [wp.zeros(count, dtype=dtype) for dtype in (wp.vec4, wp.int32, wp.vec4, wp.int32)]
-        inputs = [made.mesh.id, wp.uint64(tree.ptr), *(wp.array(values, dtype=wp.vec3) for values in rays), t_max]
-        wp.launch(walk_kernel, count, inputs, out)
-        return [array.numpy() for array in out]
+    made = ray_mesh(corners, "cpu")
+    moved = made.mesh.points.numpy().reshape(-1, 3, 3)
+    tree = build_wide_bvh(moved, BOX_MARGIN * np.linalg.norm(made.half), **building) if building else made.tree
+    kernel = make_walk_kernel(wide_bvh.walk_closest, wide_bvh.walk_any)
+    return launch_walk(kernel, made.mesh, tree.ptr, np.asarray(origins) - made.center, directions, "cpu", t_max)
 
 
 def parse(corners, **building):
@@ -93,50 +68,6 @@ def parse(corners, **building):
     assert seen * int(BLOCK) == len(flat)
     np.testing.assert_array_equal(np.sort(np.concatenate(leaves)), np.arange(len(corners)))
     return deepest
-
-
-def soup(count, seed=0, size=0.2):
-    """Triangles anywhere in a unit cube."""
-    rng = np.random.default_rng(seed)
-    return (rng.random((count, 1, 3)) + size * rng.normal(size=(count, 3, 3))).astype(np.float32)
-
-
-def shrinking(count):
-    """Triangles each a hundredth smaller and closer to a corner than the last: a tree by area peels them off singly."""
-    scale = 0.99 ** np.arange(count)[:, None, None]
-    return (scale * np.array([[0, 0, 1], [1, 0, 1], [0, 1, 1.5]])).astype(np.float32)
-
-
-def rays_toward(corners, count, seed=1):
-    """Origins around, directions to points on triangles; every eighth along an axis, every ninth at a corner."""
-    rng = np.random.default_rng(seed)
-    chosen = corners[rng.integers(len(corners), size=count)]
-    weights = rng.dirichlet([1, 1, 1], count)
-    weights[::9] = (1, 0, 0)
-    targets = np.einsum("nk,nkc->nc", weights, chosen)
-    middle, spread = corners.mean(axis=(0, 1)), np.ptp(corners, axis=(0, 1)).max()
-    origins = middle + 2.0 * spread * rng.normal(size=(count, 3))
-    directions = targets - origins
-    axis = rng.integers(3, size=count)
-    along = np.eye(3)[axis] * np.where(rng.random(count) < 0.5, -spread, spread)[:, None]
-    origins[::8], directions[::8] = (targets - 3 * along)[::8], along[::8]
-    return origins.astype(np.float32), directions.astype(np.float32)
-
-
-MESHES = {
-    "one": soup(1),
-    "seven": soup(7),
-    "eight": soup(8),
-    "nine": soup(9),
-    "sixty-five": soup(65),
-    "soup": soup(3000, size=0.05),
-    "overlapping": soup(500, size=2.0),
-    "torus": torus_mesh(0.3, 0.12, 1e-3).vertices[torus_mesh(0.3, 0.12, 1e-3).faces].astype(np.float32),
-    "shrinking": shrinking(1500),
-    "coincident": np.repeat(soup(3), 400, axis=0),
-    "flat": soup(300) * np.float32([1, 1, 0]),
-    "points": np.repeat(soup(100)[:, :1], 3, axis=1),
-}
 
 
 @pytest.mark.parametrize("name", MESHES)
@@ -178,25 +109,13 @@ def test_rays_find_what_warp_finds(name):
 
 def test_t_max_ends_rays():
     """Nothing at t_max or beyond is met; what lies just before is."""
-    corners = np.array([[[-1, -1, 2], [1, -1, 2], [0, 1, 2]]], np.float32)
-    for t_max, met in ((2.0, False), (np.nextafter(np.float32(2), np.float32(3)), True), (1.0, False), (3.0, True)):
-        _, _, wide, wide_any = walk(corners, [(0, 0, 0)], [(0, 0, 1)], t_max)
-        assert bool(wide_any[0]) == met
-        assert (wide[0, 3] >= 0) == met
-        assert wide[0, 0] == (2.0 if met else np.float32(t_max))
+    check_t_max(walk)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e38, 1e-38, 0.0])
 @pytest.mark.parametrize("where", ["origin", "direction"])
 def test_rays_of_no_sense_end(value, where):
     """Whatever they are, they come to an end, and t is never NaN."""
-    corners = MESHES["soup"]
-    origins, directions = rays_toward(corners, 300)
-    for axes in ([0], [1], [2], [0, 1, 2]):
-        broken = {"origin": origins.copy(), "direction": directions.copy()}
-        broken[where][:, axes] = value
-        _, _, wide, wide_any = walk(corners, broken["origin"], broken["direction"])
-        assert not np.isnan(wide[:, 0]).any()
-        assert ((wide[:, 0] >= 0) & (wide[:, 0] <= 1e3)).all()
-        if len(axes) == 3 and not np.isfinite(value):
-            assert (wide_any == 0).all()
+    met = check_senseless(walk, value, where)
+    if not np.isfinite(value):
+        assert (met == 0).all()

@@ -178,8 +178,8 @@ MUTATIONS = (
         7,
         "a running mean that loses a little every frame",
         "kernels/accumulate.py",
-        "        m = m + a * (x - m)\n",
-        "        m = 0.99999 * m + a * (x - m)\n",
+        "        m = m + a * wp.cw_mul(wp.vec3(1.0, 1.0, 1.0) - beyond, x - m)\n",
+        "        m = 0.99999 * m + a * wp.cw_mul(wp.vec3(1.0, 1.0, 1.0) - beyond, x - m)\n",
         "tests/test_accumulate.py::test_no_drift_over_ten_thousand_frames",
     ),
     Mutation(

@@ -21,6 +21,10 @@ class Accumulator:
         height, width = confidence.shape
         area = latlong.solid_angles(height, width)
         weight = area * np.minimum(confidence, self.confidence)
+        excess = (self.environment - radiance) / np.maximum(radiance, 0.01)
+        beyond = smooth_ramp(0.02, 0.1, excess) * smooth_ramp(0.9, 1.0, clipped)
+        radiance = radiance + beyond * (self.environment - radiance)
+        clipped = clipped + beyond * (self.clipped - clipped)
         new, old = radiance.mean(-1), self.environment.mean(-1)
         current = np.zeros((self.rows, self.columns))
         for i in range(self.rows):

@@ -30,6 +30,8 @@ PROGRESS_SECONDS = 2.0
 """Between two looks at progress."""
 FRAMES_OF = ("segment", "variation")
 """Kinds of jobs that light frames."""
+STEADY = (*FRAMES_OF, "join")
+"""Kinds of which a run consists once clips are surveyed: a recording is joined within tenths of a second."""
 STARTS = 3
 """Times in a row that a worker may die before it is ready."""
 
@@ -253,7 +255,7 @@ class Driver:
         if self._growth is None:
             return
         active = [state for state in self._workers if not state.resting]
-        light = all(state.ready and state.job is not None and state.job.kind in FRAMES_OF for state in active)
+        light = all(state.ready and state.job is not None and state.job.kind in STEADY for state in active)
         enough = self._jobs_left() - len(self._running) > len(active)
         more = self._growth.look([state.lit + state.frames for state in active] if light and enough else None)
         self._workers += [_Worker() for _ in range(more)]

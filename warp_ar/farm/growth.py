@@ -61,7 +61,7 @@ class Growth:
         """Have workers started, if it is time for more.
 
         Args:
-            frames: That each worker has lit since it was started; None where one of them does something else.
+            frames: That each worker has lit since it was started; None where one of them loads or surveys.
 
         Returns:
             How many; below zero: so many of the last ones should get no more jobs.

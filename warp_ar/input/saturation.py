@@ -254,8 +254,11 @@ def luma_top(codes: NDArray[np.uint8]) -> int | None:
         return None
     if counts[level + TOP + 1 :].sum() > 0.5 * on or counts[NEAR_FULL:].sum() > ABOVE * on:
         return None
-    crowd = codes[np.abs(luma - level) <= TOP].astype(np.float64)
-    return level if np.median(np.abs(crowd - level), axis=0).max() <= NEUTRAL_WIDE else None
+    in_crowd = np.abs(luma - level) <= TOP
+    # Where a plateau is narrower than the window, several windows hold all of it.
+    middle = int(np.median(luma[in_crowd]))
+    off = np.abs(codes[in_crowd].astype(np.float64) - middle)
+    return middle if np.median(off, axis=0).max() <= NEUTRAL_WIDE else None
 
 
 def ball_codes(image: NDArray[Any], balls: Sequence[tuple[float, float, float]]) -> NDArray[Any]:

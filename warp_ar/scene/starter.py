@@ -38,7 +38,8 @@ def _sections(source: str | int, marker: Marker, center: Sequence[float], radius
         ),
         (
             "[probe]",
-            "The mirror ball on the card's cross. MEASURE ITS RADIUS; the center's third number is the same.",
+            "The mirror ball on the card's cross. Its radius is half of what a caliper shows across it; the center's "
+            "third number is the same.",
             [("probe", "radius", f"{radius:g}"), ("probe", "center", f"[{spot}]")],
         ),
         (
