@@ -137,6 +137,8 @@ class SolverConfig:
     """Of reweighting, from a start that is far off."""
     warm_iterations: int = 3
     """The same from a solution of nearly the same problem."""
+    halvings: int = 4
+    """Most of one step, while it leads to a higher cost."""
     converged: float = 1.0e-3
     """Relative change of the largest unknown, in one reweighting, from which on nothing more is gained."""
     settled: int = 10
@@ -202,6 +204,11 @@ class EvidenceConfig:
     unseen: float = 0.5
     """Share of the card's irradiance that light may have, as a surface that faces it receives it, which the card does
     not know: from its horizon, and from below it."""
+    place: float = 0.08
+    """Deviation of the light at the ball from that at the card, as a share of it: what stands about is not all
+    modelled."""
+    flatter: float = 1.5
+    """How much more light there may be, for the same effect on the card, than as the card alone has it."""
     interval: float = 2.5
     """Standard deviations of the draws that an interval of irradiance reaches to either side."""
     found: float = 0.3
