@@ -190,6 +190,8 @@ class EvidenceConfig:
     """The same of the ball's."""
     usual_contrast: float = 30.0
     """Ratio of paper to ink above which no print is known: the response is steeper than it is taken to be."""
+    most_contrast: float = 33.0
+    """The same of paper that clips, whose light is known by the ink alone."""
     doubt: float = 2.0
     """Standard deviation of the card's logarithm per logarithm of contrast beyond that."""
     share: float = 0.1
@@ -204,9 +206,6 @@ class EvidenceConfig:
     unseen: float = 0.5
     """Share of the card's irradiance that light may have, as a surface that faces it receives it, which the card does
     not know: from its horizon, and from below it."""
-    place: float = 0.08
-    """Deviation of the light at the ball from that at the card, as a share of it: what stands about is not all
-    modelled."""
     flatter: float = 1.5
     """How much more light there may be, for the same effect on the card, than as the card alone has it."""
     interval: float = 2.5

@@ -214,8 +214,6 @@ def known_share(problem: Problem, recovered: Array, by_card: Array, bounds: tupl
     """Share of a solution that is taken for what neither equations nor draws know, 0 to 1.
 
     - What lights the card may come from where nothing is seen, in proportion to how much of the card's sky that is.
-    - Light at the ball is another than at the card, for what stands about is not all modelled: within the share
-      ``place`` of all of it, s. Of an estimate that is the share m of all the best mean with none is m^2 / (m^2 + s^2).
     - How flatly light meets the card, surfaces of unknown reflectance tell. Flat light is more light for the same
       effect on the card: no more than ``flatter`` times as much as light as the card alone has it.
     - Paper is at most so many times as bright as ink. Where it clips, ink says how much light there is at most.
@@ -226,16 +224,11 @@ def known_share(problem: Problem, recovered: Array, by_card: Array, bounds: tupl
         by_card: The same as the card alone has it, (m, 3).
         bounds: Channels in which the card clips.
     """
-    config = CONFIG.evidence
     upward = np.maximum(problem.direction[:, 2], 0.0) * problem.solid_angle
     share = 1.0 - float(upward @ problem.hidden / upward.sum())
-    form = irradiance_form(problem, spread_directions(config.directions))
-    added = form @ (recovered * problem.missing)
-    missing = float(np.linalg.norm(added) / max(np.linalg.norm(form @ problem.radiance + added), 1e-9))
-    share *= missing**2 / (missing**2 + config.place**2)
     levers = lever(problem, by_card), lever(problem, recovered)
     if np.isfinite(levers[1]) and 0.0 < levers[0] < levers[1]:
-        share *= min(config.flatter * levers[0] / levers[1], 1.0)
+        share *= min(CONFIG.evidence.flatter * levers[0] / levers[1], 1.0)
     return share * most_by_ink(problem, recovered, bounds)
 
 
@@ -255,7 +248,7 @@ def most_by_ink(problem: Problem, recovered: Array, bounds: tuple[bool, bool, bo
             continue
         added = problem.transfer[card] @ (recovered[:, c] * problem.missing[:, c])
         captured = float(np.median(problem.captured[card, c]))
-        most = float(np.median(problem.light[use, c])) * CONFIG.evidence.usual_contrast / problem.white - captured
+        most = float(np.median(problem.light[use, c])) * CONFIG.evidence.most_contrast / problem.white - captured
         factors.append(np.clip(most / max(float(np.median(added)), 1e-9), 0.0, 1.0))
     return float(np.mean(factors)) if factors else 1.0
 
