@@ -14,7 +14,9 @@ from warp_ar.light.config import CONFIG, Kind
 from warp_ar.light.evidence import (
     allowed_factor,
     doubt_of,
+    greyer,
     held_to_card,
+    known_share,
     likely_gain,
     share_by_card,
     spread_directions,
@@ -153,6 +155,55 @@ def test_cosines_of_light_at_the_card():
     assert candidates == pytest.approx([0.8, 0.6])
 
 
+def sky(recovered, *, hidden=0.0):
+    """Two cells, overhead and low over the horizon, of one steradian each; light of one of them is recovered."""
+    low = np.array([np.cos(0.2), 0.0, np.sin(0.2)])
+    problem = types.SimpleNamespace(
+        direction=np.stack([[0.0, 0.0, 1.0], low]), solid_angle=np.ones(2), missing=np.ones((2, 3)), white=0.85
+    )
+    problem.hidden, problem.kind = np.array([hidden, 0.0]), np.zeros(0, int)
+    problem.exact = np.ones((0, 3), bool)
+    return problem, np.array(recovered, float)[:, None] * np.ones(3)
+
+
+NONE_CLIPS = (False, False, False)
+
+
+def test_what_may_come_from_the_unseen_is_left_out():
+    problem, light = sky([1.0, 0.0], hidden=0.5)
+    assert known_share(problem, light, light, NONE_CLIPS) == pytest.approx(1.0 - 0.5 / (1.0 + np.sin(0.2)))
+    assert known_share(sky([1.0, 0.0])[0], light, light, NONE_CLIPS) == 1.0
+
+
+def test_flat_light_is_no_more_than_some_times_what_the_card_needs():
+    problem, flat = sky([0.0, 1.0])
+    steep = sky([1.0, 0.0])[1]
+    assert known_share(problem, flat, steep, NONE_CLIPS) == pytest.approx(CONFIG.evidence.flatter * np.sin(0.2))
+    assert known_share(problem, steep, flat, NONE_CLIPS) == 1.0
+    assert known_share(problem, 0.0 * flat, steep, NONE_CLIPS) == 1.0
+
+
+@pytest.mark.parametrize(("ink", "share"), [(0.2, 1.0), (0.1, None), (0.01, 0.0)])
+def test_clipped_paper_is_no_brighter_than_print_allows(ink, share):
+    problem, light = sky([6.0, 0.0])
+    problem.kind, problem.exact = np.array([Kind.CARD, Kind.INK]), np.ones((2, 3), bool)
+    problem.transfer, problem.captured = np.array([[1.0, 0.0], [1.0, 0.0]]), np.ones((2, 3))
+    problem.light = np.array([[3.0] * 3, [ink] * 3])
+    if share is None:
+        share = (CONFIG.evidence.most_contrast * ink / 0.85 - 1.0) / 6.0
+        assert 0.0 < share < 1.0
+    assert known_share(problem, light, light, (True, True, True)) == pytest.approx(share)
+    assert known_share(problem, light, light, NONE_CLIPS) == 1.0
+
+
+def test_print_of_low_contrast_may_be_on_grey_paper():
+    usual = CONFIG.surfaces.reflectance[Kind.INK]
+    assert greyer(0.85 / usual, 0.85) == pytest.approx(1.0)
+    assert greyer(0.5 * 0.85 / usual, 0.85) == pytest.approx(2.0)
+    assert greyer(30.0, 0.85) == 1.0
+    assert greyer(0.0, 0.85) == 1.0
+
+
 def test_contrast_beyond_print_makes_the_card_doubtful():
     assert doubt_of(20.0) == doubt_of(CONFIG.evidence.usual_contrast) == CONFIG.evidence.white
     assert doubt_of(60.0) > 0.5
@@ -169,15 +220,33 @@ def test_no_emitter_is_of_one_colour_unless_one_channel_clips(missing, expected)
     assert tie_channels(problem, np.array([[1.0, 0.5, 20.0]]))[0] == pytest.approx(expected)
 
 
-def test_without_a_card_the_light_stays_as_captured(device, scene):
-    """The table alone shows a shadow; its reflectance is a guess, and so would be the emitter."""
+def test_without_a_card_the_shadow_of_the_ball_tells(device, scene):
+    """How dark it is beside the light around it does not depend on what the table reflects."""
     light = DistantLight(device, scene)
     light.reflectance = np.full_like(light.reflectance, 0.4)
     radiance, _, _ = lit_environment(EMITTER)
     estimate, values = light.estimate(radiance)
+    assert not estimate.card.holds
+    assert estimate.method == "shading"
+    assert 0.0 < estimate.factor <= CONFIG.evidence.by_shadow
+    interval = estimate.irradiance
+    truth = true_irradiance(interval.normals, values, radiance)
+    captured = true_irradiance(interval.normals, values, np.minimum(radiance, 1.0))
+    assert np.linalg.norm(interval.value - truth) < 0.8 * np.linalg.norm(captured - truth)
+    assert (interval.value < truth + 1e-6)[4].all()
+    assert (interval.low <= truth).all()
+    assert (truth <= interval.high).all()
+
+
+def test_without_card_and_shadow_the_light_stays_as_captured(device, scene):
+    """No table beside the ball is seen: a box alone may be of any reflectance, and so of any light."""
+    light = DistantLight(device, scene)
+    light.reflectance = np.full_like(light.reflectance, 0.4)
+    light.hidden |= light.surfaces.kinds[light.surfaces.surface] == Kind.PLANE
+    radiance, _, _ = lit_environment(EMITTER)
+    estimate, values = light.estimate(radiance)
     assert (estimate.method, estimate.factor, estimate.emitters) == ("clipped", 0.0, ())
     assert not estimate.recovered.any()
-    assert not estimate.card.holds
     interval = estimate.irradiance
     truth = true_irradiance(interval.normals, values, radiance)
     assert (interval.low <= truth).all()
@@ -222,4 +291,7 @@ def test_light_holds_while_a_hand_hides_the_card(device, scene):
     hidden["visible"][light.surfaces.kinds[light.surfaces.surface] <= Kind.INK] = 0.0
     for _ in range(CONFIG.card.held):
         assert problem["self"].update(*problem["args"], hidden, *problem["rest"]) is seen
-    assert not problem["self"].update(*problem["args"], hidden, *problem["rest"]).recovered.any()
+    after = problem["self"].update(*problem["args"], hidden, *problem["rest"])
+    assert after is not seen
+    assert not after.card.holds
+    assert after.factor <= CONFIG.evidence.by_shadow

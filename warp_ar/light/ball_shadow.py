@@ -25,8 +25,8 @@ Either is listened to only where the cost, twice a negative log likelihood, fall
 new emitter: where the evidence is good, nothing is lost, and where there is none, nothing changes. Emitters stand where
 they were found, near or far; a near one lights a plane unevenly, which is no shadow.
 
-Without a card the ball's shadow is what says that light is missing at all: how dark it is beside the light around it does not
-depend on what the plane reflects.
+Without a card the ball's shadow is what says that light is missing at all: how dark it is beside the light around it
+does not depend on what the plane reflects.
 """
 
 from __future__ import annotations

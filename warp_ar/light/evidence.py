@@ -282,9 +282,9 @@ def irradiance_interval(
     """Between which bounds the irradiance at the ball's place lies.
 
     What the ball shows errs by ``capture`` to one side and ``overlooked`` to the other. What an estimate found scatters
-    as its draws do, and where part of it was held back the whole of it, and as much again, may be there. Paper may be as
-    much greyer as its print has less contrast than is usual. Where no draws
-    were made, or the card only bounds what is missing, all that clips may be as bright as ``clipped``.
+    as its draws do, and where part of it was held back the whole of it, and as much again, may be there. Paper may be
+    greyer than it is said to be (``greyer``). Where no draws were made, or the card only bounds what is missing, all
+    that clips may be as bright as ``clipped``.
 
     Args:
         problem: The equations.
