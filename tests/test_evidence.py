@@ -220,33 +220,15 @@ def test_no_emitter_is_of_one_colour_unless_one_channel_clips(missing, expected)
     assert tie_channels(problem, np.array([[1.0, 0.5, 20.0]]))[0] == pytest.approx(expected)
 
 
-def test_without_a_card_the_shadow_of_the_ball_tells(device, scene):
-    """How dark it is beside the light around it does not depend on what the table reflects."""
+def test_without_a_card_the_light_stays_as_captured(device, scene):
+    """The table alone shows a shadow; its reflectance is a guess, and so would be the emitter."""
     light = DistantLight(device, scene)
     light.reflectance = np.full_like(light.reflectance, 0.4)
-    radiance, _, _ = lit_environment(EMITTER)
-    estimate, values = light.estimate(radiance)
-    assert not estimate.card.holds
-    assert estimate.method == "shading"
-    assert 0.0 < estimate.factor <= CONFIG.evidence.by_shadow
-    interval = estimate.irradiance
-    truth = true_irradiance(interval.normals, values, radiance)
-    captured = true_irradiance(interval.normals, values, np.minimum(radiance, 1.0))
-    assert np.linalg.norm(interval.value - truth) < 0.8 * np.linalg.norm(captured - truth)
-    assert (interval.value < truth + 1e-6)[4].all()
-    assert (interval.low <= truth).all()
-    assert (truth <= interval.high).all()
-
-
-def test_without_card_and_shadow_the_light_stays_as_captured(device, scene):
-    """No table beside the ball is seen: a box alone may be of any reflectance, and so of any light."""
-    light = DistantLight(device, scene)
-    light.reflectance = np.full_like(light.reflectance, 0.4)
-    light.hidden |= light.surfaces.kinds[light.surfaces.surface] == Kind.PLANE
     radiance, _, _ = lit_environment(EMITTER)
     estimate, values = light.estimate(radiance)
     assert (estimate.method, estimate.factor, estimate.emitters) == ("clipped", 0.0, ())
     assert not estimate.recovered.any()
+    assert not estimate.card.holds
     interval = estimate.irradiance
     truth = true_irradiance(interval.normals, values, radiance)
     assert (interval.low <= truth).all()
@@ -291,7 +273,4 @@ def test_light_holds_while_a_hand_hides_the_card(device, scene):
     hidden["visible"][light.surfaces.kinds[light.surfaces.surface] <= Kind.INK] = 0.0
     for _ in range(CONFIG.card.held):
         assert problem["self"].update(*problem["args"], hidden, *problem["rest"]) is seen
-    after = problem["self"].update(*problem["args"], hidden, *problem["rest"])
-    assert after is not seen
-    assert not after.card.holds
-    assert after.factor <= CONFIG.evidence.by_shadow
+    assert not problem["self"].update(*problem["args"], hidden, *problem["rest"]).recovered.any()

@@ -24,9 +24,6 @@ Two groups of points tell f, each against all points of its plane to which hardl
 Either is listened to only where the cost, twice a negative log likelihood, falls from f = 1 by as much as is asked of a
 new emitter: where the evidence is good, nothing is lost, and where there is none, nothing changes. Emitters stand where
 they were found, near or far; a near one lights a plane unevenly, which is no shadow.
-
-Without a card the ball's shadow is what says that light is missing at all: how dark it is beside the light around it
-does not depend on what the plane reflects.
 """
 
 from __future__ import annotations
@@ -137,18 +134,8 @@ def share_told(cost: Array, sides: Array | None = None) -> float:
     return float(SHARES[np.searchsorted(likelihood, CONFIG.evidence.share * likelihood[-1])])
 
 
-@dataclasses.dataclass(frozen=True)
-class Told:
-    """What planes around a ball say of an estimate."""
-
-    reaching: float = 1.0
-    """What it is to be multiplied by, 0 to 1."""
-    fall: float = 0.0
-    """By how much the cost across the ball's shadow falls from where the ball throws none of it."""
-
-
-def told_by_planes(problem: Problem, unknowns: Array, ball: Ball) -> Told:
-    """What the planes around the ball show of an estimate.
+def reaching_factor(problem: Problem, unknowns: Array, ball: Ball) -> float:
+    """What an estimate is to be multiplied by, 0 to 1, for what the planes around the ball show of it.
 
     Args:
         problem: The equations.
@@ -157,11 +144,11 @@ def told_by_planes(problem: Problem, unknowns: Array, ball: Ball) -> Told:
     """
     added = problem.added_irradiance(unknowns).sum(axis=1)
     if ball.radius <= 0.0 or not added.any():
-        return Told()
+        return 1.0
     config = CONFIG.shadow
     usable = (problem.kind == Kind.PLANE) & problem.exact.all(axis=1)
     if not usable.any():
-        return Told()
+        return 1.0
     shown, captured = problem.light.sum(axis=1), problem.captured.sum(axis=1)
     # Where a plane shows nothing exactly, its points have no logarithm and no part in what follows.
     ratio = np.full(len(shown), np.nan)
@@ -183,8 +170,7 @@ def told_by_planes(problem: Problem, unknowns: Array, ball: Ball) -> Told:
             level, scatter = _level(ratio[elsewhere])
             across += costs(given[:, here], scatter, level, None)
     directed = share_told(across)
-    reaching = min(share_told(beside, sides), directed + ELSEWHERE * (1.0 - directed))
-    return Told(reaching, float(across[0] - across.min()))
+    return min(share_told(beside, sides), directed + ELSEWHERE * (1.0 - directed))
 
 
 def _level(ratio: Array) -> tuple[float, float]:

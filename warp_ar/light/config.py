@@ -208,10 +208,6 @@ class EvidenceConfig:
     not know: from its horizon, and from below it."""
     flatter: float = 1.5
     """How much more light there may be, for the same effect on the card, than as the card alone has it."""
-    by_shadow: float = 0.5
-    """Share that is taken of what shading alone finds, where there is no card and the ball's shadow shows it,"""
-    by_shadow_most: float = 1.0
-    """and how much that is at most over the light as captured, by the irradiance of all directions."""
     interval: float = 2.5
     """Standard deviations of the draws that an interval of irradiance reaches to either side."""
     found: float = 0.3

@@ -52,10 +52,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from warp_ar.light.ball_shadow import Ball, told_by_planes
+from warp_ar.light.ball_shadow import Ball, reaching_factor
 from warp_ar.light.card import CardCheck, check_card, covered_card
 from warp_ar.light.channel import choose_channel, told_channel
-from warp_ar.light.config import CONFIG, Kind
+from warp_ar.light.config import CONFIG
 from warp_ar.light.emitters import EmitterSearch
 from warp_ar.light.estimate import Estimate, FoundEmitter
 from warp_ar.light.evidence import (
@@ -119,7 +119,6 @@ class Recovery:
         self._evidence: _Evidence | None = None
         self._held: Estimate | None = None
         self._unseen = 0
-        self._held_unseen = 0
         self._steadiness = Steadiness()
 
     def rests(self, cells: NDArray[Any], observations: NDArray[Any]) -> bool:
@@ -158,8 +157,10 @@ class Recovery:
             problem = Problem(cells, transfer, mirrored, observations, self.surfaces, self._white, trace, aim, origin)
             view = np.zeros(3) if camera is None else (camera - self._center) / np.linalg.norm(camera - self._center)
             estimate = self._solve(problem)
-        if self._unseen == self._held_unseen:
+        if self._unseen == 0:
             self._held = estimate = self._steadiness.follow(estimate, Seen.of(cells, observations), view)
+        elif self._held is None:
+            self._steadiness = Steadiness()
         return estimate
 
     def _solve(self, problem: Problem) -> Estimate:
@@ -168,10 +169,8 @@ class Recovery:
         card = check_card(problem.points, problem.kind, problem.light)
         if not card.holds:
             return self._without_card(problem, card)
-        if self._held_unseen:
-            self._candidates, self._evidence, self._solved = [], None, 0
         self._solved += 1
-        self._unseen = self._held_unseen = 0
+        self._unseen = 0
         problem.leave_out(covered_card(problem.points, problem.kind, problem.light))
         means, bounds = problem.card_means()
         radiance_by_card = problem.expected[problem.component][:, None] * means
@@ -186,26 +185,6 @@ class Recovery:
         solution = tie_channels(problem, _solve_channels(problem, best, means, bounds))
         doubt = doubt_of(card.contrast)
         recovered, powers = held_to_card(problem, solution, by_card, problem.card_cosines(), doubt)
-        emitters = self._placed(problem, recovered, powers)
-        if is_turn or self._evidence is None:
-            c = told_channel(problem, best)
-            start = fit_channel(problem, c, problem.start(means[c]), CONFIG.solver.iterations).z
-            evidence = _weigh(problem, c, start, bounds, (recovered, by_card), self._blocks, doubt)
-            taken = recovered
-            if evidence.method == "white_card":
-                solution, taken = np.concatenate([radiance_by_card, np.zeros((len(powers), 3))]), by_card
-            reaching = told_by_planes(problem, solution, Ball(self._center, self._radius)).reaching
-            known = known_share(problem, taken, by_card, bounds)
-            self._evidence = dataclasses.replace(evidence, factor=known * min(evidence.factor, reaching))
-        evidence = self._evidence
-        if evidence.method == "shading":
-            self._held = self._estimate(problem, recovered, bounds, *evidence.parts, card, emitters)
-        else:
-            self._held = self._estimate(problem, by_card, bounds, *evidence.parts, card)
-        return self._held
-
-    def _placed(self, problem: Problem, recovered: Array, powers: Array) -> tuple[FoundEmitter, ...]:
-        """Emitters by falling power; their radiance is added to ``recovered``, and they are remembered."""
         # An emitter that gives nothing in any channel has gone out, or never was.
         self._candidates = [
             candidate for candidate, power in zip(problem.candidates, powers, strict=True) if power.any()
@@ -222,53 +201,36 @@ class Recovery:
                     candidate.cell,
                 )
             )
-        return tuple(sorted(emitters, key=lambda emitter: -float(emitter.power.sum())))
-
-    def _without_card(self, problem: Problem, card: CardCheck) -> Estimate:
-        """What is held while the card is hidden for a while, else what the ball's own shadow shows.
-
-        How dark a shadow is beside the light around it tells how bright an emitter is, whatever the surface reflects;
-        but texture, gloss and clutter look like shadows. So shading alone is believed where the ball throws the
-        shadow that it says; elsewhere the light stays as captured.
-        """
-        self._unseen += 1
-        if self._held is not None and self._held_unseen == 0 and self._unseen <= CONFIG.card.held:
-            return self._held
-        if self._held_unseen == 0:
-            self._candidates, self._evidence, self._solved = [], None, 0
-        self._held_unseen = self._unseen
-        bounds, method, factor = (True, True, True), "clipped", 0.0
-        recovered = np.zeros((len(problem.solid_angle), 3))
-        emitters: tuple[FoundEmitter, ...] = ()
-        if self.method == "shading" and (problem.parts or problem.may_hold_candidate.any()):
-            self._solved += 1
-            problem.leave_out((problem.kind == Kind.CARD) | (problem.kind == Kind.INK))
-            means, best = np.ones(3), choose_channel(problem)
-            is_turn = self._search(problem, means)
-            solution = tie_channels(problem, _solve_channels(problem, best, means, bounds))
-            recovered = problem.member @ solution[: problem.parts]
-            emitters = self._placed(problem, recovered, solution[problem.parts :])
-            if is_turn or self._evidence is None:
-                self._evidence = self._weigh_by_shadow(problem, best, solution, recovered)
-            method, factor = self._evidence.parts
-        self._held = self._estimate(problem, recovered, bounds, method, factor, card, emitters)
+        emitters.sort(key=lambda emitter: -float(emitter.power.sum()))
+        if is_turn or self._evidence is None:
+            c = told_channel(problem, best)
+            start = fit_channel(problem, c, problem.start(means[c]), CONFIG.solver.iterations).z
+            evidence = _weigh(problem, c, start, bounds, (recovered, by_card), self._blocks, doubt)
+            taken = recovered
+            if evidence.method == "white_card":
+                solution, taken = np.concatenate([radiance_by_card, np.zeros((len(powers), 3))]), by_card
+            reaching = reaching_factor(problem, solution, Ball(self._center, self._radius))
+            known = known_share(problem, taken, by_card, bounds)
+            self._evidence = dataclasses.replace(evidence, factor=known * min(evidence.factor, reaching))
+        evidence = self._evidence
+        if evidence.method == "shading":
+            self._held = self._estimate(problem, recovered, bounds, *evidence.parts, card, tuple(emitters))
+        else:
+            self._held = self._estimate(problem, by_card, bounds, *evidence.parts, card)
         return self._held
 
-    def _weigh_by_shadow(self, problem: Problem, best: int, solution: Array, recovered: Array) -> _Evidence:
-        """How much of a solution to take where there is no card."""
-        config = CONFIG.evidence
-        told = told_by_planes(problem, solution, Ball(self._center, self._radius))
-        if told.fall < 0.5 * CONFIG.search.evidence:
-            return _Evidence("clipped", 0.0, 0.0)
-        c, bounds, nothing = told_channel(problem, best), (True, True, True), np.zeros_like(recovered)
-        start = fit_channel(problem, c, problem.start(1.0), CONFIG.solver.iterations).z
-        evidence = _weigh(problem, c, start, bounds, (recovered, nothing), self._blocks, config.white)
-        if evidence.method != "shading":
-            return _Evidence("clipped", 0.0, evidence.spread)
-        form = irradiance_form(problem, spread_directions(config.directions))
-        sizes = [float(np.linalg.norm(form @ light)) for light in (problem.radiance, recovered * problem.missing)]
-        most = min(config.by_shadow, config.by_shadow_most * sizes[0] / max(sizes[1], 1e-9))
-        return dataclasses.replace(evidence, factor=min(most * min(evidence.factor, told.reaching), 1.0))
+    def _without_card(self, problem: Problem, card: CardCheck) -> Estimate:
+        """What is held while the card is hidden for a while, else the light as captured.
+
+        Without a surface of known reflectance only the shape of shadows tells how bright an emitter is, and texture,
+        gloss and clutter look like shadows.
+        """
+        self._unseen += 1
+        if self._held is not None and self._unseen <= CONFIG.card.held:
+            return self._held
+        self._held, self._candidates, self._evidence = None, [], None
+        nothing = np.zeros((len(problem.solid_angle), 3))
+        return self._estimate(problem, nothing, (True, True, True), "clipped", 0.0, card)
 
     def _search(self, problem: Problem, means: Array) -> bool:
         """Try candidates of former frames, one of them moved, and new ones where it is their turn to be looked for.
