@@ -81,11 +81,14 @@ class Block:
         o, d = (origin - self.at) @ self.rotation, d @ self.rotation
         inverse = 1.0 / np.where(np.abs(d) < 1e-9, 1e-9, d)
         a, b = (-self.size / 2 - o) * inverse, (self.size / 2 - o) * inverse
-        low, high = np.minimum(a, b), np.maximum(a, b)
-        axis = low.argmax(-1)
-        face = axis * 2 + (np.take_along_axis(d, axis[..., None], -1)[..., 0] < 0.0)
-        hit = (low.max(-1) < high.min(-1)) & (low.max(-1) > 1e-5)
-        return np.where(hit, low.max(-1), np.inf), face
+        # Reductions over an axis of three are several times as slow as its three slices.
+        low, high = (tuple(np.moveaxis(both(a, b), -1, 0)) for both in (np.minimum, np.maximum))
+        enters = np.maximum(np.maximum(low[0], low[1]), low[2])
+        leaves = np.minimum(np.minimum(high[0], high[1]), high[2])
+        axis = np.where(low[0] == enters, 0, np.where(low[1] == enters, 1, 2))
+        toward = np.where(axis == 0, d[..., 0], np.where(axis == 1, d[..., 1], d[..., 2]))
+        hit = (enters < leaves) & (enters > 1e-5)
+        return np.where(hit, enters, np.inf), axis * 2 + (toward < 0.0)
 
 
 @dataclasses.dataclass

@@ -14,7 +14,9 @@ from warp_ar.light.config import CONFIG, Kind
 from warp_ar.light.evidence import (
     allowed_factor,
     doubt_of,
+    greyer,
     held_to_card,
+    known_share,
     likely_gain,
     share_by_card,
     spread_directions,
@@ -151,6 +153,55 @@ def test_cosines_of_light_at_the_card():
     cells, candidates = problem.card_cosines()
     assert cells == pytest.approx([0.0, 0.8])
     assert candidates == pytest.approx([0.8, 0.6])
+
+
+def sky(recovered, *, hidden=0.0):
+    """Two cells, overhead and low over the horizon, of one steradian each; light of one of them is recovered."""
+    low = np.array([np.cos(0.2), 0.0, np.sin(0.2)])
+    problem = types.SimpleNamespace(
+        direction=np.stack([[0.0, 0.0, 1.0], low]), solid_angle=np.ones(2), missing=np.ones((2, 3)), white=0.85
+    )
+    problem.hidden, problem.kind = np.array([hidden, 0.0]), np.zeros(0, int)
+    problem.exact = np.ones((0, 3), bool)
+    return problem, np.array(recovered, float)[:, None] * np.ones(3)
+
+
+NONE_CLIPS = (False, False, False)
+
+
+def test_what_may_come_from_the_unseen_is_left_out():
+    problem, light = sky([1.0, 0.0], hidden=0.5)
+    assert known_share(problem, light, light, NONE_CLIPS) == pytest.approx(1.0 - 0.5 / (1.0 + np.sin(0.2)))
+    assert known_share(sky([1.0, 0.0])[0], light, light, NONE_CLIPS) == 1.0
+
+
+def test_flat_light_is_no_more_than_some_times_what_the_card_needs():
+    problem, flat = sky([0.0, 1.0])
+    steep = sky([1.0, 0.0])[1]
+    assert known_share(problem, flat, steep, NONE_CLIPS) == pytest.approx(CONFIG.evidence.flatter * np.sin(0.2))
+    assert known_share(problem, steep, flat, NONE_CLIPS) == 1.0
+    assert known_share(problem, 0.0 * flat, steep, NONE_CLIPS) == 1.0
+
+
+@pytest.mark.parametrize(("ink", "share"), [(0.2, 1.0), (0.1, None), (0.01, 0.0)])
+def test_clipped_paper_is_no_brighter_than_print_allows(ink, share):
+    problem, light = sky([6.0, 0.0])
+    problem.kind, problem.exact = np.array([Kind.CARD, Kind.INK]), np.ones((2, 3), bool)
+    problem.transfer, problem.captured = np.array([[1.0, 0.0], [1.0, 0.0]]), np.ones((2, 3))
+    problem.light = np.array([[3.0] * 3, [ink] * 3])
+    if share is None:
+        share = (CONFIG.evidence.most_contrast * ink / 0.85 - 1.0) / 6.0
+        assert 0.0 < share < 1.0
+    assert known_share(problem, light, light, (True, True, True)) == pytest.approx(share)
+    assert known_share(problem, light, light, NONE_CLIPS) == 1.0
+
+
+def test_print_of_low_contrast_may_be_on_grey_paper():
+    usual = CONFIG.surfaces.reflectance[Kind.INK]
+    assert greyer(0.85 / usual, 0.85) == pytest.approx(1.0)
+    assert greyer(0.5 * 0.85 / usual, 0.85) == pytest.approx(2.0)
+    assert greyer(30.0, 0.85) == 1.0
+    assert greyer(0.0, 0.85) == 1.0
 
 
 def test_contrast_beyond_print_makes_the_card_doubtful():

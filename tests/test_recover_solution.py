@@ -386,3 +386,12 @@ def test_all_that_is_estimated_is_finite_for_absurd_frames(device, scene):
 def test_unknown_method_is_named(scene):
     with pytest.raises(ValueError, match=r"'guess'.*white_card or shading"):
         recovery.Recovery(light_surfaces.find_surfaces(scene), 0.85, (0, 0, 0), method="guess")
+
+
+@pytest.mark.parametrize(("whole", "taken"), [(0.5, 0.5), (-1.5, -0.25), (-7.0, -1.0), (1000.0, 1.0 + 999.0 / 16.0)])
+def test_a_step_is_halved_while_it_raises_the_cost(whole, taken):
+    """From 1, where the cost is the square; four halvings are all."""
+    channel = SimpleNamespace(_cost=lambda z: float(z[0] ** 2))
+    z, least = fit._Channel._shortened(channel, np.ones(1), np.array([whole]), 1.0)
+    assert z[0] == pytest.approx(taken)
+    assert least == pytest.approx(min(taken**2, 1.0))

@@ -137,6 +137,8 @@ class SolverConfig:
     """Of reweighting, from a start that is far off."""
     warm_iterations: int = 3
     """The same from a solution of nearly the same problem."""
+    halvings: int = 4
+    """Most of one step, while it leads to a higher cost."""
     converged: float = 1.0e-3
     """Relative change of the largest unknown, in one reweighting, from which on nothing more is gained."""
     settled: int = 10
@@ -188,6 +190,8 @@ class EvidenceConfig:
     """The same of the ball's."""
     usual_contrast: float = 30.0
     """Ratio of paper to ink above which no print is known: the response is steeper than it is taken to be."""
+    most_contrast: float = 33.0
+    """The same of paper that clips, whose light is known by the ink alone."""
     doubt: float = 2.0
     """Standard deviation of the card's logarithm per logarithm of contrast beyond that."""
     share: float = 0.1
@@ -202,6 +206,8 @@ class EvidenceConfig:
     unseen: float = 0.5
     """Share of the card's irradiance that light may have, as a surface that faces it receives it, which the card does
     not know: from its horizon, and from below it."""
+    flatter: float = 1.5
+    """How much more light there may be, for the same effect on the card, than as the card alone has it."""
     interval: float = 2.5
     """Standard deviations of the draws that an interval of irradiance reaches to either side."""
     found: float = 0.3

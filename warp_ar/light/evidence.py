@@ -197,20 +197,94 @@ def held_to_card(
     return recovered - less * beyond, powers - less * own
 
 
+def lever(problem: Problem, recovered: Array) -> float:
+    """Light from all directions over what of it the card receives; infinite where that is nothing, 0 of no light.
+
+    Args:
+        problem: The equations.
+        recovered: Radiance that cells lack, (m, 3).
+    """
+    power = (recovered * problem.missing).sum(axis=1) * problem.solid_angle
+    on_card = float(power @ np.maximum(problem.direction[:, 2], 0.0))
+    total = float(power.sum())
+    return total / on_card if on_card > 0.0 else np.inf if total > 0.0 else 0.0
+
+
+def known_share(problem: Problem, recovered: Array, by_card: Array, bounds: tuple[bool, bool, bool]) -> float:
+    """Share of a solution that is taken for what neither equations nor draws know, 0 to 1.
+
+    - What lights the card may come from where nothing is seen, in proportion to how much of the card's sky that is.
+    - How flatly light meets the card, surfaces of unknown reflectance tell. Flat light is more light for the same
+      effect on the card: no more than ``flatter`` times as much as light as the card alone has it.
+    - Paper is at most so many times as bright as ink. Where it clips, ink says how much light there is at most.
+
+    Args:
+        problem: The equations, their candidates chosen.
+        recovered: Radiance that cells lack, (m, 3).
+        by_card: The same as the card alone has it, (m, 3).
+        bounds: Channels in which the card clips.
+    """
+    upward = np.maximum(problem.direction[:, 2], 0.0) * problem.solid_angle
+    share = 1.0 - float(upward @ problem.hidden / upward.sum())
+    levers = lever(problem, by_card), lever(problem, recovered)
+    if np.isfinite(levers[1]) and 0.0 < levers[0] < levers[1]:
+        share *= min(CONFIG.evidence.flatter * levers[0] / levers[1], 1.0)
+    return share * most_by_ink(problem, recovered, bounds)
+
+
+def most_by_ink(problem: Problem, recovered: Array, bounds: tuple[bool, bool, bool]) -> float:
+    """What a solution may be multiplied by, 0 to 1, for clipped paper to be no brighter beside ink than print is.
+
+    Args:
+        problem: The equations.
+        recovered: Radiance that cells lack, (m, 3).
+        bounds: Channels in which the card clips.
+    """
+    card, ink = problem.kind == Kind.CARD, problem.kind == Kind.INK
+    factors = []
+    for c in np.flatnonzero(bounds):
+        use = ink & problem.exact[:, c]
+        if not (card.any() and use.any()):
+            continue
+        added = problem.transfer[card] @ (recovered[:, c] * problem.missing[:, c])
+        captured = float(np.median(problem.captured[card, c]))
+        most = float(np.median(problem.light[use, c])) * CONFIG.evidence.most_contrast / problem.white - captured
+        factors.append(np.clip(most / max(float(np.median(added)), 1e-9), 0.0, 1.0))
+    return float(np.mean(factors)) if factors else 1.0
+
+
 def likely_gain(added: Array, missing: Array) -> float:
     """By how much an estimate lowers the squared error of irradiance in nearly all draws."""
     gain = (missing**2).sum(axis=1) - ((missing - added) ** 2).sum(axis=1)
     return float(np.quantile(gain, CONFIG.evidence.share))
 
 
+def greyer(contrast: float, white: float) -> float:
+    """How much brighter light may be than the card says, for paper that is greyer than it is said to be: at least 1.
+
+    Paper over ink is their contrast; print is usually of so much reflectance.
+
+    Args:
+        contrast: Of paper that does not clip to the ink beside it.
+        white: Reflectance that the paper is said to have.
+    """
+    return max(white / (contrast * CONFIG.surfaces.reflectance[Kind.INK]), 1.0) if contrast > 0.0 else 1.0
+
+
 def irradiance_interval(
-    problem: Problem, recovered: Array, factor: float, bounds: tuple[bool, bool, bool], spread: float | None
+    problem: Problem,
+    recovered: Array,
+    factor: float,
+    bounds: tuple[bool, bool, bool],
+    spread: float | None,
+    contrast: float = 0.0,
 ) -> Interval:
     """Between which bounds the irradiance at the ball's place lies.
 
     What the ball shows errs by ``capture`` to one side and ``overlooked`` to the other. What an estimate found scatters
-    as its draws do, and where part of it was held back the whole of it, and as much again, may be there. Where no draws
-    were made, or the card only bounds what is missing, all that clips may be as bright as ``clipped``.
+    as its draws do, and where part of it was held back the whole of it, and as much again, may be there. Paper may be
+    greyer than it is said to be (``greyer``). Where no draws were made, or the card only bounds what is missing, all
+    that clips may be as bright as ``clipped``.
 
     Args:
         problem: The equations.
@@ -218,6 +292,7 @@ def irradiance_interval(
         factor: Share of it that is taken, 0 to 1.
         bounds: Channels in which it is a lower bound.
         spread: Of the draws; None: there are none.
+        contrast: Of the card's print; 0: no card is seen.
     """
     config = CONFIG.evidence
     normals = np.array([[s if k == axis else 0.0 for k in range(3)] for axis in range(3) for s in (1.0, -1.0)])
@@ -228,5 +303,6 @@ def irradiance_interval(
     low = (1.0 - config.capture) * captured + factor * np.maximum(1.0 - reach, 0.0) * found
     high = (1.0 + config.overlooked) * captured + (2.0 - factor) * (1.0 + reach) * found
     is_open = np.array(bounds) | (spread is None)
+    high *= greyer(contrast, problem.white)
     high = np.where(is_open, np.maximum(high, (1.0 + config.overlooked) * captured + most), high)
     return Interval(normals, low, captured + factor * found, high)

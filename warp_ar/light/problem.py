@@ -126,10 +126,11 @@ class Problem:
         self.direction = cells["direction"].reshape(-1, 3).astype(float)
         self.solid_angle = cells["solid_angle"].ravel().astype(float)
         self.modelled = cells["modelled"].ravel() > 0.5
+        self.hidden = cells["hidden"].ravel().astype(float)
         # None where nothing is seen: shading may say that light is missing, hardly where it comes from.
-        seen = cells["hidden"].ravel() <= 0.0
+        seen = self.hidden <= 0.0
         self.may_hold_candidate = (self.lost.max(axis=1) > 0.1) & ~self.modelled & seen
-        return np.asarray(self.lost.max(axis=1) - cells["hidden"].ravel(), np.float64)
+        return np.asarray(self.lost.max(axis=1) - self.hidden, np.float64)
 
     def _group_cells(self, clipped: Array) -> None:
         """Regions, their components, and the radiance that those are expected to have."""

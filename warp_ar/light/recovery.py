@@ -66,6 +66,7 @@ from warp_ar.light.evidence import (
     held_to_card,
     irradiance_form,
     irradiance_interval,
+    known_share,
     likely_gain,
     most_by_card,
     spread_directions,
@@ -205,10 +206,12 @@ class Recovery:
             c = told_channel(problem, best)
             start = fit_channel(problem, c, problem.start(means[c]), CONFIG.solver.iterations).z
             evidence = _weigh(problem, c, start, bounds, (recovered, by_card), self._blocks, doubt)
+            taken = recovered
             if evidence.method == "white_card":
-                solution = np.concatenate([radiance_by_card, np.zeros((len(powers), 3))])
+                solution, taken = np.concatenate([radiance_by_card, np.zeros((len(powers), 3))]), by_card
             reaching = reaching_factor(problem, solution, Ball(self._center, self._radius))
-            self._evidence = dataclasses.replace(evidence, factor=min(evidence.factor, reaching))
+            known = known_share(problem, taken, by_card, bounds)
+            self._evidence = dataclasses.replace(evidence, factor=known * min(evidence.factor, reaching))
         evidence = self._evidence
         if evidence.method == "shading":
             self._held = self._estimate(problem, recovered, bounds, *evidence.parts, card, tuple(emitters))
@@ -269,7 +272,7 @@ class Recovery:
             method, emitters = "clipped", ()
         emitters = tuple(dataclasses.replace(emitter, power=factor * emitter.power) for emitter in emitters)
         spread = self._evidence.spread if self._evidence is not None else None
-        interval = irradiance_interval(problem, recovered, factor, bounds, spread)
+        interval = irradiance_interval(problem, recovered, factor, bounds, spread, card.contrast)
         cells = (factor * recovered).reshape(*problem.shape, 3).astype(np.float32)
         r, g, b = (0.0 if bounds[c] or factor == 0.0 else problem.card_share(c, is_bound=False) for c in range(3))
         return Estimate(cells, bounds, emitters, method, factor, card, (r, g, b), interval)
