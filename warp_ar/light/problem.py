@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from warp_ar.kernels.recover_cells import LOST
 from warp_ar.light.config import CONFIG, Kind
+from warp_ar.light.profile import excess_profile
 from warp_ar.light.noise import measured_noise, shared_errors
 from warp_ar.light.regions import connected_regions, split_regions
 from warp_ar.light.surfaces import Surfaces
@@ -120,6 +121,7 @@ class Problem:
 
     def _read_cells(self, cells: NDArray[Any]) -> Array:
         """The map's side; returns the share of each cell that clips in any channel, (m,)."""
+        self._cells = cells
         self.radiance = cells["radiance"].reshape(-1, 3).astype(float)
         self.lost = cells["clipped"].reshape(-1, 3).astype(float)
         self.missing = cells["missing"].reshape(-1, 3).astype(float)
@@ -137,6 +139,8 @@ class Problem:
         beyond = connected_regions(((clipped > LOST) & ~self.modelled).reshape(self.shape)).ravel()
         lit = connected_regions(((clipped > LOST) & self.modelled).reshape(self.shape)).ravel()
         component = np.where(lit >= 0, lit + beyond.max(initial=-1) + 1, beyond)
+        self._components_of = component
+        self.profile = np.ones_like(self.missing)
         self.part, self.parts = split_regions(component, self.direction, self.solid_angle)
         self.components = int(component.max(initial=-1)) + 1
         first = np.unique(self.part, return_index=True)[1][int((self.part < 0).any()) :]
@@ -205,6 +209,19 @@ class Problem:
         self.captured = sums[:, :3]
         mirrored_sums = through_balls @ bright.astype(np.float32)
         self.mirrored_share = mirrored_sums / np.maximum(sums[:, 3], 1e-9)
+        self._sum_parts()
+
+    def concentrate(self) -> None:
+        """PROTOTYPE"""
+        self.profile = excess_profile(self._cells, self._components_of)
+        self.missing = self.missing * self.profile
+        self._sum_parts()
+        candidates, self.candidates = self.candidates, []
+        self.candidate_columns = np.zeros((3, len(self.index), 0))
+        for one in candidates:
+            self.push(one)
+
+    def _sum_parts(self) -> None:
         order = np.argsort(self.part, kind="stable")[np.count_nonzero(self.part < 0) :]
         starts = np.unique(self.part[order], return_index=True)[1]
         columns = [np.zeros((len(self.index), 0))] * 3

@@ -181,6 +181,11 @@ class Recovery:
         means = np.maximum(means, 0.05)
         best = choose_channel(problem)
         is_turn = self._search(problem, means)
+        problem.concentrate()
+        means, bounds = problem.card_means()
+        radiance_by_card = problem.expected[problem.component][:, None] * means
+        by_card = problem.member @ radiance_by_card
+        means = np.maximum(means, 0.05)
         solution = tie_channels(problem, _solve_channels(problem, best, means, bounds))
         doubt = doubt_of(card.contrast)
         recovered, powers = held_to_card(problem, solution, by_card, problem.card_cosines(), doubt)
@@ -270,7 +275,7 @@ class Recovery:
         emitters = tuple(dataclasses.replace(emitter, power=factor * emitter.power) for emitter in emitters)
         spread = self._evidence.spread if self._evidence is not None else None
         interval = irradiance_interval(problem, recovered, factor, bounds, spread)
-        cells = (factor * recovered).reshape(*problem.shape, 3).astype(np.float32)
+        cells = (factor * recovered * problem.profile).reshape(*problem.shape, 3).astype(np.float32)
         r, g, b = (0.0 if bounds[c] or factor == 0.0 else problem.card_share(c, is_bound=False) for c in range(3))
         return Estimate(cells, bounds, emitters, method, factor, card, (r, g, b), interval)
 
