@@ -150,6 +150,12 @@ class Problem:
         area = np.bincount(component[inside], weights, minlength=self.components)
         is_surface = np.bincount(component[inside], self.modelled[inside], minlength=self.components) > 0
         self.expected = np.where(is_surface, 0.0, (area + 0.01) ** CONFIG.priors.exponent)
+        import os
+        E, FLOOR = (float(x) for x in os.environ.get("LOOK_E", "1,.05").split(","))
+        if E and self.components:
+            own, area_ = component[inside], self.solid_angle[inside]
+            all_, any_ = (np.bincount(own, area_ * x, minlength=self.components) for x in (self.lost[inside].min(axis=1), self.lost[inside].max(axis=1)))
+            self.expected = self.expected * np.maximum(all_ / np.maximum(any_, 1e-9), FLOOR) ** E
         self.is_surface = is_surface[self.component]
         self.member = np.zeros((len(component), self.parts))
         self.member[np.flatnonzero(inside), self.part[inside]] = 1.0

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from typing import Any
 from warp_ar.kernels.recover_cells import LOST
 Array = NDArray[np.float64]
-P, LOW, HIGH, T0 = (float(x) for x in os.environ.get("LOOK_P", "0,.5,.8,0").split(","))
+P, LOW, HIGH, T0 = (float(x) for x in os.environ.get("LOOK_P", "1,.5,.8,0").split(","))
 
 def neighbours(mask):
     out = np.zeros_like(mask)
@@ -38,7 +38,7 @@ def excess_profile(cells: NDArray[Any], components: NDArray[np.int64]) -> Array:
         if not len(j): continue
         theta = np.arccos(np.clip(direction[i] @ direction[j].T, -1, 1))
         e = (theta + (1 - smooth[j]) * np.pi).min(axis=1)
-        e = np.minimum(e, np.pi)
+        e = np.minimum(e, float(os.environ.get("LOOK_CAP", "1")))
         for k in np.unique(components[i]):
             if k < 0: continue
             m = components[i] == k
