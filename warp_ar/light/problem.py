@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from warp_ar.kernels.recover_cells import LOST
 from warp_ar.light.config import CONFIG, Kind
-from warp_ar.light.profile import excess_profile
+from warp_ar.light.excess import alike, depth_profile
 from warp_ar.light.noise import measured_noise, shared_errors
 from warp_ar.light.regions import connected_regions, split_regions
 from warp_ar.light.surfaces import Surfaces
@@ -109,7 +109,7 @@ class Problem:
         self._traced: dict[Candidate, Array] = {}
         self.candidates: list[Candidate] = []
         clipped = self._read_cells(cells)
-        self._group_cells(clipped)
+        self._group_cells(cells, clipped)
         self._read_points(observations, surfaces, white)
         through_balls = self._aim_transfer(cells, transfer, mirrored, surfaces, clipped)
         self._sum_light(through_balls)
@@ -121,7 +121,6 @@ class Problem:
 
     def _read_cells(self, cells: NDArray[Any]) -> Array:
         """The map's side; returns the share of each cell that clips in any channel, (m,)."""
-        self._cells = cells
         self.radiance = cells["radiance"].reshape(-1, 3).astype(float)
         self.lost = cells["clipped"].reshape(-1, 3).astype(float)
         self.missing = cells["missing"].reshape(-1, 3).astype(float)
@@ -133,14 +132,12 @@ class Problem:
         self.may_hold_candidate = (self.lost.max(axis=1) > 0.1) & ~self.modelled & seen
         return np.asarray(self.lost.max(axis=1) - cells["hidden"].ravel(), np.float64)
 
-    def _group_cells(self, clipped: Array) -> None:
+    def _group_cells(self, cells: NDArray[Any], clipped: Array) -> None:
         """Regions, their components, and the radiance that those are expected to have."""
         # What clips on modelled surfaces is not joined to what clips beyond.
         beyond = connected_regions(((clipped > LOST) & ~self.modelled).reshape(self.shape)).ravel()
         lit = connected_regions(((clipped > LOST) & self.modelled).reshape(self.shape)).ravel()
         component = np.where(lit >= 0, lit + beyond.max(initial=-1) + 1, beyond)
-        self._components_of = component
-        self.profile = np.ones_like(self.missing)
         self.part, self.parts = split_regions(component, self.direction, self.solid_angle)
         self.components = int(component.max(initial=-1)) + 1
         first = np.unique(self.part, return_index=True)[1][int((self.part < 0).any()) :]
@@ -149,13 +146,12 @@ class Problem:
         weights = (self.solid_angle * clipped)[inside]
         area = np.bincount(component[inside], weights, minlength=self.components)
         is_surface = np.bincount(component[inside], self.modelled[inside], minlength=self.components) > 0
-        self.expected = np.where(is_surface, 0.0, (area + 0.01) ** CONFIG.priors.exponent)
-        import os
-        E, FLOOR = (float(x) for x in os.environ.get("LOOK_E", "1,.05").split(","))
-        if E and self.components:
-            own, area_ = component[inside], self.solid_angle[inside]
-            all_, any_ = (np.bincount(own, area_ * x, minlength=self.components) for x in (self.lost[inside].min(axis=1), self.lost[inside].max(axis=1)))
-            self.expected = self.expected * np.maximum(all_ / np.maximum(any_, 1e-9), FLOOR) ** E
+        usual = (area + 0.01) ** CONFIG.priors.exponent
+        usual *= alike(self.lost, self.solid_angle, component, self.components)
+        self.expected = np.where(is_surface, 0.0, usual)
+        self.profile = np.ones_like(self.missing)
+        """By which ``missing`` is multiplied, (m, 3)."""
+        self._depth = depth_profile(cells, component)
         self.is_surface = is_surface[self.component]
         self.member = np.zeros((len(component), self.parts))
         self.member[np.flatnonzero(inside), self.part[inside]] = 1.0
@@ -217,17 +213,21 @@ class Problem:
         self.mirrored_share = mirrored_sums / np.maximum(sums[:, 3], 1e-9)
         self._sum_parts()
 
-    def concentrate(self) -> None:
-        """PROTOTYPE"""
-        self.profile = excess_profile(self._cells, self._components_of)
+    def share_by_depth(self) -> None:
+        """Let what cells lack grow inward from where it fades, within parts and around candidates.
+
+        Candidates are looked for before: light that lies where an emitter stands would speak against there being one.
+        """
+        self.profile = self._depth
         self.missing = self.missing * self.profile
         self._sum_parts()
         candidates, self.candidates = self.candidates, []
-        self.candidate_columns = np.zeros((3, len(self.index), 0))
-        for one in candidates:
-            self.push(one)
+        self.candidate_columns = self.candidate_columns[:, :, :0]
+        for candidate in candidates:
+            self.push(candidate)
 
     def _sum_parts(self) -> None:
+        """Irradiance of each part per radiance."""
         order = np.argsort(self.part, kind="stable")[np.count_nonzero(self.part < 0) :]
         starts = np.unique(self.part[order], return_index=True)[1]
         columns = [np.zeros((len(self.index), 0))] * 3
