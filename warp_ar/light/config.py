@@ -69,6 +69,12 @@ class PriorConfig:
     """Steradians: a region wider than this (22 degrees across) is split."""
     exponent: float = -0.5
     """Of the solid angle, in the radiance that a component is expected to have."""
+    least_alike: float = 0.05
+    """Least share of a component in which all channels clip that counts: the others are some times clipping at most."""
+    fades: tuple[float, float] = (0.6, 0.7)
+    """Radiance beside what clips, over that at clipping, from which its boundary is less and less sharp, to fading."""
+    depth: float = 1.0
+    """Radians inside a boundary at which light fades from which what it lacks grows no further."""
     spread: float = 0.8
     """Relative standard deviation of components about the common mean."""
     inside: float = 0.7

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from warp_ar.kernels.recover_cells import LOST
 from warp_ar.light.config import CONFIG, Kind
+from warp_ar.light.excess import alike, depth_profile
 from warp_ar.light.noise import measured_noise, shared_errors
 from warp_ar.light.regions import connected_regions, split_regions
 from warp_ar.light.surfaces import Surfaces
@@ -108,7 +109,7 @@ class Problem:
         self._traced: dict[Candidate, Array] = {}
         self.candidates: list[Candidate] = []
         clipped = self._read_cells(cells)
-        self._group_cells(clipped)
+        self._group_cells(cells, clipped)
         self._read_points(observations, surfaces, white)
         through_balls = self._aim_transfer(cells, transfer, mirrored, surfaces, clipped)
         self._sum_light(through_balls)
@@ -132,7 +133,7 @@ class Problem:
         self.may_hold_candidate = (self.lost.max(axis=1) > 0.1) & ~self.modelled & seen
         return np.asarray(self.lost.max(axis=1) - self.hidden, np.float64)
 
-    def _group_cells(self, clipped: Array) -> None:
+    def _group_cells(self, cells: NDArray[Any], clipped: Array) -> None:
         """Regions, their components, and the radiance that those are expected to have."""
         # What clips on modelled surfaces is not joined to what clips beyond.
         beyond = connected_regions(((clipped > LOST) & ~self.modelled).reshape(self.shape)).ravel()
@@ -146,7 +147,12 @@ class Problem:
         weights = (self.solid_angle * clipped)[inside]
         area = np.bincount(component[inside], weights, minlength=self.components)
         is_surface = np.bincount(component[inside], self.modelled[inside], minlength=self.components) > 0
-        self.expected = np.where(is_surface, 0.0, (area + 0.01) ** CONFIG.priors.exponent)
+        usual = (area + 0.01) ** CONFIG.priors.exponent
+        usual *= alike(self.lost, self.solid_angle, component, self.components)
+        self.expected = np.where(is_surface, 0.0, usual)
+        self.profile = np.ones_like(self.missing)
+        """By which ``missing`` is multiplied, (m, 3)."""
+        self._depth = depth_profile(cells, component)
         self.is_surface = is_surface[self.component]
         self.member = np.zeros((len(component), self.parts))
         self.member[np.flatnonzero(inside), self.part[inside]] = 1.0
@@ -206,6 +212,23 @@ class Problem:
         self.captured = sums[:, :3]
         mirrored_sums = through_balls @ bright.astype(np.float32)
         self.mirrored_share = mirrored_sums / np.maximum(sums[:, 3], 1e-9)
+        self._sum_parts()
+
+    def share_by_depth(self) -> None:
+        """Let what cells lack grow inward from where it fades, within parts and around candidates.
+
+        Candidates are looked for before: light that lies where an emitter stands would speak against there being one.
+        """
+        self.profile = self._depth
+        self.missing = self.missing * self.profile
+        self._sum_parts()
+        candidates, self.candidates = self.candidates, []
+        self.candidate_columns = self.candidate_columns[:, :, :0]
+        for candidate in candidates:
+            self.push(candidate)
+
+    def _sum_parts(self) -> None:
+        """Irradiance of each part per radiance."""
         order = np.argsort(self.part, kind="stable")[np.count_nonzero(self.part < 0) :]
         starts = np.unique(self.part[order], return_index=True)[1]
         columns = [np.zeros((len(self.index), 0))] * 3

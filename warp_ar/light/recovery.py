@@ -19,7 +19,8 @@ their reflectances allow.
 
 **Priors** decide what surfaces do not see. A region's s_r scatters about the mean of its connected component, that
 about one mean of all, times (solid angle)^-1/2: halfway between emitters of equal radiance and emitters of equal power,
-for what is small and still clips tends to be brighter than what is wide. The common mean is free; where nothing but the
+for what is small and still clips tends to be brighter than what is wide; less where channels clip apart from each
+other, and growing inward where it fades (``light/excess.py``). The common mean is free; where nothing but the
 card is used it is what makes the card right, and that alone is the method ``white_card``. Clipped pixels that show a
 modelled surface (the card in the ball, a box) are lit, not lights: they stay close to clipping. Channels share their
 distribution: a second pass draws each to the mean of all three, in the hue of their totals.
@@ -172,8 +173,7 @@ class Recovery:
         self._solved += 1
         self._unseen = 0
         problem.leave_out(covered_card(problem.points, problem.kind, problem.light))
-        means, bounds = problem.card_means()
-        radiance_by_card = problem.expected[problem.component][:, None] * means
+        means, bounds, radiance_by_card = _by_card(problem)
         by_card = problem.member @ radiance_by_card
         if self.method == "white_card" or not (problem.parts or problem.may_hold_candidate.any()):
             factor = problem.card_factor(bounds, doubt_of(card.contrast))
@@ -182,6 +182,9 @@ class Recovery:
         means = np.maximum(means, 0.05)
         best = choose_channel(problem)
         is_turn = self._search(problem, means)
+        problem.share_by_depth()
+        means, bounds, radiance_by_card = _by_card(problem)
+        means, by_card = np.maximum(means, 0.05), problem.member @ radiance_by_card
         solution = tie_channels(problem, _solve_channels(problem, best, means, bounds))
         doubt = doubt_of(card.contrast)
         recovered, powers = held_to_card(problem, solution, by_card, problem.card_cosines(), doubt)
@@ -273,9 +276,15 @@ class Recovery:
         emitters = tuple(dataclasses.replace(emitter, power=factor * emitter.power) for emitter in emitters)
         spread = self._evidence.spread if self._evidence is not None else None
         interval = irradiance_interval(problem, recovered, factor, bounds, spread, card.contrast)
-        cells = (factor * recovered).reshape(*problem.shape, 3).astype(np.float32)
+        cells = (factor * recovered * problem.profile).reshape(*problem.shape, 3).astype(np.float32)
         r, g, b = (0.0 if bounds[c] or factor == 0.0 else problem.card_share(c, is_bound=False) for c in range(3))
         return Estimate(cells, bounds, emitters, method, factor, card, (r, g, b), interval)
+
+
+def _by_card(problem: Problem) -> tuple[Array, tuple[bool, bool, bool], Array]:
+    """What makes the card right: from ``card_means``, and the radiance that parts then lack, (parts, 3)."""
+    means, bounds = problem.card_means()
+    return means, bounds, problem.expected[problem.component][:, None] * means
 
 
 @dataclasses.dataclass(frozen=True)
