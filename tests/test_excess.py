@@ -34,7 +34,7 @@ def test_a_component_counts_by_the_share_that_clips_in_all_channels():
     clipped = np.array([[1, 1, 1], [1, 1, 1], [1, 1, 1], [1, 0, 0], [1, 0, 0], [0.5, 0.2, 1]], float)
     area = np.array([1.0, 2.0, 1.0, 3.0, 5.0, 1.0])
     component = np.array([0, 0, 1, 1, 2, -1])
-    assert alike(clipped, area, component, 3) == pytest.approx([1.0, 0.25, CONFIG.priors.least_alike])
+    assert alike(clipped, area, component, 3) == pytest.approx([1.0, 0.25**2, CONFIG.priors.least_alike])
 
 
 @pytest.mark.parametrize("level", [1.0, 0.6, 1.18])

@@ -70,7 +70,7 @@ class PriorConfig:
     exponent: float = -0.5
     """Of the solid angle, in the radiance that a component is expected to have."""
     least_alike: float = 0.05
-    """Least share of a component in which all channels clip that counts: the others are some times clipping at most."""
+    """Least of what a component is expected to lack over one in which all channels clip: some light lacks in any."""
     fades: tuple[float, float] = (0.6, 0.7)
     """Radiance beside what clips, over that at clipping, from which its boundary is less and less sharp, to fading."""
     depth: float = 1.0

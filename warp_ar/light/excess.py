@@ -2,7 +2,7 @@
 
 **By colour.** What is far brighter than clipping clips in all channels alike. What clips in one channel and not in
 another is hardly brighter than clipping: its hue would be odd otherwise. So the radiance that a component is expected
-to lack is in proportion to the share of its clipped solid angle in which all channels clip (``alike``).
+to lack is in proportion to the square of the share of its clipped solid angle in which all channels clip (``alike``).
 
 **By depth.** A sky that brightens toward the sun clips where it reaches the limit: what it lacks is nothing at that
 boundary and grows inward. A window or a lamp ends at a wall: what it lacks is the same up to its boundary. Cells that
@@ -29,7 +29,9 @@ WHOLE = 0.9
 
 
 def alike(clipped: Array, solid_angle: Array, component: NDArray[np.int64], count: int) -> Array:
-    """Share of each component's clipped solid angle in which all channels clip, at least ``least_alike``, (count,).
+    """What each component is expected to lack over one in which all channels clip throughout, (count,).
+
+    The share of its clipped solid angle in which all channels clip, squared, and at least ``least_alike``.
 
     Args:
         clipped: Share of cells at clipping, per channel, (m, 3).
@@ -42,7 +44,7 @@ def alike(clipped: Array, solid_angle: Array, component: NDArray[np.int64], coun
         np.bincount(component[inside], (solid_angle * share)[inside], minlength=count)
         for share in (clipped.min(axis=1), clipped.max(axis=1))
     )
-    return np.asarray(np.maximum(every / np.maximum(some, 1e-9), CONFIG.priors.least_alike), np.float64)
+    return np.asarray(np.maximum((every / np.maximum(some, 1e-9)) ** 2, CONFIG.priors.least_alike), np.float64)
 
 
 def depth_profile(cells: NDArray[Any], component: NDArray[np.int64]) -> Array:
