@@ -68,6 +68,8 @@ from warp_ar.kernels.trace import TraceConfig, make_trace, offset_origin
 
 wp.set_module_options({"enable_backward": False})
 
+BESIDE_PIXELS = wp.constant(wp.uint32(0x80000000))
+"""Added to a path's number, so that its random numbers are no pixel's."""
 START = wp.constant(2)
 """Stream of random numbers by which a path starts."""
 UNIT = wp.constant(wp.float32(16777216.0))
@@ -224,7 +226,7 @@ def make_follow_lights_kernel(trace: TraceConfig) -> wp.Kernel:
         k = wp.tid() + row_start
         key = PathKey()
         # No pixel has such a number.
-        key.pixel = wp.uint32(k) + wp.uint32(0x80000000)
+        key.pixel = wp.uint32(k) + BESIDE_PIXELS
         key.sample = wp.uint32(number)
         key.seed = wp.uint32(seed)
         count = scene.lights.shape[0]
