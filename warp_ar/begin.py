@@ -29,8 +29,7 @@ PATIENCE = 2.0
 
 def begin(name: str) -> NoReturn:
     """Import the module of a command, run its ``main``, and end the process with the exit code that it returns."""
-    # NumPy's BLAS: each product wakes a thread for each core, which then turn for a while and wait for more; products
-    # here are small.
+    # NumPy's BLAS: products here are small, and would otherwise be shared among a thread for each core.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if sys.stderr is not None:
         faulthandler.enable()  # should native code crash, the report says what it was at
