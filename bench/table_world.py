@@ -2,7 +2,8 @@
 
 The light is that of an environment at infinity and of small spheres. Surfaces are Lambertian and receive what
 ``World.irradiance`` gathers: the environment from 2,048 directions, hidden by the ball and by boxes, what the ball
-throws, one coarse bounce, and every lamp. A picture is traced with one reflection in the ball.
+throws, what table and boxes send by ``BOUNCES`` of light, each as they are lit where they are seen, and every lamp. A
+picture is traced with one reflection in the ball.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ COARSE = (32, 64)
 """Rows and columns of the directions from which surfaces are lit."""
 FINE = (256, 512)
 """The same of the environment that is seen."""
+BOUNCES = 2
+"""Times that light is handed on between surfaces."""
 REMAP_MOST = 30_000
 """Rows that ``cv2.remap`` takes at a time."""
 
@@ -150,23 +153,30 @@ class World:
         bright = coarse(d * ((environment.mean(-1) + 1e-6) * area)[..., None])
         self.direction = bright / np.linalg.norm(bright, axis=1, keepdims=True)
         self.small = self.radiance.reshape(rows, columns, 3).astype(np.float32)
-        up = self.area * np.maximum(self.direction[:, 2], 0.0)
-        self.bounced = self.texture.mean((0, 1)) * (up @ self.radiance) / np.pi * 0.8
-        self.around = self.area @ self.radiance / 4.0
-        self._light_table()
-        self.faces = [[self._light_face(block, face) for face in range(6)] for block in blocks]
+        self._choose_lines()
+        lines = [len(line) for line in self.lines]
+        self.table_light = np.zeros((lines[1], lines[0], 3), np.float32)
+        self.faces = [[np.zeros((5, 5, 3), np.float32)] * 6 for _ in blocks]
+        for _ in range(BOUNCES + 1):
+            self.bounced = self.texture.mean((0, 1)) * self.table_light.mean((0, 1)) / np.pi
+            table = self._light_table()
+            self.faces = [[self._light_face(block, face) for face in range(6)] for block in blocks]
+            self.table_light = table
 
-    def _light_table(self) -> None:
-        """Irradiance of the table on lines that are close around the ball."""
+    def _choose_lines(self) -> None:
+        """Lines on which the table's light is known: close to each other around the ball."""
         far = np.geomspace(0.012, 2.0, 16)
         near, even = np.concatenate([-far[::-1], [0.0], far]), np.arange(-0.4, 0.41, 0.05)
         self.lines = [
             np.unique(np.round(np.concatenate([np.clip(near + self.center[k], -2.4, 2.4), even]), 3)) for k in (0, 1)
         ]
+
+    def _light_table(self) -> NDArray[np.float32]:
+        """Irradiance of the table on its lines."""
         grid = np.stack(np.meshgrid(*self.lines, indexing="xy"), -1)
         points = np.concatenate([grid, np.full((*grid.shape[:2], 1), 1e-4)], -1)
         lit = self.irradiance(points.reshape(-1, 3), np.array([0.0, 0.0, 1.0]))
-        self.table_light = lit.reshape(*grid.shape[:2], 3).astype(np.float32)
+        return lit.reshape(*grid.shape[:2], 3).astype(np.float32)
 
     def _light_face(self, block: Block, face: int) -> NDArray[np.float32]:
         """Irradiance of 5 x 5 points of a block's face."""
@@ -211,11 +221,14 @@ class World:
         t = np.where(down, -origin[..., 2] / np.where(down, d[..., 2], -1.0), np.inf)
         at = origin + np.where(np.isfinite(t), t, 0.0)[..., None] * d
         on = np.isfinite(t) & (np.abs(at[..., :2]) < self.half).all(-1)
-        radiance[on], nearest[on] = self.bounced, t[on]
-        for block in self.blocks:
-            t = block.distance(origin, d)[0]
+        if on.any():
+            radiance[on], nearest[on] = self._table_radiance(at[on]), t[on]
+        for block, faces in zip(self.blocks, self.faces, strict=True):
+            t, face = block.distance(origin, d)
             on = t < nearest
-            radiance[on] = block.color * self.around / np.pi * 0.7
+            if on.any():
+                o, v = np.broadcast_to(origin, radiance.shape)[on], np.broadcast_to(d, radiance.shape)[on]
+                radiance[on] = _face_radiance(block, faces, o + t[on][:, None] * v, face[on])
             nearest = np.where(on, t, nearest)
         t = sphere_distance(self.center, self.radius, origin, d)
         on = t < nearest
@@ -241,13 +254,7 @@ class World:
             t, face = block.distance(origin, d)
             on = np.flatnonzero(t < nearest)
             nearest[on] = t[on]
-            local = (origin[on] + t[on][:, None] * d[on] - block.at) @ block.rotation / block.size
-            for number in range(6):
-                own = face[on] == number
-                u, v = (number // 2 + 1) % 3, (number // 2 + 2) % 3
-                if own.any():
-                    place = 5.0 * (local[own] + 0.5) - 0.5
-                    radiance[on[own]] = sample(faces[number], place[:, v], place[:, u]) * block.color / np.pi
+            radiance[on] = _face_radiance(block, faces, origin[on] + t[on][:, None] * d[on], face[on])
         if ball:
             t = sphere_distance(self.center, self.radius, origin, d)
             on = t < nearest
@@ -266,9 +273,13 @@ class World:
         on = (t < nearest) & (np.abs(at[:, :2]) < self.half).all(-1)
         if not on.any():
             return
-        x, y = (np.interp(at[on][:, k], self.lines[k], np.arange(len(self.lines[k]))) for k in (0, 1))
-        radiance[on] = sample(self.table_light, x, y) * self._table_reflectance(at[on]) / np.pi
+        radiance[on] = self._table_radiance(at[on])
         nearest[on] = t[on]
+
+    def _table_radiance(self, at: Array) -> Array:
+        """What points on the table send, (k, 3)."""
+        x, y = (np.interp(at[:, k], self.lines[k], np.arange(len(self.lines[k]))) for k in (0, 1))
+        return np.asarray(sample(self.table_light, x, y) * self._table_reflectance(at) / np.pi)
 
     def _table_reflectance(self, at: Array) -> Array:
         """Of points on the table, the card on it, (k, 3)."""
@@ -284,3 +295,22 @@ class World:
             white = self.card.print[i.astype(int), j.astype(int)] > 0
             result[on] = np.where(white[:, None], self.card.white, self.card.ink)
         return result
+
+
+def _face_radiance(block: Block, faces: list[NDArray[np.float32]], at: Array, face: NDArray[np.int64]) -> Array:
+    """What points on a block's faces send, (k, 3).
+
+    Args:
+        block: The box.
+        faces: Irradiance of its six, 5 x 5 points each.
+        at: Where, (k, 3).
+        face: On which face, (k,).
+    """
+    place = 5.0 * ((at - block.at) @ block.rotation / block.size + 0.5) - 0.5
+    result = np.zeros((len(at), 3))
+    for number in range(6):
+        own = face == number
+        if own.any():
+            u, v = (number // 2 + 1) % 3, (number // 2 + 2) % 3
+            result[own] = sample(faces[number], place[own, v], place[own, u]) * block.color / np.pi
+    return result
