@@ -57,7 +57,7 @@ def least_missing(
     area = np.asarray(solid_angle, np.float64)
     wide = min(float((area * some)[inside].sum()), CONFIG.least.most)
     shares = alike(own.reshape(-1, 3).astype(np.float64), area.ravel(), component.ravel(), count)
-    shares *= _sharp(np.asarray(radiance, np.float64) / np.maximum(level, 1e-9), area, component, is_light)
+    shares *= _sharp(np.asarray(radiance, np.float64) / max(float(level.max()), 1e-9), area, component, is_light)
     found[inside] = CONFIG.least.least * wide**CONFIG.least.exponent * shares[component[inside], None] * level
     return found
 
