@@ -5,7 +5,9 @@
 Each map is exposed as a camera would that looks at its horizon, a little down, and meters its frame's mean to 18 %, and
 up to some stops beside that; it is clipped there. What clips then gets so many times the level of clipping more. Errors
 are relative, of irradiance over directions and channels: as clipped, with each number, with the best number of each
-picture, and clipped that many stops later, as a second, shorter photograph would. One JSON line.
+picture, as the program raises it where nothing else tells (``least``; ``light/least_missing.py``), and clipped that
+many stops later, as a second, shorter photograph would. ``allowed`` are quantiles of what ``LeastConfig.least`` may be
+for an exposure not to become worse. One JSON line.
 """
 
 from __future__ import annotations
@@ -22,7 +24,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.table_world import latlong_directions
+from warp_ar.kernels.recover_cells import CELL_COLUMNS, CELL_ROWS
+from warp_ar.light.captured import texel_solid_angles
+from warp_ar.light.config import CONFIG
 from warp_ar.light.evidence import spread_directions
+from warp_ar.light.least_missing import least_missing
 
 Map = NDArray[np.float32]
 
@@ -66,6 +72,21 @@ def metered_level(radiance: Map, column: int, stops: float) -> float:
     return float(max(float(frame.mean()), 1e-9) / GREY * 2.0**stops)
 
 
+def raise_clipped(radiance: Map, clipped: NDArray[np.bool_]) -> Map:
+    """A map with what clips raised by what nearly every place lacks.
+
+    Args:
+        radiance: As clipped, (h, 2 h, 3).
+        clipped: Where channels clip, of the same shape.
+    """
+    share = clipped.astype(np.float32)
+    cells = [cv2.resize(one, (CELL_COLUMNS, CELL_ROWS), interpolation=cv2.INTER_AREA) for one in (radiance, share)]
+    area = np.broadcast_to(texel_solid_angles(CELL_ROWS), (CELL_ROWS, CELL_COLUMNS))
+    least = least_missing(*cells, area, np.ones(area.shape, bool))
+    wide = cv2.resize(least, radiance.shape[1::-1], interpolation=cv2.INTER_NEAREST)
+    return np.asarray(radiance + share * wide, np.float32)
+
+
 def errors_of(radiance: Map, level: float) -> dict[str, float]:
     """Relative errors of irradiance of one exposure of a map, by what was done with what clips.
 
@@ -74,8 +95,8 @@ def errors_of(radiance: Map, level: float) -> dict[str, float]:
         level: Radiance at which all channels clip.
 
     Returns:
-        ``clipped``; by each number, as text; ``best``; ``stops_N``; and ``missing``, the mean radiance, over the level,
-        that what clips lacks by all directions' irradiance.
+        ``clipped``; by each number, as text; ``best``; ``least``; ``stops_N``; ``allowed``, what ``LeastConfig.least``
+        may be; and ``missing``, the mean radiance, over the level, that what clips lacks by all directions' irradiance.
     """
     truth, clipped = irradiance(radiance), irradiance(np.minimum(radiance, level))
     unit = irradiance((radiance >= level).astype(np.float32) * np.float32(level))
@@ -85,7 +106,10 @@ def errors_of(radiance: Map, level: float) -> dict[str, float]:
     def error(added: NDArray[np.float64]) -> float:
         return float(np.linalg.norm(missing - added)) / size
 
-    found = {"clipped": error(0.0 * unit), "best": error(best * unit)}
+    raised = irradiance(raise_clipped(np.minimum(radiance, level), radiance >= level)) - clipped
+    squared = float((raised * raised).sum())
+    allowed = 2.0 * CONFIG.least.least * float((raised * missing).sum()) / squared if squared > 0.0 else np.inf
+    found = {"clipped": error(0.0 * unit), "best": error(best * unit), "least": error(raised), "allowed": allowed}
     found |= {str(number): error(number * unit) for number in NUMBERS}
     for stops in SHORTER:
         found[f"stops_{stops}"] = error(irradiance(np.minimum(radiance, level * 2.0**stops)) - clipped)
@@ -94,13 +118,21 @@ def errors_of(radiance: Map, level: float) -> dict[str, float]:
 
 def summarise(rows: Sequence[dict[str, float]]) -> dict[str, Any]:
     """Means over exposures, and in what share of them each number made the picture worse."""
-    means = {key: round(float(np.mean([row[key] for row in rows])), 3) for key in rows[0] if key != "missing"}
+    others = ("missing", "allowed")
+    means = {key: round(float(np.mean([row[key] for row in rows])), 3) for key in rows[0] if key not in others}
     worse = {
-        str(number): round(float(np.mean([row[str(number)] > WORSE * row["clipped"] + 1e-4 for row in rows])), 3)
-        for number in NUMBERS
+        key: round(float(np.mean([row[key] > WORSE * row["clipped"] + 1e-4 for row in rows])), 3)
+        for key in ("least", *map(str, NUMBERS))
     }
+    allowed = np.quantile([row["allowed"] for row in rows], [0.002, 0.01, 0.02], method="lower")
     missing = np.quantile([row["missing"] for row in rows], [0.025, 0.25, 0.5, 0.75, 0.975])
-    return {"exposures": len(rows), "error": means, "worse": worse, "missing": [round(float(q), 2) for q in missing]}
+    return {
+        "exposures": len(rows),
+        "error": means,
+        "worse": worse,
+        "missing": [round(float(q), 2) for q in missing],
+        "allowed": [round(float(q), 2) for q in allowed],
+    }
 
 
 def main(device: str, arguments: Sequence[str] = ()) -> None:

@@ -37,6 +37,8 @@ from warp_ar.stages.quality import DEFAULT_PRESET
 Array = NDArray[np.float64]
 REFLECTANCE = 0.85
 """Of the ball, as ``capture`` takes it: radiance of 1 / REFLECTANCE clips."""
+BRIGHTER = 1.25
+"""Times a photograph's level of clipping that its bracket must show to tell what it lacks."""
 BALL = 0.04
 """Its radius, metres: a guess, which no light depends on."""
 CONTACT = 0.93
@@ -110,6 +112,11 @@ def compare(name: str, single: NDArray[Any], merged: NDArray[Any], lower_bound: 
     )
 
 
+def tells(merged: NDArray[Any]) -> bool:
+    """Whether a bracket's light, (h, 2 h, 3) in a photograph's camera values, is above where that clips."""
+    return float(merged.max()) > BRIGHTER / REFLECTANCE
+
+
 def read_set(folder: Path, neutral: Path) -> tuple[list[Path], list[float] | None]:
     """Photographs of a set, and their exposures where a file tells them.
 
@@ -142,6 +149,9 @@ def measure_set(folder: Path, device: str) -> list[Row]:
                 alone = capture_light([photo], **known)
             except WarpArError as error:
                 print(f"{name}: {error}", flush=True)
+                continue
+            if not tells(merged.radiance):
+                print(f"{name}: left out, the bracket shows nothing brighter", flush=True)
                 continue
             row = compare(name, alone.light.radiance, merged.radiance, merged.lower_bound)
             normals = latlong_directions(24, 48)[0].reshape(-1, 3)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from bench.bench_clipping_prior import errors_of, metered_level, summarise
+from warp_ar.light.config import CONFIG
 
 ROUNDING = 1e-4
 """float32 sums over the map."""
@@ -37,6 +38,10 @@ def test_worse_is_counted_by_number() -> None:
     assert found["worse"]["0.5"] == 0.0
     assert found["worse"]["1.5"] == 0.5
     assert found["error"]["0.5"] < found["error"]["clipped"]
+    assert found["worse"]["least"] == 0.0
+    # A lamp that hardly clips would become worse by the program's own rule.
+    assert summarise([errors_of(lamp(1.1), 1.0)])["worse"]["least"] == 1.0
+    assert summarise([errors_of(lamp(1.1), 1.0)])["allowed"][0] < CONFIG.least.least
 
 
 def test_metering_puts_the_frame_at_grey() -> None:

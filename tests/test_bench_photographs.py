@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from bench.bench_photographs import REFLECTANCE, Row, compare, read_set, summarise
+from bench.bench_photographs import REFLECTANCE, Row, compare, read_set, summarise, tells
 
 ROUNDING = 1e-5
 """float32 sums over the map."""
@@ -61,3 +61,11 @@ def test_sets_count_once_each_and_none_is_no_mean() -> None:
     assert found["error"] == pytest.approx(0.2)
     assert found["clipping"] == pytest.approx(0.1)
     assert summarise({"a": []}) == {"sets": {}} | dict.fromkeys(("error", "scaled", "clipping", "default", "captured"))
+
+
+def test_the_shortest_photograph_of_a_bracket_is_not_judged() -> None:
+    """Its reference clips where it does; that of one two stops longer is four times as bright."""
+    merged = np.full((64, 128, 3), 0.2, np.float32)
+    merged[4:12, 20:40] = 1.0 / REFLECTANCE
+    assert not tells(merged)
+    assert tells(4.0 * merged)

@@ -21,6 +21,8 @@ from warp_ar.scene import load_scene
 BRACKET = (15, 60, 250, 1000, 4000)
 LIT = 0.12
 """Relative error of irradiance: 10 % are asked for after one scale; the plane that is picked here is exact."""
+REFLECTANCE = 0.85
+"""Of the ball, as the command takes it."""
 DARK_OUTLINE = 0.06
 """Share of the radius by which an outline may be off in a photograph whose rim is two codes high."""
 
@@ -82,6 +84,24 @@ def test_one_photograph_says_how_much_is_a_lower_bound(bracket):
     assert found.light.lower_bound > 0.2
     assert any("still clips" in note and "lower bound" in note for note in found.notes)
     assert all(emitter.high is None for emitter in found.light.emitters[:2])
+
+
+def test_what_clips_in_one_photograph_is_raised_and_said(bracket):
+    """Only there: nothing else changes, emitters' lower ends stay, and a bracket is taken as it is measured."""
+    raised, plain = (capture_light(bracket[:1], device="cpu", raises=raises) for raises in (True, False))
+    more = raised.light.radiance - plain.light.radiance
+    assert (more >= 0.0).all()
+    assert more.max() > 0.3
+    # A texel at a saturation boundary clips in part, and is at least as bright as that part.
+    assert (more <= 1.05 * more.max() * REFLECTANCE * plain.light.radiance).all()
+    assert any("what clips was raised" in note for note in raised.notes)
+    assert not any("raised" in note for note in plain.notes)
+    low = [sum(emitter.low) for emitter in raised.light.emitters]
+    assert max(low) <= 1.01 * max(sum(emitter.low) for emitter in plain.light.emitters)
+    merged = [capture_light(bracket, device="cpu", shown=0, raises=raises).light for raises in (True, False)]
+    assert (merged[0].radiance == merged[1].radiance).all()
+    true, one, other = (irradiance(light.radiance) for light in (merged[0], raised.light, plain.light))
+    assert np.linalg.norm(one - true) < np.linalg.norm(other - true)
 
 
 def test_a_disc_that_mirrors_nothing_is_said(tmp_path):

@@ -89,6 +89,11 @@ def make_parser() -> argparse.ArgumentParser:
         help='response that is tried first: "srgb", "gamma:2.2" (default: srgb)',
     )
     add("--focal-35mm", type=float, metavar="MM", help="focal length for a full frame, if EXIF does not tell")
+    add(
+        "--as-clipped", action="store_true",
+        help="leave what clips in a single photograph at the level of clipping; else it is raised by what nearly every "
+        "place lacks",
+    )  # fmt: skip
     add("--reflectance", type=float, default=0.85, metavar="R", help="of the ball (default: 0.85)")
     add("--device", default="auto", metavar="auto|cpu|cuda:0", help="where the kernels run (default: auto)")
     support = parser.add_argument_group("the plane under the ball, from the shown photograph")
@@ -223,6 +228,7 @@ def capture(options: argparse.Namespace) -> int:
         support=(lambda outline, camera: _support_of(options, outline, camera)) if wanted else None,
         reflectance=options.reflectance,
         device=options.device,
+        raises=not options.as_clipped,
     )
     for note in found.notes:
         say(note)

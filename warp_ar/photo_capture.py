@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final, Literal
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,13 +21,16 @@ from warp_ar.input.check_ball import DULL, disc_contrast
 from warp_ar.input.photographs import Photograph, exposures_by_exif, exposures_by_name, read_photograph
 from warp_ar.input.response import write_response
 from warp_ar.input.support import Support
+from warp_ar.kernels.recover_cells import cell_shape
 from warp_ar.light.captured import Light, find_emitters, texel_solid_angles
+from warp_ar.light.least_missing import least_missing
 from warp_ar.scene import Camera, Pose, Probe, Scene
 from warp_ar.scene.exif import FULL_FRAME_DIAGONAL
 from warp_ar.scene.pose_file import pose_of_position
 from warp_ar.stages.quality import PRESETS
 
 Array = NDArray[np.float64]
+Map = NDArray[np.float32]
 Image = NDArray[np.uint8]
 
 PIXELS: Final = "pixels"
@@ -39,6 +43,10 @@ NEAR = 0.08
 """Share of the radius by which the ball lies elsewhere in another photograph of a bracket, at most."""
 BRACKET_ERROR = 0.05
 """Relative error of merged radiance: what a response that was estimated or assumed leaves."""
+SEEN = 0.25
+"""Mean confidence from which a part of the map was seen."""
+LEAST_SAID = 0.005
+"""Share of the light from which it is said that it was added."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,6 +81,7 @@ def capture_light(
     reflectance: float = 0.85,
     device: str = "auto",
     height: int = HEIGHT,
+    raises: bool = True,
 ) -> Capture:
     """Capture the light that a mirror ball shows in one photograph or a bracket of them.
 
@@ -89,6 +98,8 @@ def capture_light(
         reflectance: Of the ball.
         device: ``auto``, ``cpu`` or ``cuda:N``.
         height: Rows of the map.
+        raises: Whether what clips in a single photograph is raised by what nearly every place lacks
+            (``light/least_missing.py``).
 
     Raises:
         SourceError: A photograph cannot be read.
@@ -123,7 +134,7 @@ def capture_light(
     if found is not None:
         turn = found.pose.rotation
         notes.append(f"the support's normal is known within {found.tilt_deviation:.1f} degrees")
-    light, more = _unwrap(bracket, reference, camera, outline, turn, reflectance, device, height)
+    light, more = _unwrap(bracket, reference, camera, outline, turn, reflectance, device, height, raises)
     light = dataclasses.replace(light, exposure=reference.info.exposure)
     return Capture(light, outline, reference.path, camera, reference.image, found, (*notes, *more))
 
@@ -287,6 +298,7 @@ def _unwrap(
     reflectance: float,
     device: str,
     height: int,
+    raises: bool,
 ) -> tuple[Light, list[str]]:
     """The merged map of all photographs, by the pipeline that lights frames."""
     index = bracket.photos.index(reference)
@@ -328,13 +340,39 @@ def _unwrap(
         confidence = np.array(pipeline.arrays["environment_confidence"].numpy())
         clipped = np.array(pipeline.arrays["environment_clipped"].numpy())
         left_out = pipeline.bracket.notes
+    captured = np.array(radiance)
+    if raises and len(times) == 1:
+        radiance = _raised(captured, confidence, clipped)
     area = texel_solid_angles(height)
-    share = float((radiance * clipped * area[..., None]).sum() / max(float((radiance * area[..., None]).sum()), 1e-12))
+    whole = float((radiance * area[..., None]).sum())
+    share = float((radiance * clipped * area[..., None]).sum() / max(whole, 1e-12))
     notes = list(left_out)
     if share > 0.0:
         what = "the shortest exposure" if len(times) > 1 else "the photograph"
         notes.append(f"{what} still clips: {share:.1%} of the light is a lower bound")
-    return Light(radiance, confidence, find_emitters(radiance, clipped, BRACKET_ERROR), 1.0, None, share), notes
+    more = whole / max(float((captured * area[..., None]).sum()), 1e-12) - 1.0
+    if more > LEAST_SAID:
+        notes.append(
+            f"what clips was raised, which makes {more:.0%} more light: nearly every place has as much; a shorter "
+            "photograph beside this one measures it (--as-clipped leaves it out)"
+        )
+    emitters = find_emitters(radiance, clipped, BRACKET_ERROR, captured)
+    return Light(radiance, confidence, emitters, 1.0, None, share), notes
+
+
+def _raised(radiance: Map, confidence: Map, clipped: Map) -> Map:
+    """A map with what clips raised by what nearly every place lacks, (height, 2 height, 3)."""
+    height, width = radiance.shape[:2]
+    rows, columns = cell_shape(height, width)
+
+    def reduced(values: Map) -> Map:
+        return np.asarray(cv2.resize(values, (columns, rows), interpolation=cv2.INTER_AREA), np.float32)
+
+    seen = reduced(confidence) > SEEN
+    solid_angle = np.broadcast_to(texel_solid_angles(rows), (rows, columns))
+    least = least_missing(reduced(radiance), reduced(clipped), solid_angle, seen)
+    wide = cv2.resize(least, (width, height), interpolation=cv2.INTER_NEAREST)
+    return np.asarray(radiance + clipped * wide, np.float32)
 
 
 def _place(

@@ -194,14 +194,18 @@ def texel_solid_angles(height: int) -> Array:
     return np.asarray((edges[:-1] - edges[1:])[:, None] * (math.pi / height))
 
 
-def find_emitters(radiance: Map, clipped: Map, error: float) -> tuple[CapturedEmitter, ...]:
+def find_emitters(
+    radiance: Map, clipped: Map, error: float, captured: Map | None = None
+) -> tuple[CapturedEmitter, ...]:
     """Bright sources of a map, by what they bring.
 
     Args:
         radiance: (height, 2 height, 3).
         clipped: Share that clips in every exposure, of the same shape.
         error: Relative error of what does not clip.
+        captured: The same map as it was seen, where what clips was raised in ``radiance``: lower ends count by it.
     """
+    captured = radiance if captured is None else captured
     height = len(radiance)
     area = np.broadcast_to(texel_solid_angles(height), radiance.shape[:2])
     gray = radiance.mean(2)
@@ -218,6 +222,7 @@ def find_emitters(radiance: Map, clipped: Map, error: float) -> tuple[CapturedEm
         inside = labels == label
         light = radiance[inside] * area[inside][:, None]
         power = light.sum(0).astype(float)
+        least = (captured[inside] * area[inside][:, None]).sum(0).astype(float)
         if not power.any() or power.mean() < LEAST_SHARE * total:
             continue
         toward = (directions[inside] * light.mean(1)[:, None]).sum(0)
@@ -228,7 +233,7 @@ def find_emitters(radiance: Map, clipped: Map, error: float) -> tuple[CapturedEm
                 _triple(toward),
                 float(area[inside].sum()),
                 _triple(power),
-                _triple(power * (1 - error)),
+                _triple(least * (1 - error)),
                 None if clips else _triple(power * (1 + error)),
             )
         )

@@ -93,6 +93,18 @@ class PriorConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class LeastConfig:
+    """What is missing at least, where nothing but the map tells (``least_missing.py``)."""
+
+    least: float = 1.25
+    """Radiance by which what clips in all channels is raised, over the level of clipping, where a steradian clips."""
+    exponent: float = 0.25
+    """Of the solid angle that clips, in that,"""
+    most: float = 1.0
+    """and steradians from which it rises no further: a sky that clips in whole may be even, just above clipping."""
+
+
+@dataclasses.dataclass(frozen=True)
 class SearchConfig:
     """How emitters are looked for."""
 
@@ -259,6 +271,8 @@ class RecoveryConfig:
     """Of surfaces."""
     priors: PriorConfig = PriorConfig()
     """Of what clips."""
+    least: LeastConfig = LeastConfig()
+    """Of what clips where nothing else tells."""
     search: SearchConfig = SearchConfig()
     """Of emitters."""
     card: CardConfig = CardConfig()

@@ -38,7 +38,8 @@ class Estimate:
     emitters: tuple[FoundEmitter, ...] = ()
     """By falling power."""
     method: str = "clipped"
-    """What the estimate rests on: that which was asked for, or what evidence was left for."""
+    """What the estimate rests on: that which was asked for, or what evidence was left for. ``least``: no card is seen,
+    and what clips is raised by what nearly every place lacks."""
     factor: float = 0.0
     """Share of the method's own solution that evidence allows, 0 to 1; ``recovered`` and ``emitters`` hold it."""
     card: CardCheck = NO_CARD

@@ -63,7 +63,7 @@ def depth_profile(cells: NDArray[Any], component: NDArray[np.int64]) -> Array:
         if not len(whole):
             continue
         level = np.median(flat["radiance"][whole, c])
-        around = _grown((clipped > LOST).reshape(cells.shape)).ravel() & (clipped <= LOST) & beyond & seen
+        around = grown((clipped > LOST).reshape(cells.shape)).ravel() & (clipped <= LOST) & beyond & seen
         below, nearly = CONFIG.priors.fades
         outside = np.flatnonzero(around & (flat["radiance"][:, c] > below * level))
         if not len(outside):
@@ -80,7 +80,7 @@ def depth_profile(cells: NDArray[Any], component: NDArray[np.int64]) -> Array:
     return profile
 
 
-def _grown(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def grown(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """A latlong mask and its neighbours, across the seam."""
     wide = np.pad(mask, ((0, 0), (1, 1)), mode="wrap").astype(np.uint8)
     return np.asarray(cv2.dilate(wide, np.ones((3, 3), np.uint8))[:, 1:-1] > 0)

@@ -73,6 +73,7 @@ from warp_ar.light.evidence import (
     spread_directions,
 )
 from warp_ar.light.fit import fit_channel
+from warp_ar.light.least_missing import least_missing
 from warp_ar.light.problem import Candidate, Problem, Trace, candidate_directions, mirroring_points
 from warp_ar.light.solver import ONE_BLAS_THREAD
 from warp_ar.light.steadiness import Steadiness
@@ -223,7 +224,7 @@ class Recovery:
         return self._held
 
     def _without_card(self, problem: Problem, card: CardCheck) -> Estimate:
-        """What is held while the card is hidden for a while, else the light as captured.
+        """What is held while the card is hidden for a while, else what nearly every place lacks at least.
 
         Without a surface of known reflectance only the shape of shadows tells how bright an emitter is, and texture,
         gloss and clutter look like shadows.
@@ -232,8 +233,12 @@ class Recovery:
         if self._held is not None and self._unseen <= CONFIG.card.held:
             return self._held
         self._held, self._candidates, self._evidence = None, [], None
-        nothing = np.zeros((len(problem.solid_angle), 3))
-        return self._estimate(problem, nothing, (True, True, True), "clipped", 0.0, card)
+        rows, columns = problem.shape
+        maps = (side.reshape(rows, columns, 3) for side in (problem.radiance, problem.lost))
+        is_light = ~problem.modelled & (problem.hidden <= 0.0)
+        by_cell = (part.reshape(rows, columns) for part in (problem.solid_angle, is_light))
+        least = least_missing(*maps, *by_cell).reshape(-1, 3)
+        return self._estimate(problem, least, (True, True, True), "least", float(least.any()), card)
 
     def _search(self, problem: Problem, means: Array) -> bool:
         """Try candidates of former frames, one of them moved, and new ones where it is their turn to be looked for.
