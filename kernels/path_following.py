@@ -99,7 +99,7 @@ class PathState:
     depth: wp.int32
     changes_only: wp.bool  # whether it carries the difference that virtual content makes
     without: wp.bool  # whether it meets no virtual content
-    dark: wp.bool  # whether light straight from the environment is no part of what its ray brings
+    without_near: wp.bool  # whether light straight from near emitters is no part of what its ray brings
     tile: wp.int32  # of the frame, by what was learned for which the next direction is drawn; or -1
 
 
@@ -182,11 +182,18 @@ def survival(throughput: wp.vec3, vertices: wp.int32) -> wp.float32:
 
 
 @wp.func
-def light_along(sky: Sky, origin: wp.vec3, direction: wp.vec3, vertex: Vertex, density: wp.float32) -> wp.vec3:
+def light_along(
+    sky: Sky, origin: wp.vec3, direction: wp.vec3, vertex: Vertex, density: wp.float32, without_near: wp.bool
+) -> wp.vec3:
     """The environment's light on a ray to ``vertex`` that was drawn with ``density``: its share beside ``draw_sky``."""
-    light = near_radiance(sky, origin, direction, vertex.hit.t, density)
+    light = wp.vec3(0.0, 0.0, 0.0)
+    own = density
+    if not without_near:
+        light = near_radiance(sky, origin, direction, vertex.hit.t, density)
+    else:
+        own = density * (1.0 - sky.near_share)  # as only the distant environment is drawn
     if vertex.kind == NOTHING:
-        light += sky_radiance(sky, direction, density)
+        light += sky_radiance(sky, direction, own)
     return light
 
 
@@ -223,11 +230,12 @@ def candidate_value(surface: Surface, hit: Hit, wo: wp.vec3, sky: SkyLight, time
 
 @wp.func
 def draw_toward_sky(
-    scene: LocalScene, hit: Hit, surface: Surface, wo: wp.vec3, path: PathState, key: PathKey
+    scene: LocalScene, hit: Hit, surface: Surface, wo: wp.vec3, path: PathState, without_near: wp.bool, key: PathKey
 ) -> DirectionSample:
-    """A direction toward light of the environment; zero where no candidate is reflected."""
+    """A direction toward light of the environment, the distant one alone if ``without_near``; zero where none is."""
     out = DirectionSample()
     u = random_triple(key, path.depth, SKY)
+    near_share = wp.where(without_near, scene.sky.near_share, 0.0)
     count = wp.int32(1)
     pick = float(0.0)
     if path.depth == 0:
@@ -240,7 +248,9 @@ def draw_toward_sky(
     while k < count:  # not unrolled
         at = wp.float32(k) / out.times
         first = wp.vec2(wrap(u[0] + at), wrap(u[1] + wp.float32(k) * GOLDEN))
-        sky = draw_sky(scene.sky, hit.point, first, wrap(u[2] + wp.float32(k) * SILVER))
+        pick_near = near_share + (1.0 - near_share) * wrap(u[2] + wp.float32(k) * SILVER)
+        sky = draw_sky(scene.sky, hit.point, first, pick_near)
+        sky.density = sky.density / (1.0 - near_share)
         value = sky.density
         if count > 1:
             value = candidate_value(surface, hit, wo, sky, out.times)
@@ -265,11 +275,18 @@ def draw_toward_sky(
 
 @wp.func
 def draw_toward_light(
-    scene: LocalScene, hit: Hit, surface: Surface, wo: wp.vec3, path: PathState, light: wp.int32, key: PathKey
+    scene: LocalScene,
+    hit: Hit,
+    surface: Surface,
+    wo: wp.vec3,
+    path: PathState,
+    light: wp.int32,
+    without_near: wp.bool,
+    key: PathKey,
 ) -> DirectionSample:
     """A direction toward virtual light number ``light``, or toward light of the environment where that is -1."""
     if light < 0:
-        return draw_toward_sky(scene, hit, surface, wo, path, key)
+        return draw_toward_sky(scene, hit, surface, wo, path, without_near, key)
     out = DirectionSample()
     u = random_triple(key, path.depth, FIRST_LIGHT + light % (STREAMS - FIRST_LIGHT))
     sample = sample_light(scene.lights[light], hit.point)
@@ -291,7 +308,13 @@ def draw_toward_light(
 
 @wp.func
 def extend_path(
-    path: PathState, start: wp.vec3, wi: wp.vec3, reflected: wp.vec3, density: wp.float32, dark: wp.bool, key: PathKey
+    path: PathState,
+    start: wp.vec3,
+    wi: wp.vec3,
+    reflected: wp.vec3,
+    density: wp.float32,
+    without_near: wp.bool,
+    key: PathKey,
 ) -> PathState:
     """The path on its next ray, drawn with ``density`` (NO_DENSITY: a mirror's); without throughput where it ends."""
     following = path
@@ -311,7 +334,7 @@ def extend_path(
     following.density = density
     following.depth += 1
     following.tile = -1
-    following.dark = dark
+    following.without_near = without_near
     return following
 
 
@@ -460,9 +483,9 @@ def lights_at(scene: LocalScene, kind: wp.int32, surface: Surface, pair: PathPai
 
 
 @wp.func
-def is_sky_followed(scene: LocalScene, kind: wp.int32, surface: Surface, pair: PathPair) -> wp.bool:
-    """Whether the environment's light at a surface is followed from the environment (``path_photons``)."""
-    asked = scene.sky_followed and pair.white and not pair.lobe and pair.path.depth > 0
+def are_near_followed(scene: LocalScene, kind: wp.int32, surface: Surface, pair: PathPair) -> wp.bool:
+    """Whether light of near emitters at a surface is followed from them (``path_photons``)."""
+    asked = scene.near_followed and pair.white and not pair.lobe and pair.path.depth > 0
     return asked and is_polished(kind, surface)
 
 
@@ -510,14 +533,14 @@ def make_scatter(trace: TraceConfig) -> wp.Function:
         lights = lights_at(scene, kind, surface, pair)
         if with_virtual:
             direct.changed = surface.emission
-        dark = is_sky_followed(scene, kind, surface, pair)
-        for index in range(wp.where(is_mirror, lights, wp.where(dark, 0, -1)), lights + 1):
+        without_near = are_near_followed(scene, kind, surface, pair)
+        for index in range(wp.where(is_mirror, lights, -1), lights + 1):
             is_next = index == lights
             drawn = DirectionSample()
             if is_next:
                 drawn.direction = draw_next(scene, hit, surface, wo, path, key)
             else:
-                drawn = draw_toward_light(scene, hit, surface, wo, path, index, key)
+                drawn = draw_toward_light(scene, hit, surface, wo, path, index, without_near, key)
             wi = drawn.direction
             reflected = reflected_from(surface, hit, wo, wi)
             reaches = wp.max(reflected) > 0.0
@@ -532,9 +555,11 @@ def make_scatter(trace: TraceConfig) -> wp.Function:
             if reaches and not is_mirror and (is_next or drawn.density >= 0.0):
                 density = next_density(scene, hit, surface, wo, wi, path)
             if reaches and is_next:
-                following = extend_path(path, start, wi, reflected, density, dark, key)
+                following = extend_path(path, start, wi, reflected, density, without_near, key)
             elif reaches:
-                arriving = balance(drawn.times * drawn.density, density) / drawn.per * wp.cw_mul(reflected, drawn.radiance)
+                arriving = (
+                    balance(drawn.times * drawn.density, density) / drawn.per * wp.cw_mul(reflected, drawn.radiance)
+                )
                 direct = add_direct(direct, arriving, index < 0, hidden, path, with_virtual)
         return leave_surface(scene, hit, out, direct, following)
 
@@ -572,12 +597,12 @@ def meet(scene: LocalScene, vertex: Vertex, pair: PathPair) -> PathPair:
             out.radiance -= wp.cw_mul(path.throughput, pair.physical)
             out.path.changes_only = False
         out.is_known = False
-    if not (out.path.changes_only or path.dark):
+    if not out.path.changes_only:
         # As a first surface draws candidates, their density is so many times as large.
         density = path.density
         if path.depth == 1 and density > 0.0:
             density = density / wp.float32(CANDIDATES)
-        out = bring(out, light_along(scene.sky, path.origin, path.direction, vertex, density))
+        out = bring(out, light_along(scene.sky, path.origin, path.direction, vertex, density, path.without_near))
     if vertex.kind == NOTHING or path.depth >= MOST_VERTICES:
         out.next = ENDED
     return out

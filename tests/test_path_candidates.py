@@ -47,7 +47,7 @@ def candidates_kernel(
     path.depth = depth
     key = PathKey()
     key.sample = wp.uint32(i)
-    drawn = draw_toward_sky(scene, hit, surface, wo, path, key)
+    drawn = draw_toward_sky(scene, hit, surface, wo, path, False, key)
     if wp.length(drawn.direction) > 0.0:
         light = reflected_from(surface, hit, wo, drawn.direction)[0] * drawn.radiance[0] / drawn.per
         own = surface_density(surface, normal, wo, drawn.direction)
@@ -59,7 +59,7 @@ def draws(
     scene: LocalScene, metal: bool, normal: tuple[float, ...], depth: int, device: str
 ) -> tuple[np.ndarray, np.ndarray]:
     found = [wp.zeros(COUNT, dtype=wp.float32, device=device) for _ in range(2)]
-    wo = np.array(normal) + (0.5, 0.3, 0.0)
+    wo = np.array(normal) + np.array((0.5, 0.3, 0.0))
     vectors = [wp.vec3(0.1, 0.05, 0.02), wp.vec3(*normal), wp.vec3(*(wo / np.linalg.norm(wo)))]
     wp.launch(candidates_kernel, COUNT, [scene, metal, *vectors, depth], found, device=device)
     return found[0].numpy().astype(np.float64), found[1].numpy().astype(np.float64)
@@ -110,5 +110,3 @@ def test_nothing_is_drawn_where_nothing_is_reflected(device: str) -> None:
         plain, balanced = draws(scene, False, (0.0, 0.0, -1.0), 0, device)
         assert not plain.any()
         assert not balanced.any()
-
-
