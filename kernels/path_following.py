@@ -10,6 +10,7 @@ error but noise.
 References:
     [Deb98] Debevec 1998, Rendering Synthetic Objects into Real Scenes.
     [PBRT] Pharr, Jakob, Humphreys, Physically Based Rendering, 4th edition, sections 13.2 and 13.4.
+    [Tal05] Talbot, Cline, Egbert, Importance Resampling for Global Illumination, EGSR 2005.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import functools
 
 import warp as wp
 
+from warp_ar.kernels.color import brightness
 from warp_ar.kernels.materials import Surface
 from warp_ar.kernels.path_guides import draw_guide, guide_count, guide_density, guided_bin
 from warp_ar.kernels.path_sampling import (
@@ -25,6 +27,7 @@ from warp_ar.kernels.path_sampling import (
     STREAMS,
     PathKey,
     Sky,
+    SkyLight,
     balance,
     draw_on_light,
     draw_reflected,
@@ -67,9 +70,17 @@ GUIDED = wp.constant(wp.float32(0.5))
 PICK = wp.constant(0)
 SCATTER = wp.constant(1)
 SKY = wp.constant(2)
-FIRST_LIGHT = wp.constant(3)
+CHOICE = wp.constant(3)
+FIRST_LIGHT = wp.constant(4)
 """Streams of random numbers at a vertex; each virtual light has its own, as far as they go."""
 
+CANDIDATES = wp.constant(4)
+"""Directions toward the environment's light at a first surface, of which one is followed."""
+GOLDEN = wp.constant(wp.float32(0.61803399))
+SILVER = wp.constant(wp.float32(0.41421356))
+"""Steps between candidates, which spread them evenly."""
+MOST_RANDOM = wp.constant(wp.float32(0.99999994))
+"""Of what is drawn from [0, 1)."""
 
 SURFACE = wp.constant(0)
 RAY = wp.constant(1)
@@ -88,6 +99,7 @@ class PathState:
     depth: wp.int32
     changes_only: wp.bool  # whether it carries the difference that virtual content makes
     without: wp.bool  # whether it meets no virtual content
+    without_near: wp.bool  # whether light straight from near emitters is no part of what its ray brings
     tile: wp.int32  # of the frame, by what was learned for which the next direction is drawn; or -1
 
 
@@ -118,6 +130,7 @@ class DirectionSample:
 
     direction: wp.vec3  # unit; zero where there is none
     density: wp.float32  # per steradian; NO_DENSITY where no other way draws it
+    times: wp.float32  # that density is that of so many candidates together
     distance: wp.float32  # of what sends light
     radiance: wp.vec3  # from there, or the irradiance of a surface that faces the light
     per: wp.float32  # that this is divided by: the density, or 1
@@ -169,47 +182,139 @@ def survival(throughput: wp.vec3, vertices: wp.int32) -> wp.float32:
 
 
 @wp.func
-def light_along(sky: Sky, origin: wp.vec3, direction: wp.vec3, vertex: Vertex, density: wp.float32) -> wp.vec3:
+def light_along(
+    sky: Sky, origin: wp.vec3, direction: wp.vec3, vertex: Vertex, density: wp.float32, without_near: wp.bool
+) -> wp.vec3:
     """The environment's light on a ray to ``vertex`` that was drawn with ``density``: its share beside ``draw_sky``."""
-    light = near_radiance(sky, origin, direction, vertex.hit.t, density)
+    light = wp.vec3(0.0, 0.0, 0.0)
+    own = density
+    if not without_near:
+        light = near_radiance(sky, origin, direction, vertex.hit.t, density)
+    else:
+        own = density * (1.0 - sky.near_share)  # as only the distant environment is drawn
     if vertex.kind == NOTHING:
-        light += sky_radiance(sky, direction, density)
+        light += sky_radiance(sky, direction, own)
     return light
 
 
 @wp.func
-def draw_toward_light(scene: LocalScene, hit: Hit, path: PathState, light: wp.int32, key: PathKey) -> DirectionSample:
-    """A direction toward virtual light number ``light``, or toward light of the environment where that is -1."""
+def wrap(u: wp.float32) -> wp.float32:
+    """A number's part from 0 to below 1."""
+    return wp.min(u - wp.floor(u), MOST_RANDOM)
+
+
+@wp.func
+def reflected_from(surface: Surface, hit: Hit, wo: wp.vec3, wi: wp.vec3) -> wp.vec3:
+    """What a surface reflects of light from ``wi``, cosine included; of a mirror its reflectance. 0 from below."""
+    reflected = wp.vec3(0.0, 0.0, 0.0)
+    if wp.dot(hit.geometric_normal, wi) > 0.0:
+        reflected = surface.reflectance
+        if surface.model != wp.static(int(MIRROR)):
+            reflected = reflect_direct(surface, hit.normal, wo, wi)
+    return reflected
+
+
+# Light of the environment is drawn by how bright it is, not by what the surface makes of it or by where it faces. At a
+# first surface, where most of a picture's noise begins, several directions are therefore drawn, and one of them is
+# chosen by what the surface would reflect of it [Tal05]. With w_k what candidate k would reflect over the density with
+# which it was drawn, the one that is chosen counts with the mean of all w over its own, whatever the candidates have to
+# do with each other: each alone is drawn as it should be. So they are spread evenly from one random start.
+@wp.func
+def candidate_value(surface: Surface, hit: Hit, wo: wp.vec3, sky: SkyLight, times: wp.float32) -> wp.float32:
+    """What a surface would reflect of light along a candidate, by its share beside what the surface draws itself."""
+    value = brightness(wp.cw_mul(reflected_from(surface, hit, wo, sky.direction), sky.radiance))
+    if value > 0.0:
+        value *= balance(times * sky.density, surface_density(surface, hit.normal, wo, sky.direction))
+    return value
+
+
+@wp.func
+def draw_toward_sky(
+    scene: LocalScene, hit: Hit, surface: Surface, wo: wp.vec3, path: PathState, without_near: wp.bool, key: PathKey
+) -> DirectionSample:
+    """A direction toward light of the environment, the distant one alone if ``without_near``; zero where none is."""
     out = DirectionSample()
-    stream = wp.where(light < 0, SKY, FIRST_LIGHT + light % (STREAMS - FIRST_LIGHT))
-    u = random_triple(key, path.depth, stream)
+    u = random_triple(key, path.depth, SKY)
+    near_share = wp.where(without_near, scene.sky.near_share, 0.0)
+    count = wp.int32(1)
+    pick = float(0.0)
+    if path.depth == 0:
+        count = CANDIDATES
+        pick = random_triple(key, path.depth, CHOICE)[0]
+    out.times = wp.float32(count)
+    total = float(0.0)
+    chosen = float(0.0)
+    k = wp.int32(0)
+    while k < count:  # not unrolled
+        at = wp.float32(k) / out.times
+        first = wp.vec2(wrap(u[0] + at), wrap(u[1] + wp.float32(k) * GOLDEN))
+        pick_near = near_share + (1.0 - near_share) * wrap(u[2] + wp.float32(k) * SILVER)
+        sky = draw_sky(scene.sky, hit.point, first, pick_near)
+        sky.density = sky.density / (1.0 - near_share)
+        value = sky.density
+        if count > 1:
+            value = candidate_value(surface, hit, wo, sky, out.times)
+        weight = value / sky.density
+        if weight > 0.0:
+            total += weight
+            share = weight / total
+            if pick < share:
+                pick = pick / share
+                chosen = value
+                out.direction = sky.direction
+                out.density = sky.density
+                out.distance = sky.distance
+                out.radiance = sky.radiance
+            else:
+                pick = (pick - share) / (1.0 - share)
+        k += 1
+    if total > 0.0:
+        out.per = out.times * chosen / total
+    return out
+
+
+@wp.func
+def draw_toward_light(
+    scene: LocalScene,
+    hit: Hit,
+    surface: Surface,
+    wo: wp.vec3,
+    path: PathState,
+    light: wp.int32,
+    without_near: wp.bool,
+    key: PathKey,
+) -> DirectionSample:
+    """A direction toward virtual light number ``light``, or toward light of the environment where that is -1."""
     if light < 0:
-        sky = draw_sky(scene.sky, hit.point, wp.vec2(u[0], u[1]), u[2])
-        out.direction = sky.direction
-        out.density = sky.density
-        out.distance = sky.distance
-        out.radiance = sky.radiance
-        out.per = sky.density
-    else:
-        sample = sample_light(scene.lights[light], hit.point)
-        if wp.max(sample.irradiance_normal) > 0.0:
-            away = draw_on_light(scene.lights[light], sample, wp.vec2(u[0], u[1]))
-            out.direction = wp.vec3(away[0], away[1], away[2])
-            out.density = NO_DENSITY
-            if has_penumbra(scene.lights[light], sample):
-                cosine = sample.distance / away[3]
-                radius = scene.lights[light].radius
-                out.density = away[3] * away[3] / (wp.pi * radius * radius * cosine)
-            # Short of the light, so that a light on a surface is not hidden by that surface.
-            out.distance = away[3] - 2.0 * hit.error
-            out.radiance = sample.irradiance_normal
-            out.per = 1.0
+        return draw_toward_sky(scene, hit, surface, wo, path, without_near, key)
+    out = DirectionSample()
+    u = random_triple(key, path.depth, FIRST_LIGHT + light % (STREAMS - FIRST_LIGHT))
+    sample = sample_light(scene.lights[light], hit.point)
+    if wp.max(sample.irradiance_normal) > 0.0:
+        away = draw_on_light(scene.lights[light], sample, wp.vec2(u[0], u[1]))
+        out.direction = wp.vec3(away[0], away[1], away[2])
+        out.density = NO_DENSITY
+        if has_penumbra(scene.lights[light], sample):
+            cosine = sample.distance / away[3]
+            radius = scene.lights[light].radius
+            out.density = away[3] * away[3] / (wp.pi * radius * radius * cosine)
+        # Short of the light, so that a light on a surface is not hidden by that surface.
+        out.distance = away[3] - 2.0 * hit.error
+        out.radiance = sample.irradiance_normal
+        out.times = 1.0
+        out.per = 1.0
     return out
 
 
 @wp.func
 def extend_path(
-    path: PathState, start: wp.vec3, wi: wp.vec3, reflected: wp.vec3, density: wp.float32, key: PathKey
+    path: PathState,
+    start: wp.vec3,
+    wi: wp.vec3,
+    reflected: wp.vec3,
+    density: wp.float32,
+    without_near: wp.bool,
+    key: PathKey,
 ) -> PathState:
     """The path on its next ray, drawn with ``density`` (NO_DENSITY: a mirror's); without throughput where it ends."""
     following = path
@@ -229,6 +334,7 @@ def extend_path(
     following.density = density
     following.depth += 1
     following.tile = -1
+    following.without_near = without_near
     return following
 
 
@@ -310,17 +416,6 @@ def white_surface(scene: LocalScene, vertex: Vertex, lobe: wp.bool) -> Surface:
     return surface
 
 
-@wp.func
-def reflected_from(surface: Surface, hit: Hit, wo: wp.vec3, wi: wp.vec3) -> wp.vec3:
-    """What a surface reflects of light from ``wi``, cosine included; of a mirror its reflectance. 0 from below."""
-    reflected = wp.vec3(0.0, 0.0, 0.0)
-    if wp.dot(hit.geometric_normal, wi) > 0.0:
-        reflected = surface.reflectance
-        if surface.model != wp.static(int(MIRROR)):
-            reflected = reflect_direct(surface, hit.normal, wo, wi)
-    return reflected
-
-
 @wp.struct
 class DirectLight:
     """Light that reaches a surface straight from its sources, as the surface reflects it."""
@@ -388,6 +483,13 @@ def lights_at(scene: LocalScene, kind: wp.int32, surface: Surface, pair: PathPai
 
 
 @wp.func
+def are_near_followed(scene: LocalScene, kind: wp.int32, surface: Surface, pair: PathPair) -> wp.bool:
+    """Whether light of near emitters at a surface is followed from them (``path_photons``)."""
+    asked = scene.near_followed and pair.white and not pair.lobe and pair.path.depth > 0
+    return asked and is_polished(kind, surface)
+
+
+@wp.func
 def leave_surface(scene: LocalScene, hit: Hit, pair: PathPair, direct: DirectLight, following: PathState) -> PathPair:
     """The path goes from a surface to its next ray, with the light that the surface reflects of what reaches it."""
     out = bring_direct(pair, direct)
@@ -431,13 +533,14 @@ def make_scatter(trace: TraceConfig) -> wp.Function:
         lights = lights_at(scene, kind, surface, pair)
         if with_virtual:
             direct.changed = surface.emission
+        without_near = are_near_followed(scene, kind, surface, pair)
         for index in range(wp.where(is_mirror, lights, -1), lights + 1):
             is_next = index == lights
             drawn = DirectionSample()
             if is_next:
                 drawn.direction = draw_next(scene, hit, surface, wo, path, key)
             else:
-                drawn = draw_toward_light(scene, hit, path, index, key)
+                drawn = draw_toward_light(scene, hit, surface, wo, path, index, without_near, key)
             wi = drawn.direction
             reflected = reflected_from(surface, hit, wo, wi)
             reaches = wp.max(reflected) > 0.0
@@ -452,9 +555,11 @@ def make_scatter(trace: TraceConfig) -> wp.Function:
             if reaches and not is_mirror and (is_next or drawn.density >= 0.0):
                 density = next_density(scene, hit, surface, wo, wi, path)
             if reaches and is_next:
-                following = extend_path(path, start, wi, reflected, density, key)
+                following = extend_path(path, start, wi, reflected, density, without_near, key)
             elif reaches:
-                arriving = balance(drawn.density, density) / drawn.per * wp.cw_mul(reflected, drawn.radiance)
+                arriving = (
+                    balance(drawn.times * drawn.density, density) / drawn.per * wp.cw_mul(reflected, drawn.radiance)
+                )
                 direct = add_direct(direct, arriving, index < 0, hidden, path, with_virtual)
         return leave_surface(scene, hit, out, direct, following)
 
@@ -493,7 +598,11 @@ def meet(scene: LocalScene, vertex: Vertex, pair: PathPair) -> PathPair:
             out.path.changes_only = False
         out.is_known = False
     if not out.path.changes_only:
-        out = bring(out, light_along(scene.sky, path.origin, path.direction, vertex, path.density))
+        # As a first surface draws candidates, their density is so many times as large.
+        density = path.density
+        if path.depth == 1 and density > 0.0:
+            density = density / wp.float32(CANDIDATES)
+        out = bring(out, light_along(scene.sky, path.origin, path.direction, vertex, density, path.without_near))
     if vertex.kind == NOTHING or path.depth >= MOST_VERTICES:
         out.next = ENDED
     return out

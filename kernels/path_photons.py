@@ -18,6 +18,10 @@ shading is. With V this reflected radiance over the irradiance of what faces l,
 
     W  ->  W V cos(d) / (q cos(l)),    cosines with the geometric normal.
 
+Light of near emitters of the environment is followed likewise, from points of the spheres on which they lie. As they
+shine evenly to all sides, a point that is drawn with the density p per steradian around the sphere's centre, seen from
+there with the radiance L, is a light of the intensity L D^2 / p, D the sphere's radius.
+
 Lights with a disk and directional ones are left to paths from the camera. So is light by which mirrors show a lamp that
 has no size, which these do not find.
 
@@ -48,7 +52,16 @@ from warp_ar.kernels.path_following import (
     survival,
 )
 from warp_ar.kernels.path_guides import cone_versine
-from warp_ar.kernels.path_sampling import PathKey, draw_reflected, random_triple, surface_density
+from warp_ar.kernels.path_sampling import (
+    PathKey,
+    Sky,
+    direction_in_texel,
+    draw_reflected,
+    find_step,
+    random_triple,
+    surface_density,
+    within_step,
+)
 from warp_ar.kernels.path_vertices import (
     NOTHING,
     OBJECT,
@@ -71,7 +84,8 @@ wp.set_module_options({"enable_backward": False})
 BESIDE_PIXELS = wp.constant(wp.uint32(0x80000000))
 """Added to a path's number, so that its random numbers are no pixel's."""
 START = wp.constant(2)
-"""Stream of random numbers by which a path starts."""
+ON_EMITTER = wp.constant(3)
+"""Streams of random numbers by which a path starts."""
 UNIT = wp.constant(wp.float32(16777216.0))
 """Of what is summed."""
 MOST = wp.constant(wp.float32(8192.0))
@@ -100,6 +114,17 @@ def add_whole(sums: wp.array[wp.int64], index: wp.int32, value: wp.int64):
     """Add to a sum to which other threads add as well, on every device."""
 
 
+def is_polished_one(objects: npt.NDArray[np.void], materials: npt.NDArray[np.void]) -> bool:
+    """Whether an object may be polished, by any of the materials.
+
+    Args:
+        objects: Records of ``structs.Shape``.
+        materials: Records of ``structs.Material``.
+    """
+    models = {int(model) for model in materials["model"]} if len(objects) else set()
+    return bool(models - {int(LAMBERT), int(MIRROR)})
+
+
 def follows_lights(
     lights: npt.NDArray[np.void], objects: npt.NDArray[np.void], materials: npt.NDArray[np.void]
 ) -> bool:
@@ -110,10 +135,8 @@ def follows_lights(
         objects: Records of ``structs.Shape``, one of which must be polished.
         materials: Records of ``structs.Material``.
     """
-    models = {int(model) for model in materials["model"]} if len(objects) else set()
-    polished = bool(models - {int(LAMBERT), int(MIRROR)})
     sized = bool((lights["radius"] > 0.0).any() or (lights["kind"] == int(DIRECTIONAL)).any())
-    return len(lights) > 0 and polished and not sized
+    return len(lights) > 0 and is_polished_one(objects, materials) and not sized
 
 
 @wp.func
@@ -142,26 +165,51 @@ def toward_sphere(sphere: wp.vec4, point: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def draw_start(scene: LocalScene, light: Light, u: wp.vec3) -> wp.vec3:
+def draw_start(scene: LocalScene, at: wp.vec3, u: wp.vec3) -> wp.vec3:
     """Direction in which a path leaves a light: toward a virtual object."""
     count = scene.guides.virtual_spheres
     k = wp.min(wp.int32(u[2] * wp.float32(count)), count - 1)
     sphere = scene.guides.spheres[k]
-    at = light.position
     return draw_in_cone(toward_sphere(sphere, at), cone_versine(sphere, at), wp.vec2(u[0], u[1]))
 
 
 @wp.func
-def start_density(scene: LocalScene, light: Light, direction: wp.vec3) -> wp.float32:
+def start_density(scene: LocalScene, at: wp.vec3, direction: wp.vec3) -> wp.float32:
     """Density with which ``draw_start`` gives a direction, per steradian."""
     density = float(0.0)
     count = scene.guides.virtual_spheres
     for k in range(count):
         sphere = scene.guides.spheres[k]
-        most = cone_versine(sphere, light.position)
-        if versine_between(toward_sphere(sphere, light.position), direction) <= most:
+        most = cone_versine(sphere, at)
+        if versine_between(toward_sphere(sphere, at), direction) <= most:
             density += 1.0 / (2.0 * wp.pi * most * wp.float32(count))
     return density
+
+
+@wp.struct
+class PointOfEmitter:
+    """Where a path leaves a near emitter."""
+
+    position: wp.vec3
+    intensity: wp.vec3  # over the density with which the point was drawn
+
+
+@wp.func
+def draw_on_emitters(sky: Sky, u: wp.vec2) -> PointOfEmitter:
+    """A point of a near emitter, by its light as ``draw_sky`` has it."""
+    out = PointOfEmitter()
+    height = sky.radiance.shape[0]
+    width = sky.radiance.shape[1]
+    step = find_step(sky.near_steps, u[0])
+    row = sky.near_texels[step] / width
+    column = sky.near_texels[step] % width
+    within = wp.vec2(within_step(sky.near_steps, step, u[0]), u[1])
+    normal = direction_in_texel(row, column, height, width, within)
+    emitter = sky.emitters[sky.near_owner[row, column]]
+    out.position = emitter.origin + emitter.distance * normal
+    square = emitter.distance * emitter.distance
+    out.intensity = square / sky.near_density[row, column] * sky.near_radiance[row, column]
+    return out
 
 
 @wp.func
@@ -220,6 +268,8 @@ def make_follow_lights_kernel(trace: TraceConfig) -> wp.Kernel:
         scene: LocalScene,
         seed: wp.int32,
         number: wp.int32,
+        paths: wp.int32,
+        of_lights: wp.int32,
         # Out:
         image_out: LightImage,
     ):
@@ -229,10 +279,22 @@ def make_follow_lights_kernel(trace: TraceConfig) -> wp.Kernel:
         key.pixel = wp.uint32(k) + BESIDE_PIXELS
         key.sample = wp.uint32(number)
         key.seed = wp.uint32(seed)
-        count = scene.lights.shape[0]
-        light = scene.lights[k % count]
-        origin = light.position
-        direction = draw_start(scene, light, random_triple(key, 0, START))
+        origin = wp.vec3(0.0, 0.0, 0.0)
+        of_emitter = wp.vec3(0.0, 0.0, 0.0)
+        light = Light()
+        # As if all were of the kind that this one is.
+        times = wp.float32(paths)
+        if k < of_lights:
+            light = scene.lights[k % scene.lights.shape[0]]
+            origin = light.position
+            times = times * wp.float32(scene.lights.shape[0]) / wp.float32(of_lights)
+        else:
+            on = random_triple(key, 0, ON_EMITTER)
+            drawn = draw_on_emitters(scene.sky, wp.vec2(on[0], on[1]))
+            origin = drawn.position
+            of_emitter = drawn.intensity
+            times = times / wp.float32(paths - of_lights)
+        direction = draw_start(scene, origin, random_triple(key, 0, START))
         power = wp.vec3(0.0, 0.0, 0.0)
         kept = wp.vec3(1.0, 1.0, 1.0)
         depth = wp.int32(0)
@@ -243,10 +305,11 @@ def make_follow_lights_kernel(trace: TraceConfig) -> wp.Kernel:
             goes_on = vertex.kind == OBJECT or (depth > 0 and vertex.kind != NOTHING)
             toward = -direction
             if depth == 0 and goes_on:
-                sample = sample_light(light, vertex.hit.point)
-                density = start_density(scene, light, direction)
-                area = sample.distance * sample.distance / wp.max(density, 1.0e-20)
-                power = wp.float32(count) * area * sample.irradiance_normal
+                power = of_emitter
+                if k < of_lights:
+                    sample = sample_light(light, vertex.hit.point)
+                    power = sample.distance * sample.distance * sample.irradiance_normal
+                power = power * times / wp.max(start_density(scene, origin, direction), 1.0e-20)
                 goes_on = wp.max(power) > 0.0
             reflectance = wp.vec3(1.0, 1.0, 1.0)
             if goes_on and vertex.kind == PROXY:
@@ -316,11 +379,12 @@ def follow_lights(
     image_out: LightImage,
     *,
     count: int,
+    of_lights: int,
     seed: int,
     number: int,
     part: Rows | None = None,
 ) -> None:
-    """Follow paths from virtual lights, and add what pixels have of them.
+    """Follow paths from virtual lights and near emitters, and add what pixels have of them.
 
     Args:
         trace: Kinds of shape in the scene.
@@ -328,10 +392,13 @@ def follow_lights(
         scene: All that paths meet; its lights as ``follows_lights`` has them.
         image_out: Of ``make_light_image``.
         count: Paths, at most 2^31.
+        of_lights: How many of these, the first ones, are from virtual lights; the others are from near emitters.
         seed: Of the random numbers.
         number: Of this pass, by which its random numbers are others than those of the passes before.
         part: First path, and one past the last, on CPU; None means all.
     """
     kernel = make_follow_lights_kernel(trace)
     device = image_out.sums.device
-    launch_rows(kernel, (count,), [params, scene, seed, number], [image_out], rows=part, device=device)
+    launch_rows(
+        kernel, (count,), [params, scene, seed, number, count, of_lights], [image_out], rows=part, device=device
+    )

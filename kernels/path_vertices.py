@@ -48,6 +48,7 @@ class LocalScene:
     rays: RayScene
     lights: wp.array[Light]
     lights_followed: wp.bool  # whether their light is followed from them, where white surfaces have it from others
+    near_followed: wp.bool  # likewise light of near emitters
     probes: wp.array[Probe]
     sky: Sky
     guides: Guides

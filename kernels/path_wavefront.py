@@ -38,6 +38,7 @@ from warp_ar.kernels.path_following import (
     PathPair,
     PathState,
     add_direct,
+    are_near_followed,
     draw_next,
     draw_toward_light,
     end_without,
@@ -399,13 +400,14 @@ def make_shade_kernel() -> wp.Kernel:
         asked = wp.where(is_mirror, 0, 1 + lights_at(scene, facing.kind, surface, pair))
         for source in range(sources):
             wave_out.reach[source, slot] = NOT_ASKED
+        without_near = are_near_followed(scene, facing.kind, surface, pair)
         for index in range(asked + 1):
             is_next = index == asked
             drawn = DirectionSample()
             if is_next:
                 drawn.direction = draw_next(scene, hit, surface, wo, path, key)
             else:
-                drawn = draw_toward_light(scene, hit, path, index - 1, key)
+                drawn = draw_toward_light(scene, hit, surface, wo, path, index - 1, without_near, key)
             wi = drawn.direction
             reflected = reflected_from(surface, hit, wo, wi)
             if wp.max(reflected) > 0.0:
@@ -414,9 +416,9 @@ def make_shade_kernel() -> wp.Kernel:
                 if not is_mirror and (is_next or drawn.density >= 0.0):
                     density = next_density(scene, hit, surface, wo, wi, path)
                 if is_next:
-                    following = extend_path(path, start, wi, reflected, density, key)
+                    following = extend_path(path, start, wi, reflected, density, without_near, key)
                 else:
-                    share = balance(drawn.density, density) / drawn.per
+                    share = balance(drawn.times * drawn.density, density) / drawn.per
                     wave_out.arriving[index, slot] = share * wp.cw_mul(reflected, drawn.radiance)
                     wave_out.starts[index, slot] = start
                     wave_out.toward[index, slot] = wi

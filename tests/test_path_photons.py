@@ -15,6 +15,8 @@ from warp_ar.accuracy import path_tracer
 from warp_ar.accuracy.path_tracer import PathTracer, TracedPicture
 from warp_ar.kernels.path_photons import UNIT
 from warp_ar.kernels.receiver import DEFAULT_REFLECTANCE, PRIOR_WEIGHT
+from warp_ar.light.captured import CapturedEmitter
+from warp_ar.light.captured import Light as CapturedLight
 from warp_ar.scene import Camera, LambertMaterial, Light, MetallicRoughnessMaterial, Object, PhongMaterial, Proxy, Scene
 
 # Dim, so that what virtual lights bring is more than its noise.
@@ -37,13 +39,35 @@ def lit(*lights: Light, lens: tuple[float, ...] = (0.0,) * 4) -> Scene:
     return dataclasses.replace(scene, lights=lights, objects=(plastic, metal), camera=camera)
 
 
+def lamp_above() -> CapturedLight:
+    """A dim sky with a lamp that stands 0.5 m from where it was mirrored."""
+    height, toward = 64, np.array([0.3, -0.4, 0.866])
+    radiance = np.repeat(np.full((height, 2 * height, 1), 0.02, np.float32), 3, axis=2)
+    theta = (np.arange(height) + 0.5)[:, None] * math.pi / height
+    phi = ((np.arange(2 * height) + 0.5)[None] / height - 1.0) * math.pi
+    texels = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta) + 0.0 * phi], -1)
+    toward = toward / np.linalg.norm(toward)
+    radiance[texels @ toward > math.cos(math.radians(5.0))] = (60.0, 45.0, 30.0)
+    x, y, z = (float(value) for value in toward)
+    emitter = CapturedEmitter((x, y, z), 0.03, (1.0, 0.8, 0.5), (60.0, 45.0, 30.0), None, 0.5, (0.0, 0.0, 0.03))
+    return CapturedLight(radiance, np.ones(radiance.shape[:2], np.float32), (emitter,))
+
+
 def tracer_of(
-    scene: Scene, device: str, samples: int, seed: int, monkeypatch: pytest.MonkeyPatch, *, follows: bool = True
+    scene: Scene,
+    device: str,
+    samples: int,
+    seed: int,
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    follows: bool = True,
+    sky: CapturedLight | npt.NDArray[np.float32] = SKY,
 ) -> PathTracer:
     with monkeypatch.context() as patch:
         if not follows:
             patch.setattr(path_tracer, "follows_lights", lambda *given: False)
-        tracer = PathTracer(scene, SKY, FRAME, ABOVE, device=device, seed=seed)
+            patch.setattr(path_tracer, "is_polished_one", lambda *given: False)
+        tracer = PathTracer(scene, sky, FRAME, ABOVE, device=device, seed=seed)
         tracer.sample(samples)
         assert (tracer._followed > 0) == follows
         return tracer
@@ -65,7 +89,8 @@ def change_of(tracer: PathTracer) -> tuple[npt.NDArray[np.float64], npt.NDArray[
         image = tracer._image_of_lights
         sums, squares = (a.numpy().reshape(*shape, 3) / float(UNIT) for a in (image.sums, image.squares))
         pixels = shape[0] * shape[1]
-        paths = tracer._followed * math.ceil(path_tracer.PATHS_OF_LIGHTS * pixels)
+        kinds = int(tracer._follows_lights) + int(tracer._follows_emitters)
+        paths = tracer._followed * kinds * math.ceil(path_tracer.PATHS_OF_LIGHTS * pixels)
         change += sums * pixels / paths
         variance += (squares - sums**2 / paths) * (pixels / paths) ** 2
     return change, np.sqrt(variance)
@@ -101,6 +126,60 @@ def test_both_ways_have_the_same_mean(name: str, device: str, monkeypatch: pytes
     spread = np.hypot(pictures[0].error, pictures[1].error).astype(np.float64)
     total = float((pictures[0].radiance - pictures[1].radiance).astype(np.float64).sum())
     assert abs(total) <= ERRORS * math.sqrt((spread**2).sum())
+
+
+EMITTER_CASES = {
+    "emitter": lit(),
+    "emitter and light": lit(POINT),
+    "emitter and disk": lit(dataclasses.replace(POINT, radius=0.01)),
+    "emitter, polished": polish(lit(), 0.3, 0.4),
+}
+
+
+@pytest.mark.parametrize("name", EMITTER_CASES)
+def test_near_emitters_have_the_same_mean_both_ways(name: str, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Alone, beside a light that is followed as well, and beside one with a disk, which is not.
+
+    By the same seeds, and before samples go where the noise is: what shadows have of noise is the same in both.
+    """
+    scene, sky = EMITTER_CASES[name], lamp_above()
+    off, brought = [], []
+    for seed in range(40):
+        pair = [tracer_of(scene, device, 16, seed, monkeypatch, sky=sky, follows=follows) for follows in (True, False)]
+        assert pair[0]._follows_emitters
+        assert pair[0]._follows_lights == (name == "emitter and light")
+        changes = [change_of(tracer)[0] for tracer in pair]
+        off.append(changes[0] - changes[1])
+        brought.append(changes[0] - np.array(pair[0]._moments.change.numpy(), np.float64))
+    for values in (np.stack(off)[:, rows] for rows in (slice(0, 16), slice(16, 32), slice(None))):
+        sums = values.sum(axis=(1, 2, 3))
+        noise = sums.std(ddof=1) / math.sqrt(len(sums))
+        assert abs(sums.mean()) <= ERRORS * noise, (name, sums.mean(), noise)
+    assert np.stack(brought).sum(axis=(1, 2, 3)).mean() > 2.0 * ERRORS * noise, (name, noise)
+
+
+def test_an_emitter_sends_what_a_light_at_its_place_sends(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is followed from a lamp of some degrees, and from a virtual light of its intensity at its middle."""
+    sky = lamp_above()
+    emitter = sky.emitters[0]
+    at = np.array(emitter.origin) + emitter.distance * np.array(emitter.direction)
+    height = len(sky.radiance)
+    theta = (np.arange(height) + 0.5)[:, None, None] * math.pi / height
+    lamp = np.where(sky.radiance > 1.0, sky.radiance - 0.02, 0.0) * np.sin(theta) * (math.pi / height) ** 2
+    intensity = lamp.sum(axis=(0, 1)) * emitter.distance**2
+    light = Light("point", float(intensity[0]), color=tuple(intensity / intensity[0]), at=tuple(map(float, at)))
+    monkeypatch.setattr(path_tracer, "PATHS_OF_LIGHTS", 4.0)
+    images = []
+    # The same light tells reflectances, but for where the lamp stands.
+    for scene, around in ((lit(), sky), (lit(light), sky.radiance)):
+        tracer = PathTracer(scene, around, FRAME, ABOVE, device=device, seed=5)
+        tracer.sample(32)
+        change = change_of(tracer)[0] - np.array(tracer._moments.change.numpy(), np.float64)
+        images.append(change.reshape(2, 16, 3, 16, 3).sum(axis=(1, 3)))
+    assert images[1].min() > 0.0
+    # The lamp is 5 degrees to each side, 4 cm: as far as it matters to where its light goes.
+    np.testing.assert_allclose(images[0], images[1], rtol=0.1)
+    np.testing.assert_allclose(images[0].sum(axis=(0, 1)), images[1].sum(axis=(0, 1)), rtol=0.02)
 
 
 def wall(light: bool) -> Scene:

@@ -25,7 +25,7 @@ from warp_ar.kernels import path_tracer, structs
 from warp_ar.kernels.color import decode_table, encode_table
 from warp_ar.kernels.path_guides import make_guides
 from warp_ar.kernels.path_learning import learn_directions, make_squares
-from warp_ar.kernels.path_photons import follow_lights, follows_lights, make_light_image
+from warp_ar.kernels.path_photons import follow_lights, follows_lights, is_polished_one, make_light_image
 from warp_ar.kernels.path_picture import finish_picture, make_moments, map_reflectance
 from warp_ar.kernels.path_samples import add_samples, list_samples, make_round
 from warp_ar.kernels.path_sampling import make_sky
@@ -62,7 +62,7 @@ SAMPLE_BYTES = 512
 SLOT_BYTES = 2048
 """That must be free for each path of those that are followed side by side: four times what it takes."""
 PATHS_OF_LIGHTS = 0.25
-"""Paths from virtual lights per pixel and pass."""
+"""Paths from virtual lights per pixel and pass, and from near emitters."""
 FIRST_ROUND = 16
 """Samples per pixel after which something is learned from them; and again whenever there are twice as many."""
 AROUND = 9
@@ -223,7 +223,9 @@ class PathTracer:
         objects = self._local.guides.virtual_spheres if self._linear is not None else 0
         self._squares = make_squares(shape, objects, self.device)
         self._shares = wp.ones(shape, dtype=wp.float32, device=self.device)
-        self._image_of_lights = make_light_image(shape if self._follows_lights else (0, 0), self.device)
+        self._image_of_lights = make_light_image(
+            shape if self._follows_lights or self._follows_emitters else (0, 0), self.device
+        )
         self._sampled = wp.zeros(shape, dtype=wp.vec3, device=self.device)
         self._radiance = wp.zeros(shape, dtype=wp.vec3, device=self.device)
         self._error = wp.zeros(shape, dtype=wp.vec3, device=self.device)
@@ -239,9 +241,8 @@ class PathTracer:
         self._host.write_objects(objects, seconds)
         self._host.write_lights(lights, seconds)
         # Without a frame the first surface's reflectance is a factor of its paths, not of what they sum to.
-        self._follows_lights = self._linear is not None and follows_lights(
-            lights, objects, self._host.ray_scene.materials.numpy()
-        )
+        materials, known = self._host.ray_scene.materials.numpy(), self._linear is not None
+        self._follows_lights = known and follows_lights(lights, objects, materials)
         local.rays = self._host.ray_scene
         local.rays.objects = wp.array(objects, dtype=structs.Shape, device=device)
         local.lights = wp.array(lights, dtype=structs.Light, device=device)
@@ -257,6 +258,8 @@ class PathTracer:
                     record[:] = *proxy.material.reflectance, proxy.material.roughness
             local.gloss = wp.array(gloss, dtype=wp.vec4, device=device)
         local.sky = make_sky(radiance, device, emitters)
+        self._follows_emitters = known and local.sky.near_share > 0.0 and is_polished_one(objects, materials)
+        local.near_followed = self._follows_emitters
         local.guides = make_guides(objects, local.rays.materials.numpy(), balls, device)
         local.dfg = wp.zeros((DFG_SIZE, DFG_SIZE), dtype=wp.vec2, device=device)
         integrate_dfg(local.dfg)
@@ -316,16 +319,22 @@ class PathTracer:
 
     def _follow_lights(self, at_once: int) -> Iterator[None]:
         """Follow the paths of a pass from virtual lights, in parts as ``_in_parts`` has it."""
-        count = math.ceil(PATHS_OF_LIGHTS * self.camera.width * self.camera.height)
+        each = self._paths_of_each()
+        of_lights = each if self._follows_lights else 0
+        count = of_lights + (each if self._follows_emitters else 0)
 
         def trace(part: tuple[int, int] | None) -> None:
             follow_lights(
                 self._trace, self._params, self._local, self._image_of_lights,
-                count=count, seed=self.seed, number=self._followed, part=part,
+                count=count, of_lights=of_lights, seed=self.seed, number=self._followed, part=part,
             )  # fmt: skip
 
         yield from self._in_parts(follow_lights, trace, count, at_once)
         self._followed += 1
+
+    def _paths_of_each(self) -> int:
+        """Paths of a pass from virtual lights, and as many from near emitters, where either are followed."""
+        return math.ceil(PATHS_OF_LIGHTS * self.camera.width * self.camera.height)
 
     def _in_parts(
         self,
@@ -372,7 +381,7 @@ class PathTracer:
 
     def _brings_lights(self, asked: int) -> bool:
         """Whether a pass has paths from virtual lights as well."""
-        return self._follows_lights and asked == path_tracer.DIFFERENCE
+        return (self._follows_lights or self._follows_emitters) and asked == path_tracer.DIFFERENCE
 
     def _add(self, asked: int, count: int, first: int) -> None:
         """Make so many passes, as many of them in a round as it has room for."""
@@ -441,7 +450,7 @@ class PathTracer:
 
     def _finish(self) -> None:
         """Write picture and error of the samples so far."""
-        per_pixel = math.ceil(PATHS_OF_LIGHTS * self.camera.width * self.camera.height)
+        kinds = int(self._follows_lights) + int(self._follows_emitters)
         finish_picture(
             self._local,
             self._moments,
@@ -451,7 +460,7 @@ class PathTracer:
             self._error,
             self._sampled,
             self._image,
-            followed=self._followed * per_pixel / (self.camera.width * self.camera.height),
+            followed=self._followed * kinds * self._paths_of_each() / (self.camera.width * self.camera.height),
             exposure=self.exposure,
         )
 
