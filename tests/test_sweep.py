@@ -57,7 +57,7 @@ def test_truth_is_what_pictures_are_compared_with(case, device):
 
 def test_dominated_means_in_every_respect():
     def row(method, ms, flip, rmse):
-        return sweep_module.Row("c", "k", method, ms, ms, ArrayError(rmse, 0.0, 0.0), flip, "truth", flip, flip)
+        return sweep_module.Row("c", "k", method, ms, ArrayError(rmse, 0.0, 0.0), flip, "truth", flip, flip)
 
     rows = [row("a", 1.0, 0.3, 0.3), row("b", 2.0, 0.4, 0.4), row("c", 3.0, 0.3, 0.1), row("d", 4.0, 0.1, 0.1)]
     assert [sweep_module._is_dominated(one, rows) for one in rows] == [False, True, False, False]

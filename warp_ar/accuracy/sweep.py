@@ -48,7 +48,6 @@ class Row:
     setting: str
     method: str
     milliseconds: float
-    frame_milliseconds: float
     stage_error: ArrayError | None
     """Against the last method; None where sizes differ."""
     flip: float
@@ -141,7 +140,6 @@ def sweep(
                 setting.name,
                 method,
                 sum(own.values()),
-                outcome.milliseconds,
                 _stage_error(outcome, last),
                 picture_error(case, reference, outcome.images),
                 "truth" if case.truth else "last method",
