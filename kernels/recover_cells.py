@@ -26,6 +26,9 @@ FULL_TRUST = wp.constant(wp.float32(0.5))
 LOST = 0.02
 """Clipped share from which a cell's light is where it clips, not where nothing is seen, and the cell is in a region."""
 _LOST = wp.constant(wp.float32(LOST))
+BEYOND = wp.constant(wp.float32(0.25))
+"""Share of what clips in a cell, beyond proxies, from which what clips on them there is the same light: a pixel at their
+edge shows both."""
 MOST_LEFT = wp.constant(wp.float32(4.0))
 """How much more light what still clips of a cell may get because less of it clips."""
 
@@ -83,6 +86,10 @@ def make_condense_cells_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
         cell = Cell()
         toward = wp.vec3(0.0, 0.0, 0.0)
         lost_toward = wp.vec3(0.0, 0.0, 0.0)
+        # Of what lies on no proxy.
+        beyond_toward = wp.vec3(0.0, 0.0, 0.0)
+        beyond_clipped = wp.vec3(0.0, 0.0, 0.0)
+        beyond_missing = wp.vec3(0.0, 0.0, 0.0)
         for i in range(row * height // rows, (row + 1) * height // rows):
             area = texel_solid_angle(i, height, width)
             for j in range(column * width // columns, (column + 1) * width // columns):
@@ -96,6 +103,15 @@ def make_condense_cells_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
                 cell.hidden += area * (1.0 - trusted)
                 toward += area * direction
                 lost_toward += area * (lost[0] + lost[1] + lost[2]) * direction
+                if wp.max(lost) > 0.0 and not trace.occluded_by_proxies(scene, probes[0].center, direction, FAR):
+                    beyond_toward += area * (lost[0] + lost[1] + lost[2]) * direction
+                    beyond_clipped += area * lost
+                    beyond_missing += area * trusted * missing[i, j]
+        # Directions hardly differ within a cell: lengths of these sums are what was summed.
+        if wp.length(beyond_toward) > wp.max(BEYOND * wp.length(lost_toward), 0.0):
+            lost_toward = beyond_toward
+            cell.clipped = beyond_clipped
+            cell.missing = beyond_missing
         cell.radiance /= cell.solid_angle
         cell.clipped /= cell.solid_angle
         cell.missing /= cell.solid_angle
@@ -109,7 +125,8 @@ def make_condense_cells_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
         cell.direction = cell.middle
         if wp.length(lost_toward) > 0.0:
             cell.direction = wp.normalize(lost_toward)
-        if trace.occluded_by_proxies(scene, probes[0].center, cell.direction, FAR):
+        on_proxy = trace.occluded_by_proxies(scene, probes[0].center, cell.direction, FAR)
+        if on_proxy and not wp.length(beyond_toward) > BEYOND * wp.length(lost_toward):
             cell.modelled = 1.0
         cells_out[row, column] = cell
 
