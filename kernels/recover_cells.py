@@ -88,8 +88,6 @@ def make_condense_cells_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
         lost_toward = wp.vec3(0.0, 0.0, 0.0)
         # Of what lies on no proxy.
         beyond_toward = wp.vec3(0.0, 0.0, 0.0)
-        beyond_clipped = wp.vec3(0.0, 0.0, 0.0)
-        beyond_missing = wp.vec3(0.0, 0.0, 0.0)
         for i in range(row * height // rows, (row + 1) * height // rows):
             area = texel_solid_angle(i, height, width)
             for j in range(column * width // columns, (column + 1) * width // columns):
@@ -105,13 +103,10 @@ def make_condense_cells_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
                 lost_toward += area * (lost[0] + lost[1] + lost[2]) * direction
                 if wp.max(lost) > 0.0 and not trace.occluded_by_proxies(scene, probes[0].center, direction, FAR):
                     beyond_toward += area * (lost[0] + lost[1] + lost[2]) * direction
-                    beyond_clipped += area * lost
-                    beyond_missing += area * trusted * missing[i, j]
         # Directions hardly differ within a cell: lengths of these sums are what was summed.
-        if wp.length(beyond_toward) > wp.max(BEYOND * wp.length(lost_toward), 0.0):
+        is_beyond = wp.length(beyond_toward) > BEYOND * wp.length(lost_toward)
+        if is_beyond:
             lost_toward = beyond_toward
-            cell.clipped = beyond_clipped
-            cell.missing = beyond_missing
         cell.radiance /= cell.solid_angle
         cell.clipped /= cell.solid_angle
         cell.missing /= cell.solid_angle
@@ -125,8 +120,7 @@ def make_condense_cells_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
         cell.direction = cell.middle
         if wp.length(lost_toward) > 0.0:
             cell.direction = wp.normalize(lost_toward)
-        on_proxy = trace.occluded_by_proxies(scene, probes[0].center, cell.direction, FAR)
-        if on_proxy and not wp.length(beyond_toward) > BEYOND * wp.length(lost_toward):
+        if not is_beyond and trace.occluded_by_proxies(scene, probes[0].center, cell.direction, FAR):
             cell.modelled = 1.0
         cells_out[row, column] = cell
 
