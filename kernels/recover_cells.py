@@ -26,6 +26,8 @@ FULL_TRUST = wp.constant(wp.float32(0.5))
 LOST = 0.02
 """Clipped share from which a cell's light is where it clips, not where nothing is seen, and the cell is in a region."""
 _LOST = wp.constant(wp.float32(LOST))
+BEYOND = wp.constant(wp.float32(0.25))
+"""Share of what clips in a cell that lies beyond proxies from which what clips on them there is the same light."""
 MOST_LEFT = wp.constant(wp.float32(4.0))
 """How much more light what still clips of a cell may get because less of it clips."""
 
@@ -57,6 +59,85 @@ def trust(confidence: wp.float32) -> wp.float32:
 
 
 @functools.cache
+def make_leave_out_edges_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
+    """Kernel for the given kinds of proxy."""
+    trace = make_trace(TraceConfig(objects=(), proxies=proxies))
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=QUICK_TO_COMPILE)
+    def leave_out_edges_kernel(
+        # In:
+        row_start: wp.int32,
+        clipped: wp.array2d[wp.vec3],
+        probes: wp.array[Probe],
+        scene: RayScene,
+        rows: wp.int32,
+        # Out:
+        missing_out: wp.array2d[wp.vec3],
+    ):
+        """One cell of ``rows`` x 2 ``rows``."""
+        band_row, column = wp.tid()
+        row = row_start + band_row
+        height = clipped.shape[0]
+        width = clipped.shape[1]
+        on = wp.float32(0.0)
+        beyond = wp.float32(0.0)
+        turn = wp.int32(0)
+        while turn < 2:
+            for i in range(row * height // rows, (row + 1) * height // rows):
+                for j in range(column * width // (2 * rows), (column + 1) * width // (2 * rows)):
+                    share = clipped[i, j]
+                    if wp.max(share) > 0.0:
+                        direction = direction_from_latlong(wp.float32(i) + 0.5, wp.float32(j) + 0.5, height, width)
+                        area = texel_solid_angle(i, height, width) * (share[0] + share[1] + share[2])
+                        if not trace.occluded_by_proxies(scene, probes[0].center, direction, FAR):
+                            beyond += area
+                        elif turn == 0:
+                            on += area
+                        else:
+                            missing_out[i, j] = wp.vec3(0.0, 0.0, 0.0)
+            # A second time where both clip, and enough of it beyond.
+            turn += 1
+            if not (on > 0.0 and beyond > BEYOND * (on + beyond)):
+                turn = wp.int32(2)
+
+    return leave_out_edges_kernel
+
+
+def leave_out_edges(
+    clipped: wp.array,
+    probes: wp.array,
+    scene: RayScene,
+    missing_out: wp.array,
+    *,
+    proxies: tuple[int, ...],
+    rows: Rows | None = None,
+) -> None:
+    """Let proxies lack nothing beside what clips behind their edge.
+
+    A pixel of the ball that shows the edge of a table and the light behind it clips, and so may its neighbours: texels
+    of the table lack light then that comes from beyond it. Where a quarter of what clips in a cell or more lies beyond
+    proxies, what clips on them there is left out.
+
+    Args:
+        clipped: Share at clipping per channel, ``wp.vec3`` (h, w).
+        probes: ``Probe`` (P), at least one: the ball.
+        scene: Its proxies are known surfaces.
+        missing_out: From ``weigh_boundaries``, ``wp.vec3`` (h, w); set to 0 there.
+        proxies: Kinds of proxy in the scene.
+        rows: Band of rows of cells, None for all.
+    """
+    shape = cell_shape(*clipped.shape)
+    launch_rows(
+        make_leave_out_edges_kernel(proxies),
+        shape,
+        [clipped, probes, scene, shape[0]],
+        [missing_out],
+        rows=rows,
+        device=clipped.device,
+    )
+
+
+@functools.cache
 def make_condense_cells_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
     """Kernel for the given kinds of proxy."""
     trace = make_trace(TraceConfig(objects=(), proxies=proxies))
@@ -83,6 +164,9 @@ def make_condense_cells_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
         cell = Cell()
         toward = wp.vec3(0.0, 0.0, 0.0)
         lost_toward = wp.vec3(0.0, 0.0, 0.0)
+        # Of what was not left out.
+        kept = wp.vec3(0.0, 0.0, 0.0)
+        kept_toward = wp.vec3(0.0, 0.0, 0.0)
         for i in range(row * height // rows, (row + 1) * height // rows):
             area = texel_solid_angle(i, height, width)
             for j in range(column * width // columns, (column + 1) * width // columns):
@@ -96,6 +180,12 @@ def make_condense_cells_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
                 cell.hidden += area * (1.0 - trusted)
                 toward += area * direction
                 lost_toward += area * (lost[0] + lost[1] + lost[2]) * direction
+                if wp.max(missing[i, j]) > 0.0:
+                    kept += area * lost
+                    kept_toward += area * (lost[0] + lost[1] + lost[2]) * direction
+        if wp.max(kept) > 0.0:
+            cell.clipped = kept
+            lost_toward = kept_toward
         cell.radiance /= cell.solid_angle
         cell.clipped /= cell.solid_angle
         cell.missing /= cell.solid_angle
@@ -128,7 +218,7 @@ def condense_cells(
     proxies: tuple[int, ...],
     rows: Rows | None = None,
 ) -> None:
-    """Condense a map to cells.
+    """Condense a map to cells. What clips and yet lacks nothing, for ``leave_out_edges`` said so, does not count.
 
     Args:
         radiance: ``wp.vec3`` (h, w), complete.

@@ -11,7 +11,7 @@ import warp as wp
 from tests.recover_rig import probes_of, scene  # noqa: F401
 from tests.reference import recover as reference
 from warp_ar.kernels import structs
-from warp_ar.kernels.recover_cells import Cell, add_recovered, cell_shape, condense_cells
+from warp_ar.kernels.recover_cells import Cell, add_recovered, cell_shape, condense_cells, leave_out_edges
 from warp_ar.kernels.saturation_boundaries import weigh_boundaries
 from warp_ar.scene.kinds import trace_config
 from warp_ar.scene.ray_scene import HostScene
@@ -122,3 +122,39 @@ def test_cells_keep_energy_and_recovered_returns_it(device, height, scene):
         added = (area * (put_back.numpy() - radiance)).sum((0, 1))
         left = np.minimum(got["missing"], 4.0 * now.numpy()["missing"])
         assert added == pytest.approx((weight * left * recovered).sum((0, 1)), rel=1e-4, abs=1e-6)
+
+
+@pytest.mark.parametrize("height", [32, 128])
+def test_what_clips_on_a_proxy_beside_light_behind_its_edge_is_left_out(device, height, scene):
+    plane = dataclasses.replace(scene, objects=(), proxies=tuple(one for one in scene.proxies if one.shape == "plane"))
+    shape = (height, 2 * height)
+    d, area = reference.cell_directions(*shape)
+    d, area = d.reshape(*shape, 3), area.reshape(shape)
+    # The plane lies in z = 0 and reaches .8 and .6 metres from the origin.
+    center, half = np.array([-0.12, 0.03, 0.035]), np.array([0.8, 0.6])
+    reach = np.where(d[..., 2] < 0.0, -center[2] / np.minimum(d[..., 2], -1e-9), np.inf)
+    on = (np.abs(center[:2] + reach[..., None] * d[..., :2]) < half).all(axis=-1) & np.isfinite(reach)
+    clipped = (np.random.default_rng(2).uniform(0, 1, shape) > 0.5).astype(float)[..., None] * np.ones(3)
+    # Below, all clips that is the plane, and nothing else is there.
+    clipped[d[..., 2] < -0.3] = 1.0
+    weight = area * clipped[..., 0]
+    rows, columns = cell_shape(*shape)
+    sums = [(weight * of).reshape(rows, height // rows, columns, -1).sum(axis=(1, 3)) for of in (on, ~on)]
+    is_edge = (sums[0] > 0.0) & (sums[1] > 0.25 * (sums[0] + sums[1]))
+    assert is_edge.any() == (height > 32)
+    left = np.kron(is_edge, np.ones((height // rows, height // rows))).astype(bool) & on
+    missing = wp.array(clipped.astype(np.float32), dtype=wp.vec3, device=device)
+    host, proxies = HostScene(plane, device), trace_config(plane).proxies
+    source = wp.array(clipped.astype(np.float32), dtype=wp.vec3, device=device)
+    leave_out_edges(source, probes_of(device), host.ray_scene, missing, proxies=proxies)
+    assert (missing.numpy() == np.where(left[..., None], 0.0, clipped)).all()
+    # A cell's light is what is left: it lies beyond the plane, and the cell is no part of that.
+    seen = wp.full(shape, 1.0, dtype=wp.float32, device=device)
+    cells = wp.zeros((rows, columns), dtype=Cell, device=device)
+    condense_cells(source, seen, source, missing, probes_of(device), host.ray_scene, cells, proxies=proxies)
+    got = cells.numpy()
+    assert not got["modelled"][is_edge].any()
+    kept = (area * clipped[..., 0] * ~left).reshape(rows, height // rows, columns, -1).sum(axis=(1, 3))
+    total = area.reshape(rows, height // rows, columns, -1).sum(axis=(1, 3))
+    assert got["clipped"][is_edge] == pytest.approx((kept / total)[is_edge][:, None] * np.ones(3), rel=1e-4)
+    assert got["missing"][is_edge] == pytest.approx((kept / total)[is_edge][:, None] * np.ones(3), rel=1e-4)

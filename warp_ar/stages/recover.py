@@ -17,7 +17,7 @@ from warp_ar.kernels import change, relocate
 from warp_ar.kernels import recover as kernels
 from warp_ar.kernels.launch import copy
 from warp_ar.kernels.light_level import apply_level, follow_level, sum_upward
-from warp_ar.kernels.recover_cells import Cell, add_recovered, cell_shape, condense_cells
+from warp_ar.kernels.recover_cells import Cell, add_recovered, cell_shape, condense_cells, leave_out_edges
 from warp_ar.kernels.saturation_boundaries import weigh_boundaries
 from warp_ar.kernels.structs import Emitter
 from warp_ar.light import recovery
@@ -208,6 +208,7 @@ class Recover(Stage):
             Pass(self._take, on_host=True, enabled=lambda: self._arrives, beforehand=True),
             # What clips is known before the map is filled.
             Pass(self._weigh, rows=self.request.quality.environment_height, reads=("environment_clipped", "pose")),
+            Pass(self._leave_out, rows=arrays["recover_cells_now"].shape[0], enabled=lambda: bool(self._proxies)),
             Pass(self._condense, rows=arrays["recover_cells_now"].shape[0], enabled=lambda: self._asks),
             Pass(self._observe, rows=points, enabled=lambda: self._asks),
             Pass(self._transfer, rows=points, enabled=lambda: self._asks),
@@ -269,6 +270,17 @@ class Recover(Stage):
         arrays = self._arrays
         weigh_boundaries(
             arrays["environment_clipped"], arrays["params"], arrays["probes"], arrays["recover_missing"], rows=rows
+        )
+
+    def _leave_out(self, rows: Rows | None) -> None:
+        arrays = self._arrays
+        leave_out_edges(
+            arrays["environment_clipped"],
+            arrays["probes"],
+            arrays["ray_scene"],
+            arrays["recover_missing"],
+            proxies=self._proxies,
+            rows=rows,
         )
 
     def _condense(self, rows: Rows | None) -> None:
