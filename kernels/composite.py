@@ -5,6 +5,9 @@
 in linear light; ``virtual`` is premultiplied by its coverage alpha. A pixel that none of these layers changes keeps
 the frame's code bit for bit, whatever the transfer. Layers count only inside their rectangle of ``FrameParams``: what
 an earlier frame left elsewhere is not seen, and not read.
+
+What is drawn ends at the codes where the camera's channels saturate, but no darker than the frame is there: beside its
+lamps, nothing else is as bright.
 """
 
 from __future__ import annotations
@@ -24,7 +27,7 @@ from warp_ar.kernels.codes import (
     set_code,
     store_codes,
 )
-from warp_ar.kernels.color import ENCODE_KEYS, decode, encode
+from warp_ar.kernels.color import ENCODE_KEYS, below_saturation, decode, encode, saturation_codes
 from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.structs import FrameParams
 from warp_ar.kernels.visibility import inside_rect
@@ -116,7 +119,7 @@ def compose(radiance: wp.vec3, at: LayersAt) -> wp.vec3:
 
 # A row on CPU, sixteen pixels at a time: their 48 values go side by side through the processor's vectors, all but the
 # tables' look-ups; a block that no layer touches is copied. Every product and sum is rounded by itself and in the order
-# of ``compose`` and ``encode_channel``, which it equals in all bits.
+# of ``compose``, ``encode_channel`` and ``below_saturation``, which it equals in all bits.
 @wp.func_native(
     """
 #if !defined(__CUDA_ARCH__)
@@ -127,6 +130,10 @@ def compose(radiance: wp.vec3, at: LayersAt) -> wp.vec3:
     unsigned char* out = reinterpret_cast<unsigned char*>(image.data) + size_t(row) * 3 * width;
     const float* decoded = reinterpret_cast<const float*>(decode_table.data);
     const float* table = reinterpret_cast<const float*>(encode_table.data);
+    wp::int32 level[3] = {255, 255, 255};
+    if (decode_table.shape[0] > 256)
+        for (int c = 0; c < 3; ++c) level[c] = static_cast<wp::int32>(decoded[3 * 256 + c] + 0.5f);
+    const bool ends = level[0] < 255 || level[1] < 255 || level[2] < 255;
 
     // Columns that each layer reaches in this row, and where it lies.
     struct Layer { const float* at; int start, stop; };
@@ -248,6 +255,11 @@ def compose(radiance: wp.vec3, at: LayersAt) -> wp.vec3:
             for (int i = 0; i < 3 * N; ++i)
                 if (steps[i] != static_cast<float>(static_cast<wp::int32>(steps[i])))
                     while (x[i] >= table[3 * (2 * keys + found[i]) + i % 3]) ++found[i];
+        if (ends)
+            for (int i = 0; i < 3 * N; ++i) {
+                const wp::int32 most = code[i] > level[i % 3] ? code[i] : level[i % 3];
+                found[i] = found[i] < most ? found[i] : most;
+            }
         if (whole) {
             for (int i = 0; i < 3 * N; ++i) code[i] = static_cast<unsigned char>(found[i]);
         } else {
@@ -323,8 +335,9 @@ def make_composite_kernel(config: CompositeConfig, warps: bool) -> wp.Kernel:
                 if j < frame.shape[1]:
                     at = read_layers(params, layers, i, j)
                     if is_changed(at):
-                        radiance = compose(decode(decode_table, get_code(codes, k)), at)
-                        set_code(codes, k, encode(encode_table, radiance))
+                        shown = get_code(codes, k)
+                        made = encode(encode_table, compose(decode(decode_table, shown), at))
+                        set_code(codes, k, below_saturation(made, shown, saturation_codes(decode_table)))
                 k += WARP_LANES
             store_codes(codes, image_out, i, first)
         else:
@@ -332,7 +345,8 @@ def make_composite_kernel(config: CompositeConfig, warps: bool) -> wp.Kernel:
                 code = frame[i, j]
                 at = read_layers(params, layers, i, j)
                 if is_changed(at):
-                    code = encode(encode_table, compose(decode(decode_table, code), at))
+                    made = encode(encode_table, compose(decode(decode_table, code), at))
+                    code = below_saturation(made, code, saturation_codes(decode_table))
                 image_out[i, j] = code
 
     return composite_kernel
@@ -377,10 +391,11 @@ def composite(
         config: Which layers there are.
         params: (1,) FrameParams; its rectangles bound the layers.
         frame: (H, W) vec3ub, the camera's frame, RGB, contiguous.
-        decode_table: (256,) vec3 of ``color.decode_table``.
+        decode_table: (257,) vec3 of ``color.camera_table``, or (256,) of ``color.decode_table``.
         encode_table: Table of ``color.encode_table``.
         layers: From ``make_layers``.
-        image_out: (H, W) vec3ub, contiguous; values above clipping give 255, NaN gives 0.
+        image_out: (H, W) vec3ub, contiguous; values above clipping give the code where the camera
+            saturates or the frame's, whichever is more; NaN gives 0.
         rows: Band of rows; None means all.
     """
     height, width = frame.shape

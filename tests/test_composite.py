@@ -58,15 +58,28 @@ def make_arrays(virtual=None, added=None, ratio=None, mirror_ball=None):
 
 
 def run(
-    config, frame, virtual=None, added=None, ratio=None, mirror_ball=None, params=None, transfer="srgb", bands=(None,)
+    config,
+    frame,
+    virtual=None,
+    added=None,
+    ratio=None,
+    mirror_ball=None,
+    params=None,
+    transfer="srgb",
+    bands=(None,),
+    saturation=None,
 ):
+    decode, encode = tables(transfer)
+    if saturation is not None:
+        decode = wp.array(color.camera_table(transfer, saturation), dtype=wp.vec3)
     out = wp.full(frame.shape[:2], wp.vec3ub(7, 7, 7), dtype=wp.vec3ub)
     for rows in bands:
         composite.composite(
             config,
             params or make_params(),
             wp.array(frame, dtype=wp.vec3ub),
-            *tables(transfer),
+            decode,
+            encode,
             make_arrays(virtual, added, ratio, mirror_ball),
             out,
             rows=rows,
@@ -92,6 +105,24 @@ def test_what_nothing_touches_stays_bit_for_bit(device, config, transfer):
     black = np.zeros((H, W, 3), np.float32)
     empty = np.zeros((H, W, 4), np.float32), black, np.ones((H, W, 3), np.float32), black
     np.testing.assert_array_equal(run(config, frame, *empty, transfer=transfer), frame)
+
+
+@pytest.mark.parametrize("saturation", [(238, 236, 255), (255, 255, 255)], ids=str)
+@pytest.mark.parametrize("config", CONFIGS, ids=str)
+def test_what_is_drawn_ends_where_the_camera_does(device, config, saturation):
+    """No brighter than that, but no darker than the frame; what no layer touches stays, however bright."""
+    frame, virtual, added, ratio, mirror_ball = make_layers(3)
+    virtual[..., :3] *= 3.0
+    untouched = (np.arange(W) % 3 == 0) | (np.arange(W) > 30)
+    for layer, neutral in ((virtual, 0.0), (added, 0.0), (ratio, 1.0), (mirror_ball, 0.0)):
+        layer[:, untouched] = neutral
+    layers = virtual, 3.0 * added, ratio, mirror_ball
+    without = run(config, frame, *layers)
+    expected = np.minimum(without, np.maximum(frame, np.array(saturation, np.uint8)))
+    expected[:, untouched] = frame[:, untouched]
+    np.testing.assert_array_equal(run(config, frame, *layers, saturation=saturation), expected)
+    if config.virtual or config.added:
+        assert (expected != without).any() == (min(saturation) < 255)
 
 
 @pytest.mark.parametrize("config", CONFIGS, ids=str)
