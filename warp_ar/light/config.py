@@ -226,6 +226,10 @@ class EvidenceConfig:
     not know: from its horizon, and from below it."""
     flatter: float = 1.5
     """How much more light there may be, for the same effect on the card, than as the card alone has it."""
+    exposed: float = 0.1
+    """Logarithm of a camera's gain from which a frame is another exposure of what was seen before."""
+    same: float = 0.2
+    """Relative difference of irradiance, over all directions, below which light is what it was."""
     interval: float = 2.5
     """Standard deviations of the draws that an interval of irradiance reaches to either side."""
     found: float = 0.3

@@ -47,7 +47,7 @@ gives equal output.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -119,6 +119,9 @@ class Recovery:
         self._stillness = Stillness()
         self._blocks = blocks_of(surfaces)
         self._evidence: _Evidence | None = None
+        self._told: _Told | None = None
+        self.gain = np.ones(3)
+        """Of the camera in the next frame that is estimated from, (3,); its values are light times this."""
         self._held: Estimate | None = None
         self._unseen = 0
         self._steadiness = Steadiness()
@@ -215,7 +218,8 @@ class Recovery:
                 solution, taken = np.concatenate([radiance_by_card, np.zeros((len(powers), 3))]), by_card
             reaching = reaching_factor(problem, solution, Ball(self._center, self._radius))
             known = known_share(problem, taken, by_card, bounds)
-            self._evidence = dataclasses.replace(evidence, factor=known * min(evidence.factor, reaching))
+            evidence = dataclasses.replace(evidence, factor=known * min(evidence.factor, reaching))
+            self._evidence = self._by_exposures(problem, evidence, {"shading": recovered, "white_card": by_card})
         evidence = self._evidence
         if evidence.method == "shading":
             self._held = self._estimate(problem, recovered, bounds, *evidence.parts, card, tuple(emitters))
@@ -232,13 +236,39 @@ class Recovery:
         self._unseen += 1
         if self._held is not None and self._unseen <= CONFIG.card.held:
             return self._held
-        self._held, self._candidates, self._evidence = None, [], None
+        self._held, self._candidates, self._evidence, self._told = None, [], None, None
         rows, columns = problem.shape
         maps = (side.reshape(rows, columns, 3) for side in (problem.radiance, problem.lost))
         is_light = ~problem.modelled & (problem.hidden <= 0.0)
         by_cell = (part.reshape(rows, columns) for part in (problem.solid_angle, is_light))
         least = least_missing(*maps, *by_cell).reshape(-1, 3)
         return self._estimate(problem, least, (True, True, True), "least", float(least.any()), card)
+
+    def _by_exposures(self, problem: Problem, evidence: _Evidence, solutions: Mapping[str, Array]) -> _Evidence:
+        """That of another exposure of the same light, where draws scattered less in it.
+
+        At a shorter exposure less clips, and what the card lacks falls below its own error, though what clips still
+        lacks most of the light from its side. How far solutions can be relied on, surfaces and response tell, which
+        stay. It holds only if it gives the light that was known there.
+
+        Args:
+            problem: The frame's equations.
+            evidence: Of the frame.
+            solutions: By method, (cells, 3).
+        """
+        form, told = irradiance_form(problem, spread_directions(CONFIG.evidence.directions)), self._told
+
+        def light(by: _Evidence) -> Array:
+            recovered = problem.radiance + by.factor * solutions[by.method] * problem.missing
+            return np.asarray(form @ recovered / self.gain)
+
+        if told is not None and np.abs(np.log(self.gain / told.gain)).max() > CONFIG.evidence.exposed:
+            difference = np.linalg.norm(light(told.evidence) - told.light, axis=0)
+            same = difference < CONFIG.evidence.same * np.linalg.norm(told.light, axis=0)
+            if told.evidence.spread < evidence.spread and same.all():
+                return told.evidence
+        self._told = _Told(evidence, self.gain.copy(), light(evidence))
+        return evidence
 
     def _search(self, problem: Problem, means: Array) -> bool:
         """Try candidates of former frames, one of them moved, and new ones where it is their turn to be looked for.
@@ -304,6 +334,17 @@ class _Evidence:
     @property
     def parts(self) -> tuple[str, float]:
         return self.method, self.factor
+
+
+@dataclasses.dataclass(frozen=True)
+class _Told:
+    """Evidence, and the light that it gave."""
+
+    evidence: _Evidence
+    gain: Array
+    """Of the camera, (3,)."""
+    light: Array
+    """Irradiance at gain 1, (directions, 3)."""
 
 
 def _weigh(

@@ -411,6 +411,7 @@ class Recover(Stage):
         self._equations.fetch(self._stream, self._frames_stream)
         now = self._progress
         now.gain = self._arrays["gain"]()
+        now.solver.gain = np.array(now.gain, float)
         if self._has_process:
             POOL.prepare()
         # In this process a solution holds the interpreter's lock, which frames beside it wait for. Where a frame waits
