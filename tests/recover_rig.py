@@ -133,8 +133,8 @@ class DistantLight:
         )
         return out.numpy().astype(float)
 
-    def estimate(self, radiance, method="shading", extra=0.0, exposure=1.0, frames=1, camera=None):
-        """Estimate from the true radiance of cells, (m, 3); ``extra`` is irradiance that does not come from cells."""
+    def equations(self, radiance, extra=0.0, exposure=1.0):
+        """What a solver is given of a frame; arguments as for ``estimate``."""
         values, _ = cells_of(self.device, np.minimum(radiance, 1.0).reshape(CELL_ROWS, CELL_COLUMNS, 3))
         values["clipped"] = values["missing"] = (radiance >= 1.0).reshape(CELL_ROWS, CELL_COLUMNS, 3)
         down = values["direction"][..., 2] < -0.05
@@ -148,12 +148,20 @@ class DistantLight:
         observed = np.zeros(len(shown), np.dtype(kernels.Observation.numpy_dtype()))
         observed["radiance"], observed["clipped"] = np.minimum(shown, 1.0), shown >= 1.0
         observed["visible"] = ~self.hidden
-        solver = recovery.Recovery(
+        return values, straight, mirrored, observed
+
+    def solver(self, method="shading"):
+        """One that has seen nothing yet."""
+        return recovery.Recovery(
             self.surfaces, self.scene.marker.white, (-0.12, 0.03, 0.035), radius=0.035, method=method
         )
+
+    def estimate(self, radiance, method="shading", extra=0.0, exposure=1.0, frames=1, camera=None):
+        """Estimate from the true radiance of cells, (m, 3); ``extra`` is irradiance that does not come from cells."""
+        given, solver = self.equations(radiance, extra, exposure), self.solver(method)
         for _ in range(frames):
-            estimate = solver.update(values, straight, mirrored, observed, self.trace, camera)
-        return estimate, values
+            estimate = solver.update(*given, self.trace, camera)
+        return estimate, given[0]
 
 
 def lit_environment(*lights):

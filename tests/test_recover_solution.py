@@ -374,6 +374,29 @@ def test_estimates_are_reproducible_and_steady(device, scene):
     assert later.sum() == pytest.approx(once.sum(), rel=0.05)
 
 
+def factor_of(surroundings, *frames):
+    """Share of a solution that is taken, after frames of (radiance, gain of the camera)."""
+    solver = surroundings.solver()
+    for radiance, gain in frames:
+        solver.gain = np.full(3, gain)
+        estimate = solver.update(*surroundings.equations(gain * radiance), surroundings.trace)
+    return estimate.factor
+
+
+def test_what_one_exposure_tells_of_light_holds_at_another_of_the_same_light_only(device, scene):
+    """At two fifths of the exposure a low sun hardly clips, and what the card then lacks is within its error."""
+    surroundings = DistantLight(device, scene, noise=0.1)
+    sun, _, _ = lit_environment(((-0.8, -0.5, 0.25), 0.97, 2.8))
+    elsewhere, _, _ = lit_environment(((0.8, -0.5, 0.25), 0.97, 2.8))
+    alone = factor_of(surroundings, (sun, 0.4))
+    assert alone < 0.5
+    assert factor_of(surroundings, (sun, 1.0)) > 0.95
+    assert factor_of(surroundings, (sun, 1.0), (sun, 0.4)) > 0.95
+    # The sun went, another came; nothing is known of it. Nor is one exposure more told by itself.
+    assert factor_of(surroundings, (elsewhere, 1.0), (sun, 0.4)) == pytest.approx(alone, abs=0.1)
+    assert factor_of(surroundings, (sun, 0.4), (sun, 0.4)) == pytest.approx(alone, abs=0.1)
+
+
 def test_all_that_is_estimated_is_finite_for_absurd_frames(device, scene):
     """Everything clipped, and everything black."""
     for value in (0.0, 1e6):
