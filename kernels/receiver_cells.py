@@ -10,8 +10,8 @@ is too much, and the receiver would be taken for darker than it is. So per cell,
 
 which is 1 to the bit where nothing is hidden. Only cells that virtual light falls on are asked: first those that a
 light shines on, then, once it is known what these send on, those that are reached by that.
-What hides light sends some itself: a ball its reflectance times the mean of what its normal faces, a box as grey paper
-would. Planes hide nothing: the ball has seen them where the environment has them. A CUDA device has several threads
+What hides light sends some itself: a ball its reflectance times the mean of what its normal faces, a box what the
+camera sees of it there, and where it sees nothing what grey paper would. Planes hide nothing: the ball has seen them where the environment has them. A CUDA device has several threads
 share the samples of a cell; their sums are added in one order, so that the same frame gives the same bits.
 
 **Bounced light.** A lit proxy lights the others. Every cell of a coarse grid is a patch: radiance L that virtual light
@@ -38,6 +38,7 @@ from warp_ar.kernels.interpolated_irradiance import make_irradiance_at
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch, launch_rows
 from warp_ar.kernels.probe_weights import probe_share
 from warp_ar.kernels.receiver import DEFAULT_REFLECTANCE, Receiver, ReceiverCells, RelightConfig, look_up_bounced
+from warp_ar.kernels.reflect import look_up, make_find_in_frame
 from warp_ar.kernels.relight import make_direct_lighting
 from warp_ar.kernels.shadow import sample_light, tile_turn
 from warp_ar.kernels.shapes import intersect_sphere, surface_key
@@ -166,13 +167,16 @@ class Hider:
 
 @functools.cache
 def make_find_hider(config: CellConfig) -> wp.Function:
-    """``find_hider(scene, receiver, hit, toward, solids) -> Hider``; ``solids`` of ``bound_solids``."""
+    """``find_hider(params, scene, receiver, hit, toward, solids) -> Hider``; ``solids`` of ``bound_solids``."""
     mean_facing = make_mean_facing(config)
+    find_in_frame = make_find_in_frame(config.trace, config.relight.probes)
     closest_proxy = make_trace(config.trace).closest_proxy
     only_planes = set(config.trace.proxies) <= {PLANE}
 
     @wp.func(module="unique")
-    def find_hider(scene: RayScene, receiver: Receiver, hit: Hit, toward: Incidence, solids: wp.vec4) -> Hider:
+    def find_hider(
+        params: FrameParams, scene: RayScene, receiver: Receiver, hit: Hit, toward: Incidence, solids: wp.vec4
+    ) -> Hider:
         found = Hider()
         nearest = toward.distance
         for index in range(receiver.probes.shape[0]):
@@ -192,11 +196,15 @@ def make_find_hider(config: CellConfig) -> wp.Function:
                 hidden = closest_proxy(scene, origin, toward.direction, nearest)
                 if hidden.shape >= 0:
                     if scene.proxies[hidden.shape].kind != PLANE:
-                        facing = hidden.normal
-                        if wp.dot(facing, toward.direction) > 0.0:
-                            facing = -facing
                         found.hides = True
-                        found.radiance = DEFAULT_REFLECTANCE * mean_facing(receiver, hidden.point, facing)
+                        at = find_in_frame(params, receiver.picture, scene, receiver.probes, hidden)
+                        if at[0] >= 0.0:
+                            found.radiance = look_up(receiver.picture, at[0], at[1])
+                        else:
+                            facing = hidden.normal
+                            if wp.dot(facing, toward.direction) > 0.0:
+                                facing = -facing
+                            found.radiance = DEFAULT_REFLECTANCE * mean_facing(receiver, hidden.point, facing)
         return found
 
     return find_hider
@@ -279,7 +287,7 @@ def make_ambient_visibility_kernel(config: CellConfig) -> wp.Kernel:
                     toward.measure *= probe_share(places, ball_of_sample(k, places.shape[0]), hit.point)
                 flux = cosine * toward.measure * sample.radiance
                 whole += flux
-                hider = find_hider(scene, receiver, hit, toward, solids)
+                hider = find_hider(params[0], scene, receiver, hit, toward, solids)
                 if hider.hides:
                     lost += cosine * toward.measure * (sample.radiance - hider.radiance)
         if partials > 1:
