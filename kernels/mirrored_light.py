@@ -101,7 +101,7 @@ def find_mirroring(light: Light, probe: Probe, point: wp.vec3) -> Mirroring:
         return out
     out.wi = -leaving / out.distance
     cosine = -wp.dot(out.wi, normal)
-    if not cosine > MIN_COSINE:  # NaN as well
+    if cosine <= MIN_COSINE:
         return out
     from_light = float(0.0)  # 1 / d
     if light.kind != DIRECTIONAL:
