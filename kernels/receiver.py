@@ -109,8 +109,6 @@ class RelightConfig:
     """Whether the light of several mirror balls is interpolated."""
     area_samples: int = 0
     """Samples of what emits, per point; ``area_lights.POINT_SAMPLES``: as lights at points; 0: nothing emits."""
-    mirrored: bool = False
-    """Whether mirror balls throw light on the receiver (``kernels/mirrored_light.py``)."""
 
     def general(self, *, soft: bool, by_call: bool = False) -> RelightConfig:
         """For any scene in which as much is known of the receiver; ``by_call`` as in ``TraceConfig.general``."""

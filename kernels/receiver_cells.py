@@ -36,7 +36,6 @@ from warp_ar.kernels.cells import cell_pixel
 from warp_ar.kernels.environment_samples import EnvironmentSample, Incidence, ball_of_sample, sample_toward
 from warp_ar.kernels.interpolated_irradiance import make_irradiance_at
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch, launch_rows
-from warp_ar.kernels.mirrored_light import within_reach
 from warp_ar.kernels.probe_weights import probe_share
 from warp_ar.kernels.receiver import DEFAULT_REFLECTANCE, Receiver, ReceiverCells, RelightConfig, look_up_bounced
 from warp_ar.kernels.reflect import look_up, make_find_in_frame
@@ -270,8 +269,6 @@ def make_ambient_visibility_kernel(config: CellConfig) -> wp.Kernel:
             needed = sent[0] + sent[1] + sent[2] > 0.0
         else:
             needed = is_shone_on(lights, hit)
-            if wp.static(config.relight.mirrored):
-                needed = needed or within_reach(receiver.probes, hit.point)
         if not needed:
             return
         if partial == 0:
@@ -327,7 +324,7 @@ def reduce_partials_kernel(
 def make_send_light_kernel(config: CellConfig) -> wp.Kernel:
     """Kernel of ``send_light``."""
     visible_proxy = make_visible_proxy(config.trace, config.relight.probes)
-    direct_lighting = make_direct_lighting(dataclasses.replace(config.relight, bounced=False, mirrored=False))
+    direct_lighting = make_direct_lighting(dataclasses.replace(config.relight, bounced=False))
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def send_light_kernel(

@@ -7,8 +7,6 @@ irradiance E_v (facing it) arrives there along wi, unless a virtual object or a 
 
 Kd and the response are the receiver's: ``kernels/receiver.py`` has the methods and their equations.
 
-A mirror ball throws light on: ``kernels/mirrored_light.py`` has what arrives by way of it.
-
 With *cells* (``kernels/receiver_cells.py``) a receiver's reflectance knows the part of the environment that boxes and
 balls let through, and the irradiance by virtual light that lit proxies send to each other is added to the direct one:
 
@@ -30,7 +28,6 @@ from warp_ar.kernels.area_lights import make_area_count, make_area_sample
 from warp_ar.kernels.cells import any_cell_above_zero
 from warp_ar.kernels.edges import EdgeList, EdgeLists, holds_all, list_edge, listed_edges, sample_listed_edges
 from warp_ar.kernels.launch import MOST_REGISTERS, QUICK_TO_COMPILE, Rows, launch_rows, slow_to_compile
-from warp_ar.kernels.mirrored_light import find_mirroring, within_reach
 from warp_ar.kernels.pixel_order import own_pixel
 from warp_ar.kernels.receiver import (
     DEFAULT_REFLECTANCE,
@@ -42,8 +39,8 @@ from warp_ar.kernels.receiver import (
     make_respond,
 )
 from warp_ar.kernels.shadow import LightSample, has_penumbra, make_shadow, make_visible_share, sample_light, tile_turn
-from warp_ar.kernels.shapes import FAR, intersect_sphere, surface_key
-from warp_ar.kernels.structs import FrameParams, Hit, Light, Probe, RayScene
+from warp_ar.kernels.shapes import FAR, surface_key
+from warp_ar.kernels.structs import FrameParams, Hit, Light, RayScene
 from warp_ar.kernels.trace import make_trace, meets_probe
 from warp_ar.kernels.visibility import inside_rect, make_sample_direction
 
@@ -96,59 +93,6 @@ def make_area_response(config: RelightConfig) -> wp.Function:
     return area_response
 
 
-@wp.func
-def meets_other_ball(
-    probes: wp.array[Probe], own: wp.int32, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32
-) -> wp.bool:
-    """Whether a mirror ball other than ``own`` lies in the way."""
-    for index in range(probes.shape[0]):
-        if index != own:
-            probe = probes[index]
-            if intersect_sphere(probe.radius, origin - probe.center, direction, t_max) < t_max:
-                return True
-    return False
-
-
-@functools.cache
-def make_mirrored_response(config: RelightConfig) -> wp.Function:
-    """``mirrored_response(scene, lights, receiver, hit, matter) -> vec3``: E_v response of light that balls mirror."""
-    is_lit, respond = make_shadow(config.trace), make_respond(config.method)
-
-    @wp.func(module="unique")
-    def mirrored_response(
-        scene: RayScene, lights: wp.array[Light], receiver: Receiver, hit: Hit, matter: Matter
-    ) -> wp.vec3:
-        total = wp.vec3()
-        for ball in range(receiver.probes.shape[0]):
-            probe = receiver.probes[ball]
-            if wp.dot(probe.center - hit.point, hit.geometric_normal) <= -probe.radius:
-                continue
-            for index in range(lights.shape[0]):
-                by_ball = find_mirroring(lights[index], probe, hit.point)
-                n_dot_l = wp.dot(hit.normal, by_ball.wi)
-                if not by_ball.found or n_dot_l <= 0.0 or wp.dot(hit.geometric_normal, by_ball.wi) <= 0.0:
-                    continue
-                there = sample_light(lights[index], by_ball.place)
-                if wp.max(there.irradiance_normal) <= 0.0:
-                    continue
-                here = LightSample()
-                here.wi = by_ball.wi
-                here.distance = by_ball.distance
-                if not is_lit(scene, hit.point, hit.geometric_normal, hit.error, here):
-                    continue
-                if not is_lit(scene, by_ball.place, by_ball.normal, hit.error, there):
-                    continue
-                if meets_other_ball(receiver.probes, ball, hit.point, here.wi, here.distance):
-                    continue
-                if meets_other_ball(receiver.probes, ball, by_ball.place, there.wi, there.distance):
-                    continue
-                arriving = by_ball.spread * wp.cw_mul(probe.reflectance, there.irradiance_normal)
-                total += respond(matter, here.wi, n_dot_l) * arriving
-        return total
-
-    return mirrored_response
-
-
 @functools.cache
 def make_direct_lighting(config: RelightConfig) -> wp.Function:
     """``direct_lighting(scene, lights, receiver, hit, row, col, mirror, turn) -> DirectLighting``: of virtual light.
@@ -160,7 +104,6 @@ def make_direct_lighting(config: RelightConfig) -> wp.Function:
     visible_share = make_visible_share(config.trace) if config.soft else None
     find_matter, respond = make_find_matter(config), make_respond(config.method)
     area_response = make_area_response(config) if config.area_samples > 0 else None
-    mirrored_response = make_mirrored_response(config) if config.mirrored else None
 
     @wp.func(module="unique")
     def direct_lighting(
@@ -215,16 +158,6 @@ def make_direct_lighting(config: RelightConfig) -> wp.Function:
                 if wp.max(by_areas) > 0.0:
                     result.visibility |= _LIT
                     added += by_areas
-        if wp.static(config.mirrored):
-            if mirror[0] <= 0.0 and within_reach(receiver.probes, hit.point):
-                if wp.static(config.method != "flat"):
-                    if not known:
-                        known = True
-                        matter = find_matter(scene, receiver, hit, row, col, mirror)
-                by_balls = mirrored_response(scene, lights, receiver, hit, matter)
-                if wp.max(by_balls) > 0.0:
-                    result.visibility |= _LIT
-                    added += by_balls
         if wp.static(config.bounced):
             if mirror[0] <= 0.0:
                 bounced = look_up_bounced(scene, receiver, hit, row, col)
@@ -270,7 +203,7 @@ def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
             return
         if wp.static(config.edge_samples > 1):
             visibility_out[i, j] = _NOTHING
-        if wp.static(config.bounced and not config.mirrored):
+        if wp.static(config.bounced):
             if not inside_rect(i, j, params[0].direct_rect):
                 cells = receiver.cells
                 size = wp.vec2i(receiver.picture.rays.shape[0], receiver.picture.rays.shape[1])

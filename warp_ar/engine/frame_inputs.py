@@ -376,9 +376,8 @@ class FrameInputs:
         """What of the screen a frame asks about; ``light`` only where it is more than what is lit directly."""
         scene, arrays = self.host_scene, self._arrays
         outlines = {"object": scene.object_outline(), "direct": scene.light_outline()}
-        bounced, mirrored = ("relight_" + name in arrays for name in ("bounced", "ambient_visibility"))
-        if bounced or mirrored:
-            outlines["light"] = scene.light_outline(bounced=bounced, mirrored=mirrored)
+        if "relight_bounced" in arrays:
+            outlines["light"] = scene.light_outline(bounced=True)
         if "mirror_ball" in arrays or "reflected" in arrays:
             outlines["ball"] = scene.mirror_outline(receivers="reflected" in arrays)
         if "shadow_ratio" in arrays:

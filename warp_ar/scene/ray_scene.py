@@ -35,15 +35,7 @@ from warp_ar.scene.ray_mesh import (
     shared_ray_mesh,
     texture_density,
 )
-from warp_ar.scene.screen_extents import (
-    Outline,
-    ball_outline,
-    bounced_faces,
-    box_faces,
-    lit_faces,
-    mirrored_faces,
-    shaded_faces,
-)
+from warp_ar.scene.screen_extents import Outline, ball_outline, bounced_faces, box_faces, lit_faces, shaded_faces
 from warp_ar.scene.texture_codes import DECODE
 from warp_ar.scene.texture_pack import TexturePack, mask_cutoff
 from warp_ar.scene.walk_table import WalkTable
@@ -79,7 +71,7 @@ class HostScene:
         self._lights = np.zeros(len(scene.lights), _dtype(structs.Light))
         self._lit: Outline | None = None
         self._mirrors: tuple[Outline, Outline] | None = None
-        self._sent_on: dict[tuple[bool, bool], tuple[Outline, Outline]] = {}
+        self._bounced: Outline | None = None
         self._placed = b""  # the objects that the polygons below are of
         self._outline = Outline(())
         self._shaded: Outline | None = None
@@ -375,13 +367,8 @@ class HostScene:
             self._outline = Outline([face for record in _present(self._objects) for face in box_faces(record)])
             self._shaded = None
 
-    def light_outline(self, *, bounced: bool = False, mirrored: bool = False) -> Outline:
-        """Where virtual light or its shadows can fall on proxies.
-
-        Args:
-            bounced: What lit proxies send on as well.
-            mirrored: What mirror balls throw as well.
-        """
+    def light_outline(self, *, bounced: bool = False) -> Outline:
+        """Where virtual light or its shadows can fall on proxies; if ``bounced``, what lit proxies send on as well."""
         if self._lit is None:
             faces = [box_faces(record) for record in _present(self._proxies)]
             shining = self._shining()
@@ -389,18 +376,12 @@ class HostScene:
             if self.has_area_lights:
                 parts = [part for own in faces for part in own]  # what emits may be large: all is taken for lit
             self._lit = Outline(parts)
-            self._sent_on.clear()
-        if not bounced and not mirrored:
+            self._bounced = None
+        if not bounced:
             return self._lit
-        known = self._sent_on.get((bounced, mirrored))
-        if known is None or (mirrored and known[0] is not self._balls):
-            proxies, parts = _present(self._proxies), list(self._lit.polygons)
-            if bounced:
-                parts += bounced_faces(self._shining(), proxies)
-            if mirrored:
-                parts += mirrored_faces(self._shining(), self.probes, proxies)
-            known = self._sent_on[bounced, mirrored] = self._balls, Outline(parts)
-        return known[1]
+        if self._bounced is None:
+            self._bounced = Outline([*self._lit.polygons, *bounced_faces(self._shining(), _present(self._proxies))])
+        return self._bounced
 
     def _shining(self) -> npt.NDArray[Any]:
         """Records of the lights that have power: no other falls anywhere."""

@@ -18,7 +18,6 @@ import numpy.typing as npt
 
 from warp_ar import scene as scenes
 from warp_ar.kernels import structs
-from warp_ar.kernels.mirrored_light import REACH
 from warp_ar.scene import Pose
 
 FloatArray = npt.NDArray[np.float64]
@@ -171,24 +170,6 @@ def bounced_faces(lights: npt.NDArray[Any], proxies: npt.NDArray[Any]) -> list[F
             else:
                 reached += [_clip(face, normals[k], float(offsets[k])) for k in np.flatnonzero(reaching)]
     return reached
-
-
-def mirrored_faces(
-    lights: npt.NDArray[Any], probes: Iterable[scenes.Probe], proxies: npt.NDArray[Any]
-) -> list[FloatArray]:
-    """Parts of the proxies' faces onto which mirror balls that some light may reach can throw it."""
-    parts: list[FloatArray] = []
-    for probe in probes:
-        center = np.array(probe.center, np.float64)
-        around = [center + probe.radius * _CORNERS[list(face)] for face in _FACES]
-        if not any(lit_faces(light, around) for light in lights):
-            continue
-        for record in proxies:
-            faces = box_faces(record)
-            near = [part for face in faces if len(part := _clip_to_cube(face, center, REACH * probe.radius))]
-            # The surface of a mesh lies inside its box.
-            parts += faces if near and record["kind"] == structs.MESH else near
-    return parts
 
 
 def shaded_faces(record: Any, faces: list[FloatArray]) -> list[FloatArray]:

@@ -76,8 +76,6 @@ class Features:
     """Relighting asks which part of the environment reaches the receiver."""
     bounced: bool
     """Proxies that virtual light falls on light each other."""
-    mirrored: bool
-    """Mirror balls throw virtual light on the receiver."""
     soft_lights: bool
     """Virtual lights with a size cast soft shadows."""
     area_samples: int
@@ -182,7 +180,6 @@ def find_features(request: Request) -> Features:
         relight_method=relight_method,
         ambient_visibility=lit_by_both and relight_method in LOCAL,
         bounced=relight_method in LOCAL and proxies_face(scene),
-        mirrored=lit_by_both and relight_method in LOCAL and bool(scene.lights and scene.probes),
         soft_lights=quality.method("light_shadow") == "soft" and has_sized_lights(scene),
         area_samples=area_samples,
         others=others,

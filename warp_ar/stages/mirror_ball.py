@@ -58,7 +58,7 @@ def mirror_variant(features: Features, device: Any) -> mirror_ball.MirrorBallCon
 
 def mirrored_relighting(features: Features) -> RelightConfig:
     """How the receiver that a ball shows responds: cells of the frame say nothing about it."""
-    return dataclasses.replace(relight_config(features), ambient_visibility=False, bounced=False, mirrored=False)
+    return dataclasses.replace(relight_config(features), ambient_visibility=False, bounced=False)
 
 
 def _reads(features: Features, *, lit: bool) -> set[str]:
