@@ -11,8 +11,9 @@ is too much, and the receiver would be taken for darker than it is. So per cell,
 which is 1 to the bit where nothing is hidden. Only cells that virtual light falls on are asked: first those that a
 light shines on, then, once it is known what these send on, those that are reached by that.
 What hides light sends some itself: a ball its reflectance times the mean of what its normal faces, a box what the
-camera sees of it there, and where it sees nothing what grey paper would. Planes hide nothing: the ball has seen them where the environment has them. A CUDA device has several threads
-share the samples of a cell; their sums are added in one order, so that the same frame gives the same bits.
+camera sees of it there, and where it sees nothing what grey paper would. Planes hide nothing: the ball has seen them
+where the environment has them. A CUDA device has several threads share the samples of a cell; their sums are added in
+one order, so that the same frame gives the same bits.
 
 **Bounced light.** A lit proxy lights the others. Every cell of a coarse grid is a patch: radiance L that virtual light
 adds there (``relight``'s own, direct), and the area A of the surface that its pixels show. A receiver at distance r

@@ -71,8 +71,10 @@ class View:
         irradiance=None,
         scene=None,
         others=None,
+        sees_boxes=False,
         **forms,
     ):
+        """``sees_boxes``: what stands on the desk is in the frame; else the lens's axis passes far from it."""
         forms = {**forms, "several": others is not None}
         self.others = others
         kinds = tuple(sorted({int(proxy["kind"]) for proxy in proxies}))
@@ -86,6 +88,7 @@ class View:
                 "camera_position": camera,
                 "world_from_camera": turn,
                 "focal": (FOCAL, FOCAL),
+                "principal": ((size[1] - 1) / 2, (size[0] - 1) / 2) if sees_boxes else (-1e5, -1e5),
                 "light_rect": rect or (0, size[0], 0, size[1]),
                 "direct_rect": rect or (0, size[0], 0, size[1]),
             },

@@ -97,6 +97,52 @@ def test_beside_a_long_box(device):
     np.testing.assert_allclose(share[..., 0][seen], expected[seen], atol=OUTLINE)
 
 
+@pytest.mark.parametrize("code", [20, 128, 230])
+def test_a_box_sends_what_the_camera_sees_of_it(device, code):
+    """The wall of ``test_beside_a_long_box`` in the frame, as bright there as the code says in each channel."""
+    h, frame = 0.1, np.empty((*SIZE_OF_FRAME, 3), np.uint8)
+    frame[:] = code, code // 2, 0
+    shapes, samples = (DESK, box((0.2, -5, 0), (0.4, 5, h))), list_texels(sky(1.0, (64, 128)))[2]
+    view = View(shapes, frame=frame, camera=(0, 0, 1.2), sees_boxes=True)
+    share, surface = view.share(samples)
+    points = reference_relight.plane_points(np.array([0, 0, 1.2]), pixel_rays(SIZE_OF_FRAME), LOOK_DOWN)
+    d = 0.2 - points[middles(4)][..., 0]
+    # What lies far along the wall is out of the frame, and is grey paper: cells in the middle row face what is in it.
+    middle = np.abs(points[middles(4)][..., 1]) < 0.15
+    seen = (surface == 0) & (d > 0.01) & (d < 0.25) & middle
+    assert seen.sum() > 8
+    sent = tables()[0].numpy()[frame[0, 0]].diagonal()
+    expected = 1 - (1 - sent) * 0.5 * (1 - d / np.hypot(d, h))[..., None]
+    far = 0.5 * np.abs(sent - GREY).max() * 0.1
+    np.testing.assert_allclose(share[seen], expected[seen], atol=OUTLINE + far)
+    unseen = View(shapes, frame=frame, camera=(0, 0, 1.2)).share(samples)[0]
+    np.testing.assert_allclose(
+        unseen[..., 0][seen], (1 - (1 - GREY) * 0.5 * (1 - d / np.hypot(d, h)))[seen], atol=OUTLINE
+    )
+
+
+def test_a_face_that_the_camera_does_not_see_is_grey_paper(device):
+    """Turned away, behind another box, behind a ball: the frame, bright or dark, says nothing of it."""
+    hidden, screen = box((0.1, -0.1, 0), (0.2, 0.1, 0.1)), box((-0.05, -0.3, 0.2), (0.6, 0.3, 0.3))
+    lid = ball((0.06, 0.0, 0.3), 0.15)
+    samples = list_texels(sky(1.0, (32, 64)))[2]
+    points = POINTS[middles(4)]
+    for proxies, balls, first in (
+        ((DESK, hidden), [], 0.21),
+        ((DESK, hidden, screen), [], -1),
+        ((DESK, hidden), [lid], -1),
+    ):
+        dark, bright = (
+            View(proxies, balls, frame=np.full((*SIZE_OF_FRAME, 3), code, np.uint8), sees_boxes=True).share(samples)
+            for code in (0, 255)
+        )
+        np.testing.assert_array_equal(dark[1], bright[1])
+        told = (dark[1] == 0) & (points[..., 0] > first)
+        assert told.sum() > 10
+        assert dark[0][told].min() < 0.99
+        np.testing.assert_array_equal(dark[0][told], bright[0][told])
+
+
 def test_the_end_of_a_long_box_is_not_passed_by(device):
     """Beside the end of a bar, inside the ball around it: rays that leave its middle behind still meet it."""
     bar = box((-0.5, 0.02, 0.0), (0.1, 0.06, 0.1))
