@@ -16,8 +16,9 @@ where the environment has them. A CUDA device has several threads share the samp
 one order, so that the same frame gives the same bits.
 
 **Bounced light.** A lit proxy lights the others. Every cell of a coarse grid is a patch: radiance L that virtual light
-adds there (``relight``'s own, direct), and the area A of the surface that its pixels show. A receiver at distance r
-gets
+adds there (``relight``'s own, direct), and the area A of the surface that its pixels show. Where a virtual object is in
+front the patch lies on that, and sends the light that falls on it by its material's colour to all sides alike. A
+receiver at distance r gets
 
     E = sum over patches of  L A cos cos' / (r^2 + A / pi),
 
@@ -37,13 +38,14 @@ from warp_ar.kernels.cells import cell_pixel
 from warp_ar.kernels.environment_samples import EnvironmentSample, Incidence, ball_of_sample, sample_toward
 from warp_ar.kernels.interpolated_irradiance import make_irradiance_at
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch, launch_rows
+from warp_ar.kernels.materials import material_at
 from warp_ar.kernels.probe_weights import probe_share
 from warp_ar.kernels.receiver import DEFAULT_REFLECTANCE, Receiver, ReceiverCells, RelightConfig, look_up_bounced
 from warp_ar.kernels.reflect import look_up, make_find_in_frame
 from warp_ar.kernels.relight import make_direct_lighting
-from warp_ar.kernels.shadow import sample_light, tile_turn
+from warp_ar.kernels.shadow import make_shadow, sample_light, tile_turn
 from warp_ar.kernels.shapes import intersect_sphere, surface_key
-from warp_ar.kernels.structs import PLANE, FrameParams, Hit, Light, RayScene
+from warp_ar.kernels.structs import MIRROR, PHONG, PLANE, FrameParams, Hit, Light, RayScene
 from warp_ar.kernels.trace import TraceConfig, make_trace, offset_origin
 from warp_ar.kernels.visibility import inside_rect, make_visible_proxy
 
@@ -321,11 +323,57 @@ def reduce_partials_kernel(
     cells_out.ambient_surface[i, j] = PENDING - pending
 
 
+@wp.func
+def sent_share(scene: RayScene, hit: Hit) -> wp.vec3:
+    """Share of light that an object sends on, as if to all sides alike: its colour; of a picture a grey one's.
+
+    A mirror sends light to one side only, and is left out.
+    """
+    material = scene.materials[material_at(scene, hit)]
+    if material.model == MIRROR or material.unlit != 0:
+        return wp.vec3(0.0, 0.0, 0.0)
+    share = material.base_color
+    if material.base_texture >= 0:
+        share = DEFAULT_REFLECTANCE * share
+    if material.model == PHONG:
+        share = share + material.specular
+    return wp.min(wp.max(share, wp.vec3(0.0, 0.0, 0.0)), wp.vec3(1.0, 1.0, 1.0))
+
+
+@functools.cache
+def make_sent_by_object(trace: TraceConfig) -> wp.Function:
+    """``sent_by_object(scene, lights, hit) -> vec3``: radiance by virtual light of an object that shows ``hit``.
+
+    Lights count as points: their shadows on objects have no penumbra.
+    """
+    is_lit = make_shadow(trace)
+
+    @wp.func(module="unique")
+    def sent_by_object(scene: RayScene, lights: wp.array[Light], hit: Hit) -> wp.vec3:
+        share = sent_share(scene, hit)
+        received = wp.vec3()
+        if wp.max(share) > 0.0:
+            for index in range(lights.shape[0]):
+                light = sample_light(lights[index], hit.point)
+                n_dot_l = wp.dot(hit.normal, light.wi)
+                if n_dot_l <= 0.0 or wp.dot(hit.geometric_normal, light.wi) <= 0.0:
+                    continue
+                if wp.max(light.irradiance_normal) > 0.0:
+                    if is_lit(scene, hit.point, hit.geometric_normal, hit.error, light):
+                        received += n_dot_l * light.irradiance_normal
+        return wp.cw_mul(share, received) / wp.pi
+
+    return sent_by_object
+
+
 @functools.cache
 def make_send_light_kernel(config: CellConfig) -> wp.Kernel:
     """Kernel of ``send_light``."""
     visible_proxy = make_visible_proxy(config.trace, config.relight.probes)
     direct_lighting = make_direct_lighting(dataclasses.replace(config.relight, bounced=False))
+    has_objects = bool(config.trace.objects)
+    closest_object = make_trace(config.trace).closest_object
+    sent_by_object = make_sent_by_object(config.trace)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def send_light_kernel(
@@ -348,8 +396,21 @@ def make_send_light_kernel(config: CellConfig) -> wp.Kernel:
         if inside_rect(i, j, params[0].light_rect):
             hit = visible_proxy(params[0], rays[i, j], scene, receiver.probes)
             if hit.shape >= 0:
-                lit = direct_lighting(scene, lights, receiver, hit, i, j, wp.vec3(), tile_turn(ci, cj))
-                added = lit.added
+                added = wp.vec3()
+                is_object = bool(False)
+                if wp.static(has_objects):
+                    toward = params[0].world_from_camera * wp.vec3(rays[i, j][0], rays[i, j][1], 1.0)
+                    item = closest_object(scene, params[0].camera_position, toward, hit.t)
+                    if item.shape >= 0:
+                        is_object = True
+                        hit = item
+                        if wp.dot(hit.geometric_normal, toward) > 0.0:
+                            hit.geometric_normal = -hit.geometric_normal
+                            hit.normal = -hit.normal
+                        added = sent_by_object(scene, lights, hit)
+                if not is_object:
+                    lit = direct_lighting(scene, lights, receiver, hit, i, j, wp.vec3(), tile_turn(ci, cj))
+                    added = lit.added
                 if added[0] + added[1] + added[2] > 0.0:
                     ray = rays[i, j]
                     # A pixel's solid angle is cos^3 / (fx fy), the distance to its point t / cos.

@@ -31,14 +31,18 @@ from tests.receiver_cells_rig import (
 from tests.reference import receiver_cells as reference
 from tests.reference import relight as reference_relight
 from tests.reference.environment_shadow import sphere_form_factor
-from tests.relight_rig import CAMERA, DESK, FLOAT_ERROR, LOOK_DOWN, POINTS
+from tests.relight_rig import CAMERA, DESK, FLOAT_ERROR, LOOK_DOWN, POINTS, point
 from warp_ar.kernels import cells as frame_cells
 from warp_ar.kernels import environment_samples
 from warp_ar.kernels.environment_samples import EnvironmentSample
 from warp_ar.kernels.receiver import ReceiverCells
 from warp_ar.kernels.receiver_cells import Patch
 from warp_ar.kernels.structs import (
+    BOX,
     DIRECTIONAL,
+    LAMBERT,
+    MIRROR,
+    PHONG,
     PLANE,
     Light,
 )
@@ -474,6 +478,53 @@ def test_a_lit_floor_lights_the_wall_and_not_itself(device):
     far = (surface == 8) & (np.roll(surface, -3, 0) == 8)
     assert far.sum() > 20
     np.testing.assert_allclose(bounced[far], fine[far], rtol=0.1)
+
+
+MATERIALS = {
+    "matt": ({"model": LAMBERT, "base_color": (0.8, 0.4, 0.0)}, (0.8, 0.4, 0.0)),
+    "shiny": ({"model": PHONG, "base_color": (0.2, 0.2, 0.9), "specular": (0.3, 0.0, 0.4)}, (0.5, 0.2, 1.0)),
+    "picture": ({"model": LAMBERT, "base_color": (1.0, 0.5, 0.0), "base_texture": 0}, (0.5, 0.25, 0.0)),
+    "mirror": ({"model": MIRROR, "base_color": (1.0, 1.0, 1.0)}, (0.0, 0.0, 0.0)),
+    "unlit": ({"model": LAMBERT, "base_color": (1.0, 1.0, 1.0), "unlit": 1}, (0.0, 0.0, 0.0)),
+}
+
+
+@pytest.mark.parametrize("name", MATERIALS)
+def test_an_object_sends_the_light_that_falls_on_it(device, name):
+    """The flat top of a box, 0.1 m below a lamp: its colour over pi times I cos / d^2 from each patch, in its place."""
+    material, share = MATERIALS[name]
+    item = {**shape(BOX, (0.0, 0.0, 0.05), (0.1, 0.1, 0.05)), "material": 0}
+    lamp = point((0.03, -0.02, 0.4))
+    material = {"base_texture": -1, "specular_texture": -1, **material}
+    view = View(lights=[lamp], objects=[item], materials=[material])
+    patches = view.send().numpy()
+    plain = View(lights=[lamp]).send().numpy()
+    at = reference_relight.plane_points(CAMERA - [0, 0, 0.1], pixel_rays(SIZE_OF_FRAME), LOOK_DOWN)[middles(4)]
+    on_top = (np.abs(at[..., :2]) < 0.099).all(-1)
+    away = np.array(lamp["position"]) - at - [0, 0, 0.1]
+    squared = (away**2).sum(-1)
+    radiance = 0.3 / squared * (away[..., 2] / np.sqrt(squared)) / np.pi
+    if max(share) == 0:
+        assert (patches["area"][on_top] == 0).all()
+    else:
+        np.testing.assert_allclose(patches["position"][on_top], at[on_top] + [0, 0, 0.1], atol=1e-6)
+        sent = patches["flux"][on_top] / patches["area"][on_top][:, None]
+        np.testing.assert_allclose(sent, radiance[on_top][:, None] * share, rtol=1e-4, atol=1e-7)
+        # A pixel's area on the top, which is nearer: (0.5 / 60)^2, times 16 pixels.
+        np.testing.assert_allclose(patches["area"][on_top], 16 * (0.5 / FOCAL) ** 2, rtol=1e-3)
+    # Beside the box, and out of its shadow, the desk sends what it sends without.
+    beside = (np.abs(at[..., :2]) > 0.22).any(-1)
+    assert beside.any()
+    np.testing.assert_array_equal(patches["flux"][beside], plain["flux"][beside])
+
+
+def test_an_object_in_the_dark_sends_nothing(device):
+    """Under another object, which takes the lamp's light."""
+    item = {**shape(BOX, (0.0, 0.0, 0.02), (0.05, 0.05, 0.02)), "material": 0}
+    lid = {**shape(BOX, (0.0, 0.0, 0.7), (0.2, 0.2, 0.01)), "material": 0}
+    material = {"model": LAMBERT, "base_color": (1.0,) * 3, "base_texture": -1}
+    view = View(lights=[point((0, 0, 0.9))], objects=[item, lid], materials=[material])
+    assert view.send().numpy()["area"][4:8, 6:10].max() == 0
 
 
 @pytest.mark.parametrize("size", [(1, 1), (2, 3), (5, 7), (47, 61), (49, 65)])
