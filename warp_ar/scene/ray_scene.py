@@ -381,9 +381,10 @@ class HostScene:
             return self._lit
         around = self.shadow_outline()  # where what objects send on counts, too
         if self._bounced is None or self._bounced[0] is not around:
-            faces = bounced_faces(self._shining(), _present(self._proxies)) if self._lit.polygons else []
-            near = around.polygons if self._lit.polygons else ()
-            self._bounced = around, Outline([*self._lit.polygons, *faces, *near])
+            reached = list(self._lit.polygons)
+            if reached:
+                reached += [*bounced_faces(self._shining(), _present(self._proxies)), *around.polygons]
+            self._bounced = around, Outline(reached)
         return self._bounced[1]
 
     def _shining(self) -> npt.NDArray[Any]:
