@@ -10,13 +10,15 @@ is too much, and the receiver would be taken for darker than it is. So per cell,
 
 which is 1 to the bit where nothing is hidden. Only cells that virtual light falls on are asked: first those that a
 light shines on, then, once it is known what these send on, those that are reached by that.
-What hides light sends some itself: a ball its reflectance times the mean of what its normal faces, a box as grey paper
-would. Planes hide nothing: the ball has seen them where the environment has them. A CUDA device has several threads
-share the samples of a cell; their sums are added in one order, so that the same frame gives the same bits.
+What hides light sends some itself: a ball its reflectance times the mean of what its normal faces, a box what the
+camera sees of it there, and where it sees nothing what grey paper would. Planes hide nothing: the ball has seen them
+where the environment has them. A CUDA device has several threads share the samples of a cell; their sums are added in
+one order, so that the same frame gives the same bits.
 
 **Bounced light.** A lit proxy lights the others. Every cell of a coarse grid is a patch: radiance L that virtual light
-adds there (``relight``'s own, direct), and the area A of the surface that its pixels show. A receiver at distance r
-gets
+adds there (``relight``'s own, direct), and the area A of the surface that its pixels show. Where a virtual object is in
+front the patch lies on that, and sends the light that falls on it by its material's colour to all sides alike. A
+receiver at distance r gets
 
     E = sum over patches of  L A cos cos' / (r^2 + A / pi),
 
@@ -36,12 +38,14 @@ from warp_ar.kernels.cells import cell_pixel
 from warp_ar.kernels.environment_samples import EnvironmentSample, Incidence, ball_of_sample, sample_toward
 from warp_ar.kernels.interpolated_irradiance import make_irradiance_at
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch, launch_rows
+from warp_ar.kernels.materials import material_at
 from warp_ar.kernels.probe_weights import probe_share
 from warp_ar.kernels.receiver import DEFAULT_REFLECTANCE, Receiver, ReceiverCells, RelightConfig, look_up_bounced
+from warp_ar.kernels.reflect import look_up, make_find_in_frame
 from warp_ar.kernels.relight import make_direct_lighting
-from warp_ar.kernels.shadow import sample_light, tile_turn
+from warp_ar.kernels.shadow import make_shadow, sample_light, tile_turn
 from warp_ar.kernels.shapes import intersect_sphere, surface_key
-from warp_ar.kernels.structs import PLANE, FrameParams, Hit, Light, RayScene
+from warp_ar.kernels.structs import MIRROR, PHONG, PLANE, FrameParams, Hit, Light, RayScene
 from warp_ar.kernels.trace import TraceConfig, make_trace, offset_origin
 from warp_ar.kernels.visibility import inside_rect, make_visible_proxy
 
@@ -166,13 +170,16 @@ class Hider:
 
 @functools.cache
 def make_find_hider(config: CellConfig) -> wp.Function:
-    """``find_hider(scene, receiver, hit, toward, solids) -> Hider``; ``solids`` of ``bound_solids``."""
+    """``find_hider(params, scene, receiver, hit, toward, solids) -> Hider``; ``solids`` of ``bound_solids``."""
     mean_facing = make_mean_facing(config)
+    find_in_frame = make_find_in_frame(config.trace, config.relight.probes)
     closest_proxy = make_trace(config.trace).closest_proxy
     only_planes = set(config.trace.proxies) <= {PLANE}
 
     @wp.func(module="unique")
-    def find_hider(scene: RayScene, receiver: Receiver, hit: Hit, toward: Incidence, solids: wp.vec4) -> Hider:
+    def find_hider(
+        params: FrameParams, scene: RayScene, receiver: Receiver, hit: Hit, toward: Incidence, solids: wp.vec4
+    ) -> Hider:
         found = Hider()
         nearest = toward.distance
         for index in range(receiver.probes.shape[0]):
@@ -192,11 +199,15 @@ def make_find_hider(config: CellConfig) -> wp.Function:
                 hidden = closest_proxy(scene, origin, toward.direction, nearest)
                 if hidden.shape >= 0:
                     if scene.proxies[hidden.shape].kind != PLANE:
-                        facing = hidden.normal
-                        if wp.dot(facing, toward.direction) > 0.0:
-                            facing = -facing
                         found.hides = True
-                        found.radiance = DEFAULT_REFLECTANCE * mean_facing(receiver, hidden.point, facing)
+                        at = find_in_frame(params, receiver.picture, scene, receiver.probes, hidden)
+                        if at[0] >= 0.0:
+                            found.radiance = look_up(receiver.picture, at[0], at[1])
+                        else:
+                            facing = hidden.normal
+                            if wp.dot(facing, toward.direction) > 0.0:
+                                facing = -facing
+                            found.radiance = DEFAULT_REFLECTANCE * mean_facing(receiver, hidden.point, facing)
         return found
 
     return find_hider
@@ -279,7 +290,7 @@ def make_ambient_visibility_kernel(config: CellConfig) -> wp.Kernel:
                     toward.measure *= probe_share(places, ball_of_sample(k, places.shape[0]), hit.point)
                 flux = cosine * toward.measure * sample.radiance
                 whole += flux
-                hider = find_hider(scene, receiver, hit, toward, solids)
+                hider = find_hider(params[0], scene, receiver, hit, toward, solids)
                 if hider.hides:
                     lost += cosine * toward.measure * (sample.radiance - hider.radiance)
         if partials > 1:
@@ -312,11 +323,57 @@ def reduce_partials_kernel(
     cells_out.ambient_surface[i, j] = PENDING - pending
 
 
+@wp.func
+def sent_share(scene: RayScene, hit: Hit) -> wp.vec3:
+    """Share of light that an object sends on, as if to all sides alike: its colour; of a picture a grey one's.
+
+    A mirror sends light to one side only, and is left out.
+    """
+    material = scene.materials[material_at(scene, hit)]
+    if material.model == MIRROR or material.unlit != 0:
+        return wp.vec3(0.0, 0.0, 0.0)
+    share = material.base_color
+    if material.base_texture >= 0:
+        share = DEFAULT_REFLECTANCE * share
+    if material.model == PHONG:
+        share = share + material.specular
+    return wp.min(wp.max(share, wp.vec3(0.0, 0.0, 0.0)), wp.vec3(1.0, 1.0, 1.0))
+
+
+@functools.cache
+def make_sent_by_object(trace: TraceConfig) -> wp.Function:
+    """``sent_by_object(scene, lights, hit) -> vec3``: radiance by virtual light of an object that shows ``hit``.
+
+    Lights count as points: their shadows on objects have no penumbra.
+    """
+    is_lit = make_shadow(trace)
+
+    @wp.func(module="unique")
+    def sent_by_object(scene: RayScene, lights: wp.array[Light], hit: Hit) -> wp.vec3:
+        share = sent_share(scene, hit)
+        received = wp.vec3()
+        if wp.max(share) > 0.0:
+            for index in range(lights.shape[0]):
+                light = sample_light(lights[index], hit.point)
+                n_dot_l = wp.dot(hit.normal, light.wi)
+                if n_dot_l <= 0.0 or wp.dot(hit.geometric_normal, light.wi) <= 0.0:
+                    continue
+                if wp.max(light.irradiance_normal) > 0.0:
+                    if is_lit(scene, hit.point, hit.geometric_normal, hit.error, light):
+                        received += n_dot_l * light.irradiance_normal
+        return wp.cw_mul(share, received) / wp.pi
+
+    return sent_by_object
+
+
 @functools.cache
 def make_send_light_kernel(config: CellConfig) -> wp.Kernel:
     """Kernel of ``send_light``."""
     visible_proxy = make_visible_proxy(config.trace, config.relight.probes)
     direct_lighting = make_direct_lighting(dataclasses.replace(config.relight, bounced=False))
+    has_objects = bool(config.trace.objects)
+    closest_object = make_trace(config.trace).closest_object
+    sent_by_object = make_sent_by_object(config.trace)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def send_light_kernel(
@@ -339,8 +396,21 @@ def make_send_light_kernel(config: CellConfig) -> wp.Kernel:
         if inside_rect(i, j, params[0].light_rect):
             hit = visible_proxy(params[0], rays[i, j], scene, receiver.probes)
             if hit.shape >= 0:
-                lit = direct_lighting(scene, lights, receiver, hit, i, j, wp.vec3(), tile_turn(ci, cj))
-                added = lit.added
+                added = wp.vec3()
+                is_object = bool(False)
+                if wp.static(has_objects):
+                    toward = params[0].world_from_camera * wp.vec3(rays[i, j][0], rays[i, j][1], 1.0)
+                    item = closest_object(scene, params[0].camera_position, toward, hit.t)
+                    if item.shape >= 0:
+                        is_object = True
+                        hit = item
+                        if wp.dot(hit.geometric_normal, toward) > 0.0:
+                            hit.geometric_normal = -hit.geometric_normal
+                            hit.normal = -hit.normal
+                        added = sent_by_object(scene, lights, hit)
+                if not is_object:
+                    lit = direct_lighting(scene, lights, receiver, hit, i, j, wp.vec3(), tile_turn(ci, cj))
+                    added = lit.added
                 if added[0] + added[1] + added[2] > 0.0:
                     ray = rays[i, j]
                     # A pixel's solid angle is cos^3 / (fx fy), the distance to its point t / cos.

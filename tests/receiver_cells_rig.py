@@ -19,6 +19,7 @@ from warp_ar.kernels.structs import (
     FrameParams,
     KeyLight,
     Light,
+    Material,
     Probe,
     RayScene,
     Shape,
@@ -71,12 +72,18 @@ class View:
         irradiance=None,
         scene=None,
         others=None,
+        sees_boxes=False,
+        objects=(),
+        materials=(),
         **forms,
     ):
+        """``sees_boxes``: what stands on the desk is in the frame; else the lens's axis passes far from it."""
         forms = {**forms, "several": others is not None}
         self.others = others
         kinds = tuple(sorted({int(proxy["kind"]) for proxy in proxies}))
-        trace = TraceConfig((), kinds if scene is None else (BOX, PLANE, MESH))
+        trace = TraceConfig(
+            tuple(sorted({int(item["kind"]) for item in objects})), kinds if scene is None else (BOX, PLANE, MESH)
+        )
         self.relight = RelightConfig("reflectance", trace, "sh" if irradiance is None else "map", bool(probes), **forms)
         self.config = receiver_cells.CellConfig(self.relight)
         self.size = size
@@ -86,6 +93,7 @@ class View:
                 "camera_position": camera,
                 "world_from_camera": turn,
                 "focal": (FOCAL, FOCAL),
+                "principal": ((size[1] - 1) / 2, (size[0] - 1) / 2) if sees_boxes else (-1e5, -1e5),
                 "light_rect": rect or (0, size[0], 0, size[1]),
                 "direct_rect": rect or (0, size[0], 0, size[1]),
             },
@@ -93,7 +101,8 @@ class View:
         self.rays = wp.array(pixel_rays(size), dtype=wp.vec2)
         self.scene = RayScene() if scene is None else scene
         if scene is None:
-            self.scene.objects, self.scene.proxies = records(Shape), records(Shape, *proxies)
+            self.scene.objects, self.scene.proxies = records(Shape, *objects), records(Shape, *proxies)
+            self.scene.materials = records(Material, *materials)
         self.lights = records(Light, *lights)
         image = np.full((*size, 3), 128, np.uint8) if frame is None else frame
         self.frame, self.table = wp.array(image, dtype=wp.vec3ub), wp.zeros(size, wp.uint32)

@@ -31,14 +31,18 @@ from tests.receiver_cells_rig import (
 from tests.reference import receiver_cells as reference
 from tests.reference import relight as reference_relight
 from tests.reference.environment_shadow import sphere_form_factor
-from tests.relight_rig import CAMERA, DESK, FLOAT_ERROR, LOOK_DOWN, POINTS
+from tests.relight_rig import CAMERA, DESK, FLOAT_ERROR, LOOK_DOWN, POINTS, point
 from warp_ar.kernels import cells as frame_cells
 from warp_ar.kernels import environment_samples
 from warp_ar.kernels.environment_samples import EnvironmentSample
 from warp_ar.kernels.receiver import ReceiverCells
 from warp_ar.kernels.receiver_cells import Patch
 from warp_ar.kernels.structs import (
+    BOX,
     DIRECTIONAL,
+    LAMBERT,
+    MIRROR,
+    PHONG,
     PLANE,
     Light,
 )
@@ -95,6 +99,52 @@ def test_beside_a_long_box(device):
     seen = (surface == 0) & (d > 0.01)
     assert seen.sum() > 100
     np.testing.assert_allclose(share[..., 0][seen], expected[seen], atol=OUTLINE)
+
+
+@pytest.mark.parametrize("code", [20, 128, 230])
+def test_a_box_sends_what_the_camera_sees_of_it(device, code):
+    """The wall of ``test_beside_a_long_box`` in the frame, as bright there as the code says in each channel."""
+    h, frame = 0.1, np.empty((*SIZE_OF_FRAME, 3), np.uint8)
+    frame[:] = code, code // 2, 0
+    shapes, samples = (DESK, box((0.2, -5, 0), (0.4, 5, h))), list_texels(sky(1.0, (64, 128)))[2]
+    view = View(shapes, frame=frame, camera=(0, 0, 1.2), sees_boxes=True)
+    share, surface = view.share(samples)
+    points = reference_relight.plane_points(np.array([0, 0, 1.2]), pixel_rays(SIZE_OF_FRAME), LOOK_DOWN)
+    d = 0.2 - points[middles(4)][..., 0]
+    # What lies far along the wall is out of the frame, and is grey paper: cells in the middle row face what is in it.
+    middle = np.abs(points[middles(4)][..., 1]) < 0.15
+    seen = (surface == 0) & (d > 0.01) & (d < 0.25) & middle
+    assert seen.sum() > 8
+    sent = tables()[0].numpy()[frame[0, 0]].diagonal()
+    expected = 1 - (1 - sent) * 0.5 * (1 - d / np.hypot(d, h))[..., None]
+    far = 0.5 * np.abs(sent - GREY).max() * 0.1
+    np.testing.assert_allclose(share[seen], expected[seen], atol=OUTLINE + far)
+    unseen = View(shapes, frame=frame, camera=(0, 0, 1.2)).share(samples)[0]
+    np.testing.assert_allclose(
+        unseen[..., 0][seen], (1 - (1 - GREY) * 0.5 * (1 - d / np.hypot(d, h)))[seen], atol=OUTLINE
+    )
+
+
+def test_a_face_that_the_camera_does_not_see_is_grey_paper(device):
+    """Turned away, behind another box, behind a ball: the frame, bright or dark, says nothing of it."""
+    hidden, screen = box((0.1, -0.1, 0), (0.2, 0.1, 0.1)), box((-0.05, -0.3, 0.2), (0.6, 0.3, 0.3))
+    lid = ball((0.06, 0.0, 0.3), 0.15)
+    samples = list_texels(sky(1.0, (32, 64)))[2]
+    points = POINTS[middles(4)]
+    for proxies, balls, first in (
+        ((DESK, hidden), [], 0.21),
+        ((DESK, hidden, screen), [], -1),
+        ((DESK, hidden), [lid], -1),
+    ):
+        dark, bright = (
+            View(proxies, balls, frame=np.full((*SIZE_OF_FRAME, 3), code, np.uint8), sees_boxes=True).share(samples)
+            for code in (0, 255)
+        )
+        np.testing.assert_array_equal(dark[1], bright[1])
+        told = (dark[1] == 0) & (points[..., 0] > first)
+        assert told.sum() > 10
+        assert dark[0][told].min() < 0.99
+        np.testing.assert_array_equal(dark[0][told], bright[0][told])
 
 
 def test_the_end_of_a_long_box_is_not_passed_by(device):
@@ -428,6 +478,53 @@ def test_a_lit_floor_lights_the_wall_and_not_itself(device):
     far = (surface == 8) & (np.roll(surface, -3, 0) == 8)
     assert far.sum() > 20
     np.testing.assert_allclose(bounced[far], fine[far], rtol=0.1)
+
+
+MATERIALS = {
+    "matt": ({"model": LAMBERT, "base_color": (0.8, 0.4, 0.0)}, (0.8, 0.4, 0.0)),
+    "shiny": ({"model": PHONG, "base_color": (0.2, 0.2, 0.9), "specular": (0.3, 0.0, 0.4)}, (0.5, 0.2, 1.0)),
+    "picture": ({"model": LAMBERT, "base_color": (1.0, 0.5, 0.0), "base_texture": 0}, (0.5, 0.25, 0.0)),
+    "mirror": ({"model": MIRROR, "base_color": (1.0, 1.0, 1.0)}, (0.0, 0.0, 0.0)),
+    "unlit": ({"model": LAMBERT, "base_color": (1.0, 1.0, 1.0), "unlit": 1}, (0.0, 0.0, 0.0)),
+}
+
+
+@pytest.mark.parametrize("name", MATERIALS)
+def test_an_object_sends_the_light_that_falls_on_it(device, name):
+    """The flat top of a box, 0.1 m below a lamp: its colour over pi times I cos / d^2 from each patch, in its place."""
+    material, share = MATERIALS[name]
+    item = {**shape(BOX, (0.0, 0.0, 0.05), (0.1, 0.1, 0.05)), "material": 0}
+    lamp = point((0.03, -0.02, 0.4))
+    material = {"base_texture": -1, "specular_texture": -1, **material}
+    view = View(lights=[lamp], objects=[item], materials=[material])
+    patches = view.send().numpy()
+    plain = View(lights=[lamp]).send().numpy()
+    at = reference_relight.plane_points(CAMERA - [0, 0, 0.1], pixel_rays(SIZE_OF_FRAME), LOOK_DOWN)[middles(4)]
+    on_top = (np.abs(at[..., :2]) < 0.099).all(-1)
+    away = np.array(lamp["position"]) - at - [0, 0, 0.1]
+    squared = (away**2).sum(-1)
+    radiance = 0.3 / squared * (away[..., 2] / np.sqrt(squared)) / np.pi
+    if max(share) == 0:
+        assert (patches["area"][on_top] == 0).all()
+    else:
+        np.testing.assert_allclose(patches["position"][on_top], at[on_top] + [0, 0, 0.1], atol=1e-6)
+        sent = patches["flux"][on_top] / patches["area"][on_top][:, None]
+        np.testing.assert_allclose(sent, radiance[on_top][:, None] * share, rtol=1e-4, atol=1e-7)
+        # A pixel's area on the top, which is nearer: (0.5 / 60)^2, times 16 pixels.
+        np.testing.assert_allclose(patches["area"][on_top], 16 * (0.5 / FOCAL) ** 2, rtol=1e-3)
+    # Beside the box, and out of its shadow, the desk sends what it sends without.
+    beside = (np.abs(at[..., :2]) > 0.22).any(-1)
+    assert beside.any()
+    np.testing.assert_array_equal(patches["flux"][beside], plain["flux"][beside])
+
+
+def test_an_object_in_the_dark_sends_nothing(device):
+    """Under another object, which takes the lamp's light."""
+    item = {**shape(BOX, (0.0, 0.0, 0.02), (0.05, 0.05, 0.02)), "material": 0}
+    lid = {**shape(BOX, (0.0, 0.0, 0.7), (0.2, 0.2, 0.01)), "material": 0}
+    material = {"model": LAMBERT, "base_color": (1.0,) * 3, "base_texture": -1}
+    view = View(lights=[point((0, 0, 0.9))], objects=[item, lid], materials=[material])
+    assert view.send().numpy()["area"][4:8, 6:10].max() == 0
 
 
 @pytest.mark.parametrize("size", [(1, 1), (2, 3), (5, 7), (47, 61), (49, 65)])

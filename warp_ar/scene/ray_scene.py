@@ -71,7 +71,7 @@ class HostScene:
         self._lights = np.zeros(len(scene.lights), _dtype(structs.Light))
         self._lit: Outline | None = None
         self._mirrors: tuple[Outline, Outline] | None = None
-        self._bounced: Outline | None = None
+        self._bounced: tuple[Outline, Outline] | None = None
         self._placed = b""  # the objects that the polygons below are of
         self._outline = Outline(())
         self._shaded: Outline | None = None
@@ -368,7 +368,7 @@ class HostScene:
             self._shaded = None
 
     def light_outline(self, *, bounced: bool = False) -> Outline:
-        """Where virtual light or its shadows can fall on proxies; if ``bounced``, what lit proxies send on as well."""
+        """Where virtual light or its shadows can fall on proxies; if ``bounced``, what is lit sends on as well."""
         if self._lit is None:
             faces = [box_faces(record) for record in _present(self._proxies)]
             shining = self._shining()
@@ -379,9 +379,13 @@ class HostScene:
             self._bounced = None
         if not bounced:
             return self._lit
-        if self._bounced is None:
-            self._bounced = Outline([*self._lit.polygons, *bounced_faces(self._shining(), _present(self._proxies))])
-        return self._bounced
+        around = self.shadow_outline()  # where what objects send on counts, too
+        if self._bounced is None or self._bounced[0] is not around:
+            reached = list(self._lit.polygons)
+            if reached:
+                reached += [*bounced_faces(self._shining(), _present(self._proxies)), *around.polygons]
+            self._bounced = around, Outline(reached)
+        return self._bounced[1]
 
     def _shining(self) -> npt.NDArray[Any]:
         """Records of the lights that have power: no other falls anywhere."""
