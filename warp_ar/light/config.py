@@ -226,6 +226,10 @@ class EvidenceConfig:
     not know: from its horizon, and from below it."""
     flatter: float = 1.5
     """How much more light there may be, for the same effect on the card, than as the card alone has it."""
+    fitted: float = 0.25
+    """Cost per equation of a channel whose light is as modelled: on five path-traced desks 0.15 to 0.28."""
+    misfit: float = 0.3
+    """How much less of a solution is taken per cost of one, per equation, beyond that."""
     interval: float = 2.5
     """Standard deviations of the draws that an interval of irradiance reaches to either side."""
     found: float = 0.3
