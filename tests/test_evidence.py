@@ -14,6 +14,7 @@ from warp_ar.light.config import CONFIG, Kind
 from warp_ar.light.evidence import (
     allowed_factor,
     doubt_of,
+    fitting_share,
     greyer,
     held_to_card,
     known_share,
@@ -99,6 +100,20 @@ def test_a_factor_is_what_nearly_all_draws_allow():
     # Light from elsewhere is no evidence.
     assert allowed_factor(np.array([1.0, 0.0]), agreed * [0.0, 5.0]) == 0.0
     assert allowed_factor(np.zeros(2), agreed) == 0.0
+
+
+def test_what_does_not_fit_is_believed_less():
+    """By the worst channel's cost per equation; costs that modelled light has take nothing."""
+
+    def fits(*costs, rows=200):
+        return [types.SimpleNamespace(cost=rows * cost, rows=np.arange(rows)) for cost in costs]
+
+    fitted = CONFIG.evidence.fitted
+    assert fitting_share(fits(0.1, 0.5 * fitted, fitted)) == 1.0
+    expected = 1.0 / (1.0 + CONFIG.evidence.misfit)
+    assert fitting_share(fits(0.1, fitted + 1.0, 0.2)) == pytest.approx(expected)
+    assert fitting_share(fits(0.1, 0.2, fitted + 1.0, rows=3)) == pytest.approx(expected)
+    assert fitting_share(fits(*np.full(3, 1e9))) == pytest.approx(0.0, abs=1e-6)
 
 
 @pytest.mark.parametrize("share", [0.1, 0.3, 0.6])

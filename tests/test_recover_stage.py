@@ -290,7 +290,7 @@ def test_light_between_estimates_follows_the_card(scene, device, monkeypatch, me
     quality = PRESETS["low"].with_methods(recover="white_card")
     source = SourceSpec(camera=0, metering=metering)
     pose = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
-    levels = []
+    levels, added = [], []
     with Pipeline(
         dataclasses.replace(scene, source=source), device=device, quality=quality, outputs=("environment",)
     ) as pipeline:
@@ -300,8 +300,13 @@ def test_light_between_estimates_follows_the_card(scene, device, monkeypatch, me
             image[:40] = 255
             pipeline(image, time_seconds=index / 30, pose=pose)
             levels.append(pipeline.arrays["recover_level"].numpy().copy())
-            found, levelled = (pipeline.arrays[f"recover_{name}"].numpy() for name in ("recovered", "levelled"))
-            assert levelled == pytest.approx(found * levels[-1])
+            found = pipeline.arrays["recover_recovered"].numpy()
+            assert ("recover_levelled" in pipeline.arrays) == (metering == "fixed")
+            if metering == "fixed":
+                assert pipeline.arrays["recover_levelled"].numpy() == pytest.approx(found * levels[-1])
+            captured, shown = (pipeline.arrays[name].numpy() for name in ("filled_radiance", "environment"))
+            added.append((shown - captured).sum(axis=(0, 1)))
+    assert np.array(added) == pytest.approx(added[0] * np.array(levels), rel=1e-3)
     # 1 - (1 - ratio) / share
     expected = np.array([[1, 1, 1]] * 3 + [[0.6, 0.6, 0.2]] + [[0.2, 0.2, 0.0]] * 2 + [[1, 1, 1]])
     assert np.array(levels) == pytest.approx(expected if metering == "fixed" else 1.0, abs=1e-4)

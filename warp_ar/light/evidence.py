@@ -27,13 +27,14 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from warp_ar.kernels.recover_cells import CELL_ROWS
 from warp_ar.light.config import CONFIG, Kind
-from warp_ar.light.fit import fit_channel
+from warp_ar.light.fit import Fit, fit_channel
 from warp_ar.light.problem import Problem
 from warp_ar.light.surfaces import Surfaces
 
@@ -251,6 +252,19 @@ def most_by_ink(problem: Problem, recovered: Array, bounds: tuple[bool, bool, bo
         most = float(np.median(problem.light[use, c])) * CONFIG.evidence.most_contrast / problem.white - captured
         factors.append(np.clip(most / max(float(np.median(added)), 1e-9), 0.0, 1.0))
     return float(np.mean(factors)) if factors else 1.0
+
+
+def fitting_share(fits: Sequence[Fit]) -> float:
+    """Share of a solution that is taken for how badly the equations of its worst channel are met, 0 to 1.
+
+    Where light is as modelled, robust costs come to ``fitted`` per equation. What exceeds it is light, or a surface,
+    that is not modelled: it lies in the solution as well as in what is left over.
+
+    Args:
+        fits: Of the channels.
+    """
+    config, cost = CONFIG.evidence, max(fit.cost / max(len(fit.rows), 1) for fit in fits)
+    return 1.0 / (1.0 + config.misfit * max(cost - config.fitted, 0.0))
 
 
 def likely_gain(added: Array, missing: Array) -> float:

@@ -64,6 +64,7 @@ from warp_ar.light.evidence import (
     blocks_of,
     doubt_of,
     draw_missing,
+    fitting_share,
     held_to_card,
     irradiance_form,
     irradiance_interval,
@@ -211,13 +212,13 @@ class Recovery:
         emitters.sort(key=lambda emitter: -float(emitter.power.sum()))
         if is_turn or self._evidence is None:
             c = told_channel(problem, best)
-            start = fit_channel(problem, c, problem.start(means[c]), CONFIG.solver.iterations).z
-            evidence = _weigh(problem, c, start, bounds, (recovered, by_card), self._blocks, doubt)
+            fits = [fit_channel(problem, k, problem.start(means[k]), CONFIG.solver.iterations) for k in range(3)]
+            evidence = _weigh(problem, c, fits[c].z, bounds, (recovered, by_card), self._blocks, doubt)
             taken = recovered
             if evidence.method == "white_card":
                 solution, taken = np.concatenate([radiance_by_card, np.zeros((len(powers), 3))]), by_card
             reaching = reaching_factor(problem, solution, Ball(self._center, self._radius))
-            known = known_share(problem, taken, by_card, bounds)
+            known = known_share(problem, taken, by_card, bounds) * fitting_share(fits)
             evidence = dataclasses.replace(evidence, factor=known * min(evidence.factor, reaching))
             self._evidence = self._by_exposures(problem, evidence, {"shading": recovered, "white_card": by_card})
         evidence = self._evidence

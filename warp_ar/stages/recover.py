@@ -164,7 +164,7 @@ class Recover(Stage):
             "recover_level": ArraySpec((3,), wp.float32, 1.0),
             "recover_recovered": ArraySpec(cells, wp.vec3),
             "recover_found": ArraySpec((CONFIG.search.most,), Emitter),
-            "recover_levelled": ArraySpec(cells, wp.vec3),
+            **({"recover_levelled": ArraySpec(cells, wp.vec3)} if self._card else {}),
             "recover_missing": ArraySpec(shape, wp.vec3),
             "recover_cells": ArraySpec(cells, Cell),
             "recover_cells_now": ArraySpec(cells, Cell),
@@ -215,7 +215,7 @@ class Recover(Stage):
             *(looks[:2] if self._card else ()),
             Pass(self._ask, on_host=True, enabled=lambda: self._asks),
             *(looks[2:] if self._card else ()),
-            Pass(self._apply_level),
+            *self._levelling(),
             Pass(self._add, rows=arrays["recover_cells"].shape[0]),
         ]
         passes += [one for ball in range(self.features.others) for one in self._relocate(ball)]
@@ -242,6 +242,17 @@ class Recover(Stage):
             self._surfaces, scene.marker.white, ball.center, radius=ball.radius, method=self.method
         )
 
+    @property
+    def _levelled(self) -> str:
+        """Name of what cells lack: at the level that the card shows now, or as estimated where none is followed."""
+        return "recover_levelled" if self._card else "recover_recovered"
+
+    def _levelling(self) -> tuple[Pass, ...]:
+        """What an estimate found, at the level that it has now; its emitters alone where no level is followed."""
+        if self._card:
+            return (Pass(self._apply_level),)
+        return (Pass(self._show_emitters),) if "emitters" in self.wiring.writes else ()
+
     def _relocate(self, ball: int) -> list[Pass]:
         """What was recovered in the first ball's map, put into that of another as it sees it."""
         arrays, places, height = self._arrays, self._arrays["probe_places"], self.request.quality.environment_height
@@ -250,7 +261,7 @@ class Recover(Stage):
         filled, missing, sent = arrays["others_filled"][ball], arrays["recover_others_missing"], arrays["recover_sent"]
         clipped, confidence = (arrays[f"{KEPT}_{part}"][ball] for part in ("clipped", "confidence"))
         own = arrays["params"], arrays["probes"][ball + 1 : ball + 2], missing
-        found = arrays["recover_cells"], arrays["recover_levelled"]
+        found = arrays["recover_cells"], arrays[self._levelled]
         other, cells = (filled, missing, confidence), found[0]
         send = functools.partial(relocate.send_recovered, missing, confidence, *found, sent)
         share = functools.partial(relocate.share_recovered, other, *first, emitters, cells, sent, out)
@@ -326,6 +337,9 @@ class Recover(Stage):
         shown = arrays["emitters"] if "emitters" in self.wiring.writes else found
         apply_level(arrays["recover_recovered"], found, arrays["recover_level"], arrays["recover_levelled"], shown)
 
+    def _show_emitters(self, rows: Rows | None) -> None:
+        copy(self._arrays["emitters"], self._arrays["recover_found"])
+
     def _observe_points(self, points: Any, observations: Any, rows: Rows | None) -> None:
         arrays, linear = self._arrays, "linear_frame" in self.wiring.reads
         kernels.observe_surfaces(
@@ -362,7 +376,7 @@ class Recover(Stage):
             arrays["environment_confidence"],
             arrays["recover_missing"],
             arrays["recover_cells"],
-            arrays["recover_levelled"],
+            arrays[self._levelled],
             arrays["environment"],
             rows=rows,
         )
