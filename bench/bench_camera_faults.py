@@ -5,11 +5,17 @@ which the program's is compared. What clips in the ball of those frames is, befo
 the case's environment, so that a lower exposure shows as much of it as it would; elsewhere it is ``BEYOND``.
 ``WARP_AR_FAULT_CASES`` names the cases, ``WARP_AR_FAULTS`` the faults, ``WARP_AR_FAULT_SEEDS`` those of the noise, over
 which figures are means: by one alone it is partly chance what a codec leaves.
+
+``WARP_AR_FAULT_DRAWN`` says whose pictures are compared, several after a comma: ``program`` if it is not set. ``truth``
+draws the picture with the objects really there into the same frames, but without the camera's noise and codec, which
+nobody knows beforehand: what is left is not the program's. ``faultless`` draws so what this program makes of a
+faultless camera's frames: what is left to a program that knows all else about the camera.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import json
 import os
@@ -88,57 +94,111 @@ def flip(truth: Any, picture: Any) -> Any:
     return flip_evaluator.evaluate(*pair, "LDR", applyMagma=False)[0].squeeze()
 
 
-def score(case: Path, version: str, faults: Faults, device: str) -> dict[str, float]:
-    """Share of the picture's error that is kept, and errors of light and pose."""
+@dataclasses.dataclass(frozen=True, eq=False)
+class Clip:
+    """A case before the camera: linear frames (height, width, 3) without the virtual objects and with them."""
+
+    case: Path
+    version: str
+    names: tuple[str, ...]
+    truths: frozenset[str]
+    """Names of the frames that are known with the objects there."""
+    clean: tuple[Any, ...]
+    there: tuple[Any, ...]
+    """As ``clean`` where the objects are not known."""
+
+    @property
+    def phase(self) -> Any:
+        """Where in the clip each frame lies, 0 to 1."""
+        return np.linspace(0.0, 1.0, len(self.names))
+
+
+@functools.lru_cache(maxsize=1)
+def read_clip(case: Path, version: str) -> Clip:
     names = sorted(path.name for path in (case / "camera").glob("*.png"))
-    phase = np.linspace(0.0, 1.0, len(names))
-    truths = sorted(path.name for path in (case / version).glob("*.png"))
+    truths = frozenset(path.name for path in (case / version).glob("*.png"))
     mirrored = {name: mirrored_light(case, index) for index, name in enumerate(names)}
     clean = {name: light_of(case / "camera" / name, mirrored[name]) for name in names}
-    frames = expose([clean[name] for name in names], faults)
-    # The same clip with the objects there, so that its noise, codec and drift are the same camera's.
     there = [light_of(case / version / name, mirrored[name]) if name in truths else clean[name] for name in names]
-    wanted = dict(zip(names, expose(there, faults, phase=phase), strict=True))
-    scene = load_scene(case / f"scene_{version}.toml")
-    scene = dataclasses.replace(scene, source=SourceSpec(path=case / "camera", metering="automatic"))
-    known = (faults.distortion, 0.0, 0.0, 0.0, 0.0)
+    return Clip(case, version, tuple(names), truths, tuple(clean.values()), tuple(there))
+
+
+def program_results(clip: Clip, faults: Faults, frames: list[Any], device: str) -> list[Any]:
+    """What the program makes of a camera's ``frames``."""
+    scene = load_scene(clip.case / f"scene_{clip.version}.toml")
+    scene = dataclasses.replace(scene, source=SourceSpec(path=clip.case / "camera", metering="automatic"))
     if faults.distortion:
         # The calibration knows the lens: its focal length here is the picture's width.
         scale = (scene.camera.fx / scene.camera.width) ** 2
         known = (faults.distortion * scale, 0.0, 0.0, 0.0, 0.0)
         scene = dataclasses.replace(scene, camera=dataclasses.replace(scene.camera, distortion=known))
-    kept, nothing, light, angles, shifts = [], [], [], [], []
-    poses = json.loads((case / "case.json").read_text())["poses"]
     with tempfile.TemporaryDirectory() as folder:
-        for name, frame in zip(names, frames, strict=True):
+        for name, frame in zip(clip.names, frames, strict=True):
             cv2.imwrite(str(Path(folder) / name), frame[..., ::-1])
         with Session(scene, source=folder, device=device, quality=QUALITY, outputs=("image", "environment")) as session:
-            for index, (name, (_, result)) in enumerate(zip(names, session, strict=False)):
-                # A camera that ends at a code below 255 has that code's value where the light is 1.
-                gain = decode_srgb(np.array(faults.saturation))
-                gain = gain * (1.0 + faults.exposure_drift * np.sin(2 * np.pi * phase[index]))
-                tint = 1.0 + faults.white_balance_drift * np.array([1, 0, -1]) * phase[index]
-                env = case / "env" / f"{Path(name).stem}.npy"
-                if env.exists() and result.environment is not None:
-                    truth = irradiance(np.load(env) * gain * tint)
-                    light.append(np.linalg.norm(irradiance(result.environment) - truth) / np.linalg.norm(truth))
-                if result.pose is not None:
-                    turn = result.pose.rotation @ np.array(poses[index]["R"]).T
-                    angles.append(np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))))
-                    shifts.append(1e3 * np.linalg.norm(result.pose.translation - np.array(poses[index]["t"])))
-                if name in truths:
-                    difference = np.abs(wanted[name].astype(float) - frames[index]).max(-1)
-                    changed = cv2.GaussianBlur(difference, (0, 0), 3) > 5
-                    mask = cv2.dilate(changed.astype(np.uint8), np.ones((9, 9))) > 0
-                    kept.append(flip(wanted[name], result.image)[mask].mean())
-                    nothing.append(flip(wanted[name], frames[index])[mask].mean())
+            return [result for _, (_, result) in zip(clip.names, session, strict=False)]
+
+
+@functools.lru_cache(maxsize=1)
+def faultless_light(clip: Clip, device: str) -> list[Any]:
+    """Linear values of what the program draws of a faultless camera's frames; what clips as in the truth."""
+    results = program_results(clip, Faults(), expose(clip.clean, Faults()), device)
+    pictures = [np.asarray(result.image) for result in results]
+    return [
+        np.where(codes >= 254, there, decode_srgb(codes)) for codes, there in zip(pictures, clip.there, strict=True)
+    ]
+
+
+def drawn_pictures(clip: Clip, faults: Faults, drawn: str, device: str) -> list[Any]:
+    """The truth or the faultless camera's result through a camera with ``faults``, but without noise and codec."""
+    light = clip.there if drawn == "truth" else faultless_light(clip, device)
+    return list(expose(light, dataclasses.replace(faults, noise=0.0, codec=""), phase=clip.phase))
+
+
+def errors_of_results(clip: Clip, faults: Faults, results: list[Any]) -> dict[str, float]:
+    """Errors of light and pose: means over frames."""
+    light, angles, shifts = [], [], []
+    poses = json.loads((clip.case / "case.json").read_text())["poses"]
+    for index, (name, result) in enumerate(zip(clip.names, results, strict=False)):
+        # A camera that ends at a code below 255 has that code's value where the light is 1.
+        gain = decode_srgb(np.array(faults.saturation))
+        gain = gain * (1.0 + faults.exposure_drift * np.sin(2 * np.pi * clip.phase[index]))
+        tint = 1.0 + faults.white_balance_drift * np.array([1, 0, -1]) * clip.phase[index]
+        env = clip.case / "env" / f"{Path(name).stem}.npy"
+        if env.exists() and result.environment is not None:
+            truth = irradiance(np.load(env) * gain * tint)
+            light.append(np.linalg.norm(irradiance(result.environment) - truth) / np.linalg.norm(truth))
+        if result.pose is not None:
+            turn = result.pose.rotation @ np.array(poses[index]["R"]).T
+            angles.append(np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))))
+            shifts.append(1e3 * np.linalg.norm(result.pose.translation - np.array(poses[index]["t"])))
     return {
-        "kept": float(np.mean(kept) / np.mean(nothing)),
         "light": float(np.mean(light)) if light else float("nan"),
         "pose_degrees": float(np.mean(angles)) if angles else float("nan"),
         "pose_mm": float(np.mean(shifts)) if shifts else float("nan"),
-        "posed": len(angles) / len(names),
+        "posed": len(angles) / len(clip.names),
     }
+
+
+def score(clip: Clip, faults: Faults, drawn: str, device: str) -> dict[str, float]:
+    """Share of the picture's error that is kept and that error itself; of the program, errors of light and pose too."""
+    frames = expose(clip.clean, faults)
+    # The same clip with the objects there, so that its noise, codec and drift are the same camera's.
+    wanted = expose(clip.there, faults, phase=clip.phase)
+    if drawn == "program":
+        results = program_results(clip, faults, frames, device)
+        pictures, others = [result.image for result in results], errors_of_results(clip, faults, results)
+    else:
+        pictures, others = drawn_pictures(clip, faults, drawn, device), {}
+    kept, nothing = [], []
+    for name, frame, truth, picture in zip(clip.names, frames, wanted, pictures, strict=True):
+        if name in clip.truths:
+            difference = np.abs(truth.astype(float) - frame).max(-1)
+            changed = cv2.GaussianBlur(difference, (0, 0), 3) > 5
+            mask = cv2.dilate(changed.astype(np.uint8), np.ones((9, 9))) > 0
+            kept.append(flip(truth, picture)[mask].mean())
+            nothing.append(flip(truth, frame)[mask].mean())
+    return {"kept": float(np.mean(kept) / np.mean(nothing)), "flip": float(np.mean(kept)), **others}
 
 
 def main(device: str) -> None:
@@ -148,13 +208,14 @@ def main(device: str) -> None:
     cases = os.environ.get("WARP_AR_FAULT_CASES", "plastic_bunny_sunset,gold_torus_interior").split(",")
     seeds = [int(seed) for seed in os.environ.get("WARP_AR_FAULT_SEEDS", "0").split(",")]
     chosen = os.environ.get("WARP_AR_FAULTS", ",".join([*ALONE, "all"])).split(",")
-    for case in cases:
-        for fault in chosen:
-            faults = ALL if fault == "all" else ALONE[fault]
-            # Noise alone has a seed; a fault without any gives the same figures with each.
-            runs = [
-                score(TRUTH / case, "both", dataclasses.replace(faults, seed=seed), device)
-                for seed in (seeds if faults.noise else seeds[:1])
-            ]
-            rounded = {name: round(float(np.mean([run[name] for run in runs])), 4) for name in runs[0]}
-            print(json.dumps({"bench": "camera_faults", "case": case, "fault": fault, **rounded}), flush=True)
+    drawn = os.environ.get("WARP_AR_FAULT_DRAWN", "program").split(",")
+    for case, fault, whose in itertools.product(cases, chosen, drawn):
+        faults = ALL if fault == "all" else ALONE[fault]
+        # Noise alone has a seed; a fault without any gives the same figures with each.
+        runs = [
+            score(read_clip(TRUTH / case, "both"), dataclasses.replace(faults, seed=seed), whose, device)
+            for seed in (seeds if faults.noise else seeds[:1])
+        ]
+        rounded = {name: round(float(np.mean([run[name] for run in runs])), 4) for name in runs[0]}
+        line = {"bench": "camera_faults", "case": case, "fault": fault, "drawn": whose, **rounded}
+        print(json.dumps(line), flush=True)
