@@ -16,7 +16,8 @@ partly chance what a codec leaves.
   and codec of what is really there.
 - ``truth_again`` has noise and codec as well, but the noise of another seed: what matched noise and codec would give.
 - ``faultless`` draws as ``truth`` does, but what this program makes of a faultless camera's frames: what is left to a
-  program that knows all else about the camera.
+  program that knows all else about the camera. ``faultless_again`` draws that as ``truth_again`` does.
+- ``clipped`` is the program without recovery of light: beside its error of light, a fault must not invent any.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ from tests.simulated_camera import ALL, ALONE, Faults, decode_srgb, expose
 from warp_ar.light.captured import latlong_directions, texel_solid_angles
 from warp_ar.scene import SourceSpec, load_scene
 from warp_ar.session import Session
+from warp_ar.stages.quality import PRESETS, Quality
 
 TRUTH = Path(__file__).resolve().parents[2] / "shared" / "truth"
 QUALITY = "medium"
@@ -132,7 +134,9 @@ def read_clip(case: Path, version: str) -> Clip:
     return Clip(case, version, tuple(names), truths, tuple(clean.values()), tuple(there))
 
 
-def program_results(clip: Clip, faults: Faults, frames: list[Any], device: str) -> list[Any]:
+def program_results(
+    clip: Clip, faults: Faults, frames: list[Any], device: str, quality: str | Quality = QUALITY
+) -> list[Any]:
     """What the program makes of a camera's ``frames``."""
     scene = load_scene(clip.case / f"scene_{clip.version}.toml")
     scene = dataclasses.replace(scene, source=SourceSpec(path=clip.case / "camera", metering="automatic"))
@@ -144,7 +148,7 @@ def program_results(clip: Clip, faults: Faults, frames: list[Any], device: str) 
     with tempfile.TemporaryDirectory() as folder:
         for name, frame in zip(clip.names, frames, strict=True):
             cv2.imwrite(str(Path(folder) / name), frame[..., ::-1])
-        with Session(scene, source=folder, device=device, quality=QUALITY, outputs=("image", "environment")) as session:
+        with Session(scene, source=folder, device=device, quality=quality, outputs=("image", "environment")) as session:
             return [result for _, (_, result) in zip(clip.names, session, strict=False)]
 
 
@@ -160,8 +164,8 @@ def faultless_light(clip: Clip, device: str) -> list[Any]:
 
 def drawn_pictures(clip: Clip, faults: Faults, frames: list[Any], drawn: str, device: str) -> list[Any]:
     """The truth or the faultless camera's result through a camera with ``faults``, as the module says."""
-    light = faultless_light(clip, device) if drawn == "faultless" else clip.there
-    if drawn == "truth_again":
+    light = faultless_light(clip, device) if drawn.startswith("faultless") else clip.there
+    if drawn.endswith("_again"):
         return list(expose(light, dataclasses.replace(faults, seed=faults.seed + ANOTHER), phase=clip.phase))
     quiet = dataclasses.replace(faults, noise=0.0, codec="")
     pictures = expose(light, quiet, phase=clip.phase)
@@ -204,8 +208,9 @@ def score(clip: Clip, faults: Faults, drawn: str, device: str) -> dict[str, floa
     frames = expose(clip.clean, faults)
     # The same clip with the objects there, so that its noise, codec and drift are the same camera's.
     wanted = expose(clip.there, faults, phase=clip.phase)
-    if drawn == "program":
-        results = program_results(clip, faults, frames, device)
+    if drawn in ("program", "clipped"):
+        quality = PRESETS[QUALITY].with_methods(recover="clipped") if drawn == "clipped" else QUALITY
+        results = program_results(clip, faults, frames, device, quality)
         pictures, others = [result.image for result in results], errors_of_results(clip, faults, results)
     else:
         pictures, others = drawn_pictures(clip, faults, frames, drawn, device), {}
