@@ -16,7 +16,8 @@ partly chance what a codec leaves.
   and codec of what is really there.
 - ``truth_again`` has noise and codec as well, but the noise of another seed: what matched noise and codec would give.
 - ``faultless`` draws as ``truth`` does, but what this program makes of a faultless camera's frames: what is left to a
-  program that knows all else about the camera. ``faultless_again`` draws that as ``truth_again`` does.
+  program that knows all else about the camera. ``faultless_again`` draws that as ``truth_again`` does,
+  ``faultless_bare`` without vignetting, motion blur and sharpening, none of which this program draws.
 - ``clipped`` is the program without recovery of light: beside its error of light, a fault must not invent any.
 """
 
@@ -35,7 +36,7 @@ import cv2
 import flip_evaluator
 import numpy as np
 
-from tests.simulated_camera import ALL, ALONE, Faults, decode_srgb, expose
+from tests.simulated_camera import ALONE, Faults, decode_srgb, expose, faults_named
 from warp_ar.light.captured import latlong_directions, texel_solid_angles
 from warp_ar.scene import SourceSpec, load_scene
 from warp_ar.session import Session
@@ -168,6 +169,8 @@ def drawn_pictures(clip: Clip, faults: Faults, frames: list[Any], drawn: str, de
     if drawn.endswith("_again"):
         return list(expose(light, dataclasses.replace(faults, seed=faults.seed + ANOTHER), phase=clip.phase))
     quiet = dataclasses.replace(faults, noise=0.0, codec="")
+    if drawn.endswith("_bare"):
+        quiet = dataclasses.replace(quiet, vignetting=0.0, motion_blur=0.0, sharpening=0.0)
     pictures = expose(light, quiet, phase=clip.phase)
     if drawn != "truth_laid":
         return list(pictures)
@@ -223,18 +226,6 @@ def score(clip: Clip, faults: Faults, drawn: str, device: str) -> dict[str, floa
             kept.append(flip(truth, picture)[mask].mean())
             nothing.append(flip(truth, frame)[mask].mean())
     return {"kept": float(np.mean(kept) / np.mean(nothing)), "flip": float(np.mean(kept)), **others}
-
-
-def faults_named(name: str) -> Faults:
-    """One fault, ``all``, or ``all_but_NAME``: those but one."""
-    left_out = name.removeprefix("all_but_")
-    if name == "all":
-        return ALL
-    if left_out == name:
-        return ALONE[name]
-    fields = dataclasses.fields(Faults)
-    changed = {f.name: f.default for f in fields if getattr(ALONE[left_out], f.name) != f.default}
-    return dataclasses.replace(ALL, **changed)
 
 
 def main(device: str) -> None:
