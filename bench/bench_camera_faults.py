@@ -17,7 +17,8 @@ partly chance what a codec leaves.
 - ``truth_again`` has noise and codec as well, but the noise of another seed: what matched noise and codec would give.
 - ``faultless`` draws as ``truth`` does, but what this program makes of a faultless camera's frames: what is left to a
   program that knows all else about the camera. ``faultless_again`` draws that as ``truth_again`` does,
-  ``faultless_bare`` without vignetting, motion blur and sharpening, none of which this program draws.
+  ``faultless_bare`` without motion blur and sharpening, which this program does not draw; the desk has them
+  neither there, so that this is at most what they cost.
 - ``clipped`` is the program without recovery of light: beside its error of light, a fault must not invent any.
 """
 
@@ -170,7 +171,7 @@ def drawn_pictures(clip: Clip, faults: Faults, frames: list[Any], drawn: str, de
         return list(expose(light, dataclasses.replace(faults, seed=faults.seed + ANOTHER), phase=clip.phase))
     quiet = dataclasses.replace(faults, noise=0.0, codec="")
     if drawn.endswith("_bare"):
-        quiet = dataclasses.replace(quiet, vignetting=0.0, motion_blur=0.0, sharpening=0.0)
+        quiet = dataclasses.replace(quiet, motion_blur=0.0, sharpening=0.0)
     pictures = expose(light, quiet, phase=clip.phase)
     if drawn != "truth_laid":
         return list(pictures)
