@@ -3,13 +3,23 @@
 Frames of ``../shared/truth`` go through the camera; so does the picture with the virtual objects really there, with
 which the program's is compared. What clips in the ball of those frames is, before the lens, what the ball mirrors of
 the case's environment, so that a lower exposure shows as much of it as it would; elsewhere it is ``BEYOND``.
-``WARP_AR_FAULT_CASES`` names the cases, ``WARP_AR_FAULTS`` the faults, ``WARP_AR_FAULT_SEEDS`` those of the noise, over
-which figures are means: by one alone it is partly chance what a codec leaves.
+``WARP_AR_FAULT_CASES`` names the cases, all of that folder if it is not set; a case has the version with objects and
+lights where that is rendered, else that with objects alone. ``WARP_AR_FAULTS`` names the faults; ``all_but_NAME`` is
+all of them but one. ``WARP_AR_FAULT_SEEDS`` are those of the noise, over which figures are means: by one alone it is
+partly chance what a codec leaves.
 
-``WARP_AR_FAULT_DRAWN`` says whose pictures are compared, several after a comma: ``program`` if it is not set. ``truth``
-draws the picture with the objects really there into the same frames, but without the camera's noise and codec, which
-nobody knows beforehand: what is left is not the program's. ``faultless`` draws so what this program makes of a
-faultless camera's frames: what is left to a program that knows all else about the camera.
+``WARP_AR_FAULT_DRAWN`` says whose pictures are compared, several after a comma: ``program`` if it is not set.
+
+- ``truth`` is the picture with the objects really there through the same camera, but without its noise and codec, which
+  nobody knows beforehand: what is left is not the program's.
+- ``truth_laid`` lays the difference that the objects make in that picture over the camera's frame, which keeps noise
+  and codec of what is really there.
+- ``truth_again`` has noise and codec as well, but the noise of another seed: what matched noise and codec would give.
+- ``faultless`` draws as ``truth`` does, but what this program makes of a faultless camera's frames: what is left to a
+  program that knows all else about the camera. ``faultless_again`` draws that as ``truth_again`` does,
+  ``faultless_bare`` without motion blur and sharpening, which this program does not draw; the desk has them
+  neither there, so that this is at most what they cost.
+- ``clipped`` is the program without recovery of light: beside its error of light, a fault must not invent any.
 """
 
 from __future__ import annotations
@@ -27,15 +37,18 @@ import cv2
 import flip_evaluator
 import numpy as np
 
-from tests.simulated_camera import ALL, ALONE, Faults, decode_srgb, expose
+from tests.simulated_camera import ALONE, Faults, decode_srgb, expose, faults_named
 from warp_ar.light.captured import latlong_directions, texel_solid_angles
 from warp_ar.scene import SourceSpec, load_scene
 from warp_ar.session import Session
+from warp_ar.stages.quality import PRESETS, Quality
 
 TRUTH = Path(__file__).resolve().parents[2] / "shared" / "truth"
 QUALITY = "medium"
 BEYOND = 4.0
 """Linear value of what clips, unless it is known."""
+ANOTHER = 1000
+"""From a seed of the noise to the seed of noise that is like it."""
 WITHIN = (np.arange(4) + 0.5) / 4 - 0.5
 """Places within a pixel, along either side, at which it is looked up what the ball mirrors."""
 
@@ -123,7 +136,9 @@ def read_clip(case: Path, version: str) -> Clip:
     return Clip(case, version, tuple(names), truths, tuple(clean.values()), tuple(there))
 
 
-def program_results(clip: Clip, faults: Faults, frames: list[Any], device: str) -> list[Any]:
+def program_results(
+    clip: Clip, faults: Faults, frames: list[Any], device: str, quality: str | Quality = QUALITY
+) -> list[Any]:
     """What the program makes of a camera's ``frames``."""
     scene = load_scene(clip.case / f"scene_{clip.version}.toml")
     scene = dataclasses.replace(scene, source=SourceSpec(path=clip.case / "camera", metering="automatic"))
@@ -135,7 +150,7 @@ def program_results(clip: Clip, faults: Faults, frames: list[Any], device: str) 
     with tempfile.TemporaryDirectory() as folder:
         for name, frame in zip(clip.names, frames, strict=True):
             cv2.imwrite(str(Path(folder) / name), frame[..., ::-1])
-        with Session(scene, source=folder, device=device, quality=QUALITY, outputs=("image", "environment")) as session:
+        with Session(scene, source=folder, device=device, quality=quality, outputs=("image", "environment")) as session:
             return [result for _, (_, result) in zip(clip.names, session, strict=False)]
 
 
@@ -149,10 +164,22 @@ def faultless_light(clip: Clip, device: str) -> list[Any]:
     ]
 
 
-def drawn_pictures(clip: Clip, faults: Faults, drawn: str, device: str) -> list[Any]:
-    """The truth or the faultless camera's result through a camera with ``faults``, but without noise and codec."""
-    light = clip.there if drawn == "truth" else faultless_light(clip, device)
-    return list(expose(light, dataclasses.replace(faults, noise=0.0, codec=""), phase=clip.phase))
+def drawn_pictures(clip: Clip, faults: Faults, frames: list[Any], drawn: str, device: str) -> list[Any]:
+    """The truth or the faultless camera's result through a camera with ``faults``, as the module says."""
+    light = faultless_light(clip, device) if drawn.startswith("faultless") else clip.there
+    if drawn.endswith("_again"):
+        return list(expose(light, dataclasses.replace(faults, seed=faults.seed + ANOTHER), phase=clip.phase))
+    quiet = dataclasses.replace(faults, noise=0.0, codec="")
+    if drawn.endswith("_bare"):
+        quiet = dataclasses.replace(quiet, motion_blur=0.0, sharpening=0.0)
+    pictures = expose(light, quiet, phase=clip.phase)
+    if drawn != "truth_laid":
+        return list(pictures)
+    without = expose(clip.clean, quiet, phase=clip.phase)
+    return [
+        np.clip(frame.astype(int) + picture - empty, 0, 255).astype(np.uint8)
+        for frame, picture, empty in zip(frames, pictures, without, strict=True)
+    ]
 
 
 def errors_of_results(clip: Clip, faults: Faults, results: list[Any]) -> dict[str, float]:
@@ -185,11 +212,12 @@ def score(clip: Clip, faults: Faults, drawn: str, device: str) -> dict[str, floa
     frames = expose(clip.clean, faults)
     # The same clip with the objects there, so that its noise, codec and drift are the same camera's.
     wanted = expose(clip.there, faults, phase=clip.phase)
-    if drawn == "program":
-        results = program_results(clip, faults, frames, device)
+    if drawn in ("program", "clipped"):
+        quality = PRESETS[QUALITY].with_methods(recover="clipped") if drawn == "clipped" else QUALITY
+        results = program_results(clip, faults, frames, device, quality)
         pictures, others = [result.image for result in results], errors_of_results(clip, faults, results)
     else:
-        pictures, others = drawn_pictures(clip, faults, drawn, device), {}
+        pictures, others = drawn_pictures(clip, faults, frames, drawn, device), {}
     kept, nothing = [], []
     for name, frame, truth, picture in zip(clip.names, frames, wanted, pictures, strict=True):
         if name in clip.truths:
@@ -205,15 +233,17 @@ def main(device: str) -> None:
     if not TRUTH.is_dir():
         print(f"camera_faults: no {TRUTH}; nothing to compare with")
         return
-    cases = os.environ.get("WARP_AR_FAULT_CASES", "plastic_bunny_sunset,gold_torus_interior").split(",")
+    rendered = ",".join(sorted(path.name for path in TRUTH.iterdir() if (path / "case.json").exists()))
+    cases = os.environ.get("WARP_AR_FAULT_CASES", rendered).split(",")
     seeds = [int(seed) for seed in os.environ.get("WARP_AR_FAULT_SEEDS", "0").split(",")]
     chosen = os.environ.get("WARP_AR_FAULTS", ",".join([*ALONE, "all"])).split(",")
     drawn = os.environ.get("WARP_AR_FAULT_DRAWN", "program").split(",")
     for case, fault, whose in itertools.product(cases, chosen, drawn):
-        faults = ALL if fault == "all" else ALONE[fault]
+        faults = faults_named(fault)
+        version = "both" if (TRUTH / case / "both").is_dir() else "object"
         # Noise alone has a seed; a fault without any gives the same figures with each.
         runs = [
-            score(read_clip(TRUTH / case, "both"), dataclasses.replace(faults, seed=seed), whose, device)
+            score(read_clip(TRUTH / case, version), dataclasses.replace(faults, seed=seed), whose, device)
             for seed in (seeds if faults.noise else seeds[:1])
         ]
         rounded = {name: round(float(np.mean([run[name] for run in runs])), 4) for name in runs[0]}

@@ -68,6 +68,21 @@ ALL = Faults(-0.12, 4.0, 0.35, 0.33, 0.15, 0.02, 1.0, 0.8, 238, "h264", True)
 """All of them together."""
 
 
+def faults_named(name: str) -> Faults:
+    """The faults of a name: one of ``ALONE``, ``all``, or ``all_but_NAME``, which leaves one of them out.
+
+    Raises:
+        KeyError: If there is no such fault.
+    """
+    if name == "all":
+        return ALL
+    if name in ALONE:
+        return ALONE[name]
+    left_out = ALONE[name.removeprefix("all_but_")]
+    fields = [field for field in dataclasses.fields(Faults) if getattr(left_out, field.name) != field.default]
+    return dataclasses.replace(ALL, **{field.name: field.default for field in fields})
+
+
 def decode_srgb(codes: NDArray[np.uint8]) -> Array:
     """Linear values of codes."""
     c = codes / 255.0

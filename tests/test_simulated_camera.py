@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.simulated_camera import ALL, ALONE, Faults, decode_srgb, expose
+from tests.simulated_camera import ALL, ALONE, Faults, decode_srgb, expose, faults_named
 
 GREY = np.full((96, 128, 3), 0.2)
 MIRRORED = 0.05
@@ -100,3 +100,18 @@ def test_what_clips_in_the_ball_is_what_a_shorter_exposure_shows(shared):
     ratio = light[told] / (4.0 * decode_srgb(dark[told]))
     assert told.sum() > 500
     assert np.abs(np.quantile(ratio, [0.05, 0.5, 0.95]) - 1.0).max() < MIRRORED
+
+
+@pytest.mark.parametrize("name", [name for name in ALONE if name not in ("none", "mjpeg")])
+def test_all_but_one_leaves_out_that_one_alone(name):
+    """``mjpeg`` is none of all."""
+    without, alone, nothing = faults_named(f"all_but_{name}"), faults_named(name), faults_named("none")
+    fields = [field.name for field in dataclasses.fields(Faults)]
+    changed = [field for field in fields if getattr(without, field) != getattr(ALL, field)]
+    assert changed == [field for field in fields if getattr(alone, field) != getattr(nothing, field)] != []
+    assert all(getattr(without, field) == getattr(nothing, field) for field in changed)
+
+
+def test_a_fault_that_is_none_is_told():
+    with pytest.raises(KeyError, match="hands"):
+        faults_named("all_but_hands")
