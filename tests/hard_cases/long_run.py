@@ -112,7 +112,7 @@ dozen loops to settle, so that only a long run says anything."""
 def run(case: str, *, frames: int, device: str) -> Report:
     """Run one case; the first pictures to compare with are taken once the light has settled."""
     sequence, loop = CASES[case]
-    early_at = 5 * loop if 5 * loop < frames // 2 else loop
+    early_at = 5 * loop if 5 * loop <= frames // 2 else loop
     sway = Animation(sway=(0.02, 0.0, 0.0), period=loop / 30.0)
     lights = (Light("point", 0.1, at=(0.0, -0.1, 0.3), animate=sway),)
     rig = Rig(device, "recover", "shading" if case == SEARCHES else "white_card", bands=2, lights=lights)
