@@ -230,9 +230,10 @@ class EvidenceConfig:
     """Logarithm of a camera's gain from which a frame is another exposure of what was seen before."""
     same: float = 0.2
     """Relative difference of irradiance, over all directions, below which light is what it was."""
-    fitted: float = 0.25
-    """Cost per equation of a channel whose light is as modelled: on five path-traced desks 0.15 to 0.28."""
-    misfit: float = 0.3
+    fitted: float = 0.6
+    """Cost per equation of a channel whose light is as modelled: 0.15 to 0.28 on path-traced desks, to 0.61 on those with
+    rough metal."""
+    misfit: float = 0.5
     """How much less of a solution is taken per cost of one, per equation, beyond that."""
     interval: float = 2.5
     """Standard deviations of the draws that an interval of irradiance reaches to either side."""
