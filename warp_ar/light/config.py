@@ -231,7 +231,7 @@ class EvidenceConfig:
     same: float = 0.2
     """Relative difference of irradiance, over all directions, below which light is what it was."""
     fitted: float = 0.6
-    """Cost per equation of a channel whose light is as modelled: 0.15 to 0.28 on path-traced desks, to 0.61 on those with
+    """Cost per equation of a channel whose light is as modelled: 0.15 to 0.28 on path-traced desks, to 0.61 on one with
     rough metal."""
     misfit: float = 0.5
     """How much less of a solution is taken per cost of one, per equation, beyond that."""
