@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import functools
 
+import cv2
 import numpy as np
 import pytest
 from scipy.stats import binom
 
 from bench.bench_never_worse import NO_WORSE, evaluate, summarise
+from bench.environments import made_up_environment
 from bench.random_tables import make_setup
 from bench.table_world import FINE, Block, Bulb, World, latlong_directions
 
@@ -50,6 +52,23 @@ def test_the_renderer_lights_as_closed_forms_have_it():
     d, area = latlong_directions(*FINE)
     assert area.sum() == pytest.approx(4.0 * np.pi, rel=1e-4)
     assert np.linalg.norm(d, axis=-1) == pytest.approx(1.0)
+
+
+def test_surfaces_are_lit_by_what_the_picture_shows():
+    """Irradiance at the ball's place is that of what is seen from there: a wall, a box and the table, each as lit."""
+    center, cells = np.array([0.12, 0.05, 0.04]), 128
+    sky = cv2.resize(np.asarray(made_up_environment(FINE[0]), np.float32), FINE[::-1], interpolation=cv2.INTER_AREA)
+    table = np.full((64, 64, 3), 0.4, np.float32), np.full(2, 0.8)
+    blocks = [
+        Block(np.array([0.1, 0.55, 0.7]), np.array([4.0, 0.1, 1.6]), 0.0, np.array([0.7, 0.4, 0.2]), modelled=False),
+        Block(np.array([-0.1, 0.15, 0.1]), np.array([0.1, 0.1, 0.2]), 20.0, np.array([0.2, 0.5, 0.7]), modelled=False),
+    ]
+    world = World(sky, (center, 1e-6, 0.9), blocks, [], table, None)
+    d, area = (part.reshape(2 * cells**2, -1) for part in latlong_directions(cells, 2 * cells))
+    seen = world.trace(center, d, ball=False)
+    for normal in np.concatenate([np.eye(3), -np.eye(3)[:2]]):
+        expected = (np.maximum(d @ normal, 0.0) * area[:, 0]) @ seen
+        assert world.irradiance(center[None], normal)[0] == pytest.approx(expected, rel=FURNACE)
 
 
 def test_set_ups_are_the_same_every_time():
