@@ -208,7 +208,7 @@ class Recover(Stage):
             Pass(self._take, on_host=True, enabled=lambda: self._arrives, beforehand=True),
             # What clips is known before the map is filled.
             Pass(self._weigh, rows=self.request.quality.environment_height, reads=("environment_clipped", "pose")),
-            Pass(self._leave_out, rows=arrays["recover_cells_now"].shape[0], enabled=lambda: bool(self._proxies)),
+            *((Pass(self._leave_out, rows=arrays["recover_cells_now"].shape[0]),) if self._proxies else ()),
             Pass(self._condense, rows=arrays["recover_cells_now"].shape[0], enabled=lambda: self._asks),
             Pass(self._observe, rows=points, enabled=lambda: self._asks),
             Pass(self._transfer, rows=points, enabled=lambda: self._asks),
