@@ -7,7 +7,7 @@ import warp as wp
 
 from bench.common import measure, report_map
 from bench.environments import HEIGHTS, random_map
-from warp_ar.kernels import accumulate
+from warp_ar.kernels.environment import accumulate
 from warp_ar.kernels.structs import FrameParams, make_environment_view
 
 TEXEL_BYTES = 3 * (12 + 4 + 12) + 2 * (12 + 4)

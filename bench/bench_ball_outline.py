@@ -9,8 +9,8 @@ import numpy as np
 
 from tests.photo_files import encode_srgb
 from tests.rendered_room import Room, look_at, render
+from warp_ar.ball.ball_finder import find_ball, silhouette
 from warp_ar.errors import UsageError
-from warp_ar.input.ball_finder import find_ball, silhouette
 from warp_ar.scene import Camera
 
 PICTURES = 16

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.table_world import latlong_directions
-from warp_ar.kernels.recover_cells import CELL_COLUMNS, CELL_ROWS
+from warp_ar.kernels.recovery.recover_cells import CELL_COLUMNS, CELL_ROWS
 from warp_ar.light.captured import texel_solid_angles
 from warp_ar.light.config import CONFIG
 from warp_ar.light.evidence import spread_directions

@@ -11,7 +11,8 @@ import numpy as np
 import warp as wp
 
 from bench.common import measure, paired_ratio, report
-from warp_ar.kernels import color, composite
+from warp_ar.kernels import color
+from warp_ar.kernels.picture import composite
 from warp_ar.kernels.structs import FrameParams
 
 SIZES = ((480, 640), (1080, 1920))

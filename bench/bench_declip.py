@@ -6,8 +6,8 @@ import numpy as np
 import warp as wp
 
 from bench.common import measure, report
-from warp_ar.kernels import declip
 from warp_ar.kernels.color import decode_table
+from warp_ar.kernels.picture import declip
 from warp_ar.kernels.structs import FrameParams, Probe, RayScene, make_picture
 
 H, W = 480, 640

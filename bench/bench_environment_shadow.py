@@ -9,8 +9,8 @@ import warp as wp
 
 from bench.common import measure, report
 from warp_ar.engine.pipeline import Pipeline
-from warp_ar.input.sources import open_source
 from warp_ar.scene import load_scene
+from warp_ar.sources.sources import open_source
 from warp_ar.stages.quality import PRESETS
 from warp_ar.stages.shared.shadow_methods import METHODS
 

@@ -7,7 +7,7 @@ import warp as wp
 
 from bench.bench_composite import H, W, frame_and_layers
 from bench.common import measure, report
-from warp_ar.kernels import composite, expose, summed_area
+from warp_ar.kernels.picture import composite, expose, summed_area
 from warp_ar.kernels.structs import make_picture
 
 LAYERS = (("frame", composite.CompositeConfig()), ("layers", composite.CompositeConfig(virtual=True, added=True)))

@@ -6,7 +6,7 @@ import warp as wp
 
 from bench.common import measure, report_map
 from bench.environments import HEIGHTS, random_map
-from warp_ar.kernels import fill
+from warp_ar.kernels.environment import fill
 
 TEXEL_BYTES = 16 + 16 * 4 * 4 // 3 + 12
 """Texels of 16 bytes pass down and up a pyramid of 4 / 3 of the map."""

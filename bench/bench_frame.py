@@ -26,14 +26,14 @@ import warp as wp
 
 from bench.common import copy_bandwidth, measure, report
 from warp_ar.engine.pipeline import TRACK, Pipeline
-from warp_ar.input.sources import open_source
-from warp_ar.input.tracking import Tracker
-from warp_ar.kernels.shapes import intersect_mesh
+from warp_ar.kernels.rays.shapes import intersect_mesh
 from warp_ar.kernels.structs import FrameParams, RayScene
 from warp_ar.output.sinks import open_sink
 from warp_ar.scene import Pose, Scene, bundled_scenes, load_scene
 from warp_ar.scene.shapes import torus_mesh
+from warp_ar.sources.sources import open_source
 from warp_ar.stages.quality import PRESETS, Quality
+from warp_ar.tracking.tracking import Tracker
 
 CLIP_FRAMES = 48
 WARM_UP = 6

@@ -25,14 +25,14 @@ from bench.common import commit
 from tests.printed_card import PrintedCard, linear_of, poses, smooth_curve
 from tests.random_desk import RandomDesk
 from tests.rendered_room import look_at
-from warp_ar.input.ball import posed_frames
-from warp_ar.input.ball_measure import measure_ball
-from warp_ar.input.camera_calibration import calibrate_camera
-from warp_ar.input.card import write_card
-from warp_ar.input.grey_response import measure_grey_response
-from warp_ar.input.sheet import SHEET, ball_center
-from warp_ar.input.sources import open_source
+from warp_ar.ball.ball import posed_frames
+from warp_ar.ball.ball_measure import measure_ball
+from warp_ar.calibration.camera_calibration import calibrate_camera
+from warp_ar.calibration.card import write_card
+from warp_ar.calibration.grey_response import measure_grey_response
 from warp_ar.scene import Camera, Pose, Probe, Proxy
+from warp_ar.sources.sources import open_source
+from warp_ar.tracking.card_layout import SHEET, ball_center
 
 SETUPS = 100
 VIEWS = 14

@@ -14,7 +14,7 @@ import warp as wp
 
 from bench.common import measure, report
 from bench.environments import environments
-from warp_ar.kernels import irradiance, pyramid
+from warp_ar.kernels.environment import irradiance, pyramid
 from warp_ar.kernels.latlong import direction_from_latlong, sample_latlong
 from warp_ar.stages.irradiance import CLUSTERS, MAP_SIZE, TOP_MIP_SIZE
 

@@ -7,7 +7,7 @@ import warp as wp
 
 from bench.common import measure, report
 from bench.environments import HEIGHTS, random_map
-from warp_ar.kernels import key_lights
+from warp_ar.kernels.environment import key_lights
 from warp_ar.kernels.structs import KeyLight
 
 

@@ -40,9 +40,9 @@ import numpy as np
 
 from bench.bench_transport import descendants
 from bench.common import find_chromium, report
-from warp_ar.input.sources import open_source
 from warp_ar.output.sinks import VideoSink
 from warp_ar.scene import SourceSpec, dumps_scene, load_scene
+from warp_ar.sources.sources import open_source
 
 SECONDS = float(os.environ.get("WARP_AR_BENCH_SECONDS", "10"))
 WARM_SECONDS = 5.0

@@ -7,10 +7,12 @@ import warp as wp
 
 from bench.common import measure, report
 from tests.kernel_rig import constant_environment, records, shape
-from warp_ar.kernels import color, mirror_ball
-from warp_ar.kernels.receiver import Receiver, RelightConfig, make_receiver
-from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
-from warp_ar.kernels.shade import ShadeConfig
+from warp_ar.kernels import color
+from warp_ar.kernels.objects.reflect import DistantLight, DistantLightConfig
+from warp_ar.kernels.objects.shade import ShadeConfig
+from warp_ar.kernels.rays.trace import TraceConfig
+from warp_ar.kernels.receiver import mirror_ball
+from warp_ar.kernels.receiver.receiver import Receiver, RelightConfig, make_receiver
 from warp_ar.kernels.structs import (
     DIRECTIONAL,
     LAMBERT,
@@ -25,7 +27,6 @@ from warp_ar.kernels.structs import (
     Shape,
     make_picture,
 )
-from warp_ar.kernels.trace import TraceConfig
 from warp_ar.stages.mirror_ball import SAMPLES
 
 H, W, FOCAL = 480, 640, 600.0

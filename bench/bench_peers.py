@@ -20,11 +20,12 @@ import warp as wp
 
 from bench.bench_unwrap import empty_scene
 from bench.common import measure, paired_ratio, report
-from warp_ar.kernels import summed_area, unwrap
 from warp_ar.kernels.color import decode_table
+from warp_ar.kernels.environment import unwrap
+from warp_ar.kernels.picture import summed_area
+from warp_ar.kernels.picture.summed_area_strips import strip_shapes, sum_area_by_strips
+from warp_ar.kernels.rays.wide_bvh import walk_closest
 from warp_ar.kernels.structs import FrameParams, Probe, make_environment_view
-from warp_ar.kernels.summed_area_strips import strip_shapes, sum_area_by_strips
-from warp_ar.kernels.wide_bvh import walk_closest
 from warp_ar.scene.ray_mesh import make_ray_mesh
 from warp_ar.scene.shapes import torus_mesh
 

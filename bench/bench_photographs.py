@@ -26,11 +26,11 @@ from numpy.typing import NDArray
 from bench.bench_never_worse import irradiance
 from bench.table_world import latlong_directions
 from warp_ar import PRESETS, Pipeline
+from warp_ar.ball.ball_finder import BallOutline
 from warp_ar.capture import make_scene
 from warp_ar.errors import WarpArError
-from warp_ar.input.ball_finder import BallOutline
-from warp_ar.input.support import Support, plane_from_contact
 from warp_ar.photo_capture import Capture, capture_light
+from warp_ar.photographs.support import Support, plane_from_contact
 from warp_ar.scene import Camera, Probe
 from warp_ar.stages.quality import DEFAULT_PRESET
 

@@ -21,8 +21,8 @@ from bench.random_tables import load_environment
 from bench.table_world import Block
 from tests.polished_table import MIDDLE, Film, film
 from warp_ar import Pipeline
+from warp_ar.checks.check_pictures import Look
 from warp_ar.doctor import TablePolish, look_for_polish
-from warp_ar.input.check_pictures import Look
 from warp_ar.kernels.color import decode_table
 from warp_ar.scene import LambertMaterial, Object, ProxyMaterial, Scene
 

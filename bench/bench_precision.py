@@ -27,9 +27,9 @@ import numpy as np
 import warp as wp
 
 from bench.common import commit, measure
-from warp_ar.kernels.shapes import FAR, ROUNDING, intersect_sphere
-from warp_ar.kernels.summed_area import intensity, sum_area
-from warp_ar.kernels.trace import offset_origin
+from warp_ar.kernels.picture.summed_area import intensity, sum_area
+from warp_ar.kernels.rays.shapes import FAR, ROUNDING, intersect_sphere
+from warp_ar.kernels.rays.trace import offset_origin
 
 SIZES = {"640x480": (480, 640), "1080p": (1080, 1920), "4K": (2160, 3840), "8K": (4320, 7680)}
 RUNS = {"cpu": 5, "cuda": 30}

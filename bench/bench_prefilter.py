@@ -14,8 +14,8 @@ import warp as wp
 
 from bench.common import measure, report
 from bench.environments import environments
-from warp_ar.kernels import prefilter, pyramid
-from warp_ar.kernels.lobes import (
+from warp_ar.kernels.environment import prefilter, pyramid
+from warp_ar.kernels.environment.lobes import (
     Lobe,
     box_weights,
     lobe_count,

@@ -11,10 +11,10 @@ import numpy as np
 import warp as wp
 
 from bench.common import measure, report
-from warp_ar.kernels import recover as kernels
 from warp_ar.kernels import structs
-from warp_ar.kernels.recover_cells import Cell, add_recovered, cell_shape, condense_cells
-from warp_ar.kernels.saturation_boundaries import weigh_boundaries
+from warp_ar.kernels.recovery import recover as kernels
+from warp_ar.kernels.recovery.recover_cells import Cell, add_recovered, cell_shape, condense_cells
+from warp_ar.kernels.recovery.saturation_boundaries import weigh_boundaries
 from warp_ar.light import recovery
 from warp_ar.light.config import Kind
 from warp_ar.light.estimate import Estimate

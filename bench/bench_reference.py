@@ -24,9 +24,9 @@ from warp_ar.accuracy.known_frame import light_up_to
 from warp_ar.accuracy.path_tracer import PathTracer
 from warp_ar.device import usable_cores
 from warp_ar.kernels.launch import launch_rows
-from warp_ar.kernels.path_vertices import LocalScene, make_find_vertex
+from warp_ar.kernels.rays.trace import TraceConfig
+from warp_ar.kernels.reference.path_vertices import LocalScene, make_find_vertex
 from warp_ar.kernels.structs import FrameParams
-from warp_ar.kernels.trace import TraceConfig
 from warp_ar.scene import load_scene
 
 CASES = ("torus", "desk", "mirror")

@@ -11,11 +11,15 @@ import warp as wp
 
 from bench.common import measure, report
 from tests.kernel_rig import records, shape
-from warp_ar.kernels import color, environment_samples, receiver_cells, relight, summed_area
+from warp_ar.kernels import color
 from warp_ar.kernels.edges import EdgeLists
-from warp_ar.kernels.environment_samples import EnvironmentSample
+from warp_ar.kernels.environment import environment_samples
+from warp_ar.kernels.environment.environment_samples import EnvironmentSample
 from warp_ar.kernels.launch import count_partials
-from warp_ar.kernels.receiver import METHODS, ReceiverCells, RelightConfig, make_receiver
+from warp_ar.kernels.picture import summed_area
+from warp_ar.kernels.rays.trace import TraceConfig
+from warp_ar.kernels.receiver import receiver_cells, relight
+from warp_ar.kernels.receiver.receiver import METHODS, ReceiverCells, RelightConfig, make_receiver
 from warp_ar.kernels.structs import (
     BOX,
     PLANE,
@@ -30,7 +34,6 @@ from warp_ar.kernels.structs import (
     Shape,
     make_picture,
 )
-from warp_ar.kernels.trace import TraceConfig
 
 H, W = 480, 640
 

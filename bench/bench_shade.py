@@ -11,11 +11,11 @@ import warp as wp
 from bench.bench_visibility import Frame, H, W
 from bench.common import measure, report
 from warp_ar.kernels import structs
-from warp_ar.kernels.lobes import lobe_texels
-from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
-from warp_ar.kernels.shade import ShadeConfig, make_object_light, shade
+from warp_ar.kernels.environment.lobes import lobe_texels
+from warp_ar.kernels.objects.reflect import DistantLight, DistantLightConfig
+from warp_ar.kernels.objects.shade import ShadeConfig, make_object_light, shade
+from warp_ar.kernels.rays.visibility import make_visible
 from warp_ar.kernels.split_sum import integrate_dfg
-from warp_ar.kernels.visibility import make_visible
 
 LEVEL_HEIGHT = 64
 

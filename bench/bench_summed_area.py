@@ -12,8 +12,8 @@ import numpy as np
 import warp as wp
 
 from bench.common import copy_bandwidth, measure, paired_ratio, recorded, report
-from warp_ar.kernels import summed_area
-from warp_ar.kernels.summed_area_strips import strip_shapes, sum_area_by_strips
+from warp_ar.kernels.picture import summed_area
+from warp_ar.kernels.picture.summed_area_strips import strip_shapes, sum_area_by_strips
 
 SIZES = ((480, 640), (1080, 1920), (2160, 3840), (4320, 7680))
 

@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 
 from bench.common import measure, report
-from warp_ar.input.markers import MarkerDetector, find_dictionary, make_board
-from warp_ar.input.tracking import Tracker, TrackState
 from warp_ar.scene import Camera, CharucoBoard, Marker, Pose
+from warp_ar.tracking.markers import MarkerDetector, find_dictionary, make_board
+from warp_ar.tracking.tracking import Tracker, TrackState
 
 SINGLE = Marker()
 BOARD = Marker("DICT_5X5_100", board=CharucoBoard(5, 7, 0.03, 0.022))

@@ -25,8 +25,8 @@ import numpy as np
 from aiohttp import web
 
 from bench.common import find_chromium, report
-from warp_ar.input.sources import open_source
 from warp_ar.scene import load_scene
+from warp_ar.sources.sources import open_source
 from warp_ar.viewer.encoding import encode_jpeg
 
 SECONDS = float(os.environ.get("WARP_AR_BENCH_SECONDS", "10"))

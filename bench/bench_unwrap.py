@@ -10,8 +10,8 @@ import numpy as np
 import warp as wp
 
 from bench.common import measure, paired_ratio, report
-from warp_ar.kernels import unwrap
 from warp_ar.kernels.color import decode_table
+from warp_ar.kernels.environment import unwrap
 from warp_ar.kernels.structs import BOX, FrameParams, Material, Probe, RayScene, Shape, Texture, make_environment_view
 
 

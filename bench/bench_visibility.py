@@ -7,9 +7,9 @@ import warp as wp
 
 from bench.common import measure, report
 from warp_ar.kernels import structs
+from warp_ar.kernels.rays.trace import TraceConfig
+from warp_ar.kernels.rays.visibility import make_visible, trace_pixels
 from warp_ar.kernels.structs import Hit
-from warp_ar.kernels.trace import TraceConfig
-from warp_ar.kernels.visibility import make_visible, trace_pixels
 from warp_ar.scene.ray_mesh import make_ray_mesh
 from warp_ar.scene.shapes import torus_mesh
 

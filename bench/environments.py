@@ -10,7 +10,7 @@ import numpy as np
 import OpenEXR
 import warp as wp
 
-from warp_ar.kernels.pyramid import reduce_latlong
+from warp_ar.kernels.environment.pyramid import reduce_latlong
 
 HEIGHTS = (32, 64, 128, 256)
 """Rows of maps that stages of the environment are measured on."""

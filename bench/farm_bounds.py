@@ -29,10 +29,10 @@ from warp_ar.farm.lit_picture import LitPicture
 from warp_ar.farm.part_video import PartSink
 from warp_ar.farm.records import Context
 from warp_ar.farm.work import Work
-from warp_ar.input.sources import open_source
-from warp_ar.input.tracking import Tracker
-from warp_ar.input.video_file import rgb_from_video
 from warp_ar.scene import load_scene
+from warp_ar.sources.sources import open_source
+from warp_ar.sources.video_file import rgb_from_video
+from warp_ar.tracking.tracking import Tracker
 
 FRAMES = {"cpu": 12, "cuda": 96}
 WARM = 3

@@ -18,8 +18,8 @@ import numpy as np
 
 from warp_ar.device import usable_cores
 from warp_ar.farm.part_video import PartSink, join_parts
-from warp_ar.input.sources import open_source
 from warp_ar.scene import Scene, SourceSpec, dumps_scene, load_scene
+from warp_ar.sources.sources import open_source
 
 RATE = 30
 TICK = fractions.Fraction(1, RATE)

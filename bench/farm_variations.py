@@ -17,10 +17,10 @@ from bench.common import paired_ratio
 from bench.farm_bench import START_SECONDS, Bench, size_of
 from bench.farm_recordings import write_recording, write_scene
 from bench.farm_runs import Done, jobs_done, prepare, rates, work
-from warp_ar.farm.draws import draw_variation
 from warp_ar.farm.jobs import Job, parse_jobs, read_jobs
 from warp_ar.farm.lighting import Lighter
 from warp_ar.farm.survey import lit_scene, survey_clip
+from warp_ar.farm.variations import draw_variation
 from warp_ar.session import Session
 
 DATASET = """schema = 1

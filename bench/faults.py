@@ -1,7 +1,7 @@
 """What wrong set-ups cost: the table behind ``python -m warp_ar.doctor``, measured on simulated faults.
 
 The bundled desk is lit with its own numbers and with wrong ones, and both pictures are compared: mean FLIP over the
-frame. ``python -m bench.faults`` from the repository's folder writes ``warp_ar/input/fault_errors.json``.
+frame. ``python -m bench.faults`` from the repository's folder writes ``warp_ar/checks/fault_errors.json``.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ import numpy as np
 
 import warp_ar
 from warp_ar.accuracy.metrics import flip_map
-from warp_ar.input.sources import open_source
 from warp_ar.scene import Scene, load_scene
+from warp_ar.sources.sources import open_source
 
 TABLE = Path(__file__).resolve().parents[1] / "warp_ar" / "input" / "fault_errors.json"
 FRAMES = 6

@@ -95,7 +95,7 @@ class Shape:
         wp.vec3
     )  # local: half sizes (plane: x, y; box: x, y, z); radius (sphere: x); major, minor radius (torus: x, y)
     mesh: wp.uint64  # for MESH, id of the wp.Mesh in local space: corner k of triangle f is its point 3 f + k
-    tree: wp.uint64  # on CPU the address of its tree of kernels/wide_bvh.py; 0: rays walk the wp.Mesh's own
+    tree: wp.uint64  # on CPU the address of its tree of kernels/rays/wide_bvh.py; 0: rays walk the wp.Mesh's own
     first_vertex: wp.int32  # where this mesh's vertices start in the vertex arrays
     material: wp.int32  # index of its first material; -1 for proxies
     smooth: wp.int32  # 1: interpolate vertex normals
@@ -149,7 +149,7 @@ class Texture:
 
 @wp.struct
 class AreaLight:
-    """An object that emits, as a light that is all at one point; see ``kernels/area_lights.py``."""
+    """An object that emits, as a light that is all at one point; see ``kernels/rays/area_lights.py``."""
 
     object: wp.int32
     power: wp.vec3  # integral of radiance over the emitting area, local: m^2 times camera values
@@ -179,7 +179,7 @@ class RayScene:
     area_lights: wp.array[AreaLight]  # the objects that do
     emitting_faces: wp.array[wp.vec3i]  # object; triangle of its mesh, -1: the whole sphere; 1: only its front emits
     emitting_shares: wp.array[wp.float32]  # of all that is emitted, by this face and those before it; the last is 1
-    walks: wp.uint64  # on CPU the address of its table of kernels/called_walks.py; else 0
+    walks: wp.uint64  # on CPU the address of its table of kernels/rays/called_walks.py; else 0
 
 
 @wp.struct

@@ -12,8 +12,8 @@ from warp_ar.accuracy import case_report, cases
 from warp_ar.accuracy import sweep as sweep_module
 from warp_ar.accuracy.cost_table import SETTINGS
 from warp_ar.accuracy.metrics import ArrayError
-from warp_ar.input.sources import Frame
-from warp_ar.input.tracking import Tracker
+from warp_ar.sources.sources import Frame
+from warp_ar.tracking.tracking import Tracker
 
 
 def setting(name):

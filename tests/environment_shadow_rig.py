@@ -5,19 +5,16 @@ import warp as wp
 
 from tests.kernel_rig import TEXTURES, camera_fields, constant_environment, records, shape, tables
 from tests.relight_rig import CAMERA, DESK, LOOK_DOWN, RAYS, H, W
-from warp_ar.kernels import (
-    environment_samples,
-    environment_shadow,
-    environment_shadow_filter,
-    environment_shadow_wavefront,
-)
-from warp_ar.kernels.environment_samples import EnvironmentSample, SampleSets
-from warp_ar.kernels.environment_shadow_cells import (
+from warp_ar.kernels.environment import environment_samples
+from warp_ar.kernels.environment.environment_samples import EnvironmentSample, SampleSets
+from warp_ar.kernels.objects.reflect import DistantLight, DistantLightConfig
+from warp_ar.kernels.rays.trace import TraceConfig
+from warp_ar.kernels.receiver import environment_shadow, environment_shadow_filter, environment_shadow_wavefront
+from warp_ar.kernels.receiver.environment_shadow_cells import (
     EnvironmentShadowConfig,
     ShadowCells,
     shaded_shape,
 )
-from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
 from warp_ar.kernels.structs import (
     LAMBERT,
     MESH,
@@ -30,7 +27,6 @@ from warp_ar.kernels.structs import (
     Shape,
     make_picture,
 )
-from warp_ar.kernels.trace import TraceConfig
 from warp_ar.scene.ray_scene import HostScene
 
 COUNT, SIDE = 64, 4

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from warp_ar.farm.jobs import JobFile, parse_jobs
-from warp_ar.input.sources import open_source
+from warp_ar.sources.sources import open_source
 
 CLIPS = pathlib.Path(__file__).resolve().parents[1] / "scenes" / "clips"
 SIZE = (320, 240)

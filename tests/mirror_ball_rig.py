@@ -8,10 +8,12 @@ import warp as wp
 from tests.hard_cases.rig import look_at
 from tests.kernel_rig import TEXTURES, camera_fields, constant_environment, records, shape, tables
 from tests.reference import color as reference_color
-from warp_ar.kernels import color, mirror_ball
-from warp_ar.kernels.receiver import RelightConfig, make_receiver
-from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
-from warp_ar.kernels.shade import ShadeConfig
+from warp_ar.kernels import color
+from warp_ar.kernels.objects.reflect import DistantLight, DistantLightConfig
+from warp_ar.kernels.objects.shade import ShadeConfig
+from warp_ar.kernels.rays.trace import TraceConfig
+from warp_ar.kernels.receiver import mirror_ball
+from warp_ar.kernels.receiver.receiver import RelightConfig, make_receiver
 from warp_ar.kernels.structs import (
     DIRECTIONAL,
     LAMBERT,
@@ -27,7 +29,6 @@ from warp_ar.kernels.structs import (
     Shape,
     make_picture,
 )
-from warp_ar.kernels.trace import TraceConfig
 
 H, W, FOCAL = 48, 64, 150.0
 # Positions on what is mirrored carry 1e-7 of a metre, times the ball's curvature; lights are decimetres away.

@@ -23,8 +23,8 @@ from tests.test_budget import even_costs
 from warp_ar.accuracy.cost_table import relevant_settings
 from warp_ar.accuracy.costs import cost_key, write_costs
 from warp_ar.engine.pipeline import Pipeline
-from warp_ar.input.sources import open_source
 from warp_ar.scene import SourceSpec, dumps_scene, load_scene
+from warp_ar.sources.sources import open_source
 
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="needs a browser: apt-get install chromium")
 

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 
 from tests.rendered_room import look_at
-from warp_ar.input import sheet
-from warp_ar.input.card import PAPERS, draw_card
+from warp_ar.calibration.card import PAPERS, draw_card
 from warp_ar.scene import Camera, Pose
+from warp_ar.tracking import card_layout
 
 PER_METRE = 4000
 """Pixels per metre of the print: four dots of a grey are four pixels."""
@@ -36,12 +36,12 @@ class PrintedCard:
         self.black = rng.uniform(0.03, 0.1) if black is None else black
         self.spread = rng.normal(0.0, 0.015) if spread is None else spread
         width, height = (length / 1e3 for length in PAPERS[paper])
-        ink = 1.0 - sheet.draw_sheet((width, height), PER_METRE, draw_card(sheet.SHEET, PER_METRE)) / 255.0
+        ink = 1.0 - card_layout.draw_sheet((width, height), PER_METRE, draw_card(card_layout.SHEET, PER_METRE)) / 255.0
         # Ink spreads in the greys' dots alone: each patch gets what its share becomes.
-        self.origin = np.array([width / 2, 0.052 + sheet.BALL_PLACE[1] + (height - 0.2794) / 2]) * PER_METRE
-        for share, center in zip(sheet.GREYS, sheet.grey_centers(), strict=True):
+        self.origin = np.array([width / 2, 0.052 + card_layout.BALL_PLACE[1] + (height - 0.2794) / 2]) * PER_METRE
+        for share, center in zip(card_layout.GREYS, card_layout.grey_centers(), strict=True):
             x, y = self.origin + np.array([center[0], -center[1]]) * PER_METRE
-            w, h = (round(side * PER_METRE / 2) for side in sheet.GREY_SIZE)
+            w, h = (round(side * PER_METRE / 2) for side in card_layout.GREY_SIZE)
             inked = share + 4 * self.spread * share * (1 - share)
             patch = ink[round(y) - h : round(y) + h, round(x) - w : round(x) + w]
             patch += inked - share

@@ -9,9 +9,9 @@ import numpy as np
 import pypdfium2
 
 from tests.rendered_room import look_at
-from warp_ar.input import sheet
 from warp_ar.light.captured import latlong_directions
 from warp_ar.scene import Camera
+from warp_ar.tracking import card_layout
 
 PER_METRE = 3000.0
 """Pixels per metre of the printed sheet: a third of a millimetre, finer than any camera here sees it."""
@@ -37,10 +37,10 @@ class RandomDesk:
         self.paper = 0.04 + 0.6 * paper / 255
         self.size = page_mm / 1e3
         # As `sheet` has it: from the top of the paper to the board's centre.
-        self.top = 0.052 + sheet.BALL_PLACE[1] + (self.size[1] - 0.2794) / 2
+        self.top = 0.052 + card_layout.BALL_PLACE[1] + (self.size[1] - 0.2794) / 2
         self.radius = rng.uniform(0.027, 0.036)
         off = rng.uniform(-0.001, 0.001, 2)
-        self.center = np.array([*(np.array(sheet.BALL_PLACE) + off), self.radius])
+        self.center = np.array([*(np.array(card_layout.BALL_PLACE) + off), self.radius])
         focal = rng.uniform(560, 760)
         lens = (rng.uniform(-0.12, 0.02), rng.uniform(-0.02, 0.04), 0.0, 0.0, 0.0)
         self.camera = Camera(640, 480, focal, focal, *(np.array([319.5, 239.5]) + rng.uniform(-6, 6, 2)), lens)

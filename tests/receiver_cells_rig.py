@@ -9,9 +9,11 @@ import warp as wp
 from tests.kernel_rig import constant_environment, records, shape, tables
 from tests.reference import receiver_cells as reference
 from tests.relight_rig import CAMERA, DESK, LOOK_DOWN, point
-from warp_ar.kernels import receiver_cells, relight, summed_area
-from warp_ar.kernels.receiver import ReceiverCells, RelightConfig, make_receiver
-from warp_ar.kernels.receiver_cells import Patch
+from warp_ar.kernels.picture import summed_area
+from warp_ar.kernels.rays.trace import TraceConfig
+from warp_ar.kernels.receiver import receiver_cells, relight
+from warp_ar.kernels.receiver.receiver import ReceiverCells, RelightConfig, make_receiver
+from warp_ar.kernels.receiver.receiver_cells import Patch
 from warp_ar.kernels.structs import (
     BOX,
     MESH,
@@ -25,7 +27,6 @@ from warp_ar.kernels.structs import (
     Shape,
     make_picture,
 )
-from warp_ar.kernels.trace import TraceConfig
 
 SIZE_OF_FRAME = (48, 64)
 FOCAL = 60.0

@@ -9,9 +9,9 @@ import pytest
 import warp as wp
 
 from tests.reference import recover as reference
-from warp_ar.kernels import recover as kernels
 from warp_ar.kernels import structs
-from warp_ar.kernels.recover_cells import CELL_COLUMNS, CELL_ROWS, Cell
+from warp_ar.kernels.recovery import recover as kernels
+from warp_ar.kernels.recovery.recover_cells import CELL_COLUMNS, CELL_ROWS, Cell
 from warp_ar.light import recovery
 from warp_ar.light import surfaces as light_surfaces
 from warp_ar.light.solving_process import SolvingPool

@@ -5,12 +5,11 @@ import warp as wp
 
 from tests.kernel_rig import constant_environment, records, shape, tables
 from tests.reference import relight as reference
-from warp_ar.kernels import relight, summed_area
 from warp_ar.kernels.edges import EdgeLists
-from warp_ar.kernels.receiver import (
-    RelightConfig,
-    make_receiver,
-)
+from warp_ar.kernels.picture import summed_area
+from warp_ar.kernels.rays.trace import TraceConfig
+from warp_ar.kernels.receiver import relight
+from warp_ar.kernels.receiver.receiver import RelightConfig, make_receiver
 from warp_ar.kernels.structs import (
     PLANE,
     POINT,
@@ -22,7 +21,6 @@ from warp_ar.kernels.structs import (
     Shape,
     make_picture,
 )
-from warp_ar.kernels.trace import TraceConfig
 
 H, W = 48, 64
 # Points on the desk are computed in float32, 1e-7 of a metre or so; lights are decimetres away and 1/d^2 doubles that.

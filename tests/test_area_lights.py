@@ -11,7 +11,7 @@ import warp as wp
 from tests.kernel_rig import SMALL_CAMERA
 from tests.reference import area_lights as twin
 from warp_ar.errors import SceneError
-from warp_ar.kernels.area_lights import AreaSample, area_numbers, find_share, make_area_count, make_area_sample
+from warp_ar.kernels.rays.area_lights import AreaSample, area_numbers, find_share, make_area_count, make_area_sample
 from warp_ar.kernels.structs import RayScene
 from warp_ar.scene import AreaLight, Camera, EmissiveMaterial, Object, Scene, dumps_scene, loads_scene
 from warp_ar.scene.ray_scene import HostScene

@@ -12,14 +12,14 @@ import warp as wp
 
 from tests.test_path_tracer import ERRORS, look
 from warp_ar.accuracy.path_tracer import PathTracer, TracedPicture
-from warp_ar.kernels.area_lights import make_area_count, make_area_sample
-from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
-from warp_ar.kernels.shade import NearPoint, ShadeConfig, make_shade_hit
-from warp_ar.kernels.shadow import LightSample, make_shadow, tile_turn
-from warp_ar.kernels.shapes import FAR
+from warp_ar.kernels.objects.reflect import DistantLight, DistantLightConfig
+from warp_ar.kernels.objects.shade import NearPoint, ShadeConfig, make_shade_hit
+from warp_ar.kernels.rays.area_lights import make_area_count, make_area_sample
+from warp_ar.kernels.rays.shadow import LightSample, make_shadow, tile_turn
+from warp_ar.kernels.rays.shapes import FAR
+from warp_ar.kernels.rays.trace import TraceConfig, make_trace
 from warp_ar.kernels.split_sum import integrate_dfg
 from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, MIRROR, PHONG, Light, RayScene
-from warp_ar.kernels.trace import TraceConfig, make_trace
 from warp_ar.scene import (
     AreaLight,
     Camera,

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from warp_ar.input import ball
-from warp_ar.input.ball import BallView, fit_ball
+from warp_ar.ball import ball
+from warp_ar.ball.ball import BallView, fit_ball
 from warp_ar.scene import Camera, Marker, Pose, Probe, Proxy, Scene, load_scene
 from warp_ar.session import Session
 

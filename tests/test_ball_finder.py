@@ -8,9 +8,9 @@ import pytest
 
 from tests.photo_room import exposed, photograph, sphere
 from tests.rendered_room import Room, look_at, render
+from warp_ar.ball.ball_finder import far_camera, find_ball, silhouette, silhouettes, sphere_of_circle
+from warp_ar.ball.ball_rim import gradients, radial_compression
 from warp_ar.errors import UsageError
-from warp_ar.input.ball_finder import far_camera, find_ball, silhouette, silhouettes, sphere_of_circle
-from warp_ar.input.ball_rim import gradients, radial_compression
 from warp_ar.scene import Camera
 
 CLOSE = 0.5

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from tests.photo_room import exposed, photograph, sphere
+from warp_ar.ball.ball_finder import find_ball, lifted, silhouette
+from warp_ar.ball.ball_proposals import propose_circles
 from warp_ar.errors import UsageError
-from warp_ar.input.ball_finder import find_ball, lifted, silhouette
-from warp_ar.input.ball_proposals import propose_circles
 
 NEAR = 0.2
 """Share of the radius within which a proposal must be: a search begins there, which bears 0.22."""

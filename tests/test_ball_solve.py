@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from tests.rendered_room import look_at
+from warp_ar.ball.ball_finder import BallOutline
+from warp_ar.ball.ball_solve import ground_below, solve_ball
 from warp_ar.errors import UsageError
-from warp_ar.input.ball_finder import BallOutline
-from warp_ar.input.ball_solve import ground_below, solve_ball
 from warp_ar.scene import Camera, Pose, Probe, Proxy, load_scene
 
 CAMERA = Camera(640, 480, 640.0, 640.0, 319.5, 239.5)

@@ -9,13 +9,13 @@ import pytest
 
 from tests.random_desk import RandomDesk
 from tests.rendered_room import look_at
-from warp_ar.input.ball_measure import measure_ball
-from warp_ar.input.ball_radius import explains_better, mirrored_radius
-from warp_ar.input.ball_solve import find_outlines, outline_misfit, solve_ball
-from warp_ar.input.ball_views import APART, agreeing_outlines
-from warp_ar.input.card import write_card
-from warp_ar.input.sheet import SHEET, ball_center
+from warp_ar.ball.ball_measure import measure_ball
+from warp_ar.ball.ball_radius import explains_better, mirrored_radius
+from warp_ar.ball.ball_solve import find_outlines, outline_misfit, solve_ball
+from warp_ar.ball.ball_views import APART, agreeing_outlines
+from warp_ar.calibration.card import write_card
 from warp_ar.scene import Pose, Probe, Proxy
+from warp_ar.tracking.card_layout import SHEET, ball_center
 
 TABLE = Proxy("plane", at=(0.0, 0.0, 0.0), size=(1.6, 1.2))
 RADIUS = 0.4e-3

@@ -17,10 +17,8 @@ from tests.reference import latlong as latlong_reference
 from tests.reference import unwrap as probe_reference
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SceneError, UsageError
-from warp_ar.input.exposures import MOST_EXPOSURES, brightened, find_exposure, plan_bracket
-from warp_ar.input.sources import Synthetic
-from warp_ar.kernels import bracket
 from warp_ar.kernels.color import decode_table
+from warp_ar.kernels.environment import bracket
 from warp_ar.kernels.structs import make_environment_view
 from warp_ar.scene import (
     Camera,
@@ -36,6 +34,8 @@ from warp_ar.scene import (
     loads_scene,
 )
 from warp_ar.session import Session
+from warp_ar.sources.exposures import MOST_EXPOSURES, brightened, find_exposure, plan_bracket
+from warp_ar.sources.sources import Synthetic
 from warp_ar.stages.quality import PRESETS
 
 TWIN = 2e-6

@@ -13,12 +13,13 @@ import pytest
 
 from tests.test_tracking import look, make_camera, render
 from warp_ar import calibrate
+from warp_ar.ball import ball_outline
+from warp_ar.ball.ball import fit_ball
+from warp_ar.calibration import camera_calibration, card, response
 from warp_ar.errors import UsageError
-from warp_ar.input import ball_outline, camera_calibration, card, response
-from warp_ar.input.ball import fit_ball
-from warp_ar.input.tracking import Tracker
 from warp_ar.kernels.color import decode_table
 from warp_ar.scene import Camera, CharucoBoard, Marker, Pose, Probe, load_calibration, load_scene
+from warp_ar.tracking.tracking import Tracker
 
 BOARD = Marker("DICT_5X5_100", board=CharucoBoard(7, 5, 0.035, 0.026))
 FOCAL = 0.003

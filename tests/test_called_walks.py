@@ -11,9 +11,9 @@ import warp as wp
 from tests.gltf_files import Gltf
 from warp_ar import scene as scenes
 from warp_ar.kernels.launch import noting
-from warp_ar.kernels.shapes import FAR
+from warp_ar.kernels.rays.shapes import FAR
+from warp_ar.kernels.rays.trace import ALL_KINDS, BY_CALL, TraceConfig, make_trace
 from warp_ar.kernels.structs import Hit, RayScene
-from warp_ar.kernels.trace import ALL_KINDS, BY_CALL, TraceConfig, make_trace
 from warp_ar.scene.ray_scene import HostScene
 from warp_ar.scene.walk_table import WalkTable
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.reference import recover as reference
-from warp_ar.kernels.recover_cells import CELL_COLUMNS, CELL_ROWS, Cell
+from warp_ar.kernels.recovery.recover_cells import CELL_COLUMNS, CELL_ROWS, Cell
 from warp_ar.light.problem import candidate_directions
 
 FINE = 8

@@ -8,10 +8,10 @@ import pytest
 
 from tests.photo_files import write_photo
 from tests.photo_room import GAIN, environment, exposed, project, write_bracket
+from warp_ar.ball.ball_finder import find_ball
 from warp_ar.capture import main
+from warp_ar.checks.checkup import check_up
 from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, EXIT_USAGE
-from warp_ar.input.ball_finder import find_ball
-from warp_ar.input.checkup import check_up
 from warp_ar.light.captured import Light, latlong_directions, texel_solid_angles
 from warp_ar.live import main as live
 from warp_ar.live_start import say_quick_check

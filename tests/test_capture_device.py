@@ -12,8 +12,8 @@ import pytest
 
 from tests.test_sources import PATIENCE, error_of, grey, no_thread_left, take_until_error  # noqa: F401  (a fixture)
 from warp_ar.errors import SourceError, UsageError
-from warp_ar.input import capture_device
-from warp_ar.input.sources import CaptureDevice
+from warp_ar.sources import capture_device
+from warp_ar.sources.sources import CaptureDevice
 
 
 class FakeCapture:
@@ -208,7 +208,7 @@ class Exposed(FakeCapture):
 @pytest.mark.parametrize(("late", "backend"), [(0, "V4L2"), (2, "DSHOW"), (6, "V4L2")])
 def test_device_alternates_and_knows_what_it_shows(late: int, backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """However late the camera follows, no picture is taken for one of another exposure."""
-    monkeypatch.setattr("warp_ar.input.capture_device.BRACKET_SECONDS", 0.02)
+    monkeypatch.setattr("warp_ar.sources.capture_device.BRACKET_SECONDS", 0.02)
     capture = Exposed(late, backend=backend)
     with CaptureDevice(0, exposures=(1e-3, 8e-3), opener=lambda _: capture) as source:
         assert source.exposures == (8e-3, 1e-3)
@@ -225,7 +225,7 @@ def test_device_alternates_and_knows_what_it_shows(late: int, backend: str, monk
 
 def test_device_whose_light_changes_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
     """A lamp that is switched off while the exposure changes is not taken for an exposure forever."""
-    monkeypatch.setattr("warp_ar.input.capture_device.BRACKET_SECONDS", 0.02)
+    monkeypatch.setattr("warp_ar.sources.capture_device.BRACKET_SECONDS", 0.02)
     capture = Exposed(1)
     with CaptureDevice(0, exposures=(8e-3, 2e-3), opener=lambda _: capture) as source:
         frames = iter(source)
@@ -238,7 +238,7 @@ def test_device_whose_light_changes_goes_on(monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.mark.parametrize("stuck", [True, False])
 def test_device_whose_exposure_cannot_be_set(stuck: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("warp_ar.input.capture_device.BRACKET_SECONDS", 0.02)
+    monkeypatch.setattr("warp_ar.sources.capture_device.BRACKET_SECONDS", 0.02)
     if stuck:  # it says yes, and nothing happens
         capture = Exposed(0)
         monkeypatch.setattr(capture, "set", lambda key, value: True)

@@ -6,7 +6,7 @@ import warp as wp
 
 from tests.hard_cases.rig import blind_camera
 from tests.reference import latlong
-from warp_ar.kernels import change
+from warp_ar.kernels.environment import change
 from warp_ar.scene import Camera, Marker, Probe, Scene
 from warp_ar.stages.accumulate import Accumulate
 from warp_ar.stages.base import Arrays, LeftOut, Wiring

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from warp_ar.checks.check_objects import check_objects, find_outside, sphere_around, written_poses
+from warp_ar.checks.check_pictures import Look
+from warp_ar.checks.check_scene import check_scene
+from warp_ar.checks.checkup import check_look
 from warp_ar.errors import SceneError
-from warp_ar.input.check_objects import check_objects, find_outside, sphere_around, written_poses
-from warp_ar.input.check_pictures import Look
-from warp_ar.input.check_scene import check_scene
-from warp_ar.input.checkup import check_look
 from warp_ar.scene import (
     Animation,
     Camera,

@@ -9,10 +9,10 @@ import pytest
 
 from tests.printed_card import PrintedCard
 from tests.rendered_room import look_at
-from warp_ar.input.check_pictures import look_at as look_over
-from warp_ar.input.check_print import card_scale, check_print
-from warp_ar.input.sheet import SHEET
+from warp_ar.checks.check_pictures import look_at as look_over
+from warp_ar.checks.check_print import card_scale, check_print
 from warp_ar.scene import Camera, CharucoBoard, Marker, Pose
+from warp_ar.tracking.card_layout import SHEET
 
 CAMERA = Camera(640, 480, 600.0, 600.0, 321.0, 238.0)
 

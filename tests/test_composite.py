@@ -6,7 +6,8 @@ from tests.error_model import check_error
 from tests.kernel_rig import tables
 from tests.reference import color as reference_color
 from tests.reference import composite as reference
-from warp_ar.kernels import color, composite
+from warp_ar.kernels import color
+from warp_ar.kernels.picture import composite
 from warp_ar.kernels.structs import FrameParams
 
 H, W = 24, 40

@@ -7,7 +7,8 @@ import warp as wp
 from tests.error_model import check_error
 from tests.reference import color as reference_color
 from tests.reference import declip as reference
-from warp_ar.kernels import color, declip
+from warp_ar.kernels import color
+from warp_ar.kernels.picture import declip
 from warp_ar.kernels.structs import PLANE, FrameParams, Probe, RayScene, Shape, make_picture
 
 # float32 sums over a pyramid of ten levels, and one power per pixel.

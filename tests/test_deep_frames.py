@@ -20,16 +20,16 @@ import OpenEXR
 import pytest
 
 import warp_ar
+from warp_ar.calibration.saturation import ball_discs
 from warp_ar.errors import SinkError, SourceError, UsageError
-from warp_ar.input.plate import Plate, codes8, deep_table, srgb8
-from warp_ar.input.saturation import ball_discs
-from warp_ar.input.sources import open_source
 from warp_ar.kernels.color import decode_codes, encode_codes
 from warp_ar.output.encoders import describe_encoders, encoder_names, find_encoding, last_packets, parse_options
 from warp_ar.output.sinks import open_sink
 from warp_ar.scene import Pose
 from warp_ar.session import Session
 from warp_ar.signals import REC_709, REC_2020, hlg_of_light, light_of_hlg, light_of_pq, pq_of_light, rgb_from_rgb
+from warp_ar.sources.deep_frame import Plate, codes8, deep_table, srgb8
+from warp_ar.sources.sources import open_source
 from warp_ar.stages.quality import PRESETS
 
 SIZE = (64, 48)

@@ -13,24 +13,24 @@ import pytest
 from tests.printed_card import PrintedCard
 from tests.rendered_room import look_at
 from warp_ar import doctor, live_start
+from warp_ar.ball.ball_solve import rough_circle
+from warp_ar.calibration.card import draw_card
+from warp_ar.checks import checkup
+from warp_ar.checks.check_ball import check_balls
+from warp_ar.checks.check_pictures import Look, board_instead, check_pictures, take_look
+from warp_ar.checks.check_print import check_print
+from warp_ar.checks.check_proxies import check_proxies
+from warp_ar.checks.check_saturation import check_saturation
+from warp_ar.checks.check_scene import check_scene
+from warp_ar.checks.checkup import check_look, check_up
+from warp_ar.checks.finding import Finding, fault_errors, worst_first
 from warp_ar.errors import SceneError
-from warp_ar.input import checkup
-from warp_ar.input.ball_solve import rough_circle
-from warp_ar.input.card import draw_card
-from warp_ar.input.check_ball import check_balls
-from warp_ar.input.check_pictures import Look, board_instead, check_pictures, take_look
-from warp_ar.input.check_print import check_print
-from warp_ar.input.check_proxies import check_proxies
-from warp_ar.input.check_saturation import check_saturation
-from warp_ar.input.check_scene import check_scene
-from warp_ar.input.checkup import check_look, check_up
-from warp_ar.input.finding import Finding, fault_errors, worst_first
-from warp_ar.input.markers import find_dictionary
-from warp_ar.input.sheet import SHEET
-from warp_ar.input.source import Frame
-from warp_ar.input.sources import open_source
 from warp_ar.scene import Camera, CharucoBoard, Marker, Pose, Scene, SourceSpec, load_scene, loads_scene
 from warp_ar.scene.amend import amend_scene
+from warp_ar.sources.source import Frame
+from warp_ar.sources.sources import open_source
+from warp_ar.tracking.card_layout import SHEET
+from warp_ar.tracking.markers import find_dictionary
 
 FRAMES = 96
 CALM = 40

@@ -9,12 +9,12 @@ import warp as wp
 
 from tests.simulated_camera import decode_srgb
 from warp_ar import Pipeline
-from warp_ar.input.drift import CONTRASTS, ExposureDrift, codes_around, still_points
-from warp_ar.input.marker_pattern import printed_cells
-from warp_ar.input.plate import Plate
-from warp_ar.kernels.change import scale_radiance
 from warp_ar.kernels.color import ENCODE_KEYS, camera_table, decode_table, encode_table
+from warp_ar.kernels.environment.change import scale_radiance
 from warp_ar.scene import Pose, Scene, loads_scene
+from warp_ar.sources.deep_frame import Plate
+from warp_ar.tracking.drift import CONTRASTS, ExposureDrift, codes_around, still_points
+from warp_ar.tracking.marker_pattern import printed_cells
 
 SCENE = """schema = 1
 [camera]

@@ -56,7 +56,7 @@ def test_the_frames_own_harmonics_agree(device: str) -> None:
     """The kernel that frames are lit by has the same basis, order and lobe."""
     import warp as wp
 
-    from warp_ar.kernels.irradiance import make_sh_tables, project_irradiance_sh
+    from warp_ar.kernels.environment.irradiance import make_sh_tables, project_irradiance_sh
 
     radiance = wp.array(noise(), dtype=wp.vec3, device=device)
     tables = make_sh_tables(8, 16, 2, device)

@@ -7,9 +7,7 @@ import warp as wp
 from tests.environment_shadow_rig import ORIGIN, STRATIFIED, SUM_ERROR, draw, lamp_at, list_texels, sky, with_sun
 from tests.error_model import check_error
 from tests.reference import environment_shadow as reference
-from warp_ar.kernels import (
-    environment_samples,
-)
+from warp_ar.kernels.environment import environment_samples
 
 # --- Samples ----------------------------------------------------------------------------------------------------------
 

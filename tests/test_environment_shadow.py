@@ -24,9 +24,7 @@ from tests.kernel_rig import shape
 from tests.reference import environment_shadow as reference
 from tests.relight_rig import CAMERA, DESK, POINTS, H, W
 from warp_ar.engine.graph import make_plan
-from warp_ar.kernels import (
-    environment_samples,
-)
+from warp_ar.kernels.environment import environment_samples
 from warp_ar.kernels.structs import (
     BOX,
 )

@@ -21,19 +21,16 @@ from tests.environment_shadow_rig import (
 from tests.gltf_files import Gltf
 from tests.kernel_rig import records, shape
 from tests.relight_rig import CAMERA, DESK, LOOK_DOWN, POINTS, RAYS, H, W
-from warp_ar.kernels import (
-    environment_samples,
-    environment_shadow,
-    environment_shadow_filter,
-    environment_shadow_wavefront,
-)
-from warp_ar.kernels.environment_shadow_cells import (
+from warp_ar.kernels.environment import environment_samples
+from warp_ar.kernels.objects.reflect import DistantLight, DistantLightConfig
+from warp_ar.kernels.rays.trace import TraceConfig
+from warp_ar.kernels.receiver import environment_shadow, environment_shadow_filter, environment_shadow_wavefront
+from warp_ar.kernels.receiver.environment_shadow_cells import (
     EnvironmentShadowConfig,
     cell_column,
     tiled_cell,
     tiled_shape,
 )
-from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
 from warp_ar.kernels.structs import (
     BOX,
     LAMBERT,
@@ -44,7 +41,6 @@ from warp_ar.kernels.structs import (
     Shape,
     make_picture,
 )
-from warp_ar.kernels.trace import TraceConfig
 from warp_ar.scene import Camera as SceneCamera
 from warp_ar.scene import Object, Scene
 

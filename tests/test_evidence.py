@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.recover_rig import DistantLight, lit_environment, scene  # noqa: F401
-from warp_ar.kernels.recover_cells import CELL_ROWS, LOST
+from warp_ar.kernels.recovery.recover_cells import CELL_ROWS, LOST
 from warp_ar.light.card import check_card, covered_card
 from warp_ar.light.config import CONFIG, Kind
 from warp_ar.light.evidence import (

@@ -8,10 +8,11 @@ from tests.reference import color as reference_color
 from tests.reference import composite as reference_composite
 from tests.reference import expose as reference
 from tests.test_composite import CONFIGS, H, make_arrays, make_layers, make_params
-from warp_ar.input.plate import srgb8
-from warp_ar.kernels import color, expose, summed_area
+from warp_ar.kernels import color
 from warp_ar.kernels.color import decode_codes
+from warp_ar.kernels.picture import expose, summed_area
 from warp_ar.kernels.structs import make_picture
+from warp_ar.sources.deep_frame import srgb8
 
 # How far `auto` may miss: one bin of an eighth of a stop, and the share that may clip.
 BIN = 2.0**0.125

@@ -21,10 +21,10 @@ from warp_ar.farm.lighting import Lighter
 from warp_ar.farm.records import Context
 from warp_ar.farm.tables import JobsError
 from warp_ar.farm.work import Work
-from warp_ar.input.sources import open_source
 from warp_ar.kernels.color import decode_codes
 from warp_ar.output.sinks import open_sink
 from warp_ar.signals import REC_709, REC_2020, converted, hlg_of_light, pq_of_light
+from warp_ar.sources.sources import open_source
 from warp_ar.srgb import encode_srgb
 
 COUNT = 12

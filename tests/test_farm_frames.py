@@ -14,7 +14,7 @@ from tests.farm_rig import CLIPS, TICK, desk_frames, write_recording
 from warp_ar.errors import SourceError
 from warp_ar.farm.decoded_picture import DecodedPicture
 from warp_ar.farm.frames import index_frames, open_part, shown_ticks
-from warp_ar.input.video_file import rgb_from_video
+from warp_ar.sources.video_file import rgb_from_video
 
 UNEVEN = [7, 30, 41, 100, 101, 150, 203, 260, 261, 300, 390, 391]
 """Time stamps of a variable rate, the first not 0."""

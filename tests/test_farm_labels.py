@@ -16,7 +16,7 @@ from warp_ar.farm.jobs import Job
 from warp_ar.farm.labels import DEPTH_SCALE, _harmonics, run_lengths
 from warp_ar.farm.records import Context
 from warp_ar.farm.work import Work
-from warp_ar.kernels.object_masks import trace_object_masks
+from warp_ar.kernels.picture.object_masks import trace_object_masks
 from warp_ar.scene import load_scene
 
 DATASET = {

@@ -20,10 +20,10 @@ from warp_ar.farm.part_video import PartSink
 from warp_ar.farm.records import Context
 from warp_ar.farm.survey import Survey, lit_scene
 from warp_ar.farm.work import Work
-from warp_ar.input.sources import open_source
-from warp_ar.kernels.video_color import rgb_factors
+from warp_ar.kernels.picture.video_color import rgb_factors
 from warp_ar.scene import Animation, Object, dumps_scene, load_scene
 from warp_ar.session import Session
+from warp_ar.sources.sources import open_source
 
 COUNT = 10
 MOST_CODES = 2

@@ -9,8 +9,8 @@ from warp_ar.farm.jobs import Job
 from warp_ar.farm.part_video import PartSink
 from warp_ar.farm.records import Context
 from warp_ar.farm.work import Work
-from warp_ar.input import video_file
-from warp_ar.input.sources import open_source
+from warp_ar.sources import video_file
+from warp_ar.sources.sources import open_source
 
 COUNT = 12
 AHEAD = 4

@@ -18,8 +18,8 @@ from warp_ar.farm.records import Context
 from warp_ar.farm.survey import Survey
 from warp_ar.farm.tracking_process import can_share
 from warp_ar.farm.work import Work
-from warp_ar.input.sources import open_source
-from warp_ar.kernels.change import CHANGE_FLOOR, CHANGE_SHARE
+from warp_ar.kernels.environment.change import CHANGE_FLOOR, CHANGE_SHARE
+from warp_ar.sources.sources import open_source
 
 LIT, DARK = 8, 7
 """Frames with light that changes, and without any between them: long enough for the marker to be lost."""

@@ -16,8 +16,8 @@ from tests.farm_rig import SIZE, write_recording
 from warp_ar.errors import SourceError
 from warp_ar.farm.frames import index_frames, open_part
 from warp_ar.farm.tracking_process import Reading, TrackingProcess, can_share
-from warp_ar.input.tracking import Tracker
 from warp_ar.scene import load_scene
+from warp_ar.tracking.tracking import Tracker
 
 COUNT = 14
 SLOTS = 4

@@ -5,7 +5,7 @@ import warp as wp
 from tests.error_model import check_error
 from tests.reference import fill as reference
 from tests.reference import latlong
-from warp_ar.kernels import fill
+from warp_ar.kernels.environment import fill
 
 # Float32 sums and exponentials, a few roundings each.
 ROUNDING = 2e-6

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_ar.kernels import fill, structs
+from warp_ar.kernels import structs
 from warp_ar.kernels.color import decode_table
-from warp_ar.kernels.fill_frame import FRAME_TRUST, OWN_SHADOW, fill_frame, see_frame
+from warp_ar.kernels.environment import fill
+from warp_ar.kernels.environment.fill_frame import FRAME_TRUST, OWN_SHADOW, fill_frame, see_frame
 from warp_ar.scene import loads_scene
 from warp_ar.scene.kinds import trace_config
 from warp_ar.scene.ray_scene import HostScene

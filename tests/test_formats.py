@@ -14,8 +14,6 @@ import trimesh
 
 import warp_ar
 from tests.test_sources import write_video
-from warp_ar.input.frame_folder import IMAGE_SUFFIXES, LINEAR_SUFFIX
-from warp_ar.input.sources import open_source
 from warp_ar.kernels.color import decode_table
 from warp_ar.output.environment_file import ENVIRONMENT_SUFFIXES
 from warp_ar.output.gltf_file import GLTF_SUFFIX
@@ -23,6 +21,8 @@ from warp_ar.output.track_file import TRACK_SUFFIX
 from warp_ar.output.usd_file import USD_SUFFIXES
 from warp_ar.output.video_sink import VIDEO_SUFFIXES
 from warp_ar.scene.mesh_files import MESH_SUFFIXES, load_mesh
+from warp_ar.sources.frame_folder import IMAGE_SUFFIXES, LINEAR_SUFFIX
+from warp_ar.sources.sources import open_source
 
 ROOT = pathlib.Path(warp_ar.__file__).parents[1]
 PAGE = ROOT / "docs" / "formats.md"

@@ -16,8 +16,8 @@ from tests.test_pipeline import SIZE, make_scene
 from warp_ar.engine.frame_exchange import Borrowed, adopt_frame
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SceneError, UsageError
-from warp_ar.input.sources import Synthetic
 from warp_ar.scene import bundled_scenes, dumps_scene
+from warp_ar.sources.sources import Synthetic
 
 WIDTH, HEIGHT = SIZE
 

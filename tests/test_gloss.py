@@ -18,9 +18,11 @@ from tests.reference.visibility import Body
 from warp_ar.engine.graph import make_plan
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SceneError
-from warp_ar.kernels import color, gloss
-from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
-from warp_ar.kernels.shade import ShadeConfig
+from warp_ar.kernels import color
+from warp_ar.kernels.objects.reflect import DistantLight, DistantLightConfig
+from warp_ar.kernels.objects.shade import ShadeConfig
+from warp_ar.kernels.rays.trace import TraceConfig
+from warp_ar.kernels.receiver import gloss
 from warp_ar.kernels.structs import (
     LAMBERT,
     POINT,
@@ -33,7 +35,6 @@ from warp_ar.kernels.structs import (
     Shape,
     make_picture,
 )
-from warp_ar.kernels.trace import TraceConfig
 from warp_ar.scene import ProxyMaterial, dumps_scene, loads_scene
 from warp_ar.stages.request import Request
 

@@ -14,8 +14,8 @@ import numpy.typing as npt
 import pytest
 
 from warp_ar.engine.pipeline import Pipeline
-from warp_ar.input.sources import open_source
 from warp_ar.scene import bundled_scenes, load_scene
+from warp_ar.sources.sources import open_source
 from warp_ar.stages.quality import PRESETS, Quality
 
 GOLDEN = Path(__file__).parent / "golden"

@@ -10,16 +10,17 @@ import pytest
 
 from tests.printed_card import PrintedCard
 from tests.rendered_room import look_at
+from warp_ar.ball import ball_measure
+from warp_ar.ball.ball_measure import measure_ball
+from warp_ar.ball.ball_solve import BallSolution
+from warp_ar.ball.ground_seen import ground_correlations, ground_is_seen
+from warp_ar.checks import check_ball
+from warp_ar.checks.check_ball import check_balls
+from warp_ar.checks.check_pictures import take_look
 from warp_ar.errors import UsageError
-from warp_ar.input import ball_measure, check_ball
-from warp_ar.input.ball_measure import measure_ball
-from warp_ar.input.ball_solve import BallSolution
-from warp_ar.input.check_ball import check_balls
-from warp_ar.input.check_pictures import take_look
-from warp_ar.input.ground_seen import ground_correlations, ground_is_seen
-from warp_ar.input.sheet import ball_center
-from warp_ar.input.sources import open_source
 from warp_ar.scene import Camera, Pose, Probe, Proxy, load_scene
+from warp_ar.sources.sources import open_source
+from warp_ar.tracking.card_layout import ball_center
 
 CAMERA = Camera(640, 480, 600.0, 600.0, 321.0, 238.0, (-0.08, 0.02, 0.0, 0.0, 0.0))
 PROBE = Probe(ball_center(0.03), 0.03)

@@ -11,13 +11,13 @@ import pypdfium2
 import pytest
 
 from warp_ar import init
+from warp_ar.calibration.board_finder import recognise_board
+from warp_ar.calibration.card import draw_card, write_card
 from warp_ar.errors import SceneError
-from warp_ar.input import sheet
-from warp_ar.input.board_finder import recognise_board
-from warp_ar.input.card import draw_card, write_card
-from warp_ar.input.tracking import Tracker
 from warp_ar.scene import Camera, CharucoBoard, Marker, dumps_scene, load_scene, loads_scene
 from warp_ar.signature import is_signed
+from warp_ar.tracking import card_layout
+from warp_ar.tracking.tracking import Tracker
 
 PRINT_MM = 0.15
 """Of the rendered PDF: pixels of a quarter of a millimetre, found by their corners to half of one."""
@@ -29,9 +29,9 @@ def test_folder_is_a_scene(tmp_path, capsys):
     assert said.splitlines()[-1] == f"next: python -m warp_ar.live {tmp_path / 'my desk'}"
     assert "radius" not in said  # it is given
     scene = load_scene(tmp_path / "my desk")
-    assert (scene.name, scene.marker) == ("my desk", sheet.SHEET)
+    assert (scene.name, scene.marker) == ("my desk", card_layout.SHEET)
     assert scene.probes[0].radius == 0.025
-    assert scene.probes[0].center == sheet.ball_center(0.025)
+    assert scene.probes[0].center == card_layout.ball_center(0.025)
     assert scene.source.camera == 3
     assert scene.camera.field_of_view == 60.0
     assert scene.objects[0].file == (tmp_path / "my desk" / "teapot.ply").resolve()
@@ -79,7 +79,7 @@ def test_guessed_camera_fits_any_frame():
 def test_pdf_prints_at_true_scale(paper, size, tmp_path):
     """Rendered back to pixels of a quarter millimetre: board, rulers and paper have their lengths."""
     path = tmp_path / "card.pdf"
-    write_card(sheet.SHEET, path, paper)
+    write_card(card_layout.SHEET, path, paper)
     assert is_signed(path)
     with pypdfium2.PdfDocument(path) as document:
         page = document[0]
@@ -103,7 +103,7 @@ def test_pdf_prints_at_true_scale(paper, size, tmp_path):
 def test_everything_on_the_sheet_is_where_it_says(tmp_path):
     """Greys and the ball's cross, looked up by the board's own frame."""
     per_metre = 5000
-    page = sheet.draw_sheet((0.21, 0.297), per_metre, draw_card(sheet.SHEET, per_metre))
+    page = card_layout.draw_sheet((0.21, 0.297), per_metre, draw_card(card_layout.SHEET, per_metre))
     row, column = np.array(page.shape) / 2  # the sheet's width is even about the board
     marker = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)).detectMarkers(page)
     by_number = {int(n): c[0] for n, c in zip(np.ravel(marker[1]), marker[0], strict=True)}
@@ -111,10 +111,11 @@ def test_everything_on_the_sheet_is_where_it_says(tmp_path):
     a, b = by_number[0].mean(0), by_number[9].mean(0)
     origin = a + (b - a) * (1.0 / 3.0) + np.array([0.0, 0.5 / 3.0]) * (b - a)[1]
     assert np.allclose(b - a, [3 * 0.032 * per_metre, 3 * 0.032 * per_metre], atol=2)
-    for share, (x, y, _) in zip(sheet.GREYS, sheet.grey_centers(), strict=True):
+    for share, (x, y, _) in zip(card_layout.GREYS, card_layout.grey_centers(), strict=True):
         column, row = np.round(origin + np.array([x, -y]) * per_metre).astype(int)
         assert page[row - 15 : row + 15, column - 50 : column + 50].mean() / 255 == pytest.approx(1 - share, abs=0.04)
-    column, row = np.round(origin + np.array([sheet.BALL_PLACE[0], -sheet.BALL_PLACE[1]]) * per_metre).astype(int)
+    x, y = card_layout.BALL_PLACE
+    column, row = np.round(origin + np.array([x, -y]) * per_metre).astype(int)
     # Lines of a pixel, which rounding may move by one.
     assert (page[row - 1 : row + 2, column - 15 : column + 16].min(0) == 0).all()
     assert (page[row - 15 : row + 16, column - 1 : column + 2].min(1) == 0).all()
@@ -123,7 +124,7 @@ def test_everything_on_the_sheet_is_where_it_says(tmp_path):
 @pytest.mark.parametrize(
     "marker",
     [
-        sheet.SHEET,
+        card_layout.SHEET,
         Marker("DICT_5X5_100", board=CharucoBoard(7, 5, 0.03, 0.022)),
         Marker("DICT_6X6_50", board=CharucoBoard(8, 11, 1.0, 0.7)),
         Marker("DICT_APRILTAG_36h11", board=CharucoBoard(6, 5, 1.0, 0.75)),
@@ -151,10 +152,10 @@ def test_no_board_where_there_is_none():
 
 
 def test_tracker_follows_the_sheet():
-    card = draw_card(sheet.SHEET, 2000.0)
+    card = draw_card(card_layout.SHEET, 2000.0)
     height, width = card.shape
     camera = Camera(width, height, 1000.0, 1000.0, (width - 1) / 2, (height - 1) / 2)
-    track = Tracker(sheet.SHEET, camera).track(np.repeat(card[..., None], 3, 2), 0.0)
+    track = Tracker(card_layout.SHEET, camera).track(np.repeat(card[..., None], 3, 2), 0.0)
     assert np.allclose(track.pose.translation, (0, 0, 0.5), atol=1e-3)
 
 
@@ -163,4 +164,4 @@ def test_template_is_toml_with_the_reference_s_words(tmp_path, capsys):
     assert "Write the ball's radius" in capsys.readouterr().out
     data = tomllib.loads((tmp_path / "a" / "scene.toml").read_text())
     assert data["source"]["path"].endswith("clip.mp4")
-    assert json.dumps(data["probe"]["center"]) == json.dumps(list(map(float, sheet.ball_center(0.035))))
+    assert json.dumps(data["probe"]["center"]) == json.dumps(list(map(float, card_layout.ball_center(0.035))))

@@ -12,10 +12,10 @@ from tests.receiver_cells_rig import View, box, middles
 from tests.reference.probe_weights import weights
 from tests.relight_rig import DESK, FLOAT_ERROR, POINTS, point
 from tests.relight_rig import run as run_relight
-from warp_ar.kernels import environment_samples
-from warp_ar.kernels.environment_samples import EnvironmentSample
-from warp_ar.kernels.interpolated_irradiance import OtherBalls
-from warp_ar.kernels.receiver import PRIOR_WEIGHT
+from warp_ar.kernels.environment import environment_samples
+from warp_ar.kernels.environment.environment_samples import EnvironmentSample
+from warp_ar.kernels.environment.interpolated_irradiance import OtherBalls
+from warp_ar.kernels.receiver.receiver import PRIOR_WEIGHT
 
 PLACES = ((-0.15, 0.02, 0.05, 1.0), (0.2, -0.05, 0.05, 1.0), (0.1, 0.15, 0.05, 0.6))
 WHERE = np.array([[weights(PLACES[:2], point) for point in row] for row in POINTS])

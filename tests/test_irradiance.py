@@ -9,7 +9,8 @@ from tests.kernel_rig import SMALL_DESK, launch_passes
 from tests.reference import irradiance as reference
 from tests.reference import latlong
 from warp_ar.engine.graph import make_plan
-from warp_ar.kernels import guards, irradiance, pyramid
+from warp_ar.kernels import safe_math
+from warp_ar.kernels.environment import irradiance, pyramid
 from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.scene import loads_scene
 from warp_ar.stages.base import Arrays
@@ -358,7 +359,7 @@ def test_bad_texels_are_contained(device, method):
     radiance[9, 9] = np.inf
     values = run_method(radiance, method, unit(100))
     assert np.isfinite(values).all()
-    assert values.max() <= float(guards.MAX_RADIANCE) * 4 * np.pi
+    assert values.max() <= float(safe_math.MAX_RADIANCE) * 4 * np.pi
 
 
 @pytest.mark.parametrize("method", METHODS)

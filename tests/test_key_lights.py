@@ -5,7 +5,7 @@ import warp as wp
 from tests.error_model import check_error
 from tests.reference import key_lights as reference
 from tests.reference import latlong
-from warp_ar.kernels import key_lights
+from warp_ar.kernels.environment import key_lights
 from warp_ar.kernels.structs import KeyLight
 
 # Float32 sums and exponentials, a few roundings each.

@@ -13,10 +13,10 @@ from warp_ar.accuracy import known_frame
 from warp_ar.accuracy.known_frame import KnownFrame, light_of, light_up_to
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SourceError, UsageError
-from warp_ar.input.sources import open_source
 from warp_ar.kernels.structs import Emitter
 from warp_ar.light.captured import Light
 from warp_ar.scene import Pose, Scene, load_scene
+from warp_ar.sources.sources import open_source
 
 
 @pytest.fixture(scope="module")

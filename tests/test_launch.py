@@ -15,7 +15,7 @@ import pytest
 import warp as wp
 
 import warp_ar.kernels
-from warp_ar.kernels import irradiance
+from warp_ar.kernels.environment import irradiance
 from warp_ar.kernels.launch import launch_rows, takes_few_blocks
 
 ROWS = 13

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bench.bench_clipping_prior import errors_of
-from warp_ar.kernels.recover_cells import CELL_COLUMNS, CELL_ROWS
+from warp_ar.kernels.recovery.recover_cells import CELL_COLUMNS, CELL_ROWS
 from warp_ar.light.captured import texel_solid_angles
 from warp_ar.light.config import CONFIG
 from warp_ar.light.least_missing import least_missing

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_ar.kernels.light_level import MOST, STILL, apply_level, follow_level, sum_upward
-from warp_ar.kernels.recover import Observation
+from warp_ar.kernels.recovery.light_level import MOST, STILL, apply_level, follow_level, sum_upward
+from warp_ar.kernels.recovery.recover import Observation
 from warp_ar.kernels.structs import Emitter
 
 COUNT = 40

@@ -18,8 +18,8 @@ import OpenEXR
 import pytest
 
 from warp_ar import explain, live
-from warp_ar.input.sources import Synthetic
 from warp_ar.output.sinks import read_environment
+from warp_ar.sources.sources import Synthetic
 
 FRAMES = 4
 

@@ -19,7 +19,7 @@ from tests.mesh_rays_rig import (
     ray_mesh,
     rays_toward,
 )
-from warp_ar.kernels.mesh_walk import STACK, find_closest_face, meets_any_face
+from warp_ar.kernels.rays.mesh_walk import STACK, find_closest_face, meets_any_face
 from warp_ar.scene.ray_mesh import BVH_CONSTRUCTOR, BVH_LEAF_SIZE
 
 UV_TOLERANCE = 2e-5

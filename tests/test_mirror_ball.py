@@ -52,11 +52,12 @@ from tests.reference.visibility import Body
 from warp_ar.engine import scheduler
 from warp_ar.engine.graph import make_plan
 from warp_ar.engine.pipeline import Pipeline
-from warp_ar.kernels import mirror_ball
-from warp_ar.kernels.receiver import METHODS as RELIGHT_METHODS
-from warp_ar.kernels.receiver import RelightConfig
-from warp_ar.kernels.reflect import DistantLightConfig
-from warp_ar.kernels.shade import ShadeConfig
+from warp_ar.kernels.objects.reflect import DistantLightConfig
+from warp_ar.kernels.objects.shade import ShadeConfig
+from warp_ar.kernels.rays.trace import TraceConfig
+from warp_ar.kernels.receiver import mirror_ball
+from warp_ar.kernels.receiver.receiver import METHODS as RELIGHT_METHODS
+from warp_ar.kernels.receiver.receiver import RelightConfig
 from warp_ar.kernels.structs import (
     BOX,
     DIRECTIONAL,
@@ -70,7 +71,6 @@ from warp_ar.kernels.structs import (
     SPHERE,
     SPOT,
 )
-from warp_ar.kernels.trace import TraceConfig
 from warp_ar.scene import load_scene
 from warp_ar.stages.features import find_features
 from warp_ar.stages.mirror_ball import SAMPLES, mirror_config

@@ -13,9 +13,12 @@ from tests.kernel_rig import TEXTURES, camera_fields, constant_environment, reco
 from tests.reference import near_field as reference
 from tests.relight_rig import CAMERA, DESK, LOOK_DOWN, POINTS, RAYS, H, W
 from warp_ar.engine.graph import make_plan
-from warp_ar.kernels import frame_levels, near_field, near_field_rays, shade
-from warp_ar.kernels.lobes import lobe_texels
-from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
+from warp_ar.kernels.environment.lobes import lobe_texels
+from warp_ar.kernels.objects import near_field, near_field_rays, shade
+from warp_ar.kernels.objects.reflect import DistantLight, DistantLightConfig
+from warp_ar.kernels.picture import frame_levels
+from warp_ar.kernels.rays.trace import TraceConfig
+from warp_ar.kernels.rays.visibility import VisibleObjects, make_visible, trace_pixels
 from warp_ar.kernels.structs import (
     LAMBERT,
     MIRROR,
@@ -28,8 +31,6 @@ from warp_ar.kernels.structs import (
     Shape,
     make_picture,
 )
-from warp_ar.kernels.trace import TraceConfig
-from warp_ar.kernels.visibility import VisibleObjects, make_visible, trace_pixels
 from warp_ar.scene import Object, load_scene
 from warp_ar.stages.features import find_features
 from warp_ar.stages.quality import PRESETS

@@ -21,9 +21,9 @@ import numpy as np
 import pytest
 
 from warp_ar.errors import SourceError, UsageError
-from warp_ar.input import network_stream
-from warp_ar.input.network_stream import NetworkStream
-from warp_ar.input.sources import open_source
+from warp_ar.sources import network_stream
+from warp_ar.sources.network_stream import NetworkStream
+from warp_ar.sources.sources import open_source
 
 SIZE = (64, 48)
 PATIENCE = 60.0

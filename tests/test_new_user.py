@@ -11,7 +11,7 @@ import pytest
 from tests.printed_card import PrintedCard, poses
 from tests.rendered_room import look_at
 from warp_ar import __main__, calibrate, doctor, live
-from warp_ar.input.camera_calibration import MOST_FOCAL
+from warp_ar.calibration.camera_calibration import MOST_FOCAL
 from warp_ar.scene import Camera, Pose, load_scene
 
 CAMERA = Camera(640, 480, 600.0, 600.0, 321.0, 238.0)

@@ -14,10 +14,10 @@ from tests.gltf_files import SQUARE_UVS, Gltf
 from tests.reference import prefilter as reference
 from warp_ar.errors import SceneError
 from warp_ar.kernels.materials import make_surface
-from warp_ar.kernels.shapes import FAR
+from warp_ar.kernels.rays.shapes import FAR
+from warp_ar.kernels.rays.trace import TraceConfig, make_trace
 from warp_ar.kernels.split_sum import integrate_dfg
 from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, PHONG, RayScene
-from warp_ar.kernels.trace import TraceConfig, make_trace
 from warp_ar.scene import (
     Camera,
     FileMaterial,

@@ -10,12 +10,12 @@ import pytest
 
 from tests.rendered_boxes import random_boxes_seen
 from tests.rendered_room import look_at
+from warp_ar.checks.check_pictures import take_look
+from warp_ar.checks.outline_fit import _FACES, TRUSTED, fit_outline
 from warp_ar.errors import UsageError
-from warp_ar.input.check_pictures import take_look
-from warp_ar.input.outline_fit import _FACES, TRUSTED, fit_outline
-from warp_ar.input.sources import open_source
 from warp_ar.scene import Camera, Pose, Proxy, load_scene
 from warp_ar.scene.geometry import rotation_matrix
+from warp_ar.sources.sources import open_source
 
 CAMERA = Camera(640, 480, 620.0, 620.0, 322.0, 236.0, (-0.08, 0.02, 0.0, 0.0, 0.0))
 POSE = Pose(*look_at(np.array([0.1, -0.55, 0.4]), np.array([0.0, 0.02, 0.03])))

@@ -13,10 +13,10 @@ import pytest
 from tests.gltf_files import Gltf
 from tests.layer_rig import make_scene
 from warp_ar.errors import SceneError, UsageError
-from warp_ar.input.synthetic import Synthetic
 from warp_ar.scene import Object, Play, Scene, dumps_scene, loads_scene
 from warp_ar.scene.object_materials import moving_mesh_of
 from warp_ar.scene.object_shapes import part_placements
+from warp_ar.sources.synthetic import Synthetic
 from warp_ar.stages.quality import PRESETS
 from warp_ar.viewer import edits
 from warp_ar.viewer.animations import names_of, play_record, set_play

@@ -7,9 +7,9 @@ import pytest
 
 from warp_ar.accuracy import paper_figures
 from warp_ar.accuracy.paper_figures import FIGURES, READINGS, Context
-from warp_ar.kernels.expose import BOXES
-from warp_ar.kernels.receiver import METHODS
-from warp_ar.kernels.receiver import READINGS as BLENDS
+from warp_ar.kernels.picture.expose import BOXES
+from warp_ar.kernels.receiver.receiver import METHODS
+from warp_ar.kernels.receiver.receiver import READINGS as BLENDS
 from warp_ar.stages import STAGES
 from warp_ar.stages.quality import PRESETS
 

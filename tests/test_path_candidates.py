@@ -8,9 +8,9 @@ import warp as wp
 
 from tests.test_path_sampling import ERRORS, check_mean, lamp_sky, near_emitters, sunny
 from warp_ar.kernels.materials import Surface
-from warp_ar.kernels.path_following import CANDIDATES, PathState, draw_toward_sky, reflected_from
-from warp_ar.kernels.path_sampling import PathKey, balance, make_sky, surface_density
-from warp_ar.kernels.path_vertices import LocalScene
+from warp_ar.kernels.reference.path_following import CANDIDATES, PathState, draw_toward_sky, reflected_from
+from warp_ar.kernels.reference.path_sampling import PathKey, balance, make_sky, surface_density
+from warp_ar.kernels.reference.path_vertices import LocalScene
 from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, Hit
 
 COUNT = 1 << 16

@@ -10,7 +10,7 @@ import warp as wp
 
 from tests.test_path_tracer import look
 from warp_ar.kernels import structs
-from warp_ar.kernels.path_guides import (
+from warp_ar.kernels.reference.path_guides import (
     BINS,
     Guides,
     cone_versine,
@@ -22,8 +22,8 @@ from warp_ar.kernels.path_guides import (
     mirrored_density,
     place_on_sphere,
 )
-from warp_ar.kernels.path_learning import learn_directions, learn_sample, make_squares
-from warp_ar.kernels.path_sampling import NO_DENSITY, PathKey, Sky, make_sky, random_triple, sky_radiance
+from warp_ar.kernels.reference.path_learning import learn_directions, learn_sample, make_squares
+from warp_ar.kernels.reference.path_sampling import NO_DENSITY, PathKey, Sky, make_sky, random_triple, sky_radiance
 from warp_ar.kernels.sampling import frame_from_normal
 from warp_ar.scene import Camera, LambertMaterial, MirrorMaterial, Object, Proxy, Scene
 

@@ -13,8 +13,8 @@ import pytest
 from tests.test_path_tracer import ABOVE, ERRORS, WHITE, boxes, latlong_sky, look, polish
 from warp_ar.accuracy import path_tracer
 from warp_ar.accuracy.path_tracer import PathTracer, TracedPicture
-from warp_ar.kernels.path_photons import UNIT
-from warp_ar.kernels.receiver import DEFAULT_REFLECTANCE, PRIOR_WEIGHT
+from warp_ar.kernels.receiver.receiver import DEFAULT_REFLECTANCE, PRIOR_WEIGHT
+from warp_ar.kernels.reference.path_photons import UNIT
 from warp_ar.light.captured import CapturedEmitter
 from warp_ar.light.captured import Light as CapturedLight
 from warp_ar.scene import Camera, LambertMaterial, Light, MetallicRoughnessMaterial, Object, PhongMaterial, Proxy, Scene

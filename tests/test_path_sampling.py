@@ -12,7 +12,8 @@ from tests.kernel_rig import TEXTURES
 from warp_ar.kernels import structs
 from warp_ar.kernels.emitters import add_emitters
 from warp_ar.kernels.materials import make_surface
-from warp_ar.kernels.path_sampling import (
+from warp_ar.kernels.rays.shapes import FAR
+from warp_ar.kernels.reference.path_sampling import (
     ALL_MODELS,
     NO_DENSITY,
     PathKey,
@@ -29,7 +30,6 @@ from warp_ar.kernels.path_sampling import (
     surface_density,
 )
 from warp_ar.kernels.sampling import sample_cosine_hemisphere
-from warp_ar.kernels.shapes import FAR
 from warp_ar.kernels.split_sum import integrate_dfg
 from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, PHONG, Emitter, Hit, RayScene
 

@@ -11,7 +11,7 @@ import pytest
 from tests.test_path_tracer import ABOVE, RHO, boxes, latlong_sky, polish
 from warp_ar.accuracy import path_tracer
 from warp_ar.accuracy.path_tracer import PathTracer, TracedPicture
-from warp_ar.kernels.path_wavefront import make_wave
+from warp_ar.kernels.reference.path_wavefront import make_wave
 from warp_ar.scene import Light, Scene
 
 # Pixels get their shares anew after 16 samples: rounds before and after differ.

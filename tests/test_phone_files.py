@@ -12,10 +12,10 @@ import pytest
 from tests.photo_files import write_photo
 from tests.test_sources import error_of, patch_centers, patches, turn, write_video
 from warp_ar import calibrate, capture
+from warp_ar.calibration.camera_calibration import calibrate_camera
 from warp_ar.errors import UsageError
-from warp_ar.input.camera_calibration import calibrate_camera
-from warp_ar.input.sources import open_source
 from warp_ar.output.encoders import last_packets
+from warp_ar.sources.sources import open_source
 
 HEVC_LEVELS = 6
 """Codes: what x265 at its default quality and chroma at half the size leave of flat patches, measured 3."""

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from tests.photo_room import exposed, photograph, sphere
+from warp_ar.ball.ball_finder import silhouette
 from warp_ar.errors import UsageError
-from warp_ar.input.ball_finder import silhouette
-from warp_ar.input.bracket import MOVED, agree_exposures, align, register, thin_exposures
 from warp_ar.kernels.color import decode_table
+from warp_ar.photographs.bracket import MOVED, agree_exposures, align, register, thin_exposures
 
 TENTH = 0.1
 """Pixels: what alignment is asked for."""

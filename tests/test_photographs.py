@@ -9,7 +9,7 @@ import pytest
 
 from tests.photo_files import write_photo
 from warp_ar.errors import SceneError, SourceError
-from warp_ar.input.photographs import Photograph, exposures_by_exif, exposures_by_name, read_photograph
+from warp_ar.photographs.photographs import Photograph, exposures_by_exif, exposures_by_name, read_photograph
 from warp_ar.scene import loads_scene
 from warp_ar.scene.exif import PhotoInfo, read_exif
 

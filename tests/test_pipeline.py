@@ -14,11 +14,9 @@ import numpy.typing as npt
 import pytest
 import warp as wp
 
-from warp_ar.engine.carried_light import resample_light
+from warp_ar.engine.environment_history import resample_light
 from warp_ar.engine.pipeline import Pipeline, Result
 from warp_ar.errors import SceneError, UsageError
-from warp_ar.input.sources import Synthetic
-from warp_ar.input.tracking import Tracker, TrackState
 from warp_ar.scene import (
     Camera,
     Exposure,
@@ -33,7 +31,9 @@ from warp_ar.scene import (
     Scene,
 )
 from warp_ar.scene.ray_scene import HostScene
+from warp_ar.sources.sources import Synthetic
 from warp_ar.stages.quality import PRESETS
+from warp_ar.tracking.tracking import Tracker, TrackState
 
 SIZE = (320, 240)
 # Codes by which a picture may lag where its light moved too little for readers to run again; when that is, differs.

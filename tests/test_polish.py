@@ -11,7 +11,7 @@ import pytest
 
 from tests.polished_table import HEIGHT, VIEWS, WIDTH, film
 from warp_ar import doctor
-from warp_ar.input import checkup
+from warp_ar.checks import checkup
 from warp_ar.kernels.color import decode_table
 from warp_ar.light.polish import estimate_polish
 from warp_ar.scene import ProxyMaterial, dumps_scene, load_scene

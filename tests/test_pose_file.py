@@ -9,7 +9,7 @@ import pytest
 from tests.photo_room import ROOM, photograph, project, sphere
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SceneError, UsageError
-from warp_ar.input.support import plane_from_contact, plane_from_rectangle
+from warp_ar.photographs.support import plane_from_contact, plane_from_rectangle
 from warp_ar.scene import dumps_scene, loads_scene
 from warp_ar.scene.pose_file import load_poses, pose_of_position, rotation_of_quaternion
 

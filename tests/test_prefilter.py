@@ -10,9 +10,9 @@ from tests.reference import latlong
 from tests.reference import prefilter as reference
 from tests.reference import pyramid as reference_pyramid
 from warp_ar.engine.graph import make_plan
-from warp_ar.kernels import guards, pyramid
-from warp_ar.kernels.latlong import direction_from_latlong
-from warp_ar.kernels.lobes import (
+from warp_ar.kernels import safe_math
+from warp_ar.kernels.environment import pyramid
+from warp_ar.kernels.environment.lobes import (
     level_from_roughness,
     level_from_shininess,
     lobe_alpha,
@@ -24,6 +24,7 @@ from warp_ar.kernels.lobes import (
     mip_weights,
     sample_levels,
 )
+from warp_ar.kernels.latlong import direction_from_latlong
 from warp_ar.kernels.split_sum import energy_compensation, integrate_dfg, sample_dfg
 from warp_ar.scene import loads_scene
 from warp_ar.stages.base import Arrays
@@ -345,7 +346,7 @@ def test_bad_texels_are_contained(device, method):
     values = run(radiance, method).numpy()
     assert np.isfinite(values).all()
     assert (values >= 0).all()
-    assert values.max() <= float(guards.MAX_RADIANCE) * 4
+    assert values.max() <= float(safe_math.MAX_RADIANCE) * 4
 
 
 @pytest.mark.parametrize("method", METHODS)

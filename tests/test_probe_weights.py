@@ -7,18 +7,19 @@ import pytest
 import warp as wp
 
 from tests.reference import probe_weights as reference
-from warp_ar.kernels import probe_weights, structs
-from warp_ar.kernels.interpolated_irradiance import OtherBalls
-from warp_ar.kernels.lobes import lobe_texels
-from warp_ar.kernels.probe_weights import probe_weight
-from warp_ar.kernels.reflect import (
+from warp_ar.kernels import structs
+from warp_ar.kernels.environment import probe_weights
+from warp_ar.kernels.environment.interpolated_irradiance import OtherBalls
+from warp_ar.kernels.environment.lobes import lobe_texels
+from warp_ar.kernels.environment.probe_weights import probe_weight
+from warp_ar.kernels.objects.reflect import (
     DistantLight,
     DistantLightConfig,
     make_distant_irradiance,
     make_reflected_radiance,
 )
+from warp_ar.kernels.rays.trace import TraceConfig
 from warp_ar.kernels.structs import LAMBERT, MIRROR
-from warp_ar.kernels.trace import TraceConfig
 
 # Float32: a quotient of products of metres, and a sum of a few of them.
 ROUNDING = 2e-6

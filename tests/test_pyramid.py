@@ -3,7 +3,8 @@ import pytest
 import warp as wp
 
 from tests.reference import pyramid as reference
-from warp_ar.kernels import guards, pyramid
+from warp_ar.kernels import safe_math
+from warp_ar.kernels.environment import pyramid
 from warp_ar.kernels.latlong import direction_from_latlong, latlong_from_direction
 
 # Float32: sums of a few texels per level, a dozen levels at most, relative to the largest value around.
@@ -120,7 +121,7 @@ def test_bad_texels_are_contained(device):
     levels = list(unpack(build(radiance), 8, 16))
     assert levels[0][1, 1, 0] == 0.0
     assert levels[0][2, 2, 0] == 0.0
-    assert levels[0][3, 3, 0] == levels[0][4, 4, 0] == float(guards.MAX_RADIANCE)
+    assert levels[0][3, 3, 0] == levels[0][4, 4, 0] == float(safe_math.MAX_RADIANCE)
     for level in levels:
         assert np.isfinite(level).all()
         assert (level >= 0).all()

@@ -9,8 +9,8 @@ import imageio.v3
 import numpy as np
 import pytest
 
-from warp_ar.input import checkup, quick_check
-from warp_ar.input.finding import Finding
+from warp_ar.checks import checkup, quick_check
+from warp_ar.checks.finding import Finding
 from warp_ar.scene import load_scene
 
 FINDING = Finding("ball.dull", "the ball mirrors nothing", "wipe it")

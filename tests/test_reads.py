@@ -7,7 +7,7 @@ import warp as wp
 
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.engine.scheduler import Scheduler
-from warp_ar.kernels.wide_bvh import build_wide_bvh_kernel
+from warp_ar.kernels.rays.wide_bvh import build_wide_bvh_kernel
 from warp_ar.scene import bundled_scenes, load_scene
 from warp_ar.stages import STAGES
 from warp_ar.stages.base import Arrays

@@ -33,10 +33,10 @@ from tests.reference import relight as reference_relight
 from tests.reference.environment_shadow import sphere_form_factor
 from tests.relight_rig import CAMERA, DESK, FLOAT_ERROR, LOOK_DOWN, POINTS, point
 from warp_ar.kernels import cells as frame_cells
-from warp_ar.kernels import environment_samples
-from warp_ar.kernels.environment_samples import EnvironmentSample
-from warp_ar.kernels.receiver import ReceiverCells
-from warp_ar.kernels.receiver_cells import Patch
+from warp_ar.kernels.environment import environment_samples
+from warp_ar.kernels.environment.environment_samples import EnvironmentSample
+from warp_ar.kernels.receiver.receiver import ReceiverCells
+from warp_ar.kernels.receiver.receiver_cells import Patch
 from warp_ar.kernels.structs import (
     BOX,
     DIRECTIONAL,

@@ -11,14 +11,14 @@ import warp as wp
 from tests.error_model import check_error
 from tests.recover_rig import cells_of, empty_scene, points_of, probes_of, scene, seen, transfer_of  # noqa: F401
 from tests.reference import recover as reference
-from warp_ar.input.plate import srgb8
-from warp_ar.kernels import recover as kernels
 from warp_ar.kernels import structs
 from warp_ar.kernels.color import decode_table
-from warp_ar.kernels.recover_cells import CELL_COLUMNS, CELL_ROWS
+from warp_ar.kernels.recovery import recover as kernels
+from warp_ar.kernels.recovery.recover_cells import CELL_COLUMNS, CELL_ROWS
 from warp_ar.scene.geometry import rotation_matrix
 from warp_ar.scene.kinds import trace_config
 from warp_ar.scene.ray_scene import HostScene
+from warp_ar.sources.deep_frame import srgb8
 
 QUADRATURE = 0.003
 """A sum over cells of 5.6 degrees against an integral of a cosine: their middles stand for them."""

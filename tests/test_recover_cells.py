@@ -11,8 +11,8 @@ import warp as wp
 from tests.recover_rig import probes_of, scene  # noqa: F401
 from tests.reference import recover as reference
 from warp_ar.kernels import structs
-from warp_ar.kernels.recover_cells import Cell, add_recovered, cell_shape, condense_cells, leave_out_edges
-from warp_ar.kernels.saturation_boundaries import weigh_boundaries
+from warp_ar.kernels.recovery.recover_cells import Cell, add_recovered, cell_shape, condense_cells, leave_out_edges
+from warp_ar.kernels.recovery.saturation_boundaries import weigh_boundaries
 from warp_ar.scene.kinds import trace_config
 from warp_ar.scene.ray_scene import HostScene
 

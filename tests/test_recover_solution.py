@@ -14,8 +14,8 @@ from scipy.optimize import nnls
 
 from tests.recover_rig import DistantLight, lit_environment, scene  # noqa: F401
 from tests.reference import recover as reference
-from warp_ar.kernels import recover as kernels
-from warp_ar.kernels.recover_cells import CELL_COLUMNS, CELL_ROWS
+from warp_ar.kernels.recovery import recover as kernels
+from warp_ar.kernels.recovery.recover_cells import CELL_COLUMNS, CELL_ROWS
 from warp_ar.light import fit, noise, recovery, regions
 from warp_ar.light import solver as light_solver
 from warp_ar.light import surfaces as light_surfaces

@@ -14,9 +14,8 @@ import pytest
 from tests.recover_rig import scene, solve_here  # noqa: F401
 from tests.reference import recover as reference
 from warp_ar.engine.pipeline import Pipeline
-from warp_ar.input.sources import open_source
-from warp_ar.kernels import recover as kernels
-from warp_ar.kernels.recover_cells import CELL_COLUMNS, CELL_ROWS, Cell
+from warp_ar.kernels.recovery import recover as kernels
+from warp_ar.kernels.recovery.recover_cells import CELL_COLUMNS, CELL_ROWS, Cell
 from warp_ar.light import recovery
 from warp_ar.light import surfaces as light_surfaces
 from warp_ar.light.config import CONFIG
@@ -25,6 +24,7 @@ from warp_ar.light.solving_process import SolvingPool, SolvingProcess
 from warp_ar.scene import Pose, load_scene
 from warp_ar.scene.description import SourceSpec
 from warp_ar.session import Session
+from warp_ar.sources.sources import open_source
 from warp_ar.stages import recover as recover_stage
 from warp_ar.stages.quality import PRESETS
 from warp_ar.stages.recover import LATENCY, Recover

@@ -10,14 +10,15 @@ import warp as wp
 
 from tests.kernel_rig import records, shape
 from tests.relight_rig import H, W
-from warp_ar.kernels.lobes import lobe_texels
-from warp_ar.kernels.reflect import (
+from warp_ar.kernels.environment.lobes import lobe_texels
+from warp_ar.kernels.objects.reflect import (
     DistantLight,
     DistantLightConfig,
     make_distant_irradiance,
     make_find_in_frame,
     make_reflected_radiance,
 )
+from warp_ar.kernels.rays.trace import TraceConfig
 from warp_ar.kernels.structs import (
     BOX,
     LAMBERT,
@@ -32,7 +33,6 @@ from warp_ar.kernels.structs import (
     Shape,
     make_picture,
 )
-from warp_ar.kernels.trace import TraceConfig
 
 FOCAL = 60.0
 UP, DOWN = (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)

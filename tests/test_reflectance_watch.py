@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from warp_ar import PRESETS, Pipeline
-from warp_ar.input import reflectance_watch
-from warp_ar.input.ball_reflectance import BLUR, Reflected, _blurred, difference_of_halves, measure_reflectance
-from warp_ar.input.check_pictures import take_look
-from warp_ar.input.reflectance_watch import ENOUGH, FIRST, MOST, ReflectanceWatch
-from warp_ar.input.saturation import ball_discs
-from warp_ar.input.sources import open_source
+from warp_ar.ball import reflectance_watch
+from warp_ar.ball.ball_reflectance import BLUR, Reflected, _blurred, difference_of_halves, measure_reflectance
+from warp_ar.ball.reflectance_watch import ENOUGH, FIRST, MOST, ReflectanceWatch
+from warp_ar.calibration.saturation import ball_discs
+from warp_ar.checks.check_pictures import take_look
 from warp_ar.kernels.color import decode_table
 from warp_ar.live_clip import reflectances_told
 from warp_ar.scene import Pose, load_scene
+from warp_ar.sources.sources import open_source
 
 TOLD = 0.08
 """Relative error of one frame: the desk's texture is mirrored smaller than it is seen."""

@@ -23,8 +23,10 @@ from tests.relight_rig import (
     run,
     unit,
 )
-from warp_ar.kernels import color, relight, summed_area
-from warp_ar.kernels.receiver import (
+from warp_ar.kernels import color
+from warp_ar.kernels.picture import summed_area
+from warp_ar.kernels.receiver import relight
+from warp_ar.kernels.receiver.receiver import (
     METHODS,
     READINGS,
     RelightConfig,

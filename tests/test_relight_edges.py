@@ -16,7 +16,8 @@ from tests.relight_rig import (
     turn_z,
     unit,
 )
-from warp_ar.kernels.receiver import (
+from warp_ar.kernels.rays.trace import TraceConfig
+from warp_ar.kernels.receiver.receiver import (
     RelightConfig,
 )
 from warp_ar.kernels.structs import (
@@ -25,7 +26,6 @@ from warp_ar.kernels.structs import (
     PLANE,
     SPOT,
 )
-from warp_ar.kernels.trace import TraceConfig
 
 # --- edges
 

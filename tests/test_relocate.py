@@ -4,8 +4,8 @@ import numpy as np
 import warp as wp
 
 from tests.reference import latlong
-from warp_ar.kernels.recover_cells import Cell
-from warp_ar.kernels.relocate import move_emitters, relocate, send_recovered, share_recovered
+from warp_ar.kernels.recovery.recover_cells import Cell
+from warp_ar.kernels.recovery.relocate import move_emitters, relocate, send_recovered, share_recovered
 from warp_ar.kernels.structs import Emitter
 
 HEIGHT = 64

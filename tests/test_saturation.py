@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_ar.input.plate import Plate, codes8
-from warp_ar.input.saturation import FULL, SaturationLevels, ball_codes, ball_discs, luma_top
+from warp_ar.calibration.saturation import FULL, SaturationLevels, ball_codes, ball_discs, luma_top
 from warp_ar.kernels.color import camera_table, decode_table, is_saturated, saturation_codes
 from warp_ar.scene import Camera, Probe
 from warp_ar.scene.pose import Pose
+from warp_ar.sources.deep_frame import Plate, codes8
 
 DISC = (160.0, 120.0, 90.0)
 

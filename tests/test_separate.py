@@ -12,12 +12,12 @@ from tests.reference import color as reference_color
 from tests.reference import expose as reference_expose
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import UsageError
-from warp_ar.input.tracking import Track, TrackState
 from warp_ar.kernels import color
 from warp_ar.output.layer_file import compose_layers
 from warp_ar.scene import Exposure
 from warp_ar.stages.quality import PRESETS
 from warp_ar.stages.request import LAYERS, PICTURE_LAYERS
+from warp_ar.tracking.tracking import Track, TrackState
 
 # Rounding to codes, and what float32 adds to it: a thousandth of a code.
 CODES = 0.501

@@ -15,13 +15,13 @@ from tests.reference import shade as reference
 from tests.test_visibility import GENERAL, World
 from warp_ar.kernels import structs
 from warp_ar.kernels.edges import EdgeLists
-from warp_ar.kernels.lobes import lobe_texels
-from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
-from warp_ar.kernels.shade import ShadeConfig, make_object_light, shade
+from warp_ar.kernels.environment.lobes import lobe_texels
+from warp_ar.kernels.objects.reflect import DistantLight, DistantLightConfig
+from warp_ar.kernels.objects.shade import ShadeConfig, make_object_light, shade
+from warp_ar.kernels.rays.trace import TraceConfig
+from warp_ar.kernels.rays.visibility import make_visible, trace_pixels
 from warp_ar.kernels.split_sum import integrate_dfg
 from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, MIRROR, PHONG, Hit
-from warp_ar.kernels.trace import TraceConfig
-from warp_ar.kernels.visibility import make_visible, trace_pixels
 
 SIZE = (48, 64)
 FOCAL = 60.0

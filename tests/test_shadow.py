@@ -9,7 +9,7 @@ import pytest
 import warp as wp
 
 from tests.test_visibility import GENERAL, World
-from warp_ar.kernels.shadow import (
+from warp_ar.kernels.rays.shadow import (
     MIN_DISTANCE,
     SOFT_RAYS,
     LightSample,

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from warp_ar import calibrate
-from warp_ar.input.camera_calibration import CameraReport, write_camera
-from warp_ar.input.response import write_response
-from warp_ar.input.sheet import SHEET
+from warp_ar.calibration.camera_calibration import CameraReport, write_camera
+from warp_ar.calibration.response import write_response
 from warp_ar.kernels.color import decode_table
 from warp_ar.output.sinks import open_sink, write_environment
 from warp_ar.scene import Camera, load_calibration
 from warp_ar.signature import PROGRAM, is_signed, sign_png
+from warp_ar.tracking.card_layout import SHEET
 
 REPORT = CameraReport(Camera(64, 48, 60.0, 61.0, 31.5, 23.5), 0.1, (0.1,), 0.1, 1.0, (), SHEET, (5.0, 40.0))
 CURVE = np.repeat(np.linspace(0.0, 1.0, 256)[:, None] ** 2, 3, axis=1)

@@ -19,7 +19,6 @@ import pytest
 
 from warp_ar.command_line import Terminated, ended_by_signals
 from warp_ar.errors import SinkError, UsageError
-from warp_ar.input.sources import open_source
 from warp_ar.output.folder_sink import FolderSink
 from warp_ar.output.sink import FRAMES_WAITING, ThreadedSink
 from warp_ar.output.sinks import (
@@ -31,6 +30,7 @@ from warp_ar.output.sinks import (
     read_environment,
     write_environment,
 )
+from warp_ar.sources.sources import open_source
 
 # 4:2:0 at limited range keeps 219 of 255 levels; at this quality the codec adds its own rounding.
 VIDEO_LEVELS = 3

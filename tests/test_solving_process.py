@@ -19,11 +19,11 @@ from threadpoolctl import threadpool_info
 from tests.recover_rig import solve_here
 from warp_ar import Pipeline
 from warp_ar.engine.switcher import let_go
-from warp_ar.input.sources import open_source
 from warp_ar.light import solving_process
 from warp_ar.light.solver import ONE_BLAS_THREAD
 from warp_ar.light.solving_process import SolvingPool, SolvingProcess, read_message, solve_by, write_message
 from warp_ar.scene import load_scene
+from warp_ar.sources.sources import open_source
 from warp_ar.stages import recover
 
 

@@ -20,11 +20,11 @@ import pytest
 from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
 
 from warp_ar.errors import SourceError, UsageError
-from warp_ar.input import live_source
-from warp_ar.input.deep_video import TO_RGB
-from warp_ar.input.source import FRAMES_AHEAD
-from warp_ar.input.sources import Frame, FrameFolder, QueueSource, Source, Synthetic, VideoFile, open_source
-from warp_ar.input.video_file import _IN_PLANES, rgb_from_video
+from warp_ar.sources import live_source
+from warp_ar.sources.deep_video import TO_RGB
+from warp_ar.sources.source import FRAMES_AHEAD
+from warp_ar.sources.sources import Frame, FrameFolder, QueueSource, Source, Synthetic, VideoFile, open_source
+from warp_ar.sources.video_file import _IN_PLANES, rgb_from_video
 
 # 4:2:0 at limited range keeps 219 of 255 levels, and the codec adds its own rounding.
 VIDEO_LEVELS = 3

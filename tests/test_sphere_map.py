@@ -14,8 +14,9 @@ from tests.error_model import check_error
 from tests.kernel_rig import records
 from tests.reference import color as reference_color
 from tests.reference import sphere_map as reference
-from warp_ar.kernels import color, sphere_map
-from warp_ar.kernels.lobes import lobe_count
+from warp_ar.kernels import color
+from warp_ar.kernels.environment import sphere_map
+from warp_ar.kernels.environment.lobes import lobe_count
 from warp_ar.kernels.structs import FrameParams, Probe
 
 H, W = 96, 128

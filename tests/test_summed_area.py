@@ -4,9 +4,10 @@ import warp as wp
 
 from tests.error_model import check_error
 from tests.reference import summed_area as reference
-from warp_ar.kernels import color, summed_area
+from warp_ar.kernels import color
 from warp_ar.kernels.color import decode_codes
-from warp_ar.kernels.summed_area_strips import strip_shapes, sum_area_by_strips
+from warp_ar.kernels.picture import summed_area
+from warp_ar.kernels.picture.summed_area_strips import strip_shapes, sum_area_by_strips
 
 # float32(sum) / float32(count): two roundings of an exact integer and one of the quotient, at most 255 * 3 * 2^-24.
 MEAN_ROUNDING = 255 * 3 * 2.0**-24

@@ -249,7 +249,7 @@ import cv2
 import numpy as np
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.engine.tiers import QUICK_FLAGS
-from warp_ar.input.sources import open_source
+from warp_ar.sources.sources import open_source
 from warp_ar.kernels.launch import _SLOW
 from warp_ar.scene import load_scene
 

@@ -16,7 +16,7 @@ import warp as wp
 
 from tests.test_pipeline import SIZE, make_scene
 from warp_ar.engine.pipeline import Pipeline
-from warp_ar.input.sources import Synthetic
+from warp_ar.sources.sources import Synthetic
 
 WIDTH, HEIGHT = SIZE
 FRAME_BYTES = WIDTH * HEIGHT * 3

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from warp_ar.errors import UsageError
-from warp_ar.input import tracking
-from warp_ar.input.markers import MarkerDetector, find_dictionary, make_board
-from warp_ar.input.tracking import Tracker, TrackState
 from warp_ar.scene import Camera, CharucoBoard, GridBoard, Marker, Pose
+from warp_ar.tracking import tracking
+from warp_ar.tracking.markers import MarkerDetector, find_dictionary, make_board
+from warp_ar.tracking.tracking import Tracker, TrackState
 
 RENDERED_DEGREES, RENDERED_MM = 0.15, 0.4
 """Edge refinement on 8-bit renderings with noise of one grey level, markers of 60 pixels or more at about 0.6 m;

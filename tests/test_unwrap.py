@@ -10,8 +10,8 @@ from tests.error_model import check_error
 from tests.kernel_rig import records
 from tests.reference import latlong as latlong_reference
 from tests.reference import unwrap as reference
-from warp_ar.kernels import fill, key_lights, unwrap
 from warp_ar.kernels.color import decode_table
+from warp_ar.kernels.environment import fill, key_lights, unwrap
 from warp_ar.kernels.structs import (
     BOX,
     MESH,

@@ -10,8 +10,8 @@ import warp as wp
 
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import UsageError
-from warp_ar.input.sources import open_source
 from warp_ar.scene import load_scene
+from warp_ar.sources.sources import open_source
 from warp_ar.stages.shared import variants
 
 

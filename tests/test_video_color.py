@@ -14,9 +14,9 @@ from tests.farm_rig import desk_frames, write_recording
 from warp_ar.farm import device_video
 from warp_ar.farm.decoded_picture import LEAST_SIZE, DecodedPicture, can_convert
 from warp_ar.farm.device_video import SLOTS, DeviceVideo
-from warp_ar.input.video_file import rgb_from_video
-from warp_ar.kernels.video_color import rgb_factors, rgb_from_yuv, yuv_from_rgb, yuv_layout
+from warp_ar.kernels.picture.video_color import rgb_factors, rgb_from_yuv, yuv_from_rgb, yuv_layout
 from warp_ar.output.video_sink import rgb_to_yuv
+from warp_ar.sources.video_file import rgb_from_video
 
 SIZES = ((LEAST_SIZE, LEAST_SIZE), (66, 70), (240, 320))
 """Rows and columns."""

@@ -14,8 +14,8 @@ from tests.printed_card import PrintedCard
 from tests.rendered_room import look_at
 from tests.viewer_rig import Running, page_scene, rendered_cards
 from warp_ar.errors import UsageError
-from warp_ar.input.sheet import SHEET
 from warp_ar.scene import Camera, Pose, load_calibration
+from warp_ar.tracking.card_layout import SHEET
 from warp_ar.viewer import protocol
 from warp_ar.viewer.calibration import CalibrationSession
 from warp_ar.viewer.encoding import encode_jpeg

@@ -11,10 +11,10 @@ import pytest
 
 from tests.viewer_rig import SIZE, page_scene
 from warp_ar.errors import SceneError, UsageError
-from warp_ar.input.sheet import SHEET
-from warp_ar.input.sources import Synthetic
 from warp_ar.scene import Exposure, Light, MirrorMaterial, PhongMaterial, bundled_scenes, load_scene
+from warp_ar.sources.sources import Synthetic
 from warp_ar.stages.quality import PRESETS
+from warp_ar.tracking.card_layout import SHEET
 from warp_ar.viewer import edits, protocol
 from warp_ar.viewer.controls import Controls, Feed
 from warp_ar.viewer.edits import Wanted

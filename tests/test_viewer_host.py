@@ -18,11 +18,11 @@ import warp as wp
 from tests.viewer_rig import PATIENCE, SIZE, Running, jpeg, page_scene, rendered_cards
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SceneError, UsageError
-from warp_ar.input.sheet import SHEET
-from warp_ar.input.sources import Synthetic
-from warp_ar.input.tracking import TrackState
 from warp_ar.output.sinks import read_environment
 from warp_ar.scene import Animation, Camera, loads_scene
+from warp_ar.sources.sources import Synthetic
+from warp_ar.tracking.card_layout import SHEET
+from warp_ar.tracking.tracking import TrackState
 from warp_ar.viewer import protocol
 from warp_ar.viewer.encoding import encode_jpeg
 from warp_ar.viewer.lighting import FIRST, Lighting, make_target

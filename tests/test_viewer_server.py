@@ -19,8 +19,8 @@ import pytest
 from tests.viewer_rig import Page, is_refused, jpeg, mutated, picture_message, run, served
 from warp_ar.light.captured import Light as CapturedMap
 from warp_ar.viewer.backend import MOST_VIEWERS
-from warp_ar.viewer.dropped import MOST_BYTES
 from warp_ar.viewer.protocol import Bucket
+from warp_ar.viewer.uploads import MOST_BYTES
 
 
 def encode_exr() -> bytes:

@@ -16,11 +16,11 @@ import pytest
 
 from tests.browser_rig import CHROMIUM, SMALL, CanvasCamera, Tab, axe_core, chromium, serious_findings, served
 from tests.random_desk import RandomDesk
+from warp_ar.calibration.card import write_card
 from warp_ar.init import make_desk
-from warp_ar.input.card import write_card
-from warp_ar.input.sheet import SHEET
 from warp_ar.kernels.color import decode_table
 from warp_ar.srgb import decode_srgb
+from warp_ar.tracking.card_layout import SHEET
 
 pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install '.[test]'")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs a browser: apt-get install chromium")

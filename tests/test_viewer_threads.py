@@ -21,8 +21,8 @@ from tests.test_viewer_budget import known_errors  # noqa: F401  (a fixture)
 from tests.viewer_rig import PATIENCE, SIZE, Running, jpeg, page_scene, run, served
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SinkError, SourceError, UsageError
-from warp_ar.input.sources import Synthetic
 from warp_ar.output.sinks import VideoSink
+from warp_ar.sources.sources import Synthetic
 from warp_ar.stages.quality import PRESETS
 from warp_ar.viewer import browser_camera, protocol
 from warp_ar.viewer import budget as budget_setting

@@ -11,10 +11,10 @@ import warp as wp
 from tests.error_model import check_error
 from tests.reference import visibility as reference
 from warp_ar.kernels import structs
-from warp_ar.kernels.shapes import FAR
+from warp_ar.kernels.rays.shapes import FAR
+from warp_ar.kernels.rays.trace import TraceConfig, make_trace, offset_origin
+from warp_ar.kernels.rays.visibility import make_visible, trace_pixels
 from warp_ar.kernels.structs import Hit
-from warp_ar.kernels.trace import TraceConfig, make_trace, offset_origin
-from warp_ar.kernels.visibility import make_visible, trace_pixels
 from warp_ar.scene.geometry import Mesh, rotation_matrix, smooth_normals
 from warp_ar.scene.ray_mesh import make_ray_mesh
 from warp_ar.scene.shapes import sphere_mesh, torus_mesh

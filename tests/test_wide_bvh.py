@@ -16,8 +16,8 @@ from tests.mesh_rays_rig import (
     ray_mesh,
     rays_toward,
 )
-from warp_ar.kernels import wide_bvh
-from warp_ar.kernels.wide_bvh import BLOCK, LEAF_BLOCKS, MOST_DEPTH, NODE_BLOCKS, STACK, WIDTH, build_wide_bvh
+from warp_ar.kernels.rays import wide_bvh
+from warp_ar.kernels.rays.wide_bvh import BLOCK, LEAF_BLOCKS, MOST_DEPTH, NODE_BLOCKS, STACK, WIDTH, build_wide_bvh
 from warp_ar.scene.ray_mesh import BOX_MARGIN
 
 MARGIN = 1e-4

@@ -16,7 +16,7 @@ from tests.reference.unwrap import normal_angle
 from tests.rendered_lamp import Array, Desk, irradiance, picture, radiance
 from tests.rendered_room import look_at
 from warp_ar.engine.pipeline import Pipeline
-from warp_ar.kernels.unwrap import RIM_START, RIM_WIDTH
+from warp_ar.kernels.environment.unwrap import RIM_START, RIM_WIDTH
 from warp_ar.scene import Camera, LambertMaterial, Marker, MirrorMaterial, Object, Pose, Probe, Proxy, Scene
 from warp_ar.stages.quality import Quality
 

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 
 from tests.test_pipeline import make_scene
-from warp_ar.input.card import card_size, draw_card
+from warp_ar.calibration.card import card_size, draw_card
 from warp_ar.scene import Camera, Marker, Scene, SourceSpec
 from warp_ar.scene.pixel_rays import pixel_rays
 from warp_ar.viewer.address import Address

@@ -16,15 +16,15 @@ if TYPE_CHECKING:
     from warp_ar.engine.graph import Plan, make_plan
     from warp_ar.engine.pipeline import Pipeline, Result
     from warp_ar.errors import SceneError, SinkError, SourceError, UsageError, WarpArError
-    from warp_ar.input.sources import Frame, open_source
-    from warp_ar.input.tracking import Tracker, TrackState
     from warp_ar.light.captured import Light
     from warp_ar.output.sinks import open_sink, read_environment, write_environment
     from warp_ar.photo_capture import Capture, capture_light
     from warp_ar.scene import Pose, Scene, bundled_scenes, dumps_scene, load_scene
     from warp_ar.session import Session
+    from warp_ar.sources.sources import Frame, open_source
     from warp_ar.stages.quality import PRESETS, Quality
     from warp_ar.stages.request import LAYERS
+    from warp_ar.tracking.tracking import Tracker, TrackState
 
 _HOMES = {
     "errors": ("SceneError", "SinkError", "SourceError", "UsageError", "WarpArError"),

@@ -28,23 +28,23 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
+from warp_ar.ball.ball import posed_frames
+from warp_ar.ball.ball_measure import measure_ball
+from warp_ar.calibration.camera_calibration import calibrate_camera, write_camera
+from warp_ar.calibration.card import PAPERS, write_card
+from warp_ar.calibration.grey_response import MOST_DEVIATION, measure_grey_response
+from warp_ar.calibration.response import measure_response, write_response
+from warp_ar.checks.check_ball import DULL, inside_contrast
+from warp_ar.checks.checkup import source_of
 from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, run_command, say
 from warp_ar.errors import UsageError
-from warp_ar.input.ball import posed_frames
-from warp_ar.input.ball_measure import measure_ball
-from warp_ar.input.camera_calibration import calibrate_camera, write_camera
-from warp_ar.input.card import PAPERS, write_card
-from warp_ar.input.check_ball import DULL, inside_contrast
-from warp_ar.input.checkup import source_of
-from warp_ar.input.grey_response import MOST_DEVIATION, measure_grey_response
-from warp_ar.input.response import measure_response, write_response
-from warp_ar.input.sheet import SHEET
-from warp_ar.input.sources import open_source
 from warp_ar.output.places import check_places, check_replaceable
 from warp_ar.scene import CharucoBoard, Marker, bundled_scenes, load_scene, loads_scene
 from warp_ar.scene.amend import amend_scene
 from warp_ar.scene.keys import INTRINSICS
 from warp_ar.scene.starter import guesses
+from warp_ar.sources.sources import open_source
+from warp_ar.tracking.card_layout import SHEET
 
 Image = NDArray[np.uint8]
 

@@ -16,15 +16,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from warp_ar.ball.ball_finder import BallOutline
+from warp_ar.checks.check_objects import check_objects, written_poses
 from warp_ar.command_line import EXIT_DONE, Parser, run_command, say
 from warp_ar.errors import SinkError, UsageError, reason
 from warp_ar.files import write_whole
-from warp_ar.input.ball_finder import BallOutline
-from warp_ar.input.check_objects import check_objects, written_poses
-from warp_ar.input.support import Support, plane_from_contact, plane_from_rectangle
 from warp_ar.output.places import check_places, check_replaceable
 from warp_ar.output.sink import make_folder
 from warp_ar.photo_capture import PIXELS, Capture, capture_light
+from warp_ar.photographs.support import Support, plane_from_contact, plane_from_rectangle
 from warp_ar.scene import (
     Camera,
     CapturedLight,

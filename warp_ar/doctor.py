@@ -19,11 +19,11 @@ from typing import Any
 from rich.console import Console
 
 from warp_ar.begin import importing
+from warp_ar.checks.check_pictures import Look
+from warp_ar.checks.checkup import FRAMES, check_and_look, source_of
+from warp_ar.checks.finding import Finding, worst_first
 from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, run_command, say
 from warp_ar.errors import UsageError, printable
-from warp_ar.input.check_pictures import Look
-from warp_ar.input.checkup import FRAMES, check_and_look, source_of
-from warp_ar.input.finding import Finding, worst_first
 from warp_ar.scene import Pose, Scene, bundled_scenes, load_scene
 from warp_ar.scene.amend import amend_scene
 

@@ -20,9 +20,9 @@ from rich.table import Table
 from warp_ar.command_line import EXIT_DONE, Parser, run_command
 from warp_ar.engine.graph import make_plan
 from warp_ar.engine.pipeline import resolve_quality
-from warp_ar.input.exposures import plan_bracket
 from warp_ar.output.report import print_plan
 from warp_ar.scene import load_scene
+from warp_ar.sources.exposures import plan_bracket
 from warp_ar.stages import STAGES
 from warp_ar.stages.quality import DEFAULT_PRESET, PRESETS
 from warp_ar.stages.request import Request

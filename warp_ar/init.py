@@ -17,12 +17,12 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+from warp_ar.calibration.card import write_card
 from warp_ar.command_line import EXIT_DONE, Parser, run_command
 from warp_ar.errors import SinkError, UsageError, printable, reason
-from warp_ar.input.card import write_card
-from warp_ar.input.sheet import RINGS, SHEET, ball_center
 from warp_ar.scene import bundled_scenes, load_scene
 from warp_ar.scene.starter import starter_scene
+from warp_ar.tracking.card_layout import RINGS, SHEET, ball_center
 
 SCENE, MESH = "scene.toml", "teapot.ply"
 CARDS = tuple(

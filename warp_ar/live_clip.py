@@ -127,7 +127,7 @@ def _check_run(log: RunLog, session: Session, evidence: _Evidence) -> None:
     Raises:
         RunError: It did.
     """
-    from warp_ar.input.checkup import ball_is_seen
+    from warp_ar.checks.checkup import ball_is_seen
 
     _check_marker(log, session.scene, live=False)
     scene, source = session.scene, session.scene.source

@@ -22,7 +22,7 @@ def say_quick_check(options: argparse.Namespace, scene: Scene) -> bool:
     Returns:
         Whether a mirror ball was seen where the scene has one.
     """
-    from warp_ar.input.quick_check import quick_check
+    from warp_ar.checks.quick_check import quick_check
 
     try:
         checked = quick_check(scene, options.source, files_of(scene))

@@ -13,17 +13,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from warp_ar.ball.ball_finder import BallOutline, far_camera, find_ball, sphere_of_circle
+from warp_ar.calibration.response import write_response
+from warp_ar.checks.check_ball import DULL, disc_contrast
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import UsageError
-from warp_ar.input.ball_finder import BallOutline, far_camera, find_ball, sphere_of_circle
-from warp_ar.input.bracket import MOVED, Aligned, Circle, agree_exposures, align, thin_exposures
-from warp_ar.input.check_ball import DULL, disc_contrast
-from warp_ar.input.photographs import Photograph, exposures_by_exif, exposures_by_name, read_photograph
-from warp_ar.input.response import write_response
-from warp_ar.input.support import Support
-from warp_ar.kernels.recover_cells import cell_shape
+from warp_ar.kernels.recovery.recover_cells import cell_shape
 from warp_ar.light.captured import Light, find_emitters, texel_solid_angles
 from warp_ar.light.least_missing import least_missing
+from warp_ar.photographs.bracket import MOVED, Aligned, Circle, agree_exposures, align, thin_exposures
+from warp_ar.photographs.photographs import Photograph, exposures_by_exif, exposures_by_name, read_photograph
+from warp_ar.photographs.support import Support
 from warp_ar.scene import Camera, Pose, Probe, Scene
 from warp_ar.scene.exif import FULL_FRAME_DIAGONAL
 from warp_ar.scene.pose_file import pose_of_position

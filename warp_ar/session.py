@@ -12,18 +12,18 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_ar.accuracy.budget import AutoPipeline
+from warp_ar.ball.ball import BallFit, refine_balls
 from warp_ar.closing import Closing
 from warp_ar.engine.modules import Progress
 from warp_ar.engine.pipeline import Pipeline, Result, resolve_quality
 from warp_ar.engine.switcher import PipelineSwitcher, Target
 from warp_ar.errors import UsageError, WarpArError
-from warp_ar.input.ball import BallFit, refine_balls
-from warp_ar.input.exposures import plan_bracket
-from warp_ar.input.plate import check_linear
-from warp_ar.input.sources import Frame, Source, open_source
 from warp_ar.light.captured import Light
 from warp_ar.scene import CapturedLight, Scene, SourceSpec, load_calibration, load_scene
 from warp_ar.scene.exif import camera_by_exif
+from warp_ar.sources.deep_frame import check_linear
+from warp_ar.sources.exposures import plan_bracket
+from warp_ar.sources.sources import Frame, Source, open_source
 from warp_ar.stages.quality import AUTO, DEFAULT_BUDGET_MS, DEFAULT_PRESET, Quality
 
 

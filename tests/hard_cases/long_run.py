@@ -23,8 +23,8 @@ import warp as wp
 
 from tests.hard_cases import generators
 from tests.hard_cases.rig import SIZE, Rig
-from warp_ar.input.sources import open_source
 from warp_ar.scene import Animation, Light, Pose, load_scene
+from warp_ar.sources.sources import open_source
 
 DRIFT = 1.0
 """Codes: the light settles exponentially toward its loop, and the last bit of a code may go either way."""

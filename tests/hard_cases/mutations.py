@@ -45,7 +45,7 @@ MUTATIONS = (
     Mutation(
         1,
         "straight back divides 0 by 0: no plane through the axis is picked",
-        "kernels/unwrap.py",
+        "kernels/environment/unwrap.py",
         "            side = any_perpendicular(axis)\n        side = wp.normalize(side)\n",
         "            pass\n        side = side / wp.length(side)\n",
         f"{HARD}test_rows01_03_probe.py::test_light_straight_back_along_an_axis",
@@ -53,7 +53,7 @@ MUTATIONS = (
     Mutation(
         1,
         "the ball shows what lies along its normals",
-        "kernels/declip.py",
+        "kernels/picture/declip.py",
         "wi = direction - 2.0 * wp.dot(direction, normal) * normal",
         "wi = normal",
         "tests/test_declip.py::test_ball_pixel_off_the_middle_shows_what_it_mirrors",
@@ -61,7 +61,7 @@ MUTATIONS = (
     Mutation(
         1,
         "what leaves the mirror ball starts on it, not off it: at the rim it meets the ball again",
-        "kernels/mirror_ball.py",
+        "kernels/receiver/mirror_ball.py",
         "        out.origin = offset_origin(point, normal, out.wi, error)\n",
         "        out.origin = point\n",
         "tests/test_mirror_ball.py::test_grazing_the_silhouette",
@@ -69,7 +69,7 @@ MUTATIONS = (
     Mutation(
         2,
         "orthographic unwrapping: the reflected ray of a camera at infinity",
-        "kernels/unwrap.py",
+        "kernels/environment/unwrap.py",
         "        toward = wp.vec2(distance - n[0], -n[1])\n",
         "        toward = wp.vec2(1.0e6, 0.0)\n",
         "tests/test_unwrap.py::test_normals_reflect_every_direction_to_the_camera",
@@ -77,7 +77,7 @@ MUTATIONS = (
     Mutation(
         2,
         "what the camera sees is infinitely far from the ball",
-        "kernels/declip.py",
+        "kernels/picture/declip.py",
         "share = NEAREST * wp.float32(step) / wp.float32(STEPS)",
         "share = wp.float32(0.0)",
         "tests/test_declip.py::test_lamp_beyond_the_scene_is_found_at_its_distance",
@@ -85,7 +85,7 @@ MUTATIONS = (
     Mutation(
         3,
         "samples outside the frame count",
-        "kernels/unwrap.py",
+        "kernels/environment/unwrap.py",
         "            if inside >= 0.0 and ramp > 0.0:\n",
         "            if at[2] > rim[0]:\n"
         "                ramp = 1.0\n"
@@ -96,7 +96,7 @@ MUTATIONS = (
     Mutation(
         3,
         "surfaces beyond the frame are read at its border",
-        "kernels/recover.py",
+        "kernels/recovery/recover.py",
         "clear = at[2] > 0.0 and i >= 0 and j >= 0 and i < frame.shape[0] and j < frame.shape[1]",
         "i = wp.clamp(i, 0, frame.shape[0] - 1)\n                    j = wp.clamp(j, 0, frame.shape[1] - 1)\n"
         "                    clear = at[2] > 0.0",
@@ -105,7 +105,7 @@ MUTATIONS = (
     Mutation(
         3,
         "a camera inside the ball sees it mirror the environment",
-        "kernels/mirror_ball.py",
+        "kernels/receiver/mirror_ball.py",
         "        if wp.dot(normal, direction) >= 0.0:\n            return out",
         "        if wp.dot(normal, direction) >= 0.0:\n            normal = -normal",
         "tests/test_mirror_ball.py::test_a_camera_inside_the_ball_sees_no_mirror",
@@ -113,7 +113,7 @@ MUTATIONS = (
     Mutation(
         4,
         "half a texel's shift in every look-up of a packed level",
-        "kernels/pyramid.py",
+        "kernels/environment/pyramid.py",
         "    y = row - 0.5\n    x = column - 0.5\n    i = wp.int32(wp.floor(y))",
         "    y = row - 0.5\n    x = column\n    i = wp.int32(wp.floor(y))",
         "tests/test_pyramid.py::test_sampling_follows_a_ramp_without_a_shift",
@@ -121,7 +121,7 @@ MUTATIONS = (
     Mutation(
         4,
         "what clips beyond the seam is not seen from this side of it",
-        "kernels/bracket.py",
+        "kernels/environment/bracket.py",
         "(j + offset + width) % width",
         "wp.clamp(j + offset, 0, width - 1)",
         "tests/test_bracket.py::test_around_a_lamp_one_exposure_has_the_say",
@@ -145,7 +145,7 @@ MUTATIONS = (
     Mutation(
         6,
         "negative light accumulates",
-        "kernels/guards.py",
+        "kernels/safe_math.py",
         "    if wp.min(radiance) < 0.0:\n        return 0.0\n",
         "",
         f"{HARD}test_row06_garbage.py::test_what_is_no_light_is_gone_with_its_frame",
@@ -153,7 +153,7 @@ MUTATIONS = (
     Mutation(
         6,
         "filters take texels as they are",
-        "kernels/guards.py",
+        "kernels/safe_math.py",
         "    if value > 0.0:  # false for NaN\n        return wp.min(value, MAX_RADIANCE)\n    return 0.0\n",
         "    return value\n",
         f"{HARD}test_row06_garbage.py::test_any_map_gives_finite_light",
@@ -161,7 +161,7 @@ MUTATIONS = (
     Mutation(
         6,
         "averages take in what stands beside an object",
-        "kernels/near_field.py",
+        "kernels/objects/near_field.py",
         "if objects[i + a, j + b] == found:",
         "if objects[i + a, j + b] >= -1:",
         "tests/test_near_field.py::test_averages_stop_at_the_edges_of_objects",
@@ -169,7 +169,7 @@ MUTATIONS = (
     Mutation(
         6,
         "the ball takes on the shadows of what it hides, not of what it mirrors",
-        "kernels/mirror_ball.py",
+        "kernels/receiver/mirror_ball.py",
         "look_up_layer(shadow_ratio, at[0], at[1])",
         "shadow_ratio[i, j]",
         "tests/test_mirror_ball.py::test_a_broken_shadow_reaches_only_what_mirrors_its_place",
@@ -177,7 +177,7 @@ MUTATIONS = (
     Mutation(
         7,
         "a running mean that loses a little every frame",
-        "kernels/accumulate.py",
+        "kernels/environment/accumulate.py",
         "        m = m + a * wp.cw_mul(wp.vec3(1.0, 1.0, 1.0) - beyond, x - m)\n",
         "        m = 0.99999 * m + a * wp.cw_mul(wp.vec3(1.0, 1.0, 1.0) - beyond, x - m)\n",
         "tests/test_accumulate.py::test_no_drift_over_ten_thousand_frames",
@@ -185,7 +185,7 @@ MUTATIONS = (
     Mutation(
         7,
         "a scale that became NaN stays NaN",
-        "kernels/expose.py",
+        "kernels/picture/expose.py",
         "    if before > 0.0:\n        aim = before",
         "    if before != 0.0:\n        aim = before",
         f"{HARD}test_row07_accumulation.py::test_an_automatic_exposure_that_was_spoilt_heals",
@@ -201,7 +201,7 @@ MUTATIONS = (
     Mutation(
         8,
         "a mirror's level by the logarithm of its width",
-        "kernels/lobes.py",
+        "kernels/environment/lobes.py",
         "    if alpha < narrowest:\n        return wp.max(alpha, 0.0) / narrowest\n",
         "",
         "tests/test_prefilter.py::test_levels_grow_with_roughness_and_fall_with_shininess",
@@ -209,7 +209,7 @@ MUTATIONS = (
     Mutation(
         9,
         "1 / d^2 without a nearest distance",
-        "kernels/shadow.py",
+        "kernels/rays/shadow.py",
         "                d = wp.max(distance, wp.max(light.radius, MIN_DISTANCE))\n",
         "                d = distance\n",
         "tests/test_shadow.py::test_at_the_light_itself",
@@ -217,7 +217,7 @@ MUTATIONS = (
     Mutation(
         9,
         "a cone whose angles are equal divides by their difference",
-        "kernels/shadow.py",
+        "kernels/rays/shadow.py",
         "    if angle <= light.inner_angle:\n        return 1.0\n"
         "    if angle >= light.outer_angle:\n        return 0.0\n",
         "",
@@ -226,7 +226,7 @@ MUTATIONS = (
     Mutation(
         10,
         "the printed shader's plain lerp: weight two for the flat term at alpha = -1",
-        "kernels/receiver.py",
+        "kernels/receiver/receiver.py",
         "    weight = wp.min(wp.abs(alpha), 1.0)\n",
         "    weight = wp.min(alpha, 1.0)\n",
         "tests/test_relight.py::test_paper_in_its_three_cases_by_hand",
@@ -234,7 +234,7 @@ MUTATIONS = (
     Mutation(
         10,
         "the strongest light of an even environment dominates it",
-        "kernels/key_lights.py",
+        "kernels/environment/key_lights.py",
         "light.directionality = alone * wp.clamp(2.0 * wp.dot(flow, light.direction) / all[3], 0.0, 1.0)",
         "light.directionality = alone",
         "tests/test_key_lights.py::test_a_lamp_in_a_uniform_environment_dominates_by_twice_its_share",
@@ -242,7 +242,7 @@ MUTATIONS = (
     Mutation(
         11,
         "boxes look one row too far up",
-        "kernels/summed_area.py",
+        "kernels/picture/summed_area.py",
         "        total -= table[r0 - 1, c1 - 1]\n",
         "        total -= table[r0, c1 - 1]\n",
         f"{HARD}test_rows11_12_exposure.py::test_any_box_of_any_frame",
@@ -250,7 +250,7 @@ MUTATIONS = (
     Mutation(
         11,
         "what lies beyond the frame counts as black",
-        "kernels/summed_area.py",
+        "kernels/picture/summed_area.py",
         "wp.float32(wp.max((r1 - r0) * (c1 - c0), 1))",
         "wp.float32(size * size)",
         f"{HARD}test_rows11_12_exposure.py::test_a_white_frame_of_any_size_fades_evenly",
@@ -258,7 +258,7 @@ MUTATIONS = (
     Mutation(
         12,
         "exposures above 1 are taken for 1",
-        "kernels/expose.py",
+        "kernels/picture/expose.py",
         "    scale_out[0] = wp.where(params[0].exposure_scale > 0.0, params[0].exposure_scale, 0.0)\n",
         "    scale_out[0] = wp.clamp(params[0].exposure_scale, 0.0, 1.0)\n",
         f"{HARD}test_rows11_12_exposure.py::test_exposures_at_their_ends",
@@ -266,7 +266,7 @@ MUTATIONS = (
     Mutation(
         12,
         "a clipped channel is estimated below clipping",
-        "kernels/declip.py",
+        "kernels/picture/declip.py",
         "wp.clamp(k * hue[channel], radiance[channel], BRIGHTEST)",
         "wp.min(k * hue[channel], BRIGHTEST)",
         "tests/test_declip.py::test_never_below_clipping",
@@ -282,7 +282,7 @@ MUTATIONS = (
     Mutation(
         13,
         "what a proxy hides is looked up in the picture",
-        "kernels/reflect.py",
+        "kernels/objects/reflect.py",
         "        if occluded_by_proxies(scene, params.camera_position, from_camera, 1.0 - HIDDEN_MARGIN):\n"
         "            return nowhere\n",
         "",
@@ -291,7 +291,7 @@ MUTATIONS = (
     Mutation(
         13,
         "faces turned away are looked up in the picture",
-        "kernels/reflect.py",
+        "kernels/objects/reflect.py",
         "        if wp.dot(from_camera, hit.geometric_normal) >= 0.0:\n            return nowhere\n",
         "",
         "tests/test_reflect.py::test_a_face_turned_away_is_not_in_the_picture",
@@ -299,7 +299,7 @@ MUTATIONS = (
     Mutation(
         13,
         "another ball beyond what is mirrored hides it",
-        "kernels/mirror_ball.py",
+        "kernels/receiver/mirror_ball.py",
         "nearest_ball(receiver.probes, start, wi, reach)",
         "nearest_ball(receiver.probes, start, wi, FAR)",
         "tests/test_mirror_ball.py::test_a_ball_behind_what_is_mirrored_hides_nothing",
@@ -307,7 +307,7 @@ MUTATIONS = (
     Mutation(
         13,
         "rays that leave a box's middle behind are taken to miss it",
-        "kernels/receiver_cells.py",
+        "kernels/receiver/receiver_cells.py",
         "    return beside <= 0.0 or (along > 0.0 and along * along > beside)\n",
         "    return along > 0.0 and along * along > beside\n",
         "tests/test_receiver_cells.py::test_the_end_of_a_long_box_is_not_passed_by",
@@ -315,7 +315,7 @@ MUTATIONS = (
     Mutation(
         14,
         "a fixed offset of ten micrometres where surfaces look at the environment",
-        "kernels/recover.py",
+        "kernels/recovery/recover.py",
         "                origin = offset_origin(point.position, point.normal, middle, error)\n",
         "                origin = point.position + 1.0e-5 * point.normal\n",
         f"{HARD}test_rows13_14_rays.py::test_surfaces_receive_the_same_light_at_any_scale_and_place",
@@ -323,7 +323,7 @@ MUTATIONS = (
     Mutation(
         14,
         "a fixed offset of a tenth of a millimetre",
-        "kernels/trace.py",
+        "kernels/rays/trace.py",
         "                hit.error = ROUNDING * (8.0 * wp.max(wp.abs(hit.point)) + 32.0 * size)\n",
         "                hit.error = 1.0e-4\n",
         "tests/test_visibility.py::test_rays_that_leave_do_not_come_back",
@@ -339,7 +339,7 @@ MUTATIONS = (
     Mutation(
         15,
         "of a plane's two poses the one that fits this frame better",
-        "warp_ar/input/tracking.py",
+        "warp_ar/tracking/tracking.py",
         "        if guess is None or len(fits) < 2:\n",
         "        if True:\n",
         "tests/test_tracking.py::test_pose_does_not_flip",
@@ -347,7 +347,7 @@ MUTATIONS = (
     Mutation(
         15,
         "of two markers with one number the first in the list",
-        "warp_ar/input/tracking.py",
+        "warp_ar/tracking/tracking.py",
         "for d in sorted(found, key=rank):",
         "for d in found:",
         "tests/test_tracking.py::test_two_with_one_id",
@@ -363,7 +363,7 @@ MUTATIONS = (
     Mutation(
         16,
         "frames of a folder may have any size",
-        "warp_ar/input/frame_folder.py",
+        "warp_ar/sources/frame_folder.py",
         "            check_size(image, self.size, str(path), index)\n",
         "",
         "tests/test_sources.py::test_size_that_changes_is_named",
@@ -371,7 +371,7 @@ MUTATIONS = (
     Mutation(
         16,
         "of 16 bits the upper 8",
-        "warp_ar/input/frame_folder.py",
+        "warp_ar/sources/frame_folder.py",
         "((picture.astype(np.uint32) + 128) // 257).astype(np.uint8)",
         "(picture >> 8).astype(np.uint8)",
         "tests/test_sources.py::test_grey_alpha_and_16_bit_become_rgb",
@@ -395,7 +395,7 @@ MUTATIONS = (
     Mutation(
         17,
         "patches that the light has left still send it",
-        "kernels/receiver_cells.py",
+        "kernels/receiver/receiver_cells.py",
         "range(rect[0] / patch_stride, wp.min((rect[1] - 1) / patch_stride + 1, patches.shape[0]))",
         "range(patches.shape[0])",
         "tests/test_receiver_cells.py::test_nothing_of_an_earlier_frame_is_read",
@@ -411,7 +411,7 @@ MUTATIONS = (
     Mutation(
         18,
         "objects that take light from the desk give none back",
-        "kernels/environment_shadow_bounce.py",
+        "kernels/receiver/environment_shadow_bounce.py",
         "out.sent += weight * light.distant\n",
         "out.sent += 0.0 * light.distant\n",
         f"{HARD}test_row18_energy.py::test_white_objects_give_back_the_light_that_they_take",
@@ -419,7 +419,7 @@ MUTATIONS = (
     Mutation(
         18,
         "mirrored objects are laid over what the ball showed, not put in its place",
-        "kernels/mirror_ball.py",
+        "kernels/receiver/mirror_ball.py",
         "change.first = wp.cw_mul(rho, radiance) - shown",
         "change.first = wp.cw_mul(rho, radiance)",
         f"{HARD}test_row18_energy.py::test_white_objects_in_a_white_ball_change_nothing",
@@ -427,7 +427,7 @@ MUTATIONS = (
     Mutation(
         18,
         "holes are filled by a mean that is not normalised",
-        "kernels/fill.py",
+        "kernels/environment/fill.py",
         "                mean += (weight / total) * (value - mean)\n",
         "                mean += (weight / area) * (value - mean)\n",
         f"{HARD}test_row18_energy.py::test_a_constant_environment_under_any_mask",

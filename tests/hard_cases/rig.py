@@ -18,7 +18,6 @@ import warp as wp
 
 from warp_ar.engine.graph import Plan, make_plan
 from warp_ar.engine.pipeline import Pipeline
-from warp_ar.input.tracking import Track, TrackState
 from warp_ar.kernels.structs import FrameParams, RayScene
 from warp_ar.kernels.structs import Probe as BallRecord
 from warp_ar.scene import (
@@ -43,6 +42,7 @@ from warp_ar.stages.quality import PRESETS, Quality
 from warp_ar.stages.recover import Recover
 from warp_ar.stages.request import LAYERS, Request
 from warp_ar.stages.shared.settled import PUBLISHED
+from warp_ar.tracking.tracking import Track, TrackState
 
 SIZE = (48, 36)
 """Columns and rows of a frame: a few rows per band, and compiled code is the same at any size."""

@@ -21,7 +21,7 @@ from tests.hard_cases.rig import (
     assert_finite,
     numbers,
 )
-from warp_ar.kernels.unwrap import RIM_START
+from warp_ar.kernels.environment.unwrap import RIM_START
 
 MAP = (ENVIRONMENT_HEIGHT, 2 * ENVIRONMENT_HEIGHT)
 FRAMES = generators.frames(SIZE[1], SIZE[0])

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.hard_cases.rig import ENVIRONMENT_HEIGHT, FILTERS, METHODS, SIZE, LoneStage, solid_angles
-from warp_ar.kernels.lobes import lobe_count, lobe_offset, lobe_size
+from warp_ar.kernels.environment.lobes import lobe_count, lobe_offset, lobe_size
 from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, MIRROR, PHONG
 
 HEIGHT = ENVIRONMENT_HEIGHT

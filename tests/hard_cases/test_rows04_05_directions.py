@@ -15,9 +15,10 @@ from hypothesis import strategies as st
 
 from tests.hard_cases.generators import directions, frames
 from tests.hard_cases.rig import METHODS, SIZE, LoneStage, assert_finite, solid_angles
-from warp_ar.kernels import fill_frame, irradiance, latlong, materials, sampling
-from warp_ar.kernels.lobes import lobe_texels, sample_levels
-from warp_ar.kernels.shapes import sphere_uv
+from warp_ar.kernels import latlong, materials, sampling
+from warp_ar.kernels.environment import fill_frame, irradiance
+from warp_ar.kernels.environment.lobes import lobe_texels, sample_levels
+from warp_ar.kernels.rays.shapes import sphere_uv
 from warp_ar.scene import Pose
 from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.shared.picture import find_picture

@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 
 from tests.hard_cases import generators
 from tests.hard_cases.rig import METHODS, SIZE
-from warp_ar.kernels import color, composite, expose, summed_area
+from warp_ar.kernels import color
+from warp_ar.kernels.picture import composite, expose, summed_area
 from warp_ar.kernels.structs import FrameParams, make_picture
 
 FRAMES = generators.frames(SIZE[1], SIZE[0])

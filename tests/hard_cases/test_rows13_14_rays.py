@@ -31,7 +31,7 @@ from tests.hard_cases.rig import (
 from tests.recover_rig import cells_of, points_of, probes_of, seen, transfer_of
 from tests.test_visibility import World, shoot
 from warp_ar.errors import SceneError
-from warp_ar.kernels import recover
+from warp_ar.kernels.recovery import recover
 from warp_ar.scene import Object, PhongMaterial, Pose, Proxy
 from warp_ar.scene.geometry import Mesh, rotation_matrix
 from warp_ar.scene.kinds import trace_config

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from tests.hard_cases import generators
 from tests.hard_cases.rig import SIZE, Rig
 from warp_ar.errors import UsageError
-from warp_ar.input.tracking import Tracker, TrackState
 from warp_ar.scene import Camera, Marker
+from warp_ar.tracking.tracking import Tracker, TrackState
 
 FRAMES = generators.frames(SIZE[1], SIZE[0])
 

@@ -18,7 +18,6 @@ import numpy as np
 from tests.hostile.corpus import READERS, SCENE, Reader
 from warp_ar.accuracy.path_tracer import TracedPicture
 from warp_ar.errors import SinkError
-from warp_ar.input.sources import open_source
 from warp_ar.light.captured import Light
 from warp_ar.output.environment_file import EnvironmentSink
 from warp_ar.output.gltf_file import write_glb
@@ -32,6 +31,7 @@ from warp_ar.output.track_file import write_track
 from warp_ar.output.usd_file import write_usd
 from warp_ar.reference import write_picture
 from warp_ar.scene import Pose, loads_scene
+from warp_ar.sources.sources import open_source
 
 DAMAGES = 28
 """Damaged copies of each file."""

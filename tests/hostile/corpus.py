@@ -16,7 +16,6 @@ import OpenEXR
 from warp_ar.farm.jobs import parse_jobs, read_jobs
 from warp_ar.farm.status import read_status, status_lines
 from warp_ar.farm.status_page import status_page
-from warp_ar.input.sources import FrameFolder, Synthetic, open_source
 from warp_ar.kernels.color import decode_table
 from warp_ar.light.captured import Light, find_emitters
 from warp_ar.output.shot import Shot
@@ -28,6 +27,7 @@ from warp_ar.scene.exif import read_exif
 from warp_ar.scene.mesh_files import load_mesh, load_texture
 from warp_ar.scene.pose_file import load_poses
 from warp_ar.scene.shapes import torus_mesh
+from warp_ar.sources.sources import FrameFolder, Synthetic, open_source
 
 SCENE = """schema = 1
 name = "small"

@@ -25,10 +25,10 @@ from warp_ar.command_line import Terminated, ended_by_signals
 from warp_ar.errors import WarpArError
 from warp_ar.exr_file import check_whole_exr
 from warp_ar.files import write_whole
-from warp_ar.input.sources import open_source
 from warp_ar.output.environment_file import EnvironmentSink
 from warp_ar.output.layer_file import LayerFrame, LayerSink
 from warp_ar.output.sinks import open_sink, read_environment
+from warp_ar.sources.sources import open_source
 
 SIZE = (96, 128)
 FRAMES = 180

@@ -1,9 +1,9 @@
-"""Float64 twin of ``warp_ar.kernels.accumulate``, as plain as it can be."""
+"""Float64 twin of ``warp_ar.kernels.environment.accumulate``, as plain as it can be."""
 
 import numpy as np
 
 from tests.reference import latlong
-from tests.reference.guards import smooth_ramp
+from tests.reference.safe_math import smooth_ramp
 
 
 class Accumulator:

@@ -1,4 +1,4 @@
-"""Float64 twins of ``kernels/area_lights.py``, and closed forms of what areas send to a point."""
+"""Float64 twins of ``kernels/rays/area_lights.py``, and closed forms of what areas send to a point."""
 
 from __future__ import annotations
 

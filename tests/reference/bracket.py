@@ -1,4 +1,4 @@
-"""Float64 twin of ``warp_ar.kernels.bracket``."""
+"""Float64 twin of ``warp_ar.kernels.environment.bracket``."""
 
 import numpy as np
 

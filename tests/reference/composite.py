@@ -1,4 +1,4 @@
-"""Float64 twin of ``warp_ar.kernels.composite``."""
+"""Float64 twin of ``warp_ar.kernels.picture.composite``."""
 
 import numpy as np
 

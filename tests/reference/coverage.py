@@ -1,4 +1,4 @@
-"""Float64 twin of ``kernels/coverage.py``: counts samples of every pixel at an edge."""
+"""Float64 twin of ``kernels/receiver/coverage.py``: counts samples of every pixel at an edge."""
 
 import numpy as np
 

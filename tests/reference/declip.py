@@ -1,4 +1,4 @@
-"""Float64 twins of ``warp_ar.kernels.declip``."""
+"""Float64 twins of ``warp_ar.kernels.picture.declip``."""
 
 import numpy as np
 

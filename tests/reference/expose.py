@@ -1,4 +1,4 @@
-"""Float64 twins of ``warp_ar.kernels.expose``."""
+"""Float64 twins of ``warp_ar.kernels.picture.expose``."""
 
 import numpy as np
 

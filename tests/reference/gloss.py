@@ -1,4 +1,4 @@
-"""Float64 twin of ``warp_ar.kernels.gloss``: a receiver at z = 0, objects and surroundings of even radiance."""
+"""Float64 twin of ``gloss.py``: a receiver at z = 0, objects and surroundings of even radiance."""
 
 from __future__ import annotations
 

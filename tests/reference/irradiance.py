@@ -1,4 +1,4 @@
-"""Float64 twins of ``kernels/irradiance.py``."""
+"""Float64 twins of ``kernels/environment/irradiance.py``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Float64 twin of parts of ``warp_ar.kernels.key_lights``."""
+"""Float64 twin of parts of ``warp_ar.kernels.environment.key_lights``."""
 
 import numpy as np
 

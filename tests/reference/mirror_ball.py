@@ -1,4 +1,4 @@
-"""Float64 twin of ``warp_ar.kernels.mirror_ball``: Lambertian objects, one point light with hard shadows, a pinhole."""
+"""Float64 twin of ``mirror_ball.py``: Lambertian objects, one point light with hard shadows, a pinhole."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Float64 twins of ``kernels/prefilter.py``, ``lobes.py`` and ``split_sum.py``."""
+"""Float64 twins of ``kernels/environment/prefilter.py``, ``lobes.py`` and ``split_sum.py``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Float64 twin of ``warp_ar.kernels.probe_weights``."""
+"""Float64 twin of ``warp_ar.kernels.environment.probe_weights``."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Float64 twins of ``kernels/pyramid.py``."""
+"""Float64 twins of ``kernels/environment/pyramid.py``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Float64 twins of ``warp_ar.kernels.receiver_cells``: brute force over samples and patches."""
+"""Float64 twins of ``warp_ar.kernels.receiver.receiver_cells``: brute force over samples and patches."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Float64 twins of ``kernels/recover.py`` and ``recover_cells.py``: one surface point at a time, without proxies."""
+"""Float64 twins of ``recover.py`` and ``recover_cells.py``: one surface point at a time, without proxies."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Float64 twins of ``kernels/relight.py`` and ``receiver.py`` for one plane z = 0 as proxy and spheres in the way."""
+"""Float64 twins of ``relight.py`` and ``receiver.py`` for one plane z = 0 as proxy and spheres in the way."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Float64 twin of ``kernels/shade.py`` for Lambertian and mirror scenes: one ray per sample, brute force."""
+"""Float64 twin of ``kernels/objects/shade.py`` for Lambertian and mirror scenes: one ray per sample, brute force."""
 
 from __future__ import annotations
 

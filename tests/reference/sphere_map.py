@@ -1,4 +1,4 @@
-"""Float64 twins of ``warp_ar.kernels.sphere_map``, written from OpenGL's formula."""
+"""Float64 twins of ``warp_ar.kernels.environment.sphere_map``, written from OpenGL's formula."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Float64 twin of ``warp_ar.kernels.unwrap``, and a renderer of mirror balls to unwrap."""
+"""Float64 twin of ``warp_ar.kernels.environment.unwrap``, and a renderer of mirror balls to unwrap."""
 
 import cv2
 import numpy as np

@@ -1,4 +1,4 @@
-"""Float64 twins of ``kernels/shapes.py``, ``trace.py`` and ``visibility.py``: brute force over shapes and triangles."""
+"""Float64 twins of ``shapes.py``, ``trace.py`` and ``visibility.py``: brute force over shapes and triangles."""
 
 from __future__ import annotations
 

@@ -14,12 +14,12 @@ import numpy.typing as npt
 from warp_ar.accuracy.metrics import changed_region, clipped_region
 from warp_ar.engine.graph import make_plan
 from warp_ar.errors import UsageError
-from warp_ar.input.sources import Frame, open_source
-from warp_ar.input.tracking import Tracker
 from warp_ar.kernels.color import decode_table
 from warp_ar.scene import Pose, Scene, bundled_scenes, load_scene
+from warp_ar.sources.sources import Frame, open_source
 from warp_ar.stages.quality import PRESETS
 from warp_ar.stages.request import Request
+from warp_ar.tracking.tracking import Tracker
 
 Image = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]

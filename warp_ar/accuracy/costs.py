@@ -26,10 +26,10 @@ from warp_ar.accuracy.cost_table import BETWEEN, MethodCost, Scales, Setting, ch
 from warp_ar.engine.graph import Plan
 from warp_ar.engine.pipeline import DEFAULT_FRAME_INTERVAL, TRACK, Pipeline, Result
 from warp_ar.engine.switcher import let_go
-from warp_ar.input.tracking import Tracker
 from warp_ar.scene import Pose, Scene
 from warp_ar.stages.quality import PRESETS, Quality
 from warp_ar.stages.recover import EVERY_FRAME
+from warp_ar.tracking.tracking import Tracker
 
 BASE = PRESETS["medium"]
 """What costs are measured from, and what runs until something is chosen."""

@@ -15,9 +15,9 @@ from warp_ar.accuracy.path_tracer import LIGHT_SAMPLES, Image, PathTracer
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.engine.result import Result
 from warp_ar.errors import SourceError, UsageError
-from warp_ar.input.sources import Frame, Source, open_source
 from warp_ar.light.captured import CapturedEmitter, Light, texel_solid_angles
 from warp_ar.scene import Exposure, Pose, Scene
+from warp_ar.sources.sources import Frame, Source, open_source
 from warp_ar.stages.quality import Quality
 
 _LOG = logging.getLogger(__name__)

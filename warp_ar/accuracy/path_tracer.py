@@ -1,6 +1,7 @@
 """The picture of a frame by path tracing: progressive, with a standard error for every pixel.
 
-``kernels/path_tracer.py`` and ``path_following.py`` say what it sums. It knows the scene, the light of the environment
+``kernels/reference/path_tracer.py`` and ``path_following.py`` say what it sums. It knows the scene, the light of the
+environment
 and one frame with its pose, as the pipeline does, and approximates nothing else: with enough samples it is what the
 pipeline's methods are to be judged by.
 """
@@ -21,16 +22,17 @@ import warp as wp
 
 from warp_ar.device import exclusive, resolve_device, translating, usable_cores
 from warp_ar.errors import UsageError
-from warp_ar.kernels import path_tracer, structs
+from warp_ar.kernels import structs
 from warp_ar.kernels.color import decode_table, encode_table
-from warp_ar.kernels.path_guides import make_guides
-from warp_ar.kernels.path_learning import learn_directions, make_squares
-from warp_ar.kernels.path_photons import follow_lights, follows_lights, is_polished_one, make_light_image
-from warp_ar.kernels.path_picture import finish_picture, make_moments, map_reflectance
-from warp_ar.kernels.path_samples import add_samples, list_samples, make_round
-from warp_ar.kernels.path_sampling import make_sky
-from warp_ar.kernels.path_vertices import LocalScene
-from warp_ar.kernels.path_wavefront import MOST_SLOTS, Wave, make_wave
+from warp_ar.kernels.reference import path_tracer
+from warp_ar.kernels.reference.path_guides import make_guides
+from warp_ar.kernels.reference.path_learning import learn_directions, make_squares
+from warp_ar.kernels.reference.path_photons import follow_lights, follows_lights, is_polished_one, make_light_image
+from warp_ar.kernels.reference.path_picture import finish_picture, make_moments, map_reflectance
+from warp_ar.kernels.reference.path_samples import add_samples, list_samples, make_round
+from warp_ar.kernels.reference.path_sampling import make_sky
+from warp_ar.kernels.reference.path_vertices import LocalScene
+from warp_ar.kernels.reference.path_wavefront import MOST_SLOTS, Wave, make_wave
 from warp_ar.kernels.split_sum import integrate_dfg
 from warp_ar.light.captured import Light
 from warp_ar.scene import Pose, Scene

@@ -15,28 +15,28 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_ar import scene as scenes
+from warp_ar.ball.ball_occlusion import BallCover
+from warp_ar.ball.reflectance_watch import ReflectanceWatch
+from warp_ar.calibration.saturation import PERIOD, WATCHED, SaturationLevels, ball_discs
 from warp_ar.device import exclusive
-from warp_ar.engine.frame_block import FrameBlock
+from warp_ar.engine.frame_constants import FrameBlock
 from warp_ar.engine.graph import INPUTS
 from warp_ar.engine.modules import load_at_once
 from warp_ar.engine.scheduler import StageTiming
 from warp_ar.engine.transfer import Slot, Transfers
-from warp_ar.input.cover import BallCover
-from warp_ar.input.drift import ExposureDrift
-from warp_ar.input.own_markers import Places
-from warp_ar.input.plate import Plate, decode_deep
-from warp_ar.input.reflectance_watch import ReflectanceWatch
-from warp_ar.input.saturation import PERIOD, WATCHED, SaturationLevels, ball_discs
 from warp_ar.kernels.color import camera_table, decode_table, encode_table
 from warp_ar.kernels.launch import Note, noting
+from warp_ar.kernels.rays.wide_bvh import build_wide_bvh_kernel
 from warp_ar.kernels.structs import MESH, Probe
-from warp_ar.kernels.wide_bvh import build_wide_bvh_kernel
 from warp_ar.scene import Camera, Pose, Scene
 from warp_ar.scene.kinds import shape_kind
 from warp_ar.scene.pixel_rays import pixel_rays
 from warp_ar.scene.ray_scene import HostScene
 from warp_ar.scene.screen_extents import EMPTY, Outline, Rect, screen_rects
+from warp_ar.sources.deep_frame import Plate, decode_deep
 from warp_ar.stages.base import Arrays, Reach, Rows
+from warp_ar.tracking.drift import ExposureDrift
+from warp_ar.tracking.own_markers import Places
 
 _CLOCK = struct.Struct("<2f2i")
 """Of the frame's values, one behind the other: ``time``, ``time_step``, ``frame_index``, ``environment_reset``."""

@@ -20,7 +20,7 @@ import warp as wp
 from warp_ar.closing import Closing
 from warp_ar.device import exclusive, resolve_device, translating
 from warp_ar.engine.arguments import check_estimates, check_exposure, check_frames, check_number, read_scene
-from warp_ar.engine.carried_light import CarriedLight
+from warp_ar.engine.environment_history import CarriedLight
 from warp_ar.engine.frame_exchange import Borrowed, adopt_frame
 from warp_ar.engine.frame_inputs import FrameInputs, SeenFrame
 from warp_ar.engine.graph import make_plan
@@ -31,19 +31,19 @@ from warp_ar.engine.scheduler import Scheduler, StageTiming
 from warp_ar.engine.short_frames import ShortFrames
 from warp_ar.engine.transfer import Image
 from warp_ar.errors import UsageError
-from warp_ar.input.exposures import BracketPlan, brightened, find_exposure, plan_bracket
-from warp_ar.input.own_markers import OwnMarkers, Places, own_markers
-from warp_ar.input.plate import Plate, as_plate, check_plate, codes8
-from warp_ar.input.tracking import Track, Tracker, TrackState
-from warp_ar.kernels.printed_edges import fit_edges_kernel
+from warp_ar.kernels.picture.marker_edge_fit import fit_edges_kernel
 from warp_ar.light.captured import has_places
 from warp_ar.scene import Pose, Scene
 from warp_ar.scene.finite import check_finite
 from warp_ar.scene.kinds import skeleton
+from warp_ar.sources.deep_frame import Plate, as_plate, check_plate, codes8
+from warp_ar.sources.exposures import BracketPlan, brightened, find_exposure, plan_bracket
 from warp_ar.stages.base import Arrays
 from warp_ar.stages.captured import Captured
 from warp_ar.stages.quality import DEFAULT_PRESET, PRESETS, Quality
 from warp_ar.stages.request import Estimates, Request
+from warp_ar.tracking.own_markers import OwnMarkers, Places, own_markers
+from warp_ar.tracking.tracking import Track, Tracker, TrackState
 
 __all__ = ["DEFAULT_FRAME_INTERVAL", "TRACK", "Pipeline", "Result", "resolve_quality"]
 

@@ -18,9 +18,9 @@ from warp_ar.engine.layers import LayerArrays, compose_layers
 from warp_ar.engine.scheduler import StageTiming
 from warp_ar.engine.transfer import Image, Picture
 from warp_ar.errors import UsageError
-from warp_ar.input.tracking import TrackState
 from warp_ar.scene import Pose
 from warp_ar.stages.request import PICTURE_LAYERS
+from warp_ar.tracking.tracking import TrackState
 
 TRACK = "track"
 """Name of the host's own stage in reports: the marker's pose."""

@@ -20,7 +20,7 @@ import warp as wp
 
 from warp_ar.device import capturing, exclusive, translating, usable_cores
 from warp_ar.engine.crew import Crew
-from warp_ar.engine.demand import Demand
+from warp_ar.engine.frame_culling import Demand
 from warp_ar.engine.graph import Plan
 from warp_ar.engine.modules import Progress, load_modules
 from warp_ar.kernels.bands import serve_kernel

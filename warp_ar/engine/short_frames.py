@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_ar.kernels.bracket import BracketExposure
+from warp_ar.kernels.environment.bracket import BracketExposure
 from warp_ar.kernels.structs import FrameParams
 from warp_ar.scene import Pose
 from warp_ar.stages.base import Arrays, Wiring

@@ -15,8 +15,8 @@ from typing import Any, TypeAlias
 from warp_ar.device import exclusive, release_memory
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import UsageError, WarpArError
-from warp_ar.input.exposures import plan_bracket
 from warp_ar.scene import Scene
+from warp_ar.sources.exposures import plan_bracket
 from warp_ar.stages.quality import Quality
 
 Prepare: TypeAlias = Callable[[Pipeline], Any]

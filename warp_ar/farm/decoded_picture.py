@@ -6,7 +6,7 @@ from typing import Any
 
 from av.video.reformatter import Colorspace
 
-from warp_ar.input.deep_video import HD_HEIGHT
+from warp_ar.sources.deep_video import HD_HEIGHT
 
 LEAST_SIZE = 16
 """Rows and columns below which FFmpeg's filters weigh samples at the border in another way than the device."""

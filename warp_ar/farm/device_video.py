@@ -1,7 +1,7 @@
 """Pictures between decoder, GPU and encoder as video has them: 4:2:0 codes, which the GPU turns into RGB and back.
 
 The host neither converts nor copies RGB, and half as many bytes go over the bus. Codes are the same to the bit as by
-the host's conversion (``warp_ar.kernels.video_color``): that is looked at in the first picture of each segment,
+the host's conversion (``warp_ar.kernels.picture.video_color``): that is looked at in the first picture of each segment,
 and a segment in which something differs takes the host's way.
 
 All that a frame takes of the device is on one stream, in order. Nobody waits but who wants the codes of the picture.
@@ -21,7 +21,7 @@ from av.video.reformatter import ColorRange
 from warp_ar.device import exclusive, translating, wait_for
 from warp_ar.farm.decoded_picture import INTERLEAVED, DecodedPicture, matrix_of
 from warp_ar.farm.lit_picture import LitPicture
-from warp_ar.kernels.video_color import rgb_factors, rgb_from_yuv, yuv_from_rgb, yuv_layout
+from warp_ar.kernels.picture.video_color import rgb_factors, rgb_from_yuv, yuv_from_rgb, yuv_layout
 from warp_ar.output.video_sink import rgb_to_yuv
 
 Codes = npt.NDArray[np.uint8]
@@ -73,7 +73,7 @@ class DeviceVideo:
                 for interleaved in (False, True)
                 for left in (False, True)
             }
-            wp.load_module("warp_ar.kernels.video_color", device)
+            wp.load_module("warp_ar.kernels.picture.video_color", device)
         self._count = 0
         self.left = True
         """Whether chroma of pictures that are sent lies at the left one of two columns, else between them."""

@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from warp_ar.errors import reason
-from warp_ar.farm.draws import in_kindred_order
 from warp_ar.farm.growth import Growth
 from warp_ar.farm.jobs import Job, JobFile, job_of_clip, jobs_of_clip
 from warp_ar.farm.manifest import PROGRESS, Manifest, RunError, is_no_space, record_at
 from warp_ar.farm.pool import Event, Pool, is_from_outside, words_of_exit
 from warp_ar.farm.records import Outcome
+from warp_ar.farm.variations import in_kindred_order
 from warp_ar.files import write_whole
 
 TRIES = 2

@@ -17,10 +17,10 @@ from av.video.reformatter import VideoReformatter
 
 from warp_ar.errors import SourceError, reason
 from warp_ar.farm.decoded_picture import DecodedPicture, can_convert
-from warp_ar.input.frame_folder import FrameFolder
-from warp_ar.input.source import DEFAULT_FPS, Frame, RecordedSource
-from warp_ar.input.sources import open_source
-from warp_ar.input.video_file import Taken, VideoFile
+from warp_ar.sources.frame_folder import FrameFolder
+from warp_ar.sources.source import DEFAULT_FPS, Frame, RecordedSource
+from warp_ar.sources.sources import open_source
+from warp_ar.sources.video_file import Taken, VideoFile
 
 CONVERTERS = 2
 """Threads of a worker that turn decoded pictures into RGB."""

@@ -26,7 +26,7 @@ from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SinkError, reason
 from warp_ar.farm.catalogue import ObjectSpec
 from warp_ar.farm.lighting import Lit
-from warp_ar.kernels.object_masks import trace_object_masks
+from warp_ar.kernels.picture.object_masks import trace_object_masks
 from warp_ar.light.captured import latlong_directions, texel_solid_angles
 from warp_ar.output.folder_sink import PNG_OPTIONS
 from warp_ar.scene import Scene

@@ -26,12 +26,12 @@ from warp_ar.farm.frames import CONVERTERS, open_part
 from warp_ar.farm.jobs import Job, JobFile, lit_range, scene_of, source_of
 from warp_ar.farm.lit_picture import LitPicture
 from warp_ar.farm.survey import Survey, keep_depth, lit_scene
-from warp_ar.input.own_markers import own_markers
-from warp_ar.input.plate import Plate
-from warp_ar.input.source import Frame, RecordedSource
-from warp_ar.input.video_file import rgb_from_video
 from warp_ar.scene import Pose, Scene
 from warp_ar.scene.kinds import skeleton
+from warp_ar.sources.deep_frame import Plate
+from warp_ar.sources.source import Frame, RecordedSource
+from warp_ar.sources.video_file import rgb_from_video
+from warp_ar.tracking.own_markers import own_markers
 
 PIPELINES = 4
 """Pipelines that are kept for scenes of other objects: each holds its arrays."""

@@ -48,14 +48,14 @@ from warp_ar.errors import SceneError, SourceError, reason
 from warp_ar.farm.frames import FrameIndex, index_frames, open_part
 from warp_ar.farm.jobs import JobFile, lit_range, scene_of, source_of
 from warp_ar.farm.tracking_process import Reading, TrackingProcess, can_share
-from warp_ar.input.plate import check_linear
-from warp_ar.input.source import Frame, RecordedSource
-from warp_ar.input.sources import open_source
-from warp_ar.input.tracking import Track, Tracker
-from warp_ar.kernels.change import CHANGE_FLOOR, CHANGE_SHARE
+from warp_ar.kernels.environment.change import CHANGE_FLOOR, CHANGE_SHARE
 from warp_ar.light.captured import Light, find_emitters
 from warp_ar.scene import CapturedLight, Pose, Scene
+from warp_ar.sources.deep_frame import check_linear
+from warp_ar.sources.source import Frame, RecordedSource
+from warp_ar.sources.sources import open_source
 from warp_ar.stages.features import has_environment
+from warp_ar.tracking.tracking import Track, Tracker
 
 Map = npt.NDArray[np.float32]
 

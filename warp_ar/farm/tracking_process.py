@@ -23,10 +23,10 @@ import numpy as np
 from warp_ar.closing import Closing
 from warp_ar.farm.frames import FrameIndex, open_part
 from warp_ar.farm.records import OPENCV_THREADS
-from warp_ar.input.source import Frame
-from warp_ar.input.tracking import Image, Track, Tracker
 from warp_ar.light.solving_process import own_streams, read_message, start_process, write_message
 from warp_ar.scene import Camera, Marker
+from warp_ar.sources.source import Frame
+from warp_ar.tracking.tracking import Image, Track, Tracker
 
 SLOTS = 12
 """Pictures at once in shared memory: those that are being lit, and those by which tracking is ahead."""

@@ -19,7 +19,6 @@ import numpy.typing as npt
 from warp_ar.closing import Closing
 from warp_ar.engine.layers import RADIANCE
 from warp_ar.errors import WarpArError, reason
-from warp_ar.farm.draws import NoPlace, draw_variation
 from warp_ar.farm.frames import mean_rate, shown_ticks
 from warp_ar.farm.jobs import AS_RECORDED, Job, job_of_clip, jobs_of_clip, lit_range, scene_of, source_of
 from warp_ar.farm.labels import LAYERS, LabelWriter
@@ -28,6 +27,7 @@ from warp_ar.farm.manifest import aside, is_no_space, publish, publish_file
 from warp_ar.farm.part_video import PartSink, join_parts
 from warp_ar.farm.records import Context, Outcome
 from warp_ar.farm.survey import lit_scene, survey_clip
+from warp_ar.farm.variations import NoPlace, draw_variation
 from warp_ar.farm.version import program_version
 from warp_ar.scene import SourceSpec, dumps_scene
 

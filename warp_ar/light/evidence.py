@@ -32,7 +32,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from warp_ar.kernels.recover_cells import CELL_ROWS
+from warp_ar.kernels.recovery.recover_cells import CELL_ROWS
 from warp_ar.light.config import CONFIG, Kind
 from warp_ar.light.fit import Fit, fit_channel
 from warp_ar.light.problem import Problem

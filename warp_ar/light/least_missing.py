@@ -24,9 +24,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from warp_ar.kernels.recover_cells import LOST
+from warp_ar.kernels.recovery.recover_cells import LOST
+from warp_ar.light.clipping_prior import alike, grown
 from warp_ar.light.config import CONFIG
-from warp_ar.light.excess import alike, grown
 from warp_ar.light.regions import connected_regions
 
 Array = NDArray[np.float64]

@@ -29,8 +29,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from warp_ar.input.ball_reflectance import are_seen
-from warp_ar.input.card import card_size
+from warp_ar.ball.ball_reflectance import are_seen
+from warp_ar.calibration.card import card_size
 from warp_ar.scene import Camera, Pose, Probe, Proxy, Scene
 from warp_ar.scene.geometry import rotation_matrix
 

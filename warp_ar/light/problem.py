@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from warp_ar.kernels.recover_cells import LOST
+from warp_ar.kernels.recovery.recover_cells import LOST
+from warp_ar.light.clipping_prior import alike, depth_profile
 from warp_ar.light.config import CONFIG, Kind
-from warp_ar.light.excess import alike, depth_profile
 from warp_ar.light.noise import measured_noise, shared_errors
 from warp_ar.light.regions import connected_regions, split_regions
 from warp_ar.light.surfaces import Surfaces

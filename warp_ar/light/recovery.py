@@ -1,6 +1,7 @@
 """Light that clipping lost in the ball, found again from surfaces that the same light falls on.
 
-**Unknowns.** Cells of the environment that clip (``kernels/recover_cells.py``) are grouped to regions: connected ones,
+**Unknowns.** Cells of the environment that clip (``kernels/recovery/recover_cells.py``) are grouped to regions:
+connected ones,
 split where they are wider than some steradians. Region r lacks the radiance s_r >= 0, per channel, on top of what the
 ball shows. Beside regions stand *candidates*: emitters or a sun within a region, or where no ball sees, each with its
 power p_j >= 0 (radiance times solid angle, as seen from the ball), a direction and a distance. A surface k has the
@@ -20,7 +21,7 @@ their reflectances allow.
 **Priors** decide what surfaces do not see. A region's s_r scatters about the mean of its connected component, that
 about one mean of all, times (solid angle)^-1/2: halfway between emitters of equal radiance and emitters of equal power,
 for what is small and still clips tends to be brighter than what is wide; less where channels clip apart from each
-other, and growing inward where it fades (``light/excess.py``). The common mean is free; where nothing but the
+other, and growing inward where it fades (``light/clipping_prior.py``). The common mean is free; where nothing but the
 card is used it is what makes the card right, and that alone is the method ``white_card``. Clipped pixels that show a
 modelled surface (the card in the ball, a box) are lit, not lights: they stay close to clipping. Channels share their
 distribution: a second pass draws each to the mean of all three, in the hue of their totals.

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from warp_ar.input.marker_pattern import printed_cells
-from warp_ar.kernels.recover import SurfacePoint
+from warp_ar.kernels.recovery.recover import SurfacePoint
 from warp_ar.light.config import CONFIG, Kind
 from warp_ar.scene import Proxy, Scene
 from warp_ar.scene.geometry import rotation_matrix
+from warp_ar.tracking.marker_pattern import printed_cells
 
 Array = NDArray[np.float64]
 

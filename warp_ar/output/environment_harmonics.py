@@ -23,7 +23,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from warp_ar.kernels.irradiance import basis_row, cosine_lobe
+from warp_ar.kernels.environment.irradiance import basis_row, cosine_lobe
 from warp_ar.output.environment_axes import world_from_marker
 from warp_ar.signature import PROGRAM
 

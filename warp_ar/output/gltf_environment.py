@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from warp_ar.kernels.irradiance import cosine_lobe
+from warp_ar.kernels.environment.irradiance import cosine_lobe
 from warp_ar.light.captured import latlong_directions, texel_solid_angles
 from warp_ar.output.environment_axes import cube_directions, to_cube, world_from_marker
 from warp_ar.output.environment_harmonics import project_radiance

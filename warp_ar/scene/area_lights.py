@@ -1,4 +1,4 @@
-"""Objects that emit, as a table from which kernels draw places on them; see ``kernels/area_lights.py``.
+"""Objects that emit, as a table from which kernels draw places on them; see ``kernels/rays/area_lights.py``.
 
 A triangle's share of the table is its area times its mean emission. Where a picture says the emission, a twentieth of
 the shares goes by area alone: what the few places that are looked at here miss is still found, seldom.

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from warp_ar import scene as scenes
 from warp_ar.kernels import structs
-from warp_ar.kernels.trace import TraceConfig
+from warp_ar.kernels.rays.trace import TraceConfig
 from warp_ar.scene.area_lights import emits
 from warp_ar.scene.geometry import rotation_matrix
 from warp_ar.scene.mesh_materials import MeshMaterial

@@ -12,7 +12,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_ar import scene as scenes
-from warp_ar.kernels.wide_bvh import build_wide_bvh
+from warp_ar.kernels.rays.wide_bvh import build_wide_bvh
 from warp_ar.scene.geometry import Mesh
 from warp_ar.scene.object_materials import file_mesh
 from warp_ar.scene.object_shapes import ObjectShape
@@ -21,7 +21,7 @@ from warp_ar.scene.shapes import box_mesh, disk_mesh, rect_mesh, silhouette_tole
 FloatArray = npt.NDArray[np.float64]
 
 BOX_MARGIN: Final = 2.0**-18
-"""How much larger than its triangle a box of the BVH is, in radii of the mesh; see ``kernels/shapes.py``."""
+"""How much larger than its triangle a box of the BVH is, in radii of the mesh; see ``kernels/rays/shapes.py``."""
 BVH_CONSTRUCTOR: Final = "sah"
 """On CUDA; Warp's own choice there is quicker to build, and a fifth to a half slower to walk."""
 BVH_LEAF_SIZE: Final = 1

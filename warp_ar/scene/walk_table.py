@@ -1,4 +1,4 @@
-"""A scene's table of walks, by which kernels on CPU call them: see ``kernels/called_walks.py``."""
+"""A scene's table of walks, by which kernels on CPU call them: see ``kernels/rays/called_walks.py``."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_ar.kernels.called_walks import SCENE_AT
+from warp_ar.kernels.rays.called_walks import SCENE_AT
+from warp_ar.kernels.rays.walks import write_walks
 from warp_ar.kernels.structs import RayScene
-from warp_ar.kernels.walks import write_walks
 
 
 class WalkTable:

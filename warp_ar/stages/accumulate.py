@@ -8,8 +8,8 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_ar.kernels import accumulate
-from warp_ar.kernels.probe_weights import update_places
+from warp_ar.kernels.environment import accumulate
+from warp_ar.kernels.environment.probe_weights import update_places
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring, unobserved
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.probe_maps import KEPT, OTHERS, UNWRAPPED, find_view, other_maps, other_names, other_views

@@ -7,9 +7,9 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_ar.kernels import composite
-from warp_ar.kernels.codes import by_warps
 from warp_ar.kernels.launch import copy
+from warp_ar.kernels.picture import composite
+from warp_ar.kernels.picture.codes import by_warps
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.layers import composite_config, layers_of

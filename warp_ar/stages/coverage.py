@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-from warp_ar.kernels.coverage import count_coverage, make_count_coverage_kernel
+from warp_ar.kernels.receiver.coverage import count_coverage, make_count_coverage_kernel
 from warp_ar.kernels.structs import vec8
 from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.base import NOT_ASKED, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring

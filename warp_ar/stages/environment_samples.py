@@ -7,8 +7,8 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_ar.kernels import environment_samples, pyramid
-from warp_ar.kernels.environment_samples import EnvironmentSample
+from warp_ar.kernels.environment import environment_samples, pyramid
+from warp_ar.kernels.environment.environment_samples import EnvironmentSample
 from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.environment_sets import lists_texels, sample_count, sample_names, sample_slots

@@ -7,13 +7,13 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_ar.kernels import environment_shadow
-from warp_ar.kernels import environment_shadow_filter as filters
-from warp_ar.kernels import environment_shadow_wavefront as wavefront
 from warp_ar.kernels.cells import cell_shape, cell_stride
-from warp_ar.kernels.environment_samples import SampleSets
-from warp_ar.kernels.environment_shadow_cells import EnvironmentShadowConfig, ShadowCells, shaded_shape
+from warp_ar.kernels.environment.environment_samples import SampleSets
 from warp_ar.kernels.launch import count_partials
+from warp_ar.kernels.receiver import environment_shadow
+from warp_ar.kernels.receiver import environment_shadow_filter as filters
+from warp_ar.kernels.receiver import environment_shadow_wavefront as wavefront
+from warp_ar.kernels.receiver.environment_shadow_cells import EnvironmentShadowConfig, ShadowCells, shaded_shape
 from warp_ar.stages.base import (
     NO_BALL,
     NO_OBJECT,

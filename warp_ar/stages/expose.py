@@ -7,8 +7,8 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_ar.kernels import expose
-from warp_ar.kernels.codes import by_warps
+from warp_ar.kernels.picture import expose
+from warp_ar.kernels.picture.codes import by_warps
 from warp_ar.kernels.structs import make_picture
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features

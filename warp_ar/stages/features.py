@@ -11,9 +11,9 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Literal
 
-from warp_ar.kernels.area_lights import POINT_SAMPLES
-from warp_ar.kernels.expose import BOXES
-from warp_ar.kernels.reflect import DiffuseForm, DistantLightConfig
+from warp_ar.kernels.objects.reflect import DiffuseForm, DistantLightConfig
+from warp_ar.kernels.picture.expose import BOXES
+from warp_ar.kernels.rays.area_lights import POINT_SAMPLES
 from warp_ar.scene import Scene
 from warp_ar.scene.area_lights import emits_light
 from warp_ar.scene.kinds import has_sized_lights, material_model, proxies_face, trace_config

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_ar.kernels import change, fill, fill_frame
+from warp_ar.kernels.environment import change, fill, fill_frame
 from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring, unobserved
 from warp_ar.stages.features import Features

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 import warp as wp
 
-from warp_ar.kernels import gloss
+from warp_ar.kernels.receiver import gloss
 from warp_ar.scene.kinds import light_kind, proxies_face, trace_config
 from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring
 from warp_ar.stages.features import Features

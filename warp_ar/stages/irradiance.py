@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_ar.kernels import irradiance, pyramid, sphere_map
+from warp_ar.kernels.environment import irradiance, pyramid, sphere_map
 from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.settled import settled_environment

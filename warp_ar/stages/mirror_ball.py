@@ -8,10 +8,10 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_ar.kernels import mirror_ball
 from warp_ar.kernels.launch import takes_few_blocks
-from warp_ar.kernels.receiver import RelightConfig, make_receiver
-from warp_ar.kernels.reflect import DistantLight
+from warp_ar.kernels.objects.reflect import DistantLight
+from warp_ar.kernels.receiver import mirror_ball
+from warp_ar.kernels.receiver.receiver import RelightConfig, make_receiver
 from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring, clearing
 from warp_ar.stages.features import Features

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_ar.kernels.motion import find_motion, remember
+from warp_ar.kernels.picture.motion import find_motion, remember
 from warp_ar.kernels.structs import FrameParams, Shape
 from warp_ar.scene.object_shapes import object_shapes
 from warp_ar.stages.base import NOT_ASKED, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring

@@ -11,8 +11,9 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_ar.kernels import frame_levels, near_field
-from warp_ar.kernels.near_field_rays import SHARP_ALPHA
+from warp_ar.kernels.objects import near_field
+from warp_ar.kernels.objects.near_field_rays import SHARP_ALPHA
+from warp_ar.kernels.picture import frame_levels
 from warp_ar.scene import MetallicRoughnessMaterial, PhongMaterial
 from warp_ar.scene.mesh_materials import MeshMaterial
 from warp_ar.scene.object_materials import reflects_glossily, scene_materials

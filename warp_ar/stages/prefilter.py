@@ -9,8 +9,8 @@ from typing import Any, ClassVar
 import numpy as np
 import warp as wp
 
-from warp_ar.kernels import prefilter, pyramid, sphere_map
-from warp_ar.kernels.lobes import (
+from warp_ar.kernels.environment import prefilter, pyramid, sphere_map
+from warp_ar.kernels.environment.lobes import (
     Lobe,
     box_weights,
     lobe_count,

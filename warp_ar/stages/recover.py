@@ -13,12 +13,13 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_ar.kernels import change, relocate
-from warp_ar.kernels import recover as kernels
+from warp_ar.kernels.environment import change
 from warp_ar.kernels.launch import copy
-from warp_ar.kernels.light_level import apply_level, follow_level, sum_upward
-from warp_ar.kernels.recover_cells import Cell, add_recovered, cell_shape, condense_cells, leave_out_edges
-from warp_ar.kernels.saturation_boundaries import weigh_boundaries
+from warp_ar.kernels.recovery import recover as kernels
+from warp_ar.kernels.recovery import relocate
+from warp_ar.kernels.recovery.light_level import apply_level, follow_level, sum_upward
+from warp_ar.kernels.recovery.recover_cells import Cell, add_recovered, cell_shape, condense_cells, leave_out_edges
+from warp_ar.kernels.recovery.saturation_boundaries import weigh_boundaries
 from warp_ar.kernels.structs import Emitter
 from warp_ar.light import recovery
 from warp_ar.light.config import CONFIG, Kind

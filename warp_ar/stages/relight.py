@@ -10,10 +10,10 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_ar.kernels import receiver_cells, relight
 from warp_ar.kernels.cells import cell_shape, cell_stride
 from warp_ar.kernels.launch import count_partials, takes_few_blocks
-from warp_ar.kernels.receiver import Receiver, ReceiverCells, RelightConfig, make_receiver
+from warp_ar.kernels.receiver import receiver_cells, relight
+from warp_ar.kernels.receiver.receiver import Receiver, ReceiverCells, RelightConfig, make_receiver
 from warp_ar.kernels.structs import PLANE
 from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring, clearing

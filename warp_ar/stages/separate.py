@@ -7,8 +7,8 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_ar.kernels.expose import ExposeConfig
-from warp_ar.kernels.separate import SeparateLayers, make_separate_layers_kernel, separate_layers
+from warp_ar.kernels.picture.expose import ExposeConfig
+from warp_ar.kernels.picture.separate import SeparateLayers, make_separate_layers_kernel, separate_layers
 from warp_ar.kernels.structs import make_picture
 from warp_ar.stages.base import NOT_ASKED, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features

@@ -8,8 +8,15 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_ar.kernels.launch import takes_few_blocks
-from warp_ar.kernels.near_field import NearLight
-from warp_ar.kernels.shade import LEFT, LISTED, make_object_light, make_sample_edges_kernel, make_shade_kernel, shade
+from warp_ar.kernels.objects.near_field import NearLight
+from warp_ar.kernels.objects.shade import (
+    LEFT,
+    LISTED,
+    make_object_light,
+    make_sample_edges_kernel,
+    make_shade_kernel,
+    shade,
+)
 from warp_ar.stages.base import (
     NO_OBJECT,
     OUT_OF_PICTURE,

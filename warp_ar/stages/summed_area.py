@@ -8,8 +8,13 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_ar.device import usable_cores
-from warp_ar.kernels import summed_area
-from warp_ar.kernels.summed_area_strips import make_sum_strips_kernel, strip_config, strip_shapes, sum_area_by_strips
+from warp_ar.kernels.picture import summed_area
+from warp_ar.kernels.picture.summed_area_strips import (
+    make_sum_strips_kernel,
+    strip_config,
+    strip_shapes,
+    sum_area_by_strips,
+)
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.clipped import box_reads

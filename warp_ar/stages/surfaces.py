@@ -7,8 +7,8 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_ar.kernels.surfaces import make_surfaces, make_trace_surfaces_kernel, trace_surfaces
-from warp_ar.kernels.visibility import VisibleObjects
+from warp_ar.kernels.rays.visibility import VisibleObjects
+from warp_ar.kernels.receiver.surfaces import make_surfaces, make_trace_surfaces_kernel, trace_surfaces
 from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.base import NOT_ASKED, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features

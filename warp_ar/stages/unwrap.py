@@ -7,8 +7,8 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_ar.kernels import sphere_map, unwrap
-from warp_ar.kernels.probe_weights import measure_seen
+from warp_ar.kernels.environment import sphere_map, unwrap
+from warp_ar.kernels.environment.probe_weights import measure_seen
 from warp_ar.kernels.structs import BOX, MESH, PLANE
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring, unobserved
 from warp_ar.stages.features import Features

@@ -7,8 +7,8 @@ from typing import Any, ClassVar
 
 import warp as wp
 
+from warp_ar.kernels.rays.visibility import trace_pixels
 from warp_ar.kernels.structs import Hit
-from warp_ar.kernels.visibility import trace_pixels
 from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.base import (
     NO_OBJECT,

@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_ar.errors import UsageError
-from warp_ar.input.sources import QueueSource, Source
 from warp_ar.pictures import decode_picture
+from warp_ar.sources.sources import QueueSource, Source
 from warp_ar.viewer import protocol
 from warp_ar.viewer.controls import Controls, Feed, Notify
 from warp_ar.viewer.intrinsics import FocalEstimator, guessed_camera

@@ -27,7 +27,7 @@ from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import WarpArError, reason
 from warp_ar.scene import Pose
 from warp_ar.stages.quality import AUTO, DEFAULT_BUDGET_MS, PRESETS, Quality
-from warp_ar.viewer.beside import begin
+from warp_ar.viewer.background import begin
 from warp_ar.viewer.controls import Notify
 
 _COST_FRAMES: Final = 30

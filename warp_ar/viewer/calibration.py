@@ -13,12 +13,12 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from warp_ar.calibration.camera_calibration import GOOD_VIEWS, BoardViews, CameraReport, write_camera
+from warp_ar.calibration.card import write_card
 from warp_ar.errors import UsageError
-from warp_ar.input.camera_calibration import GOOD_VIEWS, BoardViews, CameraReport, write_camera
-from warp_ar.input.card import write_card
-from warp_ar.input.sheet import SHEET
 from warp_ar.scene import Camera
-from warp_ar.viewer.beside import begin
+from warp_ar.tracking.card_layout import SHEET
+from warp_ar.viewer.background import begin
 from warp_ar.viewer.controls import Notify
 
 _LOOK_SECONDS: Final = 0.4

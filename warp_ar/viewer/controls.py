@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from warp_ar.errors import SourceError, UsageError
-from warp_ar.input.sources import MOST_INDEX, QueueSource, Source, open_source
 from warp_ar.scene import Camera, Scene, SourceSpec
+from warp_ar.sources.sources import MOST_INDEX, QueueSource, Source, open_source
 from warp_ar.stages.quality import PRESETS
 from warp_ar.viewer import messages
 from warp_ar.viewer.edits import Wanted

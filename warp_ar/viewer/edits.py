@@ -9,9 +9,8 @@ from typing import Any, Final, cast
 
 import numpy as np
 
+from warp_ar.checks.check_print import card_scale
 from warp_ar.errors import UsageError
-from warp_ar.input.check_print import card_scale
-from warp_ar.input.sheet import RINGS, SHEET, ball_center
 from warp_ar.scene import (
     Camera,
     CharucoBoard,
@@ -34,6 +33,7 @@ from warp_ar.scene import (
 from warp_ar.scene.object_materials import mesh_of
 from warp_ar.stages import STAGES
 from warp_ar.stages.quality import Quality
+from warp_ar.tracking.card_layout import RINGS, SHEET, ball_center
 from warp_ar.viewer import protocol
 from warp_ar.viewer.animations import play_record, set_play
 from warp_ar.viewer.protocol import EFFECTS

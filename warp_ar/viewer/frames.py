@@ -15,10 +15,10 @@ import numpy.typing as npt
 from warp_ar.device import exclusive
 from warp_ar.engine.pipeline import Pipeline, Result
 from warp_ar.errors import WarpArError
-from warp_ar.input.sources import Frame, Source
-from warp_ar.input.tracking import TrackState
 from warp_ar.scene import Camera, Pose
+from warp_ar.sources.sources import Frame, Source
 from warp_ar.stages.quality import PRESETS
+from warp_ar.tracking.tracking import TrackState
 from warp_ar.viewer import messages
 from warp_ar.viewer.browser_camera import BrowserCamera, Image, Pushed
 from warp_ar.viewer.budget import BudgetSetting

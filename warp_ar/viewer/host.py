@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from warp_ar.checks.outline_fit import fit_outline
 from warp_ar.engine.pipeline import resolve_quality
 from warp_ar.errors import SourceError, UsageError, WarpArError
-from warp_ar.input.outline_fit import fit_outline
 from warp_ar.output.sinks import write_environment
 from warp_ar.scene import Scene, bundled_scenes, dumps_scene, load_scene
 from warp_ar.stages.quality import AUTO, DEFAULT_PRESET, PRESETS, Quality
@@ -27,7 +27,6 @@ from warp_ar.viewer.budget import BudgetSetting
 from warp_ar.viewer.bundle import pack_scene
 from warp_ar.viewer.calibration import CalibrationSession
 from warp_ar.viewer.controls import Controls, Feed, Notify, open_feed
-from warp_ar.viewer.dropped import DroppedFiles
 from warp_ar.viewer.edits import Wanted
 from warp_ar.viewer.frames import FrameLoop, Helpers, Lit
 from warp_ar.viewer.light_record import LightState
@@ -35,6 +34,7 @@ from warp_ar.viewer.lighting import Lighting, make_target
 from warp_ar.viewer.no_camera import NoCamera
 from warp_ar.viewer.recorder import Recorder
 from warp_ar.viewer.setup import SetupChecks
+from warp_ar.viewer.uploads import DroppedFiles
 
 
 class Host:

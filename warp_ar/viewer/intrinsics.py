@@ -18,8 +18,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from warp_ar.input.markers import MarkerDetector
 from warp_ar.scene import Camera, Marker
+from warp_ar.tracking.markers import MarkerDetector
 
 DEFAULT_FIELD_OF_VIEW: Final = 60.0
 """Horizontal, degrees: between a phone's main camera (65 to 70) and a laptop's (50 to 60)."""

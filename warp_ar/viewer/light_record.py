@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_ar.errors import UsageError
-from warp_ar.kernels.irradiance import cosine_lobe
+from warp_ar.kernels.environment.irradiance import cosine_lobe
 from warp_ar.light.captured import find_emitters, latlong_directions, texel_solid_angles
 from warp_ar.output.environment_axes import CUBES, FACES, check_axes, to_cube, world_from_marker
 from warp_ar.output.environment_file import write_environment

@@ -14,8 +14,8 @@ from warp_ar.engine.graph import Plan, make_plan
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.engine.switcher import PipelineSwitcher, Target
 from warp_ar.errors import WarpArError
-from warp_ar.input.exposures import plan_bracket
-from warp_ar.input.sources import Frame
+from warp_ar.sources.exposures import plan_bracket
+from warp_ar.sources.sources import Frame
 from warp_ar.stages.quality import PRESETS
 from warp_ar.stages.request import Request
 from warp_ar.viewer import messages

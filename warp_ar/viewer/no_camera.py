@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from warp_ar.checks.finding import Finding
 from warp_ar.errors import SourceError
-from warp_ar.input.finding import Finding
-from warp_ar.input.source import Frame, Source
+from warp_ar.sources.source import Frame, Source
 
 REMEDY: Final = "press “My camera”, which opens the camera of the machine that shows this page"
 _WORDS: Final = ("No camera here.", 'Press "My camera".')

@@ -11,7 +11,7 @@ from aiohttp import web
 
 from warp_ar.errors import WarpArError
 from warp_ar.viewer.backend import Backend
-from warp_ar.viewer.dropped import MOST_BYTES
+from warp_ar.viewer.uploads import MOST_BYTES
 
 DROP_SECONDS: Final = 60.0
 """How long a dropped file may be on its way."""

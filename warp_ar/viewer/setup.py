@@ -13,17 +13,17 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from warp_ar.ball.ball_measure import measure_ball
+from warp_ar.calibration.grey_response import MOST_DEVIATION, measure_grey_response
+from warp_ar.calibration.response import write_response
+from warp_ar.checks.check_objects import check_objects, find_outside
+from warp_ar.checks.check_pictures import Look, board_instead, look_at, why_unseen
+from warp_ar.checks.checkup import check_look
+from warp_ar.checks.finding import Finding
 from warp_ar.errors import UsageError, WarpArError
-from warp_ar.input.ball_measure import measure_ball
-from warp_ar.input.check_objects import check_objects, find_outside
-from warp_ar.input.check_pictures import Look, board_instead, look_at, why_unseen
-from warp_ar.input.checkup import check_look
-from warp_ar.input.finding import Finding
-from warp_ar.input.grey_response import MOST_DEVIATION, measure_grey_response
-from warp_ar.input.response import write_response
-from warp_ar.input.tracking import TrackState
 from warp_ar.scene import Camera, Pose, Probe, Scene
-from warp_ar.viewer.beside import begin
+from warp_ar.tracking.tracking import TrackState
+from warp_ar.viewer.background import begin
 from warp_ar.viewer.controls import Controls, Notify
 
 Image = npt.NDArray[np.uint8]

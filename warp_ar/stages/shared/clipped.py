@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from warp_ar.kernels.expose import ClippedEvidence, make_clipped_evidence
+from warp_ar.kernels.picture.expose import ClippedEvidence, make_clipped_evidence
 from warp_ar.stages.base import Arrays, Wiring
 from warp_ar.stages.features import Features
 from warp_ar.stages.request import Request

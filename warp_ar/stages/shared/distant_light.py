@@ -6,8 +6,8 @@ from collections.abc import Iterable, Mapping
 
 import warp as wp
 
-from warp_ar.kernels.interpolated_irradiance import OtherBalls
-from warp_ar.kernels.reflect import DistantLight
+from warp_ar.kernels.environment.interpolated_irradiance import OtherBalls
+from warp_ar.kernels.objects.reflect import DistantLight
 from warp_ar.kernels.split_sum import integrate_dfg
 from warp_ar.kernels.structs import METALLIC_ROUGHNESS
 from warp_ar.stages.base import Arrays, ArraySpec

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from warp_ar.kernels import composite
+from warp_ar.kernels.picture import composite
 
 
 def layers_of(arrays: Mapping[str, Any]) -> composite.Layers:

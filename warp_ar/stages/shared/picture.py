@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from warp_ar.kernels.rays.visibility import VisibleObjects, make_visible
 from warp_ar.kernels.structs import Picture, make_picture
-from warp_ar.kernels.visibility import VisibleObjects, make_visible
 from warp_ar.stages.base import Arrays
 from warp_ar.stages.features import Features
 

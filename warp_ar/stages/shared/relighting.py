@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from warp_ar.kernels.receiver import RelightConfig
+from warp_ar.kernels.receiver.receiver import RelightConfig
 from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.features import LOCAL, MEASURED, Features
 from warp_ar.stages.shared.picture import frame_reads

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from warp_ar.kernels.shade import ShadeConfig
+from warp_ar.kernels.objects.shade import ShadeConfig
 from warp_ar.scene.kinds import light_kind
 from warp_ar.stages.features import Features
 

@@ -12,11 +12,11 @@ import os
 from typing import Any, Final
 
 from warp_ar.errors import UsageError
-from warp_ar.kernels.composite import CompositeConfig
-from warp_ar.kernels.receiver import RelightConfig
-from warp_ar.kernels.reflect import DiffuseForm, DistantLightConfig
-from warp_ar.kernels.shade import ShadeConfig
-from warp_ar.kernels.trace import TraceConfig
+from warp_ar.kernels.objects.reflect import DiffuseForm, DistantLightConfig
+from warp_ar.kernels.objects.shade import ShadeConfig
+from warp_ar.kernels.picture.composite import CompositeConfig
+from warp_ar.kernels.rays.trace import TraceConfig
+from warp_ar.kernels.receiver.receiver import RelightConfig
 from warp_ar.stages.features import Features
 
 VARIABLE: Final = "WARP_AR_KERNELS"

@@ -1,0 +1,1 @@
+"""Kernels of the environment: from the ball's pixels to a filtered latlong map."""

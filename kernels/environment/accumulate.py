@@ -1,0 +1,229 @@
+"""The environment over time.
+
+Every texel keeps a radiance m and a confidence k and is drawn toward what the current frame says, x with confidence c:
+
+    m += a (x - m),   a = a0 c / (a0 c + (1 - a0) k),   a0 = 1 - exp(-time_step / tau):
+
+the plain exponential mean where c = k, quicker where the new view is the better one, slower where it is the worse, and
+nothing at c = 0. A texel that was never seen takes x whole. The form m + a (x - m) is exact where x = m: nothing
+drifts. k is drawn toward c in the same way and fades with ``FORGET_TIME``, so that what has not been seen for long
+gives way to what is.
+
+tau is ``FOLLOW_TIME`` and drops toward ``FOLLOW_TIME / HASTE`` where the light really changes. Noise and the jitter of
+the tracked pose make large differences of both signs in single texels; a change of the environment moves a whole
+neighbourhood one way, and stays. So the signed mean of x - m is taken over sectors of ``SECTOR_SIZE`` texels squared,
+and what counts is its smaller value in two successive frames of one sign: one corrupt frame is worth no haste, and is
+forgotten as fast as it came.
+
+A texel that clips in a channel says no more than that its radiance is x at least. Where a camera's gain drifts, the
+frames of a lower gain have shown more: m, scaled by the gain since, lies above x. There x counts as m, and the share
+that clips as the one that is known: the light does not fall because the exposure rises. Without a drift no m lies above
+what clips.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from warp_ar.kernels.color import brightness
+from warp_ar.kernels.cooperative import warp_sum
+from warp_ar.kernels.latlong import texel_solid_angle
+from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.safe_math import is_finite, light_confidence, smooth_ramp, usable_confidence
+from warp_ar.kernels.structs import EnvironmentView, FrameParams
+
+wp.set_module_options({"enable_backward": False})
+
+FOLLOW_TIME = wp.constant(wp.float32(0.15))
+"""Time constant of accumulation in seconds: after half a second 4 % of a small change are left."""
+HASTE = wp.constant(wp.float32(6.0))
+"""How much faster a significant change is followed."""
+FORGET_TIME = wp.constant(wp.float32(20.0))
+"""Time constant in seconds with which the confidence of what is not seen fades."""
+SECTOR_SIZE = 8
+"""Texels along the side of a sector in which change is measured."""
+LEAST_CHANGE = wp.constant(wp.float32(0.03))
+MOST_CHANGE = wp.constant(wp.float32(0.15))
+"""Relative change of a sector's mean at which haste begins and is full."""
+DARK = wp.constant(wp.float32(0.01))
+"""Radiance below which changes count as noise."""
+LEAST_EXCESS = wp.constant(wp.float32(0.02))
+MOST_EXCESS = wp.constant(wp.float32(0.1))
+"""Excess of what is known over what clips, relative, at which it begins to count and counts in full."""
+ALL_CLIPPED = wp.constant(wp.float32(0.9))
+"""Share of a texel from which on it is taken to clip as a whole: elsewhere noise lies to both sides."""
+
+
+@wp.func
+def known_beyond_clipping(x: wp.vec3, m: wp.vec3, clipped: wp.vec3) -> wp.vec3:
+    """How far a texel's channels clip below what is known of them, 0 to 1."""
+    beyond = wp.vec3(0.0, 0.0, 0.0)
+    for channel in range(3):
+        excess = m[channel] - x[channel]
+        if excess > 0.0 and clipped[channel] > ALL_CLIPPED:
+            beyond[channel] = smooth_ramp(LEAST_EXCESS, MOST_EXCESS, excess / wp.max(x[channel], DARK))
+            beyond[channel] *= smooth_ramp(ALL_CLIPPED, 1.0, clipped[channel])
+    return beyond
+
+
+@wp.kernel(enable_backward=False)
+def measure_change_kernel(
+    # In:
+    row_start: wp.int32,
+    lanes: wp.int32,
+    view: EnvironmentView,
+    environment: EnvironmentView,
+    # Out:
+    change_out: wp.array2d[wp.vec2],  # this frame's signed relative change, and the one before
+):
+    """Mean signed change of one sector a warp."""
+    band_row, sector_column, lane = wp.tid()
+    sector_row = row_start + band_row
+    height = view.radiance.shape[0]
+    width = view.radiance.shape[1]
+    first_row = sector_row * height // change_out.shape[0]
+    first_column = sector_column * width // change_out.shape[1]
+    rows = (sector_row + 1) * height // change_out.shape[0] - first_row
+    columns = (sector_column + 1) * width // change_out.shape[1] - first_column
+    difference = wp.float32(0.0)
+    level = wp.float32(0.0)
+    for item in range(lane, rows * columns, lanes):
+        i = first_row + item // columns
+        j = first_column + item % columns
+        m = environment.radiance[i, j]
+        seen = view.radiance[i, j]
+        x = seen + wp.cw_mul(known_beyond_clipping(seen, m, view.clipped[i, j]), m - seen)
+        certainty = usable_confidence(m, environment.confidence[i, j])
+        weight = wp.min(light_confidence(seen, view.confidence[i, j]), certainty)
+        if weight > 0.0:
+            weight *= texel_solid_angle(i, height, width)
+            new = brightness(x)
+            old = brightness(m)
+            difference += weight * (new - old)
+            level += weight * (wp.max(new, old) + DARK)
+    sum = warp_sum(wp.vec4(difference, level, 0.0, 0.0))
+    if lane == 0:
+        change = wp.float32(0.0)
+        if sum[1] > 0.0:
+            change = sum[0] / sum[1]
+        if not wp.isfinite(change):
+            change = 0.0
+        change_out[sector_row, sector_column] = wp.vec2(change, change_out[sector_row, sector_column][0])
+
+
+@wp.func
+def lasting_change(change: wp.array2d[wp.vec2], row: wp.int32, column: wp.int32) -> wp.float32:
+    """Size of a sector's change as far as two frames agree on it; rows end at the poles, columns wrap."""
+    width = change.shape[1]
+    c = change[wp.clamp(row, 0, change.shape[0] - 1), (column + width) % width]
+    if c[0] * c[1] <= 0.0:
+        return 0.0
+    return wp.min(wp.abs(c[0]), wp.abs(c[1]))
+
+
+@wp.kernel(enable_backward=False)
+def accumulate_environment_kernel(
+    # In:
+    row_start: wp.int32,
+    view: EnvironmentView,
+    change: wp.array2d[wp.vec2],
+    params: wp.array[FrameParams],
+    # In and out:
+    environment_out: EnvironmentView,
+):
+    """One texel a thread, in place."""
+    band_row, j = wp.tid()
+    i = row_start + band_row
+    x = view.radiance[i, j]
+    clipped = view.clipped
+    c = light_confidence(x, view.confidence[i, j])
+    if wp.min(clipped[i, j]) < 0.0 or not is_finite(clipped[i, j]):
+        c = 0.0
+    m = environment_out.radiance[i, j]
+    share = environment_out.clipped[i, j]
+    k = usable_confidence(m, environment_out.confidence[i, j])
+    if params[0].environment_reset != 0 or k == 0.0 or not is_finite(share):
+        k = 0.0
+        m = wp.vec3(0.0, 0.0, 0.0)
+        share = wp.vec3(0.0, 0.0, 0.0)
+    time_step = params[0].time_step
+    if not (time_step > 0.0):
+        time_step = 0.0
+
+    # Sectors are blended bilinearly: no edges between them.
+    y = (wp.float32(i) + 0.5) * wp.float32(change.shape[0]) / wp.float32(clipped.shape[0]) - 0.5
+    z = (wp.float32(j) + 0.5) * wp.float32(change.shape[1]) / wp.float32(clipped.shape[1]) - 0.5
+    row = wp.int32(wp.floor(y))
+    column = wp.int32(wp.floor(z))
+    fz = z - wp.floor(z)
+    above = wp.lerp(lasting_change(change, row, column), lasting_change(change, row, column + 1), fz)
+    below = wp.lerp(lasting_change(change, row + 1, column), lasting_change(change, row + 1, column + 1), fz)
+    significance = smooth_ramp(LEAST_CHANGE, MOST_CHANGE, wp.lerp(above, below, y - wp.floor(y)))
+
+    rate = 1.0 - wp.exp(-time_step / FOLLOW_TIME * (1.0 + (HASTE - 1.0) * significance))
+    a = wp.float32(0.0)
+    if c > 0.0:
+        a = 1.0
+        if k > 0.0:
+            a = rate * c / (rate * c + (1.0 - rate) * k)
+        beyond = known_beyond_clipping(x, m, clipped[i, j])
+        m = m + a * wp.cw_mul(wp.vec3(1.0, 1.0, 1.0) - beyond, x - m)
+        share = share + a * wp.cw_mul(wp.vec3(1.0, 1.0, 1.0) - beyond, clipped[i, j] - share)
+    k = k * wp.exp(-time_step / FORGET_TIME)
+    environment_out.radiance[i, j] = m
+    environment_out.confidence[i, j] = k + a * (c - k)
+    environment_out.clipped[i, j] = share
+
+
+def change_shape(height: int, width: int) -> tuple[int, int]:
+    """Rows and columns of the sectors in which change is measured for a map of this size."""
+    return max(1, height // SECTOR_SIZE), max(1, width // SECTOR_SIZE)
+
+
+def measure_change(
+    view: EnvironmentView, environment: EnvironmentView, change_out: wp.array, *, rows: Rows | None = None
+) -> None:
+    """Signed relative change of each sector between the accumulated light and a frame's.
+
+    Args:
+        view: (h, w) this frame's light.
+        environment: (h, w) accumulated light.
+        change_out: ``wp.vec2`` of ``change_shape(h, w)``: the change in -1..1, and what stood there before.
+        rows: Band of sector rows, None for all.
+    """
+    lanes = 1 if change_out.device.is_cpu else 32
+    launch_rows(
+        measure_change_kernel,
+        (*change_out.shape, lanes),
+        [lanes, view, environment],
+        [change_out],
+        rows=rows,
+        device=change_out.device,
+    )
+
+
+def accumulate_environment(
+    view: EnvironmentView,
+    change: wp.array,
+    params: wp.array,
+    environment_out: EnvironmentView,
+    *,
+    rows: Rows | None = None,
+) -> None:
+    """Draw the accumulated light toward a frame's; outputs are read and written in place and start at zero.
+
+    Args:
+        view: (h, w) this frame's light.
+        change: From ``measure_change``.
+        params: ``FrameParams`` (1): ``time_step`` and ``environment_reset``.
+        environment_out: (h, w) accumulated light.
+        rows: Band of rows, None for all.
+    """
+    launch_rows(
+        accumulate_environment_kernel,
+        environment_out.radiance.shape,
+        [view, change, params],
+        [environment_out],
+        rows=rows,
+        device=environment_out.radiance.device,
+    )

@@ -1,0 +1,202 @@
+"""One map of the environment from unwrapped frames of several exposures.
+
+Frame k is exposed t_k / t_0 = r_k as long as the reference, whose camera values everything else is in. What it says of
+a texel, x_k, therefore means the radiance x_k / r_k. Where nothing clips, the estimate of least variance weights each
+by its inverse variance [GAWTSL10]. With shot noise that grows with the signal and a floor of read noise and rounding,
+var(x) = FLOOR^2 + SHOT x, that is
+
+    L = sum w_k x_k / r_k / sum w_k,   w_k = c_k r_k^2 / (FLOOR^2 + SHOT x_k),
+
+with c_k the confidence of the view: the longest exposure that does not clip has nearly all the say. A running mean
+keeps equal values exactly.
+
+An exposure has none in a channel where anything within ``REACH`` of the texel clips. That is wider than the texel's own
+footprint on purpose: tracking places the ball a fraction of a pixel differently in every frame, and an emitter that the
+short exposure shows half a texel beside the place where the long one clips would lose, to the dark of the long
+exposure, what lies over its edge. Around an emitter, all comes from one exposure that shows it whole.
+
+What clips still says that there is no less light than that: where an emitter has just been switched on, the short
+exposure does not know it yet. Where all exposures clip, the shortest that sees the texel stands, with its share at
+clipping.
+
+References:
+    [GAWTSL10] Granados, Ajdin, Wand, Theobalt, Seidel, Lensch, "Optimal HDR reconstruction with linear digital
+        cameras", CVPR 2010.
+"""
+
+from __future__ import annotations
+
+import math
+
+import warp as wp
+
+from warp_ar.kernels.latlong import PI
+from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.safe_math import is_finite, light_confidence
+from warp_ar.kernels.structs import EnvironmentView
+
+wp.set_module_options({"enable_backward": False})
+
+REACH = math.radians(2.0)
+"""Angle by which a frame's map may be off: half a pixel of a ball that is 80 pixels across moves what it mirrors by
+1.8 degrees."""
+FLOOR = wp.constant(wp.float32(0.002))
+"""Standard deviation of a dark camera value: read noise, and half a code."""
+SHOT = wp.constant(wp.float32(0.0004))
+"""Variance per camera value: 2,500 electrons at clipping."""
+
+
+@wp.struct
+class BracketExposure:
+    """One of the exposures between which frames alternate."""
+
+    ratio: wp.float32  # exposure time over the reference's
+    trust: wp.float32  # 1; 0 where there has been no such frame lately
+
+
+@wp.struct
+class ExposureStack:
+    """The latest unwrapped frame of every exposure, longest first, (K, h, w) each."""
+
+    radiance: wp.array3d[wp.vec3]  # in camera values of the exposure over the ball's reflectance
+    confidence: wp.array3d[wp.float32]  # 0 or NaN: not seen
+    clipped: wp.array3d[wp.vec3]  # share at clipping, per channel
+    spread: wp.array3d[wp.vec3]  # of ``spread_clipping``
+
+
+def make_exposure_stack(radiance: wp.array, confidence: wp.array, clipped: wp.array, spread: wp.array) -> ExposureStack:
+    """The arrays of the exposures together."""
+    stack = ExposureStack()
+    stack.radiance, stack.confidence, stack.clipped, stack.spread = radiance, confidence, clipped, spread
+    return stack
+
+
+@wp.kernel(enable_backward=False)
+def spread_clipping_kernel(
+    # In:
+    row_start: wp.int32,
+    reach: wp.float32,
+    # In and out:
+    stack_out: ExposureStack,
+):
+    """Largest share at clipping along the row, one texel a thread."""
+    clipped = stack_out.clipped
+    band_row, j, k = wp.tid()
+    i = row_start + band_row
+    height = clipped.shape[1]
+    width = clipped.shape[2]
+    step = 2.0 * PI / wp.float32(width) * wp.sin((wp.float32(i) + 0.5) * PI / wp.float32(height))
+    columns = wp.min(wp.int32(wp.ceil(reach / step)), width / 2)
+    largest = wp.vec3(0.0, 0.0, 0.0)
+    for offset in range(-columns, columns + 1):
+        at = (j + offset + width) % width
+        if stack_out.confidence[k, i, at] > 0.0:
+            share = clipped[k, i, at]
+            if not is_finite(share):
+                share = wp.vec3(1.0, 1.0, 1.0)
+            largest = wp.max(largest, share)
+    stack_out.spread[k, i, j] = largest
+
+
+def spread_clipping(stack_out: ExposureStack, *, reach: float = REACH, rows: Rows | None = None) -> None:
+    """Find what clips near every texel: first half, along the rows; ``merge_exposures`` does the columns.
+
+    Args:
+        stack_out: (K, h, w); its ``spread`` is written.
+        reach: Radians.
+        rows: Band of rows, None for all.
+    """
+    count, height, width = stack_out.clipped.shape
+    launch_rows(
+        spread_clipping_kernel,
+        (height, width, count),
+        [reach],
+        [stack_out],
+        rows=rows,
+        device=stack_out.clipped.device,
+    )
+
+
+@wp.kernel(enable_backward=False)
+def merge_exposures_kernel(
+    # In:
+    row_start: wp.int32,
+    exposures: wp.array[BracketExposure],
+    stack: ExposureStack,
+    reach: wp.float32,
+    # Out:
+    view_out: EnvironmentView,
+):
+    """One texel a thread."""
+    radiance = stack.radiance
+    clipped = stack.clipped
+    band_row, j = wp.tid()
+    i = row_start + band_row
+    height = radiance.shape[1]
+    reach_rows = wp.int32(wp.ceil(reach * wp.float32(height) / PI))
+    first = wp.max(i - reach_rows, 0)
+    last = wp.min(i + reach_rows, height - 1)
+
+    total = wp.vec3(0.0, 0.0, 0.0)
+    mean = wp.vec3(0.0, 0.0, 0.0)
+    least = wp.vec3(0.0, 0.0, 0.0)
+    shortest = wp.vec3(0.0, 0.0, 0.0)
+    share = wp.vec3(0.0, 0.0, 0.0)
+    certainty = wp.float32(0.0)
+    for k in range(exposures.shape[0]):
+        c = wp.float32(0.0)
+        if exposures[k].trust > 0.0 and exposures[k].ratio > 0.0:
+            c = light_confidence(radiance[k, i, j], stack.confidence[k, i, j])
+        if c > 0.0 and is_finite(clipped[k, i, j]):
+            certainty = wp.max(certainty, c)
+            ratio = exposures[k].ratio
+            value = radiance[k, i, j]
+            brightest = wp.vec3(0.0, 0.0, 0.0)
+            for row in range(first, last + 1):
+                brightest = wp.max(brightest, stack.spread[k, row, j])
+            for channel in range(3):
+                light = value[channel] / ratio
+                if brightest[channel] == 0.0:
+                    weight = c * ratio * ratio / (FLOOR * FLOOR + SHOT * value[channel])
+                    total[channel] += weight
+                    mean[channel] += weight / total[channel] * (light - mean[channel])
+                elif clipped[k, i, j][channel] > 0.0:
+                    least[channel] = wp.max(least[channel], light)
+                shortest[channel] = light
+                share[channel] = clipped[k, i, j][channel]
+    for channel in range(3):
+        if total[channel] > 0.0:
+            shortest[channel] = mean[channel]
+            share[channel] = 0.0
+        shortest[channel] = wp.max(shortest[channel], least[channel])
+    view_out.radiance[i, j] = shortest
+    view_out.confidence[i, j] = certainty
+    view_out.clipped[i, j] = share
+
+
+def merge_exposures(
+    exposures: wp.array,
+    stack: ExposureStack,
+    view_out: EnvironmentView,
+    *,
+    reach: float = REACH,
+    rows: Rows | None = None,
+) -> None:
+    """Merge the latest unwrapped frame of every exposure.
+
+    Args:
+        exposures: ``BracketExposure`` (K), longest first; the reference, whose ratio is 1, is one of them.
+        stack: (K, h, w); its ``spread`` from ``spread_clipping``, with the same ``reach``.
+        view_out: (h, w): radiance in camera values of the reference, confidence of the view that saw the texel best,
+            the share that clips in all exposures.
+        reach: Radians.
+        rows: Band of rows, None for all.
+    """
+    launch_rows(
+        merge_exposures_kernel,
+        view_out.radiance.shape,
+        [exposures, stack, reach],
+        [view_out],
+        rows=rows,
+        device=view_out.radiance.device,
+    )

@@ -1,0 +1,345 @@
+"""The environment, whole.
+
+What no ball shows is taken from its confident neighbours by push and pull [GGSC96]: down a pyramid go means of
+radiance weighted by confidence and solid angle, up again each texel is completed from its coarser level, as far as it
+lacks confidence. Both are normalised, and in forms that are exact for equal values: a constant environment stays
+constant under any mask. Texels of a coarser level cover shares of finer ones by exact overlap, so every size works.
+Without any confidence there is no light: the map is zero.
+
+References:
+    [GGSC96] Gortler, Grzeszczuk, Szeliski, Cohen, "The Lumigraph", SIGGRAPH 1996, section 3.4.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import Any
+
+import warp as wp
+
+from warp_ar.kernels.environment.fill_frame import with_seen
+from warp_ar.kernels.latlong import PI, beside_in_row
+from warp_ar.kernels.launch import Rows, launch_rows, launch_tiles, wait_for_block
+from warp_ar.kernels.safe_math import smooth_ramp, usable_confidence
+
+wp.set_module_options({"enable_backward": False})
+
+FULL_TRUST = wp.constant(wp.float32(0.5))
+"""Confidence above which a texel is kept as it is."""
+SUPPORT = wp.constant(wp.float32(4.0))
+"""A coarser texel is fully trusted once a quarter of it is: smaller holes are then filled from nearby only."""
+COARSE_TEXELS = 2048
+"""Texels from which on the levels of filling are the work of one block, of ``COARSE_BLOCK`` threads."""
+COARSE_BLOCK = 512
+
+
+@wp.func
+def band_solid_angle(start: wp.float32, stop: wp.float32, height: wp.int32) -> wp.float32:
+    """Solid angle of the rows from start to stop per unit of longitude; a product of sines: no cancellation."""
+    half = 0.5 * PI / wp.float32(height)
+    return 2.0 * wp.sin((start + stop) * half) * wp.sin((stop - start) * half)
+
+
+@wp.func
+def sample_level_row(
+    levels: wp.array[wp.vec4], offset: wp.int32, height: wp.int32, width: wp.int32, row: wp.int32, x: wp.float32
+) -> wp.vec3:
+    """Linear sample along one row of a level, across the seam and the poles; see ``latlong.beside_in_row``."""
+    first, second, t = beside_in_row(row, x, height, width)
+    a = levels[offset + first[0] * width + first[1]]
+    b = levels[offset + second[0] * width + second[1]]
+    return wp.vec3(a[0] + t * (b[0] - a[0]), a[1] + t * (b[1] - a[1]), a[2] + t * (b[2] - a[2]))
+
+
+@wp.kernel(enable_backward=False)
+def seed_fill_kernel(
+    # In:
+    row_start: wp.int32,
+    radiance: wp.array2d[wp.vec3],
+    confidence: wp.array2d[wp.float32],
+    seen: wp.array2d[wp.vec4],
+    # Out:
+    levels_out: wp.array[wp.vec4],  # radiance and trust
+):
+    """Level 0: radiance, and how far it is to be kept."""
+    band_row, j = wp.tid()
+    i = row_start + band_row
+    value = radiance[i, j]
+    trust = smooth_ramp(0.0, FULL_TRUST, usable_confidence(value, confidence[i, j]))
+    if trust == 0.0:
+        value = wp.vec3(0.0, 0.0, 0.0)
+    level = wp.vec4(wp.max(value[0], 0.0), wp.max(value[1], 0.0), wp.max(value[2], 0.0), trust)
+    if seen.shape[0] > 0:
+        level = with_seen(level, seen[i, j])
+    levels_out[i * radiance.shape[1] + j] = level
+
+
+@wp.func
+def pulled(
+    levels: wp.array[wp.vec4],
+    i: wp.int32,
+    j: wp.int32,
+    fine_offset: wp.int32,
+    fine_height: wp.int32,
+    fine_width: wp.int32,
+    height: wp.int32,
+    width: wp.int32,
+    most: wp.float32,
+) -> wp.vec4:
+    """Texel of the next coarser level: means over exactly what it covers, of values up to ``most``."""
+    top = wp.float32(i * fine_height) / wp.float32(height)
+    bottom = wp.float32((i + 1) * fine_height) / wp.float32(height)
+    left = wp.float32(j * fine_width) / wp.float32(width)
+    right = wp.float32((j + 1) * fine_width) / wp.float32(width)
+    mean = wp.vec3(0.0, 0.0, 0.0)
+    total = wp.float32(0.0)
+    area = wp.float32(0.0)
+    for r in range(wp.int32(top), wp.min(wp.int32(wp.ceil(bottom)), fine_height)):
+        band = band_solid_angle(wp.max(top, wp.float32(r)), wp.min(bottom, wp.float32(r + 1)), fine_height)
+        for c in range(wp.int32(left), wp.min(wp.int32(wp.ceil(right)), fine_width)):
+            part = band * (wp.min(right, wp.float32(c + 1)) - wp.max(left, wp.float32(c)))
+            texel = levels[fine_offset + r * fine_width + c]
+            area += part
+            weight = part * texel[3]
+            if weight > 0.0:
+                total += weight
+                value = wp.vec3(wp.min(texel[0], most), wp.min(texel[1], most), wp.min(texel[2], most))
+                mean += (weight / total) * (value - mean)
+    return wp.vec4(mean[0], mean[1], mean[2], wp.min(1.0, SUPPORT * total / area))
+
+
+@wp.kernel(enable_backward=False)
+def pull_level_kernel(
+    # In:
+    row_start: wp.int32,
+    fine_offset: wp.int32,
+    fine_height: wp.int32,
+    fine_width: wp.int32,
+    offset: wp.int32,
+    height: wp.int32,
+    width: wp.int32,
+    most: wp.float32,
+    # Out:
+    levels_out: wp.array[wp.vec4],
+):
+    """Next coarser level."""
+    band_row, j = wp.tid()
+    i = row_start + band_row
+    levels_out[offset + i * width + j] = pulled(
+        levels_out, i, j, fine_offset, fine_height, fine_width, height, width, most
+    )
+
+
+@wp.func
+def completed(
+    levels: wp.array[wp.vec4],
+    i: wp.int32,
+    j: wp.int32,
+    offset: wp.int32,
+    height: wp.int32,
+    width: wp.int32,
+    coarse_offset: wp.int32,
+    coarse_height: wp.int32,
+    coarse_width: wp.int32,
+) -> wp.vec3:
+    """A texel, completed from the coarser level as far as it lacks trust."""
+    texel = levels[offset + i * width + j]
+    value = wp.vec3(texel[0], texel[1], texel[2])
+    if texel[3] < 1.0 and coarse_height > 0:
+        y = (wp.float32(i) + 0.5) * wp.float32(coarse_height) / wp.float32(height) - 0.5
+        x = (wp.float32(j) + 0.5) * wp.float32(coarse_width) / wp.float32(width) - 0.5
+        row = wp.floor(y)
+        above = sample_level_row(levels, coarse_offset, coarse_height, coarse_width, wp.int32(row), x)
+        below = sample_level_row(levels, coarse_offset, coarse_height, coarse_width, wp.int32(row) + 1, x)
+        value += (1.0 - texel[3]) * (above + (y - row) * (below - above) - value)
+    return value
+
+
+@wp.kernel(enable_backward=False)
+def push_level_kernel(
+    # In:
+    row_start: wp.int32,
+    offset: wp.int32,
+    height: wp.int32,
+    width: wp.int32,
+    coarse_offset: wp.int32,
+    coarse_height: wp.int32,
+    coarse_width: wp.int32,
+    # Out:
+    levels_out: wp.array[wp.vec4],
+):
+    """Complete a level from its coarser one, in place."""
+    band_row, j = wp.tid()
+    i = row_start + band_row
+    value = completed(levels_out, i, j, offset, height, width, coarse_offset, coarse_height, coarse_width)
+    # Trust stays: nothing reads it again but this texel.
+    levels_out[offset + i * width + j] = wp.vec4(value[0], value[1], value[2], 1.0)
+
+
+# A module of its own: its block is not that of other launches, and a module is compiled once per size of block.
+@wp.kernel(module="unique", enable_backward=False)
+def fill_coarse_kernel(
+    # In:
+    first_offset: wp.int32,
+    first_height: wp.int32,
+    first_width: wp.int32,
+    count: wp.int32,
+    most: wp.float32,
+    # Out:
+    levels_out: wp.array[wp.vec4],
+):
+    """One block builds the ``count`` levels below the first and completes them and the first, up again."""
+    _block, thread = wp.tid()
+    offset = first_offset
+    height = first_height
+    width = first_width
+    for _level in range(count):
+        coarse_height = (height + 1) / 2
+        coarse_width = (width + 1) / 2
+        coarse_offset = offset + height * width
+        for texel in range(thread, coarse_height * coarse_width, wp.block_dim()):
+            levels_out[coarse_offset + texel] = pulled(
+                levels_out,
+                texel // coarse_width,
+                texel % coarse_width,
+                offset,
+                height,
+                width,
+                coarse_height,
+                coarse_width,
+                most,
+            )
+        wait_for_block()
+        offset = coarse_offset
+        height = coarse_height
+        width = coarse_width
+    for level in range(count):
+        offset = first_offset
+        height = first_height
+        width = first_width
+        for _finer in range(count - 1 - level):
+            offset += height * width
+            height = (height + 1) / 2
+            width = (width + 1) / 2
+        coarse_height = (height + 1) / 2
+        coarse_width = (width + 1) / 2
+        coarse_offset = offset + height * width
+        for texel in range(thread, height * width, wp.block_dim()):
+            value = completed(
+                levels_out,
+                texel // width,
+                texel % width,
+                offset,
+                height,
+                width,
+                coarse_offset,
+                coarse_height,
+                coarse_width,
+            )
+            levels_out[offset + texel] = wp.vec4(value[0], value[1], value[2], 1.0)
+        wait_for_block()
+
+
+@wp.kernel(enable_backward=False)
+def finish_fill_kernel(
+    # In:
+    row_start: wp.int32,
+    levels: wp.array[wp.vec4],
+    coarse_offset: wp.int32,
+    coarse_height: wp.int32,
+    coarse_width: wp.int32,
+    # Out:
+    environment_out: wp.array2d[wp.vec3],
+):
+    """Complete level 0 into the map."""
+    band_row, j = wp.tid()
+    i = row_start + band_row
+    environment_out[i, j] = completed(
+        levels, i, j, 0, environment_out.shape[0], environment_out.shape[1], coarse_offset, coarse_height, coarse_width
+    )
+
+
+def fill_level_shapes(height: int, width: int) -> tuple[tuple[int, int], ...]:
+    """Rows and columns of the fill pyramid's levels, from the map itself to a single texel."""
+    shapes = [(height, width)]
+    while shapes[-1] != (1, 1):
+        rows, columns = shapes[-1]
+        shapes.append(((rows + 1) // 2, (columns + 1) // 2))
+    return tuple(shapes)
+
+
+def fill_level_offsets(height: int, width: int) -> tuple[int, ...]:
+    """Where each level starts in the packed array, and as last number the array's length."""
+    return (0, *itertools.accumulate(rows * columns for rows, columns in fill_level_shapes(height, width)))
+
+
+def seed_fill(
+    radiance: wp.array,
+    confidence: wp.array,
+    levels_out: wp.array,
+    *,
+    seen: wp.array | None = None,
+    rows: Rows | None = None,
+) -> None:
+    """Write level 0 of the fill pyramid.
+
+    Args:
+        radiance: Light that is known in part, ``wp.vec3`` (h, w).
+        confidence: ``wp.float32`` (h, w) in 0..1.
+        levels_out: ``wp.vec4`` (``fill_level_offsets(h, w)[-1]``): radiance and trust.
+        seen: Of ``fill_frame.see_frame``: what the frame shows, where the rest leaves trust open.
+        rows: Band of rows, None for all.
+    """
+    launch_rows(
+        seed_fill_kernel, radiance.shape, [radiance, confidence, seen], [levels_out], rows=rows, device=radiance.device
+    )
+
+
+def push_pull(levels_out: wp.array, height: int, width: int, *, most: float = math.inf) -> None:
+    """Build the coarser levels of a seeded fill pyramid and complete them, all but level 0.
+
+    Args:
+        levels_out: As ``seed_fill`` left it; changed in place.
+        height: Rows of level 0.
+        width: Columns of level 0.
+        most: Radiance that a texel counts for at most: no share of an emitter is spread over what is unseen beside it.
+    """
+    shapes, offsets = fill_level_shapes(height, width), fill_level_offsets(height, width)
+    device = levels_out.device
+    levels: list[tuple[Any, ...]] = [(offset, *shape) for offset, shape in zip(offsets, shapes, strict=False)]
+    # Small levels take one block less time than a launch each.
+    first = next((n for n, shape in enumerate(shapes) if n and shape[0] * shape[1] <= COARSE_TEXELS), len(levels) - 1)
+    for fine, coarse in itertools.pairwise(levels[: first + 1]):
+        launch_rows(pull_level_kernel, coarse[1:], [*fine, *coarse, most], [levels_out], rows=None, device=device)
+    launch_tiles(
+        fill_coarse_kernel,
+        [1],
+        [*levels[first], len(levels) - 1 - first, most],
+        [levels_out],
+        block_dim=COARSE_BLOCK,
+        device=device,
+    )
+    for coarse, fine in itertools.pairwise(reversed(levels[1 : first + 1])):
+        launch_rows(push_level_kernel, fine[1:], [*fine, *coarse], [levels_out], rows=None, device=device)
+
+
+def finish_fill(levels: wp.array, environment_out: wp.array, *, rows: Rows | None = None) -> None:
+    """Complete level 0 into the map that everything reads.
+
+    Args:
+        levels: As ``push_pull`` left it.
+        environment_out: ``wp.vec3`` (h, w): finite, not negative; zero if nothing at all is known.
+        rows: Band of rows, None for all.
+    """
+    height, width = environment_out.shape
+    shapes, offsets = fill_level_shapes(height, width), fill_level_offsets(height, width)
+    coarse = (offsets[1], *shapes[1]) if len(shapes) > 1 else (0, 0, 0)
+    launch_rows(
+        finish_fill_kernel,
+        environment_out.shape,
+        [levels, *coarse],
+        [environment_out],
+        rows=rows,
+        device=environment_out.device,
+    )

@@ -1,0 +1,389 @@
+"""Glossy reflections of a latlong environment: one map per lobe, from mirror to the widest, for a shader to blend.
+
+``kernels/environment/lobes.py`` says which lobes there are and where their maps lie; ``kernels/split_sum.py`` has the
+other factor
+of the split sum. Ways to fill the levels, cheapest first:
+
+Box mips (``mix_mips`` with ``box_weights``): level l is level l of a box pyramid, magnified bilinearly: the paper's
+filter. Its texel is 1.6 alpha wide.
+
+Mixed mips (``mix_mips`` with ``mip_weights``): level l is a sum of several levels of an isotropic pyramid, each read
+through quadratic B-splines, then scaled, per channel, to hold exactly the energy of the environment.
+
+Filtered importance sampling (``sample_lobes``) [KC08]: directions drawn from the lobe, each read from a level of an
+isotropic pyramid. Scaled to the energy as above.
+
+Brute force (``integrate_lobes``): every texel of the environment weighted by its solid angle and the lobe. The
+reference.
+
+References:
+    [AG02] Ashikhmin, Ghosh 2002, Simple Blurry Reflections with Environment Maps.
+    [Karis13] Karis 2013, Real Shading in Unreal Engine 4.
+    [KC08] Krivanek, Colbert 2008, Real-time Shading with Filtered Importance Sampling.
+"""
+
+from __future__ import annotations
+
+import math
+
+import warp as wp
+
+from warp_ar.kernels.environment.lobes import LARGE_LEVELS, Lobe, LobeSamples, last_lobe, locate_texel, mixed_texels
+from warp_ar.kernels.environment.pyramid import last_mip, sample_mips, sample_packed, sample_packed_smooth
+from warp_ar.kernels.latlong import texel_solid_angle
+from warp_ar.kernels.launch import Rows, launch_rows, launch_tiles, tile_kernel
+from warp_ar.kernels.safe_math import safe_radiance
+
+wp.set_module_options({"enable_backward": False})
+
+PI = wp.constant(wp.float32(math.pi))
+BLOCK = 64
+# An energy correction beyond this factor would be a fault, not a correction.
+MAX_CORRECTION = wp.constant(wp.float32(4.0))
+
+
+@wp.kernel(enable_backward=False)
+def mix_mips_kernel(
+    row_start: wp.int32,
+    # In:
+    pyramid: wp.array[wp.vec3],
+    weights: wp.array2d[wp.float32],
+    height: wp.int32,
+    smooth: wp.int32,
+    # Out:
+    levels_out: wp.array[wp.vec3],
+):
+    """One texel from the levels of a pyramid, where levels are equally large one of each; no trigonometry is needed.
+
+    What several levels read of a mip at the same place is read once.
+    """
+    index = wp.tid() + row_start
+    texels = height * 2 * height
+    at = wp.vec4i(0, index / (2 * height), index % (2 * height), 0)
+    if index >= texels:
+        at = locate_texel(index + (LARGE_LEVELS - 1) * texels, height)
+    level = at[0]
+    h = height >> wp.max(level - 2, 0)
+    w = 2 * height >> wp.max(level - 2, 0)
+    v = (wp.float32(at[1]) + 0.5) / wp.float32(h)
+    u = (wp.float32(at[2]) + 0.5) / wp.float32(w)
+    total = wp.vec3()
+    total_1 = wp.vec3()
+    total_2 = wp.vec3()
+    offset = wp.int32(0)
+    for m in range(weights.shape[1]):
+        mip_height = height >> m
+        mip_width = 2 * height >> m
+        weight = weights[level, m]
+        weight_1 = wp.float32(0.0)
+        weight_2 = wp.float32(0.0)
+        if level == 0:
+            weight_1 = weights[1, m]
+            if weights.shape[0] > 2:
+                weight_2 = weights[2, m]
+        if weight + weight_1 + weight_2 > 0.0:
+            row = v * wp.float32(mip_height)
+            column = u * wp.float32(mip_width)
+            value = wp.vec3()
+            if smooth != 0 and m > 0:
+                value = sample_packed_smooth(pyramid, offset, mip_height, mip_width, row, column)
+            else:
+                value = sample_packed(pyramid, offset, mip_height, mip_width, row, column)
+            total += value * weight
+            total_1 += value * weight_1
+            total_2 += value * weight_2
+        offset += mip_height * mip_width
+    if level > 0:
+        levels_out[index + (LARGE_LEVELS - 1) * texels] = total
+        return
+    levels_out[index] = total
+    levels_out[index + texels] = total_1
+    if weights.shape[0] > 2:
+        levels_out[index + 2 * texels] = total_2
+
+
+@wp.kernel(enable_backward=False)
+def sample_lobes_kernel(
+    row_start: wp.int32,
+    # In:
+    pyramid: wp.array[wp.vec3],
+    directions: wp.array2d[wp.vec4],
+    weights: wp.array2d[wp.float32],
+    height: wp.int32,
+    # Out:
+    levels_out: wp.array[wp.vec3],
+):
+    """One packed texel by filtered importance sampling."""
+    index = wp.tid() + row_start
+    at = locate_texel(index, height)
+    level = at[0]
+    if level == 0:
+        levels_out[index] = pyramid[index]
+        return
+    h = height >> wp.max(level - 2, 0)
+    w = 2 * height >> wp.max(level - 2, 0)
+    last = last_mip(height, 2 * height)
+    # By symmetry about z a texel's samples are those of longitude 0, turned by the texel's own: its column is added to
+    # theirs.
+    theta = PI * (wp.float32(at[1]) + 0.5) / wp.float32(h)
+    sin_theta = wp.sin(theta)
+    cos_theta = wp.cos(theta)
+    turn = (wp.float32(at[2]) + 0.5) / wp.float32(w)
+    total = wp.vec3()
+    for s in range(directions.shape[1]):
+        weight = weights[level, s]
+        if weight > 0.0:
+            local = directions[level, s]
+            x = local[0] * cos_theta + local[2] * sin_theta
+            z = local[2] * cos_theta - local[0] * sin_theta
+            v = wp.atan2(wp.sqrt(x * x + local[1] * local[1]), z) / PI
+            u = wp.atan2(local[1], x) / (2.0 * PI) + turn
+            u = u - wp.floor(u)
+            total += sample_mips(pyramid, v, u, local[3], last, height, 2 * height) * weight
+    levels_out[index] = total
+
+
+# The lobe of GGX is that of a surface seen from straight ahead, as [Karis13] has it, weighted by n.l: for light at the
+# angle w from the axis the half vector stands at w / 2, with sin^2 = (1 - cos w) / 2 and cos^2 = (1 + cos w) / 2, so
+#
+#     weight ~ cos w D(w / 2) ~ cos w alpha^4 / (sin^2 + alpha^2 cos^2)^2.
+#
+# That of Phong is cos^n w with n = 1 / alpha^2: near the axis D and cos^n both fall as 1 - w^2 / (2 alpha^2).
+@wp.kernel(enable_backward=False)
+def integrate_lobes_kernel(
+    row_start: wp.int32,
+    # In:
+    environment: wp.array2d[wp.vec3],
+    phong: wp.int32,
+    # Out:
+    levels_out: wp.array[wp.vec3],
+):
+    """One packed texel from every texel of the environment."""
+    index = wp.tid() + row_start
+    height = environment.shape[0]
+    width = environment.shape[1]
+    at = locate_texel(index, height)
+    if at[0] == 0:
+        levels_out[index] = safe_radiance(environment[at[1], at[2]])
+        return
+    h = height >> wp.max(at[0] - 2, 0)
+    w = 2 * height >> wp.max(at[0] - 2, 0)
+    alpha = 1.0 / wp.float32(1 << (last_lobe(height) - at[0]))
+    exponent = 1.0 / (alpha * alpha)
+    theta = PI * (wp.float32(at[1]) + 0.5) / wp.float32(h)
+    sin_theta = wp.sin(theta)
+    phi = 2.0 * PI * (wp.float32(at[2]) + 0.5) / wp.float32(w)
+    total = wp.vec3()
+    total_weight = wp.float32(0.0)
+    for i in range(height):
+        source_theta = PI * (wp.float32(i) + 0.5) / wp.float32(height)
+        # 1 - cos of the angle between = 2 (sin^2(dtheta / 2) + sin sin sin^2(dphi / 2)): no cancellation in narrow
+        # lobes.
+        across = wp.sin(0.5 * (source_theta - theta))
+        around = sin_theta * wp.sin(source_theta)
+        row_total = wp.vec3()
+        row_weight = wp.float32(0.0)
+        for j in range(width):
+            half_turn = wp.sin(0.5 * (2.0 * PI * (wp.float32(j) + 0.5) / wp.float32(width) - phi))
+            versine = 2.0 * (across * across + around * half_turn * half_turn)
+            cosine = 1.0 - versine
+            if cosine > 0.0:
+                weight = wp.float32(0.0)
+                if phong != 0:
+                    weight = wp.pow(cosine, exponent)
+                else:
+                    t = 0.5 * versine + 0.5 * alpha * alpha * (1.0 + cosine)
+                    weight = cosine * (alpha * alpha) * (alpha * alpha) / (t * t)
+                row_total += safe_radiance(environment[i, j]) * weight
+                row_weight += weight
+        solid_angle = texel_solid_angle(i, height, width)
+        total += row_total * solid_angle
+        total_weight += row_weight * solid_angle
+    levels_out[index] = total / wp.max(total_weight, 1.0e-30)
+
+
+@wp.func
+def locate_row(row: wp.int32, height: wp.int32) -> wp.vec4i:
+    """(level, row of the level, index of its first texel, 0) of the packed rows, counted through all levels."""
+    level = wp.int32(0)
+    first = wp.int32(0)
+    offset = wp.int32(0)
+    h = height
+    while row >= first + h:
+        offset += h * (2 * height >> wp.max(level - 2, 0))
+        first += h
+        level += 1
+        h = height >> wp.max(level - 2, 0)
+    return wp.vec4i(level, row - first, offset + (row - first) * (2 * height >> wp.max(level - 2, 0)), 0)
+
+
+@tile_kernel
+def sum_level_rows_kernel(
+    # In:
+    levels: wp.array[wp.vec3],
+    height: wp.int32,
+    # Out:
+    row_energy_out: wp.array[wp.vec3],
+):
+    """Energy of one row of one level, by one block."""
+    row, lane = wp.tid()
+    at = locate_row(row, height)
+    h = height >> wp.max(at[0] - 2, 0)
+    w = 2 * height >> wp.max(at[0] - 2, 0)
+    total = wp.vec3()
+    for j in range(lane, w, wp.block_dim()):
+        total += levels[at[2] + j]
+    sums = wp.tile_sum(wp.tile(total, preserve_type=True))
+    if lane == 0:
+        row_energy_out[row] = sums[0] * texel_solid_angle(at[1], h, w)
+
+
+@tile_kernel
+def sum_levels_kernel(
+    # In:
+    row_energy: wp.array[wp.vec3],
+    height: wp.int32,
+    # Out:
+    energy_out: wp.array[wp.vec3],
+):
+    """Energy of one level, by one block."""
+    level, lane = wp.tid()
+    first = wp.int32(0)
+    for l in range(level):
+        first += height >> wp.max(l - 2, 0)
+    total = wp.vec3()
+    for i in range(lane, height >> wp.max(level - 2, 0), wp.block_dim()):
+        total += row_energy[first + i]
+    sums = wp.tile_sum(wp.tile(total, preserve_type=True))
+    if lane == 0:
+        energy_out[level] = sums[0]
+
+
+@wp.kernel(enable_backward=False)
+def scale_levels_kernel(
+    row_start: wp.int32,
+    # In:
+    energy: wp.array[wp.vec3],
+    height: wp.int32,
+    # Out (and in: levels as filtered):
+    levels_out: wp.array[wp.vec3],
+):
+    """Scale every level to the energy of level 0."""
+    index = wp.tid() + row_start
+    level = locate_texel(index, height)[0]
+    if level > 0:
+        value = levels_out[index]
+        for c in range(3):
+            if energy[level][c] > 0.0:
+                value[c] = value[c] * wp.clamp(energy[0][c] / energy[level][c], 1.0 / MAX_CORRECTION, MAX_CORRECTION)
+        levels_out[index] = value
+
+
+def mix_mips(
+    pyramid: wp.array[wp.vec3],
+    weights: wp.array2d[wp.float32],
+    height: int,
+    levels_out: wp.array[wp.vec3],
+    *,
+    smooth: bool = False,
+    rows: Rows | None = None,
+) -> None:
+    """Fill all levels with weighted sums of a pyramid's levels.
+
+    Args:
+        pyramid: Pyramid of the (height, 2 height) environment, see ``pyramid.build_pyramid``.
+        weights: (levels, mips): ``box_weights`` for ``box_mip``, ``mip_weights`` for ``energy_mip``.
+        height: Rows of the environment.
+        levels_out: (lobe_texels(height),).
+        smooth: Read mips through quadratic B-splines, as the fitted weights expect; else bilinearly, as the paper does.
+        rows: Band of ``mixed_texels``; None means all.
+    """
+    launch_rows(
+        mix_mips_kernel,
+        (mixed_texels(height),),
+        [pyramid, weights, height, int(smooth)],
+        [levels_out],
+        rows=rows,
+        device=pyramid.device,
+    )
+
+
+def sample_lobes(
+    pyramid: wp.array[wp.vec3],
+    samples: LobeSamples,
+    height: int,
+    levels_out: wp.array[wp.vec3],
+    *,
+    rows: Rows | None = None,
+) -> None:
+    """Fill all levels by filtered importance sampling.
+
+    Args:
+        pyramid: Isotropic pyramid of the (height, 2 height) environment.
+        samples: For the same height.
+        height: Rows of the environment.
+        levels_out: (lobe_texels(height),).
+        rows: Band of packed texels; None means all.
+    """
+    inputs = [pyramid, samples.directions, samples.weights, height]
+    launch_rows(sample_lobes_kernel, levels_out.shape, inputs, [levels_out], rows=rows, device=pyramid.device)
+
+
+def integrate_lobes(
+    environment: wp.array2d[wp.vec3], lobe: Lobe, levels_out: wp.array[wp.vec3], *, rows: Rows | None = None
+) -> None:
+    """Fill all levels by summing over the whole environment: the reference.
+
+    Args:
+        environment: (H, 2 H) radiance.
+        lobe: ``ggx`` or ``phong``.
+        levels_out: (lobe_texels(H),).
+        rows: Band of packed texels; None means all.
+    """
+    inputs = [environment, int(lobe == "phong")]
+    launch_rows(integrate_lobes_kernel, levels_out.shape, inputs, [levels_out], rows=rows, device=environment.device)
+
+
+def measure_energy(
+    levels: wp.array[wp.vec3], height: int, row_energy_out: wp.array[wp.vec3], energy_out: wp.array[wp.vec3]
+) -> None:
+    """Energy of every level: the integral of radiance over the sphere, summed in a fixed order.
+
+    Args:
+        levels: (lobe_texels(height),).
+        height: Rows of the environment.
+        row_energy_out: (lobe_rows(height),) scratch.
+        energy_out: (lobe_count(height),).
+    """
+    launch_tiles(
+        sum_level_rows_kernel,
+        row_energy_out.shape,
+        [levels, height],
+        [row_energy_out],
+        block_dim=BLOCK,
+        device=levels.device,
+    )
+    launch_tiles(
+        sum_levels_kernel,
+        energy_out.shape,
+        [row_energy_out, height],
+        [energy_out],
+        block_dim=BLOCK,
+        device=levels.device,
+    )
+
+
+def scale_levels(
+    energy: wp.array[wp.vec3], height: int, levels_out: wp.array[wp.vec3], *, rows: Rows | None = None
+) -> None:
+    """Scale every level, in place, to the energy of level 0.
+
+    Args:
+        energy: As ``measure_energy`` writes.
+        height: Rows of the environment.
+        levels_out: (lobe_texels(height),).
+        rows: Band of packed texels; None means all.
+    """
+    launch_rows(
+        scale_levels_kernel, levels_out.shape, [energy, height], [levels_out], rows=rows, device=levels_out.device
+    )

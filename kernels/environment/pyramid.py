@@ -1,0 +1,445 @@
+"""Box pyramids of latlong maps: every level holds the mean radiance over its texels' solid angles.
+
+A pyramid is one packed ``wp.array[wp.vec3]``: level l has (max(H >> l, 1), max(W >> l, 1)) texels in row-major order
+and follows the levels before it; there are ``level_count(H, W)``, down to one row or column. Level 0 is the map itself,
+made safe: see ``safe_radiance``.
+
+A texel of level l is the mean of level l - 1 over the area that it covers. Sizes need not be even: the overlap of
+texels is counted in integers (texel i of h spans [i H, (i + 1) H] where texel r of H spans [r h, (r + 1) h]), its solid
+angle is a product
+
+    (phi1 - phi0) (cos theta0 - cos theta1),
+    cos theta0 - cos theta1 = 2 sin((theta0 + theta1) / 2) sin((theta1 - theta0) / 2).
+
+So every level keeps the energy.
+
+For even sizes that is the 2x2 box with its solid angles as weights: the paper's filter (section 3.2), which also is
+what a graphics library's mipmap generation does but for the weights.
+
+An *isotropic* pyramid counts columns over a wider span: near the poles a texel of a latlong map is much narrower than
+high, so that a box of texels blurs along meridians only. There a texel averages over W' / (w sin theta) columns instead
+of W' / w, at most over all of them: its footprint is as wide as high. Rows are blurred around the axis only, which
+moves no energy from row to row: energy is still kept.
+
+References:
+    [AG02] Ashikhmin, Ghosh 2002, Simple Blurry Reflections with Environment Maps.
+"""
+
+from __future__ import annotations
+
+import math
+
+import warp as wp
+
+from warp_ar.kernels.latlong import wrap_texel
+from warp_ar.kernels.launch import Rows, is_last_block, launch, launch_rows, launch_tiles, wait_for_block
+from warp_ar.kernels.safe_math import safe_radiance
+
+wp.set_module_options({"enable_backward": False})
+
+PI = wp.constant(wp.float32(math.pi))
+BLOCK = 512
+"""Threads of a block that takes a band of rows."""
+BAND_LEVELS = 3
+"""Levels that a block makes of its own band, of 2^3 rows."""
+
+
+def level_size(height: int, width: int, level: int) -> tuple[int, int]:
+    """Rows and columns of a level."""
+    return max(height >> level, 1), max(width >> level, 1)
+
+
+def level_count(height: int, width: int) -> int:
+    """Levels of a pyramid, the map itself among them: the last has one row or one column."""
+    return min(height, width).bit_length()
+
+
+def level_offset(height: int, width: int, level: int) -> int:
+    """Index of a level's first texel in the packed array."""
+    return sum(rows * columns for rows, columns in (level_size(height, width, below) for below in range(level)))
+
+
+def packed_texels(height: int, width: int) -> int:
+    """Texels of a whole pyramid."""
+    return level_offset(height, width, level_count(height, width))
+
+
+@wp.func
+def sample_packed(
+    levels: wp.array[wp.vec3], offset: wp.int32, height: wp.int32, width: wp.int32, row: wp.float32, column: wp.float32
+):
+    """Bilinear sample of one packed level at continuous coordinates, across the seam and the poles."""
+    y = row - 0.5
+    x = column - 0.5
+    i = wp.int32(wp.floor(y))
+    j = wp.int32(wp.floor(x))
+    fy = y - wp.float32(i)
+    fx = x - wp.float32(j)
+    # Texels' places first, then one copy of what is read and mixed; across the border one copy of the way round, too.
+    above_left = offset + i * width + j
+    above_right = above_left + 1
+    below_left = above_left + width
+    below_right = below_left + 1
+    if i < 0 or i + 1 >= height or j < 0 or j + 1 >= width:
+        corner = wp.int32(0)
+        while corner < 4:
+            texel = wrap_texel(i + corner / 2, j + corner % 2, height, width)
+            place = offset + texel[0] * width + texel[1]
+            if corner == 0:
+                above_left = place
+            elif corner == 1:
+                above_right = place
+            elif corner == 2:
+                below_left = place
+            else:
+                below_right = place
+            corner += 1
+    top = levels[above_left] * (1.0 - fx) + levels[above_right] * fx
+    bottom = levels[below_left] * (1.0 - fx) + levels[below_right] * fx
+    return top * (1.0 - fy) + bottom * fy
+
+
+@wp.func
+def sample_packed_smooth(
+    levels: wp.array[wp.vec3], offset: wp.int32, height: wp.int32, width: wp.int32, row: wp.float32, column: wp.float32
+):
+    """Sample of one packed level through quadratic B-splines: shows no blocks.
+
+    Nine texels, per axis (1/2 - t)^2 / 2, 3/4 - t^2, (1/2 + t)^2 / 2 at offset t from the nearest centre; the variance
+    that this adds is a quarter of a texel's width squared, per axis.
+    """
+    i = wp.int32(wp.floor(row))
+    j = wp.int32(wp.floor(column))
+    ty = row - wp.float32(i) - 0.5
+    tx = column - wp.float32(j) - 0.5
+    wy = wp.vec3(0.5 * (0.5 - ty) * (0.5 - ty), 0.75 - ty * ty, 0.5 * (0.5 + ty) * (0.5 + ty))
+    wx = wp.vec3(0.5 * (0.5 - tx) * (0.5 - tx), 0.75 - tx * tx, 0.5 * (0.5 + tx) * (0.5 + tx))
+    if i >= 1 and i + 1 < height and j >= 1 and j + 1 < width:
+        up = offset + (i - 1) * width + j
+        at = up + width
+        down = at + width
+        return (
+            (levels[up - 1] * wx[0] + levels[up] * wx[1] + levels[up + 1] * wx[2]) * wy[0]
+            + (levels[at - 1] * wx[0] + levels[at] * wx[1] + levels[at + 1] * wx[2]) * wy[1]
+            + (levels[down - 1] * wx[0] + levels[down] * wx[1] + levels[down + 1] * wx[2]) * wy[2]
+        )
+    total = wp.vec3()
+    for di in range(3):
+        texel = wrap_texel(i + di - 1, j - 1, height, width)
+        row_offset = offset + texel[0] * width
+        middle = texel[1] + 1
+        if middle == width:
+            middle = 0
+        right = middle + 1
+        if right == width:
+            right = 0
+        total += (
+            levels[row_offset + texel[1]] * wx[0]
+            + levels[row_offset + middle] * wx[1]
+            + levels[row_offset + right] * wx[2]
+        ) * wy[di]
+    return total
+
+
+@wp.func
+def last_mip(height: wp.int32, width: wp.int32) -> wp.int32:
+    """Number of the last level of a pyramid."""
+    size = wp.min(height, width)
+    last = wp.int32(0)
+    while (size >> (last + 1)) > 0:
+        last += 1
+    return last
+
+
+@wp.func
+def sample_mips(
+    levels: wp.array[wp.vec3],
+    v: wp.float32,
+    u: wp.float32,
+    level: wp.float32,
+    last: wp.int32,
+    height: wp.int32,
+    width: wp.int32,
+) -> wp.vec3:
+    """Trilinear sample of the pyramid of a (height, width) map.
+
+    Args:
+        levels: Packed levels.
+        v: Row over the map's height.
+        u: Column over the map's width.
+        level: With its fraction; clamped to those that exist.
+        last: From ``last_mip``: asked for once where many samples are taken.
+        height: Rows of level 0.
+        width: Columns of level 0.
+    """
+    clamped = wp.clamp(level, 0.0, wp.float32(last))
+    below = wp.min(wp.int32(clamped), wp.max(last - 1, 0))
+    fraction = clamped - wp.float32(below)
+    offset = wp.int32(0)
+    for l in range(below):
+        offset += (height >> l) * (width >> l)
+    h = height >> below
+    w = width >> below
+    fine = sample_packed(levels, offset, h, w, v * wp.float32(h), u * wp.float32(w))
+    if fraction == 0.0:
+        return fine
+    offset += h * w
+    h = height >> (below + 1)
+    w = width >> (below + 1)
+    coarse = sample_packed(levels, offset, h, w, v * wp.float32(h), u * wp.float32(w))
+    return fine * (1.0 - fraction) + coarse * fraction
+
+
+@wp.kernel(enable_backward=False)
+def copy_safe_kernel(
+    row_start: wp.int32,
+    # In:
+    environment: wp.array2d[wp.vec3],
+    # Out:
+    levels_out: wp.array[wp.vec3],
+):
+    """Level 0."""
+    i, j = wp.tid()
+    i += row_start
+    levels_out[i * environment.shape[1] + j] = safe_radiance(environment[i, j])
+
+
+@wp.func
+def row_share(low: wp.int32, high: wp.int32, whole: wp.int32) -> wp.float32:
+    """Half of cos theta0 - cos theta1 between two rows, in units of 1 / whole of the map's height.
+
+    As a product of sines, and from the nearer pole: exact near both.
+    """
+    unit = 0.5 * PI / wp.float32(whole)
+    middle = wp.min(low + high, 2 * whole - low - high)
+    return wp.sin(unit * wp.float32(middle)) * wp.sin(unit * wp.float32(high - low))
+
+
+@wp.func
+def sum_columns(
+    levels: wp.array[wp.vec3],
+    row_offset: wp.int32,
+    source_width: wp.int32,
+    width: wp.int32,
+    column_first: wp.int32,
+    column_last: wp.int32,
+) -> wp.vec3:
+    """Sum of a row's texels times how much of each lies between two columns, in units of 1 / width of a texel."""
+    first = column_first / width
+    if first * width > column_first:
+        first -= 1  # integer division rounds toward zero
+    last = (column_last - 1) / width
+    if last * width > column_last - 1:
+        last -= 1
+    c = first % source_width
+    if c < 0:
+        c += source_width
+    total = levels[row_offset + c] * wp.float32(wp.min(column_last, (first + 1) * width) - column_first)
+    if last > first:
+        inner = wp.vec3()
+        for _ in range(last - first - 1):
+            c += 1
+            if c == source_width:
+                c = 0
+            inner += levels[row_offset + c]
+        total += inner * wp.float32(width)
+        c += 1
+        if c == source_width:
+            c = 0
+        total += levels[row_offset + c] * wp.float32(column_last - last * width)
+    return total
+
+
+# Isotropic: to be as wide as high a texel wants a box of w = 1 / sin theta times its own width. A texel of the source
+# is half as wide and holds a box of w times that, which adds (w^2 - 1) / 4 to the variance, in units of a texel of the
+# target; so the box that is taken here has the width squared w^2 - (w^2 - 1) / 4 = 1 + 3/4 (w^2 - 1).
+@wp.func
+def reduce_texel(
+    levels: wp.array[wp.vec3],
+    source_offset: wp.int32,
+    source_height: wp.int32,
+    source_width: wp.int32,
+    height: wp.int32,
+    width: wp.int32,
+    i: wp.int32,
+    j: wp.int32,
+    isotropic: wp.int32,
+) -> wp.vec3:
+    """Texel (i, j) of a (height, width) level from the level before it."""
+    # Rows in units of 1 / (source_height * height) of the map's height, columns likewise.
+    row_first = i * source_height
+    row_last = row_first + source_height
+    column_first = j * source_width
+    column_last = column_first + source_width
+    if isotropic != 0:
+        sin_theta = wp.sin(PI * (wp.float32(i) + 0.5) / wp.float32(height))
+        # Variances of boxes add: the source's own, widened already, gives about a quarter of what is wanted.
+        wanted = wp.min(1.0 / sin_theta, wp.float32(width))
+        wider = wp.sqrt(1.0 + 0.75 * (wanted * wanted - 1.0))
+        # Every column must count equally often: boxes of whole texels do, and any symmetric box over pairs of columns.
+        half = wp.int32(0.5 * wp.float32(source_width) * (wider - 1.0))
+        column_first -= half
+        column_last += half
+        if source_width != 2 * width:
+            column_last = column_first + source_width * wp.int32(wider + 0.5)
+    total = wp.vec3()
+    total_weight = wp.float32(0.0)
+    r = row_first / height
+    while r * height < row_last:
+        low = wp.max(row_first, r * height)
+        high = wp.min(row_last, (r + 1) * height)
+        row_weight = row_share(low, high, source_height * height)
+        row_offset = source_offset + r * source_width
+        total += sum_columns(levels, row_offset, source_width, width, column_first, column_last) * row_weight
+        total_weight += row_weight
+        r += 1
+    return total / (total_weight * wp.float32(column_last - column_first))
+
+
+@wp.kernel(enable_backward=False, launch_bounds=BLOCK)
+def build_pyramid_kernel(
+    # In:
+    environment: wp.array2d[wp.vec3],
+    isotropic: wp.int32,
+    band_levels: wp.int32,
+    # In and out:
+    blocks_done: wp.array[wp.int32],
+    # Out:
+    levels_out: wp.array[wp.vec3],
+):
+    """All levels: one block takes a band of rows through the first, the block that ends last does the rest."""
+    block, lane = wp.tid()
+    rows = environment.shape[0]
+    columns = environment.shape[1]
+    band = 1 << band_levels
+    for t in range(lane, band * columns, wp.block_dim()):
+        i = block * band + t / columns
+        j = t % columns
+        levels_out[i * columns + j] = safe_radiance(environment[i, j])
+    wait_for_block()
+    bands = rows / band
+    source_offset = wp.int32(0)
+    source_height = rows
+    source_width = columns
+    first = block * band
+    count = band
+    level = wp.int32(1)
+    while (wp.min(rows, columns) >> level) > 0:
+        height = wp.max(rows >> level, 1)
+        width = wp.max(columns >> level, 1)
+        if level == band_levels + 1:
+            if not is_last_block(blocks_done, bands):
+                return
+            first = 0
+            count = source_height
+        first = first / 2
+        count = wp.max(count / 2, 1)
+        offset = source_offset + source_height * source_width
+        for t in range(lane, count * width, wp.block_dim()):
+            i = first + t / width
+            j = t % width
+            levels_out[offset + i * width + j] = reduce_texel(
+                levels_out, source_offset, source_height, source_width, height, width, i, j, isotropic
+            )
+        wait_for_block()
+        source_offset = offset
+        source_height = height
+        source_width = width
+        level += 1
+
+
+@wp.kernel(enable_backward=False)
+def reduce_latlong_kernel(
+    # In:
+    radiance: wp.array2d[wp.vec3],
+    scale: wp.float32,
+    # Out:
+    reduced_out: wp.array2d[wp.vec3],
+):
+    """One texel of a smaller map straight from the whole one."""
+    i, j = wp.tid()
+    source_height = radiance.shape[0]
+    source_width = radiance.shape[1]
+    height = reduced_out.shape[0]
+    width = reduced_out.shape[1]
+    row_first = i * source_height
+    row_last = row_first + source_height
+    column_first = j * source_width
+    column_last = column_first + source_width
+    total = wp.vec3()
+    total_weight = wp.float32(0.0)
+    r = row_first / height
+    while r * height < row_last:
+        low = wp.max(row_first, r * height)
+        high = wp.min(row_last, (r + 1) * height)
+        row_weight = row_share(low, high, source_height * height)
+        row_total = wp.vec3()
+        c = column_first / width
+        while c * width < column_last:
+            overlap = wp.min(column_last, (c + 1) * width) - wp.max(column_first, c * width)
+            row_total += safe_radiance(radiance[r, c]) * wp.float32(overlap)
+            c += 1
+        total += row_total * row_weight
+        total_weight += row_weight
+        r += 1
+    reduced_out[i, j] = total * (scale / (total_weight * wp.float32(source_width)))
+
+
+def copy_safe(environment: wp.array2d[wp.vec3], levels_out: wp.array[wp.vec3], *, rows: Rows | None = None) -> None:
+    """Write level 0 of a packed array: the environment with bad texels made safe.
+
+    Args:
+        environment: (H, W) radiance.
+        levels_out: At least H W texels.
+        rows: Band of rows; None means all.
+    """
+    launch_rows(copy_safe_kernel, environment.shape, [environment], [levels_out], rows=rows, device=environment.device)
+
+
+def build_pyramid(
+    environment: wp.array2d[wp.vec3],
+    blocks_done: wp.array[wp.int32],
+    levels_out: wp.array[wp.vec3],
+    *,
+    isotropic: bool = False,
+) -> None:
+    """Write a whole pyramid, in one launch: every level from the one before.
+
+    Args:
+        environment: (H, W) radiance, any size.
+        blocks_done: (1,) scratch, zero; it is left zero. Launches that may run side by side need one each.
+        levels_out: Packed pyramid, (packed_texels(H, W),).
+        isotropic: Widen footprints near the poles.
+    """
+    height, width = environment.shape
+    # A level's row lies within its band's rows of the level before as long as both divide evenly; the last level that
+    # bands make still is at least as many rows as there are bands.
+    band_levels = 0
+    while band_levels < BAND_LEVELS and height % (2 << band_levels) == 0:
+        band_levels += 1
+    band_levels = min(band_levels, level_count(height, width) - 1)
+    launch_tiles(
+        build_pyramid_kernel,
+        (height >> band_levels,),
+        [environment, int(isotropic), band_levels],
+        [blocks_done, levels_out],
+        block_dim=BLOCK,
+        device=environment.device,
+    )
+
+
+def reduce_latlong(radiance: wp.array2d[wp.vec3], reduced_out: wp.array2d[wp.vec3], *, scale: float = 1.0) -> None:
+    """Mean radiance over the texels of a smaller map of any size, times ``scale``.
+
+    Args:
+        radiance: (H, W).
+        reduced_out: (h, w), h <= H and w <= W.
+        scale: Factor on the result.
+    """
+    launch(
+        reduce_latlong_kernel,
+        dim=reduced_out.shape,
+        inputs=[radiance, scale],
+        outputs=[reduced_out],
+        device=radiance.device,
+    )

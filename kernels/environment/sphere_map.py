@@ -1,0 +1,319 @@
+"""The mirror ball's picture as a texture, filtered and looked up as [DH04] sections 3.1 and 3.2 do: a sphere map.
+
+The square of the frame around the ball's outline is copied into a texture; what surrounds the ball fills the texture's
+corners. Mip levels are box filters of it, corners included: "the background pixels are blended in, subtly changing the
+color at silhouette edges". A direction d of light, in eye coordinates (x right, y up, z toward the viewer), is looked
+up by OpenGL's sphere mapping, which takes viewer and light to be infinitely far and the ball to lie on the camera's
+axis:
+
+    m = 2 sqrt(d_x^2 + d_y^2 + (d_z + 1)^2),   (s, t) = (d_x, d_y) / m + 1/2:
+
+the point whose normal halves the angle between d and the viewer. Nothing is divided by the ball's reflectance, for "the
+acquired environment map can be used as is". ``unwrap``'s ``area`` and ``bilinear`` are exact where this is not.
+
+References:
+    [DH04] DiVerdi, Hoellerer, "Combining Dynamic Physical and Virtual Illumination in Augmented Reality", 2004.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from warp_ar.kernels.camera import project
+from warp_ar.kernels.color import is_clipped
+from warp_ar.kernels.environment.unwrap import mix
+from warp_ar.kernels.latlong import direction_from_latlong
+from warp_ar.kernels.launch import Rows, launch, launch_rows
+from warp_ar.kernels.pixels import clip_levels, is_at_clipping, pixel_radiance
+from warp_ar.kernels.structs import FrameParams, Probe
+
+wp.set_module_options({"enable_backward": False})
+
+SIZE = 64
+"""Side of the texture, a power of two: the ball of the bundled clips is about as large in the frame."""
+DIFFUSE_SIZE = 4
+"""Side of the level that stands for diffuse light: the last one that tells directions apart everywhere."""
+
+
+def glossy_level(lobe: int, lobes: int) -> int:
+    """Level that stands for a lobe of width 2^(lobe - (lobes - 1)): the mirror is level 0, the widest has 2x2 texels.
+
+    Lobes narrower than a texel of level 0 are the mirror's.
+    """
+    return 0 if lobe == 0 else max(SIZE.bit_length() - 2 - (lobes - 1 - lobe), 0)
+
+
+def level_count() -> int:
+    """Levels down to one texel."""
+    return SIZE.bit_length()
+
+
+def level_size(level: int) -> int:
+    """Side of a level; beyond the last one texel."""
+    return max(SIZE >> level, 1)
+
+
+def level_offset(level: int) -> int:
+    """Index of a level's first texel."""
+    return sum(level_size(below) ** 2 for below in range(level))
+
+
+def map_texels() -> int:
+    """Texels of all levels together."""
+    return level_offset(level_count())
+
+
+@wp.struct
+class Disc:
+    """The ball's outline in the frame."""
+
+    center: wp.vec2  # column and row
+    radius: wp.vec2  # pixels along columns' and rows' axes; 0 where the ball is not before the camera
+
+
+@wp.func
+def find_disc(camera: FrameParams, probe: Probe) -> Disc:
+    """Outline of a ball as if it lay on the camera's axis: a circle of the angle that the ball subtends."""
+    disc = Disc()
+    from_camera = probe.center - camera.camera_position
+    pixel = project(camera, from_camera)
+    beyond = wp.dot(from_camera, from_camera) - probe.radius * probe.radius
+    if pixel[2] > 0.0 and beyond > 0.0:
+        disc.center = wp.vec2(pixel[0], pixel[1])
+        disc.radius = camera.focal * (probe.radius / wp.sqrt(beyond))
+    return disc
+
+
+@wp.func
+def sphere_coordinates(world_from_camera: wp.mat33, direction: wp.vec3) -> wp.vec2:
+    """Place in the texture, -1..1 across the ball, columns and rows, that shows the light from a world direction."""
+    d = wp.transpose(world_from_camera) * direction
+    # The camera looks along +z here, so the viewer is at -z; rows grow downward, against the eye's y.
+    normal = wp.vec3(d[0], d[1], d[2] - 1.0)
+    length = wp.length(normal)
+    if length < 1.0e-6:
+        return wp.vec2(1.0, 0.0)  # straight from behind the ball: all of its outline
+    return wp.vec2(normal[0] / length, normal[1] / length)
+
+
+@wp.kernel(enable_backward=False)
+def copy_ball_kernel(
+    row_start: wp.int32,
+    # In:
+    params: wp.array[FrameParams],
+    probes: wp.array[Probe],
+    frame: wp.array2d[wp.vec3ub],
+    decode_table: wp.array[wp.vec3],
+    linear: wp.array2d[wp.vec3],
+    size: wp.int32,
+    # Out:
+    sphere_map_out: wp.array[wp.vec3],
+):
+    """Texel centres of level 0, bilinear in the frame, whose border goes on beyond it."""
+    band_row, column = wp.tid()
+    row = row_start + band_row
+    disc = find_disc(params[0], probes[0])
+    value = wp.vec3(0.0, 0.0, 0.0)
+    if disc.radius[0] > 0.0:
+        u = (2.0 * wp.float32(column) + 1.0) / wp.float32(size) - 1.0
+        v = (2.0 * wp.float32(row) + 1.0) / wp.float32(size) - 1.0
+        x = wp.clamp(disc.center[0] + u * disc.radius[0], 0.0, wp.float32(frame.shape[1] - 1))
+        y = wp.clamp(disc.center[1] + v * disc.radius[1], 0.0, wp.float32(frame.shape[0] - 1))
+        i = wp.int32(y)
+        j = wp.int32(x)
+        i1 = wp.min(i + 1, frame.shape[0] - 1)
+        j1 = wp.min(j + 1, frame.shape[1] - 1)
+        fx = x - wp.float32(j)
+        left = pixel_radiance(frame, decode_table, linear, i, j)
+        top = mix(left, pixel_radiance(frame, decode_table, linear, i, j1), fx)
+        left = pixel_radiance(frame, decode_table, linear, i1, j)
+        bottom = mix(left, pixel_radiance(frame, decode_table, linear, i1, j1), fx)
+        value = mix(top, bottom, y - wp.float32(i))
+    sphere_map_out[row * size + column] = value
+
+
+@wp.kernel(enable_backward=False)
+def halve_level_kernel(
+    # In:
+    above: wp.int32,
+    here: wp.int32,
+    size: wp.int32,
+    # Out:
+    sphere_map_out: wp.array[wp.vec3],
+):
+    """One texel of a level from the four of the level above it, which begins at ``above``."""
+    i, j = wp.tid()
+    first = above + 4 * i * size + 2 * j
+    below = first + 2 * size
+    left = mix(sphere_map_out[first], sphere_map_out[below], 0.5)
+    right = mix(sphere_map_out[first + 1], sphere_map_out[below + 1], 0.5)
+    sphere_map_out[here + i * size + j] = mix(left, right, 0.5)
+
+
+@wp.func
+def sample_level(sphere_map: wp.array[wp.vec3], offset: wp.int32, size: wp.int32, at: wp.vec2) -> wp.vec3:
+    """Bilinear sample of a level at a place in -1..1; the border's texels go on beyond it."""
+    last = wp.float32(size - 1)
+    x = wp.clamp(0.5 * (at[0] + 1.0) * wp.float32(size) - 0.5, 0.0, last)
+    y = wp.clamp(0.5 * (at[1] + 1.0) * wp.float32(size) - 0.5, 0.0, last)
+    i = wp.int32(y)
+    j = wp.int32(x)
+    i1 = wp.min(i + 1, size - 1)
+    j1 = wp.min(j + 1, size - 1)
+    fx = x - wp.float32(j)
+    top = mix(sphere_map[offset + i * size + j], sphere_map[offset + i * size + j1], fx)
+    bottom = mix(sphere_map[offset + i1 * size + j], sphere_map[offset + i1 * size + j1], fx)
+    return mix(top, bottom, y - wp.float32(i))
+
+
+@wp.kernel(enable_backward=False)
+def look_up_level_kernel(
+    row_start: wp.int32,
+    # In:
+    params: wp.array[FrameParams],
+    sphere_map: wp.array[wp.vec3],
+    offset: wp.int32,
+    size: wp.int32,
+    height: wp.int32,
+    width: wp.int32,
+    scale: wp.float32,
+    first: wp.int32,
+    # Out:
+    latlong_out: wp.array[wp.vec3],
+):
+    """One texel of a latlong map that begins at ``first``, from a level of the sphere map."""
+    band_row, column = wp.tid()
+    row = row_start + band_row
+    light = direction_from_latlong(wp.float32(row) + 0.5, wp.float32(column) + 0.5, height, width)
+    at = sphere_coordinates(params[0].world_from_camera, light)
+    latlong_out[first + row * width + column] = scale * sample_level(sphere_map, offset, size, at)
+
+
+@wp.kernel(enable_backward=False)
+def trust_ball_kernel(
+    row_start: wp.int32,
+    # In:
+    params: wp.array[FrameParams],
+    probes: wp.array[Probe],
+    frame: wp.array2d[wp.vec3ub],
+    linear: wp.array2d[wp.vec3],
+    linear_clip: wp.array[wp.vec3],
+    # Out:
+    confidence_out: wp.array2d[wp.float32],
+    clipped_out: wp.array2d[wp.vec3],
+):
+    """Full confidence wherever there is a ball before the camera, and whether the nearest pixel clips."""
+    band_row, column = wp.tid()
+    row = row_start + band_row
+    disc = find_disc(params[0], probes[0])
+    confidence = wp.float32(0.0)
+    clipped = wp.vec3(0.0, 0.0, 0.0)
+    if disc.radius[0] > 0.0:
+        confidence = wp.float32(1.0)
+        height = confidence_out.shape[0]
+        width = confidence_out.shape[1]
+        light = direction_from_latlong(wp.float32(row) + 0.5, wp.float32(column) + 0.5, height, width)
+        at = sphere_coordinates(params[0].world_from_camera, light)
+        x = wp.clamp(disc.center[0] + at[0] * disc.radius[0], 0.0, wp.float32(frame.shape[1] - 1))
+        y = wp.clamp(disc.center[1] + at[1] * disc.radius[1], 0.0, wp.float32(frame.shape[0] - 1))
+        i = wp.int32(wp.round(y))
+        j = wp.int32(wp.round(x))
+        if linear.shape[0] > 0:
+            clipped = is_at_clipping(linear[i, j], clip_levels(linear_clip))
+        else:
+            clipped = is_clipped(frame[i, j])
+    confidence_out[row, column] = confidence
+    clipped_out[row, column] = clipped
+
+
+def copy_ball(
+    params: wp.array,
+    probes: wp.array,
+    frame: wp.array,
+    decode_table: wp.array,
+    sphere_map_out: wp.array,
+    *,
+    linear: wp.array | None = None,
+    rows: Rows | None = None,
+) -> None:
+    """Copy the first ball's square of the frame into level 0 of a sphere map.
+
+    Args:
+        params: (1,) FrameParams: the camera.
+        probes: (P,) Probe; only the first is looked at.
+        frame: (H, W) vec3ub, RGB codes.
+        decode_table: (256,) vec3, linear value of each code.
+        sphere_map_out: (map_texels(),) vec3; ``SIZE`` squared texels are written. Zero where the ball is not before
+            the camera.
+        linear: (H, W) vec3, radiance of a frame of more than 8 bits, read in the place of its codes.
+        rows: Band of texel rows; None means all.
+    """
+    inputs = [params, probes, frame, decode_table, linear, SIZE]
+    launch_rows(copy_ball_kernel, (SIZE, SIZE), inputs, [sphere_map_out], rows=rows, device=frame.device)
+
+
+def halve_levels(sphere_map: wp.array) -> None:
+    """Fill all levels but the first, in place: each texel is the mean of four of the level above.
+
+    Args:
+        sphere_map: (map_texels(),) vec3, level 0 as ``copy_ball`` writes.
+    """
+    for level in range(1, level_count()):
+        size = level_size(level)
+        inputs = [level_offset(level - 1), level_offset(level), size]
+        launch(halve_level_kernel, (size, size), inputs, [sphere_map], device=sphere_map.device)
+
+
+def look_up_level(
+    params: wp.array,
+    sphere_map: wp.array,
+    level: int,
+    shape: tuple[int, int],
+    latlong_out: wp.array,
+    *,
+    first: int = 0,
+    scale: float = 1.0,
+    rows: Rows | None = None,
+) -> None:
+    """Write a latlong map of the light from every direction, from one level.
+
+    Args:
+        params: (1,) FrameParams: the camera's rotation.
+        sphere_map: (map_texels(),) vec3, all levels.
+        level: Which; beyond the last one it is the last.
+        shape: Rows and columns of the latlong map.
+        latlong_out: vec3, flat; ``first + rows * columns`` texels at least.
+        first: Index of the map's first texel.
+        scale: Factor on every texel.
+        rows: Band of rows of the map; None means all.
+    """
+    level = min(level, level_count() - 1)
+    inputs = [params, sphere_map, level_offset(level), level_size(level), *shape, scale, first]
+    launch_rows(look_up_level_kernel, shape, inputs, [latlong_out], rows=rows, device=sphere_map.device)
+
+
+def trust_ball(
+    params: wp.array,
+    probes: wp.array,
+    frame: wp.array,
+    confidence_out: wp.array,
+    clipped_out: wp.array,
+    *,
+    linear: wp.array | None = None,
+    linear_clip: wp.array | None = None,
+    rows: Rows | None = None,
+) -> None:
+    """Write how far a sphere map is trusted, and where its ball clips.
+
+    Args:
+        params: (1,) FrameParams: the camera.
+        probes: (P,) Probe; only the first is looked at.
+        frame: (H, W) vec3ub, RGB codes.
+        confidence_out: (h, 2 h) float32: 1, or 0 where the ball is not before the camera.
+        clipped_out: (h, 2 h) vec3: 1 in the channels that clip in the nearest pixel.
+        linear: (H, W) vec3, radiance of a frame of more than 8 bits, read in the place of its codes.
+        linear_clip: (2,) vec3, where that clips: alone, and beside another channel that does; needed with ``linear``.
+        rows: Band of rows; None means all.
+    """
+    inputs, outputs = [params, probes, frame, linear, linear_clip], [confidence_out, clipped_out]
+    launch_rows(trust_ball_kernel, confidence_out.shape, inputs, outputs, rows=rows, device=frame.device)

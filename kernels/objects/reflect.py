@@ -1,0 +1,308 @@
+"""What a ray that leaves a surface sees: the receiver in the picture, virtual objects, the environment.
+
+The receiver is known twice: as part of the environment, seen from the mirror ball, and as the camera's picture, which
+the proxies place in space. Near an object the two differ by parallax, so a ray that meets a proxy looks the point up in
+the picture. A point outside the picture, on a face turned away, or hidden from the camera by a proxy or a ball, is
+looked up in the environment instead. Proxies are taken as matt: they look the same from the camera and from the point.
+Emitters of the environment that are known by their places are seen, and light objects, from there (see ``emitters``).
+The light of several mirror balls is interpolated (see ``probe_weights``).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Literal
+
+import warp as wp
+
+from warp_ar.kernels.camera import project
+from warp_ar.kernels.emitters import correct_parallax
+from warp_ar.kernels.environment.interpolated_irradiance import OtherBalls, make_irradiance_at
+from warp_ar.kernels.environment.lobes import level_from_roughness, level_from_shininess, sample_levels
+from warp_ar.kernels.environment.probe_weights import probe_weight
+from warp_ar.kernels.latlong import sample_latlong
+from warp_ar.kernels.materials import lobe_axis, make_surface, reflect, specular_occlusion
+from warp_ar.kernels.pixels import shown_radiance
+from warp_ar.kernels.rays.trace import TraceConfig, make_trace, meets_probe
+from warp_ar.kernels.structs import (
+    LAMBERT,
+    METALLIC_ROUGHNESS,
+    MIRROR,
+    PHONG,
+    Emitter,
+    FrameParams,
+    Hit,
+    Picture,
+    Probe,
+    RayScene,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+HIDDEN_MARGIN = wp.constant(wp.float32(1.0e-3))
+"""Share of the camera's distance within which a proxy is the point itself and does not hide it."""
+RAY_SPREAD = wp.constant(wp.float32(0.1))
+"""Angle in radians that one of a few dozen rays stands for, in the pictures on what it meets."""
+
+DiffuseForm = Literal["none", "sh", "map"]
+
+
+@dataclasses.dataclass(frozen=True)
+class DistantLightConfig:
+    """Forms of the environment that exist, and what the objects make of it."""
+
+    trace: TraceConfig
+    """Kinds of shape."""
+    models: tuple[int, ...]
+    """Sorted material models of the objects."""
+    textures: bool
+    """Whether any material has a texture or emits, or any object's triangles have materials of their own."""
+    diffuse: DiffuseForm
+    """Where the environment's irradiance comes from: nine coefficients, a latlong map, or nowhere."""
+    specular: bool
+    """Whether the prefiltered environment is read."""
+    probes: bool
+    """Whether there are mirror balls, which hide the receiver."""
+    emitters: bool = False
+    """Whether emitters of the environment are known by their places."""
+    captured: bool = False
+    """Whether the environment is known without mirror balls, from a file."""
+    several: bool = False
+    """Whether the light is interpolated between that of several mirror balls."""
+    gathered: bool = True
+    """Whether rays that happen to meet what emits bring its light; else ``area_lights`` are looked for themselves."""
+
+    def general(self, form: DiffuseForm, *, by_call: bool = False) -> DistantLightConfig:
+        """For any scene with as many mirror balls, textures or not: forms that it does not call for may be empty.
+
+        Args:
+            form: Where irradiance comes from in scenes that call for it.
+            by_call: As in ``TraceConfig.general``.
+        """
+        models = tuple(sorted(map(int, (LAMBERT, PHONG, MIRROR, METALLIC_ROUGHNESS))))
+        known = self.probes or self.captured
+        diffuse: DiffuseForm = form if known else "none"
+        trace = self.trace.general(by_call=by_call)
+        return dataclasses.replace(self, trace=trace, models=models, diffuse=diffuse, specular=known)
+
+
+@wp.struct
+class DistantLight:
+    """The environment in all its forms; what a ``DistantLightConfig`` leaves out may be empty."""
+
+    environment: wp.array2d[wp.vec3]
+    irradiance_sh: wp.array[wp.vec3]  # nine coefficients
+    irradiance_map: wp.array2d[wp.vec3]  # latlong
+    levels: wp.array[wp.vec3]  # prefiltered, as ``sample_levels`` reads them
+    level_height: wp.int32  # rows of level 0
+    dfg: wp.array2d[wp.vec2]  # of ``integrate_dfg``, for METALLIC_ROUGHNESS
+    probes: wp.array[Probe]
+    emitters: wp.array[Emitter]
+    others: OtherBalls
+
+
+@wp.func
+def look_up(picture: Picture, x: wp.float32, y: wp.float32) -> wp.vec3:
+    """Bilinear sample of a frame's linear radiance; x and y are inside the outermost pixel centres."""
+    j = wp.min(wp.int32(x), picture.frame.shape[1] - 2)
+    i = wp.min(wp.int32(y), picture.frame.shape[0] - 2)
+    fx = x - wp.float32(j)
+    fy = y - wp.float32(i)
+    top = (1.0 - fx) * shown_radiance(picture, i, j) + fx * shown_radiance(picture, i, j + 1)
+    bottom = (1.0 - fx) * shown_radiance(picture, i + 1, j) + fx * shown_radiance(picture, i + 1, j + 1)
+    return (1.0 - fy) * top + fy * bottom
+
+
+@wp.func
+def look_up_layer(layer: wp.array2d[wp.vec3], x: wp.float32, y: wp.float32) -> wp.vec3:
+    """Bilinear sample of a layer over the frame, places as in ``look_up``."""
+    j = wp.min(wp.int32(x), layer.shape[1] - 2)
+    i = wp.min(wp.int32(y), layer.shape[0] - 2)
+    fx = x - wp.float32(j)
+    fy = y - wp.float32(i)
+    top = (1.0 - fx) * layer[i, j] + fx * layer[i, j + 1]
+    bottom = (1.0 - fx) * layer[i + 1, j] + fx * layer[i + 1, j + 1]
+    return (1.0 - fy) * top + fy * bottom
+
+
+@wp.func
+def knows_irradiance(distant: DistantLight) -> wp.bool:
+    """Whether this scene calls for the environment's irradiance: a kernel of several scenes has it compiled in."""
+    return distant.irradiance_map.shape[0] > 0 or distant.irradiance_sh.shape[0] > 0
+
+
+@wp.func
+def knows_levels(distant: DistantLight) -> wp.bool:
+    """Whether this scene calls for the prefiltered environment."""
+    return distant.levels.shape[0] > 0
+
+
+@functools.cache
+def make_find_in_frame(trace: TraceConfig, probes: bool) -> wp.Function:
+    """``find_in_frame(params, picture, scene, probes, hit) -> vec2``: (x, y) of a point of a proxy, or x = -1."""
+    occluded_by_proxies = make_trace(trace).occluded_by_proxies
+
+    @wp.func(module="unique")
+    def find_in_frame(
+        params: FrameParams, picture: Picture, scene: RayScene, balls: wp.array[Probe], hit: Hit
+    ) -> wp.vec2:
+        nowhere = wp.vec2(-1.0, -1.0)
+        height = picture.frame.shape[0]
+        width = picture.frame.shape[1]
+        from_camera = hit.point - params.camera_position
+        if wp.dot(from_camera, hit.geometric_normal) >= 0.0:
+            return nowhere
+        at = project(params, from_camera)
+        if at[2] <= 0.0:
+            return nowhere
+        if at[0] < 0.0 or at[0] > wp.float32(width - 1) or at[1] < 0.0 or at[1] > wp.float32(height - 1):
+            return nowhere
+        if occluded_by_proxies(scene, params.camera_position, from_camera, 1.0 - HIDDEN_MARGIN):
+            return nowhere
+        if wp.static(probes):
+            if meets_probe(balls, params.camera_position, from_camera, 1.0 - HIDDEN_MARGIN):
+                return nowhere
+        return wp.vec2(at[0], at[1])
+
+    return find_in_frame
+
+
+@functools.cache
+def make_shade_unoccluded(config: DistantLightConfig) -> wp.Function:
+    """``shade_unoccluded(scene, distant, hit, direction, spread) -> vec3``: radiance under the environment alone.
+
+    ``spread`` is the angle that the ray stands for.
+    """
+    surface_at = make_surface(config.models, config.textures)
+    glossy = make_reflected_radiance(config)
+    distant_irradiance = make_distant_irradiance(config)
+
+    @wp.func(module="unique")
+    def shade_unoccluded(
+        scene: RayScene, distant: DistantLight, hit: Hit, direction: wp.vec3, spread: wp.float32
+    ) -> wp.vec3:
+        wo = -wp.normalize(direction)
+        normal = hit.normal
+        if wp.dot(hit.geometric_normal, wo) < 0.0:
+            normal = -normal
+        cos_o = wp.max(wp.dot(normal, wo), 0.0)
+        surface = surface_at(scene, distant.dfg, hit, cos_o, spread)
+        radiance = wp.cw_mul(surface.diffuse, distant_irradiance(distant, hit.point, normal)) / wp.pi
+        if wp.static(config.textures):
+            if wp.static(config.gathered):
+                radiance = surface.occlusion * radiance + surface.emission
+            else:
+                radiance = surface.occlusion * radiance
+        if wp.static(config.specular):
+            if knows_levels(distant):
+                wi = lobe_axis(surface, reflect(wo, normal), normal)
+                reflected = glossy(distant, surface.model, surface.roughness, surface.shininess, hit.point, wi, 0.0)
+                if wp.static(config.textures):
+                    reflected *= specular_occlusion(surface.occlusion, cos_o, surface.roughness)
+                radiance += wp.cw_mul(surface.reflectance, reflected)
+        return radiance
+
+    return shade_unoccluded
+
+
+@functools.cache
+def make_distant_irradiance(config: DistantLightConfig) -> wp.Function:
+    """``distant_irradiance(distant, point, normal) -> vec3``: under the environment; 0 if none is known."""
+    form: Literal["sh", "map"] = "sh" if config.diffuse == "sh" else "map"
+    irradiance_at = make_irradiance_at(form, config.emitters, config.several)
+
+    @wp.func(module="unique")
+    def distant_irradiance(distant: DistantLight, point: wp.vec3, normal: wp.vec3) -> wp.vec3:
+        irradiance = wp.vec3(0.0)
+        if wp.static(config.diffuse != "none"):
+            if knows_irradiance(distant):
+                irradiance = irradiance_at(
+                    distant.irradiance_sh,
+                    distant.irradiance_map,
+                    distant.emitters,
+                    distant.others,
+                    point,
+                    normal,
+                )
+        return irradiance
+
+    return distant_irradiance
+
+
+@functools.cache
+def make_radiance_along(config: DistantLightConfig) -> wp.Function:
+    """``radiance_along(distant, point, direction, level) -> vec3``: a level of the environment, as a point sees it."""
+
+    @wp.func(module="unique")
+    def radiance_along(distant: DistantLight, point: wp.vec3, direction: wp.vec3, level: wp.float32) -> wp.vec3:
+        toward = direction
+        if wp.static(config.emitters):
+            toward = correct_parallax(distant.emitters, point, direction)
+        radiance = sample_levels(distant.levels, toward, level, distant.level_height)
+        if wp.static(config.several):
+            balls = distant.others
+            total = probe_weight(balls.places, 0, point)
+            for ball in range(1, balls.places.shape[0]):
+                weight = probe_weight(balls.places, ball, point)
+                if weight > 0.0:
+                    total += weight
+                    toward = direction
+                    if wp.static(config.emitters):
+                        toward = correct_parallax(balls.emitters[ball - 1], point, direction)
+                    other = sample_levels(balls.levels[ball - 1], toward, level, distant.level_height)
+                    radiance += (weight / total) * (other - radiance)
+        return radiance
+
+    return radiance_along
+
+
+@functools.cache
+def make_captured_along(config: DistantLightConfig) -> wp.Function:
+    """``captured_along(distant, point, direction) -> vec3``: the environment, unfiltered, as it was captured."""
+
+    @wp.func(module="unique")
+    def captured_along(distant: DistantLight, point: wp.vec3, direction: wp.vec3) -> wp.vec3:
+        radiance = sample_latlong(distant.environment, direction)
+        if wp.static(config.several):
+            balls = distant.others
+            total = probe_weight(balls.places, 0, point)
+            for ball in range(1, balls.places.shape[0]):
+                weight = probe_weight(balls.places, ball, point)
+                if weight > 0.0:
+                    total += weight
+                    radiance += (weight / total) * (sample_latlong(balls.environment[ball - 1], direction) - radiance)
+        return radiance
+
+    return captured_along
+
+
+@functools.cache
+def make_reflected_radiance(config: DistantLightConfig) -> wp.Function:
+    """``reflected_radiance(distant, model, roughness, shininess, point, direction, floor) -> vec3``: as a lobe sees it.
+
+    The lobe is that of a surface at ``point``, around ``direction`` (unit). ``floor`` is the least level to read: 0 for
+    what is looked at, more for what is only one ray of many.
+    """
+    radiance_along = make_radiance_along(config)
+
+    @wp.func(module="unique")
+    def reflected_radiance(
+        distant: DistantLight,
+        model: wp.int32,
+        roughness: wp.float32,
+        shininess: wp.float32,
+        point: wp.vec3,
+        direction: wp.vec3,
+        floor: wp.float32,
+    ) -> wp.vec3:
+        level = level_from_roughness(roughness, distant.level_height)
+        if wp.static(PHONG in config.models):
+            if model == PHONG:
+                level = level_from_shininess(shininess, distant.level_height)
+        if wp.static(MIRROR in config.models):
+            if model == MIRROR:
+                level = 0.0
+        return radiance_along(distant, point, direction, wp.max(level, floor))
+
+    return reflected_radiance

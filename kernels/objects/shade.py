@@ -1,0 +1,539 @@
+"""Virtual objects as the camera would see them: lit by environment and virtual lights, with smooth edges.
+
+The result is premultiplied: RGB is radiance times coverage, alpha the share of the pixel that virtual objects cover.
+
+Edges. Inside a surface one sample per pixel is enough. Where a neighbour sees another object, a surface farther off the
+tangent plane than two pixels' footprint, or a normal turned by more than 30 degrees, the pixel is traced again with n^2
+samples and averaged (a box filter, as a camera's pixels have). The samples are n-rooks in both axes, for n = 2 the
+rotated grid: no two of them share a row or column, so near-vertical and near-horizontal edges pass through n^2 shades,
+not n. The near field of a sample is taken from the pixel around it whose normal is most like its own.
+
+Normals. Surfaces are seen from both sides: normals are turned toward the viewer. An interpolated normal can still point
+away at a silhouette; it is then tipped just as far as makes it perpendicular to the view, continuously, so that the
+mirror direction leaves the surface.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+
+import warp as wp
+
+from warp_ar.kernels.edges import EdgeList, EdgeLists, holds_all, list_edge, listed_edges, sample_listed_edges
+from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows, slow_to_compile
+from warp_ar.kernels.materials import Surface, lobe_axis, make_reflect_direct, make_surface, reflect, specular_occlusion
+from warp_ar.kernels.objects.near_field import NearLight
+from warp_ar.kernels.objects.reflect import (
+    DiffuseForm,
+    DistantLight,
+    DistantLightConfig,
+    knows_levels,
+    make_distant_irradiance,
+    make_reflected_radiance,
+)
+from warp_ar.kernels.pixel_order import own_pixel
+from warp_ar.kernels.rays.area_lights import (
+    POINT_SAMPLES,
+    lobe_solid_angle,
+    looks_by_lobe,
+    make_area_count,
+    make_area_reflection,
+    make_area_sample,
+    without_lobe,
+)
+from warp_ar.kernels.rays.shadow import (
+    ALL_LIGHTS,
+    LightSample,
+    make_sample_light,
+    make_shadow,
+    make_visible_share,
+    tile_turn,
+)
+from warp_ar.kernels.rays.visibility import (
+    VisibleObjects,
+    check_edge_samples,
+    inside_rect,
+    make_primary,
+    make_sample_direction,
+)
+from warp_ar.kernels.structs import FrameParams, Hit, Light, RayScene
+
+wp.set_module_options({"enable_backward": False})
+
+# Neighbours further off the tangent plane than this many pixel footprints belong to another surface.
+EDGE_FOOTPRINTS = wp.constant(wp.float32(2.0))
+# Cosine of the turn between neighbouring normals that counts as an edge.
+EDGE_COSINE = wp.constant(wp.float32(math.cos(math.radians(30.0))))
+# Smallest cosine between shading normal and viewer.
+MIN_FACING = wp.constant(wp.float32(1.0e-3))
+
+ALONE = wp.constant(-1)
+"""Number of the one sample of a pixel without an edge."""
+SAMPLED, LISTED, LEFT = "sampled", "listed", "left"
+"""What becomes of edges in a kernel of ``make_shade_kernel``."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ShadeConfig:
+    """What a scene calls for; everything else is not compiled in."""
+
+    distant: DistantLightConfig
+    """Kinds of shape, of material and of the environment."""
+    lights: tuple[int, ...]
+    """Sorted kinds of virtual light that exist."""
+    edge_samples: int
+    """Samples per pixel along edges: a square number; 1 leaves edges hard."""
+    soft: bool = False
+    """Whether lights with a radius cast soft shadows."""
+    near_field: bool = False
+    """Whether ``near_field`` says what surrounds the objects."""
+    area_samples: int = 0
+    """Samples of what emits, per point; ``area_lights.POINT_SAMPLES``: as lights at points; 0: nothing emits."""
+
+    def general(self, form: DiffuseForm, *, soft: bool, by_call: bool = False) -> ShadeConfig:
+        """For any scene with as many mirror balls; ``form`` and ``by_call`` as in ``DistantLightConfig.general``."""
+        distant = self.distant.general(form, by_call=by_call)
+        return dataclasses.replace(self, distant=distant, lights=ALL_LIGHTS, soft=soft)
+
+    def __post_init__(self) -> None:
+        check_edge_samples(self.edge_samples)
+
+
+@wp.struct
+class ObjectLight:
+    """All that lights virtual objects; what a ``ShadeConfig`` leaves out may be empty."""
+
+    lights: wp.array[Light]
+    distant: DistantLight  # neither its map nor its probes are read
+    near: NearLight  # of ``filter_near_field``
+
+
+def make_object_light(
+    distant: DistantLight, lights: wp.array | None = None, near: NearLight | None = None
+) -> ObjectLight:
+    """The environment, virtual lights and what is near together.
+
+    Args:
+        distant: Of the environment, see ``reflect.DistantLight``.
+        lights: (n,) Light; None without virtual lights.
+        near: (H, W) each, as ``near_field.filter_near_field`` writes; None where objects show the environment alone.
+    """
+    light = ObjectLight()
+    light.distant = distant
+    if lights is not None:
+        light.lights = lights
+    if near is not None:
+        light.near = near
+    return light
+
+
+@wp.struct
+class NearPoint:
+    """What ``near_field`` knows of a point of an object."""
+
+    known: wp.bool  # False: the distant environment is all that the point receives
+    irradiance: wp.vec3
+    reflected: wp.vec4  # radiance that adds to the prefiltered environment, and the share of that which it replaces
+
+
+@wp.func
+def face_viewer(normal: wp.vec3, geometric_normal: wp.vec3, wo: wp.vec3):
+    """Both normals of a surface on the viewer's side, the one for shading at least a little."""
+    shading = normal
+    geometric = geometric_normal
+    if wp.dot(geometric, wo) < 0.0:
+        shading = -shading
+        geometric = -geometric
+    facing = wp.dot(shading, wo)
+    if facing < MIN_FACING:
+        shading = wp.normalize(shading + (MIN_FACING - facing) * wo)
+    return shading, geometric
+
+
+@functools.cache
+def make_lit_by_areas(config: ShadeConfig) -> wp.Function:
+    """``lit_by_areas(scene, hit, surface, normal, geometric, wo, turn) -> vec3``: radiance by what emits."""
+    trace, samples = config.distant.trace, config.area_samples
+    reflect_direct = make_reflect_direct(config.distant.models)
+    is_lit = make_shadow(trace)
+    area_count, area_sample = make_area_count(samples), make_area_sample(samples)
+    by_rays = samples != POINT_SAMPLES and config.distant.specular
+    area_reflection = make_area_reflection(trace, samples) if by_rays else None
+
+    @wp.func(module="unique")
+    def lit_by_areas(
+        scene: RayScene,
+        hit: Hit,
+        surface: Surface,
+        normal: wp.vec3,
+        geometric: wp.vec3,
+        wo: wp.vec3,
+        turn: wp.float32,
+    ) -> wp.vec3:
+        total = wp.vec3(0.0)
+        count = area_count(scene)
+        lobe = lobe_solid_angle(surface)
+        for k in range(count):
+            area = area_sample(scene, hit.point, normal, k, count, turn)
+            if wp.max(area.irradiance_normal) > 0.0 and wp.dot(geometric, area.wi) > 0.0:
+                lit = surface
+                if wp.static(by_rays):
+                    if looks_by_lobe(scene.objects[area.object], hit.point, lobe):
+                        lit = without_lobe(surface)
+                direct = reflect_direct(lit, normal, wo, area.wi)
+                if wp.max(direct) > 0.0:
+                    light = LightSample()
+                    light.wi = area.wi
+                    light.distance = area.distance
+                    if is_lit(scene, hit.point, geometric, hit.error, light):
+                        total += wp.cw_mul(direct, area.irradiance_normal)
+        if wp.static(by_rays):
+            if count > 0:
+                total += area_reflection(scene, hit, surface, normal, geometric, wo, turn)
+        return total
+
+    return lit_by_areas
+
+
+@functools.cache
+def make_sent_unlit(config: ShadeConfig) -> wp.Function:
+    """``sent_unlit(distant, hit, surface, normal, wo, near) -> vec3``: radiance without virtual lights.
+
+    Of what it sends itself and of the environment, as far as ``near`` does not know better.
+    """
+    forms = config.distant
+    glossy = make_reflected_radiance(forms)
+    distant_irradiance = make_distant_irradiance(forms)
+
+    @wp.func(module="unique")
+    def sent_unlit(
+        distant: DistantLight, hit: Hit, surface: Surface, normal: wp.vec3, wo: wp.vec3, near: NearPoint
+    ) -> wp.vec3:
+        radiance = wp.vec3(0.0)
+        if wp.static(forms.textures):
+            radiance = surface.emission
+        if wp.static(forms.diffuse != "none"):
+            irradiance = distant_irradiance(distant, hit.point, normal)
+            share = float(1.0)
+            if wp.static(forms.textures):
+                share = surface.occlusion
+            if wp.static(config.near_field):
+                if near.known:
+                    # A picture of occlusion shows what rays find as well: the darker of the two holds.
+                    if share < 1.0:
+                        more = wp.max(near.irradiance - irradiance, wp.vec3(0.0))
+                        irradiance = wp.min(share * irradiance, near.irradiance) + more
+                    else:
+                        irradiance = near.irradiance
+                    share = 1.0
+            irradiance *= share
+            radiance += wp.cw_mul(surface.diffuse, irradiance) / wp.pi
+        if wp.static(forms.specular):
+            glossiness = surface.reflectance[0] + surface.reflectance[1] + surface.reflectance[2]
+            if glossiness > 0.0 and knows_levels(distant):
+                wi = lobe_axis(surface, reflect(wo, normal), normal)
+                reflected = glossy(distant, surface.model, surface.roughness, surface.shininess, hit.point, wi, 0.0)
+                if wp.static(config.near_field):
+                    if near.known:
+                        added = wp.vec3(near.reflected[0], near.reflected[1], near.reflected[2])
+                        reflected = (1.0 - near.reflected[3]) * reflected + added
+                if wp.static(forms.textures):
+                    hidden = 1.0 - specular_occlusion(surface.occlusion, wp.dot(normal, wo), surface.roughness)
+                    if wp.static(config.near_field):
+                        if near.known:
+                            hidden = 0.0  # rays know
+                    reflected *= 1.0 - hidden
+                radiance += wp.cw_mul(surface.reflectance, reflected)
+        return radiance
+
+    return sent_unlit
+
+
+@functools.cache
+def make_shade_hit(config: ShadeConfig) -> wp.Function:
+    """``shade_hit``: radiance that leaves a hit against the ray's ``direction`` (not unit).
+
+    ``turn`` is for ``visible_share``, ``spread`` the width of the ray at t = 1 in metres.
+    """
+    forms = config.distant
+    surface_at = make_surface(forms.models, forms.textures)
+    sent_unlit = make_sent_unlit(config)
+    reflect_direct = make_reflect_direct(forms.models)
+    sample_light = make_sample_light(config.lights)
+    is_lit = make_shadow(forms.trace)
+    visible_share = make_visible_share(forms.trace) if config.soft else None
+    lit_by_areas = make_lit_by_areas(config) if config.area_samples > 0 else None
+
+    @wp.func(module="unique")
+    def shade_hit(
+        scene: RayScene,
+        lights: wp.array[Light],
+        distant: DistantLight,
+        hit: Hit,
+        direction: wp.vec3,
+        near: NearPoint,
+        turn: wp.float32,
+        spread: wp.float32,
+    ) -> wp.vec3:
+        wo = -wp.normalize(direction)
+        normal, geometric = face_viewer(hit.normal, hit.geometric_normal, wo)
+        surface = surface_at(scene, distant.dfg, hit, wp.dot(normal, wo), spread)
+        radiance = sent_unlit(distant, hit, surface, normal, wo, near)
+        if wp.static(len(config.lights) > 0):
+            for index in range(lights.shape[0]):
+                light = sample_light(lights[index], hit.point)
+                if wp.max(light.irradiance_normal) > 0.0:
+                    direct = reflect_direct(surface, normal, wo, light.wi)
+                    if wp.max(direct) > 0.0:
+                        if wp.static(config.soft):
+                            share = visible_share(scene, hit.point, geometric, hit.error, lights[index], light, turn)
+                            radiance += share * wp.cw_mul(direct, light.irradiance_normal)
+                        else:
+                            if is_lit(scene, hit.point, geometric, hit.error, light):
+                                radiance += wp.cw_mul(direct, light.irradiance_normal)
+        if wp.static(config.area_samples > 0):
+            radiance += lit_by_areas(scene, hit, surface, normal, geometric, wo, turn)
+        return radiance
+
+    return shade_hit
+
+
+@wp.func
+def differs(
+    i: wp.int32,
+    j: wp.int32,
+    found: wp.int32,
+    reach: wp.float32,
+    rect: wp.vec4i,
+    visible: VisibleObjects,
+    hit: Hit,
+) -> wp.bool:
+    """Whether a neighbour sees another surface than this pixel."""
+    other = wp.int32(-1)
+    if inside_rect(i, j, rect):
+        other = visible.objects[i, j]
+    if other != found:
+        return True
+    if found < 0:
+        return False
+    hits = visible.hits
+    if wp.abs(wp.dot(hit.geometric_normal, hits[i, j].point - hit.point)) > reach:
+        return True
+    return wp.dot(hit.normal, hits[i, j].normal) < EDGE_COSINE
+
+
+@wp.func
+def most_alike(visible: VisibleObjects, i: wp.int32, j: wp.int32, hit: Hit) -> wp.vec2i:
+    """Of a pixel and its eight neighbours, the one that sees what is most like a hit; (-1, -1): none sees its object.
+
+    Normals decide, nearness where they are the same.
+    """
+    objects = visible.objects
+    hits = visible.hits
+    found = wp.vec2i(-1, -1)
+    best = float(-2.0)
+    for a in range(-1, 2):
+        for b in range(-1, 2):
+            row = i + a
+            column = j + b
+            if row >= 0 and column >= 0 and row < objects.shape[0] and column < objects.shape[1]:
+                if objects[row, column] == hit.shape:
+                    likeness = wp.dot(hits[row, column].normal, hit.normal) - 1.0e-3 * wp.float32(a * a + b * b)
+                    if likeness > best:
+                        best = likeness
+                        found = wp.vec2i(row, column)
+    return found
+
+
+@functools.cache
+def make_shade_sample(config: ShadeConfig) -> wp.Function:
+    """``shade_sample``: radiance and coverage of one sample of a pixel; of ``ALONE``, its centre's hit."""
+    shade_hit = make_shade_hit(config)
+    closest_visible = make_primary(config.distant.trace)
+    centre_direction, sample_direction = make_sample_direction(1), make_sample_direction(config.edge_samples)
+
+    @wp.func(module="unique")
+    def shade_sample(
+        params: wp.array[FrameParams],
+        rays: wp.array2d[wp.vec2],
+        scene: RayScene,
+        light: ObjectLight,
+        visible: VisibleObjects,
+        pixel: wp.vec2i,
+        sample: wp.int32,
+        centre: Hit,
+    ) -> wp.vec4:
+        i = pixel[0]
+        j = pixel[1]
+        alone = sample == ALONE
+        direction = centre_direction(params, rays[i, j], 0)
+        hit = centre
+        if wp.static(config.edge_samples > 1):
+            if not alone:
+                direction = sample_direction(params, rays[i, j], sample)
+                hit = closest_visible(scene, params[0].camera_position, direction)
+        if hit.shape < 0:
+            return wp.vec4(0.0)
+        point = NearPoint()
+        if wp.static(config.near_field):
+            alike = pixel
+            if not alone:
+                alike = most_alike(visible, i, j, hit)
+            point.known = alike[0] >= 0
+            if point.known:
+                if wp.static(config.distant.diffuse != "none"):
+                    if light.near.irradiance.shape[0] > 0:
+                        point.irradiance = light.near.irradiance[alike[0], alike[1]]
+                if wp.static(config.distant.specular):
+                    if light.near.reflected.shape[0] > 0:
+                        point.reflected = light.near.reflected[alike[0], alike[1]]
+        spread = scene.pixel_spread
+        radiance = shade_hit(scene, light.lights, light.distant, hit, direction, point, tile_turn(i, j), spread)
+        return wp.vec4(radiance[0], radiance[1], radiance[2], 1.0)
+
+    return shade_sample
+
+
+@functools.cache
+def make_shade_kernel(config: ShadeConfig, edges: str = SAMPLED) -> wp.Kernel:
+    """Kernel of ``shade``, specialised to ``config``, and to what becomes of ``edges``.
+
+    Args:
+        config: What the scene calls for.
+        edges: ``SAMPLED`` in place; ``LISTED``, and nothing else done about them; or ``LEFT``: only where the list did
+            not hold all are they sampled in place, all of them. Which ones it held depends on the order of threads, and
+            kernels that are compiled separately differ in the last place.
+    """
+    shade_sample = make_shade_sample(config)
+
+    @slow_to_compile
+    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
+    def shade_kernel(
+        # In:
+        row_start: wp.int32,
+        params: wp.array[FrameParams],
+        rays: wp.array2d[wp.vec2],
+        scene: RayScene,
+        light: ObjectLight,
+        visible: VisibleObjects,
+        # Out:
+        virtual_out: wp.array2d[wp.vec4],
+        list_out: EdgeList,
+    ):
+        i, j = wp.tid()
+        if wp.static(edges == LEFT):
+            if holds_all(list_out):
+                return
+        result = wp.vec4(0.0)
+        samples = wp.int32(0)
+        rect = params[0].object_rect
+        own = own_pixel(i, j, row_start, rect, virtual_out.shape[0], virtual_out.shape[1])
+        i = own[0]
+        j = own[1]
+        if i < 0:
+            return
+        if inside_rect(i, j, rect):
+            found = visible.objects[i, j]
+            hit = Hit()
+            if found >= 0:
+                hit = visible.hits[i, j]
+            samples = wp.where(found >= 0, 1, 0)
+            if wp.static(config.edge_samples > 1):
+                reach = EDGE_FOOTPRINTS * hit.t / params[0].focal[0]
+                for k in range(4):
+                    row = i + wp.where(k == 0, -1, 0) + wp.where(k == 1, 1, 0)
+                    column = j + wp.where(k == 2, -1, 0) + wp.where(k == 3, 1, 0)
+                    if differs(row, column, found, reach, rect, visible, hit):
+                        samples = wp.static(config.edge_samples)
+            if wp.static(edges == LISTED):
+                if samples > 1:
+                    list_edge(i, j, list_out)
+                    return
+            pixel = wp.vec2i(i, j)
+            for number in range(samples):
+                sample = wp.where(wp.static(edges == LISTED) or samples == 1, ALONE, number)
+                result += shade_sample(params, rays, scene, light, visible, pixel, sample, hit)
+            if samples > 1:
+                result = result / wp.float32(samples)
+        if wp.static(edges == LEFT):
+            if samples <= 1:
+                return
+        virtual_out[i, j] = result
+
+    return shade_kernel
+
+
+@functools.cache
+def make_sample_edges_kernel(config: ShadeConfig) -> wp.Kernel:
+    """Kernel that shades every sample of the edges that were listed."""
+    shade_sample = make_shade_sample(config)
+
+    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
+    def sample_edges_kernel(
+        # In:
+        threads: wp.int32,
+        params: wp.array[FrameParams],
+        rays: wp.array2d[wp.vec2],
+        scene: RayScene,
+        light: ObjectLight,
+        visible: VisibleObjects,
+        listed: EdgeList,
+        # Out:
+        samples_out: wp.array[wp.vec4],
+    ):
+        item = wp.tid()
+        stop = listed_edges(listed) * wp.static(config.edge_samples)
+        while item < stop:
+            pixel = listed.edges[item / wp.static(config.edge_samples)]
+            sample = item % wp.static(config.edge_samples)
+            samples_out[item] = shade_sample(params, rays, scene, light, visible, pixel, sample, Hit())
+            item += threads
+
+    return sample_edges_kernel
+
+
+def shade(
+    config: ShadeConfig,
+    params: wp.array[FrameParams],
+    rays: wp.array2d[wp.vec2],
+    scene: RayScene,
+    light: ObjectLight,
+    visible: VisibleObjects,
+    virtual_out: wp.array2d[wp.vec4],
+    *,
+    edge_lists: EdgeLists | None = None,
+    cleared: bool = False,
+    rows: Rows | None = None,
+) -> None:
+    """Shade what ``trace_pixels`` found.
+
+    Given ``edge_lists``, edges are sampled on their own, with the same result but for the last places, where CUDA's
+    compiler contracts a product and a sum in one of the kernels alone.
+
+    Args:
+        config: What the scene calls for; what it leaves out may be None.
+        params: Frame values: camera and object_rect.
+        rays: (H, W) undistorted x / z and y / z of each pixel centre.
+        scene: What rays meet, and what it is made of.
+        light: From ``make_object_light``; what is near is needed if ``config.near_field``.
+        visible: (H, W) as ``trace_pixels`` writes.
+        virtual_out: (H, W) premultiplied linear RGB and coverage; zero outside ``params.object_rect``.
+        edge_lists: Scratch, for a launch over all rows.
+        cleared: Whether ``virtual_out`` is zero, so that on CUDA it need not be written outside.
+        rows: Band of rows; None means all.
+    """
+    inputs = [params, rays, scene, light, visible]
+    device = rays.device
+    if edge_lists is None or config.edge_samples == 1:
+        launch_rows(make_shade_kernel(config), rays.shape, inputs, [virtual_out, EdgeList()], rows=rows, device=device)
+        return
+    edge_lists.listed.count.zero_()
+    outputs = [virtual_out, edge_lists.listed]
+    given = {"rows": rows, "device": device, "rectangle_first": True, "alone": cleared}
+    for kernel in (make_shade_kernel(config, LISTED), make_shade_kernel(config, LEFT)):
+        launch_rows(kernel, rays.shape, inputs, outputs, **given)
+    sample_listed_edges(
+        make_sample_edges_kernel(config), inputs, edge_lists, config.edge_samples, virtual_out, weighted=False
+    )

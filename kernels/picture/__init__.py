@@ -1,0 +1,1 @@
+"""Kernels of the picture: codes and radiance, visibility, composite, exposure."""

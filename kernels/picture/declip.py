@@ -1,0 +1,562 @@
+"""How bright clipped pixels really were: the frame's linear radiance with an estimate wherever a channel clips.
+
+A camera's clipped channel says only "at least 1". Three objects say more, each where it can:
+
+**Hue.** Where some channels clip and others do not, the brightness is known from those that do not, and the missing
+channel follows from the hue c of what is around: with u the channels that did not clip,
+
+    k = sum_u L_u / sum_u c_u,   L_clipped = max(1, k c_clipped).
+
+Hue is carried in from neighbours that do not clip but are bright, for what is dark is lit otherwise: weight ((m -
+1/4) / (3/4))^2 for a largest channel m above 1/4. A second time around, the pixels so completed carry their hue into
+those where all channels clip (the core); there the darkest channel is at least 1, so the others are at least c / min
+c: the edge of a yellow emitter is red at more than 1 long before its blue clips.
+
+**Depth.** Inward, radiance goes on growing from that edge value e toward a value a, less and less: with q, a smooth
+log2 of the distance to the nearest known pixel (1 at the edge),
+
+    L = e (a / e)^(1 - 2^(-q / 2)).
+
+Without other knowledge a is one stop above e: near the median of clipped pixels in panoramas seen in perspective and
+in a mirror ball (a third to half a stop at the edge, 0.4 to 1 beyond two pixels).
+
+**The ball.** Its recovered light (``recover``) knows how much energy clipping took: that is a. A core pixel on the
+ball shows the direction that it mirrors. One on a modelled surface is not an emitter: hue and depth serve. Any other
+looks at something beyond the scene, at an unknown distance: the ball at p sees a point at distance t along the
+pixel's ray o + t d in the direction d + (o - p) / t, so from 1 / t = 0 up the first run of light that clips in the
+ball as well is what the camera sees; its brightest texel counts. Emitters have sharper edges than glow on surfaces:
+there a is approached as 1 - 2^-q. (At once would be too soon: a region's recovered energy is spread evenly over it.)
+
+**Filling.** Pull and push over a pyramid: a level's sums of weighted values are its children's; downward, what a
+texel does not know to a full weight it takes from the coarser level, bilinearly [GGSC96]. The number of levels
+climbed on the way, a smooth log2 of the distance, comes along. Only tiles in which something clips, and their
+neighbours, take part.
+
+References:
+    [GGSC96] Gortler, Grzeszczuk, Szeliski, Cohen, "The Lumigraph", SIGGRAPH 1996, section 3.4 (pull-push).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+
+import warp as wp
+
+from warp_ar.kernels.color import decode
+from warp_ar.kernels.latlong import sample_latlong
+from warp_ar.kernels.launch import Rows, launch, launch_rows
+from warp_ar.kernels.rays.shapes import FAR, intersect_sphere
+from warp_ar.kernels.rays.trace import TraceConfig, make_trace
+from warp_ar.kernels.structs import FrameParams, Picture, Probe, RayScene
+
+wp.set_module_options({"enable_backward": False})
+
+KNEE = wp.constant(wp.float32(250.0))
+"""Code above which a channel begins to count as clipped: noise and video codecs scatter around clipping."""
+CLIPPED = wp.constant(wp.float32(254.0))
+"""Code from which it is."""
+TILE_LEVEL = 4
+"""A tile is 2^4 = 16 pixels wide."""
+_TILE_LEVEL = wp.constant(TILE_LEVEL)
+DARKEST = wp.constant(wp.float32(0.25))
+"""Largest channel below which a pixel's hue says nothing of clipped neighbours: two stops below clipping."""
+LEAST_HUE = wp.constant(wp.float32(1.0 / 64.0))
+"""Smallest share of a channel in a hue; bounds what one channel says of another."""
+BRIGHTEST = wp.constant(wp.float32(1.0e4))
+"""Upper bound of every estimate."""
+STEPS = wp.constant(64)
+"""Points along a pixel's ray, even in parallax, that are looked up in the ball's light: less than two degrees apart."""
+NEAREST = wp.constant(wp.float32(2.0))
+"""Largest parallax: the nearest point is at half the distance between camera and ball."""
+
+
+@dataclasses.dataclass(frozen=True)
+class DeclipConfig:
+    """What is compiled into the last kernel."""
+
+    ball: bool = False
+    """Whether the light recovered from the ball is looked up."""
+    proxies: tuple[int, ...] = ()
+    """Kinds of proxy in the scene."""
+
+
+@wp.func
+def clipping(code: wp.vec3ub) -> wp.vec3:
+    """How far each channel counts as clipped, 0..1: 1 from ``CLIPPED`` up."""
+    return wp.vec3(
+        wp.clamp((wp.float32(code[0]) - KNEE) / (CLIPPED - KNEE), 0.0, 1.0),
+        wp.clamp((wp.float32(code[1]) - KNEE) / (CLIPPED - KNEE), 0.0, 1.0),
+        wp.clamp((wp.float32(code[2]) - KNEE) / (CLIPPED - KNEE), 0.0, 1.0),
+    )
+
+
+@wp.func
+def hue_weight(radiance: wp.vec3) -> wp.float32:
+    """How much an unclipped pixel says about its clipped neighbours."""
+    w = wp.clamp((wp.max(radiance) - DARKEST) / (1.0 - DARKEST), 0.0, 1.0)
+    return w * w
+
+
+@wp.func
+def weighted_hue(radiance: wp.vec3) -> wp.vec4:
+    """Hue (mean 1) times weight, and the weight."""
+    w = hue_weight(radiance)
+    if w == 0.0:
+        return wp.vec4()
+    scale = 3.0 * w / (radiance[0] + radiance[1] + radiance[2])
+    return wp.vec4(scale * radiance[0], scale * radiance[1], scale * radiance[2], w)
+
+
+@wp.kernel(enable_backward=False)
+def mark_tiles_kernel(
+    # In:
+    row_start: wp.int32,
+    frame: wp.array2d[wp.vec3ub],
+    # Out:
+    marked_out: wp.array2d[wp.int32],
+):
+    """1 where a tile has a clipped channel."""
+    i, j = wp.tid()
+    i += row_start
+    found = wp.int32(0)
+    for r in range(i << _TILE_LEVEL, wp.min((i + 1) << _TILE_LEVEL, frame.shape[0])):
+        for c in range(j << _TILE_LEVEL, wp.min((j + 1) << _TILE_LEVEL, frame.shape[1])):
+            code = frame[r, c]
+            if wp.float32(wp.max(wp.max(code[0], code[1]), code[2])) > KNEE:
+                found = wp.int32(1)
+    marked_out[i, j] = found
+
+
+@wp.kernel(enable_backward=False)
+def widen_tiles_kernel(
+    # In:
+    marked: wp.array2d[wp.int32],
+    # Out:
+    active_out: wp.array2d[wp.int32],
+):
+    """1 where a tile or one of its eight neighbours is marked."""
+    i, j = wp.tid()
+    found = wp.int32(0)
+    for r in range(wp.max(i - 1, 0), wp.min(i + 2, marked.shape[0])):
+        for c in range(wp.max(j - 1, 0), wp.min(j + 2, marked.shape[1])):
+            found = wp.max(found, marked[r, c])
+    active_out[i, j] = found
+
+
+@wp.kernel(enable_backward=False)
+def pull_frame_kernel(
+    # In:
+    row_start: wp.int32,
+    active: wp.array2d[wp.int32],
+    frame: wp.array2d[wp.vec3ub],
+    decode_table: wp.array[wp.vec3],
+    columns: wp.int32,
+    # Out:
+    levels_out: wp.array[wp.vec4],
+):
+    """First level: hues of pixels that clip in no channel."""
+    i, j = wp.tid()
+    i += row_start
+    if active[i >> (_TILE_LEVEL - 1), j >> (_TILE_LEVEL - 1)] == 0:
+        levels_out[i * columns + j] = wp.vec4()
+        return
+    total = wp.vec4()
+    for r in range(2 * i, wp.min(2 * i + 2, frame.shape[0])):
+        for c in range(2 * j, wp.min(2 * j + 2, frame.shape[1])):
+            code = frame[r, c]
+            if wp.max(clipping(code)) == 0.0:
+                total += weighted_hue(decode(decode_table, code))
+    levels_out[i * columns + j] = total
+
+
+@wp.kernel(enable_backward=False)
+def pull_completed_kernel(
+    # In:
+    row_start: wp.int32,
+    active: wp.array2d[wp.int32],
+    frame: wp.array2d[wp.vec3ub],
+    completed: wp.array2d[wp.vec3],
+    columns: wp.int32,
+    # Out:
+    levels_out: wp.array[wp.vec4],
+):
+    """First level again: hues of pixels that do not clip in all channels."""
+    i, j = wp.tid()
+    i += row_start
+    if active[i >> (_TILE_LEVEL - 1), j >> (_TILE_LEVEL - 1)] == 0:
+        levels_out[i * columns + j] = wp.vec4()
+        return
+    total = wp.vec4()
+    for r in range(2 * i, wp.min(2 * i + 2, frame.shape[0])):
+        for c in range(2 * j, wp.min(2 * j + 2, frame.shape[1])):
+            if wp.min(clipping(frame[r, c])) == 0.0:
+                total += weighted_hue(completed[r, c])
+    levels_out[i * columns + j] = total
+
+
+@wp.kernel(enable_backward=False)
+def pull_level_kernel(
+    # In:
+    active: wp.array2d[wp.int32],
+    to_tile: wp.int32,
+    fine_offset: wp.int32,
+    fine_rows: wp.int32,
+    fine_columns: wp.int32,
+    offset: wp.int32,
+    columns: wp.int32,
+    # Out (and in: the finer level):
+    levels_out: wp.array[wp.vec4],
+):
+    """Sums of the finer level's texels."""
+    i, j = wp.tid()
+    if to_tile >= 0 and active[i >> to_tile, j >> to_tile] == 0:
+        levels_out[offset + i * columns + j] = wp.vec4()
+        return
+    total = wp.vec4()
+    for r in range(2 * i, wp.min(2 * i + 2, fine_rows)):
+        for c in range(2 * j, wp.min(2 * j + 2, fine_columns)):
+            total += levels_out[fine_offset + r * fine_columns + c]
+    levels_out[offset + i * columns + j] = total
+
+
+@wp.func
+def sample_coarser(
+    levels: wp.array[wp.vec4], offset: wp.int32, rows: wp.int32, columns: wp.int32, i: wp.int32, j: wp.int32
+) -> wp.vec4:
+    """Filled value of a level, bilinear, at texel (i, j) of the level below it; constant beyond the border."""
+    y = wp.clamp(0.5 * wp.float32(i) - 0.25, 0.0, wp.float32(rows - 1))
+    x = wp.clamp(0.5 * wp.float32(j) - 0.25, 0.0, wp.float32(columns - 1))
+    r = wp.int32(y)
+    c = wp.int32(x)
+    fy = y - wp.float32(r)
+    fx = x - wp.float32(c)
+    below = wp.min(r + 1, rows - 1)
+    right = wp.min(c + 1, columns - 1)
+    top = levels[offset + r * columns + c] * (1.0 - fx) + levels[offset + r * columns + right] * fx
+    bottom = levels[offset + below * columns + c] * (1.0 - fx) + levels[offset + below * columns + right] * fx
+    return top * (1.0 - fy) + bottom * fy
+
+
+@wp.kernel(enable_backward=False)
+def push_level_kernel(
+    # In:
+    row_start: wp.int32,
+    active: wp.array2d[wp.int32],
+    to_tile: wp.int32,
+    coarse_offset: wp.int32,
+    coarse_rows: wp.int32,
+    coarse_columns: wp.int32,
+    offset: wp.int32,
+    columns: wp.int32,
+    # Out (and in: the coarser level, and the sums that are replaced):
+    levels_out: wp.array[wp.vec4],
+):
+    """From sums to values: hue, and levels climbed; the last level (no coarser rows) is completed by grey."""
+    i, j = wp.tid()
+    i += row_start
+    if to_tile >= 0 and active[i >> to_tile, j >> to_tile] == 0:
+        return
+    at = offset + i * columns + j
+    sums = levels_out[at]
+    above = wp.vec4(1.0, 1.0, 1.0, 0.0)
+    if coarse_rows > 0:
+        above = sample_coarser(levels_out, coarse_offset, coarse_rows, coarse_columns, i, j)
+    known = wp.min(sums[3], 1.0)
+    unknown = 1.0 - known
+    # known / weight: 1 up to a weight of 1, so a weight of 0 is no division.
+    share = wp.where(sums[3] > 1.0, 1.0 / wp.max(sums[3], 1.0), 1.0)
+    levels_out[at] = wp.vec4(
+        share * sums[0] + unknown * above[0],
+        share * sums[1] + unknown * above[1],
+        share * sums[2] + unknown * above[2],
+        unknown * (above[3] + 1.0),
+    )
+
+
+@wp.func
+def hue_of(filled: wp.vec4) -> wp.vec3:
+    """Hue with no channel near 0."""
+    return wp.vec3(wp.max(filled[0], LEAST_HUE), wp.max(filled[1], LEAST_HUE), wp.max(filled[2], LEAST_HUE))
+
+
+@wp.kernel(enable_backward=False)
+def complete_kernel(
+    # In:
+    row_start: wp.int32,
+    active: wp.array2d[wp.int32],
+    frame: wp.array2d[wp.vec3ub],
+    decode_table: wp.array[wp.vec3],
+    levels: wp.array[wp.vec4],
+    rows: wp.int32,
+    columns: wp.int32,
+    # Out:
+    declipped_out: wp.array2d[wp.vec3],
+):
+    """Linear radiance where tiles are active; missing channels by the neighbours' hue."""
+    i, j = wp.tid()
+    i += row_start
+    if active[i >> _TILE_LEVEL, j >> _TILE_LEVEL] == 0:
+        return
+    code = frame[i, j]
+    radiance = decode(decode_table, code)
+    clipped = clipping(code)
+    if wp.max(clipped) > 0.0 and wp.min(clipped) == 0.0:
+        hue = hue_of(sample_coarser(levels, 0, rows, columns, i, j))
+        kept = wp.vec3(
+            wp.where(clipped[0] > 0.0, 0.0, 1.0),
+            wp.where(clipped[1] > 0.0, 0.0, 1.0),
+            wp.where(clipped[2] > 0.0, 0.0, 1.0),
+        )
+        k = wp.dot(kept, radiance) / wp.dot(kept, hue)
+        for channel in range(3):
+            guess = wp.clamp(k * hue[channel], radiance[channel], BRIGHTEST)
+            radiance[channel] += clipped[channel] * (guess - radiance[channel])
+    declipped_out[i, j] = radiance
+
+
+@functools.cache
+def make_seen_by_ball(config: DeclipConfig) -> wp.Function:
+    """``seen_by_ball(environment, probes, params, scene, ray) -> vec3``: by the recovered light; 0 for none."""
+    trace = make_trace(TraceConfig(objects=(), proxies=config.proxies))
+
+    @wp.func(module="unique")
+    def seen_by_ball(
+        environment: wp.array2d[wp.vec3], probes: wp.array[Probe], params: FrameParams, scene: RayScene, ray: wp.vec2
+    ) -> wp.vec3:
+        origin = params.camera_position
+        direction = wp.normalize(params.world_from_camera * wp.vec3(ray[0], ray[1], 1.0))
+        nearest = wp.float32(FAR)
+        ball = int(-1)
+        for b in range(probes.shape[0]):
+            t = intersect_sphere(probes[b].radius, origin - probes[b].center, direction, nearest)
+            if t < nearest:
+                nearest = t
+                ball = b
+        if wp.static(len(config.proxies) > 0):
+            if trace.occluded_by_proxies(scene, origin, direction, nearest):
+                return wp.vec3()
+        if ball >= 0:
+            normal = wp.normalize(origin + nearest * direction - probes[ball].center)
+            wi = direction - 2.0 * wp.dot(direction, normal) * normal
+            return wp.cw_mul(probes[ball].reflectance, sample_latlong(environment, wi))
+        found = wp.vec3()
+        best = float(1.0)
+        for step in range(STEPS):
+            share = NEAREST * wp.float32(step) / wp.float32(STEPS)
+            radiance = sample_latlong(environment, direction + share * wp.normalize(origin - probes[0].center))
+            # At clipping in the ball's image: 1 / reflectance, in every channel.
+            if wp.min(wp.cw_mul(probes[0].reflectance, radiance)) >= 1.0:
+                if wp.max(radiance) > best:
+                    best = wp.max(radiance)
+                    found = radiance
+            elif best > 1.0:
+                break
+        return found
+
+    return seen_by_ball
+
+
+@functools.cache
+def make_complete_core_kernel(config: DeclipConfig) -> wp.Kernel:
+    """Kernel specialised to ``config``; equal configs share one kernel."""
+    seen_by_ball = make_seen_by_ball(config) if config.ball else None
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def complete_core_kernel(
+        # In:
+        row_start: wp.int32,
+        picture: Picture,
+        levels: wp.array[wp.vec4],
+        rows: wp.int32,
+        columns: wp.int32,
+        params: wp.array[FrameParams],
+        scene: RayScene,
+        probes: wp.array[Probe],
+        environment: wp.array2d[wp.vec3],
+        # Out:
+        declipped_out: wp.array2d[wp.vec3],
+    ):
+        i, j = wp.tid()
+        i += row_start
+        clipped = clipping(picture.frame[i, j])
+        if wp.min(clipped) == 0.0:
+            return
+        filled = sample_coarser(levels, 0, rows, columns, i, j)
+        hue = hue_of(filled)
+        edge = hue / wp.min(hue)
+        inside = 2.0 * edge
+        rate = float(0.5)
+        if wp.static(config.ball):
+            seen = seen_by_ball(environment, probes, params[0], scene, picture.rays[i, j])
+            if wp.max(seen) > 0.0:
+                inside = seen
+                rate = 1.0
+        growth = 1.0 - wp.pow(2.0, -rate * (filled[3] + 1.0))
+        for channel in range(3):
+            stops = wp.log2(wp.clamp(inside[channel], 1.0, BRIGHTEST) / edge[channel])
+            guess = wp.max(edge[channel] * wp.pow(2.0, growth * stops), 1.0)
+            radiance = declipped_out[i, j][channel]
+            declipped_out[i, j][channel] = radiance + clipped[channel] * (guess - radiance)
+
+    return complete_core_kernel
+
+
+@functools.cache
+def level_shapes(height: int, width: int) -> tuple[tuple[int, int], ...]:
+    """(rows, columns) of the levels, from half the frame's size down to one texel."""
+    shapes = [(-(-height // 2), -(-width // 2))]
+    while max(shapes[-1]) > 1:
+        rows, columns = shapes[-1]
+        shapes.append((-(-rows // 2), -(-columns // 2)))
+    return tuple(shapes)
+
+
+def level_texels(height: int, width: int) -> int:
+    """Texels of all levels together."""
+    return sum(map(math.prod, level_shapes(height, width)))
+
+
+def tile_shape(height: int, width: int) -> tuple[int, int]:
+    """Rows and columns of tiles."""
+    side = 1 << TILE_LEVEL
+    return -(-height // side), -(-width // side)
+
+
+def mark_tiles(frame: wp.array, marked_out: wp.array, *, rows: Rows | None = None) -> None:
+    """Mark the tiles, ``tile_shape(H, W)`` int32, of a frame, (H, W) vec3ub, in which some channel clips."""
+    launch_rows(mark_tiles_kernel, marked_out.shape, [frame], [marked_out], rows=rows, device=frame.device)
+
+
+def widen_tiles(marked: wp.array, active_out: wp.array) -> None:
+    """Mark the neighbours of marked tiles too; both ``tile_shape(H, W)`` int32."""
+    launch(widen_tiles_kernel, active_out.shape, [marked], [active_out], device=marked.device)
+
+
+def pull_frame(
+    active: wp.array, frame: wp.array, decode_table: wp.array, levels_out: wp.array, *, rows: Rows | None = None
+) -> None:
+    """Write the first level: weighted hues of the pixels that do not clip.
+
+    Args:
+        active: Tiles of ``widen_tiles``; the others give and get nothing.
+        frame: (H, W) vec3ub, RGB.
+        decode_table: (256,) vec3 of ``color.decode_table``.
+        levels_out: (``level_texels(H, W)``,) vec4: sums of weighted hue, and of weights.
+        rows: Band of rows of the first level; None means all.
+    """
+    shape = level_shapes(*frame.shape)[0]
+    launch_rows(
+        pull_frame_kernel, shape, [active, frame, decode_table, shape[1]], [levels_out], rows=rows, device=frame.device
+    )
+
+
+def pull_completed(
+    active: wp.array, frame: wp.array, completed: wp.array, levels_out: wp.array, *, rows: Rows | None = None
+) -> None:
+    """Write the first level from ``complete``: weighted hues of the pixels that do not clip in all channels."""
+    shape = level_shapes(*frame.shape)[0]
+    launch_rows(
+        pull_completed_kernel, shape, [active, frame, completed, shape[1]], [levels_out], rows=rows, device=frame.device
+    )
+
+
+def fill_levels(active: wp.array, shape: tuple[int, int], levels_out: wp.array) -> None:
+    """Pull sums up from the first level, and push values down to it.
+
+    Args:
+        active: Tiles of ``widen_tiles``.
+        shape: Height and width of the frame.
+        levels_out: First level: sums of weighted hue, and of weights. Becomes values: hue, and levels climbed.
+    """
+    shapes = level_shapes(*shape)
+    offsets = [sum(map(math.prod, shapes[:level])) for level in range(len(shapes))]
+    device = levels_out.device
+    for level in range(1, len(shapes)):
+        inputs = [
+            active,
+            TILE_LEVEL - 1 - level,
+            offsets[level - 1],
+            *shapes[level - 1],
+            offsets[level],
+            shapes[level][1],
+        ]
+        launch(pull_level_kernel, shapes[level], inputs, [levels_out], device=device)
+    coarser = (0, 0, 0)
+    for level in reversed(range(len(shapes))):
+        launch(
+            push_level_kernel,
+            shapes[level],
+            [0, active, TILE_LEVEL - 1 - level, *coarser, offsets[level], shapes[level][1]],
+            [levels_out],
+            device=device,
+        )
+        coarser = (offsets[level], *shapes[level])
+
+
+def complete(
+    active: wp.array,
+    frame: wp.array,
+    decode_table: wp.array,
+    levels: wp.array,
+    declipped_out: wp.array,
+    *,
+    rows: Rows | None = None,
+) -> None:
+    """Write the frame's linear radiance, channels that clip beside others that do not completed by the filled hue.
+
+    Args:
+        active: Tiles of ``widen_tiles``; pixels of others stay as they are.
+        frame: (H, W) vec3ub, RGB.
+        decode_table: (256,) vec3 of ``color.decode_table``.
+        levels: Filled levels of ``pull_frame`` and ``fill_levels``.
+        declipped_out: (H, W) vec3.
+        rows: Band of rows; None means all.
+    """
+    shape = level_shapes(*frame.shape)[0]
+    launch_rows(
+        complete_kernel,
+        frame.shape,
+        [active, frame, decode_table, levels, *shape],
+        [declipped_out],
+        rows=rows,
+        device=frame.device,
+    )
+
+
+def complete_core(
+    config: DeclipConfig,
+    picture: Picture,
+    levels: wp.array,
+    params: wp.array,
+    scene: RayScene,
+    probes: wp.array,
+    environment: wp.array | None,
+    declipped_out: wp.array,
+    *,
+    rows: Rows | None = None,
+) -> None:
+    """Write the estimate of pixels that clip in all channels.
+
+    Args:
+        config: Whether the ball's light is used, and which kinds of proxy there are.
+        picture: The frame's codes, (H, W), and where its pixels look.
+        levels: Filled levels of ``pull_completed`` and ``fill_levels``.
+        params: (1,) FrameParams; the camera's pose.
+        scene: Proxies.
+        probes: Balls; ``environment`` is the light at the first.
+        environment: (rows, columns) vec3, with clipped energy put back; None without ``config.ball``.
+        declipped_out: (H, W) vec3; other pixels stay.
+        rows: Band of rows; None means all.
+    """
+    frame = picture.frame
+    shape = level_shapes(*frame.shape)[0]
+    launch_rows(
+        make_complete_core_kernel(config),
+        frame.shape,
+        [picture, levels, *shape, params, scene, probes, environment],
+        [declipped_out],
+        rows=rows,
+        device=frame.device,
+    )

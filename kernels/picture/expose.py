@@ -1,0 +1,518 @@
+"""Another exposure of the picture: shorter, as if light had been added and the camera had answered; or longer.
+
+A shorter exposure scales linear light by s < 1. Where the camera clipped, the frame does not say how bright the scene
+was, and scaling the clipped value gives flat grey patches. A pixel counts as clipped when all its channels are: one
+that still has a hue is not far above clipping, and lifting it would leave a bright island in a surface that fades.
+
+Methods:
+``plain``: scaling alone; a clipped pixel is taken to be just clipped.
+
+``paper``: [DH04] section 4.3 to the letter. Clipped pixels are scaled by a factor that depends on "the average
+intensity of surrounding pixels", a, in a box around them, so that "the center of over-exposed regions will remain
+bright while the edges fade with the rest of the image" and "extreme darkening will eventually decimate the entire
+saturated region".
+The box grows linearly from 1 pixel at s = 1 to ``max_box`` at s = 0:
+
+    size = 1 + (1 - s) (max_box - 1).
+
+The paper gives no formula for the factor, nor the largest box. Taken is: w rises linearly from 0 where the box is half
+bright, as it is at the straight edge of a large region, to 1 where all of it is saturated; the factor goes from s to 1
+with w,
+
+    w = clamp(2 a - 1, 0, 1),   factor = s + (1 - s) w.
+
+So s = 1 is the identity, a region smaller than half the box fades like the rest, and where s is less than
+``LEAST_SCALE`` the factor falls to 0 with it. With w = a, the other simple
+reading (``paper_mean``), an edge would stay half bright and nothing would be decimated. It enters gradually from code
+``KNEE`` up, so noise around clipping does not show, and the light is guessed before virtual light is added to it: that
+is known and needs no guess. docs/paper.md compares the readings.
+
+``box``: the same, the factor no further than ``MAX_GAIN`` above s. Factor / s is a guess of the clipped pixel's
+radiance; the bound of one stop keeps the guess near the likeliest values: in renderings and photographs of environments
+most clipped pixels lie less than one stop above clipping. Here s = 0 is black everywhere, as no light is.
+
+A longer exposure, s > 1, is scaled and clipped: what a camera does.
+
+``declipped``: each clipped pixel has the radiance that ``declip`` estimates for it, at least what the camera
+shows; s = 1 is the identity.
+
+Frames of more than 8 bits: means of boxes have what 8 bits cut off (``summed_area.write_cut``). Linear light that clips
+above 1, if anywhere, needs no guess: a pixel of code 255 is what the linear picture says.
+
+What is drawn ends where the camera's channels saturate, as all that it sees does: a highlight is no brighter than a
+lamp in the frame.
+
+Pixels that no layer and no guess touches go through a table of 256 codes, made anew for every s.
+
+``auto`` keeps highlights of virtual light on the receiver below clipping. Over a grid of pixels that virtual light
+falls on, and whose own code is not clipped (those cannot be helped), the level P is found that all but
+``CLIPPED_SHARE`` of them stay below; the scale aims at
+
+    s* = min(1, max(1 / P, MIN_AUTO_SCALE)),
+
+and follows it over ``AUTO_SECONDS`` (1 - e^(-dt / tau)), the first frame at once. Levels are counted in bins of an
+eighth of a stop, in integers, so their sum does not depend on an order.
+
+References:
+    [DH04] DiVerdi, Hoellerer, "Combining Dynamic Physical and Virtual Illumination in Augmented Reality", 2004.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Literal
+
+import warp as wp
+
+from warp_ar.kernels.color import below_saturation, decode, encode, is_clipped, saturation_codes
+from warp_ar.kernels.launch import Rows, launch, launch_rows
+from warp_ar.kernels.picture.codes import (
+    WARP_LANES,
+    WARP_PIXELS,
+    by_warps,
+    get_code,
+    load_codes,
+    row_parts,
+    set_code,
+    store_codes,
+)
+from warp_ar.kernels.picture.composite import CompositeConfig, Layers, compose, is_changed, make_read_layers
+from warp_ar.kernels.picture.summed_area import fine_mean
+from warp_ar.kernels.structs import FrameParams, Picture
+
+wp.set_module_options({"enable_backward": False})
+
+METHODS = ("plain", "paper", "box", "declipped")
+"""Cheapest first."""
+BOXES = ("paper", "paper_mean", "box")
+"""What looks at a box around clipped pixels: methods, and a reading of the paper that docs/paper.md compares."""
+
+MAX_BOX = 1.0 / 8.0
+"""Side of the largest box in frame heights."""
+MAX_GAIN = wp.constant(wp.float32(2.0))
+"""How far above clipping a clipped pixel is guessed at most: one stop."""
+LEAST_SCALE = wp.constant(wp.float32(1.0e-3))
+"""Scale below which the paper's factor falls to 0 too: without light there is no picture."""
+KNEE = wp.constant(wp.float32(250.0))
+"""Code from which a pixel's darkest channel begins to count as clipped."""
+
+CLIPPED_SHARE = wp.constant(wp.float32(0.005))
+"""Share of the pixels under virtual light that ``auto`` allows to clip."""
+MIN_AUTO_SCALE = wp.constant(wp.float32(1.0 / 16.0))
+"""Darkest that ``auto`` goes."""
+AUTO_SECONDS = wp.constant(wp.float32(0.3))
+"""Time constant of ``auto``."""
+AUTO_STRIDE = 4
+"""``auto`` looks at every fourth pixel of every fourth row."""
+LEVELS = 64
+"""Bins of ``auto``: bin 0 lies below clipping, bin k from (k - 1) / 8 to k / 8 stops above it, the last one is open."""
+
+_LEVELS = wp.constant(LEVELS)
+_AUTO_STRIDE = wp.constant(AUTO_STRIDE)
+
+NO_LAYERS = CompositeConfig()
+"""The frame alone."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ExposeConfig:
+    """What is compiled into the kernel."""
+
+    method: Literal["plain", "paper", "paper_mean", "box", "declipped"] = "plain"
+    """How clipped pixels darken."""
+    layers: CompositeConfig = NO_LAYERS
+    """What is composed before it is exposed."""
+
+    def __post_init__(self) -> None:
+        known = dict.fromkeys((*METHODS, *BOXES))
+        if self.method not in known:
+            raise ValueError(f"method: {self.method!r} is none of {', '.join(known)}")
+
+
+@wp.struct
+class ClippedEvidence:
+    """What tells the radiance of pixels that clip; what a method does not read may be empty."""
+
+    summed_area: wp.array2d[wp.uint32]  # (H, W) the frame's summed-area table, for methods that look at boxes
+    cut_table: wp.array2d[wp.uint32]  # that of what 8 bits cut off; empty for frames of 8 bits
+    max_box: wp.int32  # pixels: side of the largest box
+    levels: wp.array[wp.vec3]  # (2,) radiance from which channels of a linear frame clip; empty for frames of 8 bits
+    declipped: wp.array2d[wp.vec3]  # (H, W) linear radiance with clipped pixels estimated, for ``declipped``
+
+
+@wp.struct
+class Exposure:
+    """A scale, and what it makes of codes."""
+
+    encode_table: wp.array[wp.vec3]  # of ``color.encode_table``
+    scale: wp.array[wp.float32]  # (1,), not negative
+    codes: wp.array[wp.vec3ub]  # (256,) of ``expose_codes`` for this scale
+
+
+@wp.func
+def surrounding_mean(clipped: ClippedEvidence, row: wp.int32, col: wp.int32, scale: wp.float32) -> wp.float32:
+    """Mean intensity, 0..255, of the box that a scale in 0..1 calls for.
+
+    A size between two odd numbers takes both their boxes, weighted: centred, and continuous as the scale changes.
+    """
+    reach = 0.5 * (1.0 - scale) * wp.float32(clipped.max_box - 1)
+    inner = wp.int32(reach)
+    fraction = reach - wp.float32(inner)
+    smaller = fine_mean(clipped.summed_area, clipped.cut_table, row, col, 2 * inner + 1)
+    return smaller + fraction * (fine_mean(clipped.summed_area, clipped.cut_table, row, col, 2 * inner + 3) - smaller)
+
+
+@wp.func
+def is_light(clipped: ClippedEvidence) -> wp.bool:
+    """Whether the frame is linear light that says by itself how bright what is above 1 is."""
+    return clipped.levels.shape[0] > 0 and clipped.levels[0][0] > 1.0
+
+
+@wp.func
+def clipped_gain(mean: wp.float32, scale: wp.float32) -> wp.float32:
+    """Guessed radiance of a clipped pixel, factor / s, for a box mean in 0..255 and a scale in 0..1."""
+    w = wp.clamp(2.0 / 255.0 * mean - 1.0, 0.0, 1.0)
+    # min(s + (1 - s) w, G s) / s with 1 / s bounded first, so that s = 0 is no division.
+    return wp.min(1.0 + (1.0 / wp.max(scale, 1.0e-6) - 1.0) * w, MAX_GAIN)
+
+
+@wp.func
+def paper_gain(mean: wp.float32, scale: wp.float32) -> wp.float32:
+    """Factor / s of [DH04] section 4.3 for a box mean in 0..255 and a scale in 0..1."""
+    w = wp.clamp(2.0 / 255.0 * mean - 1.0, 0.0, 1.0)
+    return 1.0 + (1.0 / wp.max(scale, LEAST_SCALE) - 1.0) * w
+
+
+@wp.func
+def paper_mean_gain(mean: wp.float32, scale: wp.float32) -> wp.float32:
+    """The same for the reading w = a."""
+    return 1.0 + (1.0 / wp.max(scale, LEAST_SCALE) - 1.0) * (mean / 255.0)
+
+
+@wp.kernel(enable_backward=False)
+def expose_codes_kernel(
+    # In:
+    decode_table: wp.array[wp.vec3],
+    encode_table: wp.array[wp.vec3],
+    scale: wp.array[wp.float32],
+    # Out:
+    codes_out: wp.array[wp.vec3ub],
+):
+    """Code of every code after scaling."""
+    i = wp.tid()
+    codes_out[i] = encode(encode_table, scale[0] * decode_table[i])
+
+
+@wp.kernel(enable_backward=False)
+def read_scale_kernel(
+    # In:
+    params: wp.array[FrameParams],
+    # Out:
+    scale_out: wp.array[wp.float32],
+):
+    """The fixed scale; NaN and negative ones are 0."""
+    scale_out[0] = wp.where(params[0].exposure_scale > 0.0, params[0].exposure_scale, 0.0)
+
+
+@wp.func
+def level_of(peak: wp.float32) -> wp.int32:
+    """Bin of the largest channel of a radiance."""
+    if not peak > 1.0:
+        return 0
+    return wp.min(wp.int32(wp.log2(wp.min(peak, 1.0e6)) * 8.0) + 1, _LEVELS - 1)
+
+
+@functools.cache
+def make_count_levels_kernel(config: CompositeConfig) -> wp.Kernel:
+    """Kernel that counts, per sampled row, how many pixels under virtual light fall into each level."""
+    read_layers = make_read_layers(config)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def count_levels_kernel(
+        # In:
+        row_start: wp.int32,
+        params: wp.array[FrameParams],
+        picture: Picture,
+        layers: Layers,
+        # Out:
+        levels_out: wp.array2d[wp.int32],
+    ):
+        strip = row_start + wp.tid()
+        for level in range(_LEVELS):
+            levels_out[strip, level] = 0
+        i = strip * _AUTO_STRIDE
+        rect = params[0].light_rect
+        if i < rect[0] or i >= rect[1]:
+            return
+        for j in range(rect[2], rect[3], _AUTO_STRIDE):
+            code = picture.frame[i, j]
+            clipped = wp.max(wp.max(code[0], code[1]), code[2]) == wp.uint8(255)
+            at = read_layers(params, layers, i, j)
+            dark = at.added == wp.vec3(0.0, 0.0, 0.0)
+            if not clipped and not at.objects[3] > 0.5 and not dark:
+                level = level_of(wp.max(compose(decode(picture.decode_table, code), at)))
+                levels_out[strip, level] = levels_out[strip, level] + 1
+
+    return count_levels_kernel
+
+
+@wp.kernel(enable_backward=False)
+def adapt_scale_kernel(
+    # In:
+    params: wp.array[FrameParams],
+    levels: wp.array2d[wp.int32],
+    # Out:
+    scale_out: wp.array[wp.float32],
+):
+    """Move the scale toward its aim; a scale of 0 has never been set."""
+    total = int(0)
+    for strip in range(levels.shape[0]):
+        for level in range(_LEVELS):
+            total += levels[strip, level]
+    allowed = wp.int32(CLIPPED_SHARE * wp.float32(total))
+    level = int(_LEVELS - 1)
+    above = int(0)
+    while level > 0:
+        for strip in range(levels.shape[0]):
+            above += levels[strip, level]
+        if above > allowed:
+            break
+        level -= 1
+    aim = wp.max(wp.pow(2.0, -0.125 * wp.float32(level)), MIN_AUTO_SCALE)
+    before = scale_out[0]
+    if before > 0.0:
+        aim = before + (aim - before) * (1.0 - wp.exp(-params[0].time_step / AUTO_SECONDS))
+    scale_out[0] = aim
+
+
+@functools.cache
+def make_find_gain(method: str) -> wp.Function:
+    """``find_gain(code, i, j, clipped, s) -> float``: a clipped pixel's guessed radiance over what it shows.
+
+    It is 1 for pixels that do not clip, and on methods that look at no box.
+    """
+    box_gain = {"paper": paper_gain, "paper_mean": paper_mean_gain}.get(method, clipped_gain)
+
+    @wp.func(module="unique")
+    def find_gain(code: wp.vec3ub, i: wp.int32, j: wp.int32, clipped: ClippedEvidence, s: wp.float32) -> wp.float32:
+        gain = float(1.0)
+        if wp.static(method in BOXES):
+            least = wp.float32(wp.min(wp.min(code[0], code[1]), code[2]))
+            if least > KNEE and s < 1.0 and not is_light(clipped):
+                share = (least - KNEE) / (255.0 - KNEE)
+                mean = surrounding_mean(clipped, i, j, s)
+                gain = 1.0 + share * (box_gain(mean, s) - 1.0)
+        return gain
+
+    return find_gain
+
+
+@functools.cache
+def make_exposed(config: ExposeConfig) -> wp.Function:
+    """``exposed(code, i, j, params, decode_table, layers, clipped, exposure) -> vec3ub``: a pixel's code."""
+    read_layers = make_read_layers(config.layers)
+    find_gain = make_find_gain(config.method)
+
+    @wp.func(module="unique")
+    def exposed(
+        code: wp.vec3ub,
+        i: wp.int32,
+        j: wp.int32,
+        params: wp.array[FrameParams],
+        picture: Picture,
+        layers: Layers,
+        clipped: ClippedEvidence,
+        exposure: Exposure,
+    ) -> wp.vec3ub:
+        s = exposure.scale[0]
+        codes = exposure.codes
+        gain = find_gain(code, i, j, clipped, s)
+        guessed = bool(gain != 1.0)
+        if wp.static(config.method == "declipped"):
+            guessed = s < 1.0 and wp.max(is_clipped(code)) > 0.0 and not is_light(clipped)
+        known = is_light(clipped) and wp.max(wp.max(code[0], code[1]), code[2]) == wp.uint8(255)
+        at = read_layers(params, layers, i, j)
+        if not guessed and not known and not is_changed(at):
+            return wp.vec3ub(codes[wp.int32(code[0])][0], codes[wp.int32(code[1])][1], codes[wp.int32(code[2])][2])
+        radiance = gain * decode(picture.decode_table, code)
+        if wp.static(config.method == "declipped"):
+            if guessed:
+                radiance = clipped.declipped[i, j]
+        if known:
+            radiance = picture.linear[i, j]
+        made = encode(exposure.encode_table, s * compose(radiance, at))
+        return below_saturation(made, code, saturation_codes(picture.decode_table))
+
+    return exposed
+
+
+@functools.cache
+def make_expose_kernel(config: ExposeConfig, warps: bool) -> wp.Kernel:
+    """Kernel specialised to ``config``, by warps (see ``codes``) or by runs of pixels; equal ones share one kernel."""
+    exposed = make_exposed(config)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def expose_kernel(
+        # In:
+        row_start: wp.int32,
+        params: wp.array[FrameParams],
+        picture: Picture,
+        layers: Layers,
+        clipped: ClippedEvidence,
+        exposure: Exposure,
+        run: wp.int32,
+        # Out:
+        image_out: wp.array2d[wp.vec3ub],
+    ):
+        i, part = wp.tid()
+        i += row_start
+        frame = picture.frame
+        if wp.static(warps):
+            first = part // WARP_LANES * WARP_PIXELS
+            own = load_codes(frame, i, first)
+            k = part % WARP_LANES
+            step, stop = WARP_LANES, WARP_PIXELS
+        else:
+            first = part * run
+            k = wp.int32(0)
+            step, stop = wp.int32(1), run
+        while k < stop:
+            j = first + k
+            if j < frame.shape[1]:
+                if wp.static(warps):  # noqa: SIM108  (of a conditional expression both sides would be compiled)
+                    code = get_code(own, k)
+                else:
+                    code = frame[i, j]
+                code = exposed(code, i, j, params, picture, layers, clipped, exposure)
+                if wp.static(warps):
+                    set_code(own, k, code)
+                else:
+                    image_out[i, j] = code
+            k += step
+        if wp.static(warps):
+            store_codes(own, image_out, i, first)
+
+    return expose_kernel
+
+
+def largest_box(height: int) -> int:
+    """``max_box`` for a frame of ``height`` rows."""
+    return max(1, round(MAX_BOX * height))
+
+
+def make_clipped_evidence(
+    height: int,
+    summed_area: wp.array | None,
+    declipped: wp.array | None,
+    cut_table: wp.array | None = None,
+    levels: wp.array | None = None,
+) -> ClippedEvidence:
+    """What is known of the clipped pixels of a frame; None for what the method does not read.
+
+    Args:
+        height: Rows of the frame.
+        summed_area: (H, W) uint32, of ``summed_area.sum_area``.
+        declipped: (H, W) vec3, linear radiance with clipped pixels estimated.
+        cut_table: (H, W) uint32, the table of what 8 bits cut off; None for frames of 8 bits.
+        levels: (2,) vec3, radiance from which channels of a linear frame clip; None for frames of 8 bits.
+    """
+    evidence = ClippedEvidence()
+    evidence.max_box = largest_box(height)
+    arrays = {"summed_area": summed_area, "declipped": declipped, "cut_table": cut_table, "levels": levels}
+    for name, array in arrays.items():
+        if array is not None:
+            setattr(evidence, name, array)
+    return evidence
+
+
+def make_exposure(encode_table: wp.array, scale: wp.array, codes: wp.array) -> Exposure:
+    """The arrays of an exposure together.
+
+    Args:
+        encode_table: Of ``color.encode_table``.
+        scale: (1,) float32, not negative.
+        codes: (256,) vec3ub, as ``expose_codes`` writes for this scale.
+    """
+    exposure = Exposure()
+    exposure.encode_table, exposure.scale, exposure.codes = encode_table, scale, codes
+    return exposure
+
+
+def read_scale(params: wp.array, scale_out: wp.array) -> None:
+    """Write the fixed scale of ``params[0]``, not below 0, to ``scale_out``, (1,) float32."""
+    launch(read_scale_kernel, 1, [params], [scale_out], device=params.device)
+
+
+def count_levels(
+    config: CompositeConfig,
+    params: wp.array,
+    picture: Picture,
+    layers: Layers,
+    levels_out: wp.array,
+    *,
+    rows: Rows | None = None,
+) -> None:
+    """Count how bright the receiver is under virtual light, for ``auto``.
+
+    Args:
+        config: Which layers there are; virtual light on the receiver must be among them.
+        params: (1,) FrameParams.
+        picture: (H, W) the camera's; its rays are not read.
+        layers: From ``make_layers``.
+        levels_out: (ceil(H / AUTO_STRIDE), LEVELS) int32, one row per sampled row of the frame.
+        rows: Band of rows of ``levels_out``; None means all.
+    """
+    launch_rows(
+        make_count_levels_kernel(config),
+        (levels_out.shape[0],),
+        [params, picture, layers],
+        [levels_out],
+        rows=rows,
+        device=levels_out.device,
+    )
+
+
+def adapt_scale(params: wp.array, levels: wp.array, scale_out: wp.array) -> None:
+    """Move ``scale_out``, (1,) float32, toward what ``levels`` of ``count_levels`` call for; 0 means never set."""
+    launch(adapt_scale_kernel, 1, [params, levels], [scale_out], device=params.device)
+
+
+def expose_codes(decode_table: wp.array, encode_table: wp.array, scale: wp.array, codes_out: wp.array) -> None:
+    """Write the code of every code, (256,) vec3ub, after scaling by ``scale``, (1,) float32."""
+    launch(expose_codes_kernel, 256, [decode_table, encode_table, scale], [codes_out], device=scale.device)
+
+
+def expose(
+    config: ExposeConfig,
+    params: wp.array,
+    picture: Picture,
+    layers: Layers,
+    clipped: ClippedEvidence,
+    exposure: Exposure,
+    image_out: wp.array,
+    *,
+    rows: Rows | None = None,
+) -> None:
+    """Write the picture at another exposure, layers composed.
+
+    Args:
+        config: Method, and which layers there are.
+        params: (1,) FrameParams; its rectangles bound the layers.
+        picture: (H, W) the camera's, contiguous; its rays are not read.
+        layers: From ``make_layers``.
+        clipped: From ``make_clipped_evidence``.
+        exposure: From ``make_exposure``.
+        image_out: (H, W) vec3ub, contiguous.
+        rows: Band of rows; None means all.
+    """
+    (height, width), device = image_out.shape, image_out.device
+    threads, run = row_parts(device, width)
+    launch_rows(
+        make_expose_kernel(config, by_warps(device, width)),
+        (height, threads),
+        [params, picture, layers, clipped, exposure, run],
+        [image_out],
+        rows=rows,
+        device=device,
+    )

@@ -1,0 +1,305 @@
+"""The camera's picture in coarser and coarser levels, and look-ups as wide as what a reflected ray stands for.
+
+A curved mirror shows many pixels of the frame in one of its own. Were each of its few rays to read one place, fine
+texture of the receiver would become moiré, and flicker as anything moves. So a ray carries how its origin and its
+direction change over the part of the pixel that it stands for [Ige99]. On a surface of normal n at distance t
+
+    dP = dO + t dD + dt D,    dt = -(dO + t dD).n / D.n,
+
+is what it covers along each of two axes, and the camera's projection turns that into A and B in the frame. Of the
+ellipse A A' + B B' the frame is read at up to ``MOST_TAPS`` places along the longer axis, each as wide as the shorter
+one or as the part of the longer one that it stands for, from the two levels nearest to that width.
+
+Level l has a texel for each 2^l x 2^l pixels, rows and columns rounded up: the mean of those that there are. It holds
+the picture as mirrors show it, with the shadows and the light that are virtual.
+
+References:
+    [Ige99] Igehy 1999, Tracing Ray Differentials.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.pixels import shown_radiance
+from warp_ar.kernels.rays.visibility import inside_rect
+from warp_ar.kernels.structs import FrameParams, Picture
+
+wp.set_module_options({"enable_backward": False})
+
+LAST_LEVEL = 6
+"""Coarsest level; its texels are as wide as 64 pixels."""
+LAST = wp.constant(wp.int32(LAST_LEVEL))
+MOST_TAPS = wp.constant(wp.int32(4))
+"""Places that are read along the longer axis of what a ray covers."""
+LEAST_COSINE = wp.constant(wp.float32(0.02))
+"""Between a ray and a surface that it grazes: what it covers there has no end."""
+
+
+@wp.struct
+class ReceiverLayers:
+    """What virtual objects and lights change in the picture of the receiver; empty where nothing does."""
+
+    shadow_ratio: wp.array2d[wp.vec3]  # factor on the frame
+    added: wp.array2d[wp.vec3]  # radiance of virtual light
+    levels: wp.array[wp.vec3]  # of ``shrink_frame``; empty where nothing mirrors
+
+
+@wp.struct
+class Footprint:
+    """How a ray changes over what it stands for, along two axes."""
+
+    origin_x: wp.vec3  # metres
+    origin_y: wp.vec3
+    turn_x: wp.vec3  # of its unit direction
+    turn_y: wp.vec3
+
+
+def level_size(height: int, width: int, level: int) -> tuple[int, int]:
+    """Rows and columns of a level."""
+    return -(-height >> level), -(-width >> level)
+
+
+def level_offset(height: int, width: int, level: int) -> int:
+    """Index of a level's first texel; level 0 is the frame itself."""
+    return sum(rows * columns for rows, columns in (level_size(height, width, one) for one in range(1, level)))
+
+
+def level_texels(height: int, width: int) -> int:
+    """Texels of all levels together."""
+    return level_offset(height, width, LAST_LEVEL + 1)
+
+
+@wp.func
+def rows_of(extent: wp.int32, level: wp.int32) -> wp.int32:
+    """Rows or columns of a level, of a frame of so many."""
+    return (extent + (1 << level) - 1) >> level
+
+
+@wp.func
+def start_of(height: wp.int32, width: wp.int32, level: wp.int32) -> wp.int32:
+    """Index of a level's first texel."""
+    start = wp.int32(0)
+    for below in range(1, level):
+        start += rows_of(height, below) * rows_of(width, below)
+    return start
+
+
+@wp.func
+def composed_radiance(
+    params: FrameParams, picture: Picture, layers: ReceiverLayers, i: wp.int32, j: wp.int32
+) -> wp.vec3:
+    """A pixel with the shadows and the light that are virtual."""
+    radiance = shown_radiance(picture, i, j)
+    if layers.shadow_ratio.shape[0] > 0:
+        radiance = wp.cw_mul(radiance, layers.shadow_ratio[i, j])
+    if layers.added.shape[0] > 0:
+        if inside_rect(i, j, params.light_rect):
+            radiance += layers.added[i, j]
+    return radiance
+
+
+@wp.kernel(enable_backward=False)
+def shrink_frame_kernel(
+    row_start: wp.int32,
+    # In:
+    params: wp.array[FrameParams],
+    picture: Picture,
+    layers: ReceiverLayers,
+    # Out:
+    levels_out: wp.array[wp.vec3],
+):
+    """A texel of level 2, and the four of level 1 that it is the mean of."""
+    i, j = wp.tid()
+    i += row_start
+    height = picture.rays.shape[0]
+    width = picture.rays.shape[1]
+    second = start_of(height, width, 2)
+    total = wp.vec3(0.0)
+    pixels = float(0.0)
+    # Most blocks are whole: loops of a fixed length take half the time.
+    if 4 * i + 4 <= height and 4 * j + 4 <= width:
+        for part in range(4):
+            row = 2 * i + part / 2
+            column = 2 * j + part % 2
+            own = wp.vec3(0.0)
+            for pixel in range(4):
+                own += composed_radiance(params[0], picture, layers, 2 * row + pixel / 2, 2 * column + pixel % 2)
+            levels_out[row * rows_of(width, 1) + column] = own / 4.0
+            total += own
+        pixels = 16.0
+    else:
+        for part in range(4):
+            row = 2 * i + part / 2
+            column = 2 * j + part % 2
+            own = wp.vec3(0.0)
+            count = float(0.0)
+            for y in range(2 * row, wp.min(2 * row + 2, height)):
+                for x in range(2 * column, wp.min(2 * column + 2, width)):
+                    own += composed_radiance(params[0], picture, layers, y, x)
+                    count += 1.0
+            if count > 0.0:
+                levels_out[row * rows_of(width, 1) + column] = own / count
+            total += own
+            pixels += count
+    levels_out[second + i * rows_of(width, 2) + j] = total / pixels
+
+
+@wp.func
+def pixels_of(extent: wp.int32, level: wp.int32, index: wp.int32) -> wp.float32:
+    """Pixels of the frame that a texel of a level covers along one axis; fewer at the far border."""
+    return wp.float32(wp.min((index + 1) << level, extent) - (index << level))
+
+
+@wp.kernel(enable_backward=False)
+def shrink_level_kernel(
+    row_start: wp.int32,
+    # In:
+    height: wp.int32,
+    width: wp.int32,
+    level: wp.int32,
+    # Out:
+    levels_out: wp.array[wp.vec3],
+):
+    """A texel of ``level`` from those of the level below that it covers."""
+    i, j = wp.tid()
+    i += row_start
+    start = start_of(height, width, level - 1)
+    columns = rows_of(width, level - 1)
+    total = wp.vec3(0.0)
+    pixels = float(0.0)
+    for y in range(2 * i, wp.min(2 * i + 2, rows_of(height, level - 1))):
+        for x in range(2 * j, wp.min(2 * j + 2, columns)):
+            count = pixels_of(height, level - 1, y) * pixels_of(width, level - 1, x)
+            total += count * levels_out[start + y * columns + x]
+            pixels += count
+    levels_out[start_of(height, width, level) + i * rows_of(width, level) + j] = total / pixels
+
+
+def shrink_frame(
+    params: wp.array, picture: Picture, layers: ReceiverLayers, levels_out: wp.array, *, rows: Rows | None = None
+) -> None:
+    """Write levels 1 and 2 of a picture.
+
+    Args:
+        params: (1,) FrameParams: light_rect, beyond which no virtual light is added.
+        picture: (H, W) the camera's.
+        layers: (H, W) what is virtual on the receiver.
+        levels_out: (level_texels(H, W),) vec3, linear radiance in camera values.
+        rows: Band of rows of level 2; None means all.
+    """
+    size = level_size(*picture.rays.shape, 2)
+    launch_rows(shrink_frame_kernel, size, [params, picture, layers], [levels_out], rows=rows, device=levels_out.device)
+
+
+def shrink_level(height: int, width: int, level: int, levels_out: wp.array, *, rows: Rows | None = None) -> None:
+    """Write one of the levels 3 to ``LAST_LEVEL`` from the one below.
+
+    Args:
+        height: Rows of the frame.
+        width: Columns of the frame.
+        level: Which.
+        levels_out: As in ``shrink_frame``.
+        rows: Band of rows of the level; None means all.
+    """
+    size = level_size(height, width, level)
+    launch_rows(shrink_level_kernel, size, [height, width, level], [levels_out], rows=rows, device=levels_out.device)
+
+
+@wp.func
+def sample_frame_level(
+    params: FrameParams, picture: Picture, layers: ReceiverLayers, x: wp.float32, y: wp.float32, level: wp.int32
+) -> wp.vec3:
+    """Bilinear sample of a level; x and y in pixels of the frame, places beyond the border are those at it."""
+    height = picture.rays.shape[0]
+    width = picture.rays.shape[1]
+    rows = rows_of(height, level)
+    columns = rows_of(width, level)
+    scale = 1.0 / wp.float32(1 << level)
+    u = wp.clamp((x + 0.5) * scale - 0.5, 0.0, wp.float32(columns - 1))
+    v = wp.clamp((y + 0.5) * scale - 0.5, 0.0, wp.float32(rows - 1))
+    j = wp.max(wp.min(wp.int32(u), columns - 2), 0)
+    i = wp.max(wp.min(wp.int32(v), rows - 2), 0)
+    fx = u - wp.float32(j)
+    fy = v - wp.float32(i)
+    start = start_of(height, width, level)
+    total = wp.vec3(0.0)
+    for corner in range(4):
+        a = corner / 2
+        b = corner % 2
+        weight = wp.where(a == 1, fy, 1.0 - fy) * wp.where(b == 1, fx, 1.0 - fx)
+        if weight > 0.0:
+            if level == 0:
+                total += weight * composed_radiance(params, picture, layers, i + a, j + b)
+            else:
+                total += weight * layers.levels[start + (i + a) * columns + j + b]
+    return total
+
+
+@wp.func
+def look_up_level(
+    params: FrameParams, picture: Picture, layers: ReceiverLayers, at: wp.vec2, size: wp.float32
+) -> wp.vec3:
+    """The picture around a place, as wide as ``size`` pixels, blended between two levels."""
+    level = wp.clamp(wp.log2(wp.max(size, 1.0)), 0.0, wp.float32(LAST))
+    below = wp.min(wp.int32(level), LAST - 1)
+    fraction = level - wp.float32(below)
+    # A loop, so that there is one copy of what reads a level: a ray's own code is long enough.
+    last = wp.where(fraction > 0.0, below + 1, below)
+    radiance = wp.vec3(0.0)
+    for one in range(below, last + 1):
+        sampled = sample_frame_level(params, picture, layers, at[0], at[1], one)
+        radiance = wp.where(one == below, sampled, radiance + fraction * (sampled - radiance))
+    return radiance
+
+
+@wp.func
+def covered_on(origin: wp.vec3, turn: wp.vec3, t: wp.float32, direction: wp.vec3, normal: wp.vec3) -> wp.vec3:
+    """What a ray covers of a surface that it meets at t, along one axis, as derived above."""
+    moved = origin + t * turn
+    cosine = wp.dot(direction, normal)
+    cosine = wp.where(cosine < 0.0, wp.min(cosine, -LEAST_COSINE), wp.max(cosine, LEAST_COSINE))
+    return moved - (wp.dot(moved, normal) / cosine) * direction
+
+
+@wp.func
+def shown_as(params: FrameParams, from_camera: wp.vec3, change: wp.vec3) -> wp.vec2:
+    """Pixels by which a point moves in the frame with ``change``; without the lens, whose part in it is small."""
+    p = wp.transpose(params.world_from_camera) * from_camera
+    d = wp.transpose(params.world_from_camera) * change
+    z = wp.max(p[2], 1.0e-6)
+    return wp.vec2(
+        params.focal[0] * (d[0] - d[2] * p[0] / z) / z,
+        params.focal[1] * (d[1] - d[2] * p[1] / z) / z,
+    )
+
+
+# A A' + B B' is a symmetric matrix of two rows, whose eigenvalues are the squares of the ellipse's half axes:
+# (xx + yy) / 2 +- sqrt((xx - yy)^2 / 4 + xy^2).
+@wp.func
+def look_up_covered(
+    params: FrameParams, picture: Picture, layers: ReceiverLayers, at: wp.vec2, a: wp.vec2, b: wp.vec2
+) -> wp.vec3:
+    """Mean of the picture over the parallelogram of sides ``a`` and ``b``, pixels, around a place in it."""
+    xx = a[0] * a[0] + b[0] * b[0]
+    yy = a[1] * a[1] + b[1] * b[1]
+    xy = a[0] * a[1] + b[0] * b[1]
+    middle = 0.5 * (xx + yy)
+    apart = wp.sqrt(0.25 * (xx - yy) * (xx - yy) + xy * xy)
+    longer = wp.sqrt(middle + apart)
+    # What is narrower than a pixel comes out as one place of width 1, which is read from level 0 alone.
+    shorter = wp.max(wp.sqrt(wp.max(middle - apart, 0.0)), 1.0)
+    taps = wp.clamp(wp.int32(wp.ceil(wp.min(longer / shorter, wp.float32(MOST_TAPS)))), 1, MOST_TAPS)
+    # Along the eigenvector of the larger eigenvalue; of two forms the one that does not cancel.
+    axis = wp.vec2(1.0, 0.0)
+    if apart > 0.0:
+        axis = wp.where(xx >= yy, wp.vec2(0.5 * (xx - yy) + apart, xy), wp.vec2(xy, 0.5 * (yy - xx) + apart))
+        axis = wp.normalize(axis)
+    step = wp.min(longer, 64.0 * wp.float32(MOST_TAPS)) / wp.float32(taps)
+    size = wp.max(shorter, step)
+    total = wp.vec3(0.0)
+    for tap in range(taps):
+        place = at + (step * (wp.float32(tap) - 0.5 * wp.float32(taps - 1))) * axis
+        total += look_up_level(params, picture, layers, place, size)
+    return total / wp.float32(taps)

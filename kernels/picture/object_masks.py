@@ -1,0 +1,75 @@
+"""Which virtual objects a ray through each pixel's centre meets, whatever hides them: silhouettes for data sets."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.rays.shapes import (
+    FAR,
+    intersect_box,
+    intersect_sphere,
+    meets_mesh,
+    to_local_point,
+    to_local_vector,
+)
+from warp_ar.kernels.rays.visibility import inside_rect
+from warp_ar.kernels.structs import BOX, MESH, SPHERE, FrameParams, RayScene
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel(enable_backward=False)
+def trace_object_masks_kernel(
+    row_start: wp.int32,
+    # In:
+    params: wp.array[FrameParams],
+    rays: wp.array2d[wp.vec2],
+    scene: RayScene,
+    # Out:
+    masks_out: wp.array2d[wp.uint64],
+):
+    """Every object on its own, whichever is nearest."""
+    i, j = wp.tid()
+    i += row_start
+    mask = wp.uint64(0)
+    if inside_rect(i, j, params[0].object_rect):
+        ray = rays[i, j]
+        origin = params[0].camera_position
+        direction = params[0].world_from_camera * wp.vec3(ray[0], ray[1], 1.0)
+        for index in range(scene.objects.shape[0]):
+            shape = scene.objects[index]
+            o = to_local_point(shape, origin)
+            d = to_local_vector(shape, direction)
+            met = wp.bool(False)
+            if shape.kind == SPHERE:
+                met = intersect_sphere(shape.extent[0], o, d, FAR) < FAR
+            if shape.kind == BOX:
+                met = intersect_box(shape.extent, o, d, FAR) < FAR
+            if shape.kind == MESH:
+                met = meets_mesh(shape, o, d, FAR)
+            if met:
+                mask |= wp.uint64(1) << wp.uint64(index)
+    masks_out[i, j] = mask
+
+
+def trace_object_masks(
+    params: wp.array[FrameParams],
+    rays: wp.array2d[wp.vec2],
+    scene: RayScene,
+    masks_out: wp.array2d[wp.uint64],
+    *,
+    rows: Rows | None = None,
+) -> None:
+    """Note which objects lie behind each pixel's centre.
+
+    Args:
+        params: Frame values: camera and object_rect, outside of which no object is.
+        rays: (H, W) undistorted x / z and y / z of each pixel centre.
+        scene: At most 64 objects: a pixel has a bit for each.
+        masks_out: (H, W) bit k: the ray meets object k, in front of whatever else.
+        rows: Band of rows; None means all.
+    """
+    launch_rows(
+        trace_object_masks_kernel, rays.shape, [params, rays, scene], [masks_out], rows=rows, device=rays.device
+    )

@@ -1,0 +1,110 @@
+"""The layers of the picture apart: what is laid over the frame, and the frame itself as linear radiance.
+
+    picture = encode(s ((1 - alpha) max(plate * shadow_ratio + added_light + mirror_ball, 0) + objects))
+
+with the exposure scale s (1 where the scene leaves the camera's exposure) and ``objects`` premultiplied by its coverage
+alpha. These are the numbers from which ``composite`` and ``expose`` make the picture, taken where they take them: a
+layer that does not reach a pixel is neutral there, whatever an earlier frame left in its array. ``plate`` is the frame,
+its clipped pixels as the method of ``expose`` estimates them.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import warp as wp
+
+from warp_ar.kernels.color import decode, is_clipped
+from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.picture.composite import Layers, make_read_layers
+from warp_ar.kernels.picture.expose import ClippedEvidence, ExposeConfig, make_find_gain
+from warp_ar.kernels.structs import FrameParams, Picture
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class SeparateLayers:
+    """The layers, (H, W) each; one that nobody asked for is empty."""
+
+    plate: wp.array2d[wp.vec3]  # linear radiance
+    objects: wp.array2d[wp.vec4]  # premultiplied linear radiance and coverage
+    shadow_ratio: wp.array2d[wp.vec3]  # factor on the plate
+    added_light: wp.array2d[wp.vec3]  # linear radiance
+    mirror_ball: wp.array2d[wp.vec3]  # change of linear radiance, of either sign
+
+
+@functools.cache
+def make_separate_layers_kernel(config: ExposeConfig) -> wp.Kernel:
+    """Kernel specialised to which layers there are and how clipped pixels are estimated; equal configs share one."""
+    read_layers = make_read_layers(config.layers)
+    find_gain = make_find_gain(config.method)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def separate_layers_kernel(
+        # In:
+        row_start: wp.int32,
+        params: wp.array[FrameParams],
+        picture: Picture,
+        layers: Layers,
+        clipped: ClippedEvidence,
+        scale: wp.array[wp.float32],
+        # Out:
+        out: SeparateLayers,
+    ):
+        i, j = wp.tid()
+        i += row_start
+        if out.plate.shape[0] > 0:
+            code = picture.frame[i, j]
+            s = float(1.0)
+            if scale.shape[0] > 0:
+                s = scale[0]
+            radiance = find_gain(code, i, j, clipped, s) * decode(picture.decode_table, code)
+            if wp.static(config.method == "declipped"):
+                if s < 1.0 and wp.max(is_clipped(code)) > 0.0:
+                    radiance = clipped.declipped[i, j]
+            out.plate[i, j] = radiance
+        at = read_layers(params, layers, i, j)
+        if out.objects.shape[0] > 0:
+            out.objects[i, j] = at.objects
+        if out.shadow_ratio.shape[0] > 0:
+            out.shadow_ratio[i, j] = at.ratio
+        if out.added_light.shape[0] > 0:
+            out.added_light[i, j] = at.added
+        if out.mirror_ball.shape[0] > 0:
+            out.mirror_ball[i, j] = at.mirror_ball
+
+    return separate_layers_kernel
+
+
+def separate_layers(
+    config: ExposeConfig,
+    params: wp.array,
+    picture: Picture,
+    layers: Layers,
+    clipped: ClippedEvidence,
+    scale: wp.array | None,
+    out: SeparateLayers,
+    *,
+    rows: Rows | None = None,
+) -> None:
+    """Write every layer that has an array in ``out``.
+
+    Args:
+        config: How ``expose`` estimates clipped pixels (``plain`` where it does not run), and which layers there are.
+        params: (1,) FrameParams; its rectangles bound the layers.
+        picture: (H, W) the camera's; its rays are not read.
+        layers: From ``composite.make_layers``.
+        clipped: From ``expose.make_clipped_evidence``.
+        scale: (1,) float32, the exposure scale; None means 1.
+        out: (H, W) arrays of the layers that are asked for.
+        rows: Band of rows; None means all.
+    """
+    launch_rows(
+        make_separate_layers_kernel(config),
+        picture.frame.shape,
+        [params, picture, layers, clipped, scale],
+        [out],
+        rows=rows,
+        device=picture.frame.device,
+    )

@@ -1,0 +1,1 @@
+"""Rays against shapes and meshes, and how their directions are drawn."""

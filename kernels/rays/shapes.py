@@ -1,0 +1,260 @@
+"""Where a ray meets one shape: a sphere, a box, a plane or a mesh, in the shape's own coordinates.
+
+Spheres, boxes and planes are intersected analytically, meshes through a BVH in local space: Warp's own on CUDA
+(``kernels/rays/mesh_walk.py``), one of eight children per node on CPU (``kernels/rays/wide_bvh.py``). Ray parameters
+``t`` are in
+multiples of the direction's length, which need not be 1; every test accepts 0 < t < t_max.
+
+References:
+    [WBW13] Woop, Benthin, Wald, "Watertight Ray/Triangle Intersection", JCGT 2(1), 2013.
+    [Ize13] Ize, "Robust BVH Ray Traversal", JCGT 2(2), 2013.
+    [HHO19] Haines, Guenther, Akenine-Moeller, "Precision Improvements for Ray/Sphere Intersection", Ray Tracing Gems
+    ch. 7, 2019.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from warp_ar.kernels.rays.mesh_walk import find_closest_face, meets_any_face
+from warp_ar.kernels.rays.wide_bvh import walk_any, walk_closest
+from warp_ar.kernels.structs import BOX, MESH, Shape
+
+wp.set_module_options({"enable_backward": False})
+
+FACES = wp.constant(8)
+"""Numbers of ``surface_key`` per shape."""
+MESH_KEY = wp.constant(7)
+"""``surface_key`` modulo ``FACES`` of a mesh."""
+# Half the spacing of float32 at 1: the relative error of one rounding.
+ROUNDING = wp.constant(wp.float32(2.0**-24))
+FAR = wp.constant(wp.float32(3.0e38))
+
+
+@wp.struct
+class Contact:
+    """Where a ray meets one shape."""
+
+    t: wp.float32  # FAR: not at all
+    face: wp.int32  # of a mesh
+    u: wp.float32  # barycentric weights of the face's first and second corner
+    v: wp.float32
+
+
+@wp.func
+def to_rigid_point(shape: Shape, point: wp.vec3) -> wp.vec3:
+    """World point in the coordinates of a shape that is not stretched."""
+    return wp.transpose(shape.rotation) * (point - shape.position) / shape.scale
+
+
+@wp.func
+def to_rigid_vector(shape: Shape, direction: wp.vec3) -> wp.vec3:
+    """World direction in the coordinates of a shape that is not stretched; as ``to_local_vector``."""
+    return wp.transpose(shape.rotation) * direction / shape.scale
+
+
+@wp.func
+def to_local_point(shape: Shape, point: wp.vec3) -> wp.vec3:
+    """World point in the shape's coordinates."""
+    if shape.stretch != 0.0:
+        return shape.inverse * (point - shape.position) / shape.scale
+    return to_rigid_point(shape, point)
+
+
+@wp.func
+def to_local_vector(shape: Shape, direction: wp.vec3) -> wp.vec3:
+    """World direction in the shape's coordinates, divided by the scale so that t keeps its meaning."""
+    if shape.stretch != 0.0:
+        return shape.inverse * direction / shape.scale
+    return to_rigid_vector(shape, direction)
+
+
+@wp.func
+def to_world_normal(shape: Shape, normal: wp.vec3) -> wp.vec3:
+    """Unit normal of the shape in the world: normals go by the inverse's transpose."""
+    if shape.stretch != 0.0:
+        return wp.normalize(wp.transpose(shape.inverse) * normal)
+    return shape.rotation * normal
+
+
+@wp.func
+def to_rigid_normal(shape: Shape, normal: wp.vec3) -> wp.vec3:
+    """Unit normal of a shape that is not stretched in the world."""
+    return shape.rotation * normal
+
+
+@wp.func
+def intersect_sphere(radius: wp.float32, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.float32:
+    """Smallest t on a sphere around the origin, FAR if none.
+
+    The discriminant is r^2 - |closest point|^2, not b^2 - ac, and the roots are q / a and c / q: neither cancels
+    [HHO19].
+    """
+    a = wp.dot(direction, direction)
+    b = -wp.dot(origin, direction)
+    nearest = origin + (b / a) * direction
+    discriminant = radius * radius - wp.dot(nearest, nearest)
+    if discriminant < 0.0:
+        return FAR
+    distance = wp.length(origin)
+    c = (distance - radius) * (distance + radius)
+    q = b + wp.where(b < 0.0, -1.0, 1.0) * wp.sqrt(a * discriminant)
+    t0 = q / a
+    t1 = t0
+    if q != 0.0:
+        t1 = c / q
+    near = wp.min(t0, t1)
+    if near <= 0.0:
+        near = wp.max(t0, t1)
+    return wp.where(near > 0.0 and near < t_max, near, FAR)
+
+
+@wp.func
+def intersect_box(half: wp.vec3, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.float32:
+    """Smallest t on a box around the origin, FAR if none; a ray along a face counts as inside, never as 0 * inf."""
+    t_near = -FAR
+    t_far = FAR
+    for axis in range(3):
+        if direction[axis] == 0.0:
+            if wp.abs(origin[axis]) > half[axis]:
+                return FAR
+        else:
+            inverse = 1.0 / direction[axis]
+            t0 = (-half[axis] - origin[axis]) * inverse
+            t1 = (half[axis] - origin[axis]) * inverse
+            t_near = wp.max(t_near, wp.min(t0, t1))
+            t_far = wp.min(t_far, wp.max(t0, t1))
+    if t_near > t_far:
+        return FAR
+    t = wp.where(t_near > 0.0, t_near, t_far)
+    return wp.where(t > 0.0 and t < t_max, t, FAR)
+
+
+@wp.func
+def intersect_plane(half: wp.vec3, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.float32:
+    """T on the rectangle |x| <= half.x, |y| <= half.y of the plane z = 0, from either side; FAR if none."""
+    if direction[2] == 0.0:
+        return FAR
+    t = -origin[2] / direction[2]
+    x = origin[0] + t * direction[0]
+    y = origin[1] + t * direction[1]
+    return wp.where(t > 0.0 and t < t_max and wp.abs(x) <= half[0] and wp.abs(y) <= half[1], t, FAR)
+
+
+@wp.func
+def enter_mesh(half: wp.vec3, origin: wp.vec3, direction: wp.vec3) -> wp.float32:
+    """T at which a ray enters the bounding sphere of a mesh, 0 if it starts inside, FAR if it passes by."""
+    a = wp.dot(direction, direction)
+    b = -wp.dot(origin, direction)
+    nearest = origin + (b / a) * direction
+    # A little more than the radius: covers the rounding of `nearest`, which grows with the origin's distance.
+    radius = 1.001 * wp.length(half) + 8.0 * ROUNDING * wp.length(origin)
+    discriminant = radius * radius - wp.dot(nearest, nearest)
+    if discriminant < 0.0:
+        return FAR
+    reach = wp.sqrt(a * discriminant)
+    if b + reach < 0.0:
+        return FAR
+    return wp.max((b - reach) / a, 0.0)
+
+
+# No ray may slip through the shared edge of two triangles. The test of a triangle is watertight [WBW13], Warp's
+# test of a node's box is not: it neither widens the interval by the rounding of its products [Ize13] nor leaves a
+# margin around triangles, and so loses rays that run through edges which are box faces as well.
+# ``warp_ar.scene.ray_mesh.make_ray_mesh`` therefore builds the BVH over boxes that are larger by 2^-18 of the mesh's
+# radius than their triangles. That margin covers the rounding 2 * 3 * 2^-24 * |box - origin| of a slab's two bounds, if
+# the origin is near; ``intersect_mesh`` first moves it to the mesh's bounding sphere, after which |box - origin| is at
+# most two radii.
+@wp.func
+def intersect_mesh(shape: Shape, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> Contact:
+    """Closest face of a mesh from either side; watertight, see above."""
+    contact = Contact()
+    contact.t = FAR
+    start = enter_mesh(shape.extent, origin, direction)
+    if start < t_max:
+        entry = origin + start * direction
+        near = wp.vec4(0.0)  # no ternary: in a kernel it takes both walks
+        if shape.tree != wp.uint64(0):
+            near = walk_closest(shape.tree, entry, direction, t_max - start)
+        else:
+            near = find_closest_face(shape.mesh, entry, direction, t_max - start)
+        contact.face = wp.cast(near[3], wp.int32)
+        if contact.face >= 0:
+            contact.t = start + near[0]
+            contact.u = near[1]
+            contact.v = near[2]
+    return contact
+
+
+@wp.func
+def meets_mesh(shape: Shape, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
+    """Whether any face of a mesh lies before t_max."""
+    start = enter_mesh(shape.extent, origin, direction)
+    if start >= t_max:
+        return False
+    entry = origin + start * direction
+    if shape.tree != wp.uint64(0):
+        return walk_any(shape.tree, entry, direction, t_max - start)
+    return meets_any_face(shape.mesh, entry, direction, t_max - start)
+
+
+@wp.func
+def box_normal(half: wp.vec3, point: wp.vec3) -> wp.vec3:
+    """Outward normal of the face that a point on a box is nearest to."""
+    x = wp.abs(point[0]) - half[0]
+    y = wp.abs(point[1]) - half[1]
+    z = wp.abs(point[2]) - half[2]
+    if x >= y and x >= z:
+        return wp.vec3(wp.where(point[0] < 0.0, -1.0, 1.0), 0.0, 0.0)
+    if y >= z:
+        return wp.vec3(0.0, wp.where(point[1] < 0.0, -1.0, 1.0), 0.0)
+    return wp.vec3(0.0, 0.0, wp.where(point[2] < 0.0, -1.0, 1.0))
+
+
+@wp.func
+def box_uv(half: wp.vec3, normal: wp.vec3, point: wp.vec3) -> wp.vec2:
+    """Texture coordinates 0..1 on each face: u and v run along the next two axes, mirrored in u on negative faces."""
+    p = wp.cw_div(point, half)
+    if normal[0] != 0.0:
+        return wp.vec2(0.5 + 0.5 * normal[0] * p[1], 0.5 + 0.5 * p[2])
+    if normal[1] != 0.0:
+        return wp.vec2(0.5 + 0.5 * normal[1] * p[2], 0.5 + 0.5 * p[0])
+    return wp.vec2(0.5 + 0.5 * normal[2] * p[0], 0.5 + 0.5 * p[1])
+
+
+@wp.func
+def onto_box(half: wp.vec3, normal: wp.vec3, point: wp.vec3) -> wp.vec3:
+    """A point near a box put onto the face of that normal."""
+    return wp.vec3(
+        wp.where(normal[0] != 0.0, normal[0] * half[0], point[0]),
+        wp.where(normal[1] != 0.0, normal[1] * half[1], point[1]),
+        wp.where(normal[2] != 0.0, normal[2] * half[2], point[2]),
+    )
+
+
+@wp.func
+def plane_uv(half: wp.vec3, point: wp.vec3) -> wp.vec2:
+    """Texture coordinates 0..1 on a plane."""
+    return wp.vec2(0.5 + 0.5 * point[0] / half[0], 0.5 + 0.5 * point[1] / half[1])
+
+
+@wp.func
+def sphere_uv(normal: wp.vec3) -> wp.vec2:
+    """Texture coordinates of a sphere: u runs as a latlong map's columns, v from -z to +z."""
+    phi = wp.atan2(normal[1], normal[0])
+    theta = wp.atan2(wp.sqrt(normal[0] * normal[0] + normal[1] * normal[1]), normal[2])
+    return wp.vec2(0.5 + phi / (2.0 * wp.pi), 1.0 - theta / wp.pi)
+
+
+@wp.func
+def surface_key(shape: Shape, index: wp.int32, geometric_normal: wp.vec3) -> wp.int32:
+    """Number that points on one flat surface share: the shape's ``index``, and the face of a box."""
+    key = FACES * index
+    if shape.kind == MESH:
+        key += MESH_KEY
+    if shape.kind == BOX:
+        local = wp.transpose(shape.rotation) * geometric_normal
+        for axis in range(3):
+            if wp.abs(local[axis]) > 0.7:
+                key += 2 * axis + wp.where(local[axis] > 0.0, 1, 0)
+    return key

@@ -1,0 +1,184 @@
+"""Primary rays: which object and which proxy each pixel of a frame shows, and where its samples look.
+
+``trace_pixels`` writes the objects that pixels show. Stages that ask for more per pixel use ``make_visible_proxy`` (the
+surface) and ``make_sample_direction`` (samples within a pixel). ``kernels/rays/trace.py`` walks the scene.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import warp as wp
+
+from warp_ar.kernels.launch import QUICK_TO_COMPILE, Rows, launch_rows
+from warp_ar.kernels.pixel_order import own_pixel
+from warp_ar.kernels.rays.shapes import FAR, ROUNDING
+from warp_ar.kernels.rays.trace import TraceConfig, make_trace, meets_probe
+from warp_ar.kernels.structs import FrameParams, Hit, Probe, RayScene
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class VisibleObjects:
+    """The virtual objects that pixels show."""
+
+    objects: wp.array2d[wp.int32]  # index of the object; -1 where there is none
+    hits: wp.array2d[Hit]  # defined only where there is an object
+
+
+@wp.func
+def inside_rect(row: wp.int32, column: wp.int32, rect: wp.vec4i) -> wp.bool:
+    """Whether a pixel lies in a rectangle (row_start, row_stop, column_start, column_stop)."""
+    return row >= rect[0] and row < rect[1] and column >= rect[2] and column < rect[3]
+
+
+@functools.cache
+def make_primary(config: TraceConfig) -> wp.Function:
+    """``closest_visible(scene, origin, direction) -> Hit``: the closest object if no proxy hides it, else shape -1."""
+    trace = make_trace(config)
+    closest_object, occluded_by_proxies = trace.closest_object, trace.occluded_by_proxies
+
+    @wp.func(module="unique")
+    def closest_visible(scene: RayScene, origin: wp.vec3, direction: wp.vec3) -> Hit:
+        hit = closest_object(scene, origin, direction, FAR)
+        if wp.static(len(config.proxies) > 0):
+            if hit.shape >= 0:
+                # Where object and proxy touch, the object is seen: both depths carry a few roundings.
+                if occluded_by_proxies(scene, origin, direction, hit.t * (1.0 - 16.0 * ROUNDING)):
+                    hit.shape = -1
+        return hit
+
+    return closest_visible
+
+
+@functools.cache
+def make_visible_proxy(config: TraceConfig, probes: bool) -> wp.Function:
+    """``visible_proxy(params, ray, scene, probes) -> Hit``: the proxy that a pixel shows, or shape -1.
+
+    A face that is seen from behind, or a mirror ball before it, is not what the camera sees of it.
+    """
+    closest_proxy = make_trace(config).closest_proxy
+
+    @wp.func(module="unique")
+    def visible_proxy(params: FrameParams, ray: wp.vec2, scene: RayScene, balls: wp.array[Probe]) -> Hit:
+        direction = params.world_from_camera * wp.vec3(ray[0], ray[1], 1.0)
+        hit = closest_proxy(scene, params.camera_position, direction, FAR)
+        if hit.shape >= 0:
+            if wp.dot(hit.geometric_normal, direction) >= 0.0:
+                hit.shape = -1
+            if wp.static(probes):
+                if meets_probe(balls, params.camera_position, direction, hit.t):
+                    hit.shape = -1
+        return hit
+
+    return visible_proxy
+
+
+def check_edge_samples(count: int) -> None:
+    """Raise an error unless ``make_sample_direction`` can place so many samples.
+
+    Raises:
+        ValueError: It is no square number.
+    """
+    if count < 1 or math.isqrt(count) ** 2 != count:
+        raise ValueError(f"edge_samples is {count}; expected a square number such as 1, 4 or 16")
+
+
+@wp.func
+def look_within_pixel(params: wp.array[FrameParams], ray: wp.vec2, sample: wp.int32, side: wp.int32) -> wp.vec3:
+    """Where one of a pixel's ``side**2`` samples looks in the world, not unit; a single one through its centre."""
+    inner = wp.vec3(ray[0], ray[1], 1.0)
+    if side > 1:
+        step = 1.0 / wp.float32(side)
+        a = wp.float32(sample % side)
+        b = wp.float32(sample / side)
+        inner[0] += ((a + (b + 0.5) * step) * step - 0.5) / params[0].focal[0]
+        inner[1] += ((b + 1.0 - (a + 0.5) * step) * step - 0.5) / params[0].focal[1]
+    return params[0].world_from_camera * inner
+
+
+@functools.cache
+def make_sample_direction(count: int) -> wp.Function:
+    """``sample_direction(params, ray, sample) -> vec3``: where a pixel's sample looks in the world, not unit.
+
+    Args:
+        count: Samples of a pixel, a square number; the only one is at the centre.
+    """
+    side = math.isqrt(count)
+
+    @wp.func(module="unique")
+    def sample_direction(params: wp.array[FrameParams], ray: wp.vec2, sample: wp.int32) -> wp.vec3:
+        return look_within_pixel(params, ray, sample, wp.static(side))
+
+    return sample_direction
+
+
+def make_visible(objects: wp.array, hits: wp.array) -> VisibleObjects:
+    """The arrays of ``trace_pixels`` together."""
+    visible = VisibleObjects()
+    visible.objects, visible.hits = objects, hits
+    return visible
+
+
+@functools.cache
+def make_trace_pixels_kernel(config: TraceConfig) -> wp.Kernel:
+    """Kernel of ``trace_pixels``, specialised to the kinds of shape that exist."""
+    closest_visible = make_primary(config)
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=QUICK_TO_COMPILE)
+    def trace_pixels_kernel(
+        row_start: wp.int32,
+        # In:
+        params: wp.array[FrameParams],
+        rays: wp.array2d[wp.vec2],
+        scene: RayScene,
+        # Out:
+        visible_out: VisibleObjects,
+    ):
+        i, j = wp.tid()
+        pixel = own_pixel(i, j, row_start, params[0].object_rect, rays.shape[0], rays.shape[1])
+        i = pixel[0]
+        j = pixel[1]
+        found = wp.int32(-1)
+        if inside_rect(i, j, params[0].object_rect):
+            ray = rays[i, j]
+            direction = params[0].world_from_camera * wp.vec3(ray[0], ray[1], 1.0)
+            hit = closest_visible(scene, params[0].camera_position, direction)
+            if hit.shape >= 0:
+                found = hit.shape
+                visible_out.hits[i, j] = hit
+        visible_out.objects[i, j] = found
+
+    return trace_pixels_kernel
+
+
+def trace_pixels(
+    config: TraceConfig,
+    params: wp.array[FrameParams],
+    rays: wp.array2d[wp.vec2],
+    scene: RayScene,
+    visible_out: VisibleObjects,
+    *,
+    rows: Rows | None = None,
+) -> None:
+    """Trace a ray through the centre of every pixel of ``params.object_rect``.
+
+    Args:
+        config: Kinds of shape in ``scene``.
+        params: Frame values: camera and object_rect.
+        rays: (H, W) undistorted x / z and y / z of each pixel centre.
+        scene: What rays meet.
+        visible_out: (H, W) the objects and hits.
+        rows: Band of rows; None means all.
+    """
+    launch_rows(
+        make_trace_pixels_kernel(config),
+        rays.shape,
+        [params, rays, scene],
+        [visible_out],
+        rows=rows,
+        device=rays.device,
+        rectangle_first=True,
+    )

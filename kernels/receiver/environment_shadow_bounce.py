@@ -1,0 +1,353 @@
+"""What virtual objects send to the receiver along a ray that met them: an estimate without a ray, or one by rays.
+
+What a ray meets is not black. Either a ray finds out (``traced``): an object reflects one of its two lobes,
+picked by their reflectance. Its rough lobe gives albedo E(n) / pi, times what a ray into it meets: nothing, 1; an
+object, that object's own colour; the receiver, 1 if a ray from there leaves the scene, else a share of the object's
+reflectance, so that light dies out between an object and the ground that it stands on, the slower the whiter the
+object. Its glossy lobe gives what is in the mirror direction.
+
+Or it is an estimate without a ray (``estimated``). Both lobes reflect the distant environment, whose part behind the
+cell's own surface is that surface: the receiver. Let h be the share of the light that objects hide, u what they send of
+the environment before the cell's surface, d of the receiver if it were not shaded. The receiver that they see is near
+the cell and shaded as it is, so the ratio r is that of
+
+    r = 1 - h + u + d r,    r = (1 - h + u) / (1 - d)
+
+with all the light that goes to and fro between an object and the ground: white objects in a white environment (u + d =
+h) leave it as it is, black ones give 1 - h, and where nothing but the ground is seen (u = 0, h = 1) all is dark.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import warp as wp
+
+from warp_ar.kernels.environment.lobes import level_from_alpha
+from warp_ar.kernels.materials import lobe_axis, make_surface, reflect
+from warp_ar.kernels.objects.reflect import (
+    RAY_SPREAD,
+    DistantLight,
+    DistantLightConfig,
+    knows_irradiance,
+    knows_levels,
+    look_up,
+    make_captured_along,
+    make_distant_irradiance,
+    make_find_in_frame,
+    make_radiance_along,
+    make_reflected_radiance,
+    make_shade_unoccluded,
+)
+from warp_ar.kernels.rays.shapes import FAR
+from warp_ar.kernels.rays.trace import make_trace, offset_origin
+from warp_ar.kernels.sampling import frame_from_normal, sample_cosine_hemisphere, uniform_from_bits
+from warp_ar.kernels.structs import SPHERE, FrameParams, Hit, Picture, RayScene, Shape
+
+wp.set_module_options({"enable_backward": False})
+
+CAUSTIC_ALPHA = wp.constant(wp.float32(0.35))
+"""Least width of an object's lobe as the receiver sees it, near the object.
+
+A mirror's image of an emitter on the receiver is too fine for the few rays that look for it: it would come out as
+specks. This blurs it to what they can carry, and keeps its energy. From afar fewer rays meet the object and each stands
+for more of what it shows: the width grows as the distance over the object's size.
+"""
+MAX_BRIGHTNESS = wp.constant(wp.float32(2.0))
+"""Largest radiance of an object, estimated, over the mean of what its surroundings send to the cell's surface.
+
+The sides of objects are dark beside a top that an emitter lights, and few samples show them: a brighter object is
+specks.
+"""
+FURTHER = wp.constant(wp.float32(0.5))
+"""Light of an object close above the receiver, over that in the open: half of what it sees is its own shadow."""
+
+
+@wp.func
+def bounding_radius(shape: Shape) -> wp.float32:
+    """Radius of a sphere around a shape's position that holds it, metres."""
+    if shape.kind == SPHERE:
+        return shape.scale * shape.extent[0]
+    return shape.scale * wp.length(shape.extent)
+
+
+@wp.func
+def caustic_alpha(shape: Shape, point: wp.vec3) -> wp.float32:
+    """Least width of the lobe of an object as a point of the receiver sees it."""
+    return wp.clamp(CAUSTIC_ALPHA * wp.length(shape.position - point) / bounding_radius(shape), CAUSTIC_ALPHA, 1.0)
+
+
+@wp.struct
+class Sent:
+    """What an object reflects along a ray."""
+
+    distant: wp.vec3  # radiance that it has from the environment
+    receiver: wp.vec3  # radiance that it would have from a receiver without shadows
+    emitted: wp.vec3  # radiance of its own
+
+
+@functools.cache
+def make_look_wide(config: DistantLightConfig) -> wp.Function:
+    """``look_wide(environment, point, direction) -> vec3``: the environment around a direction, as few rays carry it.
+
+    Emitters are where the balls saw them.
+    """
+    unplaced = dataclasses.replace(config, emitters=False)
+    distant_irradiance, radiance_along = make_distant_irradiance(unplaced), make_radiance_along(unplaced)
+
+    @wp.func(module="unique")
+    def look_wide(distant: DistantLight, point: wp.vec3, direction: wp.vec3) -> wp.vec3:
+        radiance = wp.vec3(0.0)
+        if wp.static(config.diffuse != "none"):
+            if knows_irradiance(distant) and not knows_levels(distant):
+                radiance = distant_irradiance(distant, point, direction) / wp.pi
+        if wp.static(config.specular):
+            if knows_levels(distant):
+                level = level_from_alpha(CAUSTIC_ALPHA, distant.level_height)
+                radiance = radiance_along(distant, point, direction, level)
+        return radiance
+
+    return look_wide
+
+
+@functools.cache
+def make_estimated(config: DistantLightConfig) -> wp.Function:
+    """``estimated(scene, environment, hit, direction, alpha, up, from_receiver) -> Sent``.
+
+    What an object sends back along a ray that met it at ``hit``, without a further ray: both lobes of the distant
+    environment, the glossy one ``alpha`` wide or more. What lies below ``up`` is the receiver; ``from_receiver`` is the
+    irradiance that a surface above it has from there.
+    """
+    surface_at = make_surface(config.models, config.textures)
+    reflected_radiance = make_reflected_radiance(config)
+    distant_irradiance = make_distant_irradiance(config)
+
+    @wp.func(module="unique")
+    def estimated(
+        scene: RayScene,
+        distant: DistantLight,
+        hit: Hit,
+        direction: wp.vec3,
+        alpha: wp.float32,
+        up: wp.vec3,
+        from_receiver: wp.vec3,
+    ) -> Sent:
+        wo = -direction
+        normal = hit.normal
+        if wp.dot(hit.geometric_normal, wo) < 0.0:
+            normal = -normal
+        cosine = wp.max(wp.dot(normal, wo), 0.0)
+        surface = surface_at(scene, distant.dfg, hit, cosine, RAY_SPREAD)
+        sent = Sent()
+        if wp.static(config.textures and config.gathered):
+            sent.emitted = surface.emission
+        if wp.static(config.diffuse != "none"):
+            irradiance = distant_irradiance(distant, hit.point, normal)
+            if wp.static(config.textures):
+                irradiance *= surface.occlusion
+            # A surface sees (1 - n.up) / 2 of what an even receiver sends to one that faces it.
+            received = wp.min(0.5 * (1.0 - wp.dot(normal, up)) * from_receiver, irradiance)
+            sent.receiver = wp.cw_mul(surface.diffuse, received) / wp.pi
+            sent.distant = wp.cw_mul(surface.diffuse, irradiance - received) / wp.pi
+        if wp.static(config.specular):
+            if knows_levels(distant):
+                wi = lobe_axis(surface, reflect(wo, normal), normal)
+                floor = level_from_alpha(alpha, distant.level_height)
+                reflected = reflected_radiance(
+                    distant, surface.model, surface.roughness, surface.shininess, hit.point, wi, floor
+                )
+                radiance = wp.cw_mul(surface.reflectance, reflected)
+                share = wp.clamp(0.5 - 0.5 * wp.dot(wi, up) / CAUSTIC_ALPHA, 0.0, 1.0)
+                sent.receiver += share * radiance
+                sent.distant += (1.0 - share) * radiance
+        return sent
+
+    return estimated
+
+
+@functools.cache
+def make_bounced(config: DistantLightConfig) -> wp.Function:
+    """``bounced(params, picture, scene, environment, hit, direction, alpha, seed) -> vec3``.
+
+    Radiance that an object sends back along a ray that met it at ``hit``: one lobe, the glossy one ``alpha`` wide or
+    more, one ray; a Monte-Carlo estimate.
+    """
+    trace = make_trace(config.trace)
+    closest_object, closest_proxy, occluded_by_objects = (
+        trace.closest_object,
+        trace.closest_proxy,
+        trace.occluded_by_objects,
+    )
+    surface_at = make_surface(config.models, config.textures)
+    find_in_frame = make_find_in_frame(config.trace, config.probes)
+    shade_unoccluded = make_shade_unoccluded(config)
+    reflected_radiance = make_reflected_radiance(config)
+    distant_irradiance, captured_along = make_distant_irradiance(config), make_captured_along(config)
+
+    @wp.func(module="unique")
+    def bounced(
+        params: FrameParams,
+        picture: Picture,
+        scene: RayScene,
+        distant: DistantLight,
+        hit: Hit,
+        direction: wp.vec3,
+        alpha: wp.float32,
+        seed: wp.vec3ui,
+    ) -> wp.vec3:
+        wo = -direction
+        normal = hit.normal
+        geometric = hit.geometric_normal
+        if wp.dot(geometric, wo) < 0.0:
+            normal = -normal
+            geometric = -geometric
+        surface = surface_at(scene, distant.dfg, hit, wp.max(wp.dot(normal, wo), 0.0), RAY_SPREAD)
+        emitted = wp.vec3(0.0)
+        if wp.static(config.textures and config.gathered):
+            emitted = surface.emission
+        rough = surface.diffuse[0] + surface.diffuse[1] + surface.diffuse[2]
+        glossy = surface.reflectance[0] + surface.reflectance[1] + surface.reflectance[2]
+        if wp.static(config.diffuse == "none") or not knows_irradiance(distant):
+            rough = float(0.0)
+        if wp.static(not config.specular) or not knows_levels(distant):
+            glossy = float(0.0)
+        if rough + glossy <= 0.0:
+            return emitted
+        rough_share = rough / (rough + glossy)
+        u = wp.vec2(uniform_from_bits(seed[0]), uniform_from_bits(seed[1]))
+        is_rough = uniform_from_bits(seed[2]) < rough_share
+        weight = surface.reflectance / wp.max(1.0 - rough_share, 1.0e-6)
+        wi = reflect(wo, normal)
+        if is_rough:
+            weight = surface.diffuse / rough_share
+            wi = frame_from_normal(normal) * sample_cosine_hemisphere(u)
+        if wp.dot(wi, geometric) <= 0.0:
+            return emitted
+
+        received = wp.vec3(0.0)
+        origin = offset_origin(hit.point, geometric, wi, hit.error)
+        other = closest_object(scene, origin, wi, FAR)
+        proxy = closest_proxy(scene, origin, wi, other.t)
+        if is_rough and (proxy.shape >= 0 or other.shape < 0):
+            received = distant_irradiance(distant, hit.point, normal) / wp.pi
+        if proxy.shape >= 0:
+            # Light of the receiver, as far as a ray from there leaves the scene.
+            up = proxy.geometric_normal
+            if wp.dot(up, wi) > 0.0:
+                up = -up
+            leaving = frame_from_normal(up) * sample_cosine_hemisphere(wp.vec2(u[1], u[0]))
+            start = offset_origin(proxy.point, up, leaving, proxy.error)
+            if not is_rough:
+                at = find_in_frame(params, picture, scene, distant.probes, proxy)
+                if at[0] >= 0.0:  # noqa: SIM108  (a conditional expression computes both)
+                    received = look_up(picture, at[0], at[1])
+                else:
+                    received = captured_along(distant, proxy.point, wi)
+            if occluded_by_objects(scene, start, leaving, FAR):
+                received = wp.cw_mul(received, FURTHER * (surface.diffuse + surface.reflectance))
+        elif other.shape >= 0:
+            received = shade_unoccluded(scene, distant, other, wi, RAY_SPREAD)
+        elif not is_rough:
+            if wp.static(config.specular):
+                floor = level_from_alpha(alpha, distant.level_height)
+                received = reflected_radiance(
+                    distant, surface.model, surface.roughness, surface.shininess, hit.point, wi, floor
+                )
+        if wp.static(config.textures):
+            return wp.cw_mul(weight, received) + emitted
+        return wp.cw_mul(weight, received)
+
+    return bounced
+
+
+@wp.struct
+class Before:
+    """What lies before a cell's surface, for ``estimated``."""
+
+    up: wp.vec3  # the surface's normal, on the side that light comes from
+    from_receiver: wp.vec3  # irradiance that a surface above it has from below
+    brightest: wp.float32  # largest radiance that an object is believed to have
+
+
+@functools.cache
+def make_look_before(config: DistantLightConfig) -> wp.Function:
+    """``look_before(environment, point, normal, direction) -> Before``: of a surface that ``direction`` leaves."""
+    look_wide = make_look_wide(config)
+    distant_irradiance = make_distant_irradiance(dataclasses.replace(config, emitters=False))
+
+    @wp.func(module="unique")
+    def look_before(distant: DistantLight, point: wp.vec3, normal: wp.vec3, direction: wp.vec3) -> Before:
+        before = Before()
+        before.up = normal
+        if wp.dot(normal, direction) < 0.0:
+            before.up = -normal
+        before.brightest = MAX_BRIGHTNESS * wp.max(look_wide(distant, point, before.up))
+        if wp.static(config.diffuse != "none"):
+            if knows_irradiance(distant):
+                before.from_receiver = distant_irradiance(distant, point, -before.up)
+                upward = distant_irradiance(distant, point, before.up)
+                before.brightest = MAX_BRIGHTNESS * wp.max(upward) / wp.pi
+        return before
+
+    return look_before
+
+
+@wp.struct
+class Meeting:
+    """Where a ray from the receiver met an object, and how much light from there counts."""
+
+    hit: Hit
+    direction: wp.vec3
+    alpha: wp.float32  # least width of the object's lobe
+    stands_for: wp.float32  # weight of its radiance, which is that of several samples where one ray stands for them
+
+
+@wp.struct
+class ReflectedLight:
+    """What objects send to a point of the receiver, times its weight."""
+
+    sent: wp.vec3  # of the environment
+    returned: wp.vec3  # of what the receiver sent them
+
+
+@functools.cache
+def make_reflect_back(config: DistantLightConfig, traced: bool) -> wp.Function:
+    """``reflect_back(params, picture, scene, distant, meeting, before, seed, so_far) -> ReflectedLight``.
+
+    Adds what an object sends back to what others do: found by another ray if ``traced``, else estimated from what lies
+    ``before`` the receiver, of which nothing is believed to be brighter than ``before.brightest``.
+    """
+    bounced = make_bounced(config) if traced else None
+    estimated = None if traced else make_estimated(config)
+
+    @wp.func(module="unique")
+    def reflect_back(
+        params: FrameParams,
+        picture: Picture,
+        scene: RayScene,
+        distant: DistantLight,
+        meeting: Meeting,
+        before: Before,
+        seed: wp.vec3ui,
+        so_far: ReflectedLight,
+    ) -> ReflectedLight:
+        out = so_far
+        weight = meeting.stands_for
+        if wp.static(traced):
+            out.sent += weight * bounced(
+                params, picture, scene, distant, meeting.hit, meeting.direction, meeting.alpha, seed
+            )
+        else:
+            light = estimated(
+                scene, distant, meeting.hit, meeting.direction, meeting.alpha, before.up, before.from_receiver
+            )
+            if wp.static(config.textures):
+                out.sent += weight * light.emitted
+            brightness = wp.max(light.distant + light.receiver)
+            weight *= wp.min(before.brightest / wp.max(brightness, 1.0e-20), 1.0)
+            out.sent += weight * light.distant
+            out.returned += weight * light.receiver
+        return out
+
+    return reflect_back

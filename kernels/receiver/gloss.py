@@ -1,0 +1,565 @@
+"""What polished receivers show of what is virtual: objects, highlights of virtual lights, what of both they hide.
+
+The camera's picture of a polished table holds the real surroundings, mirrored. Were the virtual objects there, they
+would be mirrored too, and hide what the table mirrors behind them. With f the receiver's specular reflection, GGX of
+the roughness that its proxy has, Smith's masking and Schlick's Fresnel over the reflectance F0,
+
+    change(x, wo) = integral over wi of  f(wo, wi) cos_i (L_with - L_without)(x, wi)
+                    + sum over virtual lights of  f(wo, wi) cos_i E visible.
+
+Half vectors are drawn as they are seen from the camera [DB23], so that a ray weighs F G2 / G1 and no more than 1, and
+f cos_i and the density cancel. Each of a pixel's rays begins at a place of its own in the pixel, and meets first
+
+- a virtual object: L_with is its radiance; L_without what the receiver mirrored there: the proxy behind it as the
+  picture shows it, else the environment, filtered as wide as one of the rays is (a narrow lamp would else be found by
+  one ray in a few, and flicker over the pixels);
+- a proxy: what the picture shows there changes by the shadows and the light that the picture has at that point;
+- a mirror ball, or nothing: no change.
+
+The shadows that objects cast on the receiver are a factor on all that the frame shows (``shadow_ratio``), although
+only the diffuse part is shadowed by them: what the receiver mirrors, S = integral of f cos_i L_without, is given back,
+
+    change += (1 - shadow_ratio) min(S, frame).
+
+Rays are spared where nothing can change: the ratio is 1, no object's sphere is within ``LOBE_REACH`` of the mirror
+direction, and no other proxy is in it. Where no object is near, one ray tells what is mirrored. The change may be
+negative.
+
+References:
+    [DB23] Dupuy, Benyoub 2023, Sampling Visible GGX Normals with Spherical Caps.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import warp as wp
+
+from warp_ar.kernels.emitters import correct_parallax
+from warp_ar.kernels.environment.lobes import level_from_alpha, sample_levels
+from warp_ar.kernels.launch import MOST_REGISTERS, QUICK_TO_COMPILE, Rows, launch_rows
+from warp_ar.kernels.materials import MIN_ALPHA, ggx_lobe, reflect, schlick
+from warp_ar.kernels.objects.reflect import DistantLight, look_up, look_up_layer, make_find_in_frame
+from warp_ar.kernels.objects.shade import NearPoint, ShadeConfig, make_shade_hit
+from warp_ar.kernels.pixels import shown_radiance
+from warp_ar.kernels.rays.shadow import make_sample_light, make_visible_share, tile_turn
+from warp_ar.kernels.rays.shapes import FAR
+from warp_ar.kernels.rays.trace import TraceConfig, make_trace, meets_probe, offset_origin
+from warp_ar.kernels.rays.visibility import inside_rect, make_sample_direction
+from warp_ar.kernels.sampling import (
+    frame_from_normal,
+    ggx_masking,
+    ggx_masking_shadowing,
+    hammersley,
+    pcg3d_hash,
+    sample_ggx_visible,
+    uniform_from_bits,
+)
+from warp_ar.kernels.structs import FrameParams, Hit, Light, Picture, Probe, RayScene
+
+wp.set_module_options({"enable_backward": False})
+
+LOBE_REACH = wp.constant(wp.float32(14.0))
+"""Tangents of a half vector, over alpha, that are looked at: 0.5 % of GGX's energy lies beyond."""
+MIRROR_ALPHA = wp.constant(wp.float32(1.0e-3))
+"""Width below which a receiver is a mirror: all rays of a pixel leave it alike."""
+EDGE_SAMPLES = 4
+"""Rays per pixel of a mirror, for the edges of what it shows."""
+MOST_RADIANCE = wp.constant(wp.float32(8.0))
+"""Radiance that one ray of a rough receiver brings at most: a highlight of a highlight would be a speckle."""
+LEAST = wp.constant(wp.float32(2.0e-4))
+"""Radiance of a highlight that is looked for: a code of 8 bits is at least 3e-4."""
+LEAST_SHADOW = wp.constant(wp.float32(0.01))
+"""Share of the frame that a shadow must take before what is mirrored is given back."""
+SMOOTHED = wp.constant(2)
+"""Pixels to each side over which a rough receiver is averaged."""
+
+
+@wp.struct
+class Gloss:
+    """How a proxy's surface mirrors."""
+
+    reflectance: wp.vec3  # F0: specular reflectance where it is seen from ahead; 0: the proxy is matt
+    roughness: wp.float32  # perceptual; alpha is its square
+
+
+@wp.struct
+class GlossLayers:
+    """The layers of the frame that a receiver mirrors, (H, W) each; what is not there is empty."""
+
+    shadow_ratio: wp.array2d[wp.vec3]
+    added: wp.array2d[wp.vec3]
+
+
+@dataclasses.dataclass(frozen=True)
+class GlossConfig:
+    """What is compiled into the kernel."""
+
+    trace: TraceConfig
+    """Kinds of shape in the scene."""
+    samples: int
+    """Rays per pixel of a rough receiver."""
+    lights: tuple[int, ...] = ()
+    """Sorted kinds of virtual light."""
+    shade: ShadeConfig | None = None
+    """How virtual objects look; None: there are none."""
+    emitters: bool = False
+    """Whether emitters of the environment are known by their places."""
+    faces: bool = False
+    """Whether one proxy may mirror another, whose light changes."""
+
+
+@wp.func
+def may_mirror(scene: RayScene, point: wp.vec3, direction: wp.vec3, reach: wp.float32) -> wp.bool:
+    """Whether an object's sphere may be within an angle of a ray, ``reach`` in radians."""
+    for index in range(scene.objects.shape[0]):
+        shape = scene.objects[index]
+        # A torus gives its two radii: their sum is no more than this.
+        radius = 1.5 * shape.scale * wp.length(shape.extent)
+        to = shape.position - point
+        distance = wp.length(to)
+        if distance <= radius:
+            return True
+        angle = wp.atan2(wp.length(wp.cross(direction, to)), wp.dot(direction, to))
+        if angle - wp.asin(radius / distance) <= reach:
+            return True
+    return False
+
+
+@wp.struct
+class Sight:
+    """What the camera sees of the scene, and what lights it."""
+
+    scene: RayScene
+    distant: DistantLight
+    picture: Picture
+    probes: wp.array[Probe]
+    layers: GlossLayers
+
+
+@wp.struct
+class Reflected:
+    """What one ray brings, by its weight."""
+
+    change: wp.vec3
+    before: wp.vec3  # what the receiver reflected there, where that was asked for
+
+
+@functools.cache
+def make_follow(config: GlossConfig) -> wp.Function:
+    """``follow(params, sight, lights, hit, wi, weight, width, asked, turn) -> Reflected``: along one reflected ray.
+
+    ``width`` is the alpha that one ray stands for; ``asked``: what was reflected before is to be known in any case.
+    """
+    trace = make_trace(config.trace)
+    closest_object, closest_proxy = trace.closest_object, trace.closest_proxy
+    shade_hit = make_shade_hit(config.shade) if config.shade is not None else None
+    find_in_frame = make_find_in_frame(config.trace, True)
+
+    @wp.func(module="unique")
+    def follow(
+        params: FrameParams,
+        sight: Sight,
+        lights: wp.array[Light],
+        hit: Hit,
+        wi: wp.vec3,
+        weight: wp.vec3,
+        width: wp.float32,
+        asked: wp.bool,
+        turn: wp.float32,
+    ) -> Reflected:
+        result = Reflected()
+        scene = sight.scene
+        distant = sight.distant
+        layers = sight.layers
+        start = offset_origin(hit.point, hit.geometric_normal, wi, hit.error)
+        behind = closest_proxy(scene, start, wi, FAR)
+        is_object = bool(False)
+        if wp.static(config.shade is not None):
+            item = closest_object(scene, start, wi, behind.t)
+            is_object = item.shape >= 0
+            if is_object and meets_probe(sight.probes, start, wi, item.t):
+                is_object = False
+        at = wp.vec2(-1.0, -1.0)
+        if behind.shape >= 0 and (is_object or asked or wp.static(config.faces)):
+            at = find_in_frame(params, sight.picture, scene, sight.probes, behind)
+        if not is_object and not asked and at[0] < 0.0:
+            return result
+        if at[0] >= 0.0:
+            result.before = look_up(sight.picture, at[0], at[1])
+        else:
+            toward = wi
+            if wp.static(config.emitters):
+                toward = correct_parallax(distant.emitters, start, wi)
+            level = level_from_alpha(width, distant.level_height)
+            result.before = sample_levels(distant.levels, toward, level, distant.level_height)
+        if wp.static(config.shade is not None):
+            if is_object:
+                spread = scene.pixel_spread * (hit.t + item.t) / wp.max(item.t, 1.0e-6) + width
+                radiance = shade_hit(scene, lights, distant, item, wi, NearPoint(), turn, spread)
+                if width > 0.0:
+                    most = wp.vec3(MOST_RADIANCE, MOST_RADIANCE, MOST_RADIANCE)
+                    radiance = wp.min(radiance, most)
+                    result.before = wp.min(result.before, most)
+                result.change = radiance - result.before
+        if at[0] >= 0.0 and not is_object and not meets_probe(sight.probes, start, wi, behind.t):
+            if layers.shadow_ratio.shape[0] > 0:
+                there = look_up_layer(layers.shadow_ratio, at[0], at[1]) - wp.vec3(1.0, 1.0, 1.0)
+                result.change += wp.cw_mul(result.before, there)
+            if layers.added.shape[0] > 0:
+                result.change += look_up_layer(layers.added, at[0], at[1])
+        result.change = wp.cw_mul(weight, result.change)
+        result.before = wp.cw_mul(weight, result.before)
+        return result
+
+    return follow
+
+
+# A sphere of angular radius e is seen by half vectors that lie, in the plane of slopes (tangents from the normal), in
+# an ellipse about the one of its centre, of radii e / 2 and e / (2 cos_d), cos_d between half vector and ray; taken as
+# the circle of the same area, s^2 = e^2 / (4 cos_d). GGX's density of slopes, alpha^2 / (pi (alpha^2 + m^2)^2), is that
+# of points spread evenly over a sphere and projected stereographically onto the plane, m = alpha tan(theta / 2). The
+# projection takes circles to circles, so a circle of radius s at slope m has the share of a cap between
+# 2 atan((m - s) / alpha) and 2 atan((m + s) / alpha) of the sphere. Over the circle's area the mean is
+#
+#     2 alpha^2 / (pi H (H + X)),   X = alpha^2 + m^2 - s^2,   H = sqrt(X^2 + 4 s^2 alpha^2);
+#
+# where X < 0 the product H (H + X) cancels, and 1 / (H + X) is (H - X) / (4 s^2 alpha^2).
+@wp.func
+def sphere_over_point(
+    normal: wp.vec3, half: wp.vec3, cos_d: wp.float32, roughness: wp.float32, reach: wp.float32
+) -> wp.float32:
+    """Highlight of a sphere over that of a point in its middle, ``reach`` being its radius over its distance."""
+    alpha = wp.max(roughness * roughness, MIN_ALPHA)
+    cross = wp.cross(normal, half)
+    cos_h = wp.max(wp.dot(normal, half), 1.0e-3)
+    point = alpha * alpha + wp.dot(cross, cross) / (cos_h * cos_h)
+    square = 0.25 * reach * reach / wp.max(cos_d, 1.0e-3)
+    x = point - square
+    cap = 4.0 * square * alpha * alpha
+    h = wp.sqrt(x * x + cap)
+    if x < 0.0:
+        return 2.0 * point * (point / h) * ((h - x) / cap)
+    return 2.0 * (point / h) * (point / (h + x))
+
+
+@functools.cache
+def make_highlights(config: GlossConfig) -> wp.Function:
+    """``highlights(sight, lights, surface, hit, wo, turn) -> vec3``: radiance that virtual lights add at a hit."""
+    sample_light = make_sample_light(config.lights)
+    visible_share = make_visible_share(config.trace)
+
+    @wp.func(module="unique")
+    def highlights(
+        sight: Sight, lights: wp.array[Light], surface: Gloss, hit: Hit, wo: wp.vec3, turn: wp.float32
+    ) -> wp.vec3:
+        result = wp.vec3(0.0, 0.0, 0.0)
+        cos_o = wp.dot(hit.normal, wo)
+        for index in range(lights.shape[0]):
+            light = sample_light(lights[index], hit.point)
+            cos_i = wp.dot(hit.normal, light.wi)
+            if cos_i > 0.0 and wp.dot(hit.geometric_normal, light.wi) > 0.0:
+                half = wp.normalize(wo + light.wi)
+                f = surface.reflectance + schlick(wp.dot(wo, half)) * (wp.vec3(1.0) - surface.reflectance)
+                lobe = cos_i * ggx_lobe(hit.normal, half, cos_i, cos_o, surface.roughness)
+                if lights[index].radius > 0.0:
+                    reach = lights[index].radius / wp.max(light.distance, 1.0e-6)
+                    lobe *= sphere_over_point(hit.normal, half, wp.dot(wo, half), surface.roughness, reach)
+                sent = lobe * wp.cw_mul(f, light.irradiance_normal)
+                if wp.max(sent) > LEAST and not meets_probe(sight.probes, hit.point, light.wi, light.distance):
+                    result += sent * visible_share(
+                        sight.scene, hit.point, hit.geometric_normal, hit.error, lights[index], light, turn
+                    )
+        return result
+
+    return highlights
+
+
+@wp.struct
+class FacetRay:
+    """What a facet of a rough receiver reflects toward the camera."""
+
+    wi: wp.vec3
+    masking: wp.float32  # share of it that other facets let pass; 0: none, it leads onto another facet
+    cos_d: wp.float32  # between the facet's normal and the ray
+
+
+@wp.func
+def draw_facet(u: wp.vec2, normal: wp.vec3, wo: wp.vec3, alpha: wp.float32) -> FacetRay:
+    """One of the facets that the camera sees, by a point of the unit square."""
+    out = FacetRay()
+    basis = frame_from_normal(normal)
+    local = wp.transpose(basis) * wo
+    facet = sample_ggx_visible(u, local, alpha)
+    away = reflect(local, facet)
+    if away[2] > 0.0:
+        out.masking = ggx_masking_shadowing(away, local, alpha) / ggx_masking(local, alpha)
+        out.cos_d = wp.max(wp.dot(local, facet), 0.0)
+        out.wi = wp.normalize(basis * away)
+    return out
+
+
+@wp.struct
+class GlossPoint:
+    """A point of a receiver that mirrors."""
+
+    hit: Hit  # its shape is -1 where a pixel shows none
+    wo: wp.vec3
+    surface: Gloss
+    alpha: wp.float32
+
+
+@functools.cache
+def make_see_receiver(config: GlossConfig) -> wp.Function:
+    """``see_receiver(params, sight, gloss, i, j) -> GlossPoint``: what pixel (i, j) shows of receivers that mirror."""
+    closest_proxy = make_trace(config.trace).closest_proxy
+
+    @wp.func(module="unique")
+    def see_receiver(
+        params: wp.array[FrameParams], sight: Sight, gloss: wp.array[Gloss], i: wp.int32, j: wp.int32
+    ) -> GlossPoint:
+        at = GlossPoint()
+        at.hit.shape = -1
+        origin = params[0].camera_position
+        ray = sight.picture.rays[i, j]
+        seen = params[0].world_from_camera * wp.vec3(ray[0], ray[1], 1.0)
+        hit = closest_proxy(sight.scene, origin, seen, FAR)
+        if hit.shape < 0:
+            return at
+        at.surface = gloss[hit.shape]
+        at.alpha = at.surface.roughness * at.surface.roughness
+        at.wo = -wp.normalize(seen)
+        if wp.max(at.surface.reflectance) <= 0.0 or wp.dot(hit.geometric_normal, at.wo) <= 0.0:
+            return at  # matt, or seen from behind
+        if wp.dot(hit.normal, at.wo) <= 0.0 or meets_probe(sight.probes, origin, seen, hit.t):
+            return at
+        at.hit = hit
+        return at
+
+    return see_receiver
+
+
+@wp.struct
+class GlossRay:
+    """One of the rays that stand for what a point of a receiver reflects."""
+
+    hit: Hit  # that it leaves
+    wi: wp.vec3
+    masking: wp.float32  # share of it that other facets let pass; 0: there is no such ray
+    cos_d: wp.float32  # between the facet's normal and the ray
+    width: wp.float32  # alpha that it stands for
+
+
+@functools.cache
+def make_draw_ray(config: GlossConfig) -> wp.Function:
+    """``draw_ray(params, sight, at, pixel, is_near, shift, sample, count) -> GlossRay``: one of ``count``.
+
+    Where no object is near, into the middle of the lobe; else of a rough receiver by a facet, its place in the sequence
+    moved by ``shift``, and of a mirror from a place of its own in the pixel.
+    """
+    closest_proxy = make_trace(config.trace).closest_proxy
+    sample_direction = make_sample_direction(EDGE_SAMPLES)
+
+    @wp.func(module="unique")
+    def draw_ray(
+        params: wp.array[FrameParams],
+        sight: Sight,
+        at: GlossPoint,
+        pixel: wp.vec2i,
+        is_near: wp.bool,
+        shift: wp.vec2,
+        sample: wp.int32,
+        count: wp.int32,
+    ) -> GlossRay:
+        out = GlossRay()
+        out.hit = at.hit
+        if not is_near:
+            out.wi = reflect(at.wo, at.hit.normal)
+            out.masking = 1.0
+            out.cos_d = wp.dot(at.hit.normal, at.wo)
+            out.width = at.alpha
+        elif at.alpha > MIRROR_ALPHA:
+            u = hammersley(sample, count) + shift
+            drawn = draw_facet(wp.vec2(u[0] - wp.floor(u[0]), u[1] - wp.floor(u[1])), at.hit.normal, at.wo, at.alpha)
+            out.wi = drawn.wi
+            out.masking = drawn.masking  # 0: onto another facet
+            out.cos_d = drawn.cos_d
+            out.width = at.alpha / wp.sqrt(wp.float32(count))
+        else:
+            origin = params[0].camera_position
+            direction = wp.normalize(sample_direction(params, sight.picture.rays[pixel[0], pixel[1]], sample))
+            out.hit = closest_proxy(sight.scene, origin, direction, FAR)
+            if out.hit.shape != at.hit.shape or meets_probe(sight.probes, origin, direction, out.hit.t):
+                return out
+            out.wi = reflect(-direction, out.hit.normal)
+            out.masking = 1.0
+            out.cos_d = -wp.dot(out.hit.normal, direction)
+        if wp.dot(out.wi, out.hit.geometric_normal) <= 0.0:
+            out.masking = 0.0
+        return out
+
+    return draw_ray
+
+
+@functools.cache
+def make_gloss_kernel(config: GlossConfig) -> wp.Kernel:
+    """Kernel specialised to ``config``; equal configs share one kernel."""
+    closest_proxy = make_trace(config.trace).closest_proxy
+    see_receiver, draw_ray, follow = make_see_receiver(config), make_draw_ray(config), make_follow(config)
+    highlights = make_highlights(config) if config.lights else None
+
+    @wp.kernel(
+        module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS, module_options=QUICK_TO_COMPILE
+    )
+    def gloss_kernel(
+        # In:
+        row_start: wp.int32,
+        params: wp.array[FrameParams],
+        sight: Sight,
+        lights: wp.array[Light],
+        gloss: wp.array[Gloss],
+        # Out:
+        change_out: wp.array2d[wp.vec3],
+        surface_out: wp.array2d[wp.int32],
+    ):
+        i, j = wp.tid()
+        i += row_start
+        change_out[i, j] = wp.vec3(0.0, 0.0, 0.0)
+        surface_out[i, j] = -1
+        if not inside_rect(i, j, params[0].ball_rect):
+            return
+        at = see_receiver(params, sight, gloss, i, j)
+        hit = at.hit
+        if hit.shape < 0:
+            return
+        turn = tile_turn(i, j)
+        change = wp.vec3(0.0, 0.0, 0.0)
+        if wp.static(len(config.lights) > 0):
+            change = highlights(sight, lights, at.surface, hit, at.wo, turn)
+        ratio = wp.vec3(1.0, 1.0, 1.0)
+        if sight.layers.shadow_ratio.shape[0] > 0 and inside_rect(i, j, params[0].shadow_rect):
+            ratio = sight.layers.shadow_ratio[i, j]
+        is_shadowed = wp.max(wp.abs(ratio - wp.vec3(1.0, 1.0, 1.0))) > LEAST_SHADOW
+        mirror = reflect(at.wo, hit.normal)
+        is_near = may_mirror(sight.scene, hit.point, mirror, 2.0 * wp.atan(LOBE_REACH * at.alpha))
+        wanted = is_shadowed or is_near
+        if wp.static(config.faces):
+            if not wanted:
+                start = offset_origin(hit.point, hit.geometric_normal, mirror, hit.error)
+                wanted = closest_proxy(sight.scene, start, mirror, FAR).shape >= 0
+        if wanted:
+            added = wp.vec3(0.0, 0.0, 0.0)
+            before = wp.vec3(0.0, 0.0, 0.0)
+            count = wp.where(at.alpha > MIRROR_ALPHA, wp.static(config.samples), wp.static(EDGE_SAMPLES))
+            if not is_near:
+                count = 1  # into the middle of the lobe, which the environment is filtered for
+            hashes = pcg3d_hash(wp.uint32(i), wp.uint32(j), wp.uint32(0))
+            shift = wp.vec2(uniform_from_bits(hashes[0]), uniform_from_bits(hashes[1]))
+            for sample in range(count):
+                ray = draw_ray(params, sight, at, wp.vec2i(i, j), is_near, shift, sample, count)
+                if ray.masking > 0.0:
+                    f = at.surface.reflectance + schlick(ray.cos_d) * (wp.vec3(1.0) - at.surface.reflectance)
+                    one = follow(
+                        params[0], sight, lights, ray.hit, ray.wi, ray.masking * f, ray.width, is_shadowed, turn
+                    )
+                    added += one.change
+                    before += one.before
+            share = 1.0 / wp.float32(count)
+            shown = shown_radiance(sight.picture, i, j)
+            given_back = wp.cw_mul(wp.vec3(1.0, 1.0, 1.0) - ratio, wp.min(share * before, shown))
+            change += share * added + wp.where(is_shadowed, 1.0, 0.0) * given_back
+        change_out[i, j] = change
+        if at.alpha > MIRROR_ALPHA:
+            surface_out[i, j] = hit.shape
+
+    return gloss_kernel
+
+
+@wp.kernel(enable_backward=False)
+def smooth_gloss_kernel(
+    # In:
+    row_start: wp.int32,
+    change: wp.array2d[wp.vec3],
+    surface: wp.array2d[wp.int32],
+    mirror_ball: wp.array2d[wp.vec3],
+    # Out:
+    reflected_out: wp.array2d[wp.vec3],
+):
+    """Mean over the pixels around on the same rough surface, which have other rays; a mirror's stay as they are."""
+    i, j = wp.tid()
+    i += row_start
+    result = change[i, j]
+    key = surface[i, j]
+    if key >= 0:
+        total = wp.vec3(0.0, 0.0, 0.0)
+        weights = float(0.0)
+        for k in range(wp.max(i - SMOOTHED, 0), wp.min(i + SMOOTHED + 1, change.shape[0])):
+            for m in range(wp.max(j - SMOOTHED, 0), wp.min(j + SMOOTHED + 1, change.shape[1])):
+                if surface[k, m] == key:
+                    total += change[k, m]
+                    weights += 1.0
+        result = total / weights
+    if mirror_ball.shape[0] > 0:
+        result += mirror_ball[i, j]
+    reflected_out[i, j] = result
+
+
+def gloss(
+    config: GlossConfig,
+    params: wp.array,
+    sight: Sight,
+    lights: wp.array | None,
+    surfaces: wp.array,
+    change_out: wp.array,
+    surface_out: wp.array,
+    *,
+    rows: Rows | None = None,
+) -> None:
+    """Write what virtual objects and lights change in what the receiver mirrors, pixel by pixel.
+
+    Args:
+        config: What the scene calls for; what it leaves out may be None.
+        params: (1,) FrameParams: camera, shadow_rect and ball_rect, beyond which nothing changes.
+        sight: The scene, its light and its picture.
+        lights: (n,) Light.
+        surfaces: (n,) Gloss, one for each proxy.
+        change_out: (H, W) vec3, change of linear radiance in camera values.
+        surface_out: (H, W) int32, the rough proxy that a pixel shows, or -1.
+        rows: Band of rows; None means all.
+    """
+    launch_rows(
+        make_gloss_kernel(config),
+        change_out.shape,
+        [params, sight, lights, surfaces],
+        [change_out, surface_out],
+        rows=rows,
+        device=change_out.device,
+    )
+
+
+def smooth_gloss(
+    change: wp.array,
+    surface: wp.array,
+    mirror_ball: wp.array | None,
+    reflected_out: wp.array,
+    *,
+    rows: Rows | None = None,
+) -> None:
+    """Write what receivers and mirror balls change, the noise of rough receivers averaged over neighbours.
+
+    Args:
+        change: (H, W) vec3 of ``gloss``.
+        surface: (H, W) int32 of ``gloss``.
+        mirror_ball: (H, W) vec3 of ``mirror_ball``, which is added; None where there is none.
+        reflected_out: (H, W) vec3.
+        rows: Band of rows; None means all.
+    """
+    launch_rows(
+        smooth_gloss_kernel,
+        change.shape,
+        [change, surface, mirror_ball],
+        [reflected_out],
+        rows=rows,
+        device=change.device,
+    )

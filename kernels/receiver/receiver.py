@@ -1,0 +1,392 @@
+"""The receiver: what a point of a physical surface is taken to be, and how it responds to virtual light.
+
+A light of irradiance E_v (facing it) that arrives along wi adds to a pixel's radiance
+
+    added = Kd / pi * E_v * response.
+
+What Kd and the response are makes the methods, with N.L = max(normal . wi, 0):
+
+========================  =========================================================  =============================
+method                    Kd                                                         response
+========================  =========================================================  =============================
+``flat``                  a grey constant                                            N.L
+``paper``                 a grey constant                                            (1), the letter of [DH04]
+``directional``           a grey constant                                            (1), linear and weighted
+``relief``                luminance of the surroundings in the pixel's hue           (2)
+``reflectance``           what the camera sees over what the environment sends, (3)  N.L
+========================  =========================================================  =============================
+
+``flat`` is what plain alpha blending of a lit proxy does. The equations stand above the functions that hold them.
+``make_find_matter`` makes what a point is, ``make_respond`` how it responds; ``kernels/receiver/relight.py`` sums
+over lights.
+
+References:
+    [DH04] DiVerdi, Hoellerer, "Combining Dynamic Physical and Virtual Illumination in Augmented Reality", 2004.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Literal
+
+import warp as wp
+
+from warp_ar.kernels.cells import look_up_cells
+from warp_ar.kernels.color import luminance
+from warp_ar.kernels.environment.interpolated_irradiance import OtherBalls, make_irradiance_at
+from warp_ar.kernels.picture.summed_area import fine_mean, intensity
+from warp_ar.kernels.pixels import cut_luma, shown_radiance
+from warp_ar.kernels.rays.shapes import surface_key
+from warp_ar.kernels.rays.trace import TraceConfig
+from warp_ar.kernels.rays.visibility import check_edge_samples
+from warp_ar.kernels.structs import Emitter, Hit, KeyLight, Picture, Probe, RayScene
+
+wp.set_module_options({"enable_backward": False})
+
+METHODS = ("flat", "paper", "directional", "relief", "reflectance")
+"""Cheapest first."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Reading:
+    """How equation (1) takes what the paper's text leaves open; the defaults are the letter of the text."""
+
+    values: Literal["video", "linear"] = "video"
+    """Of the multiplicative factor: codes over 255 as the shader samples them, or linear luminance."""
+    blend: Literal["text", "shader"] = "text"
+    """The three cases of the text, or the printed shader's lerp, which differs where alpha is negative."""
+    weighted: bool = False
+    """Whether alpha is multiplied by the directionality of the environment's light (section 4.4)."""
+
+
+READINGS: Mapping[str, Reading] = MappingProxyType(
+    {
+        "paper": Reading(),
+        "directional": Reading("linear", weighted=True),
+        "paper_linear": Reading("linear"),
+        "paper_shader": Reading(blend="shader"),
+        "paper_weighted": Reading(weighted=True),
+    }
+)
+"""Ways to take equation (1), by name: the two methods, and readings that docs/paper.md compares with ``paper``."""
+DEFAULT_REFLECTANCE = wp.constant(wp.float32(0.5))
+"""Of a receiver that nothing is known about: the material of ``flat`` and ``paper``, the prior of ``reflectance``."""
+PRIOR_WEIGHT = wp.constant(wp.float32(0.002 * math.pi))
+"""Irradiance at which the prior counts as much as the frame: that of a white receiver at half a code of 255."""
+MAX_RELIEF = wp.constant(wp.float32(4.0))
+"""Largest m: a glint of the receiver is no reason to add more than four times the light."""
+SURROUNDINGS = 1.0 / 8.0
+"""Side of the box of a pixel's surroundings, in frame heights: larger than a wire, smaller than a light's falloff."""
+_HUE_FLOOR = wp.constant(wp.float32(0.01))  # linear; noise in dark pixels has no hue
+
+
+@dataclasses.dataclass(frozen=True)
+class RelightConfig:
+    """What is compiled into the kernel."""
+
+    method: str
+    """How the receiver responds: one of ``METHODS`` or ``READINGS``."""
+    trace: TraceConfig
+    """Kinds of shape in the scene."""
+    irradiance: Literal["sh", "map"] = "sh"
+    """Form of the environment's irradiance, for ``reflectance``."""
+    probes: bool = False
+    """Whether there are mirror balls, which hide the receiver and throw shadows of virtual light."""
+    soft: bool = False
+    """Whether lights with a radius cast soft shadows; those of mirror balls stay hard."""
+    emitters: bool = False
+    """Whether ``reflectance`` knows emitters of the environment by their places."""
+    ambient_visibility: bool = False
+    """Whether ``reflectance`` knows which part of the environment reaches a point."""
+    bounced: bool = False
+    """Whether light that lit proxies send to each other is known."""
+    edge_samples: int = 1
+    """Samples per pixel along the edges of shadows and of proxies: a square number; 1 leaves edges hard."""
+    several: bool = False
+    """Whether the light of several mirror balls is interpolated."""
+    area_samples: int = 0
+    """Samples of what emits, per point; ``area_lights.POINT_SAMPLES``: as lights at points; 0: nothing emits."""
+
+    def general(self, *, soft: bool, by_call: bool = False) -> RelightConfig:
+        """For any scene in which as much is known of the receiver; ``by_call`` as in ``TraceConfig.general``."""
+        return dataclasses.replace(self, trace=self.trace.general(by_call=by_call), soft=soft)
+
+    def __post_init__(self) -> None:
+        known = dict.fromkeys((*METHODS, *READINGS))
+        if self.method not in known:
+            raise ValueError(f"method: {self.method!r} is none of {', '.join(known)}")
+        check_edge_samples(self.edge_samples)
+
+
+@wp.func
+def shader_response(n_dot_l: wp.float32, multiplicative: wp.float32, alpha: wp.float32) -> wp.float32:
+    """The lerp of [DH04]'s fragment shader as printed; light is not taken away."""
+    return wp.max((1.0 - alpha) * n_dot_l + alpha * multiplicative, 0.0)
+
+
+# Equation (1). [DH04] section 4.2: the *additive factor* is N.L, the *multiplicative factor* m the intensity of the
+# video, and alpha "the dot product of the virtual light vector and the brightest physical lighting vector". "When the
+# dot product is close to one, most of the contribution is from the multiplicative factor, when it is close to zero, the
+# contribution is from the additive factor, and when it is negative one, the inverse of the multiplicative factor is
+# used":
+#
+#     response = (1 - |alpha|) N.L + |alpha| (m if alpha > 0 else 1 - m).                                          (1)
+#
+# What the text leaves open is a ``Reading``. ``paper`` takes: m in video values, the codes that the shader samples over
+# 255, for no camera's curve is mentioned; the three cases of the text above the printed shader's lerp, (1 - alpha) N.L
+# + alpha m, which gives 2 N.L - m at -1; and alpha as it is, for the remark of section 4.4 that several lights end as
+# plain blending is an observation, not a step of the shader. docs/paper.md says what the other readings give.
+#
+# ``directional`` is (1) with the frame's linear luminance for m, and alpha times the directionality of the
+# environment's dominant light: where the light is ambient, or comes from rivals, it says nothing about bumps and N.L
+# remains.
+@wp.func
+def text_response(n_dot_l: wp.float32, intensity: wp.float32, alpha: wp.float32) -> wp.float32:
+    """Equation (1), [DH04] section 4.2."""
+    weight = wp.min(wp.abs(alpha), 1.0)
+    multiplicative = wp.where(alpha > 0.0, intensity, 1.0 - intensity)
+    return (1.0 - weight) * n_dot_l + weight * multiplicative
+
+
+# Equation (2) is (1) with the multiplicative factor made relative. The raw intensity makes a light weak on a dark
+# receiver and shines on faces that are turned away from it; what the paper wants from m is its *pattern*. So m becomes
+# the pixel's luminance over that of its surroundings (a box of the frame's summed-area table) and multiplies N.L. A
+# receiver without structure has m = 1, and gives what ``flat`` gives, for every alpha. The inverse: a bump that tilts
+# the surface by a small angle along the physical light changes its shading to 1 + e; seen from the opposite side it is
+# 1 - e = 2 - m, to first order, which also keeps the mean over the surroundings. With it (1) is
+#
+#     response = N.L (1 + alpha (m - 1)),                                                                          (2)
+#
+# linear in alpha, so nothing jumps where alpha changes sign; alpha is multiplied by the directionality. Kd is the
+# surroundings' luminance in the pixel's hue: the receiver's reflectance if white paper were just below clipping.
+@wp.func
+def relief_factor(m: wp.float32, alpha: wp.float32) -> wp.float32:
+    """Factor on N.L in equation (2)."""
+    return wp.max(1.0 + wp.clamp(alpha, -1.0, 1.0) * (wp.min(m, MAX_RELIEF) - 1.0), 0.0)
+
+
+# Equation (3). The receiver's own reflectance, from what the camera sees and what the environment sends there,
+#
+#     rho = pi L / E_environment(normal),                                                                          (3)
+#
+# which is (exactly) right for a Lambertian receiver, whatever its pattern. A prior of ``PRIOR_WEIGHT`` keeps (3) sane
+# where the environment is dark, and no reflectance exceeds 1; a clipped channel gives what its code says, a lower
+# bound. With *cells* (``receiver_cells.py``) E is the part of the environment that boxes and balls let through.
+# What shades the receiver beyond its proxy (relief, clutter) is in (3) as if it were paint.
+@wp.func
+def reflectance_of(radiance: wp.float32, irradiance: wp.float32) -> wp.float32:
+    """Equation (3) with its prior, one channel; within 0..1 for whatever comes in."""
+    rho = (wp.pi * radiance + PRIOR_WEIGHT * DEFAULT_REFLECTANCE) / (wp.max(irradiance, 0.0) + PRIOR_WEIGHT)
+    if not rho > 0.0:  # NaN as well
+        return 0.0
+    return wp.min(rho, 1.0)
+
+
+@wp.func
+def surrounding_luminance(
+    table: wp.array2d[wp.uint32],
+    cut_table: wp.array2d[wp.uint32],
+    decode_table: wp.array[wp.vec3],
+    row: wp.int32,
+    col: wp.int32,
+    size: wp.int32,
+) -> wp.float32:
+    """Linear luminance of the mean code around a pixel; never 0. A mean of codes is not swayed by a few highlights."""
+    code = fine_mean(table, cut_table, row, col, size)
+    low = wp.min(wp.int32(code), 254)
+    fraction = code - wp.float32(low)
+    linear = (1.0 - fraction) * luminance(decode_table[low]) + fraction * luminance(decode_table[low + 1])
+    return wp.max(linear, 1.0e-4)
+
+
+@wp.struct
+class ReceiverCells:
+    """What ``receiver_cells.py`` found for cells of the frame, each with the surface that it lies on."""
+
+    ambient_visibility: wp.array2d[wp.vec3]  # share of the environment that reaches a cell
+    ambient_surface: wp.array2d[wp.int32]  # ``surface_key`` of the cell, -1 for none
+    ambient_stride: wp.int32  # pixels per cell
+    bounced: wp.array2d[wp.vec3]  # irradiance by virtual light that other proxies send there
+    bounced_surface: wp.array2d[wp.int32]
+    bounced_stride: wp.int32
+
+
+@wp.struct
+class Receiver:
+    """The receiver and the environment that lights it; what a ``RelightConfig`` leaves out is empty."""
+
+    picture: Picture
+    table: wp.array2d[wp.uint32]  # the frame's summed-area table
+    cut_table: wp.array2d[wp.uint32]  # that of what 8 bits cut off; empty for frames of 8 bits
+    box: wp.int32  # side of a pixel's surroundings
+    probes: wp.array[Probe]
+    key_lights: wp.array[KeyLight]
+    irradiance_sh: wp.array[wp.vec3]
+    irradiance_map: wp.array2d[wp.vec3]
+    emitters: wp.array[Emitter]
+    others: OtherBalls
+    cells: ReceiverCells
+
+
+@wp.func
+def look_up_ambient(scene: RayScene, receiver: Receiver, hit: Hit, row: wp.int32, col: wp.int32) -> wp.vec4:
+    """Ambient visibility of what a pixel shows, and 1; zero where no cell around it knows (``look_up_cells``)."""
+    cells = receiver.cells
+    key = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
+    size = wp.vec2i(receiver.picture.frame.shape[0], receiver.picture.frame.shape[1])
+    return look_up_cells(cells.ambient_visibility, cells.ambient_surface, cells.ambient_stride, key, size, row, col)
+
+
+@wp.func
+def look_up_bounced(scene: RayScene, receiver: Receiver, hit: Hit, row: wp.int32, col: wp.int32) -> wp.vec4:
+    """Irradiance by virtual light that other proxies send to what a pixel shows, and 1; zero where there is none."""
+    cells = receiver.cells
+    key = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
+    size = wp.vec2i(receiver.picture.frame.shape[0], receiver.picture.frame.shape[1])
+    return look_up_cells(cells.bounced, cells.bounced_surface, cells.bounced_stride, key, size, row, col)
+
+
+@wp.struct
+class Matter:
+    """What a point of the receiver is taken to be."""
+
+    kd: wp.vec3  # reflectance
+    m: wp.float32  # luminance over that of the surroundings, or the intensity itself
+    key: wp.vec3  # unit, toward the environment's dominant light
+    directionality: wp.float32
+
+
+@functools.cache
+def make_find_matter(config: RelightConfig) -> wp.Function:
+    """``find_matter(scene, receiver, hit, row, col, mirror) -> Matter``; arguments as those of ``direct_lighting``."""
+    method, reading = config.method, READINGS.get(config.method)
+    irradiance_at = make_irradiance_at(config.irradiance, config.emitters, config.several)
+
+    @wp.func(module="unique")
+    def find_matter(
+        scene: RayScene, receiver: Receiver, hit: Hit, row: wp.int32, col: wp.int32, mirror: wp.vec3
+    ) -> Matter:
+        matter = Matter()
+        matter.kd = wp.vec3(DEFAULT_REFLECTANCE, DEFAULT_REFLECTANCE, DEFAULT_REFLECTANCE)
+        matter.m = 1.0
+        radiance = wp.max(shown_radiance(receiver.picture, row, col), wp.vec3(0.0, 0.0, 0.0))
+        # Light above white counts as white where it is compared with codes.
+        coded = wp.min(radiance, receiver.picture.decode_table[255])
+        is_mirrored = mirror[0] > 0.0
+        if is_mirrored:
+            coded = wp.cw_div(coded, mirror)
+            radiance = wp.cw_div(radiance, mirror)
+        if wp.static(method == "reflectance"):
+            distant = irradiance_at(
+                receiver.irradiance_sh,
+                receiver.irradiance_map,
+                receiver.emitters,
+                receiver.others,
+                hit.point,
+                hit.normal,
+            )
+            if wp.static(config.ambient_visibility):
+                if not is_mirrored:
+                    left = look_up_ambient(scene, receiver, hit, row, col)
+                    if left[3] > 0.0:
+                        distant = wp.cw_mul(distant, wp.vec3(left[0], left[1], left[2]))
+            matter.kd = wp.vec3(
+                reflectance_of(radiance[0], distant[0]),
+                reflectance_of(radiance[1], distant[1]),
+                reflectance_of(radiance[2], distant[2]),
+            )
+        else:
+            matter.key = receiver.key_lights[0].direction
+            matter.directionality = receiver.key_lights[0].directionality
+            if wp.static(method == "relief"):
+                around = luminance(radiance)
+                if not is_mirrored:
+                    around = surrounding_luminance(
+                        receiver.table, receiver.cut_table, receiver.picture.decode_table, row, col, receiver.box
+                    )
+                    matter.m = luminance(coded) / around  # like with like: what is around is a mean of codes
+                hue = radiance + wp.vec3(_HUE_FLOOR, _HUE_FLOOR, _HUE_FLOOR)
+                matter.kd = wp.min(around / luminance(hue) * hue, wp.vec3(1.0, 1.0, 1.0))
+            elif wp.static(reading is not None and reading.values == "video"):
+                seen = receiver.picture
+                cut = cut_luma(seen.frame, seen.decode_table, seen.linear, row, col)
+                matter.m = wp.clamp((wp.float32(intensity(seen.frame[row, col])) + cut) / 255.0, 0.0, 1.0)
+            else:
+                matter.m = luminance(coded)
+        return matter
+
+    return find_matter
+
+
+@functools.cache
+def make_respond(method: str) -> wp.Function:
+    """``respond(matter, wi, n_dot_l) -> float32``: a point's response, by one of ``METHODS`` or ``READINGS``.
+
+    The one place where equations (1) and (2) meet a light: at points, and on what emits. ``flat`` reads no matter.
+    """
+    reading = READINGS.get(method)
+
+    @wp.func(module="unique")
+    def respond(matter: Matter, wi: wp.vec3, n_dot_l: wp.float32) -> wp.float32:
+        response = n_dot_l
+        if wp.static(method not in ("flat", "reflectance")):
+            alpha = wp.dot(wi, matter.key)
+            if wp.static(reading is not None):
+                if wp.static(reading is not None and reading.weighted):
+                    alpha = alpha * matter.directionality
+                if wp.static(reading is not None and reading.blend == "shader"):
+                    response = shader_response(n_dot_l, matter.m, alpha)
+                else:
+                    response = text_response(n_dot_l, matter.m, alpha)
+            else:
+                response = n_dot_l * relief_factor(matter.m, alpha * matter.directionality)
+        return response
+
+    return respond
+
+
+def surroundings_size(height: int) -> int:
+    """Side of the box of a pixel's surroundings in a frame of ``height`` rows, odd."""
+    return 2 * round(0.5 * SURROUNDINGS * height) + 1
+
+
+def make_receiver(
+    config: RelightConfig,
+    picture: Picture,
+    *,
+    table: wp.array | None = None,
+    cut_table: wp.array | None = None,
+    probes: wp.array | None = None,
+    key_lights: wp.array | None = None,
+    irradiance: wp.array | None = None,
+    emitters: wp.array | None = None,
+    others: OtherBalls | None = None,
+    cells: ReceiverCells | None = None,
+) -> Receiver:
+    """What kernels read of the receiver; what the method leaves out may be None.
+
+    Args:
+        config: Method and forms of light.
+        picture: (H, W) the camera's.
+        table: (H, W) uint32, the frame's summed-area table; needed by ``relief``.
+        cut_table: (H, W) uint32, that of what 8 bits cut off; None for frames of 8 bits.
+        probes: (p,) Probe; needed if ``config.probes``.
+        key_lights: (k,) KeyLight, brightest first; needed by the paper's blend and ``relief``.
+        irradiance: Irradiance of the environment, nine coefficients or a latlong map as ``config.irradiance`` says;
+            needed by ``reflectance``.
+        emitters: (q,) Emitter, seen from the first probe; needed if ``config.emitters``.
+        others: The balls after the first; needed if ``config.several``.
+        cells: From ``receiver_cells``; needed if ``config.ambient_visibility`` or ``config.bounced``.
+    """
+    receiver = Receiver()
+    receiver.picture, receiver.box = picture, surroundings_size(picture.rays.shape[0])
+    form = f"irradiance_{config.irradiance}"
+    optional = {"table": table, "cut_table": cut_table, "probes": probes, "key_lights": key_lights, form: irradiance}
+    for name, value in {**optional, "emitters": emitters, "others": others, "cells": cells}.items():
+        if value is not None:
+            setattr(receiver, name, value)
+    return receiver

@@ -1,0 +1,647 @@
+"""What ``relight`` needs to know of the receiver beyond its own pixel, estimated for cells of the frame.
+
+**Ambient visibility.** Reflectance is what the camera sees over what the environment sends (``receiver``, equation 3).
+The environment's filtered irradiance knows nothing of what stands in the way: in the shadow of the ball or of a box it
+is too much, and the receiver would be taken for darker than it is. So per cell, over the environment's samples
+(``environment_samples``),
+
+    visibility = 1 - sum over hidden ones of measure * cos * (radiance - what hides it) / sum of measure * cos *
+    radiance,
+
+which is 1 to the bit where nothing is hidden. Only cells that virtual light falls on are asked: first those that a
+light shines on, then, once it is known what these send on, those that are reached by that.
+What hides light sends some itself: a ball its reflectance times the mean of what its normal faces, a box what the
+camera sees of it there, and where it sees nothing what grey paper would. Planes hide nothing: the ball has seen them
+where the environment has them. A CUDA device has several threads share the samples of a cell; their sums are added in
+one order, so that the same frame gives the same bits.
+
+**Bounced light.** A lit proxy lights the others. Every cell of a coarse grid is a patch: radiance L that virtual light
+adds there (``relight``'s own, direct), and the area A of the surface that its pixels show. Where a virtual object is in
+front the patch lies on that, and sends the light that falls on it by its material's colour to all sides alike. A
+receiver at distance r gets
+
+    E = sum over patches of  L A cos cos' / (r^2 + A / pi),
+
+which is a disc's form factor on its axis: finite where a box stands on the lit receiver, and pi L for a patch that
+fills the hemisphere. One bounce; what the camera does not show sends nothing, and nothing stands between. Points of one
+flat surface, which rounding puts above or below each other, share a normal: of two the upper one turns its back.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import warp as wp
+
+from warp_ar.kernels.cells import cell_pixel
+from warp_ar.kernels.environment.environment_samples import EnvironmentSample, Incidence, ball_of_sample, sample_toward
+from warp_ar.kernels.environment.interpolated_irradiance import make_irradiance_at
+from warp_ar.kernels.environment.probe_weights import probe_share
+from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch, launch_rows
+from warp_ar.kernels.materials import material_at
+from warp_ar.kernels.objects.reflect import look_up, make_find_in_frame
+from warp_ar.kernels.rays.shadow import make_shadow, sample_light, tile_turn
+from warp_ar.kernels.rays.shapes import intersect_sphere, surface_key
+from warp_ar.kernels.rays.trace import TraceConfig, make_trace, offset_origin
+from warp_ar.kernels.rays.visibility import inside_rect, make_visible_proxy
+from warp_ar.kernels.receiver.receiver import (
+    DEFAULT_REFLECTANCE,
+    Receiver,
+    ReceiverCells,
+    RelightConfig,
+    look_up_bounced,
+)
+from warp_ar.kernels.receiver.relight import make_direct_lighting
+from warp_ar.kernels.structs import MIRROR, PHONG, PLANE, FrameParams, Hit, Light, RayScene
+
+wp.set_module_options({"enable_backward": False})
+
+MIN_IRRADIANCE = wp.constant(wp.float32(1.0e-6))
+"""Irradiance, in camera values, below which a share means nothing."""
+NEGLIGIBLE = wp.constant(wp.float32(1.0 / 1024.0))
+"""Bounced light over the environment's that no 8-bit picture shows: an eighth of a code at most, taken for none."""
+MIN_FACING = wp.constant(wp.float32(0.02))
+"""Least cosine at which the area that pixels show is believed: beyond it a patch would reach over the horizon."""
+MAX_PARTIALS = 16
+"""Threads of a CUDA device that share the samples of a cell at most: few cells are asked, each of many samples."""
+KINDS = wp.constant(2)
+"""Values of a partial sum: the environment, and what is lost of it."""
+PENDING = wp.constant(-2)
+"""What ``surface_out`` holds less the cell's surface while partials of its share are not yet added."""
+
+
+@wp.struct
+class Patch:
+    """A piece of a proxy that sends virtual light on."""
+
+    position: wp.vec3
+    normal: wp.vec3
+    flux: wp.vec3  # radiance times area
+    area: wp.float32  # square metres
+
+
+@dataclasses.dataclass(frozen=True)
+class CellConfig:
+    """What is compiled into the kernels."""
+
+    relight: RelightConfig
+    """Of the direct light: kinds of shape, and form of the environment's irradiance."""
+
+    @property
+    def trace(self) -> TraceConfig:
+        """Kinds of shape."""
+        return self.relight.trace
+
+
+@wp.func
+def visible_share_of(lost: wp.float32, whole: wp.float32) -> wp.float32:
+    """Part of ``whole`` that is left without ``lost``; within 0..1 for whatever comes in, 1 where nothing is known."""
+    if not whole > MIN_IRRADIANCE:  # NaN as well
+        return 1.0
+    share = 1.0 - lost / whole
+    if not share < 1.0:
+        return 1.0
+    return wp.max(share, 0.0)
+
+
+@wp.func
+def visible_shares_of(lost: wp.vec3, whole: wp.vec3) -> wp.vec3:
+    """``visible_share_of`` for each channel."""
+    return wp.vec3(
+        visible_share_of(lost[0], whole[0]), visible_share_of(lost[1], whole[1]), visible_share_of(lost[2], whole[2])
+    )
+
+
+@wp.func
+def meets_ball(away: wp.vec3, radius: wp.float32, direction: wp.vec3) -> wp.bool:
+    """Whether a direction leads from a point into the ball around ``away``, or the point is in it."""
+    beside = wp.dot(away, away) - radius * radius
+    along = wp.dot(away, direction)
+    return beside <= 0.0 or (along > 0.0 and along * along > beside)
+
+
+@wp.func
+def in_lit_cells(cell_row: wp.int32, cell_col: wp.int32, stride: wp.int32, rect: wp.vec4i) -> wp.bool:
+    """Whether a pixel of the rectangle may look a cell up."""
+    reach = wp.vec4i(rect[0] - 2 * stride, rect[1] + 2 * stride, rect[2] - 2 * stride, rect[3] + 2 * stride)
+    return rect[0] < rect[1] and inside_rect(cell_row * stride, cell_col * stride, reach)
+
+
+@functools.cache
+def make_mean_facing(config: CellConfig) -> wp.Function:
+    """``mean_facing(receiver, point, normal) -> vec3``: mean radiance, by the cosine, of what lies before a surface.
+
+    Of the environment, emitters where the balls saw them.
+    """
+    irradiance_at = make_irradiance_at(config.relight.irradiance, False, config.relight.several)
+
+    @wp.func(module="unique")
+    def mean_facing(receiver: Receiver, point: wp.vec3, normal: wp.vec3) -> wp.vec3:
+        received = irradiance_at(
+            receiver.irradiance_sh, receiver.irradiance_map, receiver.emitters, receiver.others, point, normal
+        )
+        mean = received / wp.pi
+        # A series may ring below zero, which no light does.
+        return wp.max(mean, wp.vec3(0.0, 0.0, 0.0))
+
+    return mean_facing
+
+
+@wp.func
+def bound_solids(scene: RayScene) -> wp.vec4:
+    """Middle and radius of one ball around all proxies that can hide light: all but planes."""
+    middle = wp.vec3()
+    solid = float(0.0)
+    for index in range(scene.proxies.shape[0]):
+        if scene.proxies[index].kind != PLANE:
+            middle += scene.proxies[index].position
+            solid += 1.0
+    middle = middle / wp.max(solid, 1.0)
+    reach = float(0.0)
+    for index in range(scene.proxies.shape[0]):
+        shape = scene.proxies[index]
+        if shape.kind != PLANE:
+            reach = wp.max(reach, wp.length(shape.position - middle) + shape.scale * wp.length(shape.extent))
+    return wp.vec4(middle[0], middle[1], middle[2], reach)
+
+
+@wp.struct
+class Hider:
+    """What stands between a point of the receiver and a sample of the environment."""
+
+    hides: wp.bool
+    radiance: wp.vec3  # that it sends along the sample's direction
+
+
+@functools.cache
+def make_find_hider(config: CellConfig) -> wp.Function:
+    """``find_hider(params, scene, receiver, hit, toward, solids) -> Hider``; ``solids`` of ``bound_solids``."""
+    mean_facing = make_mean_facing(config)
+    find_in_frame = make_find_in_frame(config.trace, config.relight.probes)
+    closest_proxy = make_trace(config.trace).closest_proxy
+    only_planes = set(config.trace.proxies) <= {PLANE}
+
+    @wp.func(module="unique")
+    def find_hider(
+        params: FrameParams, scene: RayScene, receiver: Receiver, hit: Hit, toward: Incidence, solids: wp.vec4
+    ) -> Hider:
+        found = Hider()
+        nearest = toward.distance
+        for index in range(receiver.probes.shape[0]):
+            probe = receiver.probes[index]
+            away = probe.center - hit.point
+            if meets_ball(away, probe.radius, toward.direction):
+                t = intersect_sphere(probe.radius, -away, toward.direction, nearest)
+                if t < nearest:
+                    nearest = t
+                    found.hides = True
+                    normal = (t * toward.direction - away) / probe.radius
+                    found.radiance = wp.cw_mul(probe.reflectance, mean_facing(receiver, probe.center, normal))
+        if wp.static(not only_planes):
+            # Most samples pass by the ball around all proxies.
+            if meets_ball(wp.vec3(solids[0], solids[1], solids[2]) - hit.point, solids[3], toward.direction):
+                origin = offset_origin(hit.point, hit.geometric_normal, toward.direction, hit.error)
+                hidden = closest_proxy(scene, origin, toward.direction, nearest)
+                if hidden.shape >= 0:
+                    if scene.proxies[hidden.shape].kind != PLANE:
+                        found.hides = True
+                        at = find_in_frame(params, receiver.picture, scene, receiver.probes, hidden)
+                        if at[0] >= 0.0:
+                            found.radiance = look_up(receiver.picture, at[0], at[1])
+                        else:
+                            facing = hidden.normal
+                            if wp.dot(facing, toward.direction) > 0.0:
+                                facing = -facing
+                            found.radiance = DEFAULT_REFLECTANCE * mean_facing(receiver, hidden.point, facing)
+        return found
+
+    return find_hider
+
+
+@wp.func
+def is_shone_on(lights: wp.array[Light], hit: Hit) -> wp.bool:
+    """Whether a virtual light shines on a point, were nothing in the way."""
+    for index in range(lights.shape[0]):
+        light = sample_light(lights[index], hit.point)
+        if wp.dot(hit.geometric_normal, light.wi) > 0.0 and wp.max(light.irradiance_normal) > 0.0:
+            return True
+    return False
+
+
+@functools.cache
+def make_ambient_visibility_kernel(config: CellConfig) -> wp.Kernel:
+    """Kernel of ``estimate_ambient_visibility``."""
+    visible_proxy = make_visible_proxy(config.trace, config.relight.probes)
+    find_hider = make_find_hider(config)
+
+    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
+    def ambient_visibility_kernel(
+        # In:
+        row_start: wp.int32,
+        params: wp.array[FrameParams],
+        scene: RayScene,
+        lights: wp.array[Light],
+        receiver: Receiver,
+        samples: wp.array[EnvironmentSample],
+        bounced: wp.bool,
+        # Out:
+        cells_out: ReceiverCells,
+        sums_out: wp.array3d[wp.vec3],
+    ):
+        ci, cj = wp.tid()
+        ci += row_start
+        rays = receiver.picture.rays
+        stride = cells_out.ambient_stride
+        share_out = cells_out.ambient_visibility
+        surface_out = cells_out.ambient_surface
+        partials = wp.max(sums_out.shape[0] / KINDS, 1)
+        partial = ci / share_out.shape[0]
+        ci = ci % share_out.shape[0]
+        # One thread of a cell writes its surface, and no surface that another may still read as found before.
+        if not bounced:
+            if partial == 0:
+                surface_out[ci, cj] = -1
+        elif surface_out[ci, cj] >= 0:
+            return
+        if not in_lit_cells(ci, cj, stride, params[0].light_rect):
+            return
+        i = cell_pixel(ci, stride, rays.shape[0])
+        j = cell_pixel(cj, stride, rays.shape[1])
+        hit = visible_proxy(params[0], rays[i, j], scene, receiver.probes)
+        if hit.shape < 0:
+            return
+        key = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
+        needed = bool(False)
+        if bounced:
+            sent = look_up_bounced(scene, receiver, hit, i, j)
+            needed = sent[0] + sent[1] + sent[2] > 0.0
+        else:
+            needed = is_shone_on(lights, hit)
+        if not needed:
+            return
+        if partial == 0:
+            surface_out[ci, cj] = wp.where(partials > 1, PENDING - key, key)
+        solids = bound_solids(scene)
+        whole = wp.vec3()
+        lost = wp.vec3()
+        count = samples.shape[0]
+        for k in range(count * partial / partials, count * (partial + 1) / partials):
+            sample = samples[k]
+            toward = sample_toward(sample, hit.point)
+            cosine = wp.dot(hit.normal, toward.direction)
+            if cosine > 0.0:
+                if wp.static(config.relight.several):
+                    places = receiver.others.places
+                    toward.measure *= probe_share(places, ball_of_sample(k, places.shape[0]), hit.point)
+                flux = cosine * toward.measure * sample.radiance
+                whole += flux
+                hider = find_hider(params[0], scene, receiver, hit, toward, solids)
+                if hider.hides:
+                    lost += cosine * toward.measure * (sample.radiance - hider.radiance)
+        if partials > 1:
+            sums_out[partial * KINDS, ci, cj] = whole
+            sums_out[partial * KINDS + 1, ci, cj] = lost
+        else:
+            share_out[ci, cj] = visible_shares_of(lost, whole)
+
+    return ambient_visibility_kernel
+
+
+@wp.kernel(enable_backward=False)
+def reduce_partials_kernel(
+    # In:
+    sums: wp.array3d[wp.vec3],
+    # Out:
+    cells_out: ReceiverCells,
+):
+    """Shares of cells whose samples several threads have just summed."""
+    i, j = wp.tid()
+    pending = cells_out.ambient_surface[i, j]
+    if pending > PENDING:
+        return
+    whole = wp.vec3()
+    lost = wp.vec3()
+    for partial in range(sums.shape[0] / KINDS):
+        whole += sums[partial * KINDS, i, j]
+        lost += sums[partial * KINDS + 1, i, j]
+    cells_out.ambient_visibility[i, j] = visible_shares_of(lost, whole)
+    cells_out.ambient_surface[i, j] = PENDING - pending
+
+
+@wp.func
+def sent_share(scene: RayScene, hit: Hit) -> wp.vec3:
+    """Share of light that an object sends on, as if to all sides alike: its colour; of a picture a grey one's.
+
+    A mirror sends light to one side only, and is left out.
+    """
+    material = scene.materials[material_at(scene, hit)]
+    if material.model == MIRROR or material.unlit != 0:
+        return wp.vec3(0.0, 0.0, 0.0)
+    share = material.base_color
+    if material.base_texture >= 0:
+        share = DEFAULT_REFLECTANCE * share
+    if material.model == PHONG:
+        share = share + material.specular
+    return wp.min(wp.max(share, wp.vec3(0.0, 0.0, 0.0)), wp.vec3(1.0, 1.0, 1.0))
+
+
+@functools.cache
+def make_sent_by_object(trace: TraceConfig) -> wp.Function:
+    """``sent_by_object(scene, lights, hit) -> vec3``: radiance by virtual light of an object that shows ``hit``.
+
+    Lights count as points: their shadows on objects have no penumbra.
+    """
+    is_lit = make_shadow(trace)
+
+    @wp.func(module="unique")
+    def sent_by_object(scene: RayScene, lights: wp.array[Light], hit: Hit) -> wp.vec3:
+        share = sent_share(scene, hit)
+        received = wp.vec3()
+        if wp.max(share) > 0.0:
+            for index in range(lights.shape[0]):
+                light = sample_light(lights[index], hit.point)
+                n_dot_l = wp.dot(hit.normal, light.wi)
+                if n_dot_l <= 0.0 or wp.dot(hit.geometric_normal, light.wi) <= 0.0:
+                    continue
+                if wp.max(light.irradiance_normal) > 0.0:
+                    if is_lit(scene, hit.point, hit.geometric_normal, hit.error, light):
+                        received += n_dot_l * light.irradiance_normal
+        return wp.cw_mul(share, received) / wp.pi
+
+    return sent_by_object
+
+
+@functools.cache
+def make_send_light_kernel(config: CellConfig) -> wp.Kernel:
+    """Kernel of ``send_light``."""
+    visible_proxy = make_visible_proxy(config.trace, config.relight.probes)
+    direct_lighting = make_direct_lighting(dataclasses.replace(config.relight, bounced=False))
+    has_objects = bool(config.trace.objects)
+    closest_object = make_trace(config.trace).closest_object
+    sent_by_object = make_sent_by_object(config.trace)
+
+    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
+    def send_light_kernel(
+        # In:
+        row_start: wp.int32,
+        params: wp.array[FrameParams],
+        scene: RayScene,
+        lights: wp.array[Light],
+        receiver: Receiver,
+        stride: wp.int32,
+        # Out:
+        patches_out: wp.array2d[Patch],
+    ):
+        ci, cj = wp.tid()
+        ci += row_start
+        rays = receiver.picture.rays
+        patch = Patch()
+        i = cell_pixel(ci, stride, rays.shape[0])
+        j = cell_pixel(cj, stride, rays.shape[1])
+        if inside_rect(i, j, params[0].light_rect):
+            hit = visible_proxy(params[0], rays[i, j], scene, receiver.probes)
+            if hit.shape >= 0:
+                added = wp.vec3()
+                is_object = bool(False)
+                if wp.static(has_objects):
+                    toward = params[0].world_from_camera * wp.vec3(rays[i, j][0], rays[i, j][1], 1.0)
+                    item = closest_object(scene, params[0].camera_position, toward, hit.t)
+                    if item.shape >= 0:
+                        is_object = True
+                        hit = item
+                        if wp.dot(hit.geometric_normal, toward) > 0.0:
+                            hit.geometric_normal = -hit.geometric_normal
+                            hit.normal = -hit.normal
+                        added = sent_by_object(scene, lights, hit)
+                if not is_object:
+                    lit = direct_lighting(scene, lights, receiver, hit, i, j, wp.vec3(), tile_turn(ci, cj))
+                    added = lit.added
+                if added[0] + added[1] + added[2] > 0.0:
+                    ray = rays[i, j]
+                    # A pixel's solid angle is cos^3 / (fx fy), the distance to its point t / cos.
+                    length = wp.sqrt(ray[0] * ray[0] + ray[1] * ray[1] + 1.0)
+                    direction = params[0].world_from_camera * wp.vec3(ray[0], ray[1], 1.0) / length
+                    facing = wp.max(-wp.dot(direction, hit.geometric_normal), MIN_FACING)
+                    # A patch at the frame's border has fewer pixels.
+                    rows = wp.min(stride, rays.shape[0] - ci * stride)
+                    pixels = wp.float32(rows * wp.min(stride, rays.shape[1] - cj * stride))
+                    patch.area = pixels * hit.t * hit.t / (length * params[0].focal[0] * params[0].focal[1] * facing)
+                    patch.position = hit.point
+                    patch.normal = hit.geometric_normal
+                    patch.flux = patch.area * added
+        patches_out[ci, cj] = patch
+
+    return send_light_kernel
+
+
+@wp.kernel(enable_backward=False)
+def list_patches_kernel(
+    # In:
+    row_start: wp.int32,
+    patches: wp.array2d[Patch],
+    # Out:
+    listed_out: wp.array2d[Patch],
+    count_out: wp.array[wp.int32],
+):
+    """Patches of a row that send light, in their order: sums over them are the same in every run."""
+    i = wp.tid() + row_start
+    count = int(0)
+    for j in range(patches.shape[1]):
+        if patches[i, j].area > 0.0:
+            listed_out[i, count] = patches[i, j]
+            count += 1
+    count_out[i] = count
+
+
+@functools.cache
+def make_gather_light_kernel(config: CellConfig) -> wp.Kernel:
+    """Kernel of ``gather_light``."""
+    visible_proxy = make_visible_proxy(config.trace, config.relight.probes)
+    mean_facing = make_mean_facing(config)
+
+    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
+    def gather_light_kernel(
+        # In:
+        row_start: wp.int32,
+        params: wp.array[FrameParams],
+        scene: RayScene,
+        receiver: Receiver,
+        patches: wp.array2d[Patch],
+        count: wp.array[wp.int32],
+        patch_stride: wp.int32,
+        # Out:
+        cells_out: ReceiverCells,
+    ):
+        ci, cj = wp.tid()
+        ci += row_start
+        rays = receiver.picture.rays
+        stride = cells_out.bounced_stride
+        cells_out.bounced_surface[ci, cj] = -1
+        if not in_lit_cells(ci, cj, stride, params[0].light_rect):
+            return
+        i = cell_pixel(ci, stride, rays.shape[0])
+        j = cell_pixel(cj, stride, rays.shape[1])
+        hit = visible_proxy(params[0], rays[i, j], scene, receiver.probes)
+        if hit.shape < 0:
+            return
+        cells_out.bounced_surface[ci, cj] = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
+        total = wp.vec3()
+        # Rows that the light reaches: the others may be of an earlier frame.
+        rect = params[0].light_rect
+        for row in range(rect[0] / patch_stride, wp.min((rect[1] - 1) / patch_stride + 1, patches.shape[0])):
+            for k in range(count[row]):
+                patch = patches[row, k]
+                way = patch.position - hit.point
+                here = wp.dot(way, hit.normal)
+                there = -wp.dot(way, patch.normal)
+                if here > 0.0 and there > 0.0:
+                    squared = wp.dot(way, way)
+                    total += here * there / (squared * (squared + patch.area / wp.pi)) * patch.flux
+        distant = wp.pi * mean_facing(receiver, hit.point, hit.normal)
+        matters = bool(False)
+        for channel in range(3):
+            if total[channel] > NEGLIGIBLE * distant[channel]:
+                matters = True
+        cells_out.bounced[ci, cj] = wp.where(matters, total, wp.vec3(0.0, 0.0, 0.0))
+
+    return gather_light_kernel
+
+
+def estimate_ambient_visibility(
+    config: CellConfig,
+    params: wp.array[FrameParams],
+    scene: RayScene,
+    lights: wp.array[Light],
+    receiver: Receiver,
+    samples: wp.array[EnvironmentSample],
+    cells_out: ReceiverCells,
+    *,
+    bounced: bool = False,
+    sums_out: wp.array3d[wp.vec3] | None = None,
+    rows: Rows | None = None,
+) -> None:
+    """Estimate which part of the environment reaches the receiver, for cells that virtual lights may shine on.
+
+    Args:
+        config: Kinds of shape, form of the environment's irradiance.
+        params: (1,) FrameParams: camera and light_rect.
+        scene: Proxies.
+        lights: (n,) Light.
+        receiver: From ``make_receiver``: picture, balls and the environment's irradiance; with the cells of
+            ``gather_light`` if ``bounced``.
+        samples: (n,) of the environment. The same for all cells, so there is no noise; the first n of a longer
+            sequence are an aligned block of Sobol's if n is a power of 2.
+        cells_out: Cells whose ambient visibility and its surface are written.
+        bounced: Whether to add cells that get bounced light to those that were estimated before.
+        sums_out: Scratch of ``partial_sums_shape`` in which several threads share a cell; ``rows`` must be None then.
+            None means one thread per cell.
+        rows: Band of rows of cells; None means all.
+    """
+    partials = 1 if sums_out is None else sums_out.shape[0] // int(KINDS)
+    shape, device = cells_out.ambient_visibility.shape, receiver.picture.rays.device
+    launch_rows(
+        make_ambient_visibility_kernel(config),
+        (shape[0] * partials, shape[1]),
+        [params, scene, lights, receiver, samples, bounced],
+        [cells_out, sums_out],
+        rows=rows,
+        device=device,
+    )
+    if partials > 1:
+        launch(reduce_partials_kernel, shape, [sums_out], [cells_out], device=device)
+
+
+def partial_sums_shape(partials: int, rows: int, columns: int) -> tuple[int, int, int]:
+    """Shape of the array that holds the partial sums of so many cells."""
+    return partials * int(KINDS), rows, columns
+
+
+def send_light(
+    config: CellConfig,
+    params: wp.array[FrameParams],
+    scene: RayScene,
+    lights: wp.array[Light],
+    receiver: Receiver,
+    stride: int,
+    patches_out: wp.array2d[Patch],
+    *,
+    rows: Rows | None = None,
+) -> None:
+    """Find what every patch of the receiver sends on of the virtual light that falls on it.
+
+    Args:
+        config: As for ``estimate_ambient_visibility``.
+        params: (1,) FrameParams: camera and light_rect.
+        scene: Objects and proxies.
+        lights: (n,) Light.
+        receiver: From ``make_receiver``, with the cells of ``estimate_ambient_visibility`` where the config has them.
+        stride: Pixels along a patch.
+        patches_out: (ceil(H / stride), ceil(W / stride)) patches; those that send nothing have no area.
+        rows: Band of rows of patches; None means all.
+    """
+    launch_rows(
+        make_send_light_kernel(config),
+        patches_out.shape,
+        [params, scene, lights, receiver, stride],
+        [patches_out],
+        rows=rows,
+        device=patches_out.device,
+    )
+
+
+def list_patches(
+    patches: wp.array2d[Patch],
+    listed_out: wp.array2d[Patch],
+    count_out: wp.array[wp.int32],
+    *,
+    rows: Rows | None = None,
+) -> None:
+    """Move the patches that send light to the front of their rows.
+
+    Args:
+        patches: (r, c) of ``send_light``.
+        listed_out: (r, c) patches.
+        count_out: (r,) how many of a row send light.
+        rows: Band of rows; None means all.
+    """
+    launch_rows(
+        list_patches_kernel, count_out.shape, [patches], [listed_out, count_out], rows=rows, device=patches.device
+    )
+
+
+def gather_light(
+    config: CellConfig,
+    params: wp.array[FrameParams],
+    scene: RayScene,
+    receiver: Receiver,
+    patches: wp.array2d[Patch],
+    count: wp.array[wp.int32],
+    patch_stride: int,
+    cells_out: ReceiverCells,
+    *,
+    rows: Rows | None = None,
+) -> None:
+    """Sum what patches send to the cells of the receiver.
+
+    Args:
+        config: As for ``estimate_ambient_visibility``.
+        params: (1,) FrameParams: camera and light_rect.
+        scene: Proxies.
+        receiver: From ``make_receiver``: picture, balls and the environment's irradiance.
+        patches: (r, c) of ``list_patches``; only rows that light_rect reaches are read.
+        count: (r,) how many of a row send light.
+        patch_stride: Pixels along a patch.
+        cells_out: Cells whose bounced light and its surface are written; bounced light is 0 where it is less than
+            ``NEGLIGIBLE`` of the environment's.
+        rows: Band of rows of cells; None means all.
+    """
+    bounced = cells_out.bounced
+    launch_rows(
+        make_gather_light_kernel(config),
+        bounced.shape,
+        [params, scene, receiver, patches, count, patch_stride],
+        [cells_out],
+        rows=rows,
+        device=bounced.device,
+    )

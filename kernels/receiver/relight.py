@@ -1,0 +1,470 @@
+"""Virtual light on the receiver: linear radiance that a virtual light adds to each pixel of the camera's frame.
+
+Every pixel's ray meets the nearest proxy; the mirror ball, if it is in front, shows no light of its own. A light of
+irradiance E_v (facing it) arrives there along wi, unless a virtual object or a proxy stands between, and adds
+
+    added = sum over lights of  Kd / pi * E_v * visible * response.
+
+Kd and the response are the receiver's: ``kernels/receiver/receiver.py`` has the methods and their equations.
+
+With *cells* (``kernels/receiver/receiver_cells.py``) a receiver's reflectance knows the part of the environment that
+boxes and
+balls let through, and the irradiance by virtual light that lit proxies send to each other is added to the direct one:
+
+    added += Kd / pi * E_bounced.
+
+Edges. A light without size has shadows without penumbra. Where a neighbour sees another surface and one of the two is
+lit, or something else hides lights from it, the pixel is traced again with n^2 samples and averaged, as ``shade`` does
+along outlines; what the camera's pixel says of the receiver holds for all of them.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import warp as wp
+
+from warp_ar.kernels.cells import any_cell_above_zero
+from warp_ar.kernels.edges import EdgeList, EdgeLists, holds_all, list_edge, listed_edges, sample_listed_edges
+from warp_ar.kernels.launch import MOST_REGISTERS, QUICK_TO_COMPILE, Rows, launch_rows, slow_to_compile
+from warp_ar.kernels.pixel_order import own_pixel
+from warp_ar.kernels.rays.area_lights import make_area_count, make_area_sample
+from warp_ar.kernels.rays.shadow import (
+    LightSample,
+    has_penumbra,
+    make_shadow,
+    make_visible_share,
+    sample_light,
+    tile_turn,
+)
+from warp_ar.kernels.rays.shapes import FAR, surface_key
+from warp_ar.kernels.rays.trace import make_trace, meets_probe
+from warp_ar.kernels.rays.visibility import inside_rect, make_sample_direction
+from warp_ar.kernels.receiver.receiver import (
+    DEFAULT_REFLECTANCE,
+    Matter,
+    Receiver,
+    RelightConfig,
+    look_up_bounced,
+    make_find_matter,
+    make_respond,
+)
+from warp_ar.kernels.structs import FrameParams, Hit, Light, RayScene
+
+wp.set_module_options({"enable_backward": False})
+
+_INV_PI = wp.constant(wp.float32(1.0 / math.pi))
+_MASKED = 8
+"""Lights whose shadows are told apart: one bit each, of what ``relight`` writes for ``smooth_edges``."""
+_LIT = wp.constant(1 << _MASKED)
+"""The bit that tells whether any light arrives; the number of the surface stands above it."""
+_SURFACE = wp.constant(_MASKED + 1)
+_NOTHING = wp.constant(-1 << (_MASKED + 1))
+_BALL = wp.constant(-2 << (_MASKED + 1))
+
+
+@wp.struct
+class DirectLighting:
+    """What virtual light does at a point of the receiver."""
+
+    added: wp.vec3  # radiance
+    visibility: wp.int32  # whether any light arrives, and which do not: see ``is_edge``
+
+
+@functools.cache
+def make_area_response(config: RelightConfig) -> wp.Function:
+    """``area_response(scene, receiver, hit, matter, turn) -> vec3``: sum of E_v visible response over what emits."""
+    is_lit, respond = make_shadow(config.trace), make_respond(config.method)
+    area_count, area_sample = make_area_count(config.area_samples), make_area_sample(config.area_samples)
+
+    @wp.func(module="unique")
+    def area_response(scene: RayScene, receiver: Receiver, hit: Hit, matter: Matter, turn: wp.float32) -> wp.vec3:
+        total = wp.vec3()
+        count = area_count(scene)
+        for k in range(count):
+            area = area_sample(scene, hit.point, hit.normal, k, count, turn)
+            n_dot_l = wp.max(wp.dot(hit.normal, area.wi), 0.0)
+            if wp.max(area.irradiance_normal) <= 0.0 or wp.dot(hit.geometric_normal, area.wi) <= 0.0:
+                continue
+            light = LightSample()
+            light.wi = area.wi
+            light.distance = area.distance
+            if not is_lit(scene, hit.point, hit.geometric_normal, hit.error, light):
+                continue
+            if wp.static(config.probes):
+                if meets_probe(receiver.probes, hit.point, area.wi, area.distance):
+                    continue
+            total += respond(matter, area.wi, n_dot_l) * area.irradiance_normal
+        return total
+
+    return area_response
+
+
+@functools.cache
+def make_direct_lighting(config: RelightConfig) -> wp.Function:
+    """``direct_lighting(scene, lights, receiver, hit, row, col, mirror, turn) -> DirectLighting``: of virtual light.
+
+    The pixel (row, col) shows the hit: straight where ``mirror`` is zero, else as a mirror ball of that reflectance has
+    it, which says nothing about the hit's surroundings. ``turn`` is for ``visible_share``.
+    """
+    is_lit = make_shadow(config.trace)
+    visible_share = make_visible_share(config.trace) if config.soft else None
+    find_matter, respond = make_find_matter(config), make_respond(config.method)
+    area_response = make_area_response(config) if config.area_samples > 0 else None
+
+    @wp.func(module="unique")
+    def direct_lighting(
+        scene: RayScene,
+        lights: wp.array[Light],
+        receiver: Receiver,
+        hit: Hit,
+        row: wp.int32,
+        col: wp.int32,
+        mirror: wp.vec3,
+        turn: wp.float32,
+    ) -> DirectLighting:
+        result = DirectLighting()
+        known = bool(False)  # what the receiver is, found only once some light falls here
+        matter = Matter()
+        matter.kd = wp.vec3(DEFAULT_REFLECTANCE, DEFAULT_REFLECTANCE, DEFAULT_REFLECTANCE)
+        added = wp.vec3()
+        for index in range(lights.shape[0]):
+            light = sample_light(lights[index], hit.point)
+            n_dot_l = wp.max(wp.dot(hit.normal, light.wi), 0.0)
+            if wp.dot(hit.geometric_normal, light.wi) <= 0.0 or wp.max(light.irradiance_normal) <= 0.0:
+                continue
+            bit = 1 << (index % wp.static(_MASKED))
+            visible = float(1.0)
+            if wp.static(config.soft):
+                visible = visible_share(scene, hit.point, hit.geometric_normal, hit.error, lights[index], light, turn)
+                if visible <= 0.0:
+                    if not has_penumbra(lights[index], light):
+                        result.visibility |= bit
+                    continue
+            else:
+                if not is_lit(scene, hit.point, hit.geometric_normal, hit.error, light):
+                    result.visibility |= bit
+                    continue
+            if wp.static(config.probes):
+                if meets_probe(receiver.probes, hit.point, light.wi, light.distance):
+                    result.visibility |= bit
+                    continue
+            result.visibility |= _LIT
+            if wp.static(config.method != "flat"):
+                if not known:
+                    known = True
+                    matter = find_matter(scene, receiver, hit, row, col, mirror)
+            added += visible * respond(matter, light.wi, n_dot_l) * light.irradiance_normal
+        if wp.static(config.area_samples > 0):
+            if scene.area_lights.shape[0] > 0:
+                if wp.static(config.method != "flat"):
+                    if not known:
+                        known = True
+                        matter = find_matter(scene, receiver, hit, row, col, mirror)
+                by_areas = area_response(scene, receiver, hit, matter, turn)
+                if wp.max(by_areas) > 0.0:
+                    result.visibility |= _LIT
+                    added += by_areas
+        if wp.static(config.bounced):
+            if mirror[0] <= 0.0:
+                bounced = look_up_bounced(scene, receiver, hit, row, col)
+                if bounced[0] + bounced[1] + bounced[2] > 0.0:
+                    result.visibility |= _LIT
+                    if not known:
+                        matter = find_matter(scene, receiver, hit, row, col, mirror)
+                    added += wp.vec3(bounced[0], bounced[1], bounced[2])
+        result.added = wp.cw_mul(matter.kd, added) * _INV_PI
+        return result
+
+    return direct_lighting
+
+
+@functools.cache
+def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
+    """Kernel specialised to ``config``; equal configs share one kernel."""
+    closest_proxy = make_trace(config.trace).closest_proxy
+    direct_lighting = make_direct_lighting(config)
+
+    @slow_to_compile
+    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
+    def relight_kernel(
+        # In:
+        row_start: wp.int32,
+        params: wp.array[FrameParams],
+        scene: RayScene,
+        lights: wp.array[Light],
+        receiver: Receiver,
+        # Out:
+        added_out: wp.array2d[wp.vec3],
+        visibility_out: wp.array2d[wp.int32],
+    ):
+        i, j = wp.tid()
+        pixel = own_pixel(i, j, row_start, params[0].light_rect, added_out.shape[0], added_out.shape[1])
+        i = pixel[0]
+        j = pixel[1]
+        if i < 0:
+            return
+        black = wp.vec3(0.0, 0.0, 0.0)
+        added_out[i, j] = black
+        if not inside_rect(i, j, params[0].light_rect):
+            return
+        if wp.static(config.edge_samples > 1):
+            visibility_out[i, j] = _NOTHING
+        if wp.static(config.bounced):
+            if not inside_rect(i, j, params[0].direct_rect):
+                cells = receiver.cells
+                size = wp.vec2i(receiver.picture.rays.shape[0], receiver.picture.rays.shape[1])
+                if not any_cell_above_zero(cells.bounced, cells.bounced_surface, cells.bounced_stride, size, i, j):
+                    return
+        ray = receiver.picture.rays[i, j]
+        direction = params[0].world_from_camera * wp.vec3(ray[0], ray[1], 1.0)
+        hit = closest_proxy(scene, params[0].camera_position, direction, FAR)
+        # A face that is seen from behind is not the surface that the camera sees.
+        if hit.shape < 0 or wp.dot(hit.geometric_normal, direction) >= 0.0:
+            return
+        if wp.static(config.probes):
+            if meets_probe(receiver.probes, params[0].camera_position, direction, hit.t):
+                if wp.static(config.edge_samples > 1):
+                    visibility_out[i, j] = _BALL
+                return
+        lit = direct_lighting(scene, lights, receiver, hit, i, j, black, tile_turn(i, j))
+        added_out[i, j] = lit.added
+        if wp.static(config.edge_samples > 1):
+            surface = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
+            visibility_out[i, j] = (surface << _SURFACE) | lit.visibility
+
+    return relight_kernel
+
+
+@wp.func
+def is_edge(visibility: wp.array2d[wp.int32], rect: wp.vec4i, row: wp.int32, column: wp.int32) -> wp.bool:
+    """Whether virtual light may change within a pixel, or between it and the next one.
+
+    That is where something stands before a light without penumbra for one of them alone, or where they see different
+    surfaces and any light arrives. Balls have light of their own, which ``mirror_ball`` adds.
+    """
+    here = visibility[row, column]
+    if here == _BALL:
+        return False
+    for k in range(4):
+        i = row + wp.where(k == 0, -1, 0) + wp.where(k == 1, 1, 0)
+        j = column + wp.where(k == 2, -1, 0) + wp.where(k == 3, 1, 0)
+        if inside_rect(i, j, rect):
+            there = visibility[i, j]
+            if there != here and there != _BALL:
+                differs = here ^ there
+                if (differs & (_LIT - 1)) != 0:
+                    return True
+                if (differs >> _SURFACE) != 0 and ((here | there) & _LIT) != 0:
+                    return True
+    return False
+
+
+@functools.cache
+def make_sample_lighting(config: RelightConfig) -> wp.Function:
+    """``sample_lighting(params, scene, lights, receiver, row, col, sample) -> vec4``: a sample's light, and 1.
+
+    Zero where it sees a ball: such a sample does not count.
+    """
+    closest_proxy = make_trace(config.trace).closest_proxy
+    direct_lighting = make_direct_lighting(config)
+    sample_direction = make_sample_direction(config.edge_samples)
+
+    @wp.func(module="unique")
+    def sample_lighting(
+        params: wp.array[FrameParams],
+        scene: RayScene,
+        lights: wp.array[Light],
+        receiver: Receiver,
+        row: wp.int32,
+        col: wp.int32,
+        sample: wp.int32,
+    ) -> wp.vec4:
+        direction = sample_direction(params, receiver.picture.rays[row, col], sample)
+        hit = closest_proxy(scene, params[0].camera_position, direction, FAR)
+        if wp.static(config.probes):
+            if meets_probe(receiver.probes, params[0].camera_position, direction, hit.t):
+                return wp.vec4(0.0)
+        if hit.shape < 0 or wp.dot(hit.geometric_normal, direction) >= 0.0:
+            return wp.vec4(0.0, 0.0, 0.0, 1.0)
+        lit = direct_lighting(scene, lights, receiver, hit, row, col, wp.vec3(), tile_turn(row, col))
+        return wp.vec4(lit.added[0], lit.added[1], lit.added[2], 1.0)
+
+    return sample_lighting
+
+
+@functools.cache
+def make_smooth_edges_kernel(config: RelightConfig, *, left: bool = False) -> wp.Kernel:
+    """Kernel that samples edges in place; if ``left``, only where the list did not hold all."""
+    sample_lighting = make_sample_lighting(config)
+
+    @wp.kernel(
+        module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS, module_options=QUICK_TO_COMPILE
+    )
+    def smooth_edges_kernel(
+        # In:
+        row_start: wp.int32,
+        params: wp.array[FrameParams],
+        scene: RayScene,
+        lights: wp.array[Light],
+        receiver: Receiver,
+        visibility: wp.array2d[wp.int32],
+        listed: EdgeList,
+        # Out:
+        added_out: wp.array2d[wp.vec3],
+    ):
+        i, j = wp.tid()
+        if wp.static(left):
+            if holds_all(listed):
+                return
+        rect = params[0].light_rect
+        pixel = own_pixel(i, j, row_start, rect, added_out.shape[0], added_out.shape[1])
+        i = pixel[0]
+        j = pixel[1]
+        if i < 0:
+            return
+        if not inside_rect(i, j, rect):
+            return
+        if not is_edge(visibility, rect, i, j):
+            return
+        total = wp.vec4()
+        count = wp.int32(wp.static(config.edge_samples))  # a variable: the loop must not be unrolled
+        for sample in range(count):
+            total += sample_lighting(params, scene, lights, receiver, i, j, sample)
+        if total[3] > 0.0:
+            added_out[i, j] = wp.vec3(total[0], total[1], total[2]) / total[3]
+
+    return smooth_edges_kernel
+
+
+@wp.kernel(enable_backward=False)
+def list_edges_kernel(
+    # In:
+    row_start: wp.int32,
+    params: wp.array[FrameParams],
+    visibility: wp.array2d[wp.int32],
+    # Out:
+    list_out: EdgeList,
+):
+    """List the pixels that ``is_edge`` finds."""
+    i, j = wp.tid()
+    rect = params[0].light_rect
+    pixel = own_pixel(i, j, row_start, rect, visibility.shape[0], visibility.shape[1])
+    i = pixel[0]
+    j = pixel[1]
+    if i < 0:
+        return
+    if inside_rect(i, j, rect):
+        if is_edge(visibility, rect, i, j):
+            list_edge(i, j, list_out)
+
+
+@functools.cache
+def make_sample_edges_kernel(config: RelightConfig) -> wp.Kernel:
+    """Kernel that takes every sample of the edges that were listed."""
+    sample_lighting = make_sample_lighting(config)
+
+    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
+    def sample_lighting_edges_kernel(
+        # In:
+        threads: wp.int32,
+        params: wp.array[FrameParams],
+        scene: RayScene,
+        lights: wp.array[Light],
+        receiver: Receiver,
+        listed: EdgeList,
+        # Out:
+        samples_out: wp.array[wp.vec4],
+    ):
+        item = wp.tid()
+        stop = listed_edges(listed) * wp.static(config.edge_samples)
+        while item < stop:
+            edge = listed.edges[item / wp.static(config.edge_samples)]
+            sample = item % wp.static(config.edge_samples)
+            samples_out[item] = sample_lighting(params, scene, lights, receiver, edge[0], edge[1], sample)
+            item += threads
+
+    return sample_lighting_edges_kernel
+
+
+def relight(
+    config: RelightConfig,
+    params: wp.array[FrameParams],
+    scene: RayScene,
+    lights: wp.array[Light],
+    receiver: Receiver,
+    added_out: wp.array2d[wp.vec3],
+    visibility_out: wp.array2d[wp.int32] | None = None,
+    *,
+    cleared: bool = False,
+    rows: Rows | None = None,
+) -> None:
+    """Write the radiance that virtual lights add to the receiver; zero outside ``params[0].light_rect``.
+
+    One sample per pixel: where ``config.edge_samples`` is more than 1, ``smooth_edges`` comes next.
+
+    Args:
+        config: Method and kinds of shape.
+        params: (1,) FrameParams: camera, light_rect and, if ``config.bounced``, direct_rect.
+        scene: Objects and proxies.
+        lights: (n,) Light.
+        receiver: Of ``make_receiver``.
+        added_out: (H, W) linear radiance in camera values.
+        visibility_out: (H, W) which surface a pixel sees and which lights do not; needed if ``config.edge_samples`` is
+            more than 1. Only what lies in ``light_rect`` is written.
+        cleared: Whether ``added_out`` is zero, so that on CUDA it need not be written outside.
+        rows: Band of rows; None means all.
+    """
+    rays = receiver.picture.rays
+    launch_rows(
+        make_relight_kernel(config),
+        rays.shape,
+        [params, scene, lights, receiver],
+        [added_out, visibility_out],
+        rows=rows,
+        device=rays.device,
+        rectangle_first=True,
+        alone=cleared,
+    )
+
+
+def smooth_edges(
+    config: RelightConfig,
+    params: wp.array[FrameParams],
+    scene: RayScene,
+    lights: wp.array[Light],
+    receiver: Receiver,
+    visibility: wp.array2d[wp.int32],
+    added_out: wp.array2d[wp.vec3],
+    *,
+    edge_lists: EdgeLists | None = None,
+    rows: Rows | None = None,
+) -> None:
+    """Average ``config.edge_samples`` samples in pixels along the edges of shadows and of lit proxies.
+
+    Args:
+        config: As that of ``relight``, and so are all arguments that are not named here.
+        params: Likewise.
+        scene: Likewise.
+        lights: Likewise.
+        receiver: Likewise.
+        visibility: (H, W) as ``relight`` writes.
+        added_out: (H, W) as ``relight`` writes; changed along edges.
+        edge_lists: Scratch, for a launch over all rows: edges are then sampled on their own.
+        rows: Band of rows; None means all.
+    """
+    shape, device = receiver.picture.rays.shape, receiver.picture.rays.device
+    inputs = [params, scene, lights, receiver]
+    if edge_lists is None:
+        kernel = make_smooth_edges_kernel(config)
+        launch_rows(kernel, shape, [*inputs, visibility, EdgeList()], [added_out], rows=rows, device=device)
+        return
+    edge_lists.listed.count.zero_()
+    whole = {"rows": None, "device": device, "rectangle_first": True, "alone": True}
+    launch_rows(list_edges_kernel, shape, [params, visibility], [edge_lists.listed], **whole)
+    kernel = make_smooth_edges_kernel(config, left=True)
+    launch_rows(kernel, shape, [*inputs, visibility, edge_lists.listed], [added_out], **whole)
+    sample_listed_edges(
+        make_sample_edges_kernel(config), inputs, edge_lists, config.edge_samples, added_out, weighted=True
+    )

@@ -1,0 +1,1 @@
+"""Kernels that measure the receiver to recover clipped light."""

@@ -1,0 +1,191 @@
+"""How bright recovered light is now, against the frame that it was recovered from: by the card, in every frame.
+
+An estimate of what clips takes effect some frames after the one it is of, and the next comes later still; a lamp that
+is dimmed changes in between, and goes on clipping in the ball. With E what the card receives, e that part of it which
+the map shows, and ' what they are now, the level of what the map does not show is
+
+    f = (E' - e') / (E - e) = (r - q (1 - s)) / s,    r = E' / E,  q = e' / e,  s = (E - e) / E,
+
+where r is the median, over the card's paper and ink, of what points show now over what they showed then, q is read off
+the map, as a surface that faces upward receives it, and s comes with the estimate. Points of the card must agree:
+where a hand covers some or a shadow's edge passes, the level stays as it was.
+
+Noise must not flicker: a change of r / (1 - s + s f) by less than ``STILL`` is none, and by ``FOLLOWED`` is followed in
+full; between them in proportion.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from warp_ar.kernels.latlong import PI, texel_solid_angle
+from warp_ar.kernels.launch import launch
+from warp_ar.kernels.recovery.recover import Observation
+from warp_ar.kernels.structs import Emitter
+
+wp.set_module_options({"enable_backward": False})
+
+STILL = wp.constant(wp.float32(0.01))
+"""Relative change of the card's light up to which the level stays."""
+FOLLOWED = wp.constant(wp.float32(0.03))
+"""The same from which on it is followed in full."""
+LEAST_SHARE = wp.constant(wp.float32(0.1))
+"""Of the card's light that the map must not show: less of it is not told from what the map errs by."""
+LEAST_POINTS = wp.constant(wp.int32(8))
+"""Of the card that must be seen, then and now."""
+AGREEING = wp.constant(wp.float32(0.7))
+"""Share of them whose light must have changed alike,"""
+SPREAD = wp.constant(wp.float32(0.1))
+"""within this, relatively."""
+MOST = wp.constant(wp.float32(1.5))
+"""Highest level: what makes a card brighter by more is rather a lamp that was switched on, somewhere else."""
+DARK = wp.constant(wp.float32(0.0016))
+"""Radiance below which a point says nothing: quantisation."""
+
+
+@wp.kernel(enable_backward=False)
+def sum_upward_kernel(
+    # In:
+    radiance: wp.array2d[wp.vec3],
+    # Out:
+    upward_out: wp.array[wp.vec3],
+):
+    """What each row of the upper half gives a surface that faces upward."""
+    i = wp.tid()
+    height = radiance.shape[0]
+    width = radiance.shape[1]
+    cosine = wp.cos(PI * (wp.float32(i) + 0.5) / wp.float32(height))
+    total = wp.vec3(0.0, 0.0, 0.0)
+    for j in range(width):
+        total += radiance[i, j]
+    upward_out[i] = texel_solid_angle(i, height, width) * cosine * total
+
+
+@wp.kernel(enable_backward=False)
+def add_rows_kernel(
+    # In:
+    rows: wp.array[wp.vec3],
+    # Out:
+    upward_out: wp.array[wp.float32],
+):
+    """The sum of all rows, in their order."""
+    c = wp.tid()
+    total = wp.float32(0.0)
+    for i in range(rows.shape[0]):
+        total += rows[i][c]
+    upward_out[c] = total
+
+
+def sum_upward(radiance: wp.array, rows: wp.array, upward_out: wp.array) -> None:
+    """What a map gives a surface that faces upward.
+
+    Args:
+        radiance: Latlong, ``wp.vec3`` (h, w).
+        rows: Scratch, ``wp.vec3`` (h / 2).
+        upward_out: Irradiance, float32 (3).
+    """
+    launch(sum_upward_kernel, rows.shape, [radiance], [rows], device=radiance.device)
+    launch(add_rows_kernel, 3, [rows], [upward_out], device=radiance.device)
+
+
+@wp.func
+def change_of(now: Observation, then: Observation, c: wp.int32) -> wp.float32:
+    """What a point shows over what it showed, in a channel; negative where either does not tell."""
+    seen = wp.min(now.visible, then.visible) > 0.8 and wp.max(now.clipped[c], then.clipped[c]) < 0.01
+    if seen and now.radiance[c] > DARK and then.radiance[c] > DARK:
+        return now.radiance[c] / then.radiance[c]
+    return -1.0
+
+
+@wp.kernel(enable_backward=False)
+def follow_level_kernel(
+    # In:
+    now: wp.array[Observation],
+    then: wp.array[Observation],
+    upward_now: wp.array[wp.float32],
+    upward_then: wp.array[wp.float32],
+    share: wp.array[wp.float32],
+    # Out:
+    level_out: wp.array[wp.float32],
+):
+    """The point whose change is the median writes the level of its channel."""
+    c, own = wp.tid()
+    change = change_of(now[own], then[own], c)
+    unseen = share[c]
+    if change < 0.0 or unseen < LEAST_SHARE:
+        return
+    count = wp.int32(0)
+    below = wp.int32(0)
+    alike = wp.int32(0)
+    for k in range(now.shape[0]):
+        other = change_of(now[k], then[k], c)
+        if other >= 0.0:
+            count += 1
+            if other < change or (other == change and k < own):
+                below += 1
+            if wp.abs(other - change) <= SPREAD * change:
+                alike += 1
+    if count < LEAST_POINTS or below != count / 2 or wp.float32(alike) < AGREEING * wp.float32(count):
+        return
+    shown = wp.where(upward_then[c] > 0.0, upward_now[c] / wp.max(upward_then[c], 1.0e-9), 1.0)
+    # What the card would show if the level were what it was.
+    expected = unseen + (1.0 - unseen) * shown
+    off = change / expected - 1.0
+    follows = wp.clamp((wp.abs(off) - STILL) / (FOLLOWED - STILL), 0.0, 1.0)
+    level_out[c] = wp.clamp(1.0 + follows * off * expected / unseen, 0.0, MOST)
+
+
+def follow_level(
+    now: wp.array, then: wp.array, upward: tuple[wp.array, wp.array], share: wp.array, level_out: wp.array
+) -> None:
+    """Level of recovered light by what the card shows; it stays as it was where the card does not tell.
+
+    Args:
+        now: What the card's points show, ``Observation`` (n).
+        then: What they showed in the frame that the estimate is of, ``Observation`` (n).
+        upward: From ``sum_upward``, now and then.
+        share: Of the card's light then that the map does not show, by channel, float32 (3).
+        level_out: Radiance of recovered light over that of the estimate, by channel, float32 (3).
+    """
+    launch(follow_level_kernel, (3, now.shape[0]), [now, then, *upward, share], [level_out], device=now.device)
+
+
+@wp.kernel(enable_backward=False)
+def apply_level_kernel(
+    # In:
+    recovered: wp.array2d[wp.vec3],
+    emitters: wp.array[Emitter],
+    level: wp.array[wp.float32],
+    # Out:
+    recovered_out: wp.array2d[wp.vec3],
+    emitters_out: wp.array[Emitter],
+):
+    """Both times the level."""
+    row, column = wp.tid()
+    factor = wp.vec3(level[0], level[1], level[2])
+    recovered_out[row, column] = wp.cw_mul(factor, recovered[row, column])
+    if row == 0 and column < emitters.shape[0]:
+        emitter = emitters[column]
+        emitter.power = wp.cw_mul(factor, emitter.power)
+        emitters_out[column] = emitter
+
+
+def apply_level(
+    recovered: wp.array, emitters: wp.array, level: wp.array, recovered_out: wp.array, emitters_out: wp.array
+) -> None:
+    """Light of an estimate at the level that it has now.
+
+    Args:
+        recovered: Radiance that a wholly clipped texel lacks, ``wp.vec3``, of cells.
+        emitters: ``Emitter`` (k), at most as many as there are columns of cells.
+        level: From ``follow_level``, float32 (3).
+        recovered_out: As ``recovered``.
+        emitters_out: As ``emitters``.
+    """
+    launch(
+        apply_level_kernel,
+        recovered.shape,
+        [recovered, emitters, level],
+        [recovered_out, emitters_out],
+        device=recovered.device,
+    )

@@ -1,0 +1,332 @@
+"""Cells of the environment, in which recovery looks for light that the camera could not hold.
+
+The environment is condensed to ``CELL_ROWS`` x ``CELL_COLUMNS`` cells of a latlong grid (5.6 degrees), each with its
+mean radiance, its share at clipping, and the direction in which that share lies (``condense_cells``). What was found
+missing is put back into the map by ``add_recovered``.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import warp as wp
+
+from warp_ar.kernels.latlong import direction_from_latlong, latlong_from_direction, texel_solid_angle
+from warp_ar.kernels.launch import QUICK_TO_COMPILE, Rows, launch_rows
+from warp_ar.kernels.rays.shapes import FAR
+from warp_ar.kernels.rays.trace import TraceConfig, make_trace
+from warp_ar.kernels.structs import Probe, RayScene
+
+wp.set_module_options({"enable_backward": False})
+
+CELL_ROWS = 32
+CELL_COLUMNS = 64
+FULL_TRUST = wp.constant(wp.float32(0.5))
+"""Confidence above which a texel counts as seen; as for filling."""
+LOST = 0.02
+"""Clipped share from which a cell's light is where it clips, not where nothing is seen, and the cell is in a region."""
+_LOST = wp.constant(wp.float32(LOST))
+BEYOND = wp.constant(wp.float32(0.25))
+"""Share of what clips in a cell that lies beyond proxies from which what clips on them there is the same light."""
+MOST_LEFT = wp.constant(wp.float32(4.0))
+"""How much more light what still clips of a cell may get because less of it clips."""
+
+
+@wp.struct
+class Cell:
+    """A part of the environment."""
+
+    radiance: wp.vec3  # mean, as captured
+    clipped: wp.vec3  # mean share that may lack light: at clipping, or, in a cell that shows no light, not seen
+    missing: wp.vec3  # the same, saturation boundaries counting less
+    hidden: wp.float32  # mean share that is not seen; 0 in a cell that shows some light
+    modelled: wp.float32  # 1 where the first ball looks at a proxy, 0 where at the environment beyond
+    middle: wp.vec3  # unit
+    direction: wp.vec3  # unit: of what is at clipping, or of the cell's middle
+    solid_angle: wp.float32
+
+
+def cell_shape(height: int, width: int) -> tuple[int, int]:
+    """Rows and columns of cells for a map of this size."""
+    return min(CELL_ROWS, height), min(CELL_COLUMNS, width)
+
+
+@wp.func
+def trust(confidence: wp.float32) -> wp.float32:
+    """How far a texel counts as seen, 0..1; 0 for NaN."""
+    t = wp.clamp(confidence / FULL_TRUST, 0.0, 1.0)
+    return wp.where(confidence > 0.0, t * t * (3.0 - 2.0 * t), 0.0)
+
+
+@functools.cache
+def make_leave_out_edges_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
+    """Kernel for the given kinds of proxy."""
+    trace = make_trace(TraceConfig(objects=(), proxies=proxies))
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=QUICK_TO_COMPILE)
+    def leave_out_edges_kernel(
+        # In:
+        row_start: wp.int32,
+        clipped: wp.array2d[wp.vec3],
+        probes: wp.array[Probe],
+        scene: RayScene,
+        rows: wp.int32,
+        # Out:
+        missing_out: wp.array2d[wp.vec3],
+    ):
+        """One cell of ``rows`` x 2 ``rows``."""
+        band_row, column = wp.tid()
+        row = row_start + band_row
+        height = clipped.shape[0]
+        width = clipped.shape[1]
+        on = wp.float32(0.0)
+        beyond = wp.float32(0.0)
+        turn = wp.int32(0)
+        while turn < 2:
+            for i in range(row * height // rows, (row + 1) * height // rows):
+                for j in range(column * width // (2 * rows), (column + 1) * width // (2 * rows)):
+                    share = clipped[i, j]
+                    if wp.max(share) > 0.0:
+                        direction = direction_from_latlong(wp.float32(i) + 0.5, wp.float32(j) + 0.5, height, width)
+                        area = texel_solid_angle(i, height, width) * (share[0] + share[1] + share[2])
+                        if not trace.occluded_by_proxies(scene, probes[0].center, direction, FAR):
+                            beyond += area
+                        elif turn == 0:
+                            on += area
+                        else:
+                            missing_out[i, j] = wp.vec3(0.0, 0.0, 0.0)
+            # A second time where both clip, and enough of it beyond.
+            turn += 1
+            if not (on > 0.0 and beyond > BEYOND * (on + beyond)):
+                turn = wp.int32(2)
+
+    return leave_out_edges_kernel
+
+
+def leave_out_edges(
+    clipped: wp.array,
+    probes: wp.array,
+    scene: RayScene,
+    missing_out: wp.array,
+    *,
+    proxies: tuple[int, ...],
+    rows: Rows | None = None,
+) -> None:
+    """Let proxies lack nothing beside what clips behind their edge.
+
+    A pixel of the ball that shows the edge of a table and the light behind it clips, and so may its neighbours: texels
+    of the table lack light then that comes from beyond it. Where a quarter of what clips in a cell or more lies beyond
+    proxies, what clips on them there is left out.
+
+    Args:
+        clipped: Share at clipping per channel, ``wp.vec3`` (h, w).
+        probes: ``Probe`` (P), at least one: the ball.
+        scene: Its proxies are known surfaces.
+        missing_out: From ``weigh_boundaries``, ``wp.vec3`` (h, w); set to 0 there.
+        proxies: Kinds of proxy in the scene.
+        rows: Band of rows of cells, None for all.
+    """
+    shape = cell_shape(*clipped.shape)
+    launch_rows(
+        make_leave_out_edges_kernel(proxies),
+        shape,
+        [clipped, probes, scene, shape[0]],
+        [missing_out],
+        rows=rows,
+        device=clipped.device,
+    )
+
+
+@functools.cache
+def make_condense_cells_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
+    """Kernel for the given kinds of proxy."""
+    trace = make_trace(TraceConfig(objects=(), proxies=proxies))
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=QUICK_TO_COMPILE)
+    def condense_cells_kernel(
+        # In:
+        row_start: wp.int32,
+        radiance: wp.array2d[wp.vec3],
+        confidence: wp.array2d[wp.float32],
+        clipped: wp.array2d[wp.vec3],
+        missing: wp.array2d[wp.vec3],
+        probes: wp.array[Probe],
+        scene: RayScene,
+        # Out:
+        cells_out: wp.array2d[Cell],
+    ):
+        band_row, column = wp.tid()
+        row = row_start + band_row
+        height = radiance.shape[0]
+        width = radiance.shape[1]
+        rows = cells_out.shape[0]
+        columns = cells_out.shape[1]
+        cell = Cell()
+        toward = wp.vec3(0.0, 0.0, 0.0)
+        lost_toward = wp.vec3(0.0, 0.0, 0.0)
+        # Of what was not left out.
+        kept = wp.vec3(0.0, 0.0, 0.0)
+        kept_toward = wp.vec3(0.0, 0.0, 0.0)
+        for i in range(row * height // rows, (row + 1) * height // rows):
+            area = texel_solid_angle(i, height, width)
+            for j in range(column * width // columns, (column + 1) * width // columns):
+                direction = direction_from_latlong(wp.float32(i) + 0.5, wp.float32(j) + 0.5, height, width)
+                trusted = trust(confidence[i, j])
+                lost = trusted * clipped[i, j]
+                cell.solid_angle += area
+                cell.radiance += area * radiance[i, j]
+                cell.clipped += area * lost
+                cell.missing += area * trusted * missing[i, j]
+                cell.hidden += area * (1.0 - trusted)
+                toward += area * direction
+                lost_toward += area * (lost[0] + lost[1] + lost[2]) * direction
+                if wp.max(missing[i, j]) > 0.0:
+                    kept += area * lost
+                    kept_toward += area * (lost[0] + lost[1] + lost[2]) * direction
+        if wp.max(kept) > 0.0:
+            cell.clipped = kept
+            lost_toward = kept_toward
+        cell.radiance /= cell.solid_angle
+        cell.clipped /= cell.solid_angle
+        cell.missing /= cell.solid_angle
+        cell.hidden /= cell.solid_angle
+        if wp.max(cell.clipped) > _LOST:
+            cell.hidden = 0.0
+        else:
+            cell.clipped += cell.hidden * wp.vec3(1.0, 1.0, 1.0)
+            cell.missing += cell.hidden * wp.vec3(1.0, 1.0, 1.0)
+        cell.middle = wp.normalize(toward)
+        cell.direction = cell.middle
+        if wp.length(lost_toward) > 0.0:
+            cell.direction = wp.normalize(lost_toward)
+        if trace.occluded_by_proxies(scene, probes[0].center, cell.direction, FAR):
+            cell.modelled = 1.0
+        cells_out[row, column] = cell
+
+    return condense_cells_kernel
+
+
+def condense_cells(
+    radiance: wp.array,
+    confidence: wp.array,
+    clipped: wp.array,
+    missing: wp.array,
+    probes: wp.array,
+    scene: RayScene,
+    cells_out: wp.array,
+    *,
+    proxies: tuple[int, ...],
+    rows: Rows | None = None,
+) -> None:
+    """Condense a map to cells. What clips and yet lacks nothing, for ``leave_out_edges`` said so, does not count.
+
+    Args:
+        radiance: ``wp.vec3`` (h, w), complete.
+        confidence: How well each texel was seen, ``wp.float32`` (h, w).
+        clipped: Share at clipping per channel, ``wp.vec3`` (h, w).
+        missing: The same from ``weigh_boundaries``.
+        probes: ``Probe`` (P), at least one.
+        scene: Its proxies are known surfaces: what clips there is lit, not a light.
+        cells_out: ``Cell``, ``cell_shape(h, w)``.
+        proxies: Kinds of proxy in the scene.
+        rows: Band of cell rows, None for all.
+    """
+    launch_rows(
+        make_condense_cells_kernel(proxies),
+        cells_out.shape,
+        [radiance, confidence, clipped, missing, probes, scene],
+        [cells_out],
+        rows=rows,
+        device=cells_out.device,
+    )
+
+
+@wp.func
+def missing_share(confidence: wp.float32, missing: wp.vec3, unseen: wp.float32) -> wp.vec3:
+    """Share of a texel that lacks light, where ``unseen`` is what counts of one that is not seen."""
+    trusted = trust(confidence)
+    return trusted * missing + unseen * (1.0 - trusted) * wp.vec3(1.0, 1.0, 1.0)
+
+
+@wp.kernel(enable_backward=False)
+def add_recovered_kernel(
+    # In:
+    row_start: wp.int32,
+    radiance: wp.array2d[wp.vec3],
+    confidence: wp.array2d[wp.float32],
+    missing: wp.array2d[wp.vec3],
+    cells: wp.array2d[Cell],
+    recovered: wp.array2d[wp.vec3],
+    # Out:
+    recovered_out: wp.array2d[wp.vec3],
+):
+    """Every texel of a cell plus its share of the cell's recovered radiance."""
+    band_row, column = wp.tid()
+    row = row_start + band_row
+    height = radiance.shape[0]
+    width = radiance.shape[1]
+    top = row * height // recovered.shape[0]
+    bottom = (row + 1) * height // recovered.shape[0]
+    left = column * width // recovered.shape[1]
+    right = (column + 1) * width // recovered.shape[1]
+    unseen = wp.where(cells[row, column].hidden > 0.0, 1.0, 0.0)
+    now = wp.vec3(0.0, 0.0, 0.0)
+    solid_angle = wp.float32(0.0)
+    for i in range(top, bottom):
+        area = texel_solid_angle(i, height, width)
+        for j in range(left, right):
+            now += area * missing_share(confidence[i, j], missing[i, j], unseen)
+            solid_angle += area
+    now /= solid_angle
+    more = recovered[row, column]
+    then = cells[row, column].missing
+    for c in range(3):
+        if now[c] > 0.0:
+            more[c] *= wp.min(then[c] / now[c], MOST_LEFT)
+    for i in range(top, bottom):
+        for j in range(left, right):
+            share = missing_share(confidence[i, j], missing[i, j], unseen)
+            recovered_out[i, j] = radiance[i, j] + wp.cw_mul(share, more)
+
+
+def add_recovered(
+    radiance: wp.array,
+    confidence: wp.array,
+    missing: wp.array,
+    cells: wp.array,
+    recovered: wp.array,
+    recovered_out: wp.array,
+    *,
+    rows: Rows | None = None,
+) -> None:
+    """Give texels back what they lost.
+
+    Where more or less of a cell clips than when its radiance was recovered, the energy stays what was found: a
+    thousandth that clips can have a high radiance, and in the next frame be half of the cell; a video codec takes the
+    weakest channel of an emitter across the limit and back. Below a quarter of the share the energy falls with it.
+
+    Args:
+        radiance: As captured and completed, ``wp.vec3`` (h, w).
+        confidence: How well each texel was seen, ``wp.float32`` (h, w).
+        missing: Share at clipping per channel from ``weigh_boundaries``, ``wp.vec3`` (h, w).
+        cells: ``Cell``, ``cell_shape(h, w)``, of when that was.
+        recovered: Radiance that a wholly clipped texel lacks, per cell: ``wp.vec3``, ``cell_shape(h, w)``.
+        recovered_out: ``wp.vec3`` (h, w).
+        rows: Band of rows of cells, None for all.
+    """
+    launch_rows(
+        add_recovered_kernel,
+        recovered.shape,
+        [radiance, confidence, missing, cells, recovered],
+        [recovered_out],
+        rows=rows,
+        device=recovered_out.device,
+    )
+
+
+@wp.func
+def cell_of(direction: wp.vec3, rows: wp.int32, columns: wp.int32) -> wp.int32:
+    """Index of the cell that holds a direction."""
+    at = latlong_from_direction(direction, rows, columns)
+    row = wp.clamp(wp.int32(at[0]), 0, rows - 1)
+    return row * columns + wp.clamp(wp.int32(at[1]), 0, columns - 1)

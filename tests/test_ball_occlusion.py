@@ -1,0 +1,220 @@
+"""Frames in which something covers the ball tell nothing of the light."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.test_drift import POSE, encode, linear_picture
+from tests.test_drift import SCENE as WITHOUT_ROOM
+from warp_ar import PRESETS, Pipeline
+from warp_ar.ball.ball_occlusion import CELLS, DARK, PATIENCE, BallCover
+from warp_ar.calibration.saturation import ball_discs
+from warp_ar.kernels.color import decode_table
+from warp_ar.scene import Pose, loads_scene
+from warp_ar.sources.deep_frame import Plate
+
+SCENE = WITHOUT_ROOM.replace("center = [0.0, 0.3, 0.03]\nradius = 0.03", "center = [-0.26, 0.0, 0.05]\nradius = 0.05")
+"""The ball is in the picture."""
+HAND = np.array([0.35, 0.2, 0.14])
+STEP = 0.1
+"""Seconds between frames."""
+OBJECT = """
+[[object]]
+shape = "sphere"
+radius = 0.03
+at = [0.28, 0.0, 0.03]
+[object.material]
+model = "lambert"
+base_color = [0.8, 0.8, 0.8]
+"""
+RETURNED = 1e-3
+"""Relative difference of light before and after a hand: confidence has faded by a hundredth."""
+
+
+def disc(scene):
+    return ball_discs(scene.probes, scene.camera, POSE)[0]
+
+
+def picture(scene, light=1.0, mirrored=(0.5, 0.45, 0.4)):
+    """The table with a ball on it, in which a bright half and a dark one are seen, linear."""
+    linear = linear_picture(scene) * light
+    x, y, radius = disc(scene)
+    v, u = np.mgrid[: linear.shape[0], : linear.shape[1]]
+    inside = np.hypot(u - x, v - y) < radius
+    linear[inside] = np.where((u < x)[..., None], np.array(mirrored), 0.3 * np.array(mirrored))[inside]
+    return linear
+
+
+def with_hand(linear, scene, hand=HAND):
+    """A hand from the left that reaches over the ball."""
+    x, y, radius = disc(scene)
+    linear = linear.copy()
+    linear[round(y - 3 * radius) : round(y + 3 * radius), : round(x + 0.5 * radius)] = hand
+    return linear
+
+
+def watch(pictures, seconds=STEP, gains=None):
+    scene = loads_scene(SCENE)
+    cover = BallCover(scene, scene.camera)
+    gains = [np.ones(3)] * len(pictures) if gains is None else gains
+    return [
+        cover.observe(encode(one), [disc(scene)], POSE, seconds * index, gain)
+        for index, (one, gain) in enumerate(zip(pictures, gains, strict=True))
+    ]
+
+
+def watch_plates(images, plates):
+    scene = loads_scene(SCENE)
+    cover = BallCover(scene, scene.camera)
+    return [
+        cover.observe(image, [disc(scene)], POSE, STEP * index, np.ones(3), plate)
+        for index, (image, plate) in enumerate(zip(images, plates, strict=True))
+    ]
+
+
+def test_cells_are_means_of_four_samples():
+    """Each where a disc's cell has it; cells that reach out of the picture are not seen."""
+    scene = loads_scene(SCENE)
+    cover, image = BallCover(scene, scene.camera), encode(picture(scene))
+    image = np.random.default_rng(1).integers(0, 256, image.shape, np.uint8)
+    table, gain = decode_table(scene.camera.transfer).astype(float), np.array([0.7, 0.8, 1.1])
+    height, width = image.shape[:2]
+    for x, y, radius in (disc(scene), (3.2, 60.7, 20.3), (width - 1.0, 2.0, 9.5), (50.0, 40.0, 0.2)):
+        side, found = 2.0 * max(radius, 1.0) / CELLS, []
+        for row in range(CELLS):
+            for column in range(CELLS):
+                if np.hypot(2 * (row + 0.5) / CELLS - 1, 2 * (column + 0.5) / CELLS - 1) >= 0.9:
+                    continue
+                places = [
+                    (round(y - max(radius, 1.0) + side * (row + v)), round(x - max(radius, 1.0) + side * (column + u)))
+                    for v in (0.25, 0.75)
+                    for u in (0.25, 0.75)
+                ]
+                if all(0 <= v < height and 0 <= u < width for v, u in places):
+                    codes = np.mean([image[place].astype(float) for place in places], axis=0)
+                    light = [np.interp(codes[c], np.arange(256), table[:, c]) for c in range(3)]
+                    found.append(np.log(light / gain + DARK))
+                else:
+                    found.append(np.full(3, np.nan))
+        np.testing.assert_allclose(cover._cells(image, (x, y, radius), gain), np.array(found).T, rtol=1e-12, atol=1e-12)
+
+
+def test_a_fast_camera_is_looked_at_no_more_than_a_hand_moves():
+    """Frames within 8 ms of a look take what it found; those of 60 and 120 a second are all looked at."""
+    scene = loads_scene(SCENE)
+    bare, hand = encode(picture(scene)), encode(with_hand(picture(scene), scene))
+    cover = BallCover(scene, scene.camera)
+    assert not cover.rests(0.0), "nothing has been seen yet"
+    for index, image in enumerate((bare, bare, hand)):
+        now = index / 120.0
+        assert not cover.rests(now)
+        cover.observe(image, [disc(scene)], POSE, now, np.ones(3))
+    assert cover.is_covered
+    assert cover.rests(now + 0.001)
+    assert cover.rests(now + 0.0079)
+    assert not cover.rests(now + 1 / 120.0)
+    assert not cover.rests(now), "a frame of the same time is another frame"
+    cover.forget()
+    assert not cover.rests(now + 0.001)
+
+
+def test_codes_of_8_bits_are_read_alike_from_a_plate():
+    """And from nothing else: the picture beside it is black."""
+    scene = loads_scene(SCENE)
+    bare = encode(picture(scene))
+    frames = [bare, bare, encode(with_hand(picture(scene), scene)), bare]
+    plates = [Plate(frame.astype(np.uint16) * 257) for frame in frames]
+    assert watch_plates([np.zeros_like(bare)] * 4, plates) == [False, False, True, False]
+    cover = BallCover(scene, scene.camera)
+    for gain in (np.ones(3), np.array([0.7, 0.8, 1.1])):
+        for x, y, radius in (disc(scene), (3.0, 60.0, 20.0)):  # the other one reaches out of the picture
+            codes, deep = (cover._cells(frames[2], (x, y, radius), gain, plate) for plate in (None, plates[2]))
+            np.testing.assert_array_equal(codes, deep)
+
+
+def test_a_white_hand_before_lamps_above_white_is_told_by_light():
+    """The ball mirrors what is four times as bright as white: its codes are 255 with and without the hand."""
+    scene = loads_scene(SCENE)
+    bare = picture(scene, mirrored=(4.0, 4.0, 4.0))
+    frames = [bare, bare, with_hand(bare, scene, 0.9), bare]
+    codes = [encode(frame) for frame in frames]
+    assert watch_plates(codes, [Plate(frame.astype(np.float32)) for frame in frames]) == [False, False, True, False]
+    assert watch_plates(codes, [None] * 4) == [False] * 4, "8 bits do not hold it"
+
+
+def test_a_hand_is_told_while_it_is_there():
+    scene = loads_scene(SCENE)
+    bare = picture(scene)
+    hand = with_hand(bare, scene)
+    assert watch([bare, bare, hand, hand, bare]) == [False, False, True, True, False]
+
+
+def test_a_hand_is_told_under_a_gain_that_is_known():
+    scene = loads_scene(SCENE)
+    bare = picture(scene)
+    gain = np.array([0.7, 0.7, 0.7])
+    pictures = [bare, bare, 0.7 * with_hand(bare, scene)]
+    assert watch(pictures, gains=[np.ones(3), np.ones(3), gain])[2]
+    assert not watch([bare, bare, 0.7 * bare], gains=[np.ones(3), np.ones(3), gain])[2]
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_light_that_changes_is_not_taken_for_a_hand(factor):
+    scene = loads_scene(SCENE)
+    bare = picture(scene)
+    changed = picture(scene, factor, tuple(factor * np.array([0.5, 0.45, 0.4])))
+    assert watch([bare, bare, changed, changed]) == [False] * 4
+
+
+def test_what_only_the_ball_mirrors_is_light():
+    scene = loads_scene(SCENE)
+    bare = picture(scene)
+    # Somebody walks by: the ball shows it, the table hardly.
+    assert watch([bare, bare, picture(scene, 0.97, (0.1, 0.1, 0.1))]) == [False] * 3
+
+
+def test_a_hand_beside_the_ball_covers_nothing():
+    scene = loads_scene(SCENE)
+    bare = picture(scene)
+    x, y, radius = disc(scene)
+    beside = bare.copy()
+    beside[round(y - 3 * radius) : round(y + 3 * radius), : round(x - 1.2 * radius)] = HAND
+    assert watch([bare, bare, beside]) == [False] * 3
+
+
+def test_what_stays_is_believed():
+    scene = loads_scene(SCENE)
+    bare = picture(scene)
+    many = int(PATIENCE / STEP) + 4
+    told = watch([bare, bare] + [with_hand(bare, scene)] * many)
+    assert told[2 : 2 + int(PATIENCE / STEP)] == [True] * int(PATIENCE / STEP)
+    assert not any(told[-2:])
+
+
+def test_a_frame_without_the_ball_in_it_is_no_cover():
+    scene = loads_scene(SCENE)
+    cover = BallCover(scene, scene.camera)
+    image = encode(picture(scene))
+    away = Pose(POSE.rotation, np.array([0.0, 5.0, 0.8]))
+    for index, pose in enumerate((POSE, away, POSE)):
+        discs = ball_discs(scene.probes, scene.camera, pose)
+        assert not cover.observe(image, discs, pose, STEP * index, np.ones(3))
+
+
+def test_covered_frames_leave_the_light_alone(device):
+    scene = loads_scene(SCENE + OBJECT)
+    bare, hand = encode(picture(scene)), encode(with_hand(picture(scene), scene))
+    lights = []
+    pipeline = Pipeline(scene, device=device, quality=PRESETS["medium"], outputs=("image", "environment"))
+    try:
+        for index, frame in enumerate([bare, bare, hand, hand, bare]):
+            result = pipeline(cv2.GaussianBlur(frame, (0, 0), 0.5), time_seconds=STEP * index, pose=POSE)
+            lights.append(np.array(result.environment))
+            assert pipeline.inputs.covered == (frame is hand)
+    finally:
+        pipeline.close()
+    assert np.array_equal(lights[2], lights[1])
+    assert np.array_equal(lights[3], lights[1])
+    assert np.abs(lights[4] - lights[1]).max() < RETURNED * lights[1].max()

@@ -1,0 +1,298 @@
+"""What a frame does not need is left out of it, and pictures are those of a pipeline that leaves nothing out."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from tests.hard_cases.rig import SIZE, look_at, make_quality, make_scene
+from tests.recover_rig import solve_here
+from warp_ar.engine.frame_culling import Demand
+from warp_ar.engine.pipeline import Pipeline, Result
+from warp_ar.light.estimate import Estimate
+from warp_ar.light.recovery import Recovery
+from warp_ar.scene import Exposure, Light, Scene
+from warp_ar.stages.base import Reach, Wiring
+from warp_ar.stages.quality import PRESETS
+from warp_ar.stages.request import Estimates
+
+# --- The walk ---------------------------------------------------------------------------------------------------------
+
+
+class Step:
+    """What ``Demand`` asks of a stage."""
+
+    follows = False
+
+    def __init__(self, name: str, reads: str, writes: str, needs: str = "", *, follows: bool = False) -> None:
+        self.name, self.needs, self.follows = name, needs, follows
+        self.wiring = Wiring(tuple(reads.split()), tuple(writes.split()))
+
+    def reads_for(self, reach: Reach) -> tuple[str, ...]:
+        return tuple(name for name in self.wiring.reads if reach.falls or name != "response")
+
+    def idle(self, reach: Reach) -> str | None:
+        return None if not self.needs or getattr(reach, self.needs) else f"no {self.needs}"
+
+
+STEPS = (
+    Step("see", "frame", "seen", follows=True),
+    Step("keep", "seen", "environment"),
+    Step("filter", "environment", "filtered"),
+    Step("shade", "filtered", "virtual", "objects"),
+    Step("relight", "environment", "added", "light"),
+    Step("compose", "virtual added", "image"),
+)
+DARK, EMPTY, NOTHING = Reach(light=False), Reach(objects=False), Reach(objects=False, light=False)
+
+
+def test_a_frame_that_reaches_everything_leaves_nothing_out() -> None:
+    assert Demand(STEPS, ("image",)).look(Reach()) == ({}, set())  # type: ignore[arg-type]
+
+
+def test_an_idle_stage_clears_once_and_rests_with_what_only_it_reads() -> None:
+    demand = Demand(STEPS, ("image",))  # type: ignore[arg-type]
+    assert demand.look(EMPTY) == ({}, {"shade"}), "what it wrote before must go"
+    nobody = "nothing reads its filtered in this frame"
+    assert demand.look(EMPTY) == ({"shade": "no objects", "filter": nobody}, set())
+    assert demand.look(Reach()) == ({}, set())
+    assert demand.look(EMPTY)[1] == {"shade"}, "it has written since"
+
+
+def test_frames_of_one_reach_have_one_answer() -> None:
+    """The same object, so that nothing need be made of it anew; until arrays are taken to hold something again."""
+    demand = Demand(STEPS, ("image",))  # type: ignore[arg-type]
+    cleared = demand.look(EMPTY)[0]
+    resting = demand.look(EMPTY)[0]
+    assert cleared == {}
+    assert demand.look(Reach(objects=False))[0] is resting
+    assert demand.look(NOTHING)[1] == {"relight"}
+    assert demand.look(EMPTY)[0] == resting
+    demand.forget()
+    assert demand.look(EMPTY) == ({}, {"shade"})
+
+
+def test_what_accumulates_over_frames_runs_though_nothing_reads_it() -> None:
+    demand = Demand(STEPS, ("image",))  # type: ignore[arg-type]
+    demand.look(NOTHING)
+    resting, clearing = demand.look(NOTHING)
+    assert set(resting) == {"keep", "filter", "shade", "relight"}
+    assert not clearing
+
+
+def test_an_output_is_needed_in_every_frame() -> None:
+    demand = Demand(STEPS, ("image", "environment"))  # type: ignore[arg-type]
+    demand.look(NOTHING)
+    assert set(demand.look(NOTHING)[0]) == {"filter", "shade", "relight"}
+
+
+def test_what_a_stage_does_not_depend_on_in_a_frame_is_not_needed_for_it() -> None:
+    steps = (Step("respond", "frame", "response"), Step("mirror", "frame response", "image"))
+    demand = Demand(steps, ("image",))  # type: ignore[arg-type]
+    assert not demand.look(Reach())[0]
+    assert set(demand.look(Reach(falls=False))[0]) == {"respond"}
+
+
+def test_after_a_launch_of_everything_nothing_is_clear() -> None:
+    demand = Demand(STEPS, ("image",))  # type: ignore[arg-type]
+    demand.look(NOTHING)
+    demand.forget()
+    assert demand.look(NOTHING)[1] == {"shade", "relight"}
+
+
+# --- Pictures ---------------------------------------------------------------------------------------------------------
+
+POSES = {
+    "near": look_at((0.02, -0.3, 0.35)),
+    "aside": look_at((0.25, -0.35, 0.3), (-0.2, 0.1, 0.0)),
+    "away": look_at((0.0, 0.0, 1.0), (5.0, 0.0, 1.0)),
+}
+"""Everything is in the picture; the ball and less; nothing is."""
+QUALITIES = {
+    "paper": dataclasses.replace(PRESETS["paper"], environment_height=16),
+    "emitters": dataclasses.replace(PRESETS["low"].with_methods(recover="shading"), environment_height=16),
+    "every": make_quality(),
+    "high": dataclasses.replace(PRESETS["high"], environment_height=16),
+}
+"""The least that stands on the environment; recovery that only objects and lights need; what balls show, too."""
+FAR = (4.0, 0.0, 0.3)
+"""Metres: where nothing of it is in any picture, or near anything in one."""
+
+
+def scene_of(objects: bool, lights: str, scale: float = 0.7) -> Scene:
+    """One of the scenes between which a path switches: they differ in numbers alone.
+
+    Args:
+        objects: Whether virtual objects stand where they can be seen.
+        lights: ``on``, ``off`` (no power), ``one`` (the others have none) or ``aside`` (a spot misses the picture, the
+            others have no power).
+        scale: Of the exposure.
+    """
+    base = make_scene(exposure=Exposure(scale))
+    sent = base.lights
+    if lights != "on":
+        sent = tuple(dataclasses.replace(light, intensity=0.0) for light in base.lights)
+    if lights in ("one", "aside"):
+        target = (0.0, 0.0, 0.0) if lights == "one" else (0.45, -0.45, 0.0)
+        spot: Light = dataclasses.replace(base.lights[1], target=target, inner_angle=3.0, outer_angle=6.0)
+        sent = (sent[0], spot, sent[2])
+    moved = base.objects
+    if not objects:
+        moved = tuple(dataclasses.replace(item, at=FAR) for item in base.objects)
+    return dataclasses.replace(base, lights=sent, objects=moved)
+
+
+@functools.cache
+def pictures() -> tuple[np.ndarray, ...]:
+    """A bright receiver around a dark ball, as the first pose sees them, and a light that clips in the ball.
+
+    Two pictures of two lights, and two that hardly differ from the first: by those the environment moves less than its
+    readers are told of.
+    """
+    random = np.random.default_rng(3)
+    found = []
+    for mean, place in ((190, 0), (120, 2)):
+        picture = random.normal(mean, 12, (SIZE[1], SIZE[0], 3))
+        picture[9:20, 9:20] *= 0.2
+        picture[12:15, 12 + place : 15 + place] = 255
+        found.append(picture.clip(0, 255).astype(np.uint8))
+    for share in (0.2, 0.6):
+        brighter = (random.random(found[0].shape) < share) & (found[0] < 250)
+        found.append(np.where(brighter, found[0] + 1, found[0]).astype(np.uint8))
+    return tuple(found)
+
+
+Frame = tuple[str, bool, str, int, float]
+FRAMES = st.tuples(
+    st.sampled_from(list(POSES)),
+    st.booleans(),
+    st.sampled_from(("on", "off", "one", "aside")),
+    st.integers(0, 3),
+    st.sampled_from((1 / 30, 0.15, 0.5)),
+)
+"""Pose, whether objects can be seen, lights, picture, seconds since the frame before."""
+
+
+def run(
+    path: Sequence[Frame], device: str, preset: str, *, culling: bool, estimates: Estimates = "synchronous"
+) -> list[Result]:
+    """A pipeline over a path of frames, its pictures read."""
+    results, now = [], 0.0
+    with Pipeline(
+        scene_of(True, "on"),
+        device=device,
+        quality=QUALITIES[preset],
+        bands=2,
+        estimates=estimates,
+        culling=culling,
+    ) as pipeline:
+        for pose, objects, lights, picture, step in path:
+            assert pipeline.update(scene_of(objects, lights))
+            now += step
+            result = pipeline(pictures()[picture], time_seconds=now, pose=POSES[pose])
+            assert result.image is not None
+            results.append(result)
+    return results
+
+
+def assert_equal(path: Sequence[Frame], device: str, preset: str, **more: Any) -> list[Result]:
+    """Pictures with and without culling have the same bits; returns the results with."""
+    whole = run(path, device, preset, culling=False, **more)
+    culled = run(path, device, preset, culling=True, **more)
+    for index, (one, other) in enumerate(zip(whole, culled, strict=True)):
+        assert not any(timing.left_out for timing in one.stages.values())
+        differing = int((one.image != other.image).any(-1).sum())
+        assert differing == 0, f"frame {index} of {path}: {differing} pixels differ"
+    return culled
+
+
+@pytest.mark.parametrize("preset", QUALITIES)
+@settings(
+    max_examples=5,
+    deadline=None,
+    derandomize=True,
+    # The fixture is the device's name, the same for every path.
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
+)
+@given(path=st.lists(FRAMES, min_size=3, max_size=7))
+def test_pictures_are_those_of_a_pipeline_that_leaves_nothing_out(path: list[Frame], device: str, preset: str) -> None:
+    assert_equal(path, device, preset)
+
+
+SHORT = 1 / 30
+LONG = 0.15
+SHOWN, BARE = ("near", True, "on"), ("near", False, "off")
+PATHS: dict[str, tuple[Frame, ...]] = {
+    "light": (*[(*SHOWN, 0, SHORT)] * 2, *[("near", True, "off", 1, SHORT)] * 3, *[(*SHOWN, 1, SHORT)] * 2),
+    "spot": (*[("near", True, "one", 0, SHORT)] * 2, *[("near", True, "aside", 1, SHORT)] * 3, (*SHOWN, 1, SHORT)),
+    "object": (*[(*SHOWN, 0, SHORT)] * 2, *[("near", False, "on", 1, SHORT)] * 3, *[(*SHOWN, 1, SHORT)] * 2),
+    "view": (*[(*SHOWN, 0, SHORT)] * 2, *[("away", True, "on", 1, SHORT)] * 3, *[(*SHOWN, 1, SHORT)] * 2),
+    "from nothing": (*[(*BARE, 0, SHORT)] * 3, *[(*SHOWN, 0, SHORT)] * 2),
+    "drift": (*[(*SHOWN, 0, SHORT)] * 3, *[(*BARE, 1, SHORT)] * 8, *[(*SHOWN, 1, SHORT)] * 4),
+    "half": (*[(*SHOWN, 0, SHORT)] * 3, *[("near", False, "on", 2, SHORT)] * 5, *[(*SHOWN, 2, SHORT)] * 2),
+    "half for long": (*[(*SHOWN, 0, SHORT)] * 3, *[("near", False, "on", 1, SHORT)] * 14, *[(*SHOWN, 1, SHORT)] * 2),
+    "long": (*[(*SHOWN, 0, SHORT)] * 2, *[(*BARE, 1, LONG)] * 9, *[(*SHOWN, 1, SHORT)] * 6),
+}
+"""What is left out of some frames comes back: every reason; light that moves on meanwhile, read by nothing or by half
+of what reads it, a little and for long."""
+
+
+def number_estimates(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a solver's n-th estimate, from 1 on, put n / 16 into every cell: how often it was asked shows."""
+
+    def update(self: Any, cells: Any, *_: Any) -> Estimate:
+        self.asked = getattr(self, "asked", 0) + 1
+        return Estimate(np.full((*cells.shape, 3), self.asked / 16.0, np.float32), (False,) * 3)
+
+    monkeypatch.setattr(Recovery, "update", update)
+    monkeypatch.setattr(Recovery, "rests", lambda *_: False)
+    solve_here(monkeypatch)
+
+
+@pytest.mark.parametrize("path", PATHS)
+@pytest.mark.parametrize(
+    ("preset", "estimates"), [("paper", "synchronous"), ("emitters", "synchronous"), ("emitters", "delayed")]
+)
+def test_what_comes_back_is_fresh(
+    monkeypatch: pytest.MonkeyPatch, device: str, preset: str, estimates: Estimates, path: str
+) -> None:
+    number_estimates(monkeypatch)
+    results = assert_equal(PATHS[path], device, preset, estimates=estimates)
+    assert any(timing.left_out for result in results for timing in result.stages.values())
+
+
+def test_recovery_asks_in_the_frame_that_needs_it_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And not while nothing reads the environment."""
+    number_estimates(monkeypatch)
+    asked, now = [], 0.0
+    with Pipeline(
+        scene_of(True, "on"), device="cpu", quality=QUALITIES["emitters"], bands=2, estimates="synchronous"
+    ) as pipeline:
+        for pose, objects, lights, picture, step in PATHS["long"]:
+            pipeline.update(scene_of(objects, lights))
+            now += step
+            pipeline(pictures()[picture], time_seconds=now, pose=POSES[pose])
+            asked.append(round(16 * float(pipeline.arrays["recover_recovered"].numpy()[0, 0, 0])))
+    # Three at the start, for in the first bare frame what is virtual is cleared; then one at once, when it is back.
+    assert asked == [1, 2, 3, *[3] * 8, *[4] * 6]
+
+
+def test_reasons_are_those_of_the_frame() -> None:
+    view, *_, last = run(PATHS["view"][:4], "cpu", "every", culling=True)
+    assert not any(timing.left_out for timing in view.stages.values())
+    reasons = {name: timing.left_out for name, timing in last.stages.items() if timing.left_out}
+    assert reasons["shade"] == "no virtual object is in the picture"
+    assert reasons["relight"] == "virtual light falls on nothing in the picture"
+    assert reasons["mirror_ball"] == "no mirror ball is in the picture"
+    assert reasons["recover"] == "nothing reads its environment or emitters in this frame"
+    assert {"unwrap", "accumulate", "expose"}.isdisjoint(reasons)
+    off = run(PATHS["light"][:4], "cpu", "every", culling=True)[-1]
+    assert off.stages["relight"].left_out == "no virtual light has any power"
+    assert off.stages["shade"].left_out is None

@@ -1,0 +1,508 @@
+"""The outline of a mirror ball in a photograph, to a fraction of a pixel, with its uncertainty.
+
+From coarse to fine: a rough circle, given or looked for, is corrected in a reduced picture whose ball is
+``COARSE_RADIUS`` pixels, then in ever larger ones, each time by the evidence of ``ball_rim``. The unknowns are those of
+a sphere before the camera, three in all, so that the ellipse that a wide lens makes of a ball costs no further ones.
+
+How far it may be off is told by leaving out one sector of the rim after the other (a delete-a-group jackknife): what
+spoils a rim, a stand, a band of light, a shadow, spoils neighbouring pieces alike, so single pieces must not count as
+independent.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from warp_ar.ball.ball_proposals import propose_circles
+from warp_ar.ball.ball_rim import (
+    MOST_COST,
+    RimEvidence,
+    descend,
+    gather_evidence,
+    gather_steps,
+    gradients,
+    radial_compression,
+)
+from warp_ar.errors import UsageError
+from warp_ar.scene import Camera
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+SMALLEST_PICTURE = 24
+"""Pixels along the shorter side below which no picture shows a ball: noise fits any circle then."""
+COARSE_RADIUS = 48.0
+"""Pixels of the ball in the smallest picture that is looked at."""
+ROUGH_ERROR = 0.22
+"""Share of the radius by which a rough circle may be off."""
+BLURS = (0.45, 0.6, 0.75, 0.95, 1.3, 1.8)
+"""Standard deviations, pixels, of the picture's blur that are tried at full size."""
+STARTS = 4
+"""Places from which a search descends: a mirrored edge makes a circle of its own, often a stronger one."""
+SEARCHED = 1600.0
+"""Pixels along the longer side of the picture in which a ball is looked for."""
+DIM_SUPPORT = 0.4
+"""Share of the rim that is seen, below which a person should look as well."""
+TINY = 24.0
+"""Pixels of the radius below which many things look like a ball."""
+SEARCHES = 16
+"""Proposed circles from which a ball is looked for in a whole picture."""
+CERTAIN = 9.0
+"""Evidence from which on no further circle is looked at, as most pictures of a ball have it and few others."""
+LEAST_EVIDENCE = 6.0
+"""Evidence below which there is no ball. From here to ``CERTAIN`` a person should look: most are right."""
+DARK = 6.0
+"""Codes below which a lifted picture is no logarithm any more: there is noise."""
+LARGEST_RADIUS = 700.0
+"""Pixels: a larger ball is measured in a reduced picture; a fifth of a pixel is more than a lens is good for then."""
+ALIKE = 0.06
+"""Difference of mean log likelihoods of a piece within which two blurs explain a rim alike."""
+LEAST_DEVIATION = 0.08
+"""Pixels that leaving sectors out does not tell of: what is mirrored at the rim is not quite what the model says."""
+PIECES = 240
+"""Pieces that a rim is cut into."""
+COMPRESSION = 1.0
+"""Weight of the radial compression inside a rim against the steps across it."""
+BEHIND = -4.0
+"""Compression of a ball that is not wholly before the camera: less than any that is."""
+TOGETHER = 64
+"""Outlines whose compression is looked at together: more do not stay in a core's cache."""
+SECTORS = 12
+"""Sectors of the rim that are left out in turn."""
+LEAST_SUPPORT = 0.2
+"""Share of the rim that must be seen to be one."""
+
+
+@dataclasses.dataclass(frozen=True)
+class BallOutline:
+    """A ball's silhouette in a picture."""
+
+    center: tuple[float, float]
+    """Centre of the ellipse, pixels (column, row)."""
+    axes: tuple[float, float]
+    """Half axes of the ellipse in pixels, the longer first."""
+    angle: float
+    """Direction of the longer axis in degrees, from the picture's x to its y."""
+    deviation: tuple[float, float, float]
+    """Standard deviations of column, row and radius, pixels."""
+    support: float
+    """Share of the rim in view that speaks for it."""
+    sphere: tuple[float, float, float]
+    """The ball's centre in the camera's frame over its radius."""
+    evidence: float = math.inf
+    """How much looks like a mirror ball, where the whole picture was searched; else infinite."""
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether something else may have been taken for the ball: most such outlines are right, but not all."""
+        dim = self.support < DIM_SUPPORT or self.radius < TINY
+        return math.isfinite(self.evidence) and (self.evidence < CERTAIN or dim)
+
+    @property
+    def radius(self) -> float:
+        """Mean radius in pixels."""
+        return math.sqrt(self.axes[0] * self.axes[1])
+
+    def points(self, count: int = PIECES) -> Array:
+        """The outline, (count, 2) pixels."""
+        angle = 2 * np.pi * np.arange(count) / count
+        c, s = math.cos(math.radians(self.angle)), math.sin(math.radians(self.angle))
+        local = np.column_stack([self.axes[0] * np.cos(angle), self.axes[1] * np.sin(angle)])
+        return np.asarray(local @ np.array([[c, s], [-s, c]]) + self.center, float)
+
+
+def far_camera(width: int, height: int) -> Camera:
+    """A camera whose perspective is not known: so far away that a ball is a circle."""
+    focal = 30.0 * max(width, height)
+    return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+
+
+def silhouette(camera: Camera, sphere: Array, count: int = PIECES) -> tuple[Array, Array]:
+    """Outline (count, 2) in pixels and outward unit normals of a ball at ``sphere`` (centre over radius)."""
+    if not _is_before(sphere[None])[0]:
+        return np.zeros((0, 2)), np.zeros((0, 2))
+    pixels, normals = silhouettes(camera, sphere[None], count)
+    return pixels[0], normals[0]
+
+
+def _is_before(spheres: Array) -> NDArray[np.bool_]:
+    """Which spheres (m, 3) are wholly before the camera."""
+    return np.asarray((np.linalg.norm(spheres, axis=1) > 1.0) & (spheres[:, 2] > 1.0))
+
+
+def silhouettes(camera: Camera, spheres: Array, count: int = PIECES) -> tuple[Array, Array]:
+    """Outlines (m, count, 2) in pixels and outward unit normals of balls (m, 3), all wholly before the camera.
+
+    Together, for a search asks for thousands, and NumPy takes as long for a few numbers as for hundreds.
+    """
+    d = np.linalg.norm(spheres, axis=1, keepdims=True)
+    n = spheres / d
+    u = np.cross(n, np.where(np.abs(n[:, 1:2]) < 0.9, (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)))
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    angle = 2 * np.pi * np.arange(count)[:, None] / count
+    spokes = np.cos(angle) * u[:, None] + np.sin(angle) * np.cross(n, u)[:, None]
+    # Rays that touch the ball touch it on a circle: centre c - n / d, radius sqrt(1 - 1 / d^2).
+    rim = (spheres - n / d)[:, None] + np.sqrt(1.0 - 1.0 / (d * d))[:, None] * spokes
+    zero = np.zeros(3)
+    flat = cv2.projectPoints(rim.reshape(-1, 3), zero, zero, camera.matrix(), np.array(camera.distortion))[0]
+    pixels = flat.reshape(len(spheres), count, 2)
+    tangent = np.empty_like(pixels)
+    tangent[:, 1:-1] = pixels[:, 2:] - pixels[:, :-2]
+    tangent[:, 0], tangent[:, -1] = pixels[:, 1] - pixels[:, -1], pixels[:, 0] - pixels[:, -2]
+    normal = np.stack([tangent[..., 1], -tangent[..., 0]], -1)
+    normal /= np.maximum(np.hypot(normal[..., 0], normal[..., 1]), 1e-9)[..., None]
+    out = pixels - pixels.mean(1, keepdims=True)
+    sign = np.sign(out[..., 0] * normal[..., 0] + out[..., 1] * normal[..., 1])
+    return pixels, normal * sign[..., None]
+
+
+def sphere_of_circle(camera: Camera, x: float, y: float, radius: float) -> Array:
+    """Centre over radius, (3,), of the ball whose silhouette is about a circle in the picture."""
+    distortion = np.array(camera.distortion)
+    around = ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))
+    circle = np.array([[[x + dx * radius, y + dy * radius]] for dx, dy in around], float)
+    flat = cv2.undistortPoints(circle, camera.matrix(), distortion)[:, 0]
+    rays = np.column_stack([flat, np.ones(4)])
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    # Opposite rays of the cone: its axis halves them.
+    axis = rays[:2].sum(0) / np.linalg.norm(rays[:2].sum(0)) + rays[2:].sum(0) / np.linalg.norm(rays[2:].sum(0))
+    axis /= np.linalg.norm(axis)
+    half = float(np.arccos(np.clip(rays @ axis, -1.0, 1.0)).mean())
+    return np.asarray(axis / math.sin(max(half, 1e-6)), float)
+
+
+def _steps(camera: Camera, sphere: Array) -> Array:
+    """Columns: changes of a sphere (3, 3) that move its outline by a pixel right, down and outward."""
+    scale = 1.0 / math.hypot(*sphere)
+    pixels, _ = silhouette(camera, sphere, 16)
+    columns = []
+    for axis in np.eye(3):
+        ahead, _ = silhouette(camera, sphere + 1e-3 / scale * axis, 16)
+        shift = (ahead - pixels) / (1e-3 / scale)
+        out = pixels - pixels.mean(0)
+        columns.append([*shift.mean(0), float((shift * out).sum() / np.linalg.norm(out, axis=1).sum())])
+    return np.linalg.inv(np.array(columns).T)
+
+
+class _Fit:
+    """A ball's sphere against one picture's evidence about a base outline."""
+
+    def __init__(self, image: Image, camera: Camera, base: Array, shift: float, blur: float | None = None) -> None:
+        """Look at the picture; without a ``blur`` only for steps, to find the right one of several."""
+        self.base = base
+        self.steps = _steps(camera, base)
+        self.points, self.normals = silhouette(camera, base)
+        self.radius = float(np.linalg.norm(self.points - self.points.mean(0), axis=1).mean())
+        if blur is None:
+            self.evidence = gather_steps(image, self.points, self.normals, self.radius, shift=shift)
+        else:
+            self.evidence = gather_evidence(image, self.points, self.normals, self.radius, shift=shift, blur=blur)
+
+    def shifts(self, moves: Array) -> Array:
+        """Along the normals, pixels (m, n), when the outline moves by (right, down, outward), (m, 3)."""
+        return np.asarray(moves[:, :2] @ self.normals.T + moves[:, 2:])
+
+    def costs(self, moves: Array, evidence: RimEvidence | None = None) -> Array:
+        """Costs (m,) of moves (m, 3)."""
+        return (evidence or self.evidence).totals(self.shifts(moves))
+
+    def spheres(self, moves: Array) -> Array:
+        """Spheres (m, 3) of moves (m, 3)."""
+        return np.asarray(self.base + moves @ self.steps.T)
+
+    def sphere(self, move: Array) -> Array:
+        """The sphere of one move (3,)."""
+        return np.asarray(self.base + self.steps @ move)
+
+
+def _reduced(image: Image, camera: Camera, share: float) -> tuple[Image, Camera]:
+    """Picture and camera at a share of their size, with whole pixels."""
+    if share >= 1.0:
+        return image, camera
+    height, width = image.shape[:2]
+    w, h = max(round(width * share), 8), max(round(height * share), 8)
+    sx, sy = w / width, h / height
+    small = dataclasses.replace(
+        camera, width=w, height=h, fx=camera.fx * sx, fy=camera.fy * sy,
+        cx=(camera.cx + 0.5) * sx - 0.5, cy=(camera.cy + 0.5) * sy - 0.5,
+    )  # fmt: skip
+    return np.asarray(cv2.resize(image, (w, h), interpolation=cv2.INTER_AREA)), small
+
+
+def _search(image: Image, camera: Camera, sphere: Array, shift: float, step: float) -> Array:
+    """The sphere with the most rim among all whose outline is within ``shift`` pixels in every unknown."""
+    slopes, fit = gradients(image), _Fit(image, camera, sphere, math.ceil(2.0 * shift))
+
+    def compressions(moves: Array) -> Array:
+        spheres = fit.spheres(moves)
+        found, before = np.full(len(moves), BEHIND), _is_before(spheres)
+        if before.any():
+            points, normals = silhouettes(camera, spheres[before], PIECES // 3)
+            found[before] = radial_compression(slopes, points, normals, fit.radius + moves[before, 2])
+        return found
+
+    def costs(moves: Array) -> Array:
+        parts = (moves[k : k + TOGETHER] for k in range(0, len(moves), TOGETHER))
+        return np.concatenate([fit.costs(part) - COMPRESSION * compressions(part) for part in parts])
+
+    grid = np.arange(-math.ceil(shift / step), math.ceil(shift / step) + 1.0) * step
+    moves = np.stack(np.meshgrid(grid, grid, grid), -1).reshape(-1, 3)
+    chosen = _apart(moves, costs(moves), 2.5 * step)
+    found = [descend(costs, moves[k], 0.5 * step, 0.2) for k in chosen]
+    return fit.sphere(min(found, key=lambda item: item[1])[0])
+
+
+def _apart(places: Array, costs: Array, distance: float) -> list[int]:
+    """The cheapest ``STARTS`` places that are further than ``distance`` from each other."""
+    chosen: list[int] = []
+    for k in np.argsort(costs):
+        if all(np.abs(places[k] - places[other]).max() > distance for other in chosen):
+            chosen.append(int(k))
+            if len(chosen) == STARTS:
+                break
+    return chosen
+
+
+def _radius(camera: Camera, sphere: Array) -> float:
+    points, _ = silhouette(camera, sphere, 16)
+    return float(np.linalg.norm(points - points.mean(0), axis=1).mean()) if len(points) else math.inf
+
+
+def _coarse(image: Image, camera: Camera, sphere: Array, rough_error: float) -> Array:
+    """The best sphere within ``rough_error`` of a rough one, looked for everywhere in a small picture."""
+    radius = _radius(camera, sphere)
+    small, view = _reduced(image, camera, COARSE_RADIUS / radius)
+    return _search(small, view, sphere, rough_error * min(radius, COARSE_RADIUS), 2.0)
+
+
+def refine_outline(image: Image, camera: Camera, sphere: Array, largest: float = LARGEST_RADIUS) -> BallOutline:
+    """The outline near a sphere that is within some percent of right, with its uncertainty.
+
+    Args:
+        image: 8-bit RGB.
+        camera: It took the picture.
+        sphere: Centre over radius, (3,), in the camera's frame.
+        largest: A ball of a larger radius, in pixels, is measured in a reduced picture.
+
+    Raises:
+        UsageError: What is found is no ball before the camera.
+    """
+    image, camera, corner = _window(image, camera, sphere)
+    radius = _radius(camera, sphere)
+    share, finest = min(1.0, COARSE_RADIUS / radius), min(1.0, largest / radius)
+    while share < finest:
+        share = min(2.0 * share, finest)
+        picture, view = _reduced(image, camera, share)
+        sphere = _search(picture, view, sphere, 2.0, 1.0)
+    picture, view = _reduced(image, camera, finest)
+    if radius <= COARSE_RADIUS:
+        sphere = _search(picture, view, sphere, 2.0, 1.0)
+    # A wider blur moves the rim inward by as much as it is wider: what the picture cannot tell apart is uncertainty.
+    tried = []
+    for blur in BLURS:
+        fit = _Fit(picture, view, sphere, 1.5, blur)
+        move, value = descend(fit.costs, np.zeros(3), 0.4, 0.02)
+        tried.append((value + fit.evidence.least, fit.shifts(move[None])[0], fit.sphere(move), blur))
+    least = min(item[0] for item in tried)
+    likely = [item for item in tried if item[0] < least + ALIKE]
+    unsure = np.std([item[1].mean() for item in likely])
+    # Once more about what was found, so that normals and window are those of the outline itself.
+    middle = likely[(len(likely) - 1) // 2]
+    fit = _Fit(picture, view, middle[2], 1.5, middle[3])
+    move, _ = descend(fit.costs, np.zeros(3), 0.2, 0.01)
+    sector = np.arange(PIECES) * SECTORS // PIECES
+
+    def without(k: int) -> Array:
+        evidence = fit.evidence.without(sector == k)
+        return descend(lambda moves: fit.costs(moves, evidence), move, 0.1, 0.01)[0]
+
+    left = np.stack([without(k) for k in range(SECTORS)])
+    spread = np.sqrt((SECTORS - 1) / SECTORS * ((left - left.mean(0)) ** 2).sum(0)) + LEAST_DEVIATION
+    spread = np.hypot(spread, [0.0, 0.0, unsure]) / finest
+    steps = _Fit(picture, view, fit.sphere(move), 1.0).evidence
+    found = _describe(camera, fit.sphere(move), spread, steps.support(np.zeros(PIECES)))
+    return dataclasses.replace(found, center=(found.center[0] + corner[0], found.center[1] + corner[1]))
+
+
+def _window(image: Image, camera: Camera, sphere: Array) -> tuple[Image, Camera, tuple[int, int]]:
+    """The part of a picture that a ball's outline may lie in, its camera, and its corner's column and row."""
+    points, _ = silhouette(camera, sphere, 32)
+    low, high = points.min(0), points.max(0)
+    margin = 0.35 * (high - low).max() + 24.0
+    x0, y0 = (int(v) for v in np.maximum(np.floor(low - margin), 0))
+    x1, y1 = (int(v) for v in np.minimum(np.ceil(high + margin) + 1, image.shape[1::-1]))
+    part = np.ascontiguousarray(image[y0:y1, x0:x1])
+    inside = dataclasses.replace(camera, width=x1 - x0, height=y1 - y0, cx=camera.cx - x0, cy=camera.cy - y0)
+    return part, inside, (x0, y0)
+
+
+def _describe(camera: Camera, sphere: Array, spread: Array, support: float) -> BallOutline:
+    points, _ = silhouette(camera, sphere)
+    if len(points) == 0:
+        raise UsageError("the ball's outline does not fit a ball before the camera; give a rough circle")
+    (x, y), (a, b), angle = cv2.fitEllipseDirect(points.astype(np.float32)[:, None])
+    if a < b:
+        a, b, angle = b, a, angle + 90.0
+    # OpenCV's fit is in single precision: the centre by the points' mean over equal angles is no better than it.
+    dx, dy, dr = map(float, spread)
+    cx, cy, cz = map(float, sphere)
+    return BallOutline((float(x), float(y)), (a / 2, b / 2), angle % 180.0, (dx, dy, dr), support, (cx, cy, cz))
+
+
+def lifted(image: Image) -> Image:
+    """The picture with darks as steep as brights: its codes are logarithms.
+
+    In a bracket's short exposures a rim is a few codes high, beside lamps of two hundred.
+    """
+    return np.asarray(_LIFT[image])
+
+
+def find_ball(
+    image: Image, camera: Camera | None = None, rough: Sequence[float] | None = None, rough_error: float = ROUGH_ERROR
+) -> BallOutline:
+    """Find the outline of a mirror ball in a photograph.
+
+    Args:
+        image: uint8 RGB (height, width, 3).
+        camera: The camera, if known; else the ball is taken for a circle.
+        rough: Column, row and radius in pixels of a circle that is about right; None: look for the ball.
+        rough_error: Share of the radius by which ``rough`` may be off.
+
+    Raises:
+        UsageError: No ball is found, the picture is too small, or the circle lies outside of it.
+    """
+    height, width = image.shape[:2]
+    if min(width, height) < SMALLEST_PICTURE:
+        raise UsageError(
+            f"the picture is {width}x{height} pixels; expected {SMALLEST_PICTURE} or more on each side to find a ball"
+        )
+    camera = camera or far_camera(width, height)
+    if rough is None:
+        return _find_anywhere(image, camera)
+    if len(rough) != 3 or not all(map(math.isfinite, rough)) or rough[2] < 4.0:
+        raise UsageError(
+            f"ball {', '.join(f'{v:g}' for v in rough)}: expected column, row and radius (4 or more) in pixels"
+        )
+    x, y, reach = rough
+    if not (-reach < x < width + reach and -reach < y < height + reach):
+        raise UsageError(f"ball {x:g}, {y:g}, {reach:g}: the circle lies outside the picture, {width}x{height} pixels")
+    start = sphere_of_circle(camera, *rough)
+    if start[2] <= 1.0:
+        raise UsageError("no ball is before the camera at this circle; expected one that is nearer to the axis")
+    outlines = []
+    for view in (image, lifted(image)):
+        outlines.append(refine_outline(view, camera, _coarse(view, camera, start, rough_error)))
+        if outlines[-1].support >= LEAST_SUPPORT:
+            return outlines[-1]
+    raise _unseen(max(outlines, key=lambda outline: outline.support), "give a circle that is nearer to the rim")
+
+
+def _find_anywhere(image: Image, camera: Camera) -> BallOutline:
+    """The likeliest ball of a whole picture."""
+    small, view = _reduced(image, camera, SEARCHED / max(image.shape))
+    height, width = small.shape[:2]
+    # And a crop of a ball alone: as wide as the picture.
+    circles = [*propose_circles(small), ((width - 1) / 2, (height - 1) / 2, 0.48 * min(width, height))]
+    starts = [sphere_of_circle(view, *circle) for circle in circles]
+    tries = [(lift, start) for lift in (False, True) for start in starts if start[2] > 1.0]
+    pictures = small, lifted(small)
+    # What is worth a search is told by what the proposed circle itself shows: a mirrored edge may be one inside it.
+    tries = sorted(tries, key=lambda item: -_evidence(pictures[item[0]], view, item[1]))[:SEARCHES]
+    best, told = None, -math.inf
+    for lift, start in tries:
+        sphere = _coarse(pictures[lift], view, start, ROUGH_ERROR)
+        strength = _evidence(pictures[lift], view, sphere)
+        if strength > told:
+            best, told = (lift, sphere), strength
+        if told > CERTAIN:
+            break
+    ask = "give a rough circle (--ball): column, row, radius in pixels"
+    if best is None:
+        raise UsageError(f"no ball was found in the picture; {ask}")
+    lift, sphere = best
+    picture = lifted(image) if lift else image
+    outline = refine_outline(picture, camera, sphere)
+    if outline.support < LEAST_SUPPORT and (reduced := _refine_reduced(picture, camera, outline)) is not None:
+        outline, told = reduced, min(told, LEAST_EVIDENCE)  # right for soft photographs, but not beyond doubt
+    outline = dataclasses.replace(outline, evidence=told)
+    if told < LEAST_EVIDENCE or outline.support < LEAST_SUPPORT:
+        raise _unseen(outline, ask)
+    return outline
+
+
+def _refine_reduced(image: Image, camera: Camera, outline: BallOutline) -> BallOutline | None:
+    """The outline in as large a picture as shows the rim, which noise or a soft lens hides in larger ones."""
+    largest = 0.5 * min(outline.radius, LARGEST_RADIUS)
+    while largest >= COARSE_RADIUS:
+        reduced = refine_outline(image, camera, np.array(outline.sphere), largest)
+        if reduced.support >= DIM_SUPPORT:
+            return reduced  # there it must be seen well: every desk has circles that are seen a little
+        largest *= 0.5
+    return None
+
+
+def _unseen(outline: BallOutline, ask: str) -> UsageError:
+    (x, y), radius = outline.center, outline.radius
+    return UsageError(
+        f"no ball was found in the picture: the best outline, about ({x:.0f}, {y:.0f}) with a radius of {radius:.0f} "
+        f"pixels, is hardly a mirror ball's ({outline.support:.0%} of its rim is seen); {ask}"
+    )
+
+
+def outline_strength(image: Image, camera: Camera, outline: BallOutline) -> float:
+    """How much of a mirror ball is seen at an outline; compares outlines of one picture."""
+    return _strength(image, camera, np.array(outline.sphere))
+
+
+def _strength(image: Image, camera: Camera, sphere: Array) -> float:
+    """How much of a mirror ball is seen at a sphere: steps at its rim, compression inside, more for larger balls."""
+    rim = _rim(image, camera, sphere)
+    return -math.inf if rim is None else (rim.steps + COMPRESSION * rim.compression) * rim.known * rim.size
+
+
+def _evidence(image: Image, camera: Camera, sphere: Array) -> float:
+    """The same where a whole picture is searched: what is round is often no ball, and balls are of all sizes.
+
+    A plate, a lid or a mirrored horizon has as sharp a rim as a ball. Only in a ball is what is inside squeezed toward
+    it, so that counts twice.
+    """
+    rim = _rim(image, camera, sphere)
+    return -math.inf if rim is None else (rim.steps + 2.0 * rim.compression) * rim.known * (1.0 + 0.1 * rim.size)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Rim:
+    """What is seen at a sphere's rim."""
+
+    steps: float
+    """How much better than a smooth curve a step explains the pieces of the rim, mean of at most ``MOST_COST`` each."""
+    compression: float
+    """Of gradients, by ``radial_compression``."""
+    known: float
+    """Share of the rim that is in the picture."""
+    size: float
+    """Logarithm of the radius in pixels."""
+
+
+def _rim(image: Image, camera: Camera, sphere: Array) -> _Rim | None:
+    """What a picture whose ball is ``COARSE_RADIUS`` pixels shows of a rim; None where it is not in the picture."""
+    radius = _radius(camera, sphere)
+    if not math.isfinite(radius):
+        return None
+    small, view = _reduced(image, camera, COARSE_RADIUS / radius)
+    fit = _Fit(small, view, sphere, 1.0)
+    if not fit.evidence.known.any():
+        return None
+    outline = (fit.points[None], fit.normals[None], np.array([fit.radius]))
+    compression = float(radial_compression(gradients(small), *outline)[0])
+    steps = MOST_COST - float(fit.costs(np.zeros((1, 3)))[0])
+    return _Rim(steps, compression, float(fit.evidence.known.mean()), math.log(max(radius, 4.0)))
+
+
+_LIFT = np.round(255 * np.log1p(np.arange(256) / DARK) / np.log1p(255 / DARK)).astype(np.uint8)

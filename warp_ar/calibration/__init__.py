@@ -1,0 +1,1 @@
+"""Camera, lens, response and printed card."""

@@ -1,0 +1,135 @@
+"""Which ChArUco board a picture shows, when nobody says: its dictionary, its columns and rows, its markers' share.
+
+Markers of one dictionary are read; the numbers of a ChArUco board run along its rows, so that a number of columns says
+where on the board each marker is. The right one is the one under which a plane's homography explains where the markers
+are in the picture.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from warp_ar.scene import CharucoBoard, Marker
+from warp_ar.tracking.card_layout import SHEET
+from warp_ar.tracking.markers import Detection, MarkerDetector, find_dictionary
+
+Image = NDArray[np.uint8]
+
+KNOWN: Final = (SHEET, Marker(dictionary="DICT_5X5_100", board=CharucoBoard(7, 5, 0.03, 0.022)))
+"""Boards that this program has handed out: their lengths are known."""
+DICTIONARIES: Final = (
+    *("DICT_4X4_1000", "DICT_5X5_1000", "DICT_6X6_1000", "DICT_7X7_1000", "DICT_ARUCO_ORIGINAL"),
+    *("DICT_APRILTAG_36h11", "DICT_APRILTAG_25h9", "DICT_APRILTAG_16h5", "DICT_ARUCO_MIP_36h12"),
+)
+"""Dictionaries that are tried; OpenCV's smaller ones are the first entries of these."""
+_FEWEST: Final = 5
+"""Markers without which a layout is not told from another."""
+_LAYOUTS: Final = range(3, 15)
+"""Columns that are tried."""
+_OFF: Final = 0.04
+"""Median distance, in markers' sides, between where a layout has the corners and where they are: a lens bends a board
+by less, a wrong layout is off by a multiple."""
+
+
+def find_markers(image: Image) -> tuple[str, list[Detection]]:
+    """The dictionary of most markers in a picture, and its markers.
+
+    Args:
+        image: uint8 RGB or grey.
+
+    Returns:
+        The name of the smallest of OpenCV's dictionaries that has them, and the markers; an empty name without any.
+    """
+    gray = image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
+    best: tuple[str, list[Detection]] = ("", [])
+    for name in DICTIONARIES:
+        found = MarkerDetector(name).detect(gray)
+        if len(found) > len(best[1]):
+            best = (name, found)
+    name, found = best
+    return (smallest_dictionary(name, max(d.id for d in found)) if found else "", found)
+
+
+def smallest_dictionary(name: str, number: int) -> str:
+    """The smallest dictionary of the family of one that has a number."""
+    if (family := re.fullmatch(r"(DICT_\dX\d)_\d+", name)) is None:
+        return name
+    return f"{family[1]}_{next(size for size in (50, 100, 250, 1000) if number < size)}"
+
+
+def recognise_board(image: Image) -> Marker | None:
+    """The ChArUco board in a picture; None where there is none, or too little of it.
+
+    The lengths of a board that is not among ``KNOWN`` are in squares of one metre: a camera's intrinsics do not depend
+    on them.
+    """
+    name, found = find_markers(image)
+    if len(found) < _FEWEST or len({d.id for d in found}) < len(found):
+        return None
+    corners = np.stack([d.corners for d in found]).astype(float)
+    side = float(np.median(np.linalg.norm(corners - np.roll(corners, 1, 1), axis=2)))
+    for marker in KNOWN:
+        assert isinstance(marker.board, CharucoBoard)
+        ratio = marker.board.marker_length / marker.board.square_length
+        most = max(d.id for d in found)
+        if marker.dictionary.rsplit("_", 1)[0] == name.rsplit("_", 1)[0] and most < marker.board.marker_count:
+            off, _ = _explain(found, corners, marker.board.columns, 0, ratio)
+            if off < _OFF * side:
+                return marker
+    # A board whose top row starts with a marker has OpenCV's older layout, which it no longer makes.
+    tried = [(*_explain(found, corners, columns, 0, None), columns) for columns in _LAYOUTS]
+    off, ratio, columns = min(tried)
+    if off > _OFF * side or not 0.3 < ratio < 0.97:
+        return None
+    rows = max(3, math.ceil(2 * (max(d.id for d in found) + 1) / columns))
+    rows += columns * rows // 2 <= max(d.id for d in found)
+    name = smallest_dictionary(name, columns * rows // 2 - 1)
+    if columns * rows // 2 > len(find_dictionary(name).bytesList):
+        return None
+    return Marker(dictionary=name, board=CharucoBoard(columns, rows, 1.0, round(ratio, 3)))
+
+
+def _explain(
+    found: list[Detection], corners: NDArray[Any], columns: int, first: int, ratio: float | None
+) -> tuple[float, float]:
+    """Median distance in pixels between corners and a layout's, and the markers' share of a square.
+
+    Args:
+        found: The markers.
+        corners: Their corners in the picture, (n, 4, 2).
+        columns: Squares along x.
+        first: Whether the board's first square is white.
+        ratio: The markers' share of a square; None: find it, in a way that needs no more than two homographies.
+    """
+    squares = [(row, column) for row in range(64) for column in range(columns) if (row + column + first) % 2 == 1]
+    if max(d.id for d in found) >= len(squares):
+        return math.inf, 0.0
+    places = np.array([squares[d.id][::-1] for d in found], float) + 0.5
+    if min(np.ptp(places[:, 0]), np.ptp(places[:, 1])) < 1:
+        return math.inf, 0.0
+    middle = np.array([_crossing(quad) for quad in corners])
+    matrix, _ = cv2.findHomography(middle, places, 0)
+    if matrix is None:
+        return math.inf, 0.0
+    flat = cv2.perspectiveTransform(corners.reshape(-1, 1, 2), matrix).reshape(-1, 4, 2) - places[:, None]
+    if ratio is None:
+        ratio = float(np.median(np.abs(flat))) * 2
+    spokes = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * ratio / 2
+    matrix, _ = cv2.findHomography((places[:, None] + spokes).reshape(-1, 2), corners.reshape(-1, 2), 0)
+    if matrix is None:
+        return math.inf, 0.0
+    there = cv2.perspectiveTransform((places[:, None] + spokes).reshape(-1, 1, 2), matrix).reshape(-1, 2)
+    return float(np.median(np.linalg.norm(there - corners.reshape(-1, 2), axis=1))), ratio
+
+
+def _crossing(quad: NDArray[Any]) -> NDArray[Any]:
+    """Where a quadrilateral's diagonals meet: the middle of a square, in perspective."""
+    a, b, c, d = (np.append(corner, 1.0) for corner in quad)
+    point = np.cross(np.cross(a, c), np.cross(b, d))
+    return np.asarray(point[:2] / point[2])

@@ -1,0 +1,301 @@
+"""Pinhole and distortion of a camera from views of a ChArUco board.
+
+References:
+    [Z00] Z. Zhang. A flexible new technique for camera calibration. PAMI 2000.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from warp_ar.calibration.board_finder import find_markers, recognise_board, smallest_dictionary
+from warp_ar.errors import SinkError, UsageError, reason
+from warp_ar.files import write_whole
+from warp_ar.scene import Camera, CharucoBoard, Marker
+from warp_ar.signature import PROGRAM
+from warp_ar.tracking.card_layout import SHEET
+from warp_ar.tracking.markers import make_board
+
+Image = NDArray[np.uint8]
+
+_MOVED = 0.03
+"""Share of the picture's diagonal that a board's corners must have moved for another view of it to be taken."""
+_MOST_VIEWS = 60
+"""Views that are used at most: more cost time and add nothing."""
+_FEWEST_VIEWS = 4
+"""Views without which the focal length is not determined with any certainty."""
+GOOD_VIEWS = 12
+"""Views below which a warning is due."""
+_GROUPS = 15
+"""Groups of views that are left out in turn: more cost time and tell the same."""
+LEAST_TILT = 15.0
+"""Degrees by which the board's tilt must differ: else focal length and distance cannot be told apart."""
+MOST_FOCAL = 0.03
+"""Share of the focal length that its interval of two standard deviations may have."""
+_COVERAGE_CELLS = (4, 6)
+"""Rows and columns into which the picture is cut to see where the board has been."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CameraReport:
+    """A calibrated camera and how far to trust it."""
+
+    camera: Camera
+    """The camera; its transfer is not measured here."""
+    error: float
+    """Root mean square reprojection error, pixels."""
+    view_errors: tuple[float, ...]
+    """The same for each view that was used."""
+    focal_deviation: float
+    """Standard deviation of the focal length, pixels."""
+    coverage: float
+    """Share of the picture's cells where the board has been."""
+    warnings: tuple[str, ...]
+    """What would make it better, one line each."""
+    marker: Marker
+    """The board that was seen."""
+    tilts: tuple[float, float]
+    """Least and most that the board was tilted, degrees: of views that are alike, a deviation says nothing."""
+
+    @property
+    def doubt(self) -> str:
+        """Why the focal length is not to be believed, in words; empty where it is."""
+        if self.tilts[1] - self.tilts[0] < LEAST_TILT:
+            return f"the card was tilted by {self.tilts[0]:.0f} to {self.tilts[1]:.0f} degrees only"
+        if (share := 2 * self.focal_deviation / self.camera.fx) > MOST_FOCAL:
+            return f"the focal length is known to +/- {share:.0%} only"
+        return ""
+
+
+class BoardViews:
+    """Different views of a ChArUco board, collected until they calibrate a camera [Z00]."""
+
+    def __init__(self, marker: Marker | None = None, board: CharucoBoard | None = None) -> None:
+        """Collect nothing yet.
+
+        Args:
+            marker: the board that was printed; None: whichever ChArUco board the first picture of one shows.
+            board: its layout, where only the dictionary is to be told from the pictures.
+
+        Raises:
+            UsageError: if it is no ChArUco board.
+        """
+        if marker is not None and not isinstance(marker.board, CharucoBoard):
+            raise UsageError(f'--board: the camera is calibrated with a ChArUco board, such as "{SHEET.board}"')
+        self.marker: Marker | None = None
+        """The board, as soon as it is known."""
+        self._layout = board
+        self._board: Any = None
+        self._detector: Any = None
+        if marker is not None:
+            self._take(marker)
+        self._size: tuple[int, int] | None = None
+        self._seen = 0
+        self.views: list[tuple[NDArray[Any], NDArray[Any], NDArray[Any]]] = []
+        """Corners in pixels, their numbers, and where they are on the board."""
+
+    def _recognised(self, gray: Image) -> Marker | None:
+        if self._layout is None:
+            return recognise_board(gray)
+        name, found = find_markers(gray)
+        count = self._layout.marker_count
+        if not found or max(d.id for d in found) >= count:
+            return None
+        return Marker(dictionary=smallest_dictionary(name, count - 1), board=self._layout)
+
+    def _take(self, marker: Marker) -> None:
+        self.marker = marker
+        self._board = make_board(marker)
+        self._detector = cv2.aruco.CharucoDetector(self._board)
+
+    def add(self, image: Image) -> bool:
+        """Take a picture, RGB or grey uint8; True if it shows the board as none before.
+
+        Raises:
+            UsageError: if its size is not the first one's.
+        """
+        size = (image.shape[1], image.shape[0])
+        self._size = self._size or size
+        if size != self._size:
+            first = f"{self._size[0]}x{self._size[1]}"
+            turned = "; hold the camera the same way for all" if size == self._size[::-1] else ""
+            raise UsageError(f"picture {self._seen}: {size[0]}x{size[1]}; expected the first one's {first}{turned}")
+        self._seen += 1
+        gray = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        if self.marker is None:
+            if (seen := self._recognised(gray)) is None:
+                return False
+            self._take(seen)
+        corners, ids, _, _ = self._detector.detectBoard(gray)
+        # Corners on one line, or fewer than six, leave a view's pose open.
+        if ids is None or len(ids) < 6 or self._board.checkCharucoCornersCollinear(ids):
+            return False
+        corners, ids = np.asarray(corners).reshape(-1, 2), np.ravel(ids)
+        least = _MOVED * math.hypot(*size)
+        if len(self.views) >= _MOST_VIEWS or any(_moved(corners, ids, *view[:2]) <= least for view in self.views):
+            return False
+        self.views.append((corners, ids, np.asarray(self._board.getChessboardCorners())[ids]))
+        return True
+
+    def covered(self) -> NDArray[np.bool_]:
+        """Where in the picture the board has been, by rows and columns."""
+        return _covered(self.views, self._size or (1, 1))
+
+    def solve(self) -> CameraReport:
+        """Pinhole and distortion.
+
+        Raises:
+            UsageError: if too few views show the board.
+        """
+        size = self._size
+        if size is None or self.marker is None or len(self.views) < _FEWEST_VIEWS:
+            what = "a ChArUco board" if self.marker is None else f"{self.marker.board} ({self.marker.dictionary})"
+            raise UsageError(
+                f"{len(self.views)} different views of {what} in {self._seen} pictures; "
+                f"expected {_FEWEST_VIEWS} at the least, {GOOD_VIEWS} for a good result"
+            )
+        result = _calibrate(self.views, size)
+        errors = np.ravel(result[-1])
+        # A blurred or bent view must not spoil the others.
+        kept = [view for view, error in zip(self.views, errors, strict=True) if error <= 3 * np.median(errors)]
+        if len(kept) < len(self.views) and len(kept) >= _FEWEST_VIEWS:
+            result = _calibrate(kept, size)
+            errors = np.ravel(result[-1])
+        error, matrix, distortion, rotations, _, deviations, _, _ = result
+        deviation = max(float(np.ravel(deviations)[:2].max()), _spread(kept, size))
+        camera = Camera(
+            *size, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], tuple(map(float, np.ravel(distortion)))
+        )
+        covered = _covered(kept, size)
+        tilts = [math.degrees(math.acos(min(1.0, abs(cv2.Rodrigues(r)[0][2, 2])))) for r in rotations]
+        warnings = []
+        if len(kept) < GOOD_VIEWS:
+            warnings.append(f"only {len(kept)} views: take {GOOD_VIEWS} or more, from different sides and distances")
+        if covered.mean() < 0.8:
+            empty = [_place(row, column) for row, column in np.argwhere(~covered)]
+            warnings.append(f"the board never reached {', '.join(dict.fromkeys(empty))}: distortion is a guess there")
+        if max(tilts) - min(tilts) < LEAST_TILT:
+            warnings.append(
+                f"the board was tilted by {min(tilts):.0f} to {max(tilts):.0f} degrees only: "
+                "the focal length is uncertain"
+            )
+        if error > 1.0:
+            warnings.append(
+                f"reprojection error {error:.2f} pixels: is the print flat, the picture sharp, the board's text right?"
+            )
+        return CameraReport(
+            camera,
+            float(error),
+            tuple(map(float, errors)),
+            deviation,
+            float(covered.mean()),
+            tuple(warnings),
+            self.marker,
+            (min(tilts), max(tilts)),
+        )
+
+
+def calibrate_camera(
+    images: Iterable[Image], marker: Marker | None = None, board: CharucoBoard | None = None
+) -> CameraReport:
+    """Pinhole and distortion from views of a ChArUco board.
+
+    Args:
+        images: RGB or grey uint8 pictures, all of one size; views that hardly differ from earlier ones are skipped.
+        marker: the board that was printed; None: whichever the pictures show.
+        board: its layout, where only the dictionary is to be told from the pictures.
+
+    Raises:
+        UsageError: if the board is no ChArUco board, sizes differ, or too few views show it.
+    """
+    views = BoardViews(marker, board)
+    for image in images:
+        views.add(image)
+    return views.solve()
+
+
+def _covered(
+    views: Sequence[tuple[NDArray[Any], NDArray[Any], NDArray[Any]]], size: tuple[int, int]
+) -> NDArray[np.bool_]:
+    rows, columns = _COVERAGE_CELLS
+    covered = np.zeros((rows, columns), bool)
+    for corners, _, _ in views:
+        cells = np.floor(corners / size * (columns, rows)).astype(int).clip(0, (columns - 1, rows - 1))
+        covered[cells[:, 1], cells[:, 0]] = True
+    return covered
+
+
+def _moved(corners: NDArray[Any], ids: NDArray[Any], others: NDArray[Any], other_ids: NDArray[Any]) -> float:
+    """Mean distance in pixels between the corners that two views share; infinite if none."""
+    _, here, there = np.intersect1d(ids, other_ids, return_indices=True)
+    return float(np.linalg.norm(corners[here] - others[there], axis=1).mean()) if len(here) else math.inf
+
+
+def _calibrate(views: Sequence[tuple[NDArray[Any], NDArray[Any], NDArray[Any]]], size: tuple[int, int]) -> Any:
+    plain, full = (_solve(views, size, flags) for flags in (cv2.CALIB_FIX_K3, 0))
+    # The sixth-order term bends the corners of the picture wildly where it only fits noise.
+    return full if full[0] < 0.9 * plain[0] else plain
+
+
+def _solve(views: Sequence[tuple[NDArray[Any], NDArray[Any], NDArray[Any]]], size: tuple[int, int], flags: int) -> Any:
+    pixels = [corners.astype(np.float32) for corners, _, _ in views]
+    points = [points.astype(np.float32) for _, _, points in views]
+    return cv2.calibrateCameraExtended(points, pixels, size, np.eye(3), np.zeros(5), flags=flags)
+
+
+def _spread(views: Sequence[tuple[NDArray[Any], NDArray[Any], NDArray[Any]]], size: tuple[int, int]) -> float:
+    """Standard deviation of the focal length by leaving out views in turn (the jackknife), pixels.
+
+    Corners of one view are off alike (its blur, what the lens does beside the model), so that the deviation by
+    independent corners is too small. With f_g the focal length without group g of n,
+
+        s^2 = (n - 1) / n  sum_g (f_g - mean f)^2.
+    """
+    count = min(len(views), _GROUPS)
+    if count <= _FEWEST_VIEWS:
+        return 0.0
+    found = []
+    for group in range(count):
+        rest = [view for number, view in enumerate(views) if number % count != group]
+        matrix = _solve(rest, size, cv2.CALIB_FIX_K3)[1]
+        found.append((matrix[0, 0], matrix[1, 1]))
+    return float(np.sqrt((count - 1) * np.var(found, axis=0).max()))
+
+
+def _place(row: int, column: int) -> str:
+    rows, columns = _COVERAGE_CELLS
+    vertical = "top" if row == 0 else "bottom" if row == rows - 1 else "middle"
+    return f"the {vertical} {'left' if column < columns / 3 else 'right' if column >= columns * 2 / 3 else 'centre'}"
+
+
+def write_camera(report: CameraReport, path: Path) -> None:
+    """Write OpenCV's YAML (or JSON or XML, by the name's ending).
+
+    Raises:
+        SinkError: The file cannot be written.
+        UsageError: Its name has another ending.
+    """
+    if path.suffix.lower() not in (".yml", ".yaml", ".json", ".xml"):
+        raise UsageError(f"--output {path}: expected a name that ends in .yml, .json or .xml")
+    if not path.parent.is_dir():
+        raise SinkError(f"{path}: cannot be written: no folder {path.parent}")
+    camera = report.camera
+    storage = cv2.FileStorage(path.suffix.lower(), cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+    storage.write("program", PROGRAM)
+    storage.write("image_width", camera.width)
+    storage.write("image_height", camera.height)
+    storage.write("camera_matrix", camera.matrix())
+    storage.write("distortion_coefficients", np.array(camera.distortion)[None])
+    storage.write("avg_reprojection_error", report.error)
+    try:
+        write_whole(path, storage.releaseAndGetString().encode())
+    except OSError as error:
+        raise SinkError(f"{path}: cannot be written: {reason(error)}") from error

@@ -1,0 +1,191 @@
+"""What a scene's frames say is wrong with its mirror ball."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from warp_ar.ball.ball_finder import find_ball
+from warp_ar.ball.ball_radius import explains_better
+from warp_ar.ball.ball_reflectance import REFLECTANCE, measure_reflectance
+from warp_ar.ball.ball_solve import BallSolution, ground_below, rough_circle, solve_ball
+from warp_ar.ball.ball_views import agreeing_outlines
+from warp_ar.ball.ground_seen import ground_is_seen
+from warp_ar.checks.check_pictures import Look
+from warp_ar.checks.finding import Finding
+from warp_ar.errors import UsageError
+from warp_ar.scene import Camera, Pose, Probe, Scene
+
+Image = NDArray[np.uint8]
+
+SMALL: Final = 14.0
+"""Radius in pixels below which a ball shows too little of the environment."""
+CLIPPED: Final = 0.2
+"""Share of the ball that may clip: lamps and windows do, walls must not."""
+DULL: Final = 0.10
+"""Standard deviation of the encoded picture inside the ball, over its mean, below which nothing is mirrored."""
+RADIUS: Final = 0.03
+"""Share of the radius below which an outline does not contradict it; with three deviations of its own."""
+PLACE: Final = 0.15
+"""Share of the radius by which the centre may be off where the outline shows it."""
+SEEN: Final = 0.46
+"""Share of the outline that must be seen where nothing is in front of the ball.
+
+A ball in the open, whose rim here and there looks like what is behind it, shows 0.50 to 0.97; half hidden it shows
+0.44.
+"""
+SIDES: Final = 6
+"""Frames in which what the ball stands on is looked for in its place."""
+LOST: Final = 0.35
+"""Share of the outline below which there is none."""
+
+
+def check_balls(scene: Scene, look: Look, views: int = 4) -> list[Finding]:
+    """Findings about every mirror ball."""
+    if not look.views:
+        return []
+    few = look.views[:: -(-len(look.views) // views)]
+    found = []
+    for index, probe in enumerate(scene.probes):
+        label = "[probe]" if len(scene.probes) == 1 else f"[[probe]] {index}"
+        found += _check_ball(scene, look, few, probe, label)
+    return found
+
+
+def inside_contrast(views: Sequence[tuple[Image, Pose]], camera: Camera, probe: Probe) -> float:
+    """Standard deviation over mean inside a ball's outline, median over frames: of paper and paint below ``DULL``."""
+    circles = [(image, rough_circle(camera, pose, probe)) for image, pose in views]
+    parts = [disc_contrast(image, circle) for image, circle in circles if circle is not None]
+    return float(np.median(parts)) if parts else 0.0
+
+
+def disc_contrast(image: Image, circle: tuple[float, float, float]) -> float:
+    """Standard deviation over mean of a picture within a circle (x, y, radius), pixels; ``DULL`` is its bound."""
+    return _contrast(_inside_of(image, circle))
+
+
+def _contrast(part: NDArray[np.float64]) -> float:
+    return float(part.std() / max(part.mean(), 1.0))
+
+
+def _check_ball(
+    scene: Scene, look: Look, views: tuple[tuple[Image, Pose], ...], probe: Probe, label: str
+) -> list[Finding]:
+    circles = [(image, rough_circle(look.camera, pose, probe)) for image, pose in views]
+    seen = [(image, circle) for image, circle in circles if circle is not None and _inside(look, circle)]
+    command = "python -m warp_ar.calibrate ball SCENE --write"
+    if not seen:
+        text = f"{label}: the ball is outside the picture"
+        return [Finding("ball.outside", text, "move camera or ball until all of it is in view; check center")]
+    ground = _ground(scene, probe)
+    insides = [_inside_of(image, circle) for image, circle in seen]
+    contrast = float(np.median([_contrast(part) for part in insides]))
+    spread = look.views[:: -(-len(look.views) // SIDES)]
+    if ground is not None and ground_is_seen(spread, look.camera, probe, ground):
+        return [_why_lost(look, views, label, contrast)]
+    outlines = [pair for pair in agreeing_outlines(views, look.camera, probe, ground) if pair[0].support > LOST]
+    if len(outlines) < max(1, len(seen) // 2):
+        return [_why_lost(look, views, label, contrast)]
+    found = []
+    solution = solve_ball(outlines, look.camera, probe, ground)
+    pixels = float(np.median([outline.radius for outline, _ in outlines]))
+    if pixels < SMALL:
+        text = f"{label}: the ball is {2 * pixels:.0f} pixels wide; expected {2 * SMALL:.0f} or more"
+        found.append(Finding("ball.small", text, "move the camera nearer, or use a larger ball"))
+    clipped = float(np.median([(part.min(-1) >= 250).mean() for part in insides]))
+    if clipped > CLIPPED:
+        text = f"{label}: {clipped:.0%} of the ball clips; walls should not"
+        found.append(Finding("ball.clipped", text, "set a shorter exposure, or [source] exposures"))
+    if contrast < DULL:
+        text = f"{label}: the ball mirrors nothing ({contrast:.0%} contrast inside it): painted, dusty or dull"
+        found.append(Finding("ball.dull", text, "wipe it, or use a polished ball"))
+    support = float(np.median([outline.support for outline, _ in outlines]))
+    if support < SEEN:
+        text = f"{label}: only {support:.0%} of the ball's outline is seen"
+        found.append(Finding("ball.hidden", text, "take away what is in front of the ball"))
+    off = _compare(probe, solution, label, command)
+    others = [other for other in scene.probes if other is not probe]
+    seen_ball = dataclasses.replace(probe, center=solution.center, radius=solution.radius)
+    # A ball that explains what is mirrored is right, and the outlines are edges beside its rim.
+    if off and explains_better(views, look.camera, probe, seen_ball, scene.proxies, others):
+        off = []
+    return [*found, *(off or _check_reflectance(scene, look, views, probe, label))]
+
+
+def _check_reflectance(
+    scene: Scene, look: Look, views: Sequence[tuple[Image, Pose]], probe: Probe, label: str
+) -> list[Finding]:
+    """The finding that what the ball mirrors is too bright or too dark there for its reflectance."""
+    measured = [measure_reflectance(scene, look.camera, probe, view, look.table) for view in views]
+    told = [one for one in measured if one is not None]
+    if not told or 2 * len(told) < len(views):
+        return []
+    found = np.median([one.reflectance for one in told], axis=0)
+    if abs(float(np.log(found / np.array(probe.reflectance)).mean())) < REFLECTANCE:
+        return []
+    red, green, blue = np.minimum(found, 1.0)
+    text = (
+        f"{label} reflectance = {float(np.mean(probe.reflectance)):.2g}: what stands beside the ball is "
+        f"{float(found.mean()):.2f} times as bright mirrored in it as seen directly"
+    )
+    remedy = f"write reflectance = [{red:.2f}, {green:.2f}, {blue:.2f}], or wipe the ball"
+    return [Finding("ball.reflectance", text, remedy)]
+
+
+def _ground(scene: Scene, probe: Probe) -> float | None:
+    """What the ball stands on, where the scene says that it stands on it."""
+    ground = ground_below(probe, scene.proxies)
+    return ground if ground is not None and probe.center[2] - probe.radius - ground < 0.3 * probe.radius else None
+
+
+def _compare(probe: Probe, solution: BallSolution, label: str, command: str) -> list[Finding]:
+    """The solution against the scene's numbers."""
+    if not solution.radius_assumed:
+        off = solution.radius - probe.radius
+        if abs(off) > max(RADIUS * probe.radius, 3 * solution.radius_deviation):
+            text = (
+                f"{label} radius = {probe.radius:g}: outline and card together say {solution.radius:.4f} "
+                f"+/- {2 * solution.radius_deviation:.4f} m"
+            )
+            remedy = f"measure ball, card and the print's rulers; {command}"
+            return [Finding("ball.radius", text, remedy)]
+    moved = np.subtract(solution.center, probe.center)
+    allowed = np.maximum(PLACE * probe.radius, 3 * np.array(solution.center_deviation))
+    if (np.abs(moved) > allowed).any():
+        x, y, z = solution.center
+        text = f"{label} center is {1e3 * float(np.linalg.norm(moved)):.0f} mm from where the ball is seen"
+        return [Finding("ball.place", text, f"center = [{x:.4f}, {y:.4f}, {z:.4f}]; {command}")]
+    return []
+
+
+def _inside(look: Look, circle: tuple[float, float, float]) -> bool:
+    x, y, r = circle
+    return -0.5 * r < x < look.camera.width + 0.5 * r and -0.5 * r < y < look.camera.height + 0.5 * r
+
+
+def _inside_of(image: Image, circle: tuple[float, float, float]) -> NDArray[np.float64]:
+    """Pixels (n, 3) of the inner part of a disc."""
+    x, y, r = circle
+    rows, columns = np.mgrid[: image.shape[0], : image.shape[1]]
+    mask = (columns - x) ** 2 + (rows - y) ** 2 < (0.8 * r) ** 2
+    return image[mask].astype(float) if mask.any() else np.zeros((1, 3))
+
+
+def _why_lost(look: Look, views: tuple[tuple[Image, Pose], ...], label: str, contrast: float) -> Finding:
+    """What there is instead of the ball: elsewhere, flat paint, or nothing."""
+    command = "check center and radius, and that nothing hides the ball"
+    if contrast < 0.5 * DULL:
+        text = f"{label}: where the ball should be, the picture is flat: painted over, covered or not there"
+        return Finding("ball.unfound", text, command)
+    try:
+        outline = find_ball(views[0][0], look.camera)
+    except UsageError:
+        return Finding("ball.unfound", f"{label}: no ball is seen where the scene has it", command)
+    x, y = outline.center
+    where = f"({x:.0f}, {y:.0f}), {2 * outline.radius:.0f} pixels wide"
+    text = f"{label}: no ball where the scene has it; there may be one at {where}"
+    return Finding("ball.unfound", text, command)

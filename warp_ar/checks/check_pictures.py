@@ -1,0 +1,436 @@
+"""What a scene's frames say is wrong with its card and camera, by the marker that they show."""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+import itertools
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from warp_ar.calibration.board_finder import KNOWN, find_markers, recognise_board
+from warp_ar.checks.finding import Finding
+from warp_ar.kernels.color import decode_table
+from warp_ar.scene import Camera, Marker, Pose, Scene
+from warp_ar.sources.source import Source
+from warp_ar.tracking.marker_pattern import Pattern, make_pattern, printed_cells
+from warp_ar.tracking.markers import Detection, MarkerDetector, find_dictionary
+from warp_ar.tracking.tracking import Tracker, TrackState
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+RARE: Final = 0.6
+"""Share of the frames below which a marker is seen too seldom."""
+CELL_PIXELS: Final = 3.0
+"""Side in pixels of the smallest cells that are read with certainty."""
+WORST_EDGES: Final = 1.0
+"""Pixels that a print's edges may be off where the pose has them: lens and board as the scene says give 0.1 to 0.4."""
+CLIPPED: Final = 250
+"""Code at which white paper is clipped, or about to."""
+CLIPPED_SHARE: Final = 0.25
+"""Share of the card's white that may clip."""
+DARK: Final = 0.04
+"""Linear camera value below which white paper is too dark: its noise is that of the whole picture."""
+CONTRAST: Final = 0.5
+"""Black ink over white paper, linear, above which it is haze, gloss, or another transfer curve."""
+STEEPEST: Final = 33.0
+"""White paper over black ink, linear, above which no print on plain paper is: that of laser printers is 20 to 30, and
+is read within a tenth (the bundled clips' is 21, read as 19 to 23 in right set-ups). An S-shaped curve, as cameras lay
+over what they show, makes it 35 to 43 by half of smoothstep, and 84 to 103 by all of it."""
+SHADOW: Final = 0.45
+"""Logarithm of light across the card that a smooth fall does not explain."""
+BLURRED: Final = 6.0
+"""Pixels from 10 to 90 % across a printed edge beyond which the picture is out of focus."""
+SHARP: Final = 0.14
+"""Share of a picture's contrast per pixel of its sharpest edges: in focus 0.4, blurred by 4 pixels 0.08 to 0.13."""
+DRIFT: Final = 0.12
+"""Logarithm of exposure by which frames may differ."""
+TINT: Final = 0.06
+"""Change of the card's red or blue against its green that is a drift of the white balance."""
+FOCAL: Final = 0.02
+"""Share of the focal length below which the card's perspective does not contradict it: 0.015 on right set-ups."""
+FOCAL_VIEWS: Final = 10
+"""Frames in which it is looked for."""
+BOARD_VIEWS: Final = 4
+"""Frames in which a board is looked for where a single marker is expected: a hand or an edge may hide some of it."""
+BOARD_MARKERS: Final = 5
+"""Markers of the dictionary in a picture below which no board is looked for."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Look:
+    """Frames of a scene, and where the marker is in them."""
+
+    camera: Camera
+    """Of the frames' size."""
+    images: tuple[Image, ...]
+    """All frames that were looked at, RGB."""
+    views: tuple[tuple[Image, Pose], ...]
+    """Those with the marker, with ``camera_from_world``."""
+    errors: tuple[float, ...]
+    """Of those, root mean square distance of the print's edges from where the pose has them, pixels."""
+    table: NDArray[np.float32]
+    """Linear value of each code, (256, 3)."""
+
+
+def take_look(
+    scene: Scene, source: Source, frames: int, every: int = 1, tell: Callable[[str], object] | None = None
+) -> Look:
+    """Look at some of a source's first frames; of alternating exposures the longest.
+
+    Args:
+        scene: Its marker is looked for, by its camera.
+        source: Gives the frames.
+        frames: How many are taken from it.
+        every: Look at each so many of them.
+        tell: Told, for people, which frame is looked at.
+
+    Raises:
+        SceneError: The camera was calibrated for another aspect ratio.
+        SourceError: The source breaks.
+    """
+    shown = (
+        frame for frame in itertools.islice(source, frames) if frame.exposure_time in (None, *source.exposures[:1])
+    )
+    camera = scene.camera.scaled_to(*source.size)
+    count = min(frames, source.length or frames)
+
+    def some() -> Iterator[tuple[Image, float]]:
+        for frame in itertools.islice(shown, 0, None, every):
+            if tell is not None:
+                tell(f"looking at frame {frame.index + 1} of {count}")
+            yield frame.image, frame.time
+
+    return look_at(scene.marker, camera, some())
+
+
+def look_at(marker: Marker, camera: Camera, frames: Iterable[tuple[Image, float]]) -> Look:
+    """Look for the marker in frames.
+
+    Args:
+        marker: The printed card.
+        camera: It took the frames.
+        frames: 8-bit RGB of the camera's size, each with its time in seconds.
+    """
+    tracker = Tracker(marker, camera, steady=False)
+    images, views, errors = [], [], []
+    for image, seconds in frames:
+        images.append(image)
+        track = tracker.track(image, seconds)
+        if track.state is TrackState.TRACKED and track.pose is not None:
+            views.append((image, track.pose))
+            errors.append(track.reprojection_error)
+    return Look(camera, tuple(images), tuple(views), tuple(errors), decode_table(camera.transfer))
+
+
+def check_pictures(scene: Scene, look: Look) -> list[Finding]:
+    """Findings about card and camera."""
+    if not look.images:
+        return [Finding("source.empty", "the source has no frames", "check [source]")]
+    if not look.views:
+        return [why_unseen(scene.marker, look)]
+    # One of a board's markers taken for a single one gives a wrong scale: all else follows from that.
+    views = [image for image, _ in look.views]
+    if (board := board_instead(scene.marker, views[:: -(-len(views) // BOARD_VIEWS)])) is not None:
+        return [board]
+    if (twice := _marker_twice(scene.marker, views)) is not None:
+        return [twice]
+    found = []
+    share = len(look.views) / len(look.images)
+    if share < RARE:
+        text = f"the marker is seen in {share:.0%} of {len(look.images)} frames"
+        found.append(Finding("marker.rare", text, "keep the whole card in the picture, flat, lit and unhidden"))
+    side = float(np.median([_marker_side(scene.marker, look.camera, pose) for _, pose in look.views]))
+    least = CELL_PIXELS * (int(find_dictionary(scene.marker.dictionary).markerSize) + 2)
+    if side < least:
+        text = f"a marker is {side:.0f} pixels wide; expected {least:.0f} or more"
+        found.append(Finding("marker.small", text, "move the camera nearer, or print a larger card"))
+    worst = float(np.median(look.errors))
+    if worst > WORST_EDGES:
+        text = f"the print's edges are {worst:.1f} pixels from where the camera's numbers have them"
+        remedy = "lay the card flat, check [marker], and run python -m warp_ar.calibrate camera PICTURES"
+        found.append(Finding("camera.edges", text, remedy))
+    found += _check_focal(scene.marker, look)
+    few = look.views[:: max(1, len(look.views) // 6)]
+    return [*found, *_check_light(scene.marker, look, few), *_check_blur(scene.marker, look, few)]
+
+
+def _marker_twice(marker: Marker, images: Sequence[Image]) -> Finding | None:
+    """The finding that pictures show a marker of the scene twice, of which either may be followed."""
+    own = set(_pattern(marker).markers)
+    detector = MarkerDetector(marker.dictionary)
+    for image in (images[0], images[-1]):
+        counts = collections.Counter(each.id for each in detector.detect(_gray(image)) if each.id in own)
+        if not counts or counts.most_common(1)[0][1] < 2:
+            return None
+    wanted = f"{marker.dictionary} {marker.board or f'id {marker.id}'}"
+    text = f"{wanted} is in the picture twice, and either may be followed"
+    return Finding("marker.twice", text, "cover or take away the one that the scene does not mean")
+
+
+def _pattern(marker: Marker) -> Pattern:
+    return make_pattern(marker.dictionary, marker.id, marker.size, marker.board)
+
+
+def _project(camera: Camera, pose: Pose, points: Array) -> Array:
+    pixels, _ = cv2.projectPoints(
+        pose.apply(points), np.zeros(3), np.zeros(3), camera.matrix(), np.array(camera.distortion)
+    )
+    return np.asarray(pixels.reshape(-1, 2), float)
+
+
+def _marker_side(marker: Marker, camera: Camera, pose: Pose) -> float:
+    """Mean side in pixels of a marker, the median of a board's."""
+    quads = [_project(camera, pose, corners) for corners in _pattern(marker).markers.values()]
+    return float(np.median([np.linalg.norm(quad - np.roll(quad, 1, 0), axis=1).mean() for quad in quads]))
+
+
+def why_unseen(marker: Marker, look: Look) -> Finding:
+    """What the pictures show instead of the marker."""
+    image = look.images[len(look.images) // 2]
+    wanted = f"{marker.dictionary} {marker.board or f'id {marker.id}'}"
+    ids = set(_pattern(marker).markers)
+    mirrored = MarkerDetector(marker.dictionary).detect(np.ascontiguousarray(_gray(image)[:, ::-1]))
+    if ids & {d.id for d in mirrored}:
+        text = "the picture is mirrored: the marker is seen in its mirror image only"
+        return Finding("marker.mirrored", text, "turn the camera's mirroring off")
+    level = float(look.table[image].mean())
+    if level < 0.01:
+        return Finding(
+            "picture.dark", f"the picture is dark: {level:.1%} of clipping on average", "uncover the camera, add light"
+        )
+    if float((image >= CLIPPED).mean()) > 0.7:
+        return Finding("picture.clipped", "the picture is overexposed: most of it clips", "set a shorter exposure")
+    if _is_blurred(image):
+        return Finding("picture.blurred", "the picture is blurred", "focus on the card, and keep the camera still")
+    if (board := board_instead(marker, [image])) is not None:
+        return board
+    name, seen = find_markers(image)
+    if marker.board is None and name == marker.dictionary and ids & {d.id for d in seen}:
+        text = f"{wanted} is in the picture, but no camera with fx {look.camera.fx:.0f} pixels sees a square like that"
+        return Finding("camera.focal", text, "python -m warp_ar.calibrate camera PICTURES")
+    if seen:
+        numbers = ", ".join(str(n) for n in sorted({d.id for d in seen})[:6])
+        text = f"no {wanted} in {len(look.images)} frames; the picture shows {name} {numbers}"
+        return Finding("marker.other", text, "print the card that [marker] names, or write what is printed")
+    whole = "the whole card with its white margin" if marker.board else "the whole black square with its white margin"
+    text = f"no {wanted} in {len(look.images)} frames; {whole} must be in the picture"
+    return Finding("marker.unseen", text, "show all of it, flat, sharp and lit; check [marker]")
+
+
+def board_instead(marker: Marker, images: Sequence[Image]) -> Finding | None:
+    """The finding that pictures show a board of which the scene expects one marker, taken to be of another size.
+
+    Args:
+        marker: What the scene expects.
+        images: RGB pictures, uint8 (h, w, 3).
+
+    Returns:
+        None where the scene expects a board, and where no picture shows one with the marker's number.
+    """
+    if marker.board is not None:
+        return None
+    detector = MarkerDetector(marker.dictionary)
+    for image in images:
+        # Reading one dictionary takes milliseconds, recognising a layout reads all of them.
+        if len(detector.detect(_gray(image))) < BOARD_MARKERS:
+            continue
+        seen = recognise_board(image)
+        if seen is None or seen.board is None or marker.id >= seen.board.marker_count:
+            continue
+        known = seen in KNOWN
+        what = "the printed card" if seen == KNOWN[0] else "a printed board"
+        name = str(seen.board) if known else " ".join(str(seen.board).split()[:2])
+        text = (
+            f"{what} is in the picture ({seen.dictionary}, {name}), though the scene expects a single marker of "
+            f"{1e3 * marker.size:g} mm, id {marker.id}: it is one of the board's, and all lengths would be wrong"
+        )
+        lengths = name if known else f"{name} SQUARE MARKER"
+        remedy = f'write board = "{lengths}" into [marker] in place of id and size'
+        more = "" if known else ", the lengths of a square and a marker in metres"
+        return Finding("marker.board", text, f"{remedy}{more}; or take the board away and show the marker alone")
+    return None
+
+
+def _is_blurred(image: Image) -> bool:
+    """Whether nothing in a picture that has contrast has a sharp edge."""
+    gray = cv2.medianBlur(_gray(image), 3).astype(np.float32)
+    low, high = np.percentile(gray, (1, 99))
+    slope = np.hypot(cv2.Sobel(gray, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(gray, cv2.CV_32F, 0, 1, scale=1 / 8))
+    return bool(high - low > 20 and np.percentile(slope, 99.9) < SHARP * (high - low))
+
+
+def _gray(image: Image) -> Image:
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
+
+
+def _check_focal(marker: Marker, look: Look) -> list[Finding]:
+    """The focal length under which the print's edges fit best, each frame posed anew for each candidate.
+
+    The squared residuals are a parabola about their least; leaving out one frame after the other says how sure it is.
+    """
+    images = [image for image, _ in look.views[:: -(-len(look.views) // FOCAL_VIEWS)]]
+    tracker = Tracker(marker, look.camera, steady=False)
+    pictures = [(image, tracker.detect(image)) for image in images]
+    # Where it lies is looked for in few frames, and measured in all around there.
+    rough = np.exp(np.linspace(-0.3, 0.3, 9))
+    few = [_squared_errors(marker, look.camera, pictures[:: -(-len(pictures) // 3)], factor).sum() for factor in rough]
+    factors = rough[int(np.argmin(few))] * np.array([0.94, 0.97, 1.0, 1.03, 1.06])
+    squares = np.array([_squared_errors(marker, look.camera, pictures, factor) for factor in factors])
+    kept = np.isfinite(squares).all(0)
+    if kept.sum() < 4:
+        return []
+    squares = squares[:, kept]
+    count = squares.shape[1]
+    best, _ = _lowest(factors, squares.sum(1))
+    left = np.array([_lowest(factors, squares.sum(1) - squares[:, k])[0] for k in range(count)])
+    deviation = math.sqrt((count - 1) / count * float(((left - left.mean()) ** 2).sum()))
+    # Views from one side alone leave the least so flat that anything moves it.
+    as_given = _squared_errors(marker, look.camera, pictures, 1.0)[kept].sum()
+    if abs(best - 1) < max(FOCAL, 3 * deviation) or as_given < 1.02 * squares.sum(1).min():
+        return []
+    text = (
+        f"[camera] fx = {look.camera.fx:.0f}: the card's perspective in {count} views fits "
+        f"{best * look.camera.fx:.0f} +/- {2 * deviation * look.camera.fx:.0f}"
+    )
+    return [Finding("camera.focal", text, "python -m warp_ar.calibrate camera PICTURES")]
+
+
+def _squared_errors(
+    marker: Marker, camera: Camera, pictures: Sequence[tuple[Image, list[Detection]]], factor: float
+) -> Array:
+    """Mean squared distance of the print's edges in each picture, pixels squared; infinite where it is not seen."""
+    tracker = Tracker(marker, dataclasses.replace(camera, fx=camera.fx * factor, fy=camera.fy * factor), steady=False)
+    return np.array([tracker.error_of(image, found) ** 2 for image, found in pictures])
+
+
+def _lowest(factors: Array, totals: Array) -> tuple[float, float]:
+    """Where the parabola through the totals is lowest, and its curvature."""
+    curve, slope, _ = np.polyfit(factors, totals, 2)
+    if curve <= 0:
+        return float(factors[np.argmin(totals)]), 0.0
+    return float(np.clip(-slope / (2 * curve), factors[0], factors[-1])), float(curve)
+
+
+def _cell_values(marker: Marker, look: Look, image: Image, pose: Pose) -> tuple[Array, Array, Array]:
+    """White cells' places (n, 3), codes (n, 3), and black cells' codes (m, 3), of those in the picture."""
+    cells, white, _, _ = printed_cells(marker)
+    pixels = _project(look.camera, pose, cells)
+    inside = ((pixels >= 1) & (pixels <= (look.camera.width - 2, look.camera.height - 2))).all(1)
+    x, y = np.round(pixels[inside]).astype(int).T
+    codes = image[y, x].astype(float)
+    return cells[inside][white[inside]], codes[white[inside]], codes[~white[inside]]
+
+
+def _check_light(marker: Marker, look: Look, views: Sequence[tuple[Image, Pose]]) -> list[Finding]:
+    """Whether the card's white can be measured, and whether it stays."""
+    found, clipped, dark, ratios, uneven, whites = [], [], [], [], [], []
+    for image, pose in views:
+        places, white, black = _cell_values(marker, look, image, pose)
+        if len(white) < 6 or len(black) < 6:
+            continue
+        linear = np.stack([look.table[white[:, k].astype(int), k] for k in range(3)], -1)
+        ink = np.stack([look.table[black[:, k].astype(int), k] for k in range(3)], -1)
+        clipped.append(float((white.max(1) >= CLIPPED).mean()))
+        level = float(np.median(linear.mean(1)))
+        dark.append(level)
+        ratios.append(float(np.median(ink.mean(1))) / max(level, 1e-6))
+        whites.append(np.median(linear, axis=0))
+        log = np.log(np.maximum(linear.mean(1), 1e-4))
+        design = np.column_stack([np.ones(len(places)), places[:, :2]])
+        rest = log - design @ np.linalg.lstsq(design, log, rcond=None)[0]
+        # A shadow's edge leaves two groups: cells that a print's noise or a blurred edge darken are few.
+        uneven.append(float(np.percentile(rest, 85) - np.percentile(rest, 15)))
+    if not whites:
+        return []
+    if np.median(clipped) > CLIPPED_SHARE:
+        text = f"{np.median(clipped):.0%} of the card's white clips, so that it tells nothing of the light"
+        found.append(Finding("card.clipped", text, "set a shorter exposure on the camera"))
+    if np.median(dark) < DARK:
+        text = f"the card's white is dark: {np.median(dark):.1%} of clipping"
+        found.append(Finding("card.dark", text, "add light, or set a longer exposure"))
+    elif np.median(ratios) > CONTRAST:
+        text = f"the card's black is {np.median(ratios):.0%} of its white: haze, gloss, or another transfer curve"
+        found.append(
+            Finding("card.contrast", text, "turn the card out of the lamp's reflection; check [camera] transfer")
+        )
+    elif (steep := 1.0 / max(float(np.median(ratios)), 1e-3)) > STEEPEST:
+        text = (
+            f"the card's white is {steep:.0f} times as bright as its black; on plain paper it is 20 to 30 times: the "
+            "camera lays a tone curve over [camera] transfer, or the print is on glossy photo paper"
+        )
+        remedy = "turn its contrast and HDR modes off, or python -m warp_ar.calibrate response PICTURES"
+        found.append(Finding("camera.response", text, remedy))
+    if np.median(uneven) > SHADOW:
+        text = (
+            f"a shadow lies across the card: its white differs by a factor of {math.exp(float(np.median(uneven))):.1f}"
+        )
+        found.append(Finding("card.shadow", text, "move what shades the card, or the card"))
+    return [*found, *_check_drift(look, views, np.array(whites))]
+
+
+def _check_drift(look: Look, views: Sequence[tuple[Image, Pose]], whites: Array) -> list[Finding]:
+    """Drifts of the camera's own: it changes all of the picture alike; a lamp changes every side differently."""
+    found: list[Finding] = []
+    if len(whites) < 2:
+        return found
+    first, last = views[0][0], views[-1][0]
+    tints = np.log(whites[:, [0, 2]] / whites[:, 1:2])
+    levels = np.log(whites.mean(1))
+    a, b = (look.table[cv2.resize(i, (32, 24), interpolation=cv2.INTER_AREA)].reshape(-1, 3, 3) for i in (first, last))
+    low, high = (np.stack([p[..., k, k] for k in range(3)], -1) for p in (a, b))
+    known = ((low > 0.01) & (low < 0.85) & (high > 0.01) & (high < 0.85)).all(-1)
+    if known.sum() < 100:
+        return found
+    ratio = np.log(high[known] / low[known])
+    change = np.median(ratio.mean(1))
+    spread = float(np.percentile(ratio.mean(1), 80) - np.percentile(ratio.mean(1), 20))
+    if abs(change) > DRIFT and abs(levels[-1] - levels[0]) > DRIFT and spread < 0.5 * abs(change):
+        text = f"the exposure drifts: all of the picture changes by a factor of {math.exp(change):.2f}"
+        found.append(
+            Finding("camera.drift", text, 'lock the camera\'s exposure, or say [source] metering = "automatic"')
+        )
+    colour = ratio[:, [0, 2]] - ratio[:, 1:2]
+    shift, width = np.median(colour, axis=0), np.percentile(colour, 80, axis=0) - np.percentile(colour, 20, axis=0)
+    k = int(np.argmax(np.abs(shift)))
+    # A lamp that goes changes level and colour together; a camera's balance hardly changes the level.
+    alike = width[k] < 0.75 * abs(shift[k]) and abs(change) < 0.4
+    if abs(shift[k]) > TINT and abs(tints[-1, k] - tints[0, k]) > TINT and alike:
+        text = f"the white balance drifts: {'red' if k == 0 else 'blue'} by a factor of {math.exp(shift[k]):.2f}"
+        found.append(Finding("camera.balance", text, "lock the camera's white balance"))
+    return found
+
+
+def _check_blur(marker: Marker, look: Look, views: Sequence[tuple[Image, Pose]]) -> list[Finding]:
+    """Width of printed edges in the picture."""
+    pattern, widths = _pattern(marker), []
+    taps = np.linspace(-8, 8, 65)
+    for image, pose in views:
+        pixels = _project(look.camera, pose, pattern.points)
+        ahead = _project(look.camera, pose, pattern.points + 1e-4 * pattern.normals) - pixels
+        scale = np.linalg.norm(ahead, axis=1)
+        room = pattern.clearances * scale / 1e-4
+        chosen = room > 9.0
+        if chosen.sum() < 8:
+            continue
+        across = ahead[chosen] / scale[chosen, None]
+        places = (pixels[chosen][:, None] + taps[None, :, None] * across[:, None]).astype(np.float32)
+        profile = cv2.remap(_gray(image), places[..., 0], places[..., 1], cv2.INTER_LINEAR).astype(float)
+        profile = np.median(profile - profile[:, :4].mean(1, keepdims=True), axis=0)
+        top = profile[-4:].mean()
+        if top > 10:
+            widths.append(_rise(profile / top, taps))
+    if widths and np.median(widths) > BLURRED:
+        text = f"the picture is blurred: {np.median(widths):.0f} pixels across a printed edge"
+        return [Finding("picture.blurred", text, "focus on the card, and keep the camera still")]
+    return []
+
+
+def _rise(profile: Array, taps: Any) -> float:
+    return float(taps[np.argmax(profile > 0.9)] - taps[np.argmax(profile > 0.1)])

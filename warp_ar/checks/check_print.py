@@ -1,0 +1,137 @@
+"""Whether the card was printed at true scale: by the paper that it is printed on, whose size is known.
+
+A print at 97 % looks like everything else at 103 %: nothing on it tells. Its paper does. In units of the print, A4 at
+97 % is 216 mm wide, which is nearly Letter's width, and its upper edge is 179 mm from the board's middle, which is not.
+So the left, right and upper edge of the sheet are looked for where the pose has them, along lines across the margin.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from warp_ar.calibration.card import PAPERS
+from warp_ar.checks.finding import Finding
+from warp_ar.scene import Camera, CharucoBoard, Marker, Pose
+from warp_ar.tracking.card_layout import SHEET, board_top
+
+Image = NDArray[np.uint8]
+
+OFF: Final = 0.012
+"""Share by which a print's scale may be off: printers feed paper as well as that."""
+SIDES: Final = (0.096, 0.122)
+"""Metres from the board's middle between which the left and right edge of A4 or Letter lie, at 90 to 110 %."""
+UPPER: Final = (0.158, 0.200)
+"""The same of the upper edge."""
+STEP: Final = 0.0005
+"""Metres between samples across an edge."""
+LINES: Final = 24
+"""Lines across each edge."""
+DARKER: Final = 14.0
+"""Codes by which what lies beside the paper differs from it at least."""
+ALIKE: Final = 0.0012
+"""Metres within which the lines across one edge must agree."""
+AGREE: Final = 0.5
+"""Share of the lines that must."""
+SAME: Final = 0.003
+"""Metres by which the upper edge may be off where a paper and a scale have it."""
+FEWEST: Final = 2
+"""Views in which the sheet must be seen."""
+
+
+def card_scale(marker: Marker) -> float | None:
+    """Lengths of a marker over those of the printed card; None where it is not that card."""
+    board, made = marker.board, SHEET.board
+    assert isinstance(made, CharucoBoard)
+    if not isinstance(board, CharucoBoard) or marker.dictionary != SHEET.dictionary:
+        return None
+    if (board.columns, board.rows) != (made.columns, made.rows):
+        return None
+    scale = board.square_length / made.square_length
+    return scale if abs(board.marker_length / made.marker_length / scale - 1.0) < 1e-3 else None
+
+
+def check_print(marker: Marker, camera: Camera, views: Sequence[tuple[Image, Pose]]) -> list[Finding]:
+    """A finding where the paper says that the print's scale is not what the marker's lengths say."""
+    told = card_scale(marker)
+    if told is None:
+        return []
+    sheets = [sheet for image, pose in views if (sheet := _find_sheet(image, camera, pose)) is not None]
+    if len(sheets) < FEWEST:
+        return []
+    width, upper = (float(value) for value in np.median(sheets, axis=0))
+    best: tuple[float, float, str] | None = None
+    for paper in ("a4", "letter"):
+        paper_width, height = (length / 1e3 for length in PAPERS[paper])
+        # Metres of the scene over those of the world: what is printed larger is taken for metres that are smaller.
+        factor = paper_width / width
+        # Printers scale about the middle of the page.
+        printed = factor * told
+        top = (height / 2 - printed * (height / 2 - board_top(height))) / factor
+        if best is None or abs(top - upper) < best[0]:
+            best = (abs(top - upper), factor, paper)
+    assert best is not None
+    miss, factor, paper = best
+    if miss > SAME or abs(factor - 1.0) < OFF:
+        return []
+    made = SHEET.board
+    assert isinstance(made, CharucoBoard)
+    right = factor * told
+    lengths = f"{made.square_length * right:.5f} {made.marker_length * right:.5f}"
+    name = "A4" if paper == "a4" else "Letter"
+    text = f"the card is printed at {right:.1%}, by its {name} paper; [marker] says {told:.1%}"
+    remedy = (
+        f"measure its rulers, which should be {100 * right:.1f} mm, and write [marker] board = "
+        f'"charuco {made.columns}x{made.rows} {lengths}"; or print it at 100 %'
+    )
+    return [Finding("card.print", text, remedy)]
+
+
+def _find_sheet(image: Image, camera: Camera, pose: Pose) -> tuple[float, float] | None:
+    """Width of the sheet, and how far its upper edge is from the board's middle, metres; None where not seen."""
+    gray = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (0, 0), 0.8).astype(np.float32)
+    along = np.linspace(-0.05, 0.15, LINES)
+    # Not where the ball stands, nor behind it.
+    beside = np.concatenate([np.linspace(-0.09, -0.05, LINES // 2), np.linspace(0.05, 0.09, LINES // 2)])
+    sides = [_find_edge(gray, camera, pose, SIDES, [((sign, 0.0), (0.0, y)) for y in along]) for sign in (-1.0, 1.0)]
+    upper = _find_edge(gray, camera, pose, UPPER, [((0.0, 1.0), (x, 0.0)) for x in beside])
+    if sides[0] is None or sides[1] is None or upper is None:
+        return None
+    return sides[0] + sides[1], upper
+
+
+def _find_edge(
+    gray: NDArray[np.float32],
+    camera: Camera,
+    pose: Pose,
+    window: tuple[float, float],
+    lines: Sequence[tuple[tuple[float, float], tuple[float, float]]],
+) -> float | None:
+    """How far along lines, each with a direction and a start, the paper ends; None where they do not agree."""
+    far = np.arange(*window, STEP)
+    found = []
+    for way, start in lines:
+        points = np.array([[start[0] + way[0] * t, start[1] + way[1] * t, 0.0] for t in far])
+        pixels, _ = cv2.projectPoints(
+            pose.apply(points), np.zeros(3), np.zeros(3), camera.matrix(), np.array(camera.distortion)
+        )
+        x, y = pixels.reshape(-1, 2).T
+        if x.min() < 1 or y.min() < 1 or x.max() > gray.shape[1] - 2 or y.max() > gray.shape[0] - 2:
+            continue
+        values = cv2.remap(gray, x.astype(np.float32)[:, None], y.astype(np.float32)[:, None], cv2.INTER_LINEAR).ravel()
+        # The paper is bright up to its edge, and what follows is not.
+        falls = values[:-4] - values[4:]
+        k = int(falls.argmax())
+        if falls[k] < DARKER or values[: k + 1].min() < values[k + 4] + 0.5 * DARKER:
+            continue
+        weight = np.clip(values[k : k + 4] - values[k + 1 : k + 5], 0, None)
+        found.append(float(far[k] + STEP * (0.5 + (np.arange(4) * weight).sum() / max(weight.sum(), 1e-6))))
+    if len(found) < AGREE * len(lines):
+        return None
+    middle = float(np.median(found))
+    near = [value for value in found if abs(value - middle) < ALIKE]
+    return float(np.mean(near)) if len(near) >= AGREE * len(lines) else None

@@ -1,0 +1,150 @@
+"""All checks of a set-up, and their quick half."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, Final
+
+from warp_ar.ball.ball_solve import find_outlines
+from warp_ar.checks.check_ball import LOST, check_balls
+from warp_ar.checks.check_objects import check_objects, written_poses
+from warp_ar.checks.check_pictures import Look, check_pictures, take_look
+from warp_ar.checks.check_print import check_print
+from warp_ar.checks.check_proxies import check_proxies
+from warp_ar.checks.check_saturation import check_saturation
+from warp_ar.checks.check_scene import check_scene
+from warp_ar.checks.finding import Finding, worst_first
+from warp_ar.errors import SceneError, SourceError
+from warp_ar.scene import Camera, Pose, Scene
+from warp_ar.sources.sources import open_source
+
+FRAMES: Final = 120
+"""Frames that are looked at."""
+FEW_VIEWS: Final = 5
+"""Views in which paper and modelled shapes are looked for."""
+QUICK_FRAMES: Final = 12
+"""Frames that the quick half looks at."""
+SPREAD: Final = 96
+"""Frames of ``PIXELS`` over which these are spread: drifts, and views from several sides, take seconds."""
+PIXELS: Final = 640 * 480
+"""Of larger pictures so many fewer frames are read that it takes as long."""
+
+
+def source_of(scene: Scene, given: str | int | Path | None = None) -> str | int | Path | None:
+    """What ``open_source`` calls the frames: those that are given, else the scene's own."""
+    if given is not None or scene.source is None:
+        return given
+    spec = scene.source
+    return spec.path or (f"synthetic:{spec.synthetic}" if spec.synthetic is not None else spec.camera)
+
+
+def check_up(
+    scene: Scene, source: str | int | Path | None, *, frames: int = FRAMES, quick: bool = False
+) -> list[Finding]:
+    """What is wrong with a set-up, the worst first.
+
+    Args:
+        scene: The scene.
+        source: The frames; None: look at the scene's numbers alone.
+        frames: How many to look at.
+        quick: Look at a few only, which takes about a second.
+    """
+    return check_and_look(scene, source, frames=frames, quick=quick)[0]
+
+
+def check_and_look(
+    scene: Scene,
+    source: str | int | Path | None,
+    *,
+    frames: int = FRAMES,
+    quick: bool = False,
+    tell: Callable[[str], object] | None = None,
+) -> tuple[list[Finding], Look | None]:
+    """As ``check_up``, with what the frames show, so that they need not be read twice.
+
+    Args:
+        scene: The scene.
+        source: The frames; None: look at the scene's numbers alone.
+        frames: How many to look at.
+        quick: Look at a few only, which takes about a second.
+        tell: Told, for people, what is looked at: all of it takes seconds.
+
+    Returns:
+        The findings, and None in the look's place where no frames were read.
+    """
+    found = check_scene(scene)
+    if source is None:
+        return worst_first(found), None
+    try:
+        look = _read(scene, source, None if quick else frames, tell)
+    except SourceError as error:
+        unread = Finding("source.unreadable", str(error), "check [source], or give --source")
+        return worst_first([*found, unread]), None
+    except SceneError as error:
+        unread = Finding("camera.aspect", str(error), "python -m warp_ar.calibrate camera PICTURES")
+        return worst_first([*found, unread]), None
+    if tell is not None:
+        tell("looking at card, ball and light")
+    return worst_first([*found, *_check_look(scene, look, 1 if quick else 4, found)]), look
+
+
+def _read(scene: Scene, source: str | int | Path, frames: int | None, tell: Callable[[str], object] | None) -> Look:
+    """Frames of a source; for None as many as are looked at in a second, from all over its beginning."""
+    own = scene.source
+    exposures = own.exposures or () if own is not None else ()
+    with open_source(source, exposures=exposures) as opened:
+        every = 1
+        if frames is None:
+            width, height = opened.size
+            spread = round(SPREAD * min(PIXELS / (width * height), 1.0))
+            every = max(min(spread, opened.length or spread) // QUICK_FRAMES, 1)
+            frames = every * QUICK_FRAMES
+        return take_look(scene, opened, frames, every, tell)
+
+
+def check_look(scene: Scene, look: Look, views: int = 4) -> list[Finding]:
+    """What is wrong with a set-up whose frames were looked at already, the worst first.
+
+    Args:
+        scene: The scene.
+        look: What its frames show.
+        views: In how many frames the ball is looked for, each about half a second.
+    """
+    found = check_scene(scene)
+    return worst_first([*found, *_check_look(scene, look, views, found)])
+
+
+def _check_look(scene: Scene, look: Look, views: int, before: list[Finding]) -> list[Finding]:
+    if not scene.has_marker and look.images:
+        # Its poses are written down: no print is there to tell camera, light and ball by.
+        return check_objects(scene, look.camera, written_poses(scene))
+    found = check_pictures(scene, look)
+    if any(finding.name in ("marker.board", "marker.twice") for finding in found):
+        return found  # poses by another marker say nothing about prints, proxies and balls
+    few = look.views[:: max(1, -(-len(look.views) // FEW_VIEWS))]
+    found += [*check_print(scene.marker, look.camera, few), *check_proxies(scene, look.camera, few)]
+    # Where the scene's own numbers cannot be, a picture says nothing more about them.
+    if any(finding.name.startswith("units.") for finding in before):
+        return found
+    found += check_objects(scene, look.camera, [pose for _, pose in look.views])
+    told = {finding.name for finding in before}
+    balls = check_balls(scene, look, views)
+    if any(finding.name in ("camera.response", "card.contrast") for finding in found):
+        # What is mirrored is darker than what is seen directly: another curve changes their ratio.
+        balls = [finding for finding in balls if finding.name != "ball.reflectance"]
+    if not any(finding.name in ("ball.outside", "ball.unfound") for finding in balls):
+        found += check_saturation(scene, look)
+    if "ball.sunk" in told:
+        return [*found, *(f for f in balls if f.name != "ball.place")]
+    return [*found, *balls]
+
+
+def ball_is_seen(scene: Scene, camera: Camera, views: Iterable[tuple[Any, Pose]]) -> bool:
+    """Whether any of some posed RGB frames shows any of the scene's mirror balls."""
+    return any(  # frame by frame, up to the first that does: looking takes a third of a second
+        outline.support > LOST
+        for view in views
+        for probe in scene.probes
+        for outline, _ in find_outlines([view], camera, probe)
+    )

@@ -1,0 +1,425 @@
+"""Photographs of one ball at several exposures: what their exposures really are, and how they lie over each other.
+
+**Alignment.** Two exposures of one scene differ by a monotone function of codes. It is read off the joint histogram
+(the comparagram [Mann00]), and the shift and scale that make the rest least are found by Gauss-Newton with weights that
+redescend; both in turn. What the ball mirrors has thousands of edges, so a tenth of a pixel is within reach.
+
+**Exposures.** Where nothing clips, the ratio of two pictures' linear values is that of their exposures. What EXIF or
+names say is believed if the pixels agree. They cannot be asked without a response: sRGB is tried first; where it does
+not hold, the response is estimated from the bracket itself, ln g(c) = ln sRGB(c) + sum_j a_j h_j(c), with hats h_j over
+the codes, by robust least squares on
+
+    ln g(u) - ln g(v) = ln(t_u / t_v)
+
+over pixel pairs (u, v) [DM97]. A curve can take up any one ratio, but not contradictions: equal codes mean equal light
+under every response. What remains of each step tells whether the exposures hold.
+
+References:
+    [DM97] P. Debevec and J. Malik. Recovering high dynamic range radiance maps from photographs. SIGGRAPH 1997.
+    [Mann00] S. Mann. Comparametric equations with practical applications in quantigraphic image processing. 2000.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from warp_ar.errors import UsageError
+from warp_ar.kernels.color import decode_table
+from warp_ar.sources.exposures import WAVERING
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+Circle = tuple[float, float, float]
+
+PATCH = 384
+"""Most pixels across the ball's picture in which exposures are compared."""
+DARKEST, DIM, BRIGHTEST = 16, 40, 245
+"""Codes between which a pixel tells of light; those below ``DIM`` only where there are no others.
+
+Flare and processing lift the darks of single pictures, and of short exposures nothing takes its darks.
+"""
+FLAT = 30
+"""Range of codes around a pixel from which on it is beside an edge: there blur mixes what clips with what does not."""
+LEAST_PIXELS = 400
+"""Pixels well exposed in two pictures without which nothing is said of their ratio."""
+HOLDS = 0.12
+"""Logarithm of the factor by which a step may be off what the pixels say."""
+CONTRADICTS = 0.3
+"""The same where a response is estimated with it: beyond, no response explains the exposures."""
+FAR = 40.0
+"""Ratio of exposures beyond which what one shows is black or white in the other."""
+FEATURELESS = 6.0
+"""Standard deviation of codes below which a picture shows nothing."""
+MOVED = 0.75
+"""Correlation over well exposed pixels below which a picture shows something else."""
+HATS = 8
+"""Unknowns of a response: values at codes evenly spaced in (c / 255)^(1 / 2)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Aligned:
+    """Pictures of one ball laid over each other."""
+
+    circles: tuple[Circle, ...]
+    """Where the ball is in each: column, row, radius in pixels."""
+    patches: tuple[Image, ...]
+    """The balls, all of one size and place, uint8 RGB."""
+    correlation: tuple[float, ...]
+    """Of each with its neighbour toward the first; 1 for the first, NaN where too little is well exposed in both."""
+
+
+def cut_ball(image: Image, circle: Circle, size: int) -> Image:
+    """The square about a ball, its side 2.1 radii.
+
+    Args:
+        image: (height, width, 3).
+        circle: Column, row and radius of the ball in pixels.
+        size: Pixels along a side of the result.
+
+    Returns:
+        (size, size, 3), averaged where it is reduced.
+    """
+    x, y, radius = circle
+    scale = 2.1 * radius / size
+    corner = (x - 1.05 * radius + 0.5 * scale - 0.5, y - 1.05 * radius + 0.5 * scale - 0.5)
+    # Averaged first where it is reduced: a sample stands for all the pixels that it covers.
+    blurred = cv2.GaussianBlur(image, (0, 0), 0.35 * scale) if scale > 1.5 else image
+    matrix = np.array([[scale, 0.0, corner[0]], [0.0, scale, corner[1]]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return np.asarray(cv2.warpAffine(blurred, matrix, (size, size), flags=flags, borderMode=cv2.BORDER_REPLICATE))
+
+
+def _tone_curve(u: NDArray[np.float32], v: NDArray[np.float32]) -> Array:
+    """Median code of the second picture for each code of the first, (256,), rising."""
+    bins = np.clip((u / 8).astype(int), 0, 31)
+    middle = np.array([np.median(v[bins == k]) if (bins == k).sum() > 20 else np.nan for k in range(32)])
+    known = np.isfinite(middle)
+    curve = np.interp(np.arange(256), 8 * np.flatnonzero(known) + 3.5, np.maximum.accumulate(middle[known]))
+    return np.asarray(curve)
+
+
+def _gauss_newton(
+    seen: NDArray[np.float32],
+    wanted: NDArray[np.float32],
+    ok: NDArray[np.bool_],
+    x: NDArray[np.float32],
+    y: NDArray[np.float32],
+) -> Array:
+    """Step of (columns, rows, log scale) that makes ``seen`` more like ``wanted``, robustly."""
+    slope_x, slope_y = (cv2.Sobel(seen, cv2.CV_32F, *way, scale=1 / 8)[ok] for way in ((1, 0), (0, 1)))
+    error = (seen - wanted)[ok].astype(float)
+    scale = 2.0 + 1.5 * float(np.median(np.abs(error)))
+    weight = 1.0 / (1.0 + (error / scale) ** 2) ** 2
+    jacobian = np.column_stack([slope_x, slope_y, slope_x * x[ok] + slope_y * y[ok]]).astype(float)
+    normal = jacobian.T @ (weight[:, None] * jacobian) + 1e-6 * np.eye(3)
+    return np.asarray(-np.linalg.solve(normal, jacobian.T @ (weight * error)))
+
+
+def register(reference: Image, other: Image, disc: NDArray[np.bool_]) -> tuple[Array, float]:
+    """Shift and scale that lay one picture over another of another exposure.
+
+    Args:
+        reference: uint8 RGB (n, n, 3).
+        other: The same size.
+        disc: Which pixels count.
+
+    Returns:
+        (columns, rows, log of the scale about the middle) by which ``other`` must be looked up, and the correlation
+        afterwards, NaN where fewer than ``LEAST_PIXELS`` tell.
+    """
+    n = len(reference)
+    gray = [cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.float32) for picture in (reference, other)]
+    first, second = (cv2.GaussianBlur(picture, (0, 0), 1.0) for picture in gray)
+    y, x = np.asarray(np.mgrid[:n, :n] - (n - 1) / 2, np.float32)
+    well = disc & (reference.max(2) < BRIGHTEST) & (first > DARKEST)
+
+    def look(blurred: NDArray[np.float32], move: Array) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """The other picture where ``move`` lays it over the first, and which pixels are well exposed in both."""
+        grow, middle = math.exp(move[2]), (n - 1) / 2
+        at_x = (grow * x + middle + move[0]).astype(np.float32)
+        at_y = (grow * y + middle + move[1]).astype(np.float32)
+        seen = np.asarray(cv2.remap(blurred, at_x, at_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+        return seen, well & (seen > DARKEST) & (seen < BRIGHTEST - 5)
+
+    def alike(move: Array) -> float:
+        """Correlation; what is dark or clips in one of the two counts as well."""
+        seen, _ = look(second, move)
+        told = disc & ~((first <= DARKEST) & (seen <= DARKEST)) & ~((first >= BRIGHTEST) & (seen >= BRIGHTEST))
+        if told.sum() < LEAST_PIXELS:
+            return math.nan
+        wanted = np.interp(first[told], np.arange(256), _tone_curve(first[told], seen[told]))
+        if np.ptp(wanted) == 0.0:
+            # Nothing to see in either, or much that the first does not have.
+            return math.nan if np.std(seen[told]) < FEATURELESS else 0.0
+        return float(np.corrcoef(wanted, seen[told])[0, 1])
+
+    move = np.zeros(3)
+    for coarse in (4.0, 2.0, 0.0, 0.0):
+        a, b = (cv2.GaussianBlur(p, (0, 0), coarse) if coarse else p for p in (first, second))
+        for _ in range(8):
+            seen, ok = look(b, move)
+            if ok.sum() < LEAST_PIXELS:
+                return np.zeros(3), alike(np.zeros(3))
+            wanted = np.asarray(np.interp(a, np.arange(256), _tone_curve(a[ok], seen[ok])), np.float32)
+            step = _gauss_newton(seen, wanted, ok, x, y)
+            move += np.clip(step, -0.02 * n, 0.02 * n)
+            move[2] = float(np.clip(move[2], -0.1, 0.1))
+            if np.abs(step[:2]).max() < 0.01:
+                break
+    return move, alike(move)
+
+
+def align(images: Sequence[Image], circles: Sequence[Circle], exposures: Sequence[float] | None = None) -> Aligned:
+    """Lay pictures of one ball over each other, each over its neighbour toward the first.
+
+    Args:
+        images: uint8 RGB, in order of exposure.
+        circles: About where the ball is in each.
+        exposures: Of each, if known: pictures more than ``FAR`` apart have nothing in common to be aligned by.
+    """
+    size = int(min(PATCH, max(48, 2.1 * circles[0][2])))
+    rows, columns = np.mgrid[:size, :size] - (size - 1) / 2
+    disc = np.hypot(rows, columns) < 0.93 * size / 2.1
+    found, patches, correlation = [circles[0]], [cut_ball(images[0], circles[0], size)], [1.0]
+    for k, (image, (x, y, radius)) in enumerate(zip(images[1:], circles[1:], strict=True)):
+        apart = 1.0 if exposures is None else abs(math.log(exposures[k] / exposures[k + 1]))
+        if apart > math.log(FAR):
+            found.append((x, y, radius))
+            patches.append(cut_ball(image, (x, y, radius), size))
+            correlation.append(math.nan)
+            continue
+        move, told = register(patches[-1], cut_ball(image, (x, y, radius), size), disc)
+        pixel = 2.1 * radius / size
+        circle = x + pixel * move[0], y + pixel * move[1], radius * math.exp(move[2])
+        found.append(circle)
+        patches.append(cut_ball(image, circle, size))
+        correlation.append(told)
+    return Aligned(tuple(found), tuple(patches), tuple(correlation))
+
+
+@dataclasses.dataclass(frozen=True)
+class Ratios:
+    """What pixels say of the ratios of neighbouring exposures."""
+
+    pairs: tuple[tuple[Array, Array], ...]
+    """Codes (m, 3) well exposed in both pictures of each neighbouring pair."""
+    curve: Array
+    """Linear value of each code, (256, 3)."""
+    steps: tuple[float, ...]
+    """Ratio of each picture's exposure to the one before, by the pixels; NaN where too few are well exposed."""
+
+
+def _collect(patches: Sequence[Image]) -> tuple[tuple[Array, Array], ...]:
+    size = len(patches[0])
+    rows, columns = np.mgrid[:size, :size] - (size - 1) / 2
+    disc = np.hypot(rows, columns) < 0.93 * size / 2.1
+    smooth = [cv2.GaussianBlur(patch, (0, 0), 1.5) for patch in patches]
+    # Beside edges a misalignment makes a ratio of its own.
+    plain = [
+        cv2.morphologyEx(cv2.cvtColor(patch, cv2.COLOR_RGB2GRAY), cv2.MORPH_GRADIENT, np.ones((5, 5), np.uint8))
+        for patch in smooth
+    ]
+    pairs = []
+    for k in range(len(patches) - 1):
+        u, v = smooth[k], smooth[k + 1]
+        ok = disc & (u.max(2) <= BRIGHTEST) & (v.max(2) <= BRIGHTEST)
+        bright = ok & (u.min(2) >= DIM) & (v.min(2) >= DIM)
+        flat = (plain[k] < FLAT) & (plain[k + 1] < FLAT)
+        dim = ok & flat & (u.min(2) >= DARKEST) & (v.min(2) >= DARKEST)
+        ways = ((bright & flat, LEAST_PIXELS), (bright, 5 * LEAST_PIXELS), (dim, 0))
+        ok = next(chosen for chosen, least in ways if chosen.sum() >= least)
+        pairs.append((u[ok].astype(float), v[ok].astype(float)))
+    return tuple(pairs)
+
+
+def _steps(pairs: Sequence[tuple[Array, Array]], curve: Array) -> tuple[float, ...]:
+    steps = []
+    for u, v in pairs:
+        if len(u) < LEAST_PIXELS:
+            steps.append(math.nan)
+            continue
+        low, high = (np.stack([np.interp(c[:, i], np.arange(256), curve[:, i]) for i in range(3)], 1) for c in (u, v))
+        ratio = np.log(high.sum(1) / low.sum(1))
+        # Every level of brightness has the same say, however many pixels it has.
+        bins = (u.mean(1) / 16).astype(int)
+        medians = [np.median(ratio[bins == k]) for k in range(16) if (bins == k).sum() >= LEAST_PIXELS // 16]
+        steps.append(float(np.exp(np.median(medians))))
+    return tuple(steps)
+
+
+def measure_ratios(patches: Sequence[Image], curve: Array) -> Ratios:
+    """Ratios of neighbouring exposures under a response, from aligned pictures."""
+    pairs = _collect(patches)
+    return Ratios(pairs, curve, _steps(pairs, curve))
+
+
+def estimate_response(ratios: Ratios, steps: Sequence[float]) -> Ratios:
+    """The response under which the pixels agree best with given steps of exposure, and what they say under it.
+
+    All channels share a curve: cameras bend them alike, and a white balance leaves ratios alone.
+    """
+    knots = np.linspace(0.0, 1.0, HATS + 1)
+    codes = np.sqrt(np.arange(256) / 255.0)
+    hats = np.stack([np.interp(codes, knots, np.eye(HATS + 1)[j]) for j in range(HATS)], 1)
+    base = np.log(np.maximum(decode_table("srgb")[:, 1].astype(float), 1e-5))
+    rows, wanted, share = [], [], []
+    for (u, v), step in zip(ratios.pairs, steps, strict=True):
+        if len(u) < LEAST_PIXELS:
+            continue
+        u, v = u.mean(1), v.mean(1)
+        at_u, at_v = (np.stack([np.interp(c, np.arange(256), hats[:, j]) for j in range(HATS)], 1) for c in (u, v))
+        rows.append(at_v - at_u)
+        wanted.append(math.log(step) - (np.interp(v, np.arange(256), base) - np.interp(u, np.arange(256), base)))
+        # Every level of brightness has the same say, however many pixels it has.
+        bins = (u / 16).astype(int)
+        share.append(1.0 / np.bincount(bins, minlength=16)[bins])
+    if not rows:
+        return ratios
+    a, b, w = np.concatenate(rows), np.concatenate(wanted), np.concatenate(share)
+    bend = np.diff(np.eye(HATS + 1), 2, axis=0)[:, :HATS]
+    prior = 0.3 * bend.T @ bend + 1e-3 * np.eye(HATS)
+    weight, values = w, np.zeros(HATS)
+    for _ in range(12):
+        values = np.linalg.solve(a.T @ (weight[:, None] * a) + prior, a.T @ (weight * b))
+        error = a @ values - b
+        weight = w / (1.0 + (error / 0.15) ** 2)
+    table = np.exp(base + hats @ values)
+    table[0] = 0.0
+    table = np.maximum.accumulate(table)
+    curve = np.repeat((table / table[-1])[:, None], 3, 1)
+    return Ratios(ratios.pairs, curve, _steps(ratios.pairs, curve))
+
+
+@dataclasses.dataclass(frozen=True)
+class Exposures:
+    """Exposures that were agreed upon."""
+
+    ratios: tuple[float, ...]
+    """Of each picture to the first."""
+    curve: Array | None
+    """Linear value of each code, (256, 3), where sRGB does not hold; else None."""
+    notes: tuple[str, ...]
+    """What a user should know, a line each."""
+
+
+def _off(claimed: Sequence[float], seen: Sequence[float]) -> float:
+    """Largest logarithm by which a step is off what the pixels say."""
+    return max((abs(math.log(c / s)) for c, s in zip(claimed, seen, strict=True) if math.isfinite(s)), default=0.0)
+
+
+def _total(steps: Sequence[float]) -> float:
+    return 1.0 / math.prod(steps)
+
+
+def _number(value: float) -> str:
+    return f"{value:.3g}"
+
+
+def _believed(steps: dict[str, tuple[float, ...]], seen: Sequence[float], figures: str) -> tuple[str, list[str]]:
+    """Which of the claims holds, by its name, and what is to be said of it.
+
+    Raises:
+        UsageError: EXIF and names contradict each other, and the pixels bear out neither.
+    """
+    if len(steps) < 2 or _off(steps["EXIF"], steps["names"]) <= HOLDS:
+        return next(iter(steps)), []
+    best = min(steps, key=lambda name: _off(steps[name], seen))
+    if _off(steps[best], seen) > 2.0 * HOLDS:
+        raise UsageError(
+            f"exposures contradict each other: from the longest to the shortest {figures} times; "
+            "give the true ones with --exposures, take what the pixels say (--exposures pixels), or leave out pictures "
+            "with automatic ISO"
+        )
+    return best, [f"{best} and pixels agree on the exposures, which the others contradict: {figures} times"]
+
+
+def agree_exposures(
+    patches: Sequence[Image],
+    transfer: str,
+    exif: Sequence[float] | None,
+    names: Sequence[float] | None,
+    given: Sequence[float] | None = None,
+) -> Exposures:
+    """Find out which exposures hold.
+
+    Args:
+        patches: Aligned pictures, longest exposure first.
+        transfer: Response to try first.
+        exif: Exposure of each by its EXIF, None where it does not tell.
+        names: The same by the files' names.
+        given: The same as the user gives them, before which the others have no say.
+
+    Raises:
+        UsageError: EXIF, names and pixels contradict each other; the message has all figures.
+    """
+    seen = measure_ratios(patches, decode_table(transfer).astype(float))
+    steps = {
+        name: tuple(b / a for a, b in itertools.pairwise(claim))
+        for name, claim in (("--exposures", given), ("EXIF", exif), ("names", names))
+        if claim is not None
+    }
+    if given is not None:
+        steps = {"--exposures": steps["--exposures"]}
+    figures = ", ".join(f"{name} say{'s' * (name == 'EXIF')} {_number(_total(s))}" for name, s in steps.items())
+    pixels = [s for s in seen.steps if math.isfinite(s)]
+    figures += f"{', ' * bool(figures)}pixels say {_number(_total(pixels))}" + " over the steps that they tell" * (
+        len(pixels) < len(seen.steps)
+    )
+    if not steps:
+        if len(pixels) < len(seen.steps):
+            raise UsageError(
+                "neither EXIF nor names are left to tell the exposures, and too few pixels do; give --exposures"
+            )
+        note = f"exposures are from the pixels alone, with the response {transfer}: {figures} times"
+        return Exposures(tuple(np.cumprod([1.0, *seen.steps]).tolist()), None, (note,))
+    best, notes = _believed(steps, seen.steps, figures)
+    claim = steps[best]
+    ratios = tuple(np.cumprod([1.0, *claim]).tolist())
+    off = _off(claim, seen.steps)
+    if off <= HOLDS:
+        return Exposures(ratios, None, tuple(notes))
+    bent = estimate_response(seen, claim)
+    rest = _off(claim, bent.steps)
+    if rest > CONTRADICTS:
+        raise UsageError(
+            f"exposures contradict the pictures: from the longest to the shortest {figures} times, and no response "
+            f"explains them (a step is off by {math.expm1(rest):.0%}); give the true ones with --exposures, or "
+            "take what the pixels say (--exposures pixels)"
+        )
+    dark = decode_table(transfer)[:, 1][40] / max(bent.curve[40, 1], 1e-9)
+    notes.append(
+        f"the response is not {transfer} (off by {math.exp(off):.2f} in one step, {_number(float(dark))} times at code "
+        "40): it was estimated from the bracket"
+    )
+    return Exposures(ratios, bent.curve, tuple(notes))
+
+
+def thin_exposures(
+    ratios: Sequence[float], shown: int, names: Sequence[str]
+) -> tuple[tuple[int, ...], tuple[str, ...]]:
+    """Which pictures of a bracket to use: of those that are within ``WAVERING`` of each other, one.
+
+    Args:
+        ratios: Exposures.
+        shown: Index of the one that stays in any case.
+        names: Of the pictures.
+
+    Returns:
+        Indices, longest exposure first, and a note for each that is left out.
+    """
+    kept, notes = [shown], []
+    for k in sorted(range(len(ratios)), key=lambda k: -ratios[k]):
+        near = [other for other in kept if abs(math.log(ratios[k] / ratios[other])) < math.log(WAVERING)]
+        if k != shown and near:
+            ratio = max(ratios[k] / ratios[near[0]], ratios[near[0]] / ratios[k])
+            notes.append(f"{names[k]} is left out: its exposure and that of {names[near[0]]} are {ratio:.2f} apart")
+        elif k != shown:
+            kept.append(k)
+    return tuple(sorted(kept, key=lambda k: -ratios[k])), tuple(notes)

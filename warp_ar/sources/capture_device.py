@@ -1,0 +1,265 @@
+"""A camera through OpenCV, which may alternate between exposures.
+
+A device is asked for each of its exposures, and each of its pictures is measured, because devices follow some frames
+late.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from warp_ar.errors import SourceError, UsageError, reason
+from warp_ar.sources.frame_folder import rgb8
+from warp_ar.sources.live_source import LiveSource
+from warp_ar.sources.source import DEFAULT_FPS, check_exposures, check_fps, check_size, distinct
+
+Image = npt.NDArray[np.uint8]
+
+BRACKET_SECONDS = 0.4
+"""How often a capture device is asked for its other exposures, during which the picture stands still."""
+
+SETTLE_FRAMES = 5
+"""Frames after which a device is expected to have taken on its first exposure."""
+
+MOST_WAIT = 12
+"""Frames within which a device must have taken on another."""
+
+CLOSE_SECONDS = 3.0
+"""How long closing waits for a picture that is being read: a driver may hang."""
+
+MOST_MISSES = 3
+"""Times in a row that it may fail to."""
+
+LEAST_RATIO = 1.8
+"""Of neighbouring exposures of a device: nearer ones cannot be told apart by what they show."""
+
+
+class _Capture(Protocol):
+    """The part of ``cv2.VideoCapture`` that `CaptureDevice` uses."""
+
+    def isOpened(self) -> bool: ...
+    def read(self) -> tuple[bool, npt.NDArray[Any] | None]: ...
+    def get(self, key: int, /) -> float: ...
+    def getBackendName(self) -> str: ...
+    def set(self, key: int, value: float, /) -> bool: ...
+    def release(self) -> None: ...
+
+
+class _Bracketing:
+    """Asks a device for one exposure after another, and knows which of them a picture was taken with.
+
+    A device takes some frames to follow. How bright a picture is, against the last one of the longest exposure, says
+    whether it has: over the pixels that are well exposed there, the ratio of linear values is that of the times.
+    """
+
+    def __init__(self, capture: _Capture, exposures: tuple[float, ...], name: str) -> None:
+        self._capture, self.exposures, self._name = capture, exposures, name
+        backend = capture.getBackendName()
+        self._logarithmic = backend in ("DSHOW", "MSMF")
+        capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, 0.25 if self._logarithmic else 1.0)
+        self._reference: npt.NDArray[np.float32] | None = None
+        self._asked, self._waited, self._settled = 0, 0, False
+        self._misses, self._since = 0, 0.0
+        self._ask(0)
+
+    def _ask(self, index: int) -> None:
+        """Ask for an exposure: drivers of Windows take the logarithm of seconds, others ten-thousandths of one."""
+        seconds = self.exposures[index]
+        value = math.log2(seconds) if self._logarithmic else 1e4 * seconds
+        if not self._capture.set(cv2.CAP_PROP_EXPOSURE, value):
+            raise SourceError(
+                f"{self._name} does not let its exposure be set to {seconds:g} s; leave exposures out of [source]"
+            )
+        self._asked, self._waited, self._settled = index, 0, False
+
+    def label(self, image: Image, now: float) -> float | None:
+        """Exposure of a picture in seconds; None while the device is between two.
+
+        Raises:
+            SourceError: The device does not follow.
+        """
+        sparse = _DECODE[image[::8, ::8]]
+        if not self._settled:
+            self._waited += 1
+            if self._reference is None:
+                self._settled = self._waited > SETTLE_FRAMES
+            else:
+                self._settled = self._shows(sparse)
+            if not self._settled:
+                if self._reference is not None and self._waited >= MOST_WAIT:
+                    self._give_up(now)
+                return None
+        seconds = self.exposures[self._asked]
+        if self._asked == 0:
+            if self._reference is None:
+                self._since = now
+            self._reference = sparse
+            if now - self._since >= BRACKET_SECONDS:
+                self._ask(1)
+        else:
+            self._misses, self._since = 0, now
+            self._ask((self._asked + 1) % len(self.exposures))
+        return seconds
+
+    def _give_up(self, now: float) -> None:
+        """The device is late, or the environment has changed meanwhile: begin anew with the longest exposure."""
+        self._misses += self._asked != 0
+        if self._misses >= MOST_MISSES:
+            raise SourceError(
+                f"{self._name} does not follow its exposure: asked for {self.exposures[self._asked]:g} s, the picture "
+                "is no darker; leave exposures out of [source]"
+            )
+        self._ask(0)
+        self._since, self._reference = now, None
+
+    def _shows(self, sparse: npt.NDArray[np.float32]) -> bool:
+        """Whether a picture is as bright as the exposure that was asked for makes it, rather than another."""
+        assert self._reference is not None
+        well = (self._reference > 0.05) & (self._reference < 0.9)
+        if well.sum() < 30:
+            return self._waited > SETTLE_FRAMES  # too dark an environment to tell
+        ratio = float(sparse[well].sum() / self._reference[well].sum())
+        if ratio <= 0.0:
+            return self._asked == len(self.exposures) - 1
+        steps = [abs(math.log(ratio * self.exposures[0] / seconds)) for seconds in self.exposures]
+        return int(np.argmin(steps)) == self._asked
+
+
+_DECODE = (((np.arange(256) / 255 + 0.055) / 1.055) ** 2.4).astype(np.float32)
+"""About what any camera's codes mean in linear light: ratios of some powers of two need no better."""
+
+
+def _open_device(device: Any) -> Any:
+    """OpenCV's capture, without its own words on stderr: what is wrong is said in one line."""
+    log: Any = cv2.utils.logging
+    level = log.getLogLevel()
+    log.setLogLevel(log.LOG_LEVEL_ERROR)  # it warns of every backend that has no such device
+    try:
+        return cv2.VideoCapture(device)
+    finally:
+        log.setLogLevel(level)
+
+
+class CaptureDevice(LiveSource):
+    """A camera through OpenCV: a thread reads all the time and keeps the newest frame.
+
+    Args:
+        device: Index of the device, or the URL of a stream.
+        fps: Rate to ask the device for, in frames per second.
+        grace: Seconds without a frame after which the device counts as unplugged.
+        exposures: Exposure times in seconds between which to alternate: mostly the longest, the others now and then.
+        opener: Makes the capture; another one serves tests and unusual backends.
+
+    Raises:
+        SourceError: The device cannot be opened, gives no frame or does not let its exposure be set; while iterating,
+            it has been unplugged, changed its size or does not follow its exposure.
+        UsageError: ``exposures`` are too near each other to be told apart.
+    """
+
+    def __init__(
+        self,
+        device: int | str,
+        *,
+        fps: float | None = None,
+        grace: float = 2.0,
+        exposures: Sequence[float] = (),
+        opener: Callable[[Any], _Capture] = _open_device,
+    ) -> None:
+        super().__init__()
+        check_fps(fps)
+        self._name = f"capture device {device}" if isinstance(device, int) else str(device)
+        self._grace = grace
+        check_exposures(exposures)
+        self.exposures = distinct(exposures)
+        if any(longer < LEAST_RATIO * shorter for longer, shorter in itertools.pairwise(self.exposures)):
+            raise UsageError(
+                f"exposures {', '.join(f'{e:g}' for e in self.exposures)} of {self._name}: expected each to be "
+                f"{LEAST_RATIO:g} times the next or more"
+            )
+        self._bracketing: _Bracketing | None = None
+        self._stop = threading.Event()
+        self._capture = opener(device)
+        try:
+            if not self._capture.isOpened():
+                raise SourceError(
+                    f"{self._name} cannot be opened; is it plugged in, and free of other programs? "
+                    "--source PATH|INDEX takes other frames"
+                )
+            if fps is not None:
+                self._capture.set(cv2.CAP_PROP_FPS, fps)
+            first = self._read()
+            if first is None:
+                raise SourceError(f"{self._name} opened but gave no frame; is another program using it?")
+            if len(self.exposures) > 1:
+                self._bracketing = _Bracketing(self._capture, self.exposures, self._name)
+        except BaseException:
+            self._capture.release()
+            raise
+        self.size = (first.shape[1], first.shape[0])
+        told = self._capture.get(cv2.CAP_PROP_FPS)
+        self.fps = told if math.isfinite(told) and told > 0 else fps or DEFAULT_FPS
+        self.description = f"{self._name} ({self.size[0]}x{self.size[1]}, {self.fps:g} fps)"
+        if self._bracketing is None:
+            self._newest.put(first, time.monotonic())
+        self._thread = threading.Thread(target=self._run, name="warp-ar-capture", daemon=True)
+        self._thread.start()
+
+    def _read(self) -> Image | None:
+        """The next frame; None once nothing has come for the time of grace, or when told to stop."""
+        deadline = time.monotonic() + self._grace
+        while not self._stop.is_set():
+            ok, picture = self._capture.read()
+            if ok and picture is not None and picture.size:
+                return self._in_rgb(picture)
+            if time.monotonic() > deadline:
+                return None
+            self._stop.wait(0.01)
+        return None
+
+    def _in_rgb(self, picture: npt.NDArray[Any]) -> Image:
+        """A picture as the capture gives it, in RGB of 8 bits."""
+        if picture.dtype == np.uint8 and picture.ndim == 3 and picture.shape[2] == 3:
+            return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB, self._memory_for(*picture.shape[:2])), np.uint8)
+        return rgb8(picture[..., 2::-1] if picture.ndim == 3 else picture, self._name)
+
+    def _run(self) -> None:
+        error = None
+        while not self._stop.is_set():
+            try:
+                image = self._read()
+                if image is None:
+                    if not self._stop.is_set():
+                        error = SourceError(f"{self._name} gave no frame for {self._grace:g} s; was it unplugged?")
+                    break
+                check_size(image, self.size, self._name, None)
+                now, exposure = time.monotonic(), None
+                if self._bracketing is not None:
+                    exposure = self._bracketing.label(image, now)
+                    if exposure is None:
+                        continue
+            except SourceError as problem:
+                error = problem
+                break
+            except Exception as problem:  # whatever it is, who waits for a picture is told
+                error = SourceError(f"{self._name}: {reason(problem)}")
+                error.__cause__ = problem
+                break
+            self._newest.put(image, now, exposure)
+        self._newest.close(error)
+
+    def close(self) -> None:
+        """End the reader and release the device; one whose driver hangs is left to it."""
+        self._stop.set()
+        super().close()
+        self._thread.join(CLOSE_SECONDS)
+        if not self._thread.is_alive():
+            self._capture.release()

@@ -1,0 +1,187 @@
+"""A folder of images as frames.
+
+Pictures of other kinds are brought to 8-bit RGB: grey is repeated, alpha is dropped without blending (a camera's colour
+does not depend on it), 16-bit values v become round(v / 257), so that 65535 is 255. Linear light, of OpenEXRs and of
+TIFFs of floats, is encoded as sRGB, light above 1 as 1; primaries that an OpenEXR names become Rec. 709's. The plate of
+a frame is what it was before. An orientation that an image carries is applied. A folder whose frames alternate between
+exposures says so in its sidecar, ``exposures.json``.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import pathlib
+import re
+from collections.abc import Generator, Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from warp_ar.errors import SourceError
+from warp_ar.exr_file import read_linear_exr
+from warp_ar.files import parse_json, read_text
+from warp_ar.pictures import foreign_words, read_picture
+from warp_ar.sources.deep_frame import Plate, finite_light, srgb8
+from warp_ar.sources.source import (
+    DEFAULT_FPS,
+    Frame,
+    RecordedSource,
+    check_fps,
+    check_size,
+    distinct,
+    existing_path,
+    names_in,
+    nearest_name,
+)
+
+Image = npt.NDArray[np.uint8]
+
+LINEAR_SUFFIX = ".exr"
+IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", LINEAR_SUFFIX})
+"""What `FrameFolder` takes for a frame; other files in a folder are ignored."""
+
+SIDECAR = "exposures.json"
+"""Optional file in a frame folder, seconds of exposure: ``{"0000.png": 0.008, ...}`` by file name, or ``[0.016,
+0.001]``, which frames have in turn."""
+
+
+class FrameFolder(RecordedSource):
+    """The images of a folder in natural name order (``f2.png`` before ``f10.png``), or one image.
+
+    Args:
+        path: The folder or image.
+        fps: Frames per second; frame n is shown at n / fps.
+        loop: Start again at the end.
+        exposures: Exposure times in seconds that images have in turn, instead of what ``exposures.json`` says.
+
+    Raises:
+        SourceError: The path does not exist, holds no image, its first image or its ``exposures.json`` cannot be used.
+        UsageError: ``fps`` or one of ``exposures`` is not a positive number.
+    """
+
+    def __init__(
+        self,
+        path: str | pathlib.Path,
+        *,
+        fps: float = DEFAULT_FPS,
+        loop: bool = False,
+        exposures: Sequence[float] = (),
+    ) -> None:
+        super().__init__(loop=loop, exposures=exposures)
+        check_fps(fps)
+        path = existing_path(pathlib.Path(path))
+        folder = path if path.is_dir() else path.parent
+        self._paths = [path]
+        if path.is_dir():
+            images = (name for name in names_in(path) if pathlib.Path(name).suffix.lower() in IMAGE_SUFFIXES)
+            self._paths = [path / name for name in sorted(images, key=_natural_key)]
+        if not self._paths:
+            for name in sorted(names_in(path)):
+                if words := foreign_words(pathlib.Path(name).suffix.lower()):
+                    raise SourceError(f"{path} holds no images that are read; {name} is {words}")
+            raise SourceError(f"{path} holds no images; put frames there as {', '.join(sorted(IMAGE_SUFFIXES))}")
+        told = _read_exposures(folder)
+        self._exposures = told if isinstance(told, dict) else {}
+        if isinstance(told, tuple):
+            self._cycle = self._cycle or told
+        shown = [self._exposures[path.name] for path in self._paths if path.name in self._exposures]
+        self.exposures = distinct(self._cycle or shown)
+        first, plate = read_frame(self._paths[0])
+        height, width, _ = first.shape
+        self.deep = "" if plate is None else "codes" if plate.picture.dtype == np.uint16 else "light"
+        self.size, self.fps, self.length = (width, height), fps, len(self._paths)
+        self.description = f"{path} ({self.length} images, {width}x{height})"
+
+    def _decode(self) -> Generator[Frame, None, None]:
+        for index, path in enumerate(self._paths):
+            image, plate = read_frame(path)
+            check_size(image, self.size, str(path), index)
+            kept = plate if self.keeps_depth else None
+            yield Frame(index, index / self.fps, image, self._exposures.get(path.name), kept)
+
+
+def read_image(path: pathlib.Path) -> Image:
+    """8-bit RGB of an image file, as the module's docstring says."""
+    return read_frame(path)[0]
+
+
+def read_frame(path: pathlib.Path) -> tuple[Image, Plate | None]:
+    """An image file as the module's docstring says.
+
+    Returns:
+        8-bit RGB, (height, width, 3); and where the file has more bits, the picture itself.
+
+    Raises:
+        SourceError: It cannot be read, is no picture, too large, or holds values of another kind.
+    """
+    label = f"frame {path}"
+    if path.suffix.lower() == LINEAR_SUFFIX:
+        light = finite_light(read_linear_exr(path, SourceError, label))
+    else:
+        picture = read_picture(path, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH, SourceError, label)
+        if picture.dtype == np.uint8:
+            return rgb8(picture, label), None
+        if picture.dtype == np.uint16:
+            image = rgb8(picture, label)
+            return image, Plate(_three_channels(picture), codes=image)
+        if picture.dtype not in (np.float32, np.float64):
+            raise SourceError(f"{label} holds {picture.dtype} values; 8 or 16 bits, or floats, are needed")
+        light = finite_light(_three_channels(picture))
+    image = srgb8(light)
+    return image, Plate(light, codes=image)
+
+
+def _three_channels(picture: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """(H, W, 3) from grey, RGB or RGBA."""
+    if picture.ndim == 2:
+        picture = picture[..., None]
+    if picture.shape[2] == 1:
+        picture = np.repeat(picture, 3, axis=2)
+    return np.ascontiguousarray(picture[..., :3])
+
+
+def rgb8(picture: npt.NDArray[Any], name: str) -> Image:
+    """(H, W, 3) uint8 from grey, RGB or RGBA of 8 or 16 bits.
+
+    Raises:
+        SourceError: It holds values of another kind; ``name`` stands in the message.
+    """
+    if picture.dtype == np.uint16:
+        # Rounds v / 257 exactly: 257 is odd, so there are no ties.
+        picture = ((picture.astype(np.uint32) + 128) // 257).astype(np.uint8)
+    if picture.dtype != np.uint8:
+        raise SourceError(f"{name} holds {picture.dtype} values; 8- or 16-bit whole numbers are needed")
+    return _three_channels(picture)
+
+
+def _read_exposures(folder: pathlib.Path) -> dict[str, float] | tuple[float, ...]:
+    """Exposures in seconds by file name or in turn, from the folder's sidecar; empty where there is none."""
+    path = folder / SIDECAR
+    if not os.path.lexists(path):
+        return {}
+    table = parse_json(read_text(path, SourceError, expected="JSON"), str(path), SourceError)
+    if not isinstance(table, dict | list) or not table:
+        raise SourceError(
+            f'{path} must hold an object such as {{"0000.png": 0.008}}, seconds by file name, or a list such as '
+            "[0.016, 0.001], seconds that frames have in turn"
+        )
+    names = names_in(folder)
+    for name, seconds in table.items() if isinstance(table, dict) else enumerate(table):
+        if isinstance(name, str) and name not in names:
+            hint = nearest_name(name, names)
+            advice = f"did you mean {hint!r}?" if hint else "it must name files beside it"
+            raise SourceError(f"{path} names {name!r}, which is not there; {advice}")
+        if isinstance(seconds, bool) or not isinstance(seconds, int | float) or not 0 < seconds < math.inf:
+            raise SourceError(f"{path}: {name!r} is {seconds!r}; it must be a positive number of seconds")
+    if isinstance(table, list):
+        return tuple(map(float, table))
+    return {name: float(seconds) for name, seconds in table.items()}
+
+
+def _natural_key(name: str) -> list[tuple[int, int, str]]:
+    """Sorts runs of digits by value; the last part keeps ``f01`` and ``f1`` in one order on every machine."""
+    parts = [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", name) if part]
+    return [*parts, (2, 0, name)]

@@ -1,0 +1,191 @@
+"""A camera or a phone on the network, by PyAV: RTSP, HTTP (also motion JPEG), and what else FFmpeg's libraries fetch.
+
+A thread decodes whatever comes as it comes and keeps the newest picture, so that a slow reader lags by one frame and
+not by a queue. A line that breaks is opened again, after a tenth of a second, then twice as long each time; only when
+nothing has come for ``grace`` seconds is the source at its end.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from typing import Any
+
+import av
+import numpy as np
+import numpy.typing as npt
+from av.video.reformatter import VideoReformatter
+
+from warp_ar.errors import SourceError, reason
+from warp_ar.files import limits, too_much
+from warp_ar.sources.live_source import LiveSource
+from warp_ar.sources.source import DEFAULT_FPS, check_fps, check_size
+from warp_ar.sources.video_file import rgb_from_video
+
+Image = npt.NDArray[np.uint8]
+
+SCHEMES = ("rtsp", "rtsps", "http", "https", "rtmp", "rtmps", "srt", "udp", "tcp")
+"""Of addresses that are streams."""
+
+GRACE_SECONDS = 15.0
+"""How long a line may be broken."""
+OPEN_SECONDS = 5.0
+"""How long one attempt to open it may take, and how long it may be silent."""
+FIRST_PAUSE = 0.1
+LONGEST_PAUSE = 2.0
+"""Seconds before another attempt."""
+
+# What is on the network only: an answer must not name a file of this machine.
+_PROTOCOLS = "rtsp,rtsps,rtp,srtp,udp,tcp,tls,http,https,httpproxy,crypto,rtmp,rtmps,srt"
+_OPTIONS = {
+    "protocol_whitelist": _PROTOCOLS,
+    "fflags": "nobuffer",
+    "flags": "low_delay",
+    "max_delay": "200000",
+}
+_RTSP = {
+    # Lost packets of UDP smear the picture that light is read from; some cameras know no other way.
+    "rtsp_transport": "tcp+udp",
+    "rtsp_flags": "prefer_tcp",
+    "fpsprobesize": "3",  # the rate is in its description: half a second less until the first picture
+}
+# How long a stream is looked at before its first picture is there.
+_PROBING = {"probesize": "500000", "analyzeduration": "1000000"}
+
+
+class NetworkStream(LiveSource):
+    """A stream from the network, opened again when its line breaks.
+
+    Args:
+        address: Its URL; one of ``SCHEMES``.
+        fps: Nominal rate, where the stream tells none.
+        grace: Seconds without a picture after which the source ends.
+
+    Raises:
+        SourceError: The stream cannot be opened or gives no picture; while iterating, its line stays broken, or its
+            pictures change their size.
+        UsageError: ``fps`` is not a positive number.
+    """
+
+    def __init__(self, address: str, *, fps: float | None = None, grace: float = GRACE_SECONDS) -> None:
+        super().__init__()
+        check_fps(fps)
+        self._address, self._grace = address, grace
+        self._name = _without_password(address)
+        self.reconnects = 0
+        """How often the line was opened again."""
+        self._stop = threading.Event()
+        self._ready = threading.Event()
+        self._problem = ""
+        self._failed: SourceError | None = None
+        self.size = (0, 0)
+        self.fps = fps or DEFAULT_FPS
+        self._told_fps = fps is not None
+        self._thread = threading.Thread(target=self._run, name="warp-ar-stream", daemon=True)
+        self._thread.start()
+        self._ready.wait()
+        if self._failed is not None:
+            self._thread.join()
+            raise self._failed
+        self.description = f"{self._name} ({self.size[0]}x{self.size[1]}, {self.fps:g} fps)"
+
+    def _run(self) -> None:
+        """Decode until told to stop, opening the line again as often as it breaks."""
+        last, pause = time.monotonic(), FIRST_PAUSE
+        while not self._stop.is_set():
+            came, heard = False, time.monotonic()
+            try:
+                for image in self._pictures():
+                    self._take(image)
+                    came, last, pause = True, time.monotonic(), FIRST_PAUSE
+                    heard = last
+                    if self._stop.is_set():
+                        break
+                self._problem = "the stream ended"
+            except SourceError as error:
+                self._end(error)
+                return
+            except (av.FFmpegError, OSError, ValueError) as error:
+                # What FFmpeg calls a wait that was cut short depends on where it was.
+                silent = time.monotonic() - heard > 0.9 * OPEN_SECONDS
+                self._problem = f"no picture came for {OPEN_SECONDS:g} s" if silent else reason(error)
+            except Exception as error:  # whatever it is, who waits for a picture is told
+                failed = SourceError(f"{self._name}: {type(error).__name__}: {reason(error)}")
+                failed.__cause__ = error
+                self._end(failed)
+                return
+            if self._stop.is_set():
+                break
+            first = not self._ready.is_set()
+            if first or time.monotonic() - last > self._grace:
+                what = "cannot be opened" if first and not came else f"gave no picture for {self._grace:g} s"
+                self._end(SourceError(f"{self._name} {what} ({self._problem}); check its address, and that it is on"))
+                return
+            self._stop.wait(pause)
+            pause = min(2.0 * pause, LONGEST_PAUSE)
+            self.reconnects += 1
+        self._end(None)
+
+    def _end(self, error: SourceError | None) -> None:
+        self._failed = error
+        self._newest.close(error)
+        self._ready.set()
+
+    def _take(self, image: Image) -> None:
+        if not self._ready.is_set():
+            self.size = (image.shape[1], image.shape[0])
+            self._ready.set()
+        check_size(image, self.size, self._name, None)
+        self._newest.put(image, time.monotonic())
+
+    def _pictures(self) -> Any:
+        """Pictures of one connection, as they come."""
+        waits = (OPEN_SECONDS, OPEN_SECONDS)
+        rtsp = self._address.lower().startswith("rtsp")
+        with contextlib.closing(
+            av.open(self._address, options={**_OPTIONS, **_PROBING, **(_RTSP if rtsp else {})}, timeout=waits)
+        ) as container:
+            if not container.streams.video:
+                raise SourceError(f"{self._name} has no video stream; choose one with pictures")
+            stream = container.streams.video[0]
+            context = stream.codec_context
+            if context is None:
+                raise SourceError(f"{self._name} has a video stream of no known codec; choose another encoding")
+            if context.width * context.height > limits().picture_pixels:
+                label = f"{self._name} is {context.width}x{context.height}: a frame of it"
+                raise SourceError(too_much(label, context.width * context.height, "pixels", "picture_pixels"))
+            context.options = {"max_pixels": str(limits().picture_pixels)}
+            rate = float(stream.average_rate or stream.guessed_rate or 0.0)
+            if rate > 0.0 and not self._told_fps:
+                self.fps = rate
+            stream.thread_type = "SLICE"  # threads per frame hold back as many frames
+            reformatter, last = VideoReformatter(), time.monotonic()
+            # Packets of sound too: where they alone come, nothing else would end the wait for a picture.
+            for packet in container.demux():
+                if self._stop.is_set():
+                    return
+                if time.monotonic() - last > OPEN_SECONDS:
+                    raise TimeoutError
+                if packet.stream_index != stream.index:
+                    continue
+                try:
+                    pictures = packet.decode()
+                except av.InvalidDataError:
+                    continue  # a damaged packet: the next whole picture mends it
+                for picture in pictures:
+                    yield rgb_from_video(reformatter, picture, self._memory_for)
+                    last = time.monotonic()
+
+    def close(self) -> None:
+        """End the reader."""
+        self._stop.set()
+        super().close()
+        self._thread.join(2.0 * OPEN_SECONDS)
+
+
+def _without_password(address: str) -> str:
+    """The address for messages: what stands before an @ may be a password."""
+    scheme, _, rest = address.partition("://")
+    place, slash, path = rest.partition("/")
+    return f"{scheme}://{place.rpartition('@')[2]}{slash}{path.partition('?')[0]}"

@@ -1,0 +1,82 @@
+"""Frames in: image folders, video files, capture devices, generated clips and a queue that others push into.
+
+Every source yields the same object, a `Frame` in 8-bit RGB, and falls into one of two kinds. A recorded source (folder,
+video, generated) loses no frame and is decoded a few frames ahead on one thread. A live source (device, queue) holds
+one frame, the newest, because a late frame is worth less than none; what it skips is counted in ``dropped``.
+
+Frames may alternate between exposures, of which only one is shown: the others tell what clips in it.
+"""
+
+from __future__ import annotations
+
+import os
+import pathlib
+from collections.abc import Sequence
+
+from warp_ar.errors import SourceError, UsageError
+from warp_ar.pictures import foreign_words
+from warp_ar.sources.capture_device import CaptureDevice
+from warp_ar.sources.frame_folder import IMAGE_SUFFIXES, FrameFolder
+from warp_ar.sources.live_source import QueueSource
+from warp_ar.sources.network_stream import SCHEMES, NetworkStream
+from warp_ar.sources.source import DEFAULT_FPS, Frame, Source, check_exposures, check_fps, existing_path
+from warp_ar.sources.synthetic import Synthetic
+from warp_ar.sources.video_file import VideoFile
+
+__all__ = [
+    "CaptureDevice",
+    "Frame",
+    "FrameFolder",
+    "NetworkStream",
+    "QueueSource",
+    "Source",
+    "Synthetic",
+    "VideoFile",
+    "open_source",
+]
+
+
+MOST_INDEX = 1023
+"""Largest index of a capture device."""
+
+
+def open_source(
+    spec: str | int | pathlib.Path, *, fps: float | None = None, loop: bool = False, exposures: Sequence[float] = ()
+) -> Source:
+    """Open whatever ``spec`` names.
+
+    Args:
+        spec: A folder of images, an image, a video file, the index of a capture device (a number, also as text), the
+            URL of a camera's stream (``rtsp://...``, ``http://...``), or ``synthetic:NAME``.
+        fps: Frames per second: the rate of a folder (default 30), a new rate for a video's frames, or what is asked of
+            a device.
+        loop: Start again at the end, with index and time going on. Without effect on live sources.
+        exposures: Exposure times in seconds that frames have in turn: those of a recording, or to be asked of a device.
+
+    Raises:
+        SourceError: There is no such source, or it cannot be read.
+        UsageError: ``fps`` is not a positive number, ``exposures`` are no times, or there is no generated source of
+            that name.
+    """
+    check_fps(fps)
+    check_exposures(exposures)
+    text = str(spec)
+    if isinstance(spec, int) or (text.isdecimal() and not os.path.lexists(text)):
+        if len(text) > 4 or not 0 <= (index := int(text)) <= MOST_INDEX:
+            raise SourceError(f"there is no capture device {text[:40]}; they are numbered from 0 to {MOST_INDEX}")
+        return CaptureDevice(index, fps=fps, exposures=exposures)
+    if text.startswith("synthetic:"):
+        return Synthetic(text.removeprefix("synthetic:"), fps=fps or DEFAULT_FPS, loop=loop)
+    if "://" in text:
+        scheme = text.partition("://")[0].lower()
+        if scheme not in SCHEMES:
+            raise SourceError(f"{text[:60]}: no stream is read by {scheme!r}; expected {', '.join(SCHEMES)}")
+        if exposures:
+            raise UsageError("exposures: a stream from the network does not let its exposure be set")
+        return NetworkStream(text, fps=fps)
+    path = existing_path(pathlib.Path(spec))
+    if path.is_dir() or path.suffix.lower() in IMAGE_SUFFIXES:
+        return FrameFolder(path, fps=fps or DEFAULT_FPS, loop=loop, exposures=exposures)
+    if words := foreign_words(path.suffix.lower()):
+        raise SourceError(f"{path} is {words}")
+    return VideoFile(path, fps=fps, loop=loop, exposures=exposures)

@@ -1,0 +1,505 @@
+"""Marker to pose: detection, refinement on every printed edge, steadying without lag, and a state to trust it by.
+
+The world is the marker's frame: origin at the centre of the marker or board, x right and y up the printed page, z out
+of it, metres. A pose is ``camera_from_world``: it maps a world point X to the camera point R X + t; the camera looks
+along +z, x right, y down, and pixel centres lie at integers.
+
+Detection gives four corners, good to about 0.3 pixel: 0.25 degrees for a marker of 90 pixels. The printed pattern gives
+far more: every border between a black and a white cell is a line whose place is known. Refinement therefore slides the
+pose until those borders lie where the image has its edges [HS90], by Gauss-Newton with a redescending weight. Along the
+normal of a border the image is sampled in linear light over a window of half width h; the edge of a step from b to w
+lies, whatever its blur, where the area says:
+
+    e = (1 / (w - b)) * integral of (w - I(u)) du over [-h, h], minus h
+
+No derivative is taken, so noise averages out. What shifts all edges the same way, from black to white, is not motion: a
+clipped white, a transfer curve that is not quite known, ink that spreads. A camera that moves smears edges by their
+direction, and so they shift. The shift of an edge with normal n in the picture is n'Sn, the three numbers of S unknown.
+
+References:
+    [HS90] C. Harris and C. Stennett. RAPID, a video rate object tracker. BMVC 1990.
+    [CB14] T. Collins and A. Bartoli. Infinitesimal plane-based pose estimation. IJCV 2014: the two poses of a plane, as
+    OpenCV computes them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import enum
+import math
+from collections.abc import Sequence
+from typing import TypeGuard
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from warp_ar.errors import UsageError
+from warp_ar.kernels.picture.marker_edge_fit import CORRELATED, NOISE_FLOOR
+from warp_ar.scene import Camera, Marker, Pose
+from warp_ar.tracking.edge_fit import Box, EdgeFitter
+from warp_ar.tracking.marker_pattern import make_pattern
+from warp_ar.tracking.markers import Detection, MarkerDetector
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+_ENVIRONMENT = 0.6
+"""Half width of the search around the last marker, beyond the marker itself, in its own sizes."""
+
+_CLOSE = 0.25
+"""The same where a sharp marker is looked for first: half the pixels. It takes a marker from the same pixels."""
+
+_INSIDE = 12.0
+"""Pixels by which all corners of a marker must lie within that part: edges are sampled beyond them."""
+
+_BEFORE = np.array([3, 0, 1, 2])
+"""The corner before each of a marker's."""
+
+_NEAR = 0.5
+"""Distance of a marker from where it is expected, over the least size at which it is, within which no other is looked
+for."""
+
+_SHARP_AGAIN = 8
+"""Frames after which a marker that looked blurred is looked for as a sharp one again."""
+
+_REACH = (4.0, 3.0, 2.5, 2.5)
+"""Half width of the sampled window in pixels, per Gauss-Newton step; a cell that is narrower limits it further."""
+
+_LOST_REACH = (9.0, 6.0, 4.0, 3.0, 2.5)
+"""The same where the pose is only a prediction from earlier frames."""
+
+_CORNER_NOISE = 0.5
+"""Pixels: standard deviation of a detected corner where edges are too small to refine."""
+
+_PATTERN = 0.7
+"""Least correlation of the cells' brightness with the printed pattern."""
+
+_SUPPORT = 0.4
+"""Least share of the printed edges that must agree with a pose: with less, chance and clutter could."""
+
+_ENOUGH = 0.7
+"""Share of a board's edges that makes detection needless."""
+
+_ALIKE = 3.0
+"""The second pose of a plane is examined when its reprojection error is less than this many times that of the first
+..."""
+
+_ALIKE_PIXELS = 0.5
+"""... or less than this many pixels larger."""
+
+_FLIP_EVIDENCE = 12.0
+"""Log likelihood that must pile up against the current one of the two poses before the other is taken: e^12."""
+
+_FRAME_EVIDENCE = 4.0
+"""Most that one frame may add to it, so that one bad frame cannot flip the pose."""
+
+_SETTLE = 9.0
+"""Squared deviations (in standard deviations, per degree of freedom) at which half of an innovation is believed."""
+
+_FORGET = 0.4
+"""Seconds in which a steadied pose forgets at least 1 - 1/e of what came before."""
+
+
+class TrackState(enum.Enum):
+    """What a track's pose rests on."""
+
+    TRACKED = "tracked"
+    """The marker was measured in this frame."""
+    HELD = "held"
+    """Not measured for a moment: the pose is extrapolated from the last measurements, with a velocity that dies
+    away."""
+    LOST = "lost"
+    """Not measured for longer than the hold time: no pose."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Track:
+    """Where the marker is in one frame."""
+
+    pose: Pose | None
+    """``camera_from_world``, or None when lost."""
+    state: TrackState
+    """What the pose rests on."""
+    quality: float
+    """0 to 1: the share of the printed edges that support the pose, lowered by its uncertainty (1 degree or 1 % of
+    distance halve it)."""
+    corners: NDArray[np.float32] | None
+    """Corners of the marker or board in the image under ``pose``, (4, 2) pixels, clockwise from the page's top left;
+    None when lost."""
+    reprojection_error: float
+    """Root mean square distance in pixels between predicted and measured edges (corners, where too small); infinite if
+    not measured."""
+
+
+def _rotation(vector: Array) -> Array:
+    return np.asarray(cv2.Rodrigues(np.asarray(vector, float))[0], float)
+
+
+def _log(rotation: Array) -> Array:
+    """Rotation vector of a matrix, of length 0 to pi: no sign to choose, as there would be with a quaternion."""
+    return np.asarray(cv2.Rodrigues(rotation)[0], float).ravel()
+
+
+def _difference(a: Pose, b: Pose) -> Array:
+    """(6,) rotation vector w and translation d with a = (exp(w) b.R, b.t + d)."""
+    return np.concatenate([_log(a.rotation @ b.rotation.T), a.translation - b.translation])
+
+
+def _moved(pose: Pose, step: Array) -> Pose:
+    return Pose(_rotation(step[:3]) @ pose.rotation, pose.translation + step[3:6])
+
+
+@dataclasses.dataclass(frozen=True)
+class _Fit:
+    """A pose measured in one frame."""
+
+    pose: Pose
+    information: Array
+    """(6, 6): inverse covariance of rotation vector and translation about the pose."""
+    error: float
+    """Root mean square residual, pixels."""
+    support: float
+    """0 to 1: share of the printed edges that agree."""
+    cost: float
+    """Robust mean squared residual, pixels squared."""
+    pattern: float
+    """Correlation of the cells' brightness with the print."""
+    edges: bool
+    """Whether it rests on edges; else on the detected corners only."""
+
+
+class Tracker:
+    """Follows one marker or board through a sequence of frames.
+
+    Args:
+        marker: what to follow.
+        camera: the camera; its transfer curve matters little, for a common shift of all edges is solved for.
+        hold: seconds for which the pose is extrapolated after the last measurement.
+        steady: whether to steady the pose over time. The steadied pose strays from the measured one by no more than
+            about the measurement's own uncertainty: a still marker stands still, a moving one does not lag.
+
+    Raises:
+        UsageError: if the marker does not exist.
+    """
+
+    def __init__(self, marker: Marker, camera: Camera, *, hold: float = 0.2, steady: bool = True) -> None:
+        self._pattern = make_pattern(marker.dictionary, marker.id, marker.size, marker.board)
+        self._detector = MarkerDetector(marker.dictionary)
+        self._shape = (camera.height, camera.width)
+        self._matrix = np.asarray(camera.matrix(), float)
+        self._distortion = np.asarray(camera.distortion, float).ravel()
+        self._hold, self._steady = hold, steady
+        self._fitter = EdgeFitter(self._pattern, camera)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget every earlier frame."""
+        self._pose: Pose | None = None
+        self._velocity = np.zeros(6)
+        self._time = -np.inf
+        self._quality = 0.0
+        self._evidence = 0.0
+        self._rival = False
+        self._blurred = 0  # frames in which the marker is not looked for as a sharp one
+
+    def track(self, image: Image, time: float) -> Track:
+        """Find the marker in the next frame.
+
+        Args:
+            image: uint8 (height, width, 3) RGB, or (height, width) grey.
+            time: seconds, growing from frame to frame.
+
+        Raises:
+            UsageError: if the image is not of the camera's size and 8-bit.
+        """
+        if image.dtype != np.uint8 or image.shape[:2] != self._shape or image.shape[2:] not in ((), (3,)):
+            h, w = self._shape
+            raise UsageError(f"image: {image.dtype} {image.shape} should be uint8 ({h}, {w}, 3), the camera's size")
+        if not 0 <= time - self._time <= self._hold:
+            self.reset()  # too long ago to say anything, or a clock that ran backwards
+        guess = self._predict(time)
+        fit = self._measure(image, guess)
+        if fit is None:
+            return self._without(guess, time)
+        pose, quality = self._steadied(fit, guess, time), self._judge(fit)
+        if self._pose is not None:
+            elapsed = max(time - self._time, 1e-3)
+            self._velocity = _difference(pose, self._pose) / elapsed
+        self._pose, self._time, self._quality = pose, time, quality
+        return Track(pose, TrackState.TRACKED, quality, self._outline(pose), fit.error)
+
+    def detect(self, image: Image) -> list[Detection]:
+        """The followed markers in a whole picture, uint8 RGB or grey; they depend on the picture, not on the camera."""
+        return self._detect(image)
+
+    def error_of(self, image: Image, found: list[Detection]) -> float:
+        """How well the print fits where it was found, whatever earlier frames say.
+
+        Args:
+            image: As for ``track``.
+            found: What ``detect`` gave of it, by any tracker of this marker.
+
+        Returns:
+            What ``track`` of a new tracker says: root mean square distance in pixels; infinite where no pose fits.
+        """
+        self._show(image)
+        fit = self._fit_detections(found, None)
+        return np.inf if fit is None else fit.error
+
+    def _without(self, guess: Pose | None, time: float) -> Track:
+        if guess is None:
+            return Track(None, TrackState.LOST, 0.0, None, np.inf)
+        quality = self._quality * (1 - (time - self._time) / self._hold) if self._hold > 0 else 0.0
+        return Track(guess, TrackState.HELD, float(np.clip(quality, 0, 1)), self._outline(guess), np.inf)
+
+    def _predict(self, time: float) -> Pose | None:
+        """The last pose moved on: the velocity halves over the hold time, so that a lost marker does not fly away."""
+        if self._pose is None:
+            return None
+        elapsed = time - self._time
+        decay = np.log(2) / max(self._hold, 1e-3)
+        guess = _moved(self._pose, self._velocity * (-np.expm1(-decay * elapsed) / decay))
+        return guess if guess.apply(self._pattern.outline)[:, 2].min() > 0 else self._pose
+
+    def _project(self, points: Array) -> tuple[Array, Array]:
+        """Pixels (n, 2) of camera points (n, 3), and their derivative (n, 2, 3) by the camera point."""
+        # With no rotation and no translation, OpenCV's derivative by translation is the one by the point.
+        zero = np.zeros(3)
+        pixels, jacobian = cv2.projectPoints(points, zero, zero, self._matrix, self._distortion)
+        return pixels.reshape(-1, 2), np.asarray(jacobian)[:, 3:6].reshape(-1, 2, 3)
+
+    def _outline(self, pose: Pose) -> NDArray[np.float32]:
+        return self._project(pose.apply(self._pattern.outline))[0].astype(np.float32)
+
+    def _measure(self, image: Image, guess: Pose | None) -> _Fit | None:
+        """The pose in this image alone; ``guess`` only says where to look, and which of two like poses to prefer."""
+        if guess is not None:
+            # A board has no second pose to confuse it with, and dozens of markers to decode: its edges come first.
+            if len(self._pattern.markers) > 1:
+                self._show(image, self._around(self._outline(guess)))
+                fit = self._fit_guess(guess)
+                if fit is not None and fit.support >= _ENOUGH:
+                    return fit
+            fit = self._fit_detections(self._find_expected(image, guess), guess)
+            if fit is None or not fit.edges:
+                # Perhaps only partly hidden or cut off, so that corners are missing or wrong: its edges may still be
+                # there.
+                self._show(image, self._around(self._outline(guess)))
+                fit = self._fit_guess(guess) or fit
+            if fit is not None:
+                return fit
+        found = self._detect(image)
+        self._rival = len(found) > len({d.id for d in found})
+        fit = self._fit_detections(found, guess)
+        if fit is None or not fit.edges or self._rival or len(self._pattern.markers) > 1:
+            return fit
+        # Found as it will be in the next frame, so that a marker that stands still does so from the first frame on.
+        return self._fit_detections(self._find_expected(image, fit.pose), fit.pose) or fit
+
+    def _show(self, image: Image, box: Box | None = None) -> Image:
+        """A part of the image in grey, all of it where none is named: what is detected in and fitted to."""
+        h, w = self._shape
+        return self._fitter.show(image, (slice(0, h), slice(0, w)) if box is None else box)
+
+    def _around(self, outline: NDArray[np.float32], environment: float = _ENVIRONMENT) -> Box:
+        """Rows and columns of the image around a marker's outline, never empty."""
+        low, high = outline.min(0), outline.max(0)
+        environment = environment * float((high - low).max()) + 16
+        h, w = self._shape
+        (x0, y0), (x1, y1) = np.clip(low - environment, 0, (w - 32, h - 32)), np.clip(high + environment, 32, (w, h))
+        return slice(int(y0), int(np.ceil(y1))), slice(int(x0), int(np.ceil(x1)))
+
+    def _smallest(self, guess: Pose) -> float:
+        """Edge length in pixels below which nothing is a marker where one is expected at ``guess``."""
+        corners = np.concatenate([guess.apply(c) for c in self._pattern.markers.values()])
+        pixels = self._project(corners)[0].reshape(-1, 4, 2)
+        sides = pixels - pixels[:, _BEFORE]
+        return 0.6 * float(np.sqrt((sides**2).sum(axis=2)).mean(axis=1).min())
+
+    def _find_expected(self, image: Image, guess: Pose) -> list[Detection]:
+        """The followed markers where they are expected; one marker first as a sharp one, if it lately was.
+
+        A marker that the narrow threshold sees, both see in the same place; one that it does not see may be blurred.
+        """
+        smallest, expected = self._smallest(guess), self._outline(guess)
+        if len(self._pattern.markers) == 1 and self._blurred == 0:
+            for environment in (_CLOSE, _ENVIRONMENT):
+                box = self._around(expected, environment)
+                found = self._detect(image, box, smallest, sharp=True)
+                near = [d for d in found if np.linalg.norm(d.corners - expected, axis=1).mean() < _NEAR * smallest]
+                if near and (environment == _ENVIRONMENT or all(_is_inside(d.corners, box) for d in near)):
+                    return found
+            self._blurred = _SHARP_AGAIN
+        self._blurred = max(self._blurred - 1, 0)
+        return self._detect(image, self._around(expected), smallest)
+
+    def _detect(
+        self, image: Image, box: Box | None = None, smallest: float = 10.0, *, sharp: bool = False
+    ) -> list[Detection]:
+        """The followed markers in a part of the image, all of it where none is named, in pixels of the whole."""
+        detected = self._detector.detect(self._show(image, box), max(smallest, 10.0), sharp=sharp)
+        origin = np.array((0, 0) if box is None else (box[1].start, box[0].start), np.float32)
+        return [Detection(d.id, d.corners + origin) for d in detected if d.id in self._pattern.markers]
+
+    def _fit_detections(self, found: list[Detection], guess: Pose | None) -> _Fit | None:
+        found = self._chosen(found, guess)
+        if not found:
+            return None
+        corners = np.concatenate([d.corners for d in found]).astype(float)
+        points = np.concatenate([self._pattern.markers[d.id] for d in found])
+        candidates = self._plane_poses(points, corners)
+        if not candidates:
+            return None
+        most = max(_ALIKE * candidates[0][1], candidates[0][1] + _ALIKE_PIXELS)
+        alike = [pose for pose, error in candidates if error < most or pose is candidates[0][0]]
+        fits = self._refined(alike, points, corners)
+        good = [fit for fit in fits if fit.pattern >= _PATTERN]
+        return self._preferred(good, guess) if good else None
+
+    def _chosen(self, found: list[Detection], guess: Pose | None) -> list[Detection]:
+        """One detection per id: the one nearest to where it is expected, else the largest."""
+        if len(found) < 2:
+            return found
+
+        def rank(d: Detection) -> float:
+            if guess is None:
+                return -abs(float(cv2.contourArea(d.corners)))
+            expected = self._project(guess.apply(self._pattern.markers[d.id]))[0]
+            return float(np.linalg.norm(d.corners - expected, axis=1).mean())
+
+        best: dict[int, Detection] = {}
+        for d in sorted(found, key=rank):
+            best.setdefault(d.id, d)
+        return list(best.values())
+
+    def _plane_poses(self, points: Array, corners: Array) -> list[tuple[Pose, float]]:
+        """Both poses of a plane [CB14], with reprojection errors in pixels, best first.
+
+        Clockwise corners make z point toward the camera in both.
+        """
+        # With z into the page a marker seen straight on is not turned at all. With z out of it, it is turned by exactly
+        # half a turn, where OpenCV's solver divides 0 by 0 and returns a pose that is 160 pixels off.
+        facing = np.diag([1.0, -1.0, -1.0])
+        try:
+            _, rotations, translations, _ = cv2.solvePnPGeneric(
+                points @ facing, corners, self._matrix, self._distortion, flags=cv2.SOLVEPNP_IPPE
+            )
+        except cv2.error:  # corners on one line
+            return []
+        poses = []
+        for r, t in zip(rotations, translations, strict=True):
+            if not np.isfinite([r, t]).all():
+                continue
+            pose = Pose(_rotation(r) @ facing, np.asarray(t, float).ravel())
+            if pose.apply(self._pattern.outline)[:, 2].min() > 0:
+                residual = self._project(pose.apply(points))[0] - corners
+                poses.append((pose, float(np.sqrt((residual**2).sum(1).mean()))))
+        return sorted(poses, key=lambda p: p[1])
+
+    def _preferred(self, fits: list[_Fit], guess: Pose | None) -> _Fit:
+        """One of the two poses of a plane: the better in this frame, unless earlier frames speak for the other."""
+        if guess is None or len(fits) < 2:
+            self._evidence = 0.0
+            return min(fits, key=lambda f: f.cost)
+        near, far = sorted(fits, key=lambda f: float(np.linalg.norm(_difference(f.pose, guess)[:3])))
+        noise = max(min(near.cost, far.cost), NOISE_FLOOR**2)
+        independent = 0.5 * len(self._pattern.points) / CORRELATED
+        against = float(np.clip(independent * (near.cost - far.cost) / noise, -_FRAME_EVIDENCE, _FRAME_EVIDENCE))
+        self._evidence = max(self._evidence + against, 0.0)
+        if self._evidence < _FLIP_EVIDENCE:
+            return near
+        self._evidence = 0.0
+        return far
+
+    def _refined(self, poses: list[Pose], points: Array, corners: Array) -> list[_Fit]:
+        """Poses fitted to the edges, or to the corners where the edges are too small to be measured."""
+        fits = []
+        for pose, fit in zip(poses, self._fit_edges(poses, _REACH), strict=True):
+            fits.append(fit if _holds(fit) else self._fit_corners(pose, points, corners))
+        return fits
+
+    def _fit_corners(self, pose: Pose, points: Array, corners: Array) -> _Fit:
+        """A pose as corners that were detected have it."""
+        camera = pose.apply(points)
+        pixels, jacobian = self._project(camera)
+        residual = pixels - corners
+        rows = _pose_rows(jacobian, camera - pose.translation).reshape(-1, 6)
+        information = rows.T @ rows / _CORNER_NOISE**2
+        cost = float((residual**2).mean())
+        pattern = float(self._fitter.fit([pose], ())[0]["pattern"])
+        return _Fit(pose, information, float(np.sqrt(2 * cost)), 0.5, cost, pattern, edges=False)
+
+    def _fit_guess(self, guess: Pose) -> _Fit | None:
+        fit = self._fit_edges([guess], _LOST_REACH)[0]
+        return fit if _holds(fit) else None
+
+    def _fit_edges(self, poses: list[Pose], reaches: Sequence[float]) -> list[_Fit | None]:
+        """Gauss-Newton on the printed edges from each pose; None where too few are seen."""
+        fits: list[_Fit | None] = []
+        for index, found in enumerate(self._fitter.fit(poses, reaches)):
+            if not found["fitted"]:
+                fits.append(None)
+                continue
+            pose = Pose(found["rotation"].copy(), found["translation"].copy())
+            error, support, cost, pattern = (float(found[name]) for name in ("error", "support", "cost", "pattern"))
+            information = self._fitter.information(index)
+            fits.append(_Fit(pose, information, error, support, cost, pattern, edges=True))
+        return fits
+
+    def _steadied(self, fit: _Fit, guess: Pose | None, time: float) -> Pose:
+        """The measured pose, averaged with the last one as far as both agree within the measurement's own noise.
+
+        With innovation x of information L, s = x'Lx / 6 is 1 on average where nothing moved. Taking the share s / (s +
+        c) of x leaves c x / (s + c): at most half of sqrt(c) standard deviations, however the camera moves.
+        """
+        if self._pose is None or guess is None or not self._steady:
+            return fit.pose
+        step = _difference(fit.pose, self._pose)
+        deviation = float(step @ fit.information @ step) / 6
+        share = max(deviation / (deviation + _SETTLE), -np.expm1(-(time - self._time) / _FORGET))
+        return _moved(self._pose, share * step)
+
+    def _judge(self, fit: _Fit) -> float:
+        """Quality from what supports the pose and how well it is determined."""
+        variances = [max(value, 0.0) for value in _inverse(fit.information).diagonal().tolist()]
+        turn = math.degrees(math.sqrt(sum(variances[:3])))
+        shift = 100.0 * math.sqrt(sum(variances[3:])) / math.hypot(*fit.pose.translation.tolist())
+        quality = min(1.0, fit.support / 0.9) / (1.0 + turn**2 + shift**2)
+        return min(max(quality * (0.5 if self._rival else 1.0), 0.0), 1.0)
+
+
+def _inverse(information: Array) -> Array:
+    """Covariance of a pose; where some motion of it is not seen at all, of the others."""
+    with contextlib.suppress(np.linalg.LinAlgError):
+        inverse = np.asarray(np.linalg.inv(information), float)
+        if inverse.diagonal().min() > 0.0:
+            return inverse
+    return np.asarray(np.linalg.pinv(information), float)
+
+
+def _is_inside(corners: NDArray[np.float32], box: Box) -> bool:
+    """Whether corners lie well within a part of the image."""
+    rows, columns = box
+    low, high = corners.min(0), corners.max(0)
+    return bool(
+        (low >= (columns.start + _INSIDE, rows.start + _INSIDE)).all()
+        and (high <= (columns.stop - _INSIDE, rows.stop - _INSIDE)).all()
+    )
+
+
+def _holds(fit: _Fit | None) -> TypeGuard[_Fit]:
+    return fit is not None and fit.support >= _SUPPORT and fit.pattern >= _PATTERN
+
+
+def _pose_rows(jacobian: Array, arm: Array) -> Array:
+    """Derivative (n, 2, 6) of pixels by a pose's rotation vector and translation; ``arm`` is R X.
+
+    exp(w) R X + t + d moves by w x RX + d, so a row j of the derivative by the point gives (RX x j, j).
+    """
+    x, y, z = arm.T[:, :, None]
+    a, b, c = np.moveaxis(jacobian, 2, 0)
+    rows = np.empty((len(arm), 2, 6))
+    rows[..., 0], rows[..., 1], rows[..., 2], rows[..., 3:] = y * c - z * b, z * a - x * c, x * b - y * a, jacobian
+    return rows
