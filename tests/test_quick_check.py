@@ -51,7 +51,7 @@ def test_the_same_set_up_is_looked_at_once(looks, frames):
 def test_a_change_is_looked_at_anew(looks, frames, tmp_path, monkeypatch):
     scene, mesh = load_scene("desk"), tmp_path / "mesh.ply"
     mesh.write_bytes(b"one")
-    code = tmp_path / "package" / "input"
+    code = tmp_path / "package" / "checks"
     code.mkdir(parents=True)
     (code / "check.py").write_text("pass")
     monkeypatch.setattr(quick_check, "_PACKAGE", code.parent)

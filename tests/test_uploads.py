@@ -139,14 +139,14 @@ def test_what_cannot_be_used_is_refused_in_one_line(files, wanted, tmp_path, nam
 
 
 def test_limits_are_said(files, wanted, monkeypatch):
-    monkeypatch.setattr(dropped, "MOST_TRIANGLES", 11)
+    monkeypatch.setattr(uploads, "MOST_TRIANGLES", 11)
     with pytest.raises(UsageError, match="12 triangles; at most 11"):
         files.take("box.ply", box(0.1, 0.1, 0.1), wanted)
-    monkeypatch.setattr(dropped, "MOST_BYTES", 50)
+    monkeypatch.setattr(uploads, "MOST_BYTES", 50)
     with pytest.raises(UsageError, match="bytes; at most 50"):
         files.take("box.ply", box(0.1, 0.1, 0.1), wanted)
     monkeypatch.undo()
-    monkeypatch.setattr(dropped, "MOST_FILES", 1)
+    monkeypatch.setattr(uploads, "MOST_FILES", 1)
     files.take("box.ply", box(0.1, 0.1, 0.1), wanted)
     with pytest.raises(UsageError, match="1 files were dropped already"):
         files.take("box.ply", box(0.1, 0.1, 0.1), wanted)

@@ -37,8 +37,8 @@ _HOMES = {
     "photo_capture": ("Capture", "capture_light"),
     "session": ("Session",),
     "output.sinks": ("open_sink", "read_environment", "write_environment"),
-    "input.sources": ("Frame", "open_source"),
-    "input.tracking": ("TrackState", "Tracker"),
+    "sources.sources": ("Frame", "open_source"),
+    "tracking.tracking": ("TrackState", "Tracker"),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 

@@ -20,7 +20,7 @@ from warp_ar.checks.finding import Finding
 from warp_ar.scene import Scene
 
 _PACKAGE: Final = Path(__file__).parents[1]
-_CODE: Final = ("input", "kernels", "scene")
+_CODE: Final = ("ball", "calibration", "checks", "kernels", "scene", "sources", "tracking")
 """Packages that decide what is found."""
 _NOT_LOOKED: Final = ("source.", "units.", "marker.", "picture.", "camera.aspect", "ball.unfound", "ball.outside")
 """What findings begin with after which a ball was not looked for, or one of several not seen."""
@@ -91,7 +91,7 @@ def _key(scene: Scene, source: Path, files: Iterable[Path]) -> str:
     known = hashlib.sha256(pickle.dumps(scene))
     known.update(f"{cv2.__version__} {np.__version__}".encode())
     for folder in _CODE:
-        for path in sorted((_PACKAGE / folder).glob("*.py")):
+        for path in sorted((_PACKAGE / folder).rglob("*.py")):
             known.update(_stamp(path))
     for path in [source, *files]:
         for file in _files_in(path):
