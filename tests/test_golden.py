@@ -27,6 +27,7 @@ CASES = {
     **{name: (name, QUALITY) for name in SCENES},
     "desk_bounce": ("desk", QUALITY.with_methods(relight="bounce")),
     **{f"{name}_paper": (name, PRESETS["paper"]) for name in SCENES},
+    **{f"{name}_high": (name, PRESETS["high"]) for name in ("desk", "torus", "mirror")},
 }
 """Scene and quality of every golden frame."""
 
