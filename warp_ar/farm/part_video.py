@@ -37,8 +37,7 @@ ENCODER_THREADS = 2
 """Of x264 and x265, on every machine."""
 _X264 = "rc-lookahead=10:mbtree=1"
 """With these of `veryfast`, x264's preset `superfast` looks no less far ahead. What it leaves out is the search for
-motion by fractions of a pixel: three fifths of the processor time for a twentieth more bytes and 0.1 codes of error
-(docs/notes/2026-11-24-farm.md)."""
+motion by fractions of a pixel: three fifths of the processor time for a twentieth more bytes and 0.1 codes of error."""
 _X265 = f"pools=none:frame-threads={ENCODER_THREADS}:open-gop=0"
 """x265's threads that share a picture depend on the machine's cores: there are none, only some that take one each."""
 _MOST_SCALE = 100_000_000

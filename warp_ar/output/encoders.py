@@ -98,7 +98,7 @@ def _with_defaults(encoder: str, options: Mapping[str, str]) -> dict[str, str]:
 
     x264's tree of macroblocks (`mbtree`), in its code for AVX-512, reads memory that nothing has written: at some
     sizes, 320x240 among them, the same pictures then give other bytes from run to run. Its other code does not, gives
-    the same bytes whatever the processor, and is as fast (docs/notes/2026-11-23-encoders.md).
+    the same bytes whatever the processor, and is as fast.
     """
     wanted = {**_DEFAULTS.get(encoder, {}), **options}
     key = {"libx264": "x264-params", "libx265": "x265-params"}.get(encoder)
