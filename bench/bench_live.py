@@ -1,14 +1,13 @@
-"""The live page on the bundled desk: frames a second served and shown, latency, growth, hostile clients, and profiles.
+"""The live page on the bundled desk: frames a second served and shown, latency, growth, hostile clients.
 
 Server and viewers share this machine. Parts, which ``WARP_AR_BENCH`` picks, separated by commas:
 
 - ``serve``: one light client, three, one beside a client that reads nothing, one beside one that sends bad messages;
 - ``clip`` and ``camera``: Chromium shows the clip, then its own fake camera. A time code in the picture tells on the
   screen which frame it is, and so how long ago the source gave it. Needs playwright and Chromium;
-- ``profile``: where the program's time goes in the cases of one light client, clip and camera. Needs py-spy.
 
 ``WARP_AR_BENCH_SECONDS`` is how long each case runs (default 10; 600 for ten minutes without growth). All of it takes
-8 cases of that and 15 seconds more each.
+6 cases of that and 15 seconds more each.
 """
 
 from __future__ import annotations
@@ -22,7 +21,6 @@ import json
 import os
 import random
 import re
-import shutil
 import signal
 import statistics
 import struct
@@ -38,7 +36,6 @@ import aiohttp
 import cv2
 import numpy as np
 
-from bench.bench_transport import descendants
 from bench.common import find_chromium, report
 from warp_ar.output.sinks import VideoSink
 from warp_ar.scene import SourceSpec, dumps_scene, load_scene
@@ -46,8 +43,7 @@ from warp_ar.sources.sources import open_source
 
 SECONDS = float(os.environ.get("WARP_AR_BENCH_SECONDS", "10"))
 WARM_SECONDS = 5.0
-PARTS = ("serve", "clip", "camera", "profile")
-PROFILE_SECONDS = 8
+PARTS = ("serve", "clip", "camera")
 START_SECONDS = 120.0
 FUZZ_MESSAGES = 10_000
 BITS, CELL = 7, 12  # the time code: the frame's number as squares along the bottom edge
@@ -88,6 +84,15 @@ def write_coded_desk(folder: Path) -> tuple[Path, Path]:
 
 
 # ---------------------------------------------------------------------------------------------------------- the server
+
+
+def descendants(pid: int) -> Iterator[int]:
+    """Yield the processes that a process has started, and those that they have."""
+    with contextlib.suppress(OSError):
+        for task in Path(f"/proc/{pid}/task").iterdir():
+            for child in (task / "children").read_text().split():
+                yield int(child)
+                yield from descendants(int(child))
 
 
 @dataclasses.dataclass
@@ -392,85 +397,16 @@ def showing(device: str, case: str, page: Any, server: Served) -> None:
     )
 
 
-# ------------------------------------------------------------------------------------------------------------- profiles
-
-# Innermost of these in a stack says what it was doing.
-WORK = {
-    "Tracker.track": "track the marker",
-    "Scheduler.run": "kernels",
-    "_drain": "kernels",
-    "SideBySide._work": "kernels",
-    "invoke": "kernels",
-    "encode_jpeg": "pack JPEG",
-    "BrowserCamera.push": "unpack the camera's JPEG",
-    "BrowserCamera._estimate": "estimate the focal length",
-    "Pipeline._set_frame_values": "poses and rectangles",
-    "Pipeline._upload": "copies",
-    "Result.image": "copies",
-    "Server._message": "headers and messages",
-    "Server._receive": "headers and messages",
-    "Server._send": "headers and messages",
-    "Server._tick": "state and light",
-    "FrameLoop._look_at_light": "state and light",
-    "VideoFile._pictures": "decode the clip",
-    "_ahead": "decode the clip",
-    "PipelineSwitcher._build": "build pipelines",
-    "BaseEventLoop._run_once": "event loop",
-}
-# Threads that wait in C, which py-spy takes for running.
-IDLE = ("_worker", "EpollSelector.select", "Condition.wait")
-
-
-def profile(case: str, server: Served) -> None:
-    """Where the program's processor time goes, by py-spy: shares of the samples in which a thread was running."""
-    spy = shutil.which("py-spy", path=f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}")
-    if spy is None:
-        print(json.dumps({"case": f"profile, {case}", "left_out": "needs py-spy"}))
-        return
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "stacks.txt"
-        command = [spy, "record", "--pid", str(server.pid), "--duration", str(PROFILE_SECONDS), "--rate", "60"]
-        done = subprocess.run([*command, "--format", "raw", "--output", str(path)], capture_output=True, text=True)
-        if done.returncode or not path.is_file():
-            print(json.dumps({"case": f"profile, {case}", "left_out": done.stderr.strip()[-200:]}))
-            return
-        shares: collections.Counter[str] = collections.Counter()
-        for line in path.read_text().splitlines():
-            stack, _, count = line.rpartition(" ")
-            names = [entry.partition(" (")[0].strip() for entry in stack.split(";")]
-            if names[-1] in IDLE:
-                continue
-            shares[next((WORK[name] for name in reversed(names) if name in WORK), names[-1])] += int(count)
-    total = sum(shares.values()) or 1
-    cores = total / (PROFILE_SECONDS * 60)
-    table = {name: f"{100 * count / total:.1f} %" for name, count in shares.most_common(12)}
-    print(json.dumps({"case": f"profile, {case}", "cores_busy": round(cores, 2), **table}), flush=True)
-
-
-def _profiled_view(server: Served) -> None:
-    async def both() -> None:
-        looking = asyncio.create_task(view(Growth(server), PROFILE_SECONDS + 2.0))
-        await asyncio.sleep(WARM_SECONDS)
-        await asyncio.get_running_loop().run_in_executor(None, profile, "1 light client", server)
-        await looking
-
-    asyncio.run(both())
-
-
 def main(device: str) -> None:
     parts = set(filter(None, os.environ.get("WARP_AR_BENCH", "").split(","))) or set(PARTS)
     cases = ["1 light client", "3 light clients", "1 beside one that reads nothing", "1 beside a hostile one"]
     runs = len(cases) * ("serve" in parts) + ("clip" in parts) + ("camera" in parts)
-    profiles = ("profile" in parts) * (1 + ("clip" in parts) + ("camera" in parts))
-    took = runs * (SECONDS + 15) + profiles * (PROFILE_SECONDS + 10)
+    took = runs * (SECONDS + 15)
     print(json.dumps({"parts": sorted(parts), "takes_minutes": round(took / 60, 1)}), flush=True)
     if "serve" in parts:
         for case in cases:
             with served(device) as server:
                 asyncio.run(serving(device, case, server))
-    if "profile" in parts:
-        with served(device) as server:
-            _profiled_view(server)
     shown = [case for case in ("clip", "camera") if case in parts]
     if not shown:
         return
@@ -479,5 +415,3 @@ def main(device: str) -> None:
         with served(device, str(scene)) as server, browsing(camera, server) as page:
             for case in shown if page is not None else []:
                 showing(device, case, page, server)
-                if "profile" in parts:
-                    profile(f"{case} in Chromium", server)

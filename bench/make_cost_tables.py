@@ -5,7 +5,6 @@ It runs, one after another, and says what each took:
   errors    what each method errs, at half size over ten frames: ``warp_ar/accuracy/cost_table.json``
   presets   what each preset errs, over whole clips: ``bench/results/presets.json``
   costs     milliseconds of every method and preset: ``bench/results/cpu_costs.jsonl``
-  budget    the same of ``desk`` for the bench of budgets: ``bench/results/desk_budget_costs.json``
   tables    all of it into ``docs/accuracy.md`` and ``README.md``
 
 Errors do not depend on what else runs: they and the costs of other devices can be made at other times (``--only``), and
@@ -41,7 +40,7 @@ ERROR_OPTIONS = ("--shrink", "2", "--frames", "10")
 PRESET_OPTIONS = ("--presets", "--frames", "1000")
 KEYS = ("case", "setting", "method", "quality")
 """Of a line: what it is about."""
-STEPS = ("errors", "presets", "costs", "budget", "tables")
+STEPS = ("errors", "presets", "costs", "tables")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -192,7 +191,6 @@ def main() -> int:
         "errors": lambda: make_errors(runs, options.stage, options.scenes),
         "presets": lambda: make_presets(runs, options.presets, options.scenes),
         "costs": lambda: make_costs(processor_time=options.processor_time),
-        "budget": lambda: subprocess.run([sys.executable, "-m", "bench.record_costs"], cwd=ROOT, check=True),
         "tables": lambda: subprocess.run([sys.executable, "-m", "bench.write_cost_tables"], cwd=ROOT, check=True),
     }
     for name in STEPS:

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import warp as wp
 
-from tests.test_path_tracer import look
 from warp_ar.kernels import structs
 from warp_ar.kernels.reference.path_guides import (
     BINS,
@@ -25,7 +24,6 @@ from warp_ar.kernels.reference.path_guides import (
 from warp_ar.kernels.reference.path_learning import learn_directions, learn_sample, make_squares
 from warp_ar.kernels.reference.path_sampling import NO_DENSITY, PathKey, Sky, make_sky, random_triple, sky_radiance
 from warp_ar.kernels.sampling import frame_from_normal
-from warp_ar.scene import Camera, LambertMaterial, MirrorMaterial, Object, Proxy, Scene
 
 COUNT = 1 << 16
 # Standard errors that a mean may be off; seeds are fixed.
@@ -182,33 +180,6 @@ def studio() -> np.ndarray:
     radiance[4:7, 8:11] = (12.0, 11.0, 9.0)
     radiance[6:8, 22:25] = (5.0, 6.0, 8.0)
     return radiance
-
-
-@pytest.mark.parametrize("mode", ["whole", "known"])
-def test_a_mirror_and_chalk_agree_with_another_renderer(mode: str, device: str) -> None:
-    """Light that a mirror throws onto a desk and onto chalk: blocks of 16 x 16 within three standard errors.
-
-    In the mode ``known`` Mitsuba's picture of the empty desk is the frame, and all that is not there is a difference.
-    """
-    mi = pytest.importorskip("mitsuba")
-    mi.set_variant("scalar_rgb")
-    from bench.check_reference import Case, check
-
-    scene = Scene(
-        Camera(64, 48, 75.0, 75.0, 31.5, 23.5),
-        proxies=(Proxy("plane", size=(1.2, 1.0)),),
-        objects=(
-            Object("sphere", radius=0.06, at=(0.03, 0.04, 0.061), material=MirrorMaterial((0.95, 0.93, 0.88))),
-            Object("sphere", radius=0.05, at=(0.12, -0.06, 0.051), material=LambertMaterial((0.75, 0.75, 0.75))),
-        ),
-    )
-    case = Case(scene, studio(), look((0.05, -0.5, 0.35)), 0.0)
-    row = check(mi, case, mode, 256, device)
-    # Of 36 scores the largest is 3 by chance in one of ten; seeds are fixed.
-    assert row["scores"] >= 27
-    assert row["z_max"] < 3.0, row
-    assert row["z_rms"] < 1.4, row
-    assert row["ratio"] == pytest.approx([1.0] * 3, abs=0.02)
 
 
 # Float32 sums of 256 chances.

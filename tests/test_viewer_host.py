@@ -57,7 +57,7 @@ def test_numbers_are_edited_in_place_and_structure_is_swapped_in() -> None:
 
 
 def test_changes_of_quality_leave_no_arrays_behind(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Even without the garbage collector; ``bench page`` watches the whole process over a thousand changes."""
+    """Even without the garbage collector."""
     made: list[weakref.ref[Any]] = []
     begin = wp.array.__init__
 
