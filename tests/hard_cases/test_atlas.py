@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import collections
 import json
 import pathlib
 import subprocess
 import sys
 
-from tests.hard_cases import atlas, measure_errors, mutations, table
+from tests.hard_cases import atlas, measure_errors
 from tests.hard_cases.rig import METHODS, SIZE, make_quality, make_scene
 from warp_ar import explain
 from warp_ar.engine.graph import make_plan
@@ -67,35 +66,3 @@ def test_tests_that_stand_elsewhere_exist() -> None:
         assert f"def {function}(" in (ROOT / "tests" / file).read_text(), (
             f"{name} is named in the atlas and does not exist"
         )
-
-
-def test_every_row_has_breaks_that_still_apply() -> None:
-    """What ``python -m tests.hard_cases.mutations`` would replace stands there once, and the test it names exists."""
-    count = collections.Counter(mutation.row for mutation in mutations.MUTATIONS)
-    assert set(count) == set(atlas.ROWS)
-    assert min(count.values()) > 1, "a row whose tests were tried by one break only"
-    for mutation in mutations.MUTATIONS:
-        found = (ROOT / mutation.file).read_text().count(mutation.old)
-        assert found == 1, f"{mutation.what!r}: its text occurs {found} times in {mutation.file}; expected once"
-        file, function = mutation.test.split("[")[0].split("::")
-        assert f"def {function}(" in (ROOT / file).read_text(), f"{mutation.test} does not exist"
-
-
-REPORT = """<testsuites><testsuite><testcase classname="a" name="test_one[{device}-bilinear]"><properties>
-<property name="atlas" value="1/unwrap/bilinear"/></properties>{inner}</testcase></testsuite></testsuites>"""
-
-
-def test_the_table_adds_reports_up(tmp_path: pathlib.Path) -> None:
-    """One report a file, both devices in one; a test that was run again counts once."""
-    paths = []
-    for number, (device, inner) in enumerate((("cpu", ""), ("cuda:0", "<failure/>"), ("cuda:0", ""), ("cpu", ""))):
-        paths.append(tmp_path / f"r_{number}.xml")
-        paths[-1].write_text(REPORT.format(device=device, inner=inner).replace('"a"', f'"a{number % 2}"'))
-    found = table.read_reports(paths)
-    # The failure in the second report counts until the same test passes in a later one: here it never does.
-    assert found["CUDA"][1, "unwrap", "bilinear"] == [False, True]
-    assert found["CPU"][1, "unwrap", "bilinear"] == [True, True]
-    made = table.make_table(found, "")
-    assert "| 1 | unwrap | sphere_map bilinear area | 1/3 (2 tests) | FAILED: bilinear |" in made
-    assert "| 15 | track | default |  | on the host |" in made
-    assert table.make_table({"CPU": {}, "CUDA": {}}, made).splitlines()[2] == made.splitlines()[2], "kept"
