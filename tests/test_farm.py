@@ -252,7 +252,7 @@ def test_what_killed_workers_left_is_gone_when_a_run_ends(finished, monkeypatch)
         raise RunError("the disk is full")
 
     pool = types.SimpleNamespace(size=0, names=())
-    monkeypatch.setattr(cli, "_make_pool", lambda options, jobs, folder: (pool, None))
+    monkeypatch.setattr(cli, "_make_pool", lambda options, jobs, folder: pool)
     monkeypatch.setattr(Driver, "run", work)
     assert main(["resume", str(run)]) == 1
     assert not (run / ".aside").exists()

@@ -10,7 +10,7 @@ import pytest
 from warp_ar.errors import UsageError
 from warp_ar.farm import pool
 from warp_ar.farm.pool import ProcessPool, Teller, cores_of, devices_of, is_from_outside, keeping_to, words_of_exit
-from warp_ar.farm.ray_pool import _knock
+from warp_ar.farm.ray_pool import _knock, share_of_gpu
 from warp_ar.farm.records import Context
 
 
@@ -120,10 +120,15 @@ def test_workers_see_no_interrupt_even_as_they_begin(tmp_path):
                 held = next(int(line.split()[1], 16) for line in file if line.startswith("SigBlk"))
             assert held >> (signal.SIGINT - 1) & 1
             assert not held >> (signal.SIGTERM - 1) & 1
-        pool.add(["cpu"])
-        assert (pool.size, len(pool._workers), len(pool._cores)) == (3, 3, 3)
         assert all(process.is_alive() for process, _ in pool._workers)
     finally:
         pool.close()
     assert not any(process.is_alive() for process, _ in pool._workers)
     assert signal.pthread_sigmask(signal.SIG_BLOCK, []) == before
+
+
+@pytest.mark.parametrize(("workers", "gpus"), [(1, 1), (2, 2), (1, 4), (3, 1), (7, 2), (16, 2), (48, 8)])
+def test_all_actors_find_room_on_the_gpus(workers, gpus):
+    share = share_of_gpu(workers, gpus)
+    assert 0 < share <= 1
+    assert gpus * int(1 / share + 1e-9) >= workers

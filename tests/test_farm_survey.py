@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import fractions
 import time
 
@@ -16,7 +15,6 @@ from warp_ar.farm.jobs import Job, scene_of
 from warp_ar.farm.part_video import PartSink
 from warp_ar.farm.records import Context
 from warp_ar.farm.survey import Survey
-from warp_ar.farm.tracking_process import can_share
 from warp_ar.farm.work import Work
 from warp_ar.kernels.environment.change import CHANGE_FLOOR, CHANGE_SHARE
 from warp_ar.sources.sources import open_source
@@ -26,7 +24,6 @@ LIT, DARK = 8, 7
 RATE = 24
 LATE = 0.05
 """Seconds after which a frame's light is asked for: others have been rendered by then."""
-needs_sharing = pytest.mark.skipif(not can_share(), reason="needs memory that goes with the last process that uses it")
 
 
 @pytest.fixture(scope="module")
@@ -74,27 +71,16 @@ def one_after_another(jobs):
         return np.array(poses), keys, lights, pipeline.inputs.saturation.levels
 
 
-@pytest.mark.parametrize("beside", [False, pytest.param(True, marks=needs_sharing)])
-def test_a_survey_is_that_of_frames_one_after_another(folder, tmp_path, monkeypatch, beside):
-    take, started, start = survey._Look.take, [], survey.TrackingProcess
+def test_a_survey_is_that_of_frames_one_after_another(folder, tmp_path, monkeypatch):
+    take = survey._Look.take
 
     def take_late(self, *arguments):
         time.sleep(LATE)
         take(self, *arguments)
 
-    def noted_start(reading, **options):
-        started.append(start(dataclasses.replace(reading, slots=options["held"] + 2), **options))
-        return started[-1]
-
     monkeypatch.setattr(survey._Look, "take", take_late)
-    monkeypatch.setattr(survey, "TrackingProcess", noted_start)
-    monkeypatch.setattr(survey, "BESIDE_CORES", 1)
-    if beside:
-        monkeypatch.setattr(survey, "BESIDE_FRAMES", 1)
     jobs = make_jobs(folder, [{"scene": "desk", "path": "a.mp4"}])
     found = surveyed(jobs, tmp_path / "run")
-    assert len(started) == beside
-    assert all(process._process.poll() is not None for process in started), "what reads ends with the survey"
     poses, keys, lights, saturation = one_after_another(jobs)
     np.testing.assert_array_equal(found.poses, poses)
     assert np.isnan(poses[LIT + DARK - 1, 0]), "the marker must be lost"

@@ -15,7 +15,6 @@ import OpenEXR
 
 from warp_ar.farm.jobs import parse_jobs, read_jobs
 from warp_ar.farm.status import read_status, status_lines
-from warp_ar.farm.status_page import status_page
 from warp_ar.kernels.color import decode_table
 from warp_ar.light.captured import Light, find_emitters
 from warp_ar.output.shot import Shot
@@ -193,9 +192,8 @@ def _jobs(path: pathlib.Path) -> None:
 
 
 def _status(path: pathlib.Path) -> object:
-    """What ``farm status`` says, in words and on its page."""
+    """What ``farm status`` says."""
     folder = path.parent
-    status_page(folder, lambda name: None, refresh=False)
     return status_lines(folder, read_status(folder))
 
 

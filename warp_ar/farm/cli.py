@@ -36,7 +36,7 @@ def make_parser() -> argparse.ArgumentParser:
             "--workers",
             type=int,
             metavar="N",
-            help="workers here (default: as many for each GPU as a short trial finds room for, or one per 4 cores)",
+            help="workers here (default: one per 4 cores, on GPUs one per 2)",
         )
         command.add_argument(
             "--ray",
@@ -46,20 +46,13 @@ def make_parser() -> argparse.ArgumentParser:
             help="workers of a Ray cluster, or of one that is started here",
         )
     plan = commands.add_parser("plan", help="count jobs, try three of them on a few frames, say what all would take")
-    plan.add_argument("jobs", type=Path, nargs="?", metavar="JOBS.toml", help="clips, and what is to be made of them")
+    plan.add_argument("jobs", type=Path, metavar="JOBS.toml", help="clips, and what is to be made of them")
     plan.add_argument("--workers", type=int, metavar="N", help="workers that there will be")
-    plan.add_argument(
-        "--figures", type=Path, metavar="FILE", help="instead of trying jobs: tables of what many GPUs would take"
-    )
-    plan.add_argument("--gpus", metavar="N,M", help="with --figures: for how many (default: 1,8,32,128,1000)")
     for command in (run, resume, plan):
         command.add_argument("--device", default="auto", metavar="auto|cpu|cuda", help="where the kernels run")
     status = commands.add_parser("status", help="say where a run stands")
     status.add_argument("folder", type=Path, metavar="DIR", help="the run's folder")
-    how = status.add_mutually_exclusive_group()
-    how.add_argument("--json", action="store_true", help="as JSON")
-    how.add_argument("--html", type=Path, metavar="FILE", help="as a page that needs nothing else")
-    how.add_argument("--serve", type=int, metavar="PORT", help="as a page on this machine, drawn anew at each look")
+    status.add_argument("--json", action="store_true", help="as JSON")
     return parser
 
 
@@ -83,24 +76,12 @@ def command(options: argparse.Namespace) -> int:
 
 
 def tell_status(options: argparse.Namespace) -> int:
-    """``farm status``.
+    """Print where a run stands.
 
     Raises:
         RunError: The run is damaged.
-        UsageError: There is none in the folder, or ``--serve`` is no port.
+        UsageError: There is none in the folder.
     """
-    if options.html is not None or options.serve is not None:
-        from warp_ar.farm.status_page import HOST, make_server, write_page
-
-        if options.html is not None:
-            write_page(options.folder, options.html)
-            return EXIT_DONE
-        if not 0 <= options.serve < 1 << 16:
-            raise UsageError(f"--serve {options.serve}: expected a port from 0 to 65535")
-        with make_server(options.folder, options.serve) as server:
-            say(f"http://{HOST}:{server.server_port} shows {options.folder}; Ctrl+C ends it")
-            server.serve_forever()
-        return EXIT_DONE
     status = read_status(options.folder)
     print(json.dumps(status, indent=1) if options.json else "\n".join(status_lines(options.folder, status)))
     return EXIT_DONE
@@ -153,36 +134,28 @@ def work(options: argparse.Namespace, folder: Path) -> int:
             if getattr(options, "failed", False):
                 for key in list(manifest.failed):
                     manifest.add("again", key, reason="resumed with --failed")
-            pool, growth = _make_pool(options, jobs, folder)
-            summary = Driver(jobs, folder, manifest, pool, mine, say, growth).run()
+            pool = _make_pool(options, jobs, folder)
+            summary = Driver(jobs, folder, manifest, pool, mine, say).run()
         finally:
             manifest.close()
             clear_aside(folder)  # what workers that were killed left takes room, and is nobody's
     return _tell(folder, summary.failed)
 
 
-def _make_pool(options: argparse.Namespace, jobs: Any, folder: Path) -> tuple[Any, Any]:
-    """Workers, and what decides whether more come: on GPUs of this machine, where nobody has said how many."""
-    from warp_ar.device import usable_cores
-    from warp_ar.farm.fitting import fit_workers
-    from warp_ar.farm.growth import Growth
+def _make_pool(options: argparse.Namespace, jobs: Any, folder: Path) -> Any:
+    """Start the workers."""
     from warp_ar.farm.pool import ProcessPool, devices_of
     from warp_ar.farm.records import Context
 
     context = Context(jobs, folder.absolute(), "cpu")
     if options.ray is None:
-        workers, most = options.workers, 0
-        gpus = devices_of(options.device, None)
-        if workers is None and gpus[0] != "cpu":
-            workers, most = fit_workers(jobs, gpus, usable_cores(), say)
-        processes = ProcessPool(context, devices_of(options.device, workers))
-        return processes, Growth(gpus, most, processes.add, say) if most > processes.size else None
+        return ProcessPool(context, devices_of(options.device, options.workers))
     from warp_ar.farm.ray_pool import RayPool
 
     pool = RayPool(context, options.ray or None, options.workers)
     if page := pool.dashboard():
         say(f"Ray's page: http://{page}")
-    return pool, None
+    return pool
 
 
 def _tell(folder: Path, failed: dict[str, str]) -> int:
@@ -198,34 +171,8 @@ def _tell(folder: Path, failed: dict[str, str]) -> int:
     return EXIT_FAILED
 
 
-def _tell_scale(options: argparse.Namespace) -> int:
-    """Tables of what many GPUs would take."""
-    from warp_ar.farm.scale import GPUS, read_figures, table_of
-
-    gpus: Sequence[int] = GPUS
-    if options.gpus is not None:
-        try:
-            gpus = [int(part) for part in options.gpus.split(",")]
-        except ValueError:
-            gpus = [0]
-        if min(gpus) < 1:
-            raise UsageError(f"--gpus {options.gpus}: expected numbers from 1 on with commas between, such as 1,8")
-    source, tasks = read_figures(options.figures)
-    text = "\n\n".join([source] * bool(source) + [table_of(task, gpus) for task in tasks])
-    print("\n".join(map(printable, text.splitlines())))
-    return EXIT_DONE
-
-
 def plan(options: argparse.Namespace) -> int:
-    """``farm plan``.
-
-    Raises:
-        UsageError: No job file is named, and no figures; or ``--gpus`` makes no sense.
-    """
-    if options.figures is not None:
-        return _tell_scale(options)
-    if options.jobs is None or options.gpus is not None:
-        raise UsageError("plan: name a job file, or --figures FILE, with --gpus or without")
+    """Count jobs, try a few, and say what all would take."""
     with importing():
         from warp_ar.farm.plan import make_plan
         from warp_ar.farm.pool import cores_of, devices_of, keeping_to

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 from warp_ar.errors import reason
-from warp_ar.farm.growth import Growth
 from warp_ar.farm.jobs import Job, JobFile, job_of_clip, jobs_of_clip
 from warp_ar.farm.manifest import PROGRESS, Manifest, RunError, is_no_space, record_at
 from warp_ar.farm.pool import Event, Pool, is_from_outside, words_of_exit
@@ -30,8 +29,6 @@ PROGRESS_SECONDS = 2.0
 """Between two looks at progress."""
 FRAMES_OF = ("segment", "variation")
 """Kinds of jobs that light frames."""
-STEADY = (*FRAMES_OF, "join")
-"""Kinds of which a run consists once clips are surveyed: a recording is joined within tenths of a second."""
 STARTS = 3
 """Times in a row that a worker may die before it is ready."""
 
@@ -60,10 +57,6 @@ class _Worker:
     """Seconds that they took."""
     deaths: int = 0
     """Before it was ready, in a row."""
-    lit: int = 0
-    """Frames of the jobs that it has finished since it was started."""
-    resting: bool = False
-    """Whether it gets no more jobs."""
 
 
 class Driver:
@@ -77,7 +70,6 @@ class Driver:
         pool: Pool,
         version: str,
         say: Callable[[str], None],
-        growth: Growth | None = None,
     ) -> None:
         """Find out what is open.
 
@@ -88,9 +80,7 @@ class Driver:
             pool: Workers.
             version: Of the program, which all workers must be of.
             say: Called with a line for people now and then.
-            growth: Decides whether more workers come; None: these are all.
         """
-        self._growth = growth
         self._jobs, self._folder, self._manifest, self._pool = jobs, folder, manifest, pool
         self._version, self._say = version, say
         self._workers = [_Worker() for _ in range(pool.size)]
@@ -230,7 +220,7 @@ class Driver:
         waiting: Job | None = None
         while True:
             for worker, state in enumerate(self._workers):
-                if not state.ready or state.resting or state.job is not None:
+                if not state.ready or state.job is not None:
                     continue
                 job, waiting = waiting or next_job(), None
                 if job is None:
@@ -243,24 +233,11 @@ class Driver:
                 if waiting is None:
                     return
                 continue
-            self._grow()  # here: where jobs are short, there is always one that has just ended
             for event in self._pool.wait(1.0):
                 self._hear(event)
             if time.monotonic() - self._lines_since > PROGRESS_SECONDS:
                 self._lines_since = time.monotonic()
                 self._write_progress()
-
-    def _grow(self) -> None:
-        """Have more workers come, or the last ones rest, by what all of them light."""
-        if self._growth is None:
-            return
-        active = [state for state in self._workers if not state.resting]
-        light = all(state.ready and state.job is not None and state.job.kind in STEADY for state in active)
-        enough = self._jobs_left() - len(self._running) > len(active)
-        more = self._growth.look([state.lit + state.frames for state in active] if light and enough else None)
-        self._workers += [_Worker() for _ in range(more)]
-        for state in active[more:] if more < 0 else ():
-            state.resting = True
 
     def _hear(self, event: Event) -> None:
         """Take what a worker says."""
@@ -282,7 +259,6 @@ class Driver:
                     state.busy += time.monotonic() - state.since
                     frames = int(event.value.values.get("frames", 0))
                     state.total += frames
-                    state.lit += frames if job.kind in FRAMES_OF else 0
                     state.frames = 0
                     self._take(job, event.value)
             case "died":
@@ -299,7 +275,7 @@ class Driver:
                     f"worker {event.worker} died {STARTS} times before it was ready; see "
                     f"{self._folder / 'log' / f'worker-{event.worker}.log'}"
                 )
-        state.ready, state.frames, state.lit = False, 0, 0
+        state.ready, state.frames = False, 0
         if job is None:
             return
         self._running.discard(job)

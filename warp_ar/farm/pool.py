@@ -30,6 +30,10 @@ from warp_ar.farm.version import program_version
 
 CORES = 4
 """Of a worker on CPU: more of them leave stages of few rows waiting."""
+GPU_CORES = 2
+"""Of a worker on a GPU, which keeps about so many busy with decoding and encoding."""
+MOST_OF_GPU = 16
+"""Workers that share a GPU unless more are asked for: each holds its arrays there."""
 TELL_SECONDS = 0.5
 """Between two messages about frames."""
 
@@ -67,7 +71,7 @@ def devices_of(device: str, workers: int | None) -> list[str]:
 
     Args:
         device: ``auto``, ``cpu`` or ``cuda``.
-        workers: How many; None: one per GPU, or one per four cores.
+        workers: How many; None: one per four cores, on GPUs one per two, and at least one for each GPU.
     """
     if device == "cpu":
         return ["cpu"] * (workers or max(1, usable_cores() // CORES))
@@ -79,7 +83,8 @@ def devices_of(device: str, workers: int | None) -> list[str]:
     import warp as wp
 
     found = [str(gpu) for gpu in wp.get_cuda_devices()] if device in ("auto", "cuda") else [str(first)]
-    return [found[n % len(found)] for n in range(workers or len(found))]
+    each = min(max(usable_cores() // GPU_CORES // len(found), 1), MOST_OF_GPU)
+    return [found[n % len(found)] for n in range(workers or each * len(found))]
 
 
 def by_siblings(cores: Iterable[int]) -> list[int]:
@@ -150,14 +155,6 @@ class ProcessPool:
         self._workers: list[tuple[Any, Any]] = []
         for worker in range(self.size):
             self._workers.append(self._start(worker))
-
-    def add(self, devices: Sequence[str]) -> None:
-        """Start more workers, on these devices."""
-        self.names += devices
-        self._cores = cores_of(self.names)
-        for worker in range(self.size, len(self.names)):
-            self._workers.append(self._start(worker))
-        self.size = len(self.names)
 
     def _start(self, worker: int) -> tuple[Any, Any]:
         mine, theirs = self._spawn.Pipe()

@@ -19,8 +19,7 @@ value``) since the last key: the tolerance within which stages that read the env
 
 Poses and light of a frame rest on the frames before it, so a clip is surveyed in order. But its steps run side by side:
 some threads decode, one follows the marker, one has kernels gather the light of the frame before, one compares and
-packs what came of the one before that. Of a long clip another process reads and follows the marker. What each step
-sees, and so every byte, is as if they were one after another.
+packs what came of the one before that. What each step sees, and so every byte, is as if they were one after another.
 """
 
 from __future__ import annotations
@@ -41,13 +40,11 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_ar.device import usable_cores
-from warp_ar.engine.pipeline import AHEAD as SUBMITTED
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.engine.result import Result
 from warp_ar.errors import SceneError, SourceError, reason
 from warp_ar.farm.frames import FrameIndex, index_frames, open_part
 from warp_ar.farm.jobs import JobFile, lit_range, scene_of, source_of
-from warp_ar.farm.tracking_process import Reading, TrackingProcess, can_share
 from warp_ar.kernels.environment.change import CHANGE_FLOOR, CHANGE_SHARE
 from warp_ar.light.captured import Light, find_emitters
 from warp_ar.scene import CapturedLight, Pose, Scene
@@ -65,11 +62,6 @@ LIGHT = "light.exr"
 """The environment at the clip's end, with the emitters that were found."""
 CONVERTERS = 4
 """Threads that turn decoded pictures into RGB: with fewer they are the slowest step."""
-BESIDE_FRAMES = 1000
-"""Frames of a clip from which on a process beside this one reads and looks for the marker: to start it takes a second
-of processor time and 150 MB for as long as the survey lasts."""
-BESIDE_CORES = 4
-"""Cores from which on it does."""
 AHEAD = 8
 """Frames at most whose marker has been looked for and whose light has not been gathered: solving for light that clips
 takes as long as some frames, and comes with one of several."""
@@ -269,15 +261,9 @@ def _look_at_frames(
         if not look.captures:
             return
     gpu, converters = jobs.settings.gpu_of(device), min(CONVERTERS, usable_cores())
-    is_long = end - first >= BESIDE_FRAMES and usable_cores() >= BESIDE_CORES
     with contextlib.ExitStack() as stack:
         source = stack.enter_context(open_part(path, index, first, end, fps, gpu, converters=converters))
         linear = keep_depth(source, look.scene)
-        tracked: Iterator[tuple[Frame, Track | None]] | None = None
-        if is_long and given is None and not linear and can_share():
-            camera = look.scene.camera.scaled_to(*source.size)
-            reading = Reading(path, index, first, end, fps, gpu, converters, look.scene.marker, camera)
-            tracked = iter(stack.enter_context(TrackingProcess(reading, held=SUBMITTED)))
         pipeline = Pipeline(
             look.scene,
             device=device,
@@ -290,7 +276,7 @@ def _look_at_frames(
         )
         with pipeline, ThreadPoolExecutor(1, "warp_ar-keep") as keeper:
             waiting: collections.deque[Future[None]] = collections.deque()
-            for frame, result in _submitted(tracked or _tracked(source, pipeline), pipeline):
+            for frame, result in _submitted(_tracked(source, pipeline), pipeline):
                 if result.pose is not None:
                     look.poses[frame.index] = (*result.pose.rotation.ravel(), *result.pose.translation)
                     waiting.append(keeper.submit(look.take, frame.index, result, writer))
