@@ -403,6 +403,23 @@ def test_impossible_numbers_are_refused_and_the_next_frame_works(
         assert run(pipeline, frames[:1])[0].state is TrackState.TRACKED
 
 
+def test_poses_and_scenes_that_are_none_are_refused_by_name(frames: Frames) -> None:
+    with Pipeline(make_scene(), device="cpu", quality="paper") as pipeline:
+        for pose, given in (((np.eye(3), np.zeros(3)), "tuple"), (np.eye(4), "ndarray"), ("desk", "str")):
+            with pytest.raises(UsageError, match=rf"pose is {given}; expected a Pose\(R, t\)"):
+                pipeline(frames[0], pose=pose)  # type: ignore[arg-type]
+        with pytest.raises(UsageError, match="scene is str; expected a Scene"):
+            pipeline.update("desk")  # type: ignore[arg-type]
+        assert pipeline(frames[0]).image.any()
+    for rotation, translation, wrong in (
+        (np.eye(4), np.zeros(3), r"rotation has the shape \(4, 4\)"),
+        (np.eye(3), np.zeros((3, 1)), r"translation has the shape \(3, 1\)"),
+        (None, np.zeros(3), "rotation is NoneType"),
+    ):
+        with pytest.raises(UsageError, match=wrong):
+            Pose(rotation, translation)  # type: ignore[arg-type]
+
+
 def test_numbers_of_a_scene_that_are_not_finite_are_named(frames: Frames) -> None:
     """A scene of a file cannot have any; one that was made in Python can, and every pixel would be one."""
     good = make_scene(lights=(Light("point", 1.0, at=(0.0, 0.0, 0.4)),))

@@ -135,6 +135,64 @@ def test_a_bad_edit_changes_nothing_and_says_why() -> None:
         running.next()
 
 
+@pytest.mark.parametrize(
+    "edit",
+    [
+        {"part": "marker", "index": 0, "key": "size", "value": 80},
+        {"part": "probe", "index": 0, "key": "radius", "value": 1e-9},
+    ],
+)
+def test_an_edit_that_a_scene_file_may_have_never_ends_the_frames(edit: dict[str, Any]) -> None:
+    with Running(page_scene()) as running:
+        running.edit(type="set", **edit)
+        running.next(6)
+        running.edit(type="undo")
+        running.until(lambda: running.next(2).plan > 0 and running.settled)
+
+
+def test_a_frame_that_fails_is_told_and_frames_go_on_with_what_was_there(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    light = Pipeline.__call__
+
+    def failing(self: Pipeline, *arguments: Any, **more: Any) -> Any:
+        if self.scene.objects[0].at[0] == 0.5:
+            raise ZeroDivisionError("no such frame")
+        return light(self, *arguments, **more)
+
+    monkeypatch.setattr(Pipeline, "__call__", failing)
+    with Running(page_scene()) as running:
+        good = running.host.wanted()
+        running.edit(type="set", part="object", index=0, key="at", value=[0.5, 0.0, 0.03])
+        running.until(lambda: [m for m in running.messages if m["type"] == "notice" and "no such frame" in m["text"]])
+        running.until(lambda: running.host.wanted() == good)
+        assert running.next().plan > 0
+        undone = [m for m in running.messages if m["type"] == "scene"][-1]
+        assert undone["undo"] is None
+        # One that fails whatever is shown: viewers see the camera's picture, and hear of it now and then.
+        monkeypatch.setattr(Pipeline, "__call__", lambda *_, **__: 1 // 0)
+        running.until(lambda: running.next(1).plan == 0)
+        monkeypatch.setattr(Pipeline, "__call__", light)
+        running.until(lambda: running.next(1).plan > 0)
+    assert "ZeroDivisionError" in capfd.readouterr().err
+
+
+def test_a_pipeline_that_cannot_be_made_for_any_reason_leaves_the_one_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    with Running(page_scene()) as running:
+        make = Pipeline.__init__
+
+        def failing(self: Pipeline, *arguments: Any, **more: Any) -> None:
+            raise KeyError("broken")
+
+        monkeypatch.setattr(Pipeline, "__init__", failing)
+        running.edit(type="effect", name="objects", on=False)
+        running.until(lambda: [m for m in running.messages if m["type"] == "notice" and "broken" in m["text"]])
+        running.until(lambda: running.settled)
+        assert running.next().plan == 1
+        assert not running.host.wanted().off
+        monkeypatch.setattr(Pipeline, "__init__", make)
+
+
 def test_a_held_frame_follows_edits() -> None:
     with Running(page_scene(lights=())) as running:
         running.next()

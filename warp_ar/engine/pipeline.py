@@ -238,6 +238,8 @@ class Pipeline(Closing):
             UsageError: The pipeline is closed, or another process's.
         """
         self._check_usable()
+        if not isinstance(scene, Scene):
+            raise UsageError(f"scene is {type(scene).__name__}; expected a Scene, such as load_scene returns")
         check_exposure(scene)
         check_finite(scene, leave=("pose",))  # which stays as it was, or calls for another pipeline
         self._finish()
@@ -420,6 +422,8 @@ class Pipeline(Closing):
         if exposure_time is not None:
             check_number("exposure_time", exposure_time, above=0.0)
         pose = given.pose if isinstance(given, Track) else given
+        if pose is not None and not isinstance(pose, Pose):
+            raise UsageError(f"pose is {type(pose).__name__}; expected a Pose(R, t), camera_from_world, or a Track")
         if pose is not None and not (np.isfinite(pose.rotation).all() and np.isfinite(pose.translation).all()):
             raise UsageError("pose holds a number that is not finite; expected a rotation and a translation")
         plate, image = self._take_depth(image)

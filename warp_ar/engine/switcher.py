@@ -108,7 +108,7 @@ class PipelineSwitcher:
             building, self._building = self._building, None
             try:
                 built = building.result()
-            except WarpArError:
+            except Exception:  # one that is no WarpArError, too: it would be built again before each frame
                 if self._built_for is self._wanted:
                     self._refused, self._wanted = self._wanted, self._shown
                     raise

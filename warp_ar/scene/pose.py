@@ -7,6 +7,8 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from warp_ar.errors import UsageError
+
 Array = NDArray[np.float64]
 
 
@@ -18,6 +20,18 @@ class Pose:
     """Rotation matrix R, float64 (3, 3)."""
     translation: Array
     """Translation t, float64 (3,), metres."""
+
+    def __post_init__(self) -> None:
+        """Check the shapes.
+
+        Raises:
+            UsageError: The rotation is not (3, 3), or the translation not (3,).
+        """
+        for name, value, shape in (("rotation", self.rotation, (3, 3)), ("translation", self.translation, (3,))):
+            if np.shape(value) != shape:
+                given = f"has the shape {np.shape(value)}" if hasattr(value, "shape") else f"is {type(value).__name__}"
+                right = f"expected an array {shape}, such as M[:3, :3] and M[:3, 3] of a 4x4 matrix M"
+                raise UsageError(f"Pose: {name} {given}; {right}")
 
     def inverse(self) -> Pose:
         """The motion back: from ``camera_from_world`` to ``world_from_camera``."""

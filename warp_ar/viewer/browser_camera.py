@@ -17,8 +17,9 @@ from warp_ar.errors import UsageError
 from warp_ar.pictures import decode_picture
 from warp_ar.sources.sources import QueueSource, Source
 from warp_ar.viewer import protocol
-from warp_ar.viewer.controls import Controls, Feed, Notify
+from warp_ar.viewer.controls import Controls, Feed
 from warp_ar.viewer.intrinsics import FocalEstimator, guessed_camera
+from warp_ar.viewer.messages import Notify
 
 Image = npt.NDArray[np.uint8]
 

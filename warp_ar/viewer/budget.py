@@ -24,11 +24,9 @@ from warp_ar.accuracy.costs import BASE, Costs, cost_key, measure_steps, read_co
 from warp_ar.cache_folder import cache_folder
 from warp_ar.engine.graph import make_plan
 from warp_ar.engine.pipeline import Pipeline
-from warp_ar.errors import WarpArError, reason
 from warp_ar.scene import Pose
 from warp_ar.stages.quality import AUTO, DEFAULT_BUDGET_MS, PRESETS, Quality
-from warp_ar.viewer.background import begin
-from warp_ar.viewer.controls import Notify
+from warp_ar.viewer.messages import Notify, begin, failure
 
 _COST_FRAMES: Final = 30
 """Frames whose median tells what a preset costs."""
@@ -128,14 +126,9 @@ class BudgetSetting:
         except StopIteration as end:
             write_costs(self._folder, self._cache_key, end.value)
             self._adopt(end.value)
-        except (WarpArError, RuntimeError, MemoryError) as error:
-            # Such as a device whose memory is full.
-            self._failed = key
-            text = f"What methods cost cannot be measured: {reason(error)}"
-            self._notify({"type": "notice", "text": text, "bad": True})
-        except BaseException:
+        except Exception as error:
             self._failed = key  # else they would be measured again and again
-            raise
+            self._notify(failure(error, "what methods cost stays unknown"))
         finally:
             self._progress = progress
         self._notify(self.record())

@@ -18,8 +18,7 @@ from warp_ar.calibration.card import write_card
 from warp_ar.errors import UsageError
 from warp_ar.scene import Camera
 from warp_ar.tracking.card_layout import SHEET
-from warp_ar.viewer.background import begin
-from warp_ar.viewer.controls import Notify
+from warp_ar.viewer.messages import Notify, begin, failure
 
 _LOOK_SECONDS: Final = 0.4
 """How often the board is looked for."""
@@ -79,7 +78,7 @@ class CalibrationSession:
             new = True
             if self._views is views:
                 self._views = None
-            self._notify({"type": "notice", "text": str(error), "bad": True})
+            self._notify(failure(error))
         if new:
             self._notify(self.message())
 

@@ -13,9 +13,9 @@ from warp_ar.errors import SourceError, UsageError
 from warp_ar.scene import Camera, Scene, SourceSpec
 from warp_ar.sources.sources import MOST_INDEX, QueueSource, Source, open_source
 from warp_ar.stages.quality import PRESETS
-from warp_ar.viewer import messages
-from warp_ar.viewer.edits import Wanted
+from warp_ar.viewer.edits import Wanted, wanted_record
 from warp_ar.viewer.history import History
+from warp_ar.viewer.messages import Notify
 from warp_ar.viewer.no_camera import NoCamera
 
 CAMERA: Final = "camera"
@@ -24,9 +24,6 @@ TRACED: Final = "traced"
 DIFFERENCE: Final = "difference"
 CONVERGING: Final = (TRACED, DIFFERENCE)
 """What a held picture is compared with: the reference, or how far from it the picture is, in colours."""
-
-Notify = Callable[[dict[str, Any]], None]
-"""Takes a message for all viewers, on any thread."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -163,7 +160,8 @@ class Controls:
     def scene_message(self) -> dict[str, Any]:
         """The scene as it is edited, and what can be undone."""
         with self.changed:
-            return messages.scene(self.wanted, self._history.undo_label, self._history.redo_label)
+            undo, redo = self._history.undo_label, self._history.redo_label
+            return {"type": "scene", "scene": wanted_record(self.wanted), "undo": undo, "redo": redo}
 
     def camera_of(self, feed: Feed, wanted: Wanted | None = None) -> Camera:
         """What is known of the camera that took a feed's frames."""

@@ -17,7 +17,6 @@ from warp_ar.accuracy.known_frame import KnownFrame, exposed_scene, light_of
 from warp_ar.accuracy.path_tracer import Image, PathTracer, TracedPicture
 from warp_ar.device import exclusive
 from warp_ar.engine.pipeline import Pipeline, Result
-from warp_ar.errors import UsageError, WarpArError, reason
 from warp_ar.viewer.controls import TRACED
 
 FULL_SCALE: Final = 0.2
@@ -124,7 +123,7 @@ class Convergence:
         """Add a slice of samples; whether there is a new picture to show.
 
         Raises:
-            WarpArError: The frame cannot be traced, such as where a mesh's file is gone; it is not tried again.
+            Exception: The frame cannot be traced, such as on a device whose memory is full; it is not tried again.
         """
         made = self._made
         if made is None or not made.done():
@@ -133,12 +132,9 @@ class Convergence:
         try:
             tracer = made.result()
             tracer.sample_for(SLICE_SECONDS)
-        except (WarpArError, RuntimeError, MemoryError) as error:
+        except Exception:
             self._made = None  # the picture goes on without a reference
-            if isinstance(error, WarpArError):
-                raise
-            # Such as a device whose memory is full.
-            raise UsageError(f"the reference cannot be traced here: {reason(error)}") from error
+            raise
         now = time.monotonic()
         if tracer.samples < 1 or now - self._shown < SHOWN_SECONDS:
             return False

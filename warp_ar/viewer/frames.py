@@ -19,16 +19,16 @@ from warp_ar.scene import Camera, Pose
 from warp_ar.sources.sources import Frame, Source
 from warp_ar.stages.quality import PRESETS
 from warp_ar.tracking.tracking import TrackState
-from warp_ar.viewer import messages
 from warp_ar.viewer.browser_camera import BrowserCamera, Image, Pushed
 from warp_ar.viewer.budget import BudgetSetting
 from warp_ar.viewer.calibration import CalibrationSession
-from warp_ar.viewer.controls import CONVERGING, Controls, Notify
+from warp_ar.viewer.controls import CONVERGING, Controls
 from warp_ar.viewer.convergence import Convergence
 from warp_ar.viewer.edits import Wanted
 from warp_ar.viewer.intrinsics import guessed_camera
 from warp_ar.viewer.light_record import LightState
 from warp_ar.viewer.lighting import Lighting
+from warp_ar.viewer.messages import Notify, failure
 from warp_ar.viewer.recorder import Recorder
 from warp_ar.viewer.setup import SetupChecks
 
@@ -148,14 +148,14 @@ class FrameLoop:
         return round(100.0 * float(cv2.norm(lit.image, lit.other, cv2.NORM_L1)) / (lit.image.size * 255.0), 3)
 
     def run(self) -> None:
-        """Light frames until told to stop. Errors of a source are told to the viewers; another source may follow."""
+        """Light frames until told to stop. A failure of a source is told to the viewers; another source may follow."""
         controls = self._controls
         while not controls.stopped:
             try:
                 with controls.feed.source as source:
                     self._run_source(source)
-            except WarpArError as error:
-                self._notify(messages.notice(error))
+            except Exception as error:
+                self._notify(failure(error, "no more frames come from this source"))
             with controls.changed:
                 controls.changed.wait_for(lambda: controls.leaving)
             controls.adopt()
@@ -252,11 +252,11 @@ class FrameLoop:
         return True
 
     def _step(self) -> bool:
-        """Add a slice of samples; whether there is a new picture to show. What cannot be traced is told."""
+        """Add a slice of samples; True if there is a new picture to show. A failure is told."""
         try:
             return self.convergence.step()
-        except WarpArError as error:
-            self._notify(messages.notice(error))
+        except Exception as error:
+            self._notify(failure(error, "the picture goes on without a reference"))
             return False
 
     def _beside(self, pipeline: Pipeline, frame: Frame, result: Result, now: float) -> Image | None:
@@ -284,14 +284,20 @@ class FrameLoop:
         if helpers.lighting.swaps != self._plan:
             self._plan = helpers.lighting.swaps
             helpers.budget.restart()
-        self.latest = self._lit_by(pipeline, frame, now, pushed) or self._plain(frame, pushed)
+        try:
+            lit = self._lit_by(pipeline, frame, now, pushed)
+        except Exception as error:
+            self._tell_failure(error)
+            lit = None
+        self.latest = lit or self._plain(frame, pushed)
         self._times.append(time.monotonic())
         if self.latest.plan:
+            helpers.lighting.note_lit()
             helpers.setup.note(frame.image, self.latest.state, self.latest.pose, self._times[-1])
         try:
             helpers.recorder.add(self.latest.image)
-        except WarpArError as error:
-            self._notify(messages.notice(error))
+        except Exception as error:
+            self._notify(failure(error))
         self._publish(self.latest)
         self._busy_ms = (time.perf_counter() - begin) * 1e3
         if helpers.budget.measuring:
@@ -300,21 +306,25 @@ class FrameLoop:
                 controls.changed.wait_for(lambda: controls.leaving, timeout=_MEASURING_REST)
         return True
 
+    def _tell_failure(self, error: Exception) -> None:
+        """Tell why a frame is not lit. After a fault, the edit since the last lit frame is taken back.
+
+        An error of the program's own, such as of an exposure that was not announced, says nothing of the edit.
+        """
+        taken_back = not isinstance(error, WarpArError) and self._helpers.lighting.take_back()
+        if taken_back or time.monotonic() - self._notice_time > _NOTICE_SECONDS:
+            self._notice_time = time.monotonic()
+            then = "the edit is taken back and the frames go on" if taken_back else "the frames go on"
+            self._notify(failure(error, then))
+
     def _lit_by(self, pipeline: Pipeline | None, frame: Frame, now: float, pushed: Pushed | None) -> Lit | None:
         """The lit frame; None where it cannot be lit."""
         height, width = frame.image.shape[:2]
         if pipeline is None or pipeline.size != (width, height):
             return None  # a pipeline for this camera is being built
         start = time.perf_counter()
-        try:
-            result = pipeline(frame.image, time_seconds=now, exposure_time=frame.exposure_time)
-            image = result.image
-        except WarpArError as error:
-            # A frame that is refused, such as one of an exposure that was not announced: the next may be lit.
-            if time.monotonic() - self._notice_time > _NOTICE_SECONDS:
-                self._notice_time = time.monotonic()
-                self._notify(messages.notice(error))
-            return None
+        result = pipeline(frame.image, time_seconds=now, exposure_time=frame.exposure_time)
+        image = result.image
         light_ms = (time.perf_counter() - start) * 1e3
         self.seconds = float(pipeline.arrays["seconds"]())
         self._base = now + 1.0 / PLAY_RATE

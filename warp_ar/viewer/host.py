@@ -21,16 +21,17 @@ from warp_ar.errors import SourceError, UsageError, WarpArError
 from warp_ar.output.sinks import write_environment
 from warp_ar.scene import Scene, bundled_scenes, dumps_scene, load_scene
 from warp_ar.stages.quality import AUTO, DEFAULT_PRESET, PRESETS, Quality
-from warp_ar.viewer import calibration, edits, messages, protocol
+from warp_ar.viewer import calibration, edits, protocol
 from warp_ar.viewer.browser_camera import BrowserCamera
 from warp_ar.viewer.budget import BudgetSetting
 from warp_ar.viewer.bundle import pack_scene
 from warp_ar.viewer.calibration import CalibrationSession
-from warp_ar.viewer.controls import Controls, Feed, Notify, open_feed
+from warp_ar.viewer.controls import Controls, Feed, open_feed
 from warp_ar.viewer.edits import Wanted
 from warp_ar.viewer.frames import FrameLoop, Helpers, Lit
 from warp_ar.viewer.light_record import LightState
 from warp_ar.viewer.lighting import Lighting, make_target
+from warp_ar.viewer.messages import Notify, failure, notice
 from warp_ar.viewer.no_camera import NoCamera
 from warp_ar.viewer.recorder import Recorder
 from warp_ar.viewer.setup import SetupChecks
@@ -209,7 +210,7 @@ class Host:
         how = f"fitted to edges of the picture, within {2e3 * found.deviation:.0f} mm"
         if not found.fitted:
             how = f"not certain, for {found.doubt}. Look at its handles, or point it out anew from nearer and higher up"
-        self._notify({"type": "notice", "text": f"{kind.capitalize()} of {sides} mm: {how}.", "bad": False})
+        self._notify(notice(f"{kind.capitalize()} of {sides} mm: {how}."))
 
     def _open_scene(self, name: str) -> None:
         if name not in bundled_scenes():
@@ -235,7 +236,7 @@ class Host:
             feed = open_feed(scene, self._given_source)
         except WarpArError as error:
             # Such as a scene without a source, or one whose file has gone: others may bring a camera.
-            self._notify(messages.notice(error))
+            self._notify(failure(error))
             absent = error if isinstance(error, SourceError) else SourceError(str(error))
             feed = Feed(NoCamera((scene.camera.width, scene.camera.height), absent))
         self._camera.leave(feed)

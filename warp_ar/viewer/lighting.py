@@ -14,14 +14,16 @@ from warp_ar.engine.graph import Plan, make_plan
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.engine.switcher import PipelineSwitcher, Target
 from warp_ar.errors import WarpArError
+from warp_ar.output.report import left_out, stage_names
 from warp_ar.sources.exposures import plan_bracket
 from warp_ar.sources.sources import Frame
+from warp_ar.stages import STAGES
 from warp_ar.stages.quality import PRESETS
 from warp_ar.stages.request import Request
-from warp_ar.viewer import messages
 from warp_ar.viewer.browser_camera import Image
-from warp_ar.viewer.controls import CAMERA, Controls, Feed, Notify
+from warp_ar.viewer.controls import CAMERA, Controls, Feed
 from warp_ar.viewer.edits import Wanted
+from warp_ar.viewer.messages import Notify, failure, notice
 
 FIRST: Final = dataclasses.replace(
     PRESETS["low"].with_methods(recover="white_card", environment_shadow="none"), name="the first picture"
@@ -132,15 +134,14 @@ class Lighting:
             self._aim(wanted, compare, feed)
         before = self._main.swaps
         try:
-            self._follow_main(wanted)
-        except WarpArError as error:
-            if self._first is not None:
+            self._follow_main()
+        except Exception as error:
+            if self._first is not None and isinstance(error, WarpArError):
                 self._first = None  # what is wanted itself may do
             else:
-                self._settled = True
-                self._notify(messages.notice(error))
-                self._give_up()
-                controls.give_back(self._good, wanted)
+                self._first, self._settled = None, True
+                self._notify(failure(error, "what was shown before stays"))
+                self.take_back()
         if self._main.swaps != before:
             assert self._main.pipeline is not None
             self.plan = self._main.pipeline.plan
@@ -152,8 +153,8 @@ class Lighting:
         elif not self.changing:
             try:
                 self._second.follow(self._then, prepare=self._warm_up)
-            except WarpArError as error:
-                self._notify(messages.notice(error))
+            except Exception as error:
+                self._notify(failure(error))
         return self._main.pipeline if self._place == _place(self._now) else None
 
     def _tell_bracket(self, notes: tuple[str, ...]) -> None:
@@ -161,9 +162,26 @@ class Lighting:
         if notes != self._bracket_notes:
             self._bracket_notes = notes
             for note in notes:
-                self._notify({"type": "notice", "text": note, "bad": False})
+                self._notify(notice(note))
 
-    def _follow_main(self, wanted: Wanted) -> None:
+    def note_lit(self) -> None:
+        """Note that a frame was lit: what it shows is good, and is gone back to where a later edit fails."""
+        if self._settled and self._followed is not None:
+            self._good = self._followed[0]
+
+    def take_back(self) -> bool:
+        """Want again what was good, after a failure of what is followed now.
+
+        Returns:
+            True if something else was wanted; False if what was good has failed itself.
+        """
+        if self._followed is None or self._followed[0] is self._good:
+            return False
+        self._give_up()
+        self._controls.give_back(self._good, self._followed[0])
+        return True
+
+    def _follow_main(self) -> None:
         target = self._first or self._now
         self._main.follow(target, prepare=self._warm_up)
         if self._main.shows(target):
@@ -171,7 +189,7 @@ class Lighting:
             if self._first is not None:
                 self._first = None
             else:
-                self._good, self._settled = wanted, True
+                self._settled = True
 
     def _warm_up(self, pipeline: Pipeline) -> None:
         """Load the kernels of a new pipeline; viewers are told how far that is."""
@@ -198,8 +216,26 @@ class Lighting:
         return None
 
     def plan_message(self) -> dict[str, Any]:
-        """The stages that run, and why the others do not."""
-        return messages.plan(self.plan, self.swaps, self.device)
+        """Return the message of the stages that run, and of those left out with the reason."""
+        told = {"type": "plan", "plan": self.swaps, "device": self.device, "quality": None, "run": [], "left_out": []}
+        if self.plan is None:
+            return told
+        quality = self.plan.request.quality
+        summaries = {kind.name: kind.summary for kind in STAGES} | {"track": "finds the marker and the camera's pose"}
+        methods = {kind.name: list(kind.methods) for kind in STAGES if len(kind.methods) > 1}
+        run = [
+            {
+                "stage": name,
+                "method": quality.method(name),
+                "methods": methods.get(name, []),
+                "summary": summaries[name],
+            }
+            for name in stage_names(self.plan)
+        ]
+        out = [
+            {"stage": name, "reason": reason, "methods": methods.get(name, [])} for name, reason in left_out(self.plan)
+        ]
+        return {**told, "quality": quality.name, "run": run, "left_out": out}
 
     def close(self, wait_seconds: float | None = None) -> bool:
         """Let the pipelines go; what is being built is waited for, at most so many seconds. Whether it has ended."""

@@ -1,55 +1,58 @@
-"""What viewers are told of scene and plan, as plain data; ``protocol`` has what they say."""
+"""Messages to viewers as plain data: notices, failures, the scene and the plan. ``protocol`` has those from viewers."""
 
 from __future__ import annotations
 
-from typing import Any
+import sys
+import traceback
+from collections.abc import Callable
+from concurrent.futures import Executor, Future
+from typing import Any, Final
 
-from warp_ar.engine.graph import Plan
-from warp_ar.errors import WarpArError
-from warp_ar.output.report import left_out, stage_names
-from warp_ar.stages import STAGES
-from warp_ar.viewer.edits import Wanted, wanted_record
+from warp_ar.errors import WarpArError, reason
 
+Notify = Callable[[dict[str, Any]], None]
+"""Receiver of a message for all viewers, called on any thread."""
 
-def notice(error: WarpArError) -> dict[str, Any]:
-    """What could not be done, and why."""
-    return {"type": "notice", "text": str(error), "bad": True}
-
-
-def scene(wanted: Wanted, undo: str | None, redo: str | None) -> dict[str, Any]:
-    """The scene as it is edited, and what can be undone and done again, in words."""
-    return {"type": "scene", "scene": wanted_record(wanted), "undo": undo, "redo": redo}
+_LONGEST: Final = 400
+"""Characters of a notice about a fault: an exception's text may be a whole file."""
 
 
-def plan(plan: Plan | None, number: int, device: str) -> dict[str, Any]:
-    """The stages that run, and why the others do not.
+def notice(text: str, *, bad: bool = False) -> dict[str, Any]:
+    """Return a notice; ``bad`` marks a refusal or a failure."""
+    return {"type": "notice", "text": text, "bad": bad}
+
+
+def failure(error: BaseException, then: str = "the frames go on") -> dict[str, Any]:
+    """Return the notice for an exception; every exception of a frame or of work beside the frames comes here.
+
+    An error of the program's own says what is wrong as it stands. Any other is a fault of the program: its traceback
+    goes to the terminal, and viewers are told its type, its text and what happens next.
 
     Args:
-        plan: What lights the frames; None while nothing does.
-        number: Of the plan; frames name the one that they were lit by.
-        device: What it runs on.
+        error: The exception.
+        then: What happens next, where the error is a fault.
     """
-    summaries = {kind.name: kind.summary for kind in STAGES} | {"track": "finds the marker and the camera's pose"}
-    methods = {kind.name: list(kind.methods) for kind in STAGES if len(kind.methods) > 1}
-    told: dict[str, Any] = {
-        "type": "plan",
-        "plan": number,
-        "device": device,
-        "quality": None,
-        "run": [],
-        "left_out": [],
-    }
-    if plan is None:
-        return told
-    quality = plan.request.quality
-    run = [
-        {
-            "stage": name,
-            "method": quality.method(name),
-            "methods": methods.get(name, []),
-            "summary": summaries[name],
-        }
-        for name in stage_names(plan)
-    ]
-    out = [{"stage": name, "reason": reason, "methods": methods.get(name, [])} for name, reason in left_out(plan)]
-    return {**told, "quality": quality.name, "run": run, "left_out": out}
+    if isinstance(error, WarpArError):
+        return notice(str(error), bad=True)
+    if sys.stderr is not None:
+        traceback.print_exception(error, file=sys.stderr)
+    return notice(f"this failed: {type(error).__name__}: {reason(error)[:_LONGEST]}; {then}", bad=True)
+
+
+def begin(helper: Executor, notify: Notify, work: Callable[..., None], *arguments: Any) -> Future[None]:
+    """Run work beside the frames; an error that it does not catch itself becomes a notice.
+
+    Args:
+        helper: Executor that runs it.
+        notify: Receiver of the notice, called on the helper's thread.
+        work: Function to run.
+        *arguments: Arguments of ``work``.
+    """
+
+    def tell(future: Future[None]) -> None:
+        if not future.cancelled() and (error := future.exception()) is not None:
+            notify(failure(error))
+
+    future = helper.submit(work, *arguments)
+    future.add_done_callback(tell)
+    return future

@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 from aiohttp import WSCloseCode, WSMsgType, web
 
-from warp_ar.errors import UsageError, WarpArError
+from warp_ar.errors import UsageError
 from warp_ar.scene import bundled_scenes
 from warp_ar.stages.quality import PRESETS
 from warp_ar.viewer import protocol
@@ -31,6 +31,7 @@ from warp_ar.viewer.address import LOOPBACK, Address, listen
 from warp_ar.viewer.backend import MOST_VIEWERS, Backend
 from warp_ar.viewer.encoding import encode_jpeg, encode_light
 from warp_ar.viewer.gate import HEADER_SECONDS, Gate
+from warp_ar.viewer.messages import failure
 from warp_ar.viewer.page_files import PageFiles
 from warp_ar.viewer.shared_light import SharedLight
 
@@ -358,8 +359,8 @@ class Server:
             case _:
                 try:
                     await self.backend.aside(self.backend.host.edit, command, viewer)
-                except WarpArError as error:
-                    viewer.tell(json.dumps({"type": "notice", "text": str(error), "bad": True}))
+                except Exception as error:
+                    viewer.tell(json.dumps(failure(error, "nothing was changed")))
                     viewer.tell(json.dumps(self.backend.host.scene_message()))
 
     def _camera_picture(self, viewer: _Viewer, data: bytes) -> None:
@@ -379,8 +380,8 @@ class Server:
             await self.backend.aside(self.backend.host.push, picture, viewer)
         except protocol.ProtocolError as error:
             await self._drop(viewer, WSCloseCode.POLICY_VIOLATION, str(error))
-        except WarpArError as error:
-            viewer.tell(json.dumps({"type": "notice", "text": str(error), "bad": True}))
+        except Exception as error:
+            viewer.tell(json.dumps(failure(error)))
 
     @staticmethod
     async def _drop(viewer: _Viewer, code: int, reason: str, seconds: float = 5.0) -> None:

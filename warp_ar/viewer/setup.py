@@ -23,8 +23,8 @@ from warp_ar.checks.finding import Finding
 from warp_ar.errors import UsageError, WarpArError
 from warp_ar.scene import Camera, Pose, Probe, Scene
 from warp_ar.tracking.tracking import TrackState
-from warp_ar.viewer.background import begin
-from warp_ar.viewer.controls import Controls, Notify
+from warp_ar.viewer.controls import Controls
+from warp_ar.viewer.messages import Notify, begin
 
 Image = npt.NDArray[np.uint8]
 
