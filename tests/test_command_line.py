@@ -1,6 +1,7 @@
 """What commands share: the collector of garbage while things are loaded, and at the end."""
 
 import gc
+import json
 import os
 import pathlib
 import signal
@@ -13,8 +14,11 @@ import weakref
 import pytest
 
 from warp_ar.begin import EXIT_INTERRUPTED, EXIT_TERMINATED
-from warp_ar.command_line import Parser, Terminated, ended_by_signals, loading
+from warp_ar.command_line import Parser, Terminated, ended_by_signals, loading, run_command
 from warp_ar.errors import UsageError
+
+FOUND = {**os.environ, "PYTHONPATH": str(pathlib.Path(__file__).parents[1])}
+"""Environment in which the package is found from any folder."""
 
 
 class Node:
@@ -98,6 +102,48 @@ def test_output_that_nobody_reads_or_that_does_not_fit_is_no_traceback():
     finally:
         os.close(writer)
     assert (done.returncode, done.stderr) == (141, "")
+
+
+@pytest.mark.parametrize("kind", ["closed", "broken"])
+@pytest.mark.parametrize("way", ["page", "clip"])
+def test_nobody_has_to_listen_to_what_is_said(way, kind, tmp_path):
+    """Frames are lit whether or not somebody reads the standard error; nothing of it comes into a file."""
+    report = tmp_path / "report.json"
+    options = ["--headless", "--report", report] if way == "clip" else ["--port", "0", "--no-browser"]
+    command = [sys.executable, "-m", "warp_ar.live", "desk", "--frames", "2", "--device", "cpu", "--quality", "paper"]
+    read, write = os.pipe()
+    os.close(read)
+    done = subprocess.run(
+        [*command, *options],
+        stdout=subprocess.PIPE,
+        stderr=write,
+        preexec_fn=(lambda: os.close(2)) if kind == "closed" else None,
+        check=False,
+    )
+    os.close(write)
+    assert done.returncode == 0
+    if way == "clip":
+        assert len(json.loads(report.read_text())["frames"]) == 2
+    else:
+        assert b"is at http" in done.stdout
+
+
+def test_a_folder_that_was_deleted_is_told_in_one_line(tmp_path):
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    script = "import os, sys; os.rmdir(os.getcwd()); from warp_ar.init import main; sys.exit(main(['desk']))"
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=gone, env=FOUND, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (2, "warp_ar: the current folder is gone; run this in another one\n")
+
+
+def test_too_little_memory_is_told_in_one_line(capsys):
+    def command():
+        raise MemoryError("Unable to allocate 9 TiB")
+
+    assert run_command(command) == 1
+    assert capsys.readouterr().err == "warp_ar: there is not enough memory: Unable to allocate 9 TiB\n"
 
 
 def test_letters_that_a_terminal_does_not_know_are_numbers():

@@ -15,7 +15,7 @@ from PIL import Image
 
 from tests.gltf_files import Gltf
 from tests.test_pipeline import make_scene
-from warp_ar.errors import UsageError, WarpArError
+from warp_ar.errors import SinkError, UsageError, WarpArError
 from warp_ar.light.captured import Light
 from warp_ar.output.places import files_of
 from warp_ar.scene import SourceSpec, dumps_scene, load_scene
@@ -291,8 +291,65 @@ def test_zips_of_others_are_refused(files, wanted, tmp_path, members, said):
     assert list(tmp_path.iterdir()) == [], "what was refused was kept"
 
 
-def test_what_is_no_zip_is_refused(files, wanted, bundle):
+def raw_zip(*names):
+    """A ZIP of a scene and of small members by any name."""
+    return packed(**{"scene.toml": SCENE_OF_ONE}, **dict.fromkeys(names, b"x" * 50))
+
+
+def corrupt():
+    """A ZIP whose compressed bytes are no deflate stream; its directory is in order."""
+    data = bytearray(packed(**{"scene.toml": SCENE_OF_ONE * 20}))
+    data[len(b"scene.toml") + 30 : len(b"scene.toml") + 60] = b"\xff" * 30
+    return bytes(data)
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (corrupt(), "no ZIP that can be unpacked"),
+        (raw_zip("a.bin", "a.bin__b.bin"), "a.bin is a file and a folder"),
+        (raw_zip("n" * 300 + ".bin"), "304 characters"),
+        (raw_zip("__".join(["folder"] * 700) + ".bin"), "folders within each other"),
+        (raw_zip("__".join(["d"] * 2000) + ".bin"), "folders within each other"),
+    ],
+    ids=["deflate", "both", "name", "path", "levels"],
+)
+def test_zips_that_no_folder_can_hold_are_refused(files, wanted, tmp_path, data, said):
+    with pytest.raises(UsageError, match=said):
+        files.take("desk.zip", data, wanted)
+    assert list(tmp_path.iterdir()) == [], "what was refused was kept"
+
+
+@pytest.mark.parametrize(
+    "error", [RuntimeError("broken"), MemoryError(), RecursionError(), OSError(28, "No space left")]
+)
+def test_nothing_is_kept_whatever_goes_wrong(files, wanted, tmp_path, monkeypatch, error):
+    monkeypatch.setattr(uploads, "load_mesh", lambda path: (_ for _ in ()).throw(error))
+    for _ in range(uploads.MOST_FILES + 1):
+        with pytest.raises(SinkError if isinstance(error, OSError) else type(error)):
+            files.take("box.ply", box(0.1, 0.1, 0.1), wanted)
+        assert list(tmp_path.iterdir()) == []
+    monkeypatch.undo()
+    files.take("box.ply", box(0.1, 0.1, 0.1), wanted)
+
+
+def test_all_files_together_have_a_limit(files, wanted, tmp_path, monkeypatch):
+    data = box(0.1, 0.1, 0.1)
+    monkeypatch.setattr(uploads, "MOST_KEPT_BYTES", 2 * len(data))
+    for _ in range(2):
+        files.take("box.ply", data, wanted)
+    with pytest.raises(UsageError, match="bytes would be kept"):
+        files.take("box.ply", data, wanted)
+    bomb = packed(**{"scene.toml": SCENE_OF_ONE.partition("[[object]]")[0], "big.bin": bytes(1 << 20)})
+    monkeypatch.setattr(uploads, "MOST_KEPT_BYTES", 2 * len(data) + len(bomb))
+    with pytest.raises(UsageError, match="would be kept"):
+        files.take("bomb.zip", bomb, wanted)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["00", "01"]
+
+
+def test_what_is_no_zip_is_refused(wanted, bundle, tmp_path_factory):
     _, data = bundle
+    files = DroppedFiles(tmp_path_factory.mktemp("own"))
     for spoiled in (b"PK", b"", data[:300], data[:-400]):
         with pytest.raises(UsageError, match="no ZIP that can be unpacked"):
-            DroppedFiles(files._folder).take("desk.zip", spoiled, wanted)
+            files.take("desk.zip", spoiled, wanted)

@@ -10,6 +10,7 @@ import random
 import tempfile
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import aiohttp
 import cv2
@@ -18,6 +19,7 @@ import pytest
 
 from tests.viewer_rig import Page, is_refused, jpeg, mutated, picture_message, run, served
 from warp_ar.light.captured import Light as CapturedMap
+from warp_ar.viewer import uploads
 from warp_ar.viewer.backend import MOST_VIEWERS
 from warp_ar.viewer.protocol import Bucket
 from warp_ar.viewer.uploads import MOST_BYTES
@@ -108,6 +110,15 @@ async def test_files_are_dropped() -> None:
         async with site.session.post(f"{site.url}/drop/x.exr", data=light[:60]) as response:
             assert response.status == 422
             assert (await response.text()).startswith("x.exr")
+        for error, status, said in (
+            (OSError(28, "No space left on device"), 507, "No space left"),
+            (ZeroDivisionError("broken"), 422, "ZeroDivisionError: broken"),
+        ):
+            with pytest.MonkeyPatch.context() as patched:
+                patched.setattr(uploads, "load_mesh", Mock(side_effect=error))
+                async with site.session.post(f"{site.url}/drop/x.ply", data=b"ply") as response:
+                    assert response.status == status
+                    assert said in await response.text()
         too_large = io.BytesIO(bytes(MOST_BYTES + 1))
         with contextlib.suppress(aiohttp.ClientError, ConnectionError):  # refused before all of it was sent
             async with site.session.post(f"{site.url}/drop/large.ply", data=too_large) as response:

@@ -31,13 +31,20 @@ def begin(name: str) -> NoReturn:
     """Import the module of a command, run its ``main``, and end the process with the exit code that it returns."""
     # NumPy's BLAS: products here are small, and would otherwise be shared among a thread for each core.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    if sys.stderr is not None:
-        faulthandler.enable()  # should native code crash, the report says what it was at
+    if sys.stderr is None:
+        # Closed by whoever started this (2>&-). The next file that is opened would take its place, and get its lines.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
+        sys.stderr = os.fdopen(2, "w")
+    faulthandler.enable()  # should native code crash, the report says what it was at
     # For good: when the command is done there is nothing either that an exception would put in order.
     for signal_name in _heeded():
         signal.signal(getattr(signal, signal_name), end_at_once)
-    with importing():
-        module = importlib.import_module(name)
+    try:
+        with importing():
+            module = importlib.import_module(name)
+    except MemoryError:
+        print("warp_ar: there is not enough memory to load the libraries", file=sys.stderr)
+        sys.exit(1)
     leave(module.main())
 
 

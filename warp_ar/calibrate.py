@@ -36,8 +36,8 @@ from warp_ar.calibration.grey_response import MOST_DEVIATION, measure_grey_respo
 from warp_ar.calibration.response import measure_response, write_response
 from warp_ar.checks.check_ball import DULL, inside_contrast
 from warp_ar.checks.checkup import source_of
-from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, run_command, say
-from warp_ar.errors import UsageError
+from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, run_command
+from warp_ar.errors import UsageError, say
 from warp_ar.output.places import check_places, check_replaceable
 from warp_ar.scene import CharucoBoard, Marker, bundled_scenes, load_scene, loads_scene
 from warp_ar.scene.amend import amend_scene

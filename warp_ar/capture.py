@@ -18,8 +18,8 @@ import numpy as np
 
 from warp_ar.ball.ball_finder import BallOutline
 from warp_ar.checks.check_objects import check_objects, written_poses
-from warp_ar.command_line import EXIT_DONE, Parser, run_command, say
-from warp_ar.errors import SinkError, UsageError, reason
+from warp_ar.command_line import EXIT_DONE, Parser, run_command
+from warp_ar.errors import SinkError, UsageError, reason, say
 from warp_ar.files import write_whole
 from warp_ar.output.places import check_places, check_replaceable
 from warp_ar.output.sink import make_folder

@@ -20,7 +20,7 @@ from types import FrameType
 from typing import Any, NoReturn
 
 from warp_ar.begin import EXIT_INTERRUPTED, EXIT_TERMINATED, end_at_once, handling
-from warp_ar.errors import SinkError, UsageError, WarpArError, printable, reason
+from warp_ar.errors import SinkError, UsageError, WarpArError, reason, say
 from warp_ar.output.sink import close_open_sinks
 
 EXIT_DONE = 0
@@ -31,8 +31,6 @@ EXIT_PIPE = 141
 
 _LARGEST = 2**31 - 1
 """Largest whole number of an argument: they count frames, samples, pixels, ports."""
-_LONGEST = 1000
-"""Characters of a message that are shown: a path may have thousands."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -85,14 +83,6 @@ class Terminated(KeyboardInterrupt):
     """The process was asked to end by SIGTERM or SIGHUP; it does so as after Ctrl-C."""
 
 
-def say(text: object) -> None:
-    """Print a line to stderr: on one line, and with nothing in it that a terminal would obey."""
-    shown = printable(text)
-    if len(shown) > _LONGEST:
-        shown = f"{shown[: _LONGEST * 2 // 3]}... ({len(shown)} characters) ...{shown[-_LONGEST // 4 :]}"
-    print(f"warp_ar: {shown}", file=sys.stderr)
-
-
 def run_command(command: Callable[[], int], failures: type[WarpArError] | tuple[type[WarpArError], ...] = ()) -> int:
     """Run a command; what a user can cause is one line, and a signal ends it in order.
 
@@ -122,7 +112,13 @@ def run_command(command: Callable[[], int], failures: type[WarpArError] | tuple[
         return EXIT_TERMINATED
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
+    except MemoryError as error:
+        say(f"there is not enough memory: {reason(error)}")
+        return EXIT_FAILED
     except OSError as error:
+        if _folder_is_gone():
+            say("the current folder is gone; run this in another one")
+            return EXIT_USAGE
         if error.filename is not None or error.errno not in (errno.EPIPE, errno.ENOSPC):
             raise
         _drop_output()
@@ -130,6 +126,15 @@ def run_command(command: Callable[[], int], failures: type[WarpArError] | tuple[
             return EXIT_PIPE
         say(f"what this command prints cannot be written: {reason(error)}")
         return EXIT_FAILED
+
+
+def _folder_is_gone() -> bool:
+    """Return True if the folder that this process runs in was deleted."""
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        return True
+    return False
 
 
 def _drop_output() -> None:

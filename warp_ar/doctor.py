@@ -22,8 +22,8 @@ from warp_ar.begin import importing
 from warp_ar.checks.check_pictures import Look
 from warp_ar.checks.checkup import FRAMES, check_and_look, source_of
 from warp_ar.checks.finding import Finding, worst_first
-from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, run_command, say
-from warp_ar.errors import UsageError, printable
+from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, run_command
+from warp_ar.errors import UsageError, printable, say
 from warp_ar.scene import Pose, Scene, bundled_scenes, load_scene
 from warp_ar.scene.amend import amend_scene
 

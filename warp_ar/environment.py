@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, run_command, say
-from warp_ar.errors import SinkError, UsageError
+from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, run_command
+from warp_ar.errors import SinkError, UsageError, say
 from warp_ar.output.color_spaces import COLOR_SPACES, grey_card_scale
 from warp_ar.output.environment_axes import AXES, LAYOUTS
 from warp_ar.output.environment_file import (

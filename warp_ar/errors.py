@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
+import sys
 
 
 class WarpArError(Exception):
@@ -38,3 +40,16 @@ _UNPRINTABLE = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2
 def printable(text: object) -> str:
     r"""A text on one line that a terminal shows as it is: control characters become ``\x1b`` and the like."""
     return _UNPRINTABLE.sub(lambda match: match[0].encode("unicode_escape").decode(), str(text))
+
+
+_LONGEST = 1000
+"""Characters of a message that are shown: a path may have thousands."""
+
+
+def say(text: object) -> None:
+    """Print a line to stderr: on one line, and with nothing in it that a terminal would obey."""
+    shown = printable(text)
+    if len(shown) > _LONGEST:
+        shown = f"{shown[: _LONGEST * 2 // 3]}... ({len(shown)} characters) ...{shown[-_LONGEST // 4 :]}"
+    with contextlib.suppress(OSError, ValueError):  # nobody may listen any more: what runs goes on
+        print(f"warp_ar: {shown}", file=sys.stderr, flush=True)

@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from warp_ar.begin import importing
-from warp_ar.command_line import EXIT_DONE, Parser, run_command, say
-from warp_ar.errors import SinkError, SourceError, UsageError
+from warp_ar.command_line import EXIT_DONE, Parser, run_command
+from warp_ar.errors import SinkError, SourceError, UsageError, say
 from warp_ar.output.environment_file import write_environment
 from warp_ar.output.gltf_file import GLTF_SUFFIX, write_glb
 from warp_ar.output.places import check_places, check_replaceable, files_of

@@ -16,8 +16,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from warp_ar.begin import EXIT_INTERRUPTED, EXIT_TERMINATED, handling, importing
-from warp_ar.command_line import EXIT_DONE, loading, say
-from warp_ar.errors import UsageError, WarpArError, printable, reason
+from warp_ar.command_line import EXIT_DONE, loading
+from warp_ar.errors import UsageError, WarpArError, printable, reason, say
 from warp_ar.files import write_whole
 from warp_ar.live_start import hurry_compilers, say_quick_check
 from warp_ar.output.encoders import parse_options

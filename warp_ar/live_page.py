@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from warp_ar.begin import EXIT_INTERRUPTED, EXIT_TERMINATED, importing
-from warp_ar.command_line import EXIT_DONE, EXIT_USAGE, Terminated, loading, say
-from warp_ar.errors import UsageError, WarpArError, printable
+from warp_ar.command_line import EXIT_DONE, EXIT_USAGE, Terminated, loading
+from warp_ar.errors import UsageError, WarpArError, printable, say
 from warp_ar.live_start import hurry_compilers, say_quick_check
 from warp_ar.scene import Scene, load_scene
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Final
 
-from warp_ar.command_line import say
-from warp_ar.errors import WarpArError
+from warp_ar.errors import WarpArError, say
 from warp_ar.output.places import files_of
 from warp_ar.scene import Scene, bundled_scenes
 

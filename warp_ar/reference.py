@@ -27,8 +27,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from warp_ar.accuracy.known_frame import KnownFrame, light_up_to
 from warp_ar.accuracy.path_tracer import DEFAULT_SAMPLES, PathTracer, TracedPicture
-from warp_ar.command_line import EXIT_DONE, Parser, run_command, say
-from warp_ar.errors import SinkError, SourceError, UsageError, reason
+from warp_ar.command_line import EXIT_DONE, Parser, run_command
+from warp_ar.errors import SinkError, SourceError, UsageError, reason, say
 from warp_ar.exr_file import write_exr
 from warp_ar.files import write_whole
 from warp_ar.light.captured import Light

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from warp_ar.begin import importing
-from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, run_command, say
-from warp_ar.errors import UsageError, printable
+from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, run_command
+from warp_ar.errors import UsageError, printable, say
 from warp_ar.farm.jobs import parse_jobs, read_jobs
 from warp_ar.farm.manifest import Manifest, RunError, begin_run, clear_aside, load_run, locked
 from warp_ar.farm.status import read_status, status_lines, words_of_seconds

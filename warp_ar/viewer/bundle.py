@@ -6,6 +6,7 @@ import dataclasses
 import io
 import re
 import zipfile
+import zlib
 from pathlib import Path, PurePosixPath
 from typing import Any, Final, TypeVar
 
@@ -22,6 +23,10 @@ _KINDS: Final = {*MESH_SUFFIXES, ".mtl", ".bin", ".exr", ".txt", ".json", ".usda
     *(".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".gif", ".ppm", ".ktx2")
 }
 """Endings of what a scene names."""
+LONGEST_NAME: Final = 200
+"""Characters of a member's name with its folders."""
+MOST_LEVELS: Final = 8
+"""Folders within each other that a member may lie in."""
 _T = TypeVar("_T")
 
 
@@ -61,7 +66,7 @@ def unpack_scene(name: str, data: bytes, folder: Path, most: int) -> Path:
     Args:
         name: To show.
         data: The ZIP; nothing of it is trusted.
-        folder: It must not be there yet.
+        folder: Empty folder for its files.
         most: Bytes that it may unpack to.
 
     Raises:
@@ -78,7 +83,7 @@ def unpack_scene(name: str, data: bytes, folder: Path, most: int) -> Path:
                     contents[member.filename] = opened.read(member.file_size + 1)
                 if len(contents[member.filename]) != member.file_size:
                     raise UsageError(f"{name}: {_shown(member.filename)} is not as large as its header says")
-    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, OSError) as error:
+    except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, OSError) as error:
         raise UsageError(f"{name}: no ZIP that can be unpacked: {str(error)[:120]}") from error
     for inside, content in contents.items():
         path = folder / inside
@@ -97,9 +102,15 @@ def _check_members(name: str, members: list[zipfile.ZipInfo], most: int) -> None
         raise UsageError(f"{name} unpacks to {size:,} bytes; at most {most:,} are taken")
     for inside in names:
         parts = PurePosixPath(inside)
+        if len(inside) > LONGEST_NAME or len(parts.parts) > MOST_LEVELS + 1:
+            limits = f"at most {LONGEST_NAME} characters and {MOST_LEVELS} folders within each other are taken"
+            raise UsageError(f"{name}: {_shown(inside)} ... has {len(inside)} characters; {limits}")
         plain = re.fullmatch(r"[\w .()-]+(/[\w .()-]+)*", inside) and ".." not in parts.parts
         if not plain or (inside != SCENE and parts.suffix.lower() not in _KINDS):
             raise UsageError(f"{name}: {_shown(inside)} is nothing that a scene names")
+    folders = {str(folder) for inside in names for folder in PurePosixPath(inside).parents}
+    if both := folders.intersection(names):
+        raise UsageError(f"{name}: {_shown(min(both))} is a file and a folder")
 
 
 def _moved(value: _T, places: dict[Path, Path]) -> _T:

@@ -332,10 +332,10 @@ class Wanted:
 
 
 def beside(scene: Scene, folder: Path) -> Scene:
-    """The scene with files of a folder named as if they lay beside its own file."""
+    """Return the scene with files in a folder named as if they lay beside its own file."""
 
     def named(path: Any) -> Any:
-        return Path(path.name) if isinstance(path, Path) and path.parent == folder else path
+        return Path(path.name) if isinstance(path, Path) and path.is_relative_to(folder) else path
 
     captured = scene.captured
     return dataclasses.replace(

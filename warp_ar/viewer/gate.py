@@ -16,13 +16,13 @@ import errno
 import itertools
 import socket
 import ssl
-import sys
 import time
 from collections.abc import Iterable
 from typing import Any, Final
 
 from aiohttp import web
 
+from warp_ar.errors import say
 from warp_ar.viewer import protocol
 
 HEADER_SECONDS: Final = 10.0
@@ -294,8 +294,4 @@ class Gate:
         now = time.monotonic()
         if now - self._told >= TOLD_SECONDS:
             self._told = now
-            print(
-                f"warp_ar: too many connections are open; those that wait longest are cut ({self._cut} so far)",
-                file=sys.stderr,
-                flush=True,
-            )
+            say(f"too many connections are open; those that wait longest are cut ({self._cut} so far)")

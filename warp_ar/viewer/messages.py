@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import traceback
 from collections.abc import Callable
@@ -34,7 +35,7 @@ def failure(error: BaseException, then: str = "the frames go on") -> dict[str, A
     """
     if isinstance(error, WarpArError):
         return notice(str(error), bad=True)
-    if sys.stderr is not None:
+    with contextlib.suppress(OSError, ValueError):  # nobody may read it any more
         traceback.print_exception(error, file=sys.stderr)
     return notice(f"this failed: {type(error).__name__}: {reason(error)[:_LONGEST]}; {then}", bad=True)
 

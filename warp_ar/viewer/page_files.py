@@ -9,12 +9,15 @@ from typing import Final
 
 from aiohttp import web
 
-from warp_ar.errors import WarpArError
+from warp_ar.errors import SinkError, WarpArError
 from warp_ar.viewer.backend import Backend
+from warp_ar.viewer.messages import failure
 from warp_ar.viewer.uploads import MOST_BYTES
 
 DROP_SECONDS: Final = 60.0
 """How long a dropped file may be on its way."""
+DROPS: Final = 4
+"""Files that may be on their way at once: a slow one does not hold up the others."""
 _TYPES: Final = {
     "html": "text/html; charset=utf-8",
     "css": "text/css; charset=utf-8",
@@ -29,7 +32,7 @@ class PageFiles:
     def __init__(self, app: web.Application, backend: Backend) -> None:
         """Add them to the server's application."""
         self._backend = backend
-        self._taking = False
+        self._coming = 0
         # Read once: no request's path ever becomes a file's.
         folder = importlib.resources.files("warp_ar.viewer") / "static"
         self._static = {item.name: item.read_bytes() for item in folder.iterdir() if item.name.split(".")[-1] in _TYPES}
@@ -82,9 +85,9 @@ class PageFiles:
         """Take a file that was dropped onto the picture; its answer says in words what became of it."""
         host = await self._backend.started()
         name = request.match_info["name"]
-        if self._taking:
-            return web.Response(status=429, text="another file is being taken: wait until it is there\n")
-        self._taking = True
+        if self._coming >= DROPS:
+            return web.Response(status=429, text=f"{DROPS} files are on their way already: wait until one is there\n")
+        self._coming += 1
         try:
             # Its own bound, for all other requests have none worth the name; and not for ever.
             async with asyncio.timeout(DROP_SECONDS):
@@ -103,8 +106,10 @@ class PageFiles:
             return web.Response(
                 status=400, text="the file did not come whole\n"
             )  # nobody hears it: the sender has gone
-        except WarpArError as error:
-            return web.Response(status=422, text=f"{error}\n")
+        except SinkError as error:
+            return web.Response(status=507, text=f"{error}\n")
+        except Exception as error:
+            return web.Response(status=422, text=failure(error, "nothing was changed")["text"] + "\n")
         finally:
-            self._taking = False
+            self._coming -= 1
         return web.Response(text=f"{words}\n")

@@ -17,7 +17,7 @@ from typing import Any, Final
 import cv2
 import numpy as np
 
-from warp_ar.errors import SceneError, UsageError, WarpArError
+from warp_ar.errors import SceneError, SinkError, UsageError, WarpArError, reason
 from warp_ar.files import limits, parse_toml, too_much
 from warp_ar.light.captured import Light
 from warp_ar.light.latlong_axes import from_axes
@@ -32,6 +32,8 @@ MOST_BYTES: Final = 1 << 26
 """Of one file: 64 MB."""
 MOST_FILES: Final = 32
 """Files that one run of the page keeps: edits that are undone still need theirs."""
+MOST_KEPT_BYTES: Final = 1 << 29
+"""Bytes of all files that one run of the page keeps: 512 MB."""
 MOST_TRIANGLES: Final = 1_000_000
 """Of a mesh: beyond that a page waits too long."""
 SIZES: Final = (0.02, 0.4)
@@ -51,9 +53,8 @@ class DroppedFiles:
     """Takes files; one at a time."""
 
     def __init__(self, folder: Path) -> None:
-        """Keep files in a folder, which must be there."""
+        """Keep files in numbered folders of ``folder``, which must be there."""
         self._folder, self._count = folder, 0
-        confine(folder)
 
     def take(self, name: str, data: bytes, wanted: Wanted) -> Edit:
         """Keep a file and say what to make of it.
@@ -64,7 +65,9 @@ class DroppedFiles:
             wanted: What is shown now.
 
         Raises:
-            WarpArError: It is none that can be used; it is not kept.
+            UsageError: It is none that can be used.
+            SinkError: The disk is full, or the file cannot be written for another reason.
+                Whatever is raised, nothing of the file is kept.
         """
         suffix = Path(name).suffix.lower()
         if suffix not in SUFFIXES:
@@ -76,27 +79,35 @@ class DroppedFiles:
         if self._count >= MOST_FILES:
             raise UsageError(f"{MOST_FILES} files were dropped already; start the program anew for more")
         stem = re.sub(r"[^A-Za-z0-9_-]+", "_", Path(name).stem)[:40] or "file"
-        path = self._folder / f"{self._count:02d}-{stem}{suffix}"
-        path.write_bytes(data)
+        # Each in a folder of its own, with all that is made of it: nothing else is to be removed where it is refused.
+        place = self._folder / f"{self._count:02d}"
+        path = place / f"{stem}{suffix}"
         try:
+            self._check_room(len(data))
+            place.mkdir()
+            confine(place)
             if suffix == ".zip":
-                edit = _bundle_edit(_shown(name), data, path.with_suffix(""), wanted)
-                path.unlink()
-            elif suffix in LIGHTS:
-                edit = _light_edit(_shown(name), path)
+                edit = _bundle_edit(_shown(name), data, place, wanted)
             else:
-                edit = _mesh_edit(_shown(name), path, wanted)
-        except WarpArError as error:
-            # The folder is nobody's business. What was made of a file lies beside it.
-            words = str(error)
-            for made in self._folder.glob(f"{path.stem}.*"):
-                words = words.replace(str(made), _shown(name))
-                made.unlink()
-            words = words.replace(str(path.with_suffix("")), _shown(name))
-            shutil.rmtree(path.with_suffix(""), ignore_errors=True)
-            raise UsageError(words) from error
+                path.write_bytes(data)
+                edit = _light_edit(_shown(name), path) if suffix in LIGHTS else _mesh_edit(_shown(name), path, wanted)
+            self._check_room(0)
+        except BaseException as error:
+            shutil.rmtree(place, ignore_errors=True)
+            if isinstance(error, OSError):
+                raise SinkError(f"{_shown(name)} cannot be kept: {reason(error)}") from error
+            if isinstance(error, WarpArError):  # the folder is nobody's business
+                words = re.sub(rf"{re.escape(str(path.with_suffix('')))}(\.\w+)?", _shown(name), str(error))
+                raise UsageError(words.replace(str(place), _shown(name))) from error
+            raise
         self._count += 1
         return edit
+
+    def _check_room(self, more: int) -> None:
+        """Refuse a file with which more would be kept than may be."""
+        kept = more + sum(file.stat().st_size for file in self._folder.glob("[0-9][0-9]/**/*") if file.is_file())
+        if kept > MOST_KEPT_BYTES:
+            raise UsageError(f"{kept:,} bytes would be kept; at most {MOST_KEPT_BYTES:,} are: start the program anew")
 
 
 def _shown(name: str) -> str:
