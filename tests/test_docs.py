@@ -9,6 +9,7 @@ import shlex
 
 import pytest
 
+from docs import tables
 from warp_ar.command_line import Parser
 from warp_ar.errors import UsageError
 
@@ -68,3 +69,8 @@ def test_benches_and_tools_exist(page: pathlib.Path) -> None:
 
 def test_pages_have_commands() -> None:
     assert sum(len(commands(page)) for page in PAGES) > 50
+
+
+def test_made_parts_are_those_of_the_code() -> None:
+    """``python -m docs.tables --write`` brings them up to date."""
+    assert tables.main([]) == 0

@@ -97,7 +97,7 @@ def test_all_commands_are_listed(capsys):
     assert __main__.main([]) == 0
     said = capsys.readouterr().out
     assert "python -m warp_ar.init my_desk" in said
-    from docs.hooks import COMMANDS
+    from docs.tables import COMMANDS
 
     assert {name.removesuffix(".cli") for name in COMMANDS} == set(__main__.COMMANDS)
 

@@ -1,12 +1,14 @@
-"""Parts of the documentation that are made from the code when the site is built.
+"""Parts of the documentation that are made from the code: keys, commands, stages, presets.
 
-A page says ``<!-- made: NAME -->`` where the part belongs.
+    python -m docs.tables            # name the pages that are out of date; exits with 1 if there are any
+    python -m docs.tables --write    # bring them up to date
+
+A page holds such a part between ``<!-- made: NAME -->`` and ``<!-- /made -->``.
 """
 
 from __future__ import annotations
 
 import argparse
-import functools
 import importlib
 import pathlib
 import re
@@ -74,11 +76,6 @@ def values_of(action: argparse.Action) -> str:
     return f"{name} ..." if action.nargs == "+" else name
 
 
-def paper_figures() -> str:
-    """The paper's figures as ``python -m warp_ar.paper --out docs/paper`` wrote them."""
-    return (pathlib.Path(__file__).parent / "paper" / "figures.md").read_text(encoding="utf-8")
-
-
 def stages() -> str:
     """Every stage: what it does, its methods, and the file of its kernels."""
     from warp_ar.stages import STAGES
@@ -113,26 +110,41 @@ def chosen(stage: str, quality: Any) -> str:
     return methods[-1] if method == "default" else method
 
 
-def example(name: str) -> str:
-    """A worked example as the changes that it makes."""
-    text = (pathlib.Path(__file__).parent / "examples" / f"{name}.diff").read_text(encoding="utf-8")
-    parts = re.split(r"^diff --git a/(\S+) b/\S+\n", text, flags=re.M)[1:]
-    shown = []
-    for path, change in zip(parts[::2], parts[1::2], strict=True):
-        lines = [line for line in change.splitlines() if not line.startswith(("index ", "--- ", "+++ ", "new file"))]
-        shown += [f'??? example "`{path}`"', "", "    ```diff", *(f"    {line}" for line in lines), "    ```", ""]
-    return "\n".join(shown)
-
-
 PARTS = {
     "scene-keys": scene_keys,
     "command-line": command_line,
     "stages": stages,
     "presets": presets,
-    "paper-figures": paper_figures,
-} | {f"example-{name}": functools.partial(example, name) for name in ("stage", "method", "scene-key", "source")}
+}
 
 
-def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Put the made parts into a page."""
-    return re.sub(r"<!-- made: ([\w-]+) -->", lambda match: PARTS[match[1]](), markdown)
+def with_parts(markdown: str) -> str:
+    """Return a page's text with every made part as the code has it today."""
+    made = r"<!-- made: ([\w-]+) -->.*?<!-- /made -->"
+    return re.sub(
+        made,
+        lambda match: f"<!-- made: {match[1]} -->\n{PARTS[match[1]]().strip()}\n<!-- /made -->",
+        markdown,
+        flags=re.DOTALL,
+    )
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Compare the pages with the code, or write them."""
+    parser = argparse.ArgumentParser(prog="python -m docs.tables", description="Tables of the pages.")
+    parser.add_argument("--write", action="store_true", help="bring the pages up to date")
+    options = parser.parse_args(arguments)
+    stale = []
+    for page in sorted(pathlib.Path(__file__).parent.glob("*.md")):
+        text = page.read_text(encoding="utf-8")
+        if (made := with_parts(text)) != text:
+            stale.append(page.name)
+            if options.write:
+                page.write_text(made, encoding="utf-8")
+    for name in stale:
+        print(f"docs/{name}: {'written' if options.write else 'out of date; python -m docs.tables --write mends it'}")
+    return int(bool(stale) and not options.write)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
