@@ -14,9 +14,9 @@ import warp as wp
 
 from bench.common import measure, report
 from bench.environments import environments
-from warp_ar.kernels.environment import irradiance, pyramid
+from warp_ar.kernels.environment import irradiance
 from warp_ar.kernels.latlong import direction_from_latlong, sample_latlong
-from warp_ar.stages.irradiance import CLUSTERS, MAP_SIZE, TOP_MIP_SIZE
+from warp_ar.stages.irradiance import CLUSTERS, MAP_SIZE
 
 HEIGHTS = (32, 64, 128)
 
@@ -47,20 +47,14 @@ def methods(environment: wp.array, device: Any) -> dict[str, tuple[Any, wp.array
     """Work and output of every method."""
     height, width = environment.shape
     with wp.ScopedDevice(device):
-        top, sh = wp.zeros(TOP_MIP_SIZE, dtype=wp.vec3), wp.zeros(9, dtype=wp.vec3)
-        two, four = (irradiance.make_sh_tables(height, width, order, device) for order in (2, 4))
-        sums2, sums4 = wp.zeros((height, 5), dtype=wp.vec3), wp.zeros((height, 9), dtype=wp.vec3)
-        coefficients, smooth = wp.zeros(25, dtype=wp.vec3), wp.zeros(MAP_SIZE, dtype=wp.vec3)
+        sh, sums = wp.zeros(9, dtype=wp.vec3), wp.zeros((height, 5), dtype=wp.vec3)
+        tables = irradiance.make_sh_tables(height, width, device)
         few, clustered = wp.zeros(math.prod(CLUSTERS), dtype=irradiance.Cluster), wp.zeros(MAP_SIZE, dtype=wp.vec3)
         all_, exact = wp.zeros(height * width, dtype=irradiance.Cluster), wp.zeros(MAP_SIZE, dtype=wp.vec3)
 
     def sh2() -> None:
-        irradiance.project_irradiance_sh(environment, two, sums2, sh)
+        irradiance.project_irradiance_sh(environment, tables, sums, sh)
         irradiance.window_sh(sh)
-
-    def sh4() -> None:
-        irradiance.project_irradiance_sh(environment, four, sums4, coefficients)
-        irradiance.evaluate_sh4(coefficients, smooth)
 
     def clusters() -> None:
         irradiance.gather_clusters(environment, CLUSTERS, few)
@@ -71,9 +65,7 @@ def methods(environment: wp.array, device: Any) -> dict[str, tuple[Any, wp.array
         irradiance.sum_clusters(all_, exact)
 
     return {
-        "top_mip": (lambda: pyramid.reduce_latlong(environment, top, scale=math.pi), top),
         "sh2": (sh2, sh),
-        "sh4": (sh4, smooth),
         "clusters": (clusters, clustered),
         "brute_force": (brute_force, exact),
     }

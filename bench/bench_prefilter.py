@@ -17,7 +17,6 @@ from bench.environments import environments
 from warp_ar.kernels.environment import prefilter, pyramid
 from warp_ar.kernels.environment.lobes import (
     Lobe,
-    box_weights,
     lobe_count,
     lobe_offset,
     lobe_rows,
@@ -41,20 +40,18 @@ def methods(environment: wp.array, lobe: Lobe, device: Any) -> dict[str, tuple[A
     def levels() -> wp.array:
         return wp.zeros(lobe_texels(height), dtype=wp.vec3, device=device)
 
-    box = wp.zeros(pyramid.packed_texels(height, 2 * height), dtype=wp.vec3, device=device)
-    blocks_done = wp.zeros(1, dtype=wp.int32, device=device)
+    mips = wp.zeros(pyramid.packed_texels(height, 2 * height), dtype=wp.vec3, device=device)
     row_energy = wp.zeros(lobe_rows(height), dtype=wp.vec3, device=device)
     energy = wp.zeros(lobe_count(height), dtype=wp.vec3, device=device)
 
-    def mix(numbers: np.ndarray, smooth: bool) -> tuple[Any, wp.array]:
+    def mix(numbers: np.ndarray) -> tuple[Any, wp.array]:
         out, weights = levels(), wp.array(numbers.astype(np.float32), dtype=wp.float32, device=device)
 
         def function() -> None:
-            pyramid.build_pyramid(environment, blocks_done, box, isotropic=smooth)
-            prefilter.mix_mips(box, weights, height, out, smooth=smooth)
-            if smooth:
-                prefilter.measure_energy(out, height, row_energy, energy)
-                prefilter.scale_levels(energy, height, out)
+            pyramid.build_pyramid(environment, mips)
+            prefilter.mix_mips(mips, weights, height, out)
+            prefilter.measure_energy(out, height, row_energy, energy)
+            prefilter.scale_levels(energy, height, out)
 
         return function, out
 
@@ -62,8 +59,8 @@ def methods(environment: wp.array, lobe: Lobe, device: Any) -> dict[str, tuple[A
         out, samples = levels(), make_lobe_samples(height, lobe, count, device)
 
         def function() -> None:
-            pyramid.build_pyramid(environment, blocks_done, box, isotropic=True)
-            prefilter.sample_lobes(box, samples, height, out)
+            pyramid.build_pyramid(environment, mips)
+            prefilter.sample_lobes(mips, samples, height, out)
             prefilter.measure_energy(out, height, row_energy, energy)
             prefilter.scale_levels(energy, height, out)
 
@@ -71,8 +68,7 @@ def methods(environment: wp.array, lobe: Lobe, device: Any) -> dict[str, tuple[A
 
     exact = levels()
     return {
-        "box_mip": mix(box_weights(height), False),
-        "energy_mip": mix(mip_weights(height, lobe), True),
+        "energy_mip": mix(mip_weights(height, lobe)),
         **{f"fis{count}": sample(count) for count in SAMPLES},
         "brute_force": (lambda: prefilter.integrate_lobes(environment, lobe, exact), exact),
     }

@@ -236,10 +236,9 @@ def make_environment_view(radiance: wp.array, confidence: wp.array, clipped: wp.
 
 @wp.struct
 class KeyLight:
-    """A dominant direction of the environment."""
+    """The dominant direction of the environment."""
 
     direction: wp.vec3  # unit, toward the light
-    irradiance: wp.vec3  # on a surface that faces it, from the texels that belong to it
     directionality: wp.float32  # 0 ambient environment .. 1 all light from this direction
 
 

@@ -44,7 +44,7 @@ def report(case) -> case_report.CaseReport:
     ]
     rows = tuple(
         sweep_module.Row(case.name, "irradiance", method, ms, error, flip, "last method", flip, flip, False)
-        for method, ms, error, flip in (("top_mip", 0.5, ArrayError(0.3, 2.0, -0.01), 0.1), ("sh2", 1.0, None, 0.0))
+        for method, ms, error, flip in (("sphere_mip", 0.5, ArrayError(0.3, 2.0, -0.01), 0.1), ("sh2", 1.0, None, 0.0))
     )
     wholes = tuple(
         case_report.Whole(label, ms, flip, {"irradiance": "sh2"}, {index: image})
@@ -55,6 +55,6 @@ def report(case) -> case_report.CaseReport:
     )
     region = np.zeros(camera.shape[:2], bool)
     region[100:140, 60:90] = True
-    pictures = {("irradiance", "top_mip"): images[0], ("irradiance", "sh2"): images[1]}
+    pictures = {("irradiance", "sphere_mip"): images[0], ("irradiance", "sh2"): images[1]}
     named = dataclasses.replace(case, name="<made> & so on")
     return case_report.CaseReport(named, {index: images[1]}, rows, pictures, wholes, region)

@@ -25,18 +25,23 @@ COSTS = Costs(
     20.0,
     {
         "environment_height": {"32": -2.0, "64": 0.0, "128": 8.0, "256": 36.0},
-        "irradiance": {"top_mip": -2.0, "sh2": 0.0, "sh4": 3.0, "clusters": 8.0},
-        "prefilter": {"box_mip": -2.0, "energy_mip": 0.0, "fis32": 5.0, "fis128": 20.0},
+        "irradiance": {"sphere_mip": -2.0, "sh2": 0.0, "clusters": 3.0, "brute_force": 8.0},
+        "prefilter": {"sphere_mip": -2.0, "energy_mip": 0.0, "fis128": 5.0, "brute_force": 20.0},
         "environment_shadow": {"none": -8.0, "coarse": 0.0, "bounce": 30.0},
     },
     {"environment_height": {"32": {"prefilter": 0.25}, "128": {"prefilter": 4.0}, "256": {"prefilter": 16.0}}},
 )
 BASE = {"environment_height": "64", "irradiance": "sh2", "prefilter": "energy_mip", "environment_shadow": "coarse"}
-CHEAPEST = {"environment_height": "32", "irradiance": "top_mip", "prefilter": "box_mip", "environment_shadow": "none"}
+CHEAPEST = {
+    "environment_height": "32",
+    "irradiance": "sphere_mip",
+    "prefilter": "sphere_mip",
+    "environment_shadow": "none",
+}
 ERRORS = {
     "environment_height": {"32": 0.03, "64": 0.01, "128": 0.007, "256": 0.0},
-    "irradiance": {"top_mip": 0.1, "sh2": 0.02, "sh4": 0.01, "clusters": 0.0},
-    "prefilter": {"box_mip": 0.04, "energy_mip": 0.01, "fis32": 0.005, "fis128": 0.0},
+    "irradiance": {"sphere_mip": 0.1, "sh2": 0.02, "clusters": 0.01, "brute_force": 0.0},
+    "prefilter": {"sphere_mip": 0.04, "energy_mip": 0.01, "fis128": 0.005, "brute_force": 0.0},
     "environment_shadow": {"none": 0.06, "coarse": 0.03, "bounce": 0.0},
 }
 UNSCALED = Costs(COSTS.base, COSTS.methods)
@@ -162,7 +167,7 @@ def test_a_tighter_budget_never_errs_less():
 def test_settings_that_multiply_are_priced_so():
     """The dearest methods of both add up to 56 ms and take 356."""
     adding, multiplying = (Controller(costs, ERRORS, 130.0) for costs in (UNSCALED, COSTS))
-    both = {"environment_height": "256", "prefilter": "fis128"}
+    both = {"environment_height": "256", "prefilter": "brute_force"}
     assert both.items() <= adding.settings.items(), "as if costs added up, both would fit"
     assert not both.items() <= multiplying.settings.items()
     assert COSTS.base + COSTS.excess(multiplying.settings) <= AIM * 130.0

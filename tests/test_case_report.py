@@ -15,16 +15,16 @@ pytest.importorskip("flip_evaluator")
 
 def test_choices_are_made_from_the_committed_list(report, monkeypatch):
     """Not from the errors of the case that they are scored on, unless there is no list yet."""
-    listed = {"irradiance": {"top_mip": 0.7, "sh2": 0.2}}
+    listed = {"irradiance": {"sphere_mip": 0.7, "sh2": 0.2}}
     monkeypatch.setattr(case_report, "load_errors", lambda: listed)
     assert case_report.listed_errors(report.rows) is listed
-    monkeypatch.setattr(case_report, "load_errors", lambda: {"irradiance": {"top_mip": 0.0, "sh2": 0.0}})
-    assert case_report.listed_errors(report.rows) == {"irradiance": {"top_mip": 0.1, "sh2": 0.0}}
+    monkeypatch.setattr(case_report, "load_errors", lambda: {"irradiance": {"sphere_mip": 0.0, "sh2": 0.0}})
+    assert case_report.listed_errors(report.rows) == {"irradiance": {"sphere_mip": 0.1, "sh2": 0.0}}
 
 
 def test_all_work_is_announced(case, device, monkeypatch):
     """What is reported as done adds up to what was promised: the time left ends at zero."""
-    cheap = [dataclasses.replace(setting("irradiance"), methods=("top_mip", "sh2", "brute_force"))]
+    cheap = [dataclasses.replace(setting("irradiance"), methods=("sphere_mip", "sh2", "brute_force"))]
     monkeypatch.setattr(case_report, "RUNS", ("paper", "low"))
     done = []
     truth = dataclasses.replace(case, truth={3: case.frames[3].image})

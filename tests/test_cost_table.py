@@ -32,7 +32,7 @@ def test_what_is_turned_is_set(setting):
 
 
 def test_turning_changes_nothing_else():
-    turned = turn(PRESETS["medium"], {"irradiance": "sh4", "edge_samples": "16"})
+    turned = turn(PRESETS["medium"], {"irradiance": "sh2", "edge_samples": "16"})
     for setting in SETTINGS:
         if setting.name not in ("irradiance", "edge_samples"):
             assert chosen(turned, setting) == chosen(PRESETS["medium"], setting)
@@ -144,12 +144,10 @@ def test_price_list_is_checked():
         read_errors({})
     with pytest.raises(UsageError, match=r"errors\.irradiance\.sh2 is -1"):
         read_errors({"errors": {"irradiance": {"sh2": -1}}})
-    errors = read_errors({"errors": {"irradiance": {"top_mip": 0.5, "sh4": 0.1}}})
+    errors = read_errors({"errors": {"irradiance": {"sphere_mip": 0.5, "clusters": 0.1}}})
     assert errors["irradiance"] == {
-        "sphere_mip": 0.0,
-        "top_mip": 0.5,
+        "sphere_mip": 0.5,
         "sh2": 0.5,
-        "sh4": 0.1,
         "clusters": 0.1,
         "brute_force": 0.1,
     }

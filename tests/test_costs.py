@@ -15,7 +15,9 @@ from warp_ar.engine.pipeline import Pipeline
 from warp_ar.stages.quality import PRESETS
 
 SETTING = next(setting for setting in SETTINGS if setting.name == "irradiance")
-KEPT = Costs(12.5, {"irradiance": {"sh2": 0.0, "sh4": 1.25}}, {"irradiance": {"sh4": {"prefilter": 2.0}}}, 2.5, 20.0)
+KEPT = Costs(
+    12.5, {"irradiance": {"sh2": 0.0, "clusters": 1.25}}, {"irradiance": {"clusters": {"prefilter": 2.0}}}, 2.5, 20.0
+)
 
 
 def test_costs_are_kept(tmp_path):
@@ -36,7 +38,7 @@ def test_costs_are_kept(tmp_path):
         '{"a": {"base": "x", "methods": {"irradiance": {"sh2": 0}}}}',
         '{"a": {"base": 1, "methods": {"irradiance": {"sh9": 0}}}}',
         '{"a": {"base": 1, "methods": {"irradiance": {}}}}',
-        '{"a": {"base": 1, "methods": {"prefilter": {"box_mip": 0}}}}',
+        '{"a": {"base": 1, "methods": {"prefilter": {"energy_mip": 0}}}}',
         '{"a": {"base": 1, "methods": {"irradiance": {"sh2": 0}}}}',
         '{"a": {"base": 1, "methods": {"irradiance": {"sh2": 0}}, "scales": [], "track": 0, "work": 1}}',
     ],

@@ -8,8 +8,7 @@ import warp as wp
 
 from warp_ar.kernels import structs
 from warp_ar.kernels.color import decode_table
-from warp_ar.kernels.environment import fill
-from warp_ar.kernels.environment.fill_frame import FRAME_TRUST, OWN_SHADOW, fill_frame, see_frame
+from warp_ar.kernels.environment.fill_frame import FRAME_TRUST, OWN_SHADOW, fill_frame
 from warp_ar.scene import loads_scene
 from warp_ar.scene.kinds import trace_config
 from warp_ar.scene.ray_scene import HostScene
@@ -102,28 +101,6 @@ def test_a_map_is_that_of_its_ball(device):
     second = filled(device, ramp(), SCENE + PLANE, seed, balls=balls, ball=1).copy()
     np.testing.assert_array_equal(second, filled(device, ramp(), SCENE + PLANE, seed, balls=balls[::-1]))
     assert (second != filled(device, ramp(), SCENE + PLANE, seed, balls=balls)).any()
-
-
-def test_what_the_frame_shows_may_be_looked_up_first(device):
-    """Before the ball's own picture is known: both ways end with the same map."""
-    random, shape = np.random.default_rng(5), (HEIGHT, WIDTH)
-    balls = ((0.0, 0.0, 0.1), (0.1, 0.15, 0.06))
-    radiance = wp.array(random.uniform(0.0, 1.0, (*shape, 3)), dtype=wp.vec3, device=device)
-    confidence = random.uniform(0.0, 1.0, shape) * (random.uniform(size=shape) > 0.3)
-    confidence = wp.array(confidence, dtype=wp.float32, device=device)
-    _host, arguments, proxies = given(device, ramp(), SCENE + PLANE, balls)
-    size = fill.fill_level_offsets(*shape)[-1]
-    for ball in range(2):
-        at_once, first = (wp.zeros(size, dtype=wp.vec4, device=device) for _ in range(2))
-        seen = wp.empty(shape, dtype=wp.vec4, device=device)
-        fill.seed_fill(radiance, confidence, at_once)
-        bare = at_once.numpy().copy()
-        fill_frame(*arguments, at_once, shape, proxies=proxies, ball=ball)
-        see_frame(*arguments, seen, proxies=proxies, ball=ball)
-        fill.seed_fill(radiance, confidence, first, seen=seen)
-        # NVRTC joins products and sums in each kernel as it likes.
-        np.testing.assert_allclose(first.numpy(), at_once.numpy(), rtol=0.0 if device == "cpu" else 1e-6)
-        assert (at_once.numpy() != bare).any(axis=-1).sum() > 300
 
 
 def test_at_infinity_a_direction_is_where_the_camera_looks_along_it(device):

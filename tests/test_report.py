@@ -20,12 +20,12 @@ def test_records_and_tables_hold_every_method(report):
     with console.file:
         report_module.print_report(report, console)
     text = console.export_text()
-    assert all(word in text for word in ("top_mip", "sh2", "30.00%", "ours near the"))
+    assert all(word in text for word in ("sphere_mip", "sh2", "30.00%", "ours near the"))
 
 
 def test_cost_table_is_what_choices_read(report):
     made = report_module.make_cost_table([report, report], "cpu")
     errors = read_errors(json.loads(json.dumps(made)))
-    assert errors["irradiance"]["top_mip"] == pytest.approx(0.1)
+    assert errors["irradiance"]["sphere_mip"] == pytest.approx(0.1)
     assert errors["irradiance"]["sh2"] == 0.0
-    assert made["stage_errors"]["irradiance"] == {"top_mip": 0.3}
+    assert made["stage_errors"]["irradiance"] == {"sphere_mip": 0.3}

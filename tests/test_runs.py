@@ -17,7 +17,7 @@ MAP = 3e-3
 
 def test_sparse_runs_keep_the_light(case, device):
     """Frames before the one that counts may run at another quality without a trace."""
-    other = PRESETS["low"].with_methods(irradiance="sh4")
+    other = PRESETS["low"].with_methods(irradiance="sh2")
     full = runs.run(case, PRESETS["low"], device, setting("recover"))
     sparse = runs.run(case, PRESETS["low"], device, setting("recover"), between=other)
     np.testing.assert_array_equal(sparse.output, full.output)
@@ -26,7 +26,7 @@ def test_sparse_runs_keep_the_light(case, device):
 
 def test_in_turn_is_alone(case, device):
     """Qualities that run in turn do not touch each other."""
-    qualities = {"a": PRESETS["low"], "b": PRESETS["low"].with_methods(irradiance="sh4")}
+    qualities = {"a": PRESETS["low"], "b": PRESETS["low"].with_methods(irradiance="sh2")}
     times, images = runs.run_in_turn(case, qualities, device, time.perf_counter)
     for label, quality in qualities.items():
         alone = runs.run(case, quality, device)
@@ -55,7 +55,7 @@ def test_a_kept_light_changes_no_picture(case, device):
     """What further qualities go on from is as if each had lit the frames before by itself."""
     between = PRESETS["low"].with_methods(irradiance="sh2")
     with runs.LightBefore() as before:
-        for method in ("sh4", "top_mip", "clusters"):
+        for method in ("sphere_mip", "clusters"):
             quality = PRESETS["low"].with_methods(irradiance=method)
             alone = runs.run(case, quality, device, setting("recover"), between=between, timed=2)
             kept = runs.run(case, quality, device, setting("recover"), between=between, timed=2, before=before)

@@ -89,9 +89,9 @@ def test_effects_are_left_out_of_what_is_shown() -> None:
     assert wanted.with_effect("exposure", False).shown_scene().exposure == Exposure()
     assert wanted.with_effect("relief", False).shown_quality().method("relight") == "flat"
     assert wanted.with_effect("environment_shadow", False).shown_quality().method("environment_shadow") == "none"
-    assert wanted.with_method("prefilter", "box_mip").shown_quality().method("prefilter") == "box_mip"
-    assert wanted.with_method("prefilter", "box_mip").with_method("prefilter", "").shown_quality() == PRESETS["low"]
-    for stage, method in [("prefilter", "best"), ("nonsense", "box_mip")]:
+    assert wanted.with_method("prefilter", "fis128").shown_quality().method("prefilter") == "fis128"
+    assert wanted.with_method("prefilter", "fis128").with_method("prefilter", "").shown_quality() == PRESETS["low"]
+    for stage, method in [("prefilter", "best"), ("nonsense", "fis128")]:
         with pytest.raises(UsageError):
             wanted.with_method(stage, method)
 
@@ -153,7 +153,7 @@ def test_edits_are_undone_and_done_again() -> None:
         {"type": "set", "part": "proxy", "index": 0, "key": "at", "value": [0.1, 0.0, 0.0]},
         {"type": "show", "part": "light", "index": 0, "on": False},
         {"type": "effect", "name": "receiver", "on": False},
-        {"type": "method", "stage": "prefilter", "method": "box_mip"},
+        {"type": "method", "stage": "prefilter", "method": "fis128"},
         {"type": "card", "radius": 0.03, "ruler": 0.1},
         {"type": "reset"},
     ):

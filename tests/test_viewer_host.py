@@ -93,7 +93,7 @@ def test_pipelines_are_built_while_frames_flow(device: str) -> None:
         running.edit(type="compare", other="paper")
         for index in range(6):
             running.edit(type="effect", name=("objects", "lights", "exposure")[index % 3], on=index > 2)
-            running.edit(type="method", stage="irradiance", method=("sh4", "sh2")[index % 2])
+            running.edit(type="method", stage="irradiance", method=("clusters", "sh2")[index % 2])
             running.until(lambda: not running.host.state_message()["building"])
             assert running.next().image.any()
         assert not [message for message in running.messages if message["type"] == "notice"]

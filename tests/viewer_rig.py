@@ -49,7 +49,7 @@ GOOD = [
     {"type": "show", "part": "object", "index": 1, "on": False},
     {"type": "effect", "name": "relief", "on": False},
     {"type": "quality", "name": "low"},
-    {"type": "method", "stage": "prefilter", "method": "box_mip"},
+    {"type": "method", "stage": "prefilter", "method": "fis128"},
     {"type": "budget", "ms": 20.0},
     {"type": "budget", "ms": None},
     {"type": "compare", "other": "camera"},

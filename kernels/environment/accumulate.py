@@ -26,7 +26,6 @@ from __future__ import annotations
 import warp as wp
 
 from warp_ar.kernels.color import brightness
-from warp_ar.kernels.cooperative import warp_sum
 from warp_ar.kernels.latlong import texel_solid_angle
 from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.safe_math import is_finite, light_confidence, smooth_ramp, usable_confidence
@@ -70,14 +69,13 @@ def known_beyond_clipping(x: wp.vec3, m: wp.vec3, clipped: wp.vec3) -> wp.vec3:
 def measure_change_kernel(
     # In:
     row_start: wp.int32,
-    lanes: wp.int32,
     view: EnvironmentView,
     environment: EnvironmentView,
     # Out:
     change_out: wp.array2d[wp.vec2],  # this frame's signed relative change, and the one before
 ):
-    """Mean signed change of one sector a warp."""
-    band_row, sector_column, lane = wp.tid()
+    """Mean signed change of one sector a thread."""
+    band_row, sector_column = wp.tid()
     sector_row = row_start + band_row
     height = view.radiance.shape[0]
     width = view.radiance.shape[1]
@@ -87,7 +85,7 @@ def measure_change_kernel(
     columns = (sector_column + 1) * width // change_out.shape[1] - first_column
     difference = wp.float32(0.0)
     level = wp.float32(0.0)
-    for item in range(lane, rows * columns, lanes):
+    for item in range(rows * columns):
         i = first_row + item // columns
         j = first_column + item % columns
         m = environment.radiance[i, j]
@@ -101,14 +99,12 @@ def measure_change_kernel(
             old = brightness(m)
             difference += weight * (new - old)
             level += weight * (wp.max(new, old) + DARK)
-    sum = warp_sum(wp.vec4(difference, level, 0.0, 0.0))
-    if lane == 0:
-        change = wp.float32(0.0)
-        if sum[1] > 0.0:
-            change = sum[0] / sum[1]
-        if not wp.isfinite(change):
-            change = 0.0
-        change_out[sector_row, sector_column] = wp.vec2(change, change_out[sector_row, sector_column][0])
+    change = wp.float32(0.0)
+    if level > 0.0:
+        change = difference / level
+    if not wp.isfinite(change):
+        change = 0.0
+    change_out[sector_row, sector_column] = wp.vec2(change, change_out[sector_row, sector_column][0])
 
 
 @wp.func
@@ -191,11 +187,10 @@ def measure_change(
         change_out: ``wp.vec2`` of ``change_shape(h, w)``: the change in -1..1, and what stood there before.
         rows: Band of sector rows, None for all.
     """
-    lanes = 1 if change_out.device.is_cpu else 32
     launch_rows(
         measure_change_kernel,
-        (*change_out.shape, lanes),
-        [lanes, view, environment],
+        change_out.shape,
+        [view, environment],
         [change_out],
         rows=rows,
         device=change_out.device,

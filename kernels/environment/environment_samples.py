@@ -156,67 +156,40 @@ def row_weight(row: wp.int32, height: wp.int32, width: wp.int32) -> wp.float32:
     return direction_weight(0.5 * (top + bottom)) * (top - bottom) * 2.0 * PI / wp.float32(width)
 
 
-# Sums that run along rows are one chain of additions, whoever does them. On CUDA a warp's lanes load what comes next
-# side by side and hand it round: a thread that loads and stores in turn waits for memory at every step.
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    value = __shfl_sync(0xffffffffu, value, lane);
-#endif
-    return value;
-""")
-def of_lane(value: wp.float32, lane: wp.int32) -> wp.float32:
-    """A lane's value; on CPU there is one lane."""
-
-
 @wp.kernel(enable_backward=False)
 def sum_along_rows_kernel(
     # In:
-    row_start: wp.int32,
-    lanes: wp.int32,
     environment: wp.array2d[wp.vec3],
     # Out:
     cumulative_out: wp.array2d[wp.float32],
 ):
     """Running sums of brightness along one row; compensated, so that a sun does not swallow the sky beside it."""
-    band_row, lane = wp.tid()
-    i = band_row + row_start
-    width = environment.shape[1]
+    i = wp.tid()
     total = float(0.0)
     lost = float(0.0)
-    for first in range(0, width, lanes):
-        own = brightness(safe_radiance(environment[i, wp.min(first + lane, width - 1)]))
-        for k in range(wp.min(lanes, width - first)):
-            term = of_lane(own, k) - lost
-            after = total + term
-            lost = (after - total) - term
-            total = after
-            if k == lane:
-                cumulative_out[i, first + k] = total
+    for j in range(environment.shape[1]):
+        term = brightness(safe_radiance(environment[i, j])) - lost
+        after = total + term
+        lost = (after - total) - term
+        total = after
+        cumulative_out[i, j] = total
 
 
 @wp.kernel(enable_backward=False)
 def sum_rows_kernel(
     # In:
-    lanes: wp.int32,
     cumulative: wp.array2d[wp.float32],
     # Out:
     rows_out: wp.array[wp.vec2],
 ):
-    """Running sums over rows of (weighted brightness, weight); one warp, a few hundred terms."""
-    lane = wp.tid()
+    """Sum of (weighted brightness, weight) over the rows up to one; each thread adds up its own."""
+    i = wp.tid()
     height = cumulative.shape[0]
     width = cumulative.shape[1]
     total = wp.vec2(0.0, 0.0)
-    for first in range(0, height, lanes):
-        row = wp.min(first + lane, height - 1)
-        weight = row_weight(row, height, width)
-        bright = weight * cumulative[row, width - 1]
-        for k in range(wp.min(lanes, height - first)):
-            total += wp.vec2(of_lane(bright, k), of_lane(weight * wp.float32(width), k))
-            if k == lane:
-                rows_out[first + k] = total
+    for row in range(i + 1):
+        total += row_weight(row, height, width) * wp.vec2(cumulative[row, width - 1], wp.float32(width))
+    rows_out[i] = total
 
 
 @wp.kernel(enable_backward=False)
@@ -397,17 +370,9 @@ def sum_environment(
         cumulative_out: (h, w) brightness summed along each row.
         rows_out: (h,) weighted brightness and weight, summed over rows.
     """
-    device = environment.device
-    lanes = 1 if device.is_cpu else 32
-    launch_rows(
-        sum_along_rows_kernel,
-        (environment.shape[0], lanes),
-        [lanes, environment],
-        [cumulative_out],
-        rows=None,
-        device=device,
-    )
-    launch(sum_rows_kernel, dim=lanes, inputs=[lanes, cumulative_out], outputs=[rows_out], device=device)
+    device, height = environment.device, environment.shape[0]
+    launch(sum_along_rows_kernel, height, [environment], [cumulative_out], device=device)
+    launch(sum_rows_kernel, height, [cumulative_out], [rows_out], device=device)
 
 
 def draw_samples(

@@ -18,9 +18,8 @@ from typing import Any
 
 import warp as wp
 
-from warp_ar.kernels.environment.fill_frame import with_seen
 from warp_ar.kernels.latlong import PI, beside_in_row
-from warp_ar.kernels.launch import Rows, launch_rows, launch_tiles, wait_for_block
+from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.safe_math import smooth_ramp, usable_confidence
 
 wp.set_module_options({"enable_backward": False})
@@ -29,9 +28,6 @@ FULL_TRUST = wp.constant(wp.float32(0.5))
 """Confidence above which a texel is kept as it is."""
 SUPPORT = wp.constant(wp.float32(4.0))
 """A coarser texel is fully trusted once a quarter of it is: smaller holes are then filled from nearby only."""
-COARSE_TEXELS = 2048
-"""Texels from which on the levels of filling are the work of one block, of ``COARSE_BLOCK`` threads."""
-COARSE_BLOCK = 512
 
 
 @wp.func
@@ -58,7 +54,6 @@ def seed_fill_kernel(
     row_start: wp.int32,
     radiance: wp.array2d[wp.vec3],
     confidence: wp.array2d[wp.float32],
-    seen: wp.array2d[wp.vec4],
     # Out:
     levels_out: wp.array[wp.vec4],  # radiance and trust
 ):
@@ -69,10 +64,8 @@ def seed_fill_kernel(
     trust = smooth_ramp(0.0, FULL_TRUST, usable_confidence(value, confidence[i, j]))
     if trust == 0.0:
         value = wp.vec3(0.0, 0.0, 0.0)
-    level = wp.vec4(wp.max(value[0], 0.0), wp.max(value[1], 0.0), wp.max(value[2], 0.0), trust)
-    if seen.shape[0] > 0:
-        level = with_seen(level, seen[i, j])
-    levels_out[i * radiance.shape[1] + j] = level
+    value = wp.max(value, wp.vec3(0.0, 0.0, 0.0))
+    levels_out[i * radiance.shape[1] + j] = wp.vec4(value[0], value[1], value[2], trust)
 
 
 @wp.func
@@ -177,70 +170,6 @@ def push_level_kernel(
     levels_out[offset + i * width + j] = wp.vec4(value[0], value[1], value[2], 1.0)
 
 
-# A module of its own: its block is not that of other launches, and a module is compiled once per size of block.
-@wp.kernel(module="unique", enable_backward=False)
-def fill_coarse_kernel(
-    # In:
-    first_offset: wp.int32,
-    first_height: wp.int32,
-    first_width: wp.int32,
-    count: wp.int32,
-    most: wp.float32,
-    # Out:
-    levels_out: wp.array[wp.vec4],
-):
-    """One block builds the ``count`` levels below the first and completes them and the first, up again."""
-    _block, thread = wp.tid()
-    offset = first_offset
-    height = first_height
-    width = first_width
-    for _level in range(count):
-        coarse_height = (height + 1) / 2
-        coarse_width = (width + 1) / 2
-        coarse_offset = offset + height * width
-        for texel in range(thread, coarse_height * coarse_width, wp.block_dim()):
-            levels_out[coarse_offset + texel] = pulled(
-                levels_out,
-                texel // coarse_width,
-                texel % coarse_width,
-                offset,
-                height,
-                width,
-                coarse_height,
-                coarse_width,
-                most,
-            )
-        wait_for_block()
-        offset = coarse_offset
-        height = coarse_height
-        width = coarse_width
-    for level in range(count):
-        offset = first_offset
-        height = first_height
-        width = first_width
-        for _finer in range(count - 1 - level):
-            offset += height * width
-            height = (height + 1) / 2
-            width = (width + 1) / 2
-        coarse_height = (height + 1) / 2
-        coarse_width = (width + 1) / 2
-        coarse_offset = offset + height * width
-        for texel in range(thread, height * width, wp.block_dim()):
-            value = completed(
-                levels_out,
-                texel // width,
-                texel % width,
-                offset,
-                height,
-                width,
-                coarse_offset,
-                coarse_height,
-                coarse_width,
-            )
-            levels_out[offset + texel] = wp.vec4(value[0], value[1], value[2], 1.0)
-        wait_for_block()
-
-
 @wp.kernel(enable_backward=False)
 def finish_fill_kernel(
     # In:
@@ -274,25 +203,17 @@ def fill_level_offsets(height: int, width: int) -> tuple[int, ...]:
     return (0, *itertools.accumulate(rows * columns for rows, columns in fill_level_shapes(height, width)))
 
 
-def seed_fill(
-    radiance: wp.array,
-    confidence: wp.array,
-    levels_out: wp.array,
-    *,
-    seen: wp.array | None = None,
-    rows: Rows | None = None,
-) -> None:
+def seed_fill(radiance: wp.array, confidence: wp.array, levels_out: wp.array, *, rows: Rows | None = None) -> None:
     """Write level 0 of the fill pyramid.
 
     Args:
         radiance: Light that is known in part, ``wp.vec3`` (h, w).
         confidence: ``wp.float32`` (h, w) in 0..1.
         levels_out: ``wp.vec4`` (``fill_level_offsets(h, w)[-1]``): radiance and trust.
-        seen: Of ``fill_frame.see_frame``: what the frame shows, where the rest leaves trust open.
         rows: Band of rows, None for all.
     """
     launch_rows(
-        seed_fill_kernel, radiance.shape, [radiance, confidence, seen], [levels_out], rows=rows, device=radiance.device
+        seed_fill_kernel, radiance.shape, [radiance, confidence], [levels_out], rows=rows, device=radiance.device
     )
 
 
@@ -308,19 +229,9 @@ def push_pull(levels_out: wp.array, height: int, width: int, *, most: float = ma
     shapes, offsets = fill_level_shapes(height, width), fill_level_offsets(height, width)
     device = levels_out.device
     levels: list[tuple[Any, ...]] = [(offset, *shape) for offset, shape in zip(offsets, shapes, strict=False)]
-    # Small levels take one block less time than a launch each.
-    first = next((n for n, shape in enumerate(shapes) if n and shape[0] * shape[1] <= COARSE_TEXELS), len(levels) - 1)
-    for fine, coarse in itertools.pairwise(levels[: first + 1]):
+    for fine, coarse in itertools.pairwise(levels):
         launch_rows(pull_level_kernel, coarse[1:], [*fine, *coarse, most], [levels_out], rows=None, device=device)
-    launch_tiles(
-        fill_coarse_kernel,
-        [1],
-        [*levels[first], len(levels) - 1 - first, most],
-        [levels_out],
-        block_dim=COARSE_BLOCK,
-        device=device,
-    )
-    for coarse, fine in itertools.pairwise(reversed(levels[1 : first + 1])):
+    for coarse, fine in itertools.pairwise(reversed(levels[1:])):
         launch_rows(push_level_kernel, fine[1:], [*fine, *coarse], [levels_out], rows=None, device=device)
 
 

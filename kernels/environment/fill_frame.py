@@ -20,7 +20,7 @@ import warp as wp
 
 from warp_ar.kernels.camera import project
 from warp_ar.kernels.latlong import direction_from_latlong
-from warp_ar.kernels.launch import Rows, launch, launch_rows
+from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.pixels import pixel_radiance
 from warp_ar.kernels.rays.shapes import FAR
 from warp_ar.kernels.rays.trace import TraceConfig, make_trace
@@ -155,56 +155,6 @@ def make_fill_frame_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
         levels_out[i * shape[1] + j] = with_seen(known, seen)
 
     return fill_frame_kernel
-
-
-@functools.cache
-def make_see_frame_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
-    """Kernel of ``see_frame``."""
-    see_texel = make_see_texel(proxies)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def see_frame_kernel(
-        # In:
-        picture: Picture,
-        params: wp.array[FrameParams],
-        probes: wp.array[Probe],
-        scene: RayScene,
-        ball: wp.int32,
-        # Out:
-        seen_out: wp.array2d[wp.vec4],
-    ):
-        i, j = wp.tid()
-        shape = wp.vec2i(seen_out.shape[0], seen_out.shape[1])
-        seen_out[i, j] = see_texel(picture, params, probes, scene, shape, ball, i, j)
-
-    return see_frame_kernel
-
-
-def see_frame(
-    picture: Picture,
-    params: wp.array,
-    probes: wp.array,
-    scene: RayScene,
-    seen_out: wp.array,
-    *,
-    proxies: tuple[int, ...],
-    ball: int = 0,
-) -> None:
-    """Look up all directions in the frame, for ``fill.seed_fill``: together they do what ``fill_frame`` does.
-
-    It needs nothing of the ball's picture, and so can run before that has been read.
-
-    Args:
-        picture: As those of ``fill_frame``, and so are all arguments that are not named here.
-        params: Likewise.
-        probes: Likewise.
-        scene: Likewise.
-        seen_out: ``wp.vec4`` (h, w): sum of the radiance of directions that the camera sees, and their number.
-        proxies: Likewise.
-        ball: Likewise.
-    """
-    kernel = make_see_frame_kernel(proxies)
-    launch(kernel, seen_out.shape, [picture, params, probes, scene, ball], [seen_out], device=seen_out.device)
 
 
 def fill_frame(

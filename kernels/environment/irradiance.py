@@ -37,8 +37,7 @@ its eigenvectors' frame
     min E_s = max over mu <= w_2 min q of   c + mu - sum_i (w_1 b_i)^2 / (w_2 q_i - mu),
 
 concave in mu. The window scales the eigenvalues and does not turn the eigenvectors: one eigen-decomposition per channel
-serves the whole bisection over s. Evaluation clamps at zero what rounding leaves. Order 4 is clamped, not windowed: its
-lobes are a fifth as deep, and where the truth is not negative a clamp never errs more than what it clamps.
+serves the whole bisection over s. Evaluation clamps at zero what rounding leaves.
 
 Clusters. The sum over all texels costs texels times directions. Irradiance is smooth, so nearby texels may share a
 direction: a block of texels becomes one distant light with their summed flux and their mean direction m, weighted by
@@ -73,21 +72,20 @@ PI = wp.constant(wp.float32(math.pi))
 BLOCK = 64  # threads that share one sum on CUDA; one on CPU
 WINDOW_STEPS = wp.constant(24)
 DUAL_STEPS = wp.constant(32)
-MAX_ORDER = 4
+ORDER = 2
+"""Highest l of the spherical harmonics."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ShTables:
     """Integrals of the basis over rows and columns of a map, on a device."""
 
-    order: int
-    """Highest l."""
     columns: wp.array2d[wp.float32]
-    """(W, 2 order + 1): integral over the column of 1, cos phi, sin phi, cos 2 phi, sin 2 phi ..."""
+    """(W, 5): integral over the column of 1, cos phi, sin phi, cos 2 phi, sin 2 phi."""
     rows: wp.array2d[wp.float32]
-    """(H, (order + 1)^2): A_l times the integral over the row of N P_lm(cos theta) sin theta."""
+    """(H, 9): A_l times the integral over the row of N P_lm(cos theta) sin theta."""
     fourier: wp.array[wp.int32]
-    """((order + 1)^2,): which column integral a coefficient takes."""
+    """(9,): which column integral a coefficient takes."""
 
 
 def cosine_lobe(l: int) -> float:
@@ -106,7 +104,7 @@ def basis_row(l: int, m: int, z: np.ndarray) -> np.ndarray:
     """N P_l|m|(z) of the real orthonormal basis without the Condon-Shortley sign, sqrt 2 of m != 0 included; float64.
 
     Args:
-        l: Degree, 0 to ``MAX_ORDER``.
+        l: Degree.
         m: Order, -l to l.
         z: cos theta, any shape.
     """
@@ -116,23 +114,17 @@ def basis_row(l: int, m: int, z: np.ndarray) -> np.ndarray:
     return norm * (1.0 - z * z) ** (m / 2.0) * legendre(z)
 
 
-def make_sh_tables(height: int, width: int, order: int, device: wp.DeviceLike) -> ShTables:
+def make_sh_tables(height: int, width: int, device: wp.DeviceLike) -> ShTables:
     """Tables for maps of one size; made once, in double precision.
 
     Args:
         height: Rows of the map.
         width: Columns of the map.
-        order: Highest l: 2 or 4.
         device: Where the tables live.
-
-    Raises:
-        ValueError: ``order`` is not from 0 to ``MAX_ORDER``.
     """
-    if not 0 <= order <= MAX_ORDER:
-        raise ValueError(f"order: {order} is not from 0 to {MAX_ORDER}")
     edges = (2.0 * np.arange(width + 1) / width - 1.0) * np.pi
     columns = [np.diff(edges)]
-    for k in range(1, order + 1):
+    for k in range(1, ORDER + 1):
         columns += [np.diff(np.sin(k * edges)) / k, -np.diff(np.cos(k * edges)) / k]
     # Gauss-Legendre over each row in theta: the integrands are trigonometric polynomials of low degree, exact to
     # rounding.
@@ -141,12 +133,11 @@ def make_sh_tables(height: int, width: int, order: int, device: wp.DeviceLike) -
     theta = (2.0 * np.arange(height)[:, None] + 1.0 + nodes[None, :]) * half
     measure = np.sin(theta) * weights * half
     rows, fourier = [], []
-    for l in range(order + 1):
+    for l in range(ORDER + 1):
         for m in range(-l, l + 1):
             rows.append(cosine_lobe(l) * (basis_row(l, m, np.cos(theta)) * measure).sum(1))
             fourier.append(0 if m == 0 else 2 * m - 1 if m > 0 else -2 * m)
     return ShTables(
-        order,
         wp.array(np.stack(columns, 1).astype(np.float32), dtype=wp.float32, device=device),
         wp.array(np.stack(rows, 1).astype(np.float32), dtype=wp.float32, device=device),
         wp.array(np.array(fourier, np.int32), dtype=wp.int32, device=device),
@@ -288,33 +279,6 @@ def window_sh_kernel(
         irradiance_sh_out[i] = irradiance_sh_out[i] * w[wp.where(i > 3, 1, 0)]
 
 
-# For l = 4 the factors are those of m = 0, 3/16 sqrt(1 / pi), and of |m| = 1 to 4, times sqrt(1 / pi):
-# 3/4 sqrt(5/2), 3/8 sqrt 5 (twice that for xy), 3/4 sqrt(35/2), 3/16 sqrt 35 (four times that for xy (x^2 - y^2)).
-@wp.func
-def sh4_basis(i: wp.int32, d: wp.vec3) -> wp.float32:
-    """Basis function 9 + i of order 4 (l = 4; l = 3 has no part in irradiance), for i = 0..8."""
-    x = d[0]
-    y = d[1]
-    z = d[2]
-    if i == 0:
-        return 2.50334294 * x * y * (x * x - y * y)
-    if i == 1:
-        return 1.77013077 * y * z * (3.0 * x * x - y * y)
-    if i == 2:
-        return 0.94617470 * x * y * (7.0 * z * z - 1.0)
-    if i == 3:
-        return 0.66904654 * y * z * (7.0 * z * z - 3.0)
-    if i == 4:
-        return 0.10578555 * (35.0 * z * z * z * z - 30.0 * z * z + 3.0)
-    if i == 5:
-        return 0.66904654 * x * z * (7.0 * z * z - 3.0)
-    if i == 6:
-        return 0.47308735 * (x * x - y * y) * (7.0 * z * z - 1.0)
-    if i == 7:
-        return 1.77013077 * x * z * (x * x - 3.0 * y * y)
-    return 0.62583574 * (x * x * (x * x - 3.0 * y * y) - y * y * (3.0 * x * x - y * y))
-
-
 @wp.func
 def texel_direction(i: wp.int32, j: wp.int32, height: wp.int32, width: wp.int32) -> wp.vec3:
     """Direction of a texel's centre."""
@@ -322,24 +286,6 @@ def texel_direction(i: wp.int32, j: wp.int32, height: wp.int32, width: wp.int32)
     phi = (2.0 * (wp.float32(j) + 0.5) / wp.float32(width) - 1.0) * PI
     sin_theta = wp.sin(theta)
     return wp.vec3(sin_theta * wp.cos(phi), sin_theta * wp.sin(phi), wp.cos(theta))
-
-
-@wp.kernel(enable_backward=False)
-def evaluate_sh4_kernel(
-    row_start: wp.int32,
-    # In:
-    coefficients: wp.array[wp.vec3],
-    # Out:
-    irradiance_map_out: wp.array2d[wp.vec3],
-):
-    """One direction's irradiance from 25 coefficients."""
-    i, j = wp.tid()
-    i += row_start
-    d = texel_direction(i, j, irradiance_map_out.shape[0], irradiance_map_out.shape[1])
-    total = sum_sh2(coefficients, d)
-    for k in range(9):
-        total += coefficients[16 + k] * sh4_basis(k, d)
-    irradiance_map_out[i, j] = wp.vec3(wp.max(total[0], 0.0), wp.max(total[1], 0.0), wp.max(total[2], 0.0))
 
 
 @wp.struct
@@ -492,8 +438,8 @@ def project_irradiance_sh(
     Args:
         environment: (H, W) radiance.
         tables: Of the same size.
-        row_sums_out: (H, 2 order + 1) scratch.
-        irradiance_sh_out: ((order + 1)^2,).
+        row_sums_out: (H, 5) scratch.
+        irradiance_sh_out: (9,).
     """
     launch_tiles(
         sum_columns_kernel,
@@ -516,26 +462,6 @@ def project_irradiance_sh(
 def window_sh(irradiance_sh_out: wp.array[wp.vec3]) -> None:
     """Window nine coefficients, (9,), in place, as little as keeps irradiance from being negative anywhere."""
     launch(window_sh_kernel, dim=1, outputs=[irradiance_sh_out], device=irradiance_sh_out.device)
-
-
-def evaluate_sh4(
-    coefficients: wp.array[wp.vec3], irradiance_map_out: wp.array2d[wp.vec3], *, rows: Rows | None = None
-) -> None:
-    """Map of irradiance from 25 coefficients, clamped at zero.
-
-    Args:
-        coefficients: (25,), as ``project_irradiance_sh`` writes at order 4.
-        irradiance_map_out: (h, w).
-        rows: Band of rows; None means all.
-    """
-    launch_rows(
-        evaluate_sh4_kernel,
-        irradiance_map_out.shape,
-        [coefficients],
-        [irradiance_map_out],
-        rows=rows,
-        device=coefficients.device,
-    )
 
 
 def gather_clusters(

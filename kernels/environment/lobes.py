@@ -28,8 +28,6 @@ from warp_ar.kernels.latlong import latlong_from_direction
 
 wp.set_module_options({"enable_backward": False})
 
-LARGE_LEVELS = wp.constant(3)
-"""Levels that have as many texels as the environment, if there are so many at all."""
 # How much coarser a level of the pyramid is read than the bare share of a sample asks for: samples then overlap, as
 # [KC08] advise. Between 0, best for smooth skies, and 0.5, best for small emitters, by error against brute force.
 SAMPLE_BIAS = 0.25
@@ -55,11 +53,6 @@ def lobe_offset(height: int, level: int) -> int:
 def lobe_texels(height: int) -> int:
     """Texels of all levels together: the length of ``prefilter_levels``."""
     return lobe_offset(height, lobe_count(height))
-
-
-def mixed_texels(height: int) -> int:
-    """Work items of ``mix_mips``: levels that are as large as level 0 are written along with it."""
-    return lobe_texels(height) - (min(LARGE_LEVELS, lobe_count(height)) - 1) * 2 * height**2
 
 
 def lobe_alpha(height: int, level: int) -> float:
@@ -287,21 +280,6 @@ def make_lobe_samples(height: int, lobe: Lobe, count: int, device: wp.DeviceLike
         wp.array(directions.astype(np.float32), dtype=wp.vec4, device=device),
         wp.array(weights.astype(np.float32), dtype=wp.float32, device=device),
     )
-
-
-def box_weights(height: int) -> np.ndarray:
-    """Weights for ``mix_mips`` that make level l of the pyramid level l of the reflections: method ``box_mip``.
-
-    Args:
-        height: Rows of the environment.
-
-    Returns:
-        (levels, mips).
-    """
-    weights = np.zeros((lobe_count(height), level_count(height, 2 * height)))
-    for level in range(weights.shape[0]):
-        weights[level, min(level, weights.shape[1] - 1)] = 1.0
-    return weights
 
 
 def lobe_rows(height: int) -> int:

@@ -4,10 +4,7 @@
 other factor
 of the split sum. Ways to fill the levels, cheapest first:
 
-Box mips (``mix_mips`` with ``box_weights``): level l is level l of a box pyramid, magnified bilinearly: the paper's
-filter. Its texel is 1.6 alpha wide.
-
-Mixed mips (``mix_mips`` with ``mip_weights``): level l is a sum of several levels of an isotropic pyramid, each read
+Mixed mips (``mix_mips``): level l is a sum of several levels of an isotropic pyramid, each read
 through quadratic B-splines, then scaled, per channel, to hold exactly the energy of the environment.
 
 Filtered importance sampling (``sample_lobes``) [KC08]: directions drawn from the lobe, each read from a level of an
@@ -28,7 +25,7 @@ import math
 
 import warp as wp
 
-from warp_ar.kernels.environment.lobes import LARGE_LEVELS, Lobe, LobeSamples, last_lobe, locate_texel, mixed_texels
+from warp_ar.kernels.environment.lobes import Lobe, LobeSamples, last_lobe, locate_texel
 from warp_ar.kernels.environment.pyramid import last_mip, sample_mips, sample_packed, sample_packed_smooth
 from warp_ar.kernels.latlong import texel_solid_angle
 from warp_ar.kernels.launch import Rows, launch_rows, launch_tiles, tile_kernel
@@ -49,57 +46,30 @@ def mix_mips_kernel(
     pyramid: wp.array[wp.vec3],
     weights: wp.array2d[wp.float32],
     height: wp.int32,
-    smooth: wp.int32,
     # Out:
     levels_out: wp.array[wp.vec3],
 ):
-    """One texel from the levels of a pyramid, where levels are equally large one of each; no trigonometry is needed.
-
-    What several levels read of a mip at the same place is read once.
-    """
+    """One packed texel from the levels of a pyramid; no trigonometry is needed."""
     index = wp.tid() + row_start
-    texels = height * 2 * height
-    at = wp.vec4i(0, index / (2 * height), index % (2 * height), 0)
-    if index >= texels:
-        at = locate_texel(index + (LARGE_LEVELS - 1) * texels, height)
+    at = locate_texel(index, height)
     level = at[0]
-    h = height >> wp.max(level - 2, 0)
-    w = 2 * height >> wp.max(level - 2, 0)
-    v = (wp.float32(at[1]) + 0.5) / wp.float32(h)
-    u = (wp.float32(at[2]) + 0.5) / wp.float32(w)
+    v = (wp.float32(at[1]) + 0.5) / wp.float32(height >> wp.max(level - 2, 0))
+    u = (wp.float32(at[2]) + 0.5) / wp.float32(2 * height >> wp.max(level - 2, 0))
     total = wp.vec3()
-    total_1 = wp.vec3()
-    total_2 = wp.vec3()
     offset = wp.int32(0)
     for m in range(weights.shape[1]):
         mip_height = height >> m
         mip_width = 2 * height >> m
         weight = weights[level, m]
-        weight_1 = wp.float32(0.0)
-        weight_2 = wp.float32(0.0)
-        if level == 0:
-            weight_1 = weights[1, m]
-            if weights.shape[0] > 2:
-                weight_2 = weights[2, m]
-        if weight + weight_1 + weight_2 > 0.0:
+        if weight > 0.0:
             row = v * wp.float32(mip_height)
             column = u * wp.float32(mip_width)
-            value = wp.vec3()
-            if smooth != 0 and m > 0:
-                value = sample_packed_smooth(pyramid, offset, mip_height, mip_width, row, column)
+            if m > 0:
+                total += weight * sample_packed_smooth(pyramid, offset, mip_height, mip_width, row, column)
             else:
-                value = sample_packed(pyramid, offset, mip_height, mip_width, row, column)
-            total += value * weight
-            total_1 += value * weight_1
-            total_2 += value * weight_2
+                total += weight * sample_packed(pyramid, offset, mip_height, mip_width, row, column)
         offset += mip_height * mip_width
-    if level > 0:
-        levels_out[index + (LARGE_LEVELS - 1) * texels] = total
-        return
     levels_out[index] = total
-    levels_out[index + texels] = total_1
-    if weights.shape[0] > 2:
-        levels_out[index + 2 * texels] = total_2
 
 
 @wp.kernel(enable_backward=False)
@@ -285,27 +255,19 @@ def mix_mips(
     height: int,
     levels_out: wp.array[wp.vec3],
     *,
-    smooth: bool = False,
     rows: Rows | None = None,
 ) -> None:
-    """Fill all levels with weighted sums of a pyramid's levels.
+    """Fill all levels with weighted sums of a pyramid's levels, each read through quadratic B-splines.
 
     Args:
         pyramid: Pyramid of the (height, 2 height) environment, see ``pyramid.build_pyramid``.
-        weights: (levels, mips): ``box_weights`` for ``box_mip``, ``mip_weights`` for ``energy_mip``.
+        weights: (levels, mips) of ``mip_weights``.
         height: Rows of the environment.
         levels_out: (lobe_texels(height),).
-        smooth: Read mips through quadratic B-splines, as the fitted weights expect; else bilinearly, as the paper does.
-        rows: Band of ``mixed_texels``; None means all.
+        rows: Band of packed texels; None means all.
     """
-    launch_rows(
-        mix_mips_kernel,
-        (mixed_texels(height),),
-        [pyramid, weights, height, int(smooth)],
-        [levels_out],
-        rows=rows,
-        device=pyramid.device,
-    )
+    inputs = [pyramid, weights, height]
+    launch_rows(mix_mips_kernel, levels_out.shape, inputs, [levels_out], rows=rows, device=pyramid.device)
 
 
 def sample_lobes(

@@ -1,4 +1,4 @@
-"""Box pyramids of latlong maps: every level holds the mean radiance over its texels' solid angles.
+"""Isotropic pyramids of latlong maps: levels hold mean radiances over solid angles, about as wide as high.
 
 A pyramid is one packed ``wp.array[wp.vec3]``: level l has (max(H >> l, 1), max(W >> l, 1)) texels in row-major order
 and follows the levels before it; there are ``level_count(H, W)``, down to one row or column. Level 0 is the map itself,
@@ -13,12 +13,9 @@ angle is a product
 
 So every level keeps the energy.
 
-For even sizes that is the 2x2 box with its solid angles as weights: the paper's filter (section 3.2), which also is
-what a graphics library's mipmap generation does but for the weights.
-
-An *isotropic* pyramid counts columns over a wider span: near the poles a texel of a latlong map is much narrower than
-high, so that a box of texels blurs along meridians only. There a texel averages over W' / (w sin theta) columns instead
-of W' / w, at most over all of them: its footprint is as wide as high. Rows are blurred around the axis only, which
+Columns are counted over a wider span, so that a footprint is as wide as high: near the poles a texel of a latlong map
+is much narrower than high, and a box of texels would blur along meridians only. There a texel averages over
+W' / (w sin theta) columns instead of W' / w, at most over all of them. Rows are blurred around the axis only, which
 moves no energy from row to row: energy is still kept.
 
 References:
@@ -32,16 +29,12 @@ import math
 import warp as wp
 
 from warp_ar.kernels.latlong import wrap_texel
-from warp_ar.kernels.launch import Rows, is_last_block, launch, launch_rows, launch_tiles, wait_for_block
+from warp_ar.kernels.launch import Rows, launch, launch_rows
 from warp_ar.kernels.safe_math import safe_radiance
 
 wp.set_module_options({"enable_backward": False})
 
 PI = wp.constant(wp.float32(math.pi))
-BLOCK = 512
-"""Threads of a block that takes a band of rows."""
-BAND_LEVELS = 3
-"""Levels that a block makes of its own band, of 2^3 rows."""
 
 
 def level_size(height: int, width: int, level: int) -> tuple[int, int]:
@@ -263,7 +256,6 @@ def reduce_texel(
     width: wp.int32,
     i: wp.int32,
     j: wp.int32,
-    isotropic: wp.int32,
 ) -> wp.vec3:
     """Texel (i, j) of a (height, width) level from the level before it."""
     # Rows in units of 1 / (source_height * height) of the map's height, columns likewise.
@@ -271,17 +263,16 @@ def reduce_texel(
     row_last = row_first + source_height
     column_first = j * source_width
     column_last = column_first + source_width
-    if isotropic != 0:
-        sin_theta = wp.sin(PI * (wp.float32(i) + 0.5) / wp.float32(height))
-        # Variances of boxes add: the source's own, widened already, gives about a quarter of what is wanted.
-        wanted = wp.min(1.0 / sin_theta, wp.float32(width))
-        wider = wp.sqrt(1.0 + 0.75 * (wanted * wanted - 1.0))
-        # Every column must count equally often: boxes of whole texels do, and any symmetric box over pairs of columns.
-        half = wp.int32(0.5 * wp.float32(source_width) * (wider - 1.0))
-        column_first -= half
-        column_last += half
-        if source_width != 2 * width:
-            column_last = column_first + source_width * wp.int32(wider + 0.5)
+    sin_theta = wp.sin(PI * (wp.float32(i) + 0.5) / wp.float32(height))
+    # Variances of boxes add: the source's own, widened already, gives about a quarter of what is wanted.
+    wanted = wp.min(1.0 / sin_theta, wp.float32(width))
+    wider = wp.sqrt(1.0 + 0.75 * (wanted * wanted - 1.0))
+    # Every column must count equally often: boxes of whole texels do, and any symmetric box over pairs of columns.
+    half = wp.int32(0.5 * wp.float32(source_width) * (wider - 1.0))
+    column_first -= half
+    column_last += half
+    if source_width != 2 * width:
+        column_last = column_first + source_width * wp.int32(wider + 0.5)
     total = wp.vec3()
     total_weight = wp.float32(0.0)
     r = row_first / height
@@ -296,56 +287,23 @@ def reduce_texel(
     return total / (total_weight * wp.float32(column_last - column_first))
 
 
-@wp.kernel(enable_backward=False, launch_bounds=BLOCK)
-def build_pyramid_kernel(
+@wp.kernel(enable_backward=False)
+def reduce_level_kernel(
     # In:
-    environment: wp.array2d[wp.vec3],
-    isotropic: wp.int32,
-    band_levels: wp.int32,
-    # In and out:
-    blocks_done: wp.array[wp.int32],
+    source_offset: wp.int32,
+    source_height: wp.int32,
+    source_width: wp.int32,
+    height: wp.int32,
+    width: wp.int32,
     # Out:
     levels_out: wp.array[wp.vec3],
 ):
-    """All levels: one block takes a band of rows through the first, the block that ends last does the rest."""
-    block, lane = wp.tid()
-    rows = environment.shape[0]
-    columns = environment.shape[1]
-    band = 1 << band_levels
-    for t in range(lane, band * columns, wp.block_dim()):
-        i = block * band + t / columns
-        j = t % columns
-        levels_out[i * columns + j] = safe_radiance(environment[i, j])
-    wait_for_block()
-    bands = rows / band
-    source_offset = wp.int32(0)
-    source_height = rows
-    source_width = columns
-    first = block * band
-    count = band
-    level = wp.int32(1)
-    while (wp.min(rows, columns) >> level) > 0:
-        height = wp.max(rows >> level, 1)
-        width = wp.max(columns >> level, 1)
-        if level == band_levels + 1:
-            if not is_last_block(blocks_done, bands):
-                return
-            first = 0
-            count = source_height
-        first = first / 2
-        count = wp.max(count / 2, 1)
-        offset = source_offset + source_height * source_width
-        for t in range(lane, count * width, wp.block_dim()):
-            i = first + t / width
-            j = t % width
-            levels_out[offset + i * width + j] = reduce_texel(
-                levels_out, source_offset, source_height, source_width, height, width, i, j, isotropic
-            )
-        wait_for_block()
-        source_offset = offset
-        source_height = height
-        source_width = width
-        level += 1
+    """One texel of a level, which follows the level before it."""
+    i, j = wp.tid()
+    offset = source_offset + source_height * source_width
+    levels_out[offset + i * width + j] = reduce_texel(
+        levels_out, source_offset, source_height, source_width, height, width, i, j
+    )
 
 
 @wp.kernel(enable_backward=False)
@@ -396,36 +354,18 @@ def copy_safe(environment: wp.array2d[wp.vec3], levels_out: wp.array[wp.vec3], *
     launch_rows(copy_safe_kernel, environment.shape, [environment], [levels_out], rows=rows, device=environment.device)
 
 
-def build_pyramid(
-    environment: wp.array2d[wp.vec3],
-    blocks_done: wp.array[wp.int32],
-    levels_out: wp.array[wp.vec3],
-    *,
-    isotropic: bool = False,
-) -> None:
-    """Write a whole pyramid, in one launch: every level from the one before.
+def build_pyramid(environment: wp.array2d[wp.vec3], levels_out: wp.array[wp.vec3]) -> None:
+    """Write a whole pyramid, every level from the one before.
 
     Args:
         environment: (H, W) radiance, any size.
-        blocks_done: (1,) scratch, zero; it is left zero. Launches that may run side by side need one each.
         levels_out: Packed pyramid, (packed_texels(H, W),).
-        isotropic: Widen footprints near the poles.
     """
-    height, width = environment.shape
-    # A level's row lies within its band's rows of the level before as long as both divide evenly; the last level that
-    # bands make still is at least as many rows as there are bands.
-    band_levels = 0
-    while band_levels < BAND_LEVELS and height % (2 << band_levels) == 0:
-        band_levels += 1
-    band_levels = min(band_levels, level_count(height, width) - 1)
-    launch_tiles(
-        build_pyramid_kernel,
-        (height >> band_levels,),
-        [environment, int(isotropic), band_levels],
-        [blocks_done, levels_out],
-        block_dim=BLOCK,
-        device=environment.device,
-    )
+    copy_safe(environment, levels_out)
+    for level in range(1, level_count(*environment.shape)):
+        source, shape = level_size(*environment.shape, level - 1), level_size(*environment.shape, level)
+        inputs = [level_offset(*environment.shape, level - 1), *source, *shape]
+        launch(reduce_level_kernel, shape, inputs, [levels_out], device=environment.device)
 
 
 def reduce_latlong(radiance: wp.array2d[wp.vec3], reduced_out: wp.array2d[wp.vec3], *, scale: float = 1.0) -> None:

@@ -304,29 +304,6 @@ def mix(a: wp.vec3, b: wp.vec3, t: wp.float32) -> wp.vec3:
     return a + t * (b - a)
 
 
-GATHER_LANES = 8
-"""Threads that share a texel's samples on CUDA; on CPU one has them all."""
-FEW_TEXELS = 16384
-"""Texels up to which they do; each of more is small in the frame, and has few samples."""
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    return __shfl_xor_sync(0xffu << (threadIdx.x & 24), value, reach);
-#else
-    return value;
-#endif
-""")
-def lane_across(value: wp.float32, reach: wp.int32) -> wp.float32:
-    """Value of the lane whose number among the ``GATHER_LANES`` of a texel differs by the bit ``reach``."""
-
-
-@wp.func
-def vec_across(value: wp.vec3, reach: wp.int32) -> wp.vec3:
-    """``lane_across`` of a vector."""
-    return wp.vec3(lane_across(value[0], reach), lane_across(value[1], reach), lane_across(value[2], reach))
-
-
 @wp.struct
 class Texel:
     """Where a frame shows a texel of the environment: its corners, as ``project_corners`` writes them."""
@@ -363,7 +340,7 @@ def footprint_samples(a0: wp.vec3, a1: wp.vec3, b0: wp.vec3, b1: wp.vec3) -> wp.
 
 @functools.cache
 def make_average_footprint(method: str, linear: bool) -> wp.Function:
-    """``average_footprint(frame, table, texel, rim, lane, lanes) -> Footprint``: over every ``lanes``-th sample.
+    """``average_footprint(frame, table, texel, rim) -> Footprint``.
 
     ``rim``: pixels from the silhouette at which confidence starts, and over which it rises.
     """
@@ -378,8 +355,6 @@ def make_average_footprint(method: str, linear: bool) -> wp.Function:
         table: wp.array[wp.vec3],
         texel: Texel,
         rim: wp.vec2,
-        lane: wp.int32,
-        lanes: wp.int32,
     ) -> Footprint:
         out = Footprint()
         last_row = wp.float32(frame.shape[0] - 1)
@@ -394,7 +369,7 @@ def make_average_footprint(method: str, linear: bool) -> wp.Function:
         area = wp.float32(0.0)
         left = wp.vec3(0.0, 0.0, 0.0)
         right = wp.vec3(0.0, 0.0, 0.0)
-        for sample in range(lane, count_y * count_x, lanes):
+        for sample in range(count_y * count_x):
             a = sample // count_x
             b = sample % count_x
             if a != line:
@@ -433,30 +408,6 @@ def make_average_footprint(method: str, linear: bool) -> wp.Function:
     return average_footprint
 
 
-@wp.func
-def join_lanes(part: Footprint, lane: wp.int32, lanes: wp.int32) -> Footprint:
-    """The footprint of which each of a texel's lanes has averaged a part; all lanes get the same bits."""
-    out = part
-    reach = lanes / 2
-    while reach > 0:
-        other = lane_across(out.total, reach)
-        mean = vec_across(out.mean, reach)
-        clipped = vec_across(out.clipped, reach)
-        out.possible += lane_across(out.possible, reach)
-        if out.total + other > 0.0:
-            # The lower lane's mean first.
-            t = other / (out.total + other)
-            if (lane & reach) == 0:
-                out.mean = mix(out.mean, mean, t)
-                out.clipped = mix(out.clipped, clipped, t)
-            else:
-                out.mean = mix(mean, out.mean, out.total / (out.total + other))
-                out.clipped = mix(clipped, out.clipped, out.total / (out.total + other))
-        out.total += other
-        reach = reach / 2
-    return out
-
-
 @functools.cache
 def make_gather_probe_kernel(method: str, linear: bool = False) -> wp.Kernel:
     """Kernel of one method, of frames of 8-bit codes or ``linear`` ones.
@@ -473,7 +424,6 @@ def make_gather_probe_kernel(method: str, linear: bool = False) -> wp.Kernel:
     def gather_probe_kernel(
         # In:
         row_start: wp.int32,
-        lanes: wp.int32,
         frame: wp.array2d[pixel],
         table: wp.array[wp.vec3],
         probes: wp.array[Probe],
@@ -483,7 +433,7 @@ def make_gather_probe_kernel(method: str, linear: bool = False) -> wp.Kernel:
         # Out:
         view_out: EnvironmentView,
     ):
-        band_row, column, lane = wp.tid()
+        band_row, column = wp.tid()
         row = row_start + band_row
         width = view_out.radiance.shape[1]
         radiance = wp.vec3(0.0, 0.0, 0.0)
@@ -501,8 +451,7 @@ def make_gather_probe_kernel(method: str, linear: bool = False) -> wp.Kernel:
             facing = wp.min(wp.min(texel.c00[2], texel.c01[2]), wp.min(texel.c10[2], texel.c11[2])) >= 0.0
             closest = wp.max(wp.max(texel.c00[2], texel.c01[2]), wp.max(texel.c10[2], texel.c11[2]))
             if facing and closest > rim[0]:
-                part = average_footprint(frame, table, texel, rim, lane, lanes)
-                found = join_lanes(part, lane, lanes)
+                found = average_footprint(frame, table, texel, rim)
                 if found.total > 0.0:
                     across = texel.c11 - texel.c00
                     along = texel.c10 - texel.c01
@@ -518,10 +467,9 @@ def make_gather_probe_kernel(method: str, linear: bool = False) -> wp.Kernel:
                         radiance = mix(radiance, wp.cw_div(found.mean, probes[index].reflectance), vote / votes)
                         clipped = mix(clipped, found.clipped, vote / votes)
                         confidence = wp.max(confidence, certainty)
-        if lane == 0:
-            view_out.radiance[row, column] = radiance
-            view_out.confidence[row, column] = confidence
-            view_out.clipped[row, column] = clipped
+        view_out.radiance[row, column] = radiance
+        view_out.confidence[row, column] = confidence
+        view_out.clipped[row, column] = clipped
 
     return gather_probe_kernel
 
@@ -559,15 +507,11 @@ def gather_probe(
     Raises:
         ValueError: There is no such method.
     """
-    # A texel has one sample but at the method that averages. Many texels keep a device busy by themselves.
-    lanes, shape, device = 1, view_out.radiance.shape, view_out.radiance.device
-    if method == "area" and device.is_cuda:
-        lanes = GATHER_LANES if shape[0] * shape[1] <= FEW_TEXELS else 2
     launch_rows(
         make_gather_probe_kernel(method, frame.dtype is wp.vec3),
-        (*shape, lanes),
-        [lanes, frame, decode_table, probes, corners, wp.vec2(rim_start, rim_width), own],
+        view_out.radiance.shape,
+        [frame, decode_table, probes, corners, wp.vec2(rim_start, rim_width), own],
         [view_out],
         rows=rows,
-        device=device,
+        device=view_out.radiance.device,
     )

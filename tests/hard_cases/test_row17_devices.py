@@ -37,7 +37,7 @@ BOUNDS = {
     "accumulate": Bound(1e-5, "exponentials and a dozen roundings"),
     "recover": Bound(1e-3, "fits of many terms", 0.01),
     "fill": Bound(1e-5, "sums over a pyramid's levels"),
-    "key_lights": Bound(2e-3, "sums over a window in another order, refined by ten mean shifts"),
+    "key_lights": Bound(1e-5, "sums over the map"),
     "irradiance": Bound(1e-5, "sums over the map, in the order of a block's lanes"),
     "prefilter": Bound(5e-5, "sums over the map and powers with exponents up to 1e3"),
     "visibility": Bound(1e-5, "a dozen roundings of a hit", 0.005),

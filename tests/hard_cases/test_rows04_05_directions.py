@@ -16,13 +16,10 @@ from hypothesis import strategies as st
 from tests.hard_cases.generators import directions, frames
 from tests.hard_cases.rig import METHODS, SIZE, LoneStage, assert_finite, solid_angles
 from warp_ar.kernels import latlong, materials, sampling
-from warp_ar.kernels.environment import fill_frame, irradiance
+from warp_ar.kernels.environment import irradiance
 from warp_ar.kernels.environment.lobes import lobe_texels, sample_levels
 from warp_ar.kernels.rays.shapes import sphere_uv
 from warp_ar.scene import Pose
-from warp_ar.scene.kinds import trace_config
-from warp_ar.stages.shared.picture import find_picture
-from warp_ar.stages.shared.variants import trace_variant
 
 FURNACE = 5e-4
 LIGHT_STAGES = [
@@ -104,20 +101,8 @@ def test_no_answer_leaves_the_maps_range(device, stage, method, height, turn, se
     else:
         (values,) = out.values()
         values = values / (np.pi if stage == "irradiance" else 1.0)
-    slack = 1.1 if method == "sh4" else 1 + tolerance(method, height)  # a truncated series rings
-    slack = 1.2 if stage == "prefilter" and method not in ("box_mip", "brute_force") else slack  # scaled to the energy
+    slack = 1.2 if stage == "prefilter" and method != "brute_force" else 1 + tolerance(method, height)  # scaled
     assert surroundings.min() / slack <= values.min() <= values.max() <= surroundings.max() * slack
-
-
-@pytest.mark.parametrize("height", [1, 3])
-def test_a_camera_that_looks_nowhere_shows_no_direction(device, height):
-    """A GPU looks up what the frame shows of all directions, also of those that the ball tells."""
-    lone = make_lone(device, "fill", METHODS["fill"][0], height)
-    seen = wp.full((height, 2 * height), wp.vec4(1.0), dtype=wp.vec4, device=device)
-    arrays = [lone.arrays[name] for name in ("params", "probes", "ray_scene")]
-    proxies = trace_variant(trace_config(lone.stage.request.scene), wp.get_device(device)).proxies
-    fill_frame.see_frame(find_picture(lone.arrays), *arrays, seen, proxies=proxies, ball=0)
-    np.testing.assert_array_equal(seen.numpy(), 0.0)
 
 
 @wp.kernel(module="unique", enable_backward=False)

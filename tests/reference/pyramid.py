@@ -38,12 +38,3 @@ def reduce_latlong(radiance, height, width):
     columns = overlap(source_width, width)
     columns /= columns.sum(1, keepdims=True)
     return np.einsum("ir,jc,rck->ijk", rows, columns, radiance, optimize=True)
-
-
-def build_pyramid(radiance):
-    """All levels of a box pyramid, each from the level before."""
-    levels = [radiance]
-    height, width = radiance.shape[:2]
-    for level in range(1, min(height, width).bit_length()):
-        levels.append(reduce_latlong(levels[-1], max(height >> level, 1), max(width >> level, 1)))
-    return levels

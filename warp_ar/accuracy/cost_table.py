@@ -99,7 +99,6 @@ BETWEEN: Mapping[str, Mapping[str, tuple[str, str, float]]] = {
         "224": ("128", "256", 33 / 48),
     },
     "edge_samples": {"9": ("4", "16", 5 / 12)},
-    "prefilter": {"fis64": ("fis32", "fis128", 1 / 3), "fis96": ("fis32", "fis128", 2 / 3)},
     "environment_shadow": {
         "coarse8": ("none", "coarse", 25 / 64),
         "coarse6": ("none", "coarse", 25 / 36),

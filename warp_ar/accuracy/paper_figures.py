@@ -441,10 +441,10 @@ class Reading:
 
 
 _BLEND = "what the multiplicative factor is taken from"
-_EXACT = {"unwrap": "bilinear", "irradiance": "top_mip", "prefilter": "box_mip"}
+_EXACT = {"unwrap": "bilinear", "irradiance": "sh2", "prefilter": "energy_mip"}
 READINGS: tuple[Reading, ...] = (
     Reading("3.1", "the environment map", "OpenGL's sphere map, boxes over its texture (taken)", {}),
-    Reading("3.1", "the environment map", "exact places on the ball, means over solid angles", _EXACT),
+    Reading("3.1", "the environment map", "exact places on the ball, spherical harmonics, mixed mips", _EXACT),
     Reading("4.2", _BLEND, "video values, light added in linear light (taken)", {}),
     Reading("4.2", _BLEND, "linear luminance", {"relight": "paper_linear"}),
     Reading("4.2", _BLEND, "video values, everything else in video values too", {}, video=True),

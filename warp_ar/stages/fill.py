@@ -79,67 +79,31 @@ class Fill(Stage):
                 arrays[self.wiring.writes[0]], arrays["fill_published"], arrays["fill_difference"], rows=rows
             )
 
-        frame = find_picture(arrays), arrays["params"], arrays["probes"], arrays["ray_scene"]
         proxies = trace_variant(trace_config(self.request.scene), device).proxies
-        # What the frame shows of all directions, where it is known before what the balls show.
-        seen = None if device.is_cpu else wp.zeros((len(maps), height, 2 * height), dtype=wp.vec4, device=device)
-        passes = [] if seen is None else self._look_first(seen, frame, proxies)
-        for ball, known in enumerate(maps):
-            found = (frame, proxies) if seen is None else seen[ball]
-            passes += self._complete(arrays, ball, *known, most, found)
+        passes = [one for ball, known in enumerate(maps) for one in self._complete(arrays, ball, known, most, proxies)]
         if self._on_cpu:
             passes.append(Pass(measure, rows=height))
         return [dataclasses.replace(one, enabled=lambda: not self._holds) for one in passes]
 
-    def _look_first(self, seen: Any, frame: tuple[Any, ...], proxies: tuple[int, ...]) -> list[Pass]:
-        """On CUDA: what the frame shows of all directions, while the ball's own picture is still read."""
-        reads = tuple(name for name in self.wiring.reads if name in (*frame_reads(self.features), "pose"))
-        return [
-            Pass(
-                lambda rows, ball=ball: fill_frame.see_frame(  # type: ignore[misc]
-                    *frame, seen[ball], proxies=proxies, ball=ball
-                ),
-                reads=reads,
-            )
-            for ball in range(len(seen))
-        ]
-
+    @staticmethod
     def _complete(
-        self,
-        arrays: Arrays,
-        ball: int,
-        radiance: Any,
-        confidence: Any,
-        filled: Any,
-        most: float,
-        frame: Any,
+        arrays: Arrays, ball: int, known: tuple[Any, ...], most: float, proxies: tuple[int, ...]
     ) -> list[Pass]:
-        """Passes that complete the map of one ball; balls take turns with the pyramid.
-
-        ``frame`` is what the frame shows, looked up before; or what is looked up in between, and the kinds of proxy.
-        """
+        """Return the passes that complete the map of one ball; balls take turns with the pyramid."""
+        radiance, confidence, filled = known
         shape = height, _ = radiance.shape
         levels = arrays["fill_levels"]
-        seen = None if isinstance(frame, tuple) else frame
+        scene = find_picture(arrays), arrays["params"], arrays["probes"], arrays["ray_scene"]
 
-        def seed(rows: Rows | None) -> None:
-            fill.seed_fill(radiance, confidence, levels, seen=seen, rows=rows)
+        def see(rows: Rows | None) -> None:
+            fill_frame.fill_frame(*scene, levels, shape, proxies=proxies, ball=ball, rows=rows)
 
-        def push_pull(rows: Rows | None) -> None:
-            fill.push_pull(levels, *shape, most=most)
-
-        def finish(rows: Rows | None) -> None:
-            fill.finish_fill(levels, filled, rows=rows)
-
-        passes = [Pass(seed, rows=height), Pass(push_pull), Pass(finish, rows=height)]
-        if isinstance(frame, tuple):
-            scene, proxies = frame
-
-            def see(rows: Rows | None) -> None:
-                fill_frame.fill_frame(*scene, levels, shape, proxies=proxies, ball=ball, rows=rows)
-
-            passes.insert(1, Pass(see, rows=height))
-        return passes
+        return [
+            Pass(lambda rows: fill.seed_fill(radiance, confidence, levels, rows=rows), rows=height),
+            Pass(see, rows=height),
+            Pass(lambda rows: fill.push_pull(levels, *shape, most=most)),
+            Pass(lambda rows: fill.finish_fill(levels, filled, rows=rows), rows=height),
+        ]
 
     def begin(self) -> None:
         """Keep the last map where something covers a ball: it covers what the frame shows behind it as well."""

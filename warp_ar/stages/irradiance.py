@@ -8,12 +8,11 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_ar.kernels.environment import irradiance, pyramid, sphere_map
+from warp_ar.kernels.environment import irradiance, sphere_map
 from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.settled import settled_environment
 
-TOP_MIP_SIZE = (4, 8)  # the last level of the pyramid that still tells directions apart
 MAP_SIZE = (32, 64)  # bilinear error of a cosine lobe: (pi / 32)^2 / 8 = 0.12 % of its peak
 CLUSTERS = (10, 20)
 
@@ -24,9 +23,7 @@ class Irradiance(Stage):
     name: ClassVar[str] = "irradiance"
     methods: ClassVar[Mapping[str, str]] = {
         "sphere_mip": "a 4x4 level of the sphere map, background included (the paper)",
-        "top_mip": "a 4x8 map of means over solid angles",
         "sh2": "spherical harmonics of order 2",
-        "sh4": "of order 4",
         "clusters": "200 clusters of the environment, summed for every direction",
         "brute_force": "every texel for every direction",
     }
@@ -46,9 +43,9 @@ class Irradiance(Stage):
 
     @classmethod
     def method_for(cls, features: Features) -> str:
-        """The nearest to the paper's where light from a file leaves no ball to look up."""
+        """Spherical harmonics in the place of the paper's, where light from a file leaves no ball to look up."""
         method = super().method_for(features)
-        return "top_mip" if method == "sphere_mip" and not features.observed else method
+        return "sh2" if method == "sphere_mip" and not features.observed else method
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
@@ -73,17 +70,8 @@ class Irradiance(Stage):
         height = self.request.quality.environment_height
         if self.method == "sphere_mip":
             return {"irradiance_map": ArraySpec(MAP_SIZE, wp.vec3)}
-        if self.method == "top_mip":
-            size = (min(TOP_MIP_SIZE[0], height), min(TOP_MIP_SIZE[1], 2 * height))
-            return {"irradiance_map": ArraySpec(size, wp.vec3)}
         if self.method == "sh2":
             return {"irradiance_sh": ArraySpec((9,), wp.vec3), "irradiance_row_sums": ArraySpec((height, 5), wp.vec3)}
-        if self.method == "sh4":
-            return {
-                "irradiance_map": ArraySpec(MAP_SIZE, wp.vec3),
-                "irradiance_row_sums": ArraySpec((height, 9), wp.vec3),
-                "irradiance_coefficients": ArraySpec((25,), wp.vec3),
-            }
         count = math.prod(self._blocks())
         return {
             "irradiance_map": ArraySpec(MAP_SIZE, wp.vec3),
@@ -111,21 +99,12 @@ class Irradiance(Stage):
 
     def _filter(self, arrays: Arrays, environment: Any, target: Any) -> list[Pass]:
         """Passes from one map of the environment to its irradiance; maps take turns with the sums."""
-        if self.method == "top_mip":
-            return [Pass(lambda rows: pyramid.reduce_latlong(environment, target, scale=math.pi))]
-        if self.method in ("sh2", "sh4"):
-            order = 2 if self.method == "sh2" else 4
-            tables = irradiance.make_sh_tables(*environment.shape, order, environment.device)
+        if self.method == "sh2":
+            tables = irradiance.make_sh_tables(*environment.shape, environment.device)
             sums = arrays["irradiance_row_sums"]
-            if self.method == "sh2":
-                return [
-                    Pass(lambda rows: irradiance.project_irradiance_sh(environment, tables, sums, target)),
-                    Pass(lambda rows: irradiance.window_sh(target)),
-                ]
-            coefficients = arrays["irradiance_coefficients"]
             return [
-                Pass(lambda rows: irradiance.project_irradiance_sh(environment, tables, sums, coefficients)),
-                Pass(lambda rows: irradiance.evaluate_sh4(coefficients, target, rows=rows), rows=MAP_SIZE[0]),
+                Pass(lambda rows: irradiance.project_irradiance_sh(environment, tables, sums, target)),
+                Pass(lambda rows: irradiance.window_sh(target)),
             ]
         blocks = self._blocks()
         clusters = arrays["irradiance_clusters"]

@@ -12,7 +12,6 @@ import warp as wp
 from warp_ar.kernels.environment import prefilter, pyramid, sphere_map
 from warp_ar.kernels.environment.lobes import (
     Lobe,
-    box_weights,
     lobe_count,
     lobe_offset,
     lobe_rows,
@@ -20,7 +19,6 @@ from warp_ar.kernels.environment.lobes import (
     lobe_texels,
     make_lobe_samples,
     mip_weights,
-    mixed_texels,
 )
 from warp_ar.scene import Material, MirrorMaterial, PhongMaterial, Scene
 from warp_ar.scene.object_materials import reflects_glossily, scene_materials
@@ -46,11 +44,7 @@ class Prefilter(Stage):
     name: ClassVar[str] = "prefilter"
     methods: ClassVar[Mapping[str, str]] = {
         "sphere_mip": "mip levels of the sphere map, background included (the paper)",
-        "box_mip": "a pyramid of means over solid angles",
         "energy_mip": "a pyramid that keeps energy, mixed to fit the lobe",
-        "fis32": "32 importance samples per texel",
-        "fis64": "64 importance samples per texel",
-        "fis96": "96 importance samples per texel",
         "fis128": "128 importance samples per texel",
         "brute_force": "every texel for every direction and width",
     }
@@ -59,7 +53,7 @@ class Prefilter(Stage):
     unread: ClassVar[str] = "no virtual object has a glossy material"
     converges: ClassVar[bool] = True
     settings: ClassVar[tuple[str, ...]] = ("environment_height",)
-    unseen_method: ClassVar[str | None] = "box_mip"
+    unseen_method: ClassVar[str | None] = "energy_mip"
     numerics: ClassVar[Numerics] = Numerics(
         precision="float32; versines, weights made in float64",
         bound=5e-5,
@@ -70,9 +64,9 @@ class Prefilter(Stage):
 
     @classmethod
     def method_for(cls, features: Features) -> str:
-        """The nearest to the paper's where light from a file leaves no ball to look up."""
+        """``energy_mip`` in the place of the paper's, where light from a file leaves no ball to look up."""
         method = super().method_for(features)
-        return "box_mip" if method == "sphere_mip" and not features.observed else method
+        return "energy_mip" if method == "sphere_mip" and not features.observed else method
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
@@ -107,8 +101,6 @@ class Prefilter(Stage):
             return specs
         if self.method != "brute_force" and not self._mirrors_only:
             specs["prefilter_pyramid"] = ArraySpec((pyramid.packed_texels(height, 2 * height),), wp.vec3)
-            specs["prefilter_blocks_done"] = ArraySpec((1,), wp.int32)
-        if self.method not in ("box_mip", "brute_force") and not self._mirrors_only:
             specs["prefilter_row_energy"] = ArraySpec((lobe_rows(height),), wp.vec3)
             specs["prefilter_energy"] = ArraySpec((lobe_count(height),), wp.vec3)
         return specs
@@ -132,30 +124,22 @@ class Prefilter(Stage):
         if self.method == "brute_force":
             return [Pass(lambda rows: prefilter.integrate_lobes(environment, lobe, levels, rows=rows), rows=texels)]
 
-        box, blocks_done = arrays["prefilter_pyramid"], arrays["prefilter_blocks_done"]
-        isotropic = self.method != "box_mip"
-        passes = [Pass(lambda rows: pyramid.build_pyramid(environment, blocks_done, box, isotropic=isotropic))]
-        if self.method in ("box_mip", "energy_mip"):
-            numbers = mip_weights(height, lobe) if isotropic else box_weights(height)
-            weights = wp.array(numbers.astype(np.float32), dtype=wp.float32, device=device)
-            passes.append(
-                Pass(
-                    lambda rows: prefilter.mix_mips(box, weights, height, levels, smooth=isotropic, rows=rows),
-                    rows=mixed_texels(height),
-                )
-            )
+        mips = arrays["prefilter_pyramid"]
+        passes = [Pass(lambda rows: pyramid.build_pyramid(environment, mips))]
+        if self.method == "energy_mip":
+            weights = wp.array(mip_weights(height, lobe).astype(np.float32), dtype=wp.float32, device=device)
+            passes.append(Pass(lambda rows: prefilter.mix_mips(mips, weights, height, levels, rows=rows), rows=texels))
         else:
             samples = make_lobe_samples(height, lobe, int(self.method.removeprefix("fis")), device)
             passes.append(
-                Pass(lambda rows: prefilter.sample_lobes(box, samples, height, levels, rows=rows), rows=texels)
+                Pass(lambda rows: prefilter.sample_lobes(mips, samples, height, levels, rows=rows), rows=texels)
             )
-        if isotropic:
-            row_energy, energy = arrays["prefilter_row_energy"], arrays["prefilter_energy"]
-            passes += [
-                Pass(lambda rows: prefilter.measure_energy(levels, height, row_energy, energy)),
-                Pass(lambda rows: prefilter.scale_levels(energy, height, levels, rows=rows), rows=texels),
-            ]
-        return passes
+        row_energy, energy = arrays["prefilter_row_energy"], arrays["prefilter_energy"]
+        return [
+            *passes,
+            Pass(lambda rows: prefilter.measure_energy(levels, height, row_energy, energy)),
+            Pass(lambda rows: prefilter.scale_levels(energy, height, levels, rows=rows), rows=texels),
+        ]
 
     def _look_up(self, arrays: Arrays) -> list[Pass]:
         """Every lobe's directions in a level of the sphere map; mirrors alone need no more than the first."""
