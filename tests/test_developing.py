@@ -68,7 +68,7 @@ def test_example_applies_and_works(name: str, copy: pathlib.Path) -> None:
 
 def test_page_shows_every_example() -> None:
     page = (ROOT / "docs" / "developing.md").read_text(encoding="utf-8")
-    assert set(re.findall(r"<!-- made: example-([\w-]+) -->", page)) == set(CASES)
+    assert set(re.findall(r"`docs/examples/([\w-]+)\.diff`", page)) == set(CASES)
     assert {path.stem for path in EXAMPLES.glob("*.diff")} == set(CASES)
 
 

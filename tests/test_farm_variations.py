@@ -160,6 +160,6 @@ def test_variations_of_the_same_kinds_follow_each_other(dataset, drawn, monkeypa
     for number, told in zip(order, kinds, strict=True):
         if len(told) == len(drawn[number].kinds):
             assert told == drawn[number].kinds
-    monkeypatch.setattr(draws, "CHUNK", 5)
+    monkeypatch.setattr(variations, "CHUNK", 5)
     chunked = list(in_kindred_order(dataset, 0, len(drawn)))
     assert [sorted(chunked[n : n + 5]) for n in range(0, len(drawn), 5)] == [[*range(5)], [*range(5, 10)], [10, 11]]
