@@ -47,7 +47,6 @@ def frame_and_layers(device: str, height: int, width: int, rows: int) -> tuple[A
 
 
 def main(device: str) -> None:
-    config = composite.CompositeConfig(virtual=True, added=True, ratio=True, mirror_ball=True)
     for height, width in SIZES:
         for name, share in CASES:
             rows = round(share * height)
@@ -57,7 +56,7 @@ def main(device: str) -> None:
             moved = height * width * 6 + rows * width * (16 + 3 * 12)
             source, target = (wp.zeros(moved // 2, dtype=wp.uint8, device=device) for _ in range(2))
             calls = {
-                "ours": lambda inputs=inputs, image=image: composite.composite(config, *inputs, image),
+                "ours": lambda inputs=inputs, image=image: composite.composite(*inputs, image),
                 "copy": lambda source=source, target=target: wp.copy(target, source),
             }
             calls["ours"]()

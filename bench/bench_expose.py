@@ -10,8 +10,6 @@ from bench.common import measure, report
 from warp_ar.kernels.picture import composite, expose, summed_area
 from warp_ar.kernels.structs import make_picture
 
-LAYERS = (("frame", composite.CompositeConfig()), ("layers", composite.CompositeConfig(virtual=True, added=True)))
-
 
 def main(device: str) -> None:
     params, frame, decode, encode, over = frame_and_layers(device, H)
@@ -25,17 +23,17 @@ def main(device: str) -> None:
     summed_area.sum_area(frame, table)
     shown, exposure = make_picture(frame, decode, None), expose.make_exposure(encode, scale, codes)
     clipped = expose.make_clipped_evidence(H, table, declipped)
-    for name, layers in LAYERS:
+    for name, layers in (("frame", composite.make_layers()), ("layers", over)):
         contenders = {}
         for method in expose.METHODS:
 
-            def call(config: expose.ExposeConfig = expose.ExposeConfig(method, layers)) -> None:  # noqa: B008
+            def call(method: str = method, layers: composite.Layers = layers) -> None:
                 expose.read_scale(params, scale)
                 expose.expose_codes(decode, encode, scale, codes)
-                expose.expose(config, params, shown, over, clipped, exposure, image)
+                expose.expose(method, params, shown, layers, clipped, exposure, image)
 
             call()
-            if not layers.virtual:  # black stays black, nothing that was not clipped brightens
+            if name == "frame":  # black stays black, nothing that was not clipped brightens
                 assert (image.numpy()[H // 10 :] <= picture[H // 10 :]).all()
             contenders[method] = call
         for method, times in measure(contenders, device).items():

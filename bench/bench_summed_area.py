@@ -13,7 +13,6 @@ import warp as wp
 
 from bench.common import copy_bandwidth, measure, paired_ratio, recorded, report
 from warp_ar.kernels.picture import summed_area
-from warp_ar.kernels.picture.summed_area_strips import strip_shapes, sum_area_by_strips
 
 SIZES = ((480, 640), (1080, 1920), (2160, 3840), (4320, 7680))
 
@@ -23,13 +22,9 @@ def main(device: str) -> None:
         values = np.random.default_rng(0).integers(0, 256, (height, width), dtype=np.uint8)
         frame = wp.array(np.repeat(values[..., None], 3, axis=2), dtype=wp.vec3ub, device=device)
         table = wp.zeros((height, width), wp.uint32, device=device)
-        sums = [wp.zeros(shape, wp.uint32, device=device) for shape in strip_shapes(height, width)]
 
-        def ours(frame=frame, sums=sums, table=table):
-            if frame.device.is_cpu:
-                summed_area.sum_area(frame, table)
-            else:
-                sum_area_by_strips(frame, *sums, table)
+        def ours(frame=frame, table=table):
+            summed_area.sum_area(frame, table)
 
         ours()
         exact = values.cumsum(0, dtype=np.uint32).cumsum(1, dtype=np.uint32)

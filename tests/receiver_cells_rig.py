@@ -9,7 +9,6 @@ import warp as wp
 from tests.kernel_rig import constant_environment, records, shape, tables
 from tests.reference import receiver_cells as reference
 from tests.relight_rig import CAMERA, DESK, LOOK_DOWN, point
-from warp_ar.kernels.picture import summed_area
 from warp_ar.kernels.rays.trace import TraceConfig
 from warp_ar.kernels.receiver import receiver_cells, relight
 from warp_ar.kernels.receiver.receiver import ReceiverCells, RelightConfig, make_receiver
@@ -106,8 +105,7 @@ class View:
             self.scene.materials = records(Material, *materials)
         self.lights = records(Light, *lights)
         image = np.full((*size, 3), 128, np.uint8) if frame is None else frame
-        self.frame, self.table = wp.array(image, dtype=wp.vec3ub), wp.zeros(size, wp.uint32)
-        summed_area.sum_area(self.frame, self.table)
+        self.frame = wp.array(image, dtype=wp.vec3ub)
         self.keys = records(KeyLight, {"direction": (0, 0, 1), "directionality": 0.0})
         self.probes = records(Probe, *probes)
         self.surroundings = wp.array(constant_environment(surroundings), dtype=wp.vec3)
@@ -118,7 +116,6 @@ class View:
         return make_receiver(
             self.relight,
             make_picture(self.frame, tables()[0], self.rays),
-            table=self.table,
             probes=self.probes,
             key_lights=self.keys,
             irradiance=self.surroundings,

@@ -6,7 +6,6 @@ import warp as wp
 from tests.kernel_rig import constant_environment, records, shape, tables
 from tests.reference import relight as reference
 from warp_ar.kernels.edges import EdgeLists
-from warp_ar.kernels.picture import summed_area
 from warp_ar.kernels.rays.trace import TraceConfig
 from warp_ar.kernels.receiver import relight
 from warp_ar.kernels.receiver.receiver import RelightConfig, make_receiver
@@ -79,8 +78,7 @@ def run(
     params = records(FrameParams, {"camera_position": CAMERA, "world_from_camera": LOOK_DOWN, "light_rect": rect})
     scene = RayScene()
     scene.objects, scene.proxies = records(Shape, *objects), records(Shape, *proxies)
-    frame_array, table = wp.array(frame, dtype=wp.vec3ub), wp.zeros((H, W), wp.uint32)
-    summed_area.sum_area(frame_array, table)
+    frame_array = wp.array(frame, dtype=wp.vec3ub)
     keys = records(KeyLight, {"direction": key[0], "directionality": key[1]})
     surroundings = wp.array(constant_environment((1, 1, 1)) if sh is None else sh, dtype=wp.vec3)
     if irradiance_map is not None:
@@ -94,7 +92,6 @@ def run(
             wp.array(RAYS, dtype=wp.vec2),
             None if linear is None else wp.array(np.float32(linear), dtype=wp.vec3),
         ),
-        table=table,
         probes=records(Probe, *probes),
         key_lights=keys,
         irradiance=surroundings,
@@ -130,17 +127,12 @@ def run_edges(
     params = records(FrameParams, place)
     scene = RayScene()
     scene.objects, scene.proxies = records(Shape, *objects), records(Shape, *proxies)
-    frame, table = (
-        wp.full((height, width), wp.vec3ub(255, 255, 255), dtype=wp.vec3ub),
-        wp.zeros((height, width), wp.uint32),
-    )
-    summed_area.sum_area(frame, table)
+    frame = wp.full((height, width), wp.vec3ub(255, 255, 255), dtype=wp.vec3ub)
     keys = records(KeyLight, {"direction": (0, 0, 1), "directionality": 0.0})
     rays = wp.array(np.stack([columns, lines], -1).astype(np.float32), dtype=wp.vec2)
     receiver = make_receiver(
         config,
         make_picture(frame, tables()[0], rays),
-        table=table,
         probes=records(Probe, *probes),
         key_lights=keys,
         irradiance=wp.array(constant_environment((1, 1, 1)), dtype=wp.vec3),

@@ -1,3 +1,5 @@
+from typing import NamedTuple
+
 import numpy as np
 import pytest
 import warp as wp
@@ -12,13 +14,17 @@ from warp_ar.kernels.structs import FrameParams
 
 H, W = 24, 40
 
-CONFIGS = [
-    composite.CompositeConfig(v, a, r, m)
-    for m in (False, True)
-    for v in (False, True)
-    for a in (False, True)
-    for r in (False, True)
-]
+
+class Laid(NamedTuple):
+    """The layers that there are."""
+
+    virtual: bool = False
+    added: bool = False
+    ratio: bool = False
+    mirror_ball: bool = False
+
+
+CONFIGS = [Laid(v, a, r, m) for m in (False, True) for v in (False, True) for a in (False, True) for r in (False, True)]
 
 
 def make_params(
@@ -70,18 +76,19 @@ def run(
     bands=(None,),
     saturation=None,
 ):
+    given = (virtual, added, ratio, mirror_ball)
+    layers = make_arrays(*(values if there else None for values, there in zip(given, config, strict=True)))
     decode, encode = tables(transfer)
     if saturation is not None:
         decode = wp.array(color.camera_table(transfer, saturation), dtype=wp.vec3)
     out = wp.full(frame.shape[:2], wp.vec3ub(7, 7, 7), dtype=wp.vec3ub)
     for rows in bands:
         composite.composite(
-            config,
             params or make_params(),
             wp.array(frame, dtype=wp.vec3ub),
             decode,
             encode,
-            make_arrays(virtual, added, ratio, mirror_ball),
+            layers,
             out,
             rows=rows,
         )

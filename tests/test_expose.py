@@ -7,7 +7,7 @@ from tests.kernel_rig import tables
 from tests.reference import color as reference_color
 from tests.reference import composite as reference_composite
 from tests.reference import expose as reference
-from tests.test_composite import CONFIGS, H, make_arrays, make_layers, make_params
+from tests.test_composite import H, make_arrays, make_layers, make_params
 from warp_ar.kernels import color
 from warp_ar.kernels.color import decode_codes
 from warp_ar.kernels.picture import expose, summed_area
@@ -23,7 +23,6 @@ def run(
     frame,
     scale,
     method="box",
-    layers=CONFIGS[0],
     virtual=None,
     added=None,
     ratio=None,
@@ -43,7 +42,6 @@ def run(
     expose.read_scale(params, scale_array)
     expose.expose_codes(decode, encode, scale_array, codes)
     over = make_arrays(virtual, added, ratio, mirror_ball)
-    config = expose.ExposeConfig(method, layers)
     deep = {}
     light = None if light is None else wp.array(light, dtype=wp.vec3)
     if light is not None:
@@ -53,7 +51,7 @@ def run(
         deep = {"cut_table": cut_table, "levels": wp.array(np.full((2, 3), clips), dtype=wp.vec3)}
     picture, exposure = make_picture(frame_array, decode, None, light), expose.make_exposure(encode, scale_array, codes)
     clipped = expose.make_clipped_evidence(height, table, wp.array(declipped(frame, transfer), dtype=wp.vec3), **deep)
-    expose.expose(config, params, picture, over, clipped, exposure, image)
+    expose.expose(method, params, picture, over, clipped, exposure, image)
     return image.numpy()
 
 
@@ -107,8 +105,7 @@ def test_what_is_drawn_ends_where_the_camera_does(device, level):
     over = make_arrays(drawn)
     clipped = expose.make_clipped_evidence(8, None, None)
     params = make_params(*4 * [(0, 8, 0, 8)], 1.0)
-    config = expose.ExposeConfig("plain", CONFIGS[4])
-    expose.expose(config, params, picture, over, clipped, expose.make_exposure(encode, scale, codes), image)
+    expose.expose("plain", params, picture, over, clipped, expose.make_exposure(encode, scale, codes), image)
     shown = image.numpy()
     np.testing.assert_array_equal(shown[:, 4:], frame[:, 4:])
     dark = round(255.0 * float(color.encode_codes("srgb", np.array([[0.2]]))[0, 0]))
@@ -166,7 +163,7 @@ def test_layers_are_composed_before_they_are_exposed(device, scale):
     gains = reference.gains(frame, scale, expose.largest_box(H))
     total = reference_composite.compose(linear(frame) * gains[..., None], *layers)
     exact = reference_color.encoded_srgb(np.clip(scale * total, 0.0, 1.0))
-    check_error("expose", run(frame, scale, "box", CONFIGS[15], *layers), exact)
+    check_error("expose", run(frame, scale, "box", *layers), exact)
 
 
 @pytest.mark.parametrize("method", ["paper", "box"])
@@ -274,10 +271,9 @@ def auto(added, frame=None, frames=1, time_step=1.0 / 30, start=0.0, virtual=Non
     levels = wp.zeros((-(-height // expose.AUTO_STRIDE), expose.LEVELS), wp.int32)
     scale = wp.array([start], dtype=wp.float32)
     frame, decode = wp.array(frame, dtype=wp.vec3ub), tables()[0]
-    layers = expose.CompositeConfig(virtual is not None, True, mirror_ball=mirror_ball is not None)
     for _ in range(frames):
         over = make_arrays(virtual, added, None, mirror_ball)
-        expose.count_levels(layers, params, make_picture(frame, decode, None), over, levels)
+        expose.count_levels(params, make_picture(frame, decode, None), over, levels)
         expose.adapt_scale(params, levels, scale)
     return float(scale.numpy()[0])
 

@@ -315,7 +315,7 @@ def test_lost_marker_passes_the_frame_and_keeps_the_light(frames: Frames) -> Non
 
 def test_only_what_the_scene_calls_for_is_planned() -> None:
     def stages(**changes: object) -> set[str]:
-        quality = PRESETS["low"].with_methods(expose="plain", relight="relief")
+        quality = PRESETS["low"].with_methods(expose="plain", relight="paper")
         with Pipeline(make_scene(**changes), device="cpu", quality=quality) as pipeline:
             return {stage.name for stage, _ in pipeline.plan.stages}
 

@@ -7,7 +7,6 @@ from tests.reference import summed_area as reference
 from warp_ar.kernels import color
 from warp_ar.kernels.color import decode_codes
 from warp_ar.kernels.picture import summed_area
-from warp_ar.kernels.picture.summed_area_strips import strip_shapes, sum_area_by_strips
 
 # float32(sum) / float32(count): two roundings of an exact integer and one of the quotient, at most 255 * 3 * 2^-24.
 MEAN_ROUNDING = 255 * 3 * 2.0**-24
@@ -59,51 +58,21 @@ def test_intensity_of_grey_is_its_value(device):
     np.testing.assert_array_equal(make_table(grey).numpy()[0], np.arange(256).cumsum())
 
 
-# One warp and many, columns to spare and none; rows aligned to words (multiples of 4) and not; one strip, several
-# groups of strips, strips of one row and of several, the last one cut short; more columns than a block has threads for.
-@pytest.mark.parametrize("size", [(1, 1), (1, 97), (97, 3), (64, 128), (333, 132), (130, 4400), (1600, 257)])
-def test_strips_match_twin(device, size):
-    """And again over what the launch before left, whose marks must not count."""
-    shapes = strip_shapes(*size)
-    sums, state = [wp.full(shape, 7, dtype=wp.uint32) for shape in shapes[:2]], wp.zeros(shapes[2], wp.uint32)
-    for seed in range(3):
-        frame = random_frame(*size, seed)
-        table = wp.full(size, 7, dtype=wp.uint32)
-        sum_area_by_strips(wp.array(frame, dtype=wp.vec3ub), *sums, state, table)
-        np.testing.assert_array_equal(table.numpy(), reference.sum_area(frame))
-
-
-def test_strips_of_white_are_exact(device):
-    """The largest sums that halves of words must hold, and a table that overflows."""
-    height, width = 4320, 7680 if device != "cpu" else 64
-    shapes = strip_shapes(height, width)
-    scratch = [wp.zeros(shape, wp.uint32) for shape in shapes]
-    table = wp.zeros((height, width), wp.uint32)
-    sum_area_by_strips(wp.array(white(height, width), dtype=wp.vec3ub), *scratch, table)
-    counts = np.outer(np.arange(1, height + 1, dtype=np.int64), np.arange(1, width + 1))
-    np.testing.assert_array_equal(table.numpy(), (255 * counts) % 2**32)
-
-
 @pytest.mark.parametrize("size", [(1, 1), (1, 97), (97, 1), (63, 64), (130, 257)])
 def test_matches_twin(device, size):
     frame = random_frame(*size)
     check_error("summed_area", make_table(frame).numpy(), reference.sum_area(frame))
 
 
-# One slab and several, of one height and of two; rows of whole vectors, with a rest, and of a rest alone.
-@pytest.mark.parametrize("size", [(1, 1), (16, 16), (50, 333), (97, 15), (480, 640), (130, 48)])
-@pytest.mark.parametrize("threads", [1, 2, 3, 16])
-def test_slabs_match_twin(device, size, threads):
-    """In any bands of slabs, over what a table and its ends held before."""
-    frame = random_frame(*size)
-    shape = summed_area.slab_shape(*size, threads)
-    assert 1 <= shape[0] <= threads
-    table, ends = wp.full(size, 7, dtype=wp.uint32), wp.full(shape, 7, dtype=wp.uint32)
-    for band in ((0, 1), (1, 1), (1, shape[0])):
-        summed_area.sum_slabs(wp.array(frame, dtype=wp.vec3ub), table, ends, rows=band)
-    summed_area.add_ends(ends)
-    for band in ((0, shape[0] // 2), (shape[0] // 2, shape[0] - 1)):
-        summed_area.join_slabs(ends, table, rows=band)
+@pytest.mark.parametrize("size", [(1, 1), (50, 333), (97, 15)])
+def test_bands_give_the_same_table(device, size):
+    """In any bands of rows and of columns, over what a table held before."""
+    frame, table = random_frame(*size), wp.full(size, 7, dtype=wp.uint32)
+    for band in ((0, 1), (1, 1), (1, size[0])):
+        summed_area.sum_rows(wp.array(frame, dtype=wp.vec3ub), table, rows=band)
+    groups = summed_area.column_groups(size[1])
+    for band in ((0, groups // 2), (groups // 2, groups)):
+        summed_area.sum_columns(table, groups=band)
     np.testing.assert_array_equal(table.numpy(), reference.sum_area(frame))
 
 

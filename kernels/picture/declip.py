@@ -66,8 +66,6 @@ LEAST_HUE = wp.constant(wp.float32(1.0 / 64.0))
 """Smallest share of a channel in a hue; bounds what one channel says of another."""
 BRIGHTEST = wp.constant(wp.float32(1.0e4))
 """Upper bound of every estimate."""
-STEPS = wp.constant(64)
-"""Points along a pixel's ray, even in parallax, that are looked up in the ball's light: less than two degrees apart."""
 NEAREST = wp.constant(wp.float32(2.0))
 """Largest parallax: the nearest point is at half the distance between camera and ball."""
 
@@ -343,8 +341,9 @@ def make_seen_by_ball(config: DeclipConfig) -> wp.Function:
             return wp.cw_mul(probes[ball].reflectance, sample_latlong(environment, wi))
         found = wp.vec3()
         best = float(1.0)
-        for step in range(STEPS):
-            share = NEAREST * wp.float32(step) / wp.float32(STEPS)
+        steps = environment.shape[0] / 2  # even in parallax: neighbours are less than two texels apart
+        for step in range(steps):
+            share = NEAREST * wp.float32(step) / wp.float32(steps)
             radiance = sample_latlong(environment, direction + share * wp.normalize(origin - probes[0].center))
             # At clipping in the ball's image: 1 / reflectance, in every channel.
             if wp.min(wp.cw_mul(probes[0].reflectance, radiance)) >= 1.0:

@@ -59,26 +59,15 @@ References:
 
 from __future__ import annotations
 
-import dataclasses
 import functools
-from typing import Literal
 
 import warp as wp
 
 from warp_ar.kernels.color import below_saturation, decode, encode, is_clipped, saturation_codes
 from warp_ar.kernels.launch import Rows, launch, launch_rows
-from warp_ar.kernels.picture.codes import (
-    WARP_LANES,
-    WARP_PIXELS,
-    by_warps,
-    get_code,
-    load_codes,
-    row_parts,
-    set_code,
-    store_codes,
-)
-from warp_ar.kernels.picture.composite import CompositeConfig, Layers, compose, is_changed, make_read_layers
+from warp_ar.kernels.picture.composite import Layers, compose, is_changed, read_layers
 from warp_ar.kernels.picture.summed_area import fine_mean
+from warp_ar.kernels.pixels import pixel_run
 from warp_ar.kernels.structs import FrameParams, Picture
 
 wp.set_module_options({"enable_backward": False})
@@ -110,24 +99,6 @@ LEVELS = 64
 
 _LEVELS = wp.constant(LEVELS)
 _AUTO_STRIDE = wp.constant(AUTO_STRIDE)
-
-NO_LAYERS = CompositeConfig()
-"""The frame alone."""
-
-
-@dataclasses.dataclass(frozen=True)
-class ExposeConfig:
-    """What is compiled into the kernel."""
-
-    method: Literal["plain", "paper", "paper_mean", "box", "declipped"] = "plain"
-    """How clipped pixels darken."""
-    layers: CompositeConfig = NO_LAYERS
-    """What is composed before it is exposed."""
-
-    def __post_init__(self) -> None:
-        known = dict.fromkeys((*METHODS, *BOXES))
-        if self.method not in known:
-            raise ValueError(f"method: {self.method!r} is none of {', '.join(known)}")
 
 
 @wp.struct
@@ -223,38 +194,32 @@ def level_of(peak: wp.float32) -> wp.int32:
     return wp.min(wp.int32(wp.log2(wp.min(peak, 1.0e6)) * 8.0) + 1, _LEVELS - 1)
 
 
-@functools.cache
-def make_count_levels_kernel(config: CompositeConfig) -> wp.Kernel:
-    """Kernel that counts, per sampled row, how many pixels under virtual light fall into each level."""
-    read_layers = make_read_layers(config)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def count_levels_kernel(
-        # In:
-        row_start: wp.int32,
-        params: wp.array[FrameParams],
-        picture: Picture,
-        layers: Layers,
-        # Out:
-        levels_out: wp.array2d[wp.int32],
-    ):
-        strip = row_start + wp.tid()
-        for level in range(_LEVELS):
-            levels_out[strip, level] = 0
-        i = strip * _AUTO_STRIDE
-        rect = params[0].light_rect
-        if i < rect[0] or i >= rect[1]:
-            return
-        for j in range(rect[2], rect[3], _AUTO_STRIDE):
-            code = picture.frame[i, j]
-            clipped = wp.max(wp.max(code[0], code[1]), code[2]) == wp.uint8(255)
-            at = read_layers(params, layers, i, j)
-            dark = at.added == wp.vec3(0.0, 0.0, 0.0)
-            if not clipped and not at.objects[3] > 0.5 and not dark:
-                level = level_of(wp.max(compose(decode(picture.decode_table, code), at)))
-                levels_out[strip, level] = levels_out[strip, level] + 1
-
-    return count_levels_kernel
+@wp.kernel(enable_backward=False)
+def count_levels_kernel(
+    # In:
+    row_start: wp.int32,
+    params: wp.array[FrameParams],
+    picture: Picture,
+    layers: Layers,
+    # Out:
+    levels_out: wp.array2d[wp.int32],
+):
+    """Count, in one sampled row, how many pixels under virtual light fall into each level."""
+    strip = row_start + wp.tid()
+    for level in range(_LEVELS):
+        levels_out[strip, level] = 0
+    i = strip * _AUTO_STRIDE
+    rect = params[0].light_rect
+    if i < rect[0] or i >= rect[1]:
+        return
+    for j in range(rect[2], rect[3], _AUTO_STRIDE):
+        code = picture.frame[i, j]
+        clipped = wp.max(wp.max(code[0], code[1]), code[2]) == wp.uint8(255)
+        at = read_layers(params, layers, i, j)
+        dark = at.added == wp.vec3(0.0, 0.0, 0.0)
+        if not clipped and not at.objects[3] > 0.5 and not dark:
+            level = level_of(wp.max(compose(decode(picture.decode_table, code), at)))
+            levels_out[strip, level] = levels_out[strip, level] + 1
 
 
 @wp.kernel(enable_backward=False)
@@ -309,48 +274,16 @@ def make_find_gain(method: str) -> wp.Function:
 
 
 @functools.cache
-def make_exposed(config: ExposeConfig) -> wp.Function:
-    """``exposed(code, i, j, params, decode_table, layers, clipped, exposure) -> vec3ub``: a pixel's code."""
-    read_layers = make_read_layers(config.layers)
-    find_gain = make_find_gain(config.method)
+def make_expose_kernel(method: str) -> wp.Kernel:
+    """Return the kernel of one of ``METHODS`` or ``BOXES``; equal ones share one kernel.
 
-    @wp.func(module="unique")
-    def exposed(
-        code: wp.vec3ub,
-        i: wp.int32,
-        j: wp.int32,
-        params: wp.array[FrameParams],
-        picture: Picture,
-        layers: Layers,
-        clipped: ClippedEvidence,
-        exposure: Exposure,
-    ) -> wp.vec3ub:
-        s = exposure.scale[0]
-        codes = exposure.codes
-        gain = find_gain(code, i, j, clipped, s)
-        guessed = bool(gain != 1.0)
-        if wp.static(config.method == "declipped"):
-            guessed = s < 1.0 and wp.max(is_clipped(code)) > 0.0 and not is_light(clipped)
-        known = is_light(clipped) and wp.max(wp.max(code[0], code[1]), code[2]) == wp.uint8(255)
-        at = read_layers(params, layers, i, j)
-        if not guessed and not known and not is_changed(at):
-            return wp.vec3ub(codes[wp.int32(code[0])][0], codes[wp.int32(code[1])][1], codes[wp.int32(code[2])][2])
-        radiance = gain * decode(picture.decode_table, code)
-        if wp.static(config.method == "declipped"):
-            if guessed:
-                radiance = clipped.declipped[i, j]
-        if known:
-            radiance = picture.linear[i, j]
-        made = encode(exposure.encode_table, s * compose(radiance, at))
-        return below_saturation(made, code, saturation_codes(picture.decode_table))
-
-    return exposed
-
-
-@functools.cache
-def make_expose_kernel(config: ExposeConfig, warps: bool) -> wp.Kernel:
-    """Kernel specialised to ``config``, by warps (see ``codes``) or by runs of pixels; equal ones share one kernel."""
-    exposed = make_exposed(config)
+    Raises:
+        ValueError: There is no such method.
+    """
+    known = dict.fromkeys((*METHODS, *BOXES))
+    if method not in known:
+        raise ValueError(f"method: {method!r} is none of {', '.join(known)}")
+    find_gain = make_find_gain(method)
 
     @wp.kernel(module="unique", enable_backward=False)
     def expose_kernel(
@@ -365,33 +298,33 @@ def make_expose_kernel(config: ExposeConfig, warps: bool) -> wp.Kernel:
         # Out:
         image_out: wp.array2d[wp.vec3ub],
     ):
+        """Expose a run of pixels of one row."""
         i, part = wp.tid()
         i += row_start
-        frame = picture.frame
-        if wp.static(warps):
-            first = part // WARP_LANES * WARP_PIXELS
-            own = load_codes(frame, i, first)
-            k = part % WARP_LANES
-            step, stop = WARP_LANES, WARP_PIXELS
-        else:
-            first = part * run
-            k = wp.int32(0)
-            step, stop = wp.int32(1), run
-        while k < stop:
-            j = first + k
-            if j < frame.shape[1]:
-                if wp.static(warps):  # noqa: SIM108  (of a conditional expression both sides would be compiled)
-                    code = get_code(own, k)
-                else:
-                    code = frame[i, j]
-                code = exposed(code, i, j, params, picture, layers, clipped, exposure)
-                if wp.static(warps):
-                    set_code(own, k, code)
-                else:
-                    image_out[i, j] = code
-            k += step
-        if wp.static(warps):
-            store_codes(own, image_out, i, first)
+        s = exposure.scale[0]
+        codes = exposure.codes
+        saturation = saturation_codes(picture.decode_table)
+        for j in range(part * run, wp.min(part * run + run, image_out.shape[1])):
+            code = picture.frame[i, j]
+            gain = find_gain(code, i, j, clipped, s)
+            guessed = bool(gain != 1.0)
+            if wp.static(method == "declipped"):
+                guessed = s < 1.0 and wp.max(is_clipped(code)) > 0.0 and not is_light(clipped)
+            known = is_light(clipped) and wp.max(wp.max(code[0], code[1]), code[2]) == wp.uint8(255)
+            at = read_layers(params, layers, i, j)
+            if guessed or known or is_changed(at):
+                radiance = gain * decode(picture.decode_table, code)
+                if wp.static(method == "declipped"):
+                    if guessed:
+                        radiance = clipped.declipped[i, j]
+                if known:
+                    radiance = picture.linear[i, j]
+                made = encode(exposure.encode_table, s * compose(radiance, at))
+                image_out[i, j] = below_saturation(made, code, saturation)
+            else:
+                image_out[i, j] = wp.vec3ub(
+                    codes[wp.int32(code[0])][0], codes[wp.int32(code[1])][1], codes[wp.int32(code[2])][2]
+                )
 
     return expose_kernel
 
@@ -445,7 +378,6 @@ def read_scale(params: wp.array, scale_out: wp.array) -> None:
 
 
 def count_levels(
-    config: CompositeConfig,
     params: wp.array,
     picture: Picture,
     layers: Layers,
@@ -456,15 +388,14 @@ def count_levels(
     """Count how bright the receiver is under virtual light, for ``auto``.
 
     Args:
-        config: Which layers there are; virtual light on the receiver must be among them.
         params: (1,) FrameParams.
         picture: (H, W) the camera's; its rays are not read.
-        layers: From ``make_layers``.
+        layers: From ``make_layers``, virtual light on the receiver among them.
         levels_out: (ceil(H / AUTO_STRIDE), LEVELS) int32, one row per sampled row of the frame.
         rows: Band of rows of ``levels_out``; None means all.
     """
     launch_rows(
-        make_count_levels_kernel(config),
+        count_levels_kernel,
         (levels_out.shape[0],),
         [params, picture, layers],
         [levels_out],
@@ -484,7 +415,7 @@ def expose_codes(decode_table: wp.array, encode_table: wp.array, scale: wp.array
 
 
 def expose(
-    config: ExposeConfig,
+    method: str,
     params: wp.array,
     picture: Picture,
     layers: Layers,
@@ -497,7 +428,7 @@ def expose(
     """Write the picture at another exposure, layers composed.
 
     Args:
-        config: Method, and which layers there are.
+        method: One of ``METHODS``, or of the readings in ``BOXES``.
         params: (1,) FrameParams; its rectangles bound the layers.
         picture: (H, W) the camera's, contiguous; its rays are not read.
         layers: From ``make_layers``.
@@ -507,10 +438,10 @@ def expose(
         rows: Band of rows; None means all.
     """
     (height, width), device = image_out.shape, image_out.device
-    threads, run = row_parts(device, width)
+    run = pixel_run(device)
     launch_rows(
-        make_expose_kernel(config, by_warps(device, width)),
-        (height, threads),
+        make_expose_kernel(method),
+        (height, -(-width // run)),
         [params, picture, layers, clipped, exposure, run],
         [image_out],
         rows=rows,

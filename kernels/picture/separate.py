@@ -16,8 +16,8 @@ import warp as wp
 
 from warp_ar.kernels.color import decode, is_clipped
 from warp_ar.kernels.launch import Rows, launch_rows
-from warp_ar.kernels.picture.composite import Layers, make_read_layers
-from warp_ar.kernels.picture.expose import ClippedEvidence, ExposeConfig, make_find_gain
+from warp_ar.kernels.picture.composite import Layers, read_layers
+from warp_ar.kernels.picture.expose import ClippedEvidence, make_find_gain
 from warp_ar.kernels.structs import FrameParams, Picture
 
 wp.set_module_options({"enable_backward": False})
@@ -35,10 +35,9 @@ class SeparateLayers:
 
 
 @functools.cache
-def make_separate_layers_kernel(config: ExposeConfig) -> wp.Kernel:
-    """Kernel specialised to which layers there are and how clipped pixels are estimated; equal configs share one."""
-    read_layers = make_read_layers(config.layers)
-    find_gain = make_find_gain(config.method)
+def make_separate_layers_kernel(method: str) -> wp.Kernel:
+    """Return the kernel for one of the methods of ``expose``; equal ones share one kernel."""
+    find_gain = make_find_gain(method)
 
     @wp.kernel(module="unique", enable_backward=False)
     def separate_layers_kernel(
@@ -60,7 +59,7 @@ def make_separate_layers_kernel(config: ExposeConfig) -> wp.Kernel:
             if scale.shape[0] > 0:
                 s = scale[0]
             radiance = find_gain(code, i, j, clipped, s) * decode(picture.decode_table, code)
-            if wp.static(config.method == "declipped"):
+            if wp.static(method == "declipped"):
                 if s < 1.0 and wp.max(is_clipped(code)) > 0.0:
                     radiance = clipped.declipped[i, j]
             out.plate[i, j] = radiance
@@ -78,7 +77,7 @@ def make_separate_layers_kernel(config: ExposeConfig) -> wp.Kernel:
 
 
 def separate_layers(
-    config: ExposeConfig,
+    method: str,
     params: wp.array,
     picture: Picture,
     layers: Layers,
@@ -91,7 +90,7 @@ def separate_layers(
     """Write every layer that has an array in ``out``.
 
     Args:
-        config: How ``expose`` estimates clipped pixels (``plain`` where it does not run), and which layers there are.
+        method: How ``expose`` estimates clipped pixels: ``plain`` where it does not run.
         params: (1,) FrameParams; its rectangles bound the layers.
         picture: (H, W) the camera's; its rays are not read.
         layers: From ``composite.make_layers``.
@@ -101,7 +100,7 @@ def separate_layers(
         rows: Band of rows; None means all.
     """
     launch_rows(
-        make_separate_layers_kernel(config),
+        make_separate_layers_kernel(method),
         picture.frame.shape,
         [params, picture, layers, clipped, scale],
         [out],

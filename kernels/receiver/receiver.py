@@ -11,9 +11,7 @@ method                    Kd                                                    
 ========================  =========================================================  =============================
 ``flat``                  a grey constant                                            N.L
 ``paper``                 a grey constant                                            (1), the letter of [DH04]
-``directional``           a grey constant                                            (1), linear and weighted
-``relief``                luminance of the surroundings in the pixel's hue           (2)
-``reflectance``           what the camera sees over what the environment sends, (3)  N.L
+``reflectance``           what the camera sees over what the environment sends, (2)  N.L
 ========================  =========================================================  =============================
 
 ``flat`` is what plain alpha blending of a lit proxy does. The equations stand above the functions that hold them.
@@ -38,7 +36,7 @@ import warp as wp
 from warp_ar.kernels.cells import look_up_cells
 from warp_ar.kernels.color import luminance
 from warp_ar.kernels.environment.interpolated_irradiance import OtherBalls, make_irradiance_at
-from warp_ar.kernels.picture.summed_area import fine_mean, intensity
+from warp_ar.kernels.picture.summed_area import intensity
 from warp_ar.kernels.pixels import cut_luma, shown_radiance
 from warp_ar.kernels.rays.shapes import surface_key
 from warp_ar.kernels.rays.trace import TraceConfig
@@ -47,7 +45,7 @@ from warp_ar.kernels.structs import Emitter, Hit, KeyLight, Picture, Probe, RayS
 
 wp.set_module_options({"enable_backward": False})
 
-METHODS = ("flat", "paper", "directional", "relief", "reflectance")
+METHODS = ("flat", "paper", "reflectance")
 """Cheapest first."""
 
 
@@ -66,22 +64,16 @@ class Reading:
 READINGS: Mapping[str, Reading] = MappingProxyType(
     {
         "paper": Reading(),
-        "directional": Reading("linear", weighted=True),
         "paper_linear": Reading("linear"),
         "paper_shader": Reading(blend="shader"),
         "paper_weighted": Reading(weighted=True),
     }
 )
-"""Ways to take equation (1), by name: the two methods, and readings that docs/paper.md compares with ``paper``."""
+"""Ways to take equation (1), by name: the method, and readings that docs/paper.md compares with it."""
 DEFAULT_REFLECTANCE = wp.constant(wp.float32(0.5))
 """Of a receiver that nothing is known about: the material of ``flat`` and ``paper``, the prior of ``reflectance``."""
 PRIOR_WEIGHT = wp.constant(wp.float32(0.002 * math.pi))
 """Irradiance at which the prior counts as much as the frame: that of a white receiver at half a code of 255."""
-MAX_RELIEF = wp.constant(wp.float32(4.0))
-"""Largest m: a glint of the receiver is no reason to add more than four times the light."""
-SURROUNDINGS = 1.0 / 8.0
-"""Side of the box of a pixel's surroundings, in frame heights: larger than a wire, smaller than a light's falloff."""
-_HUE_FLOOR = wp.constant(wp.float32(0.01))  # linear; noise in dark pixels has no hue
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,10 +132,6 @@ def shader_response(n_dot_l: wp.float32, multiplicative: wp.float32, alpha: wp.f
 # 255, for no camera's curve is mentioned; the three cases of the text above the printed shader's lerp, (1 - alpha) N.L
 # + alpha m, which gives 2 N.L - m at -1; and alpha as it is, for the remark of section 4.4 that several lights end as
 # plain blending is an observation, not a step of the shader. docs/paper.md says what the other readings give.
-#
-# ``directional`` is (1) with the frame's linear luminance for m, and alpha times the directionality of the
-# environment's dominant light: where the light is ambient, or comes from rivals, it says nothing about bumps and N.L
-# remains.
 @wp.func
 def text_response(n_dot_l: wp.float32, intensity: wp.float32, alpha: wp.float32) -> wp.float32:
     """Equation (1), [DH04] section 4.2."""
@@ -152,55 +140,21 @@ def text_response(n_dot_l: wp.float32, intensity: wp.float32, alpha: wp.float32)
     return (1.0 - weight) * n_dot_l + weight * multiplicative
 
 
-# Equation (2) is (1) with the multiplicative factor made relative. The raw intensity makes a light weak on a dark
-# receiver and shines on faces that are turned away from it; what the paper wants from m is its *pattern*. So m becomes
-# the pixel's luminance over that of its surroundings (a box of the frame's summed-area table) and multiplies N.L. A
-# receiver without structure has m = 1, and gives what ``flat`` gives, for every alpha. The inverse: a bump that tilts
-# the surface by a small angle along the physical light changes its shading to 1 + e; seen from the opposite side it is
-# 1 - e = 2 - m, to first order, which also keeps the mean over the surroundings. With it (1) is
+# Equation (2). The receiver's own reflectance, from what the camera sees and what the environment sends there,
 #
-#     response = N.L (1 + alpha (m - 1)),                                                                          (2)
+#     rho = pi L / E_environment(normal),                                                                          (2)
 #
-# linear in alpha, so nothing jumps where alpha changes sign; alpha is multiplied by the directionality. Kd is the
-# surroundings' luminance in the pixel's hue: the receiver's reflectance if white paper were just below clipping.
-@wp.func
-def relief_factor(m: wp.float32, alpha: wp.float32) -> wp.float32:
-    """Factor on N.L in equation (2)."""
-    return wp.max(1.0 + wp.clamp(alpha, -1.0, 1.0) * (wp.min(m, MAX_RELIEF) - 1.0), 0.0)
-
-
-# Equation (3). The receiver's own reflectance, from what the camera sees and what the environment sends there,
-#
-#     rho = pi L / E_environment(normal),                                                                          (3)
-#
-# which is (exactly) right for a Lambertian receiver, whatever its pattern. A prior of ``PRIOR_WEIGHT`` keeps (3) sane
+# which is (exactly) right for a Lambertian receiver, whatever its pattern. A prior of ``PRIOR_WEIGHT`` keeps (2) sane
 # where the environment is dark, and no reflectance exceeds 1; a clipped channel gives what its code says, a lower
 # bound. With *cells* (``receiver_cells.py``) E is the part of the environment that boxes and balls let through.
-# What shades the receiver beyond its proxy (relief, clutter) is in (3) as if it were paint.
+# What shades the receiver beyond its proxy (relief, clutter) is in (2) as if it were paint.
 @wp.func
 def reflectance_of(radiance: wp.float32, irradiance: wp.float32) -> wp.float32:
-    """Equation (3) with its prior, one channel; within 0..1 for whatever comes in."""
+    """Equation (2) with its prior, one channel; within 0..1 for whatever comes in."""
     rho = (wp.pi * radiance + PRIOR_WEIGHT * DEFAULT_REFLECTANCE) / (wp.max(irradiance, 0.0) + PRIOR_WEIGHT)
     if not rho > 0.0:  # NaN as well
         return 0.0
     return wp.min(rho, 1.0)
-
-
-@wp.func
-def surrounding_luminance(
-    table: wp.array2d[wp.uint32],
-    cut_table: wp.array2d[wp.uint32],
-    decode_table: wp.array[wp.vec3],
-    row: wp.int32,
-    col: wp.int32,
-    size: wp.int32,
-) -> wp.float32:
-    """Linear luminance of the mean code around a pixel; never 0. A mean of codes is not swayed by a few highlights."""
-    code = fine_mean(table, cut_table, row, col, size)
-    low = wp.min(wp.int32(code), 254)
-    fraction = code - wp.float32(low)
-    linear = (1.0 - fraction) * luminance(decode_table[low]) + fraction * luminance(decode_table[low + 1])
-    return wp.max(linear, 1.0e-4)
 
 
 @wp.struct
@@ -220,9 +174,6 @@ class Receiver:
     """The receiver and the environment that lights it; what a ``RelightConfig`` leaves out is empty."""
 
     picture: Picture
-    table: wp.array2d[wp.uint32]  # the frame's summed-area table
-    cut_table: wp.array2d[wp.uint32]  # that of what 8 bits cut off; empty for frames of 8 bits
-    box: wp.int32  # side of a pixel's surroundings
     probes: wp.array[Probe]
     key_lights: wp.array[KeyLight]
     irradiance_sh: wp.array[wp.vec3]
@@ -255,7 +206,7 @@ class Matter:
     """What a point of the receiver is taken to be."""
 
     kd: wp.vec3  # reflectance
-    m: wp.float32  # luminance over that of the surroundings, or the intensity itself
+    m: wp.float32  # the multiplicative factor: intensity of the video
     key: wp.vec3  # unit, toward the environment's dominant light
     directionality: wp.float32
 
@@ -302,16 +253,7 @@ def make_find_matter(config: RelightConfig) -> wp.Function:
         else:
             matter.key = receiver.key_lights[0].direction
             matter.directionality = receiver.key_lights[0].directionality
-            if wp.static(method == "relief"):
-                around = luminance(radiance)
-                if not is_mirrored:
-                    around = surrounding_luminance(
-                        receiver.table, receiver.cut_table, receiver.picture.decode_table, row, col, receiver.box
-                    )
-                    matter.m = luminance(coded) / around  # like with like: what is around is a mean of codes
-                hue = radiance + wp.vec3(_HUE_FLOOR, _HUE_FLOOR, _HUE_FLOOR)
-                matter.kd = wp.min(around / luminance(hue) * hue, wp.vec3(1.0, 1.0, 1.0))
-            elif wp.static(reading is not None and reading.values == "video"):
+            if wp.static(reading is not None and reading.values == "video"):
                 seen = receiver.picture
                 cut = cut_luma(seen.frame, seen.decode_table, seen.linear, row, col)
                 matter.m = wp.clamp((wp.float32(intensity(seen.frame[row, col])) + cut) / 255.0, 0.0, 1.0)
@@ -326,40 +268,30 @@ def make_find_matter(config: RelightConfig) -> wp.Function:
 def make_respond(method: str) -> wp.Function:
     """``respond(matter, wi, n_dot_l) -> float32``: a point's response, by one of ``METHODS`` or ``READINGS``.
 
-    The one place where equations (1) and (2) meet a light: at points, and on what emits. ``flat`` reads no matter.
+    The one place where equation (1) meets a light: at points, and on what emits. ``flat`` reads no matter.
     """
     reading = READINGS.get(method)
 
     @wp.func(module="unique")
     def respond(matter: Matter, wi: wp.vec3, n_dot_l: wp.float32) -> wp.float32:
         response = n_dot_l
-        if wp.static(method not in ("flat", "reflectance")):
+        if wp.static(reading is not None):
             alpha = wp.dot(wi, matter.key)
-            if wp.static(reading is not None):
-                if wp.static(reading is not None and reading.weighted):
-                    alpha = alpha * matter.directionality
-                if wp.static(reading is not None and reading.blend == "shader"):
-                    response = shader_response(n_dot_l, matter.m, alpha)
-                else:
-                    response = text_response(n_dot_l, matter.m, alpha)
+            if wp.static(reading is not None and reading.weighted):
+                alpha = alpha * matter.directionality
+            if wp.static(reading is not None and reading.blend == "shader"):
+                response = shader_response(n_dot_l, matter.m, alpha)
             else:
-                response = n_dot_l * relief_factor(matter.m, alpha * matter.directionality)
+                response = text_response(n_dot_l, matter.m, alpha)
         return response
 
     return respond
-
-
-def surroundings_size(height: int) -> int:
-    """Side of the box of a pixel's surroundings in a frame of ``height`` rows, odd."""
-    return 2 * round(0.5 * SURROUNDINGS * height) + 1
 
 
 def make_receiver(
     config: RelightConfig,
     picture: Picture,
     *,
-    table: wp.array | None = None,
-    cut_table: wp.array | None = None,
     probes: wp.array | None = None,
     key_lights: wp.array | None = None,
     irradiance: wp.array | None = None,
@@ -367,15 +299,13 @@ def make_receiver(
     others: OtherBalls | None = None,
     cells: ReceiverCells | None = None,
 ) -> Receiver:
-    """What kernels read of the receiver; what the method leaves out may be None.
+    """Return the receiver as kernels read it; what the method leaves out may be None.
 
     Args:
         config: Method and forms of light.
         picture: (H, W) the camera's.
-        table: (H, W) uint32, the frame's summed-area table; needed by ``relief``.
-        cut_table: (H, W) uint32, that of what 8 bits cut off; None for frames of 8 bits.
         probes: (p,) Probe; needed if ``config.probes``.
-        key_lights: (k,) KeyLight, brightest first; needed by the paper's blend and ``relief``.
+        key_lights: (k,) KeyLight, brightest first; needed by the paper's blend.
         irradiance: Irradiance of the environment, nine coefficients or a latlong map as ``config.irradiance`` says;
             needed by ``reflectance``.
         emitters: (q,) Emitter, seen from the first probe; needed if ``config.emitters``.
@@ -383,9 +313,9 @@ def make_receiver(
         cells: From ``receiver_cells``; needed if ``config.ambient_visibility`` or ``config.bounced``.
     """
     receiver = Receiver()
-    receiver.picture, receiver.box = picture, surroundings_size(picture.rays.shape[0])
+    receiver.picture = picture
     form = f"irradiance_{config.irradiance}"
-    optional = {"table": table, "cut_table": cut_table, "probes": probes, "key_lights": key_lights, form: irradiance}
+    optional = {"probes": probes, "key_lights": key_lights, form: irradiance}
     for name, value in {**optional, "emitters": emitters, "others": others, "cells": cells}.items():
         if value is not None:
             setattr(receiver, name, value)

@@ -150,9 +150,11 @@ def request_for(stage: str, method: str) -> Request | None:
         return dataclasses.replace(request, scene=with_sized_lights(request.scene), quality=quality)
     methods = {} if method == "default" else {stage: method}
     # Some stages run only where another one is on its best method, some only without a change of exposure, one only
-    # where the frames alternate between exposure times, some only where relief is turned or layers are asked for.
+    # where the frames alternate between exposure times, some only in the paper's way or where layers are asked for.
     best = {one.name: list(one.methods)[-1] for one in STAGES if len(one.methods) > 1}
-    ways = itertools.product(((), tuple(LAYERS)), ({}, best, {"relight": "relief"}), (0.7, 1.0), ((), BRACKET))
+    ways = itertools.product(
+        ((), tuple(LAYERS)), ({}, best, {"relight": "paper", "expose": "box"}), (0.7, 1.0), ((), BRACKET)
+    )
     for layers, others, scale, times in ways:
         quality = make_quality(**{**others, **methods})
         request = Request(make_scene(exposure=Exposure(scale)), quality, SIZE, ("image", "environment", *layers), times)

@@ -104,7 +104,7 @@ def exposed(method, image, scale, device):
     expose.read_scale(params, factor)
     expose.expose_codes(decode, encode, factor, codes)
     expose.expose(
-        expose.ExposeConfig(method),
+        method,
         params,
         make_picture(frame, decode, None),
         composite.make_layers(),

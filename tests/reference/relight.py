@@ -47,7 +47,6 @@ def text_response(n_dot_l, m, alpha):
 
 READINGS = {
     "paper": ("video", text_response, False),
-    "directional": ("linear", text_response, True),
     "paper_linear": ("linear", text_response, False),
     "paper_shader": ("video", shader_response, False),
     "paper_weighted": ("video", text_response, True),
@@ -55,27 +54,14 @@ READINGS = {
 """Values of the multiplicative factor, blend, whether alpha is weighted."""
 
 
-def relief_factor(m, alpha):
-    return np.maximum(1.0 + np.clip(alpha, -1.0, 1.0) * (np.minimum(m, 4.0) - 1.0), 0.0)
-
-
 def reflectance(radiance, irradiance):
     weight = 0.002 * np.pi
     return np.clip((np.pi * radiance + 0.5 * weight) / (irradiance + weight), 0.0, 1.0)
 
 
-def surrounding_luminance(frame, decode_table, size):
-    values = summed_area.intensity(frame)
-    mean = np.array(
-        [[summed_area.box_mean(values, i, j, size) for j in range(frame.shape[1])] for i in range(frame.shape[0])]
-    )
-    grey = decode_table.astype(np.float64) @ LUMINANCE
-    return np.maximum(np.interp(mean, np.arange(256), grey), 1e-4)
-
-
-def respond(method, frame, radiance, around, n_dot_l, alpha, directionality, surroundings, coded=None):
-    """(Kd, response) of one light, equations of the module's docstring; ``coded``: what 8 bits hold of the radiance."""
-    m = ((radiance if coded is None else coded) @ LUMINANCE)[..., None]
+def respond(method, frame, radiance, n_dot_l, alpha, directionality, surroundings):
+    """(Kd, response) of one light, equations of the module's docstring."""
+    m = (radiance @ LUMINANCE)[..., None]
     kd = np.full(radiance.shape, 0.5)
     if method == "flat":
         return kd, n_dot_l
@@ -84,8 +70,4 @@ def respond(method, frame, radiance, around, n_dot_l, alpha, directionality, sur
         if values == "video":
             m = (summed_area.intensity(frame) / 255.0)[..., None]
         return kd, response(n_dot_l, m, alpha * directionality if weighted else alpha)
-    if method == "reflectance":
-        return reflectance(radiance, surroundings), n_dot_l
-    hue = radiance + 0.01
-    kd = np.minimum(around[..., None] / (hue @ LUMINANCE)[..., None] * hue, 1.0)
-    return kd, n_dot_l * relief_factor(m / around[..., None], alpha * directionality)
+    return reflectance(radiance, surroundings), n_dot_l

@@ -1,4 +1,4 @@
-"""Exact twins of ``kernels/picture/summed_area.py`` and ``summed_area_strips.py`` in 64-bit integers."""
+"""Exact twins of ``kernels/picture/summed_area.py`` in 64-bit integers."""
 
 import numpy as np
 

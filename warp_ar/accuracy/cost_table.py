@@ -100,15 +100,7 @@ BETWEEN: Mapping[str, Mapping[str, tuple[str, str, float]]] = {
     },
     "edge_samples": {"9": ("4", "16", 5 / 12)},
     "environment_shadow": {
-        "coarse8": ("none", "coarse", 25 / 64),
         "coarse6": ("none", "coarse", 25 / 36),
-        "bounce5": ("none", "bounce", 4 / 25),
-        "bounce4": ("none", "bounce", 4 / 16),
-        "bounce3": ("none", "bounce", 4 / 9),
-        "bounce64": ("none", "bounce", 1.15),
-        "bounce128": ("none", "bounce", 2.3),
-        "bounce192": ("none", "bounce", 3.45),
-        "bounce256": ("none", "bounce", 4.6),
     },
     "shade": {"few_rays": ("environment", "one_bounce", 1 / 2)},
 }

@@ -7,13 +7,10 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_ar.kernels.launch import copy
 from warp_ar.kernels.picture import composite
-from warp_ar.kernels.picture.codes import by_warps
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
-from warp_ar.stages.shared.layers import composite_config, layers_of
-from warp_ar.stages.shared.rows import union_of
+from warp_ar.stages.shared.layers import layers_of
 
 
 class Composite(Stage):
@@ -46,27 +43,11 @@ class Composite(Stage):
         return {"image": ArraySpec((height, width), wp.vec3ub)}
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """On CPU a plain copy, then a pass over the rows that a layer can reach; on CUDA one pass over all."""
-        config = composite_config(self.features.layers)
-        width, height = self.request.size
-        if not device.is_cpu:
-            composite.make_composite_kernel(config, by_warps(device, width))
+        """One pass over all pixels."""
         image, frame, layers = arrays["image"], arrays["frame"], layers_of(arrays)
+        tables = arrays["decode"], arrays["encode"]
 
         def launch(rows: Rows | None) -> None:
-            composite.composite(
-                config,
-                arrays["params"],
-                frame,
-                arrays["decode"],
-                arrays["encode"],
-                layers,
-                image,
-                rows=rows,
-            )
+            composite.composite(arrays["params"], frame, *tables, layers, image, rows=rows)
 
-        if not device.is_cpu:
-            return [Pass(launch, rows=height)]
-        extents = [arrays["object_rows"]] * config.virtual + [arrays["light_rows"]] * config.added
-        extents += [arrays["shadow_rows"]] * config.ratio + [arrays["ball_rows"]] * config.mirror_ball
-        return [Pass(lambda rows: copy(image, frame), rows=height), Pass(launch, rows=height, extent=union_of(extents))]
+        return [Pass(launch, rows=self.request.size[1])]

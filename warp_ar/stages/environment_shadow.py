@@ -77,17 +77,9 @@ class EnvironmentShadow(Stage):
     name: ClassVar[str] = "environment_shadow"
     methods: ClassVar[Mapping[str, str]] = {
         "none": "none (the paper)",
-        "coarse8": "32 rays per estimate, every eighth pixel, and an estimate of reflected light",
         "coarse6": "32 rays, every sixth pixel, and an estimate of reflected light",
         "coarse": "32 rays, every fifth pixel, and an estimate of reflected light",
-        "bounce5": "64 rays, every fifth pixel, and reflected light by a ray for half of them",
-        "bounce4": "64 rays, every fourth pixel, and reflected light by a ray for half of them",
-        "bounce3": "64 rays, every third pixel, and reflected light by a ray for half of them",
         "bounce": "64 rays, every second pixel, and reflected light by a ray for half of them",
-        "bounce64": "the same, and reflected light by a ray for each of them",
-        "bounce128": "the same with 128 rays",
-        "bounce192": "the same with 192 rays",
-        "bounce256": "the same with 256 rays",
         "brute_force": "every texel of the environment at every pixel",
     }
     summary: ClassVar[str] = "shadows of virtual objects on the receiver under the environment"

@@ -8,14 +8,12 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_ar.kernels.picture import expose
-from warp_ar.kernels.picture.codes import by_warps
 from warp_ar.kernels.structs import make_picture
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.clipped import box_reads, clipped_evidence
-from warp_ar.stages.shared.layers import composite_config, layers_of
+from warp_ar.stages.shared.layers import layers_of
 from warp_ar.stages.shared.picture import frame_reads
-from warp_ar.stages.shared.variants import composite_variant
 
 
 class Expose(Stage):
@@ -26,8 +24,7 @@ class Expose(Stage):
         "plain": "scaled",
         "paper": "scaled less where surroundings clip too (the paper)",
         "box": "the same, by one stop at most",
-        "glow": "from the glow around them",
-        "ball": "from the glow and the ball's view of the same lamp",
+        "ball": "from the glow around them and the ball's view of the same emitter",
     }
     remembers: ClassVar[tuple[str, ...]] = ("expose_scale",)
     summary: ClassVar[str] = "another exposure: over-exposed regions keep what they can be guessed to have had"
@@ -70,11 +67,8 @@ class Expose(Stage):
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """The scale, the codes, the picture."""
-        composed = composite_variant(composite_config(self.features.layers), device)
-        config = expose.ExposeConfig(
-            self.method if self.features.boxed else "declipped" if self.features.declipped else "plain", composed
-        )
-        expose.make_expose_kernel(config, by_warps(device, self.request.size[0]))
+        method = self.features.exposure_method
+        expose.make_expose_kernel(method)
         params, decode, encode = (arrays[name] for name in ("params", "decode", "encode"))
         picture = make_picture(arrays["frame"], decode, None, arrays["linear_frame"])
         scale, codes = arrays["expose_scale"], arrays["expose_codes"]
@@ -84,7 +78,7 @@ class Expose(Stage):
             levels = arrays["expose_levels"]
 
             def count(rows: Rows | None) -> None:
-                expose.count_levels(composed, params, picture, layers, levels, rows=rows)
+                expose.count_levels(params, picture, layers, levels, rows=rows)
 
             passes.append(Pass(count, rows=levels.shape[0]))
             passes.append(Pass(lambda rows: expose.adapt_scale(params, levels, scale)))
@@ -96,7 +90,7 @@ class Expose(Stage):
         exposure = expose.make_exposure(encode, scale, codes)
 
         def launch(rows: Rows | None) -> None:
-            expose.expose(config, params, picture, layers, clipped, exposure, arrays["image"], rows=rows)
+            expose.expose(method, params, picture, layers, clipped, exposure, arrays["image"], rows=rows)
 
         passes.append(Pass(launch, rows=self.request.size[1]))
         return passes

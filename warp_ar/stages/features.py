@@ -126,6 +126,13 @@ class Features:
         return self.others if self.distant.diffuse != "none" or measured else 0
 
     @property
+    def exposure_method(self) -> str:
+        """Form of the exposure's kernel: a method that looks at boxes, or a name of its own."""
+        if self.boxed:
+            return self.request.quality.method("expose")
+        return "declipped" if self.declipped else "plain"
+
+    @property
     def shadowed(self) -> bool:
         """Virtual objects change the environment on the receiver."""
         return "shadow_ratio" in self.layers
@@ -175,7 +182,7 @@ def find_features(request: Request) -> Features:
         layers=layers,
         exposed=exposed,
         boxed=darkened and quality.method("expose") in BOXES,
-        declipped=darkened and quality.method("expose") in ("glow", "ball"),
+        declipped=darkened and quality.method("expose") == "ball",
         declipped_by_ball=quality.method("expose") == "ball" and recovered,
         relight_method=relight_method,
         ambient_visibility=lit_by_both and relight_method in LOCAL,

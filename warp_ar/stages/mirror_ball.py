@@ -22,7 +22,7 @@ from warp_ar.stages.shared.distant_light import (
     make_other_balls,
 )
 from warp_ar.stages.shared.picture import find_picture, frame_reads
-from warp_ar.stages.shared.relighting import SUMMED, SUMMED_CUT, relight_config, relight_reads
+from warp_ar.stages.shared.relighting import relight_config, relight_reads
 from warp_ar.stages.shared.rows import GrowingRows
 from warp_ar.stages.shared.shading import mirrored_shading, shade_config
 from warp_ar.stages.shared.variants import relight_variant, shade_variant, shares_kernels, trace_variant
@@ -68,8 +68,7 @@ def _reads(features: Features, *, lit: bool) -> set[str]:
         reads |= {"objects", *distant_light_reads(features)}
         reads |= {"lights"} if shade_config(features).lights else set()
     if lit:
-        # The ball shows the receiver too small for a pixel's surroundings to mean anything.
-        reads |= set(relight_reads(features)) - {SUMMED, SUMMED_CUT, "environment_samples"}
+        reads |= set(relight_reads(features)) - {"environment_samples"}
     if features.shadowed:
         reads.add("shadow_ratio")
     return reads

@@ -80,7 +80,7 @@ PRESETS: Mapping[str, Quality] = MappingProxyType(
                 relight="reflectance",
                 recover="shading",
                 environment_shadow="coarse",
-                expose="glow",
+                expose="ball",
                 mirror_ball="single",
                 shade="environment",
             ),

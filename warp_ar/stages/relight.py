@@ -23,7 +23,7 @@ from warp_ar.stages.shared.distant_light import make_other_balls
 from warp_ar.stages.shared.edge_lists import edge_arrays, make_edge_lists
 from warp_ar.stages.shared.environment_sets import SAMPLES
 from warp_ar.stages.shared.picture import find_picture
-from warp_ar.stages.shared.relighting import SUMMED, SUMMED_CUT, relight_config, relight_reads
+from warp_ar.stages.shared.relighting import relight_config, relight_reads
 from warp_ar.stages.shared.rows import GrowingRows
 from warp_ar.stages.shared.variants import relight_variant
 
@@ -53,8 +53,6 @@ class Relight(Stage):
     methods: ClassVar[Mapping[str, str]] = {
         "flat": "on a grey receiver",
         "paper": "blended by the frame's brightness (the paper)",
-        "directional": "the same, as far as the environment's light has a direction",
-        "relief": "the paper's blend, relief told from paint",
         "reflectance": "on the reflectance that frame and environment light give",
         "bounce": "the same, knowing the environment's own shadows, and what lit surfaces send each other",
         "brute_force": "the same at every pixel, with 1,024 rays and patches of 4 pixels",
@@ -153,8 +151,6 @@ class Relight(Stage):
     def _receiver(self, config: RelightConfig, arrays: Arrays) -> Receiver:
         """What kernels read of the receiver."""
         names = {
-            "table": SUMMED,
-            "cut_table": SUMMED_CUT,
             "key_lights": "key_lights",
             "irradiance": self.features.irradiance,
             "emitters": "emitters",

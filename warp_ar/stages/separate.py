@@ -7,15 +7,13 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_ar.kernels.picture.expose import ExposeConfig
 from warp_ar.kernels.picture.separate import SeparateLayers, make_separate_layers_kernel, separate_layers
 from warp_ar.kernels.structs import make_picture
 from warp_ar.stages.base import NOT_ASKED, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
 from warp_ar.stages.request import LAYERS, PICTURE_LAYERS
 from warp_ar.stages.shared.clipped import box_reads, clipped_evidence
-from warp_ar.stages.shared.layers import composite_config, layers_of
-from warp_ar.stages.shared.variants import composite_variant
+from warp_ar.stages.shared.layers import layers_of
 
 SOURCES: Mapping[str, str] = {
     "objects": "virtual",
@@ -68,11 +66,8 @@ class Separate(Stage):
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """One pass over all pixels."""
         features, reads = self.features, self.wiring.reads
-        config = ExposeConfig(
-            features.request.quality.method("expose") if features.boxed else self._plain(),
-            composite_variant(composite_config(features.layers), device),
-        )
-        make_separate_layers_kernel(config)
+        method = features.exposure_method
+        make_separate_layers_kernel(method)
         out = SeparateLayers()
         for name in PICTURE_LAYERS:
             if LAYERS[name].resource in self.wiring.writes:
@@ -88,9 +83,6 @@ class Separate(Stage):
         )
 
         def launch(rows: Rows | None) -> None:
-            separate_layers(config, *inputs, out, rows=rows)
+            separate_layers(method, *inputs, out, rows=rows)
 
         return [Pass(launch, rows=self.request.size[1])]
-
-    def _plain(self) -> Any:
-        return "declipped" if self.features.declipped else "plain"

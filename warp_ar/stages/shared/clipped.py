@@ -6,7 +6,11 @@ from warp_ar.kernels.picture.expose import ClippedEvidence, make_clipped_evidenc
 from warp_ar.stages.base import Arrays, Wiring
 from warp_ar.stages.features import Features
 from warp_ar.stages.request import Request
-from warp_ar.stages.shared.relighting import SUMMED, SUMMED_CUT
+
+SUMMED = "summed_area"
+"""Resource: the frame's summed-area table."""
+SUMMED_CUT = "summed_area_cut"
+"""Resource: that of what 8 bits cut off, for frames of more."""
 
 
 def box_reads(features: Features) -> tuple[str, ...]:

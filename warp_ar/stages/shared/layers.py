@@ -13,13 +13,3 @@ def layers_of(arrays: Mapping[str, Any]) -> composite.Layers:
     mirror_ball = "reflected" if "reflected" in arrays else "mirror_ball"
     names = ("virtual", "added_light", "shadow_ratio", mirror_ball)
     return composite.make_layers(*(arrays.get(name) for name in names))
-
-
-def composite_config(layers: tuple[str, ...]) -> composite.CompositeConfig:
-    """Which layers to compile in."""
-    return composite.CompositeConfig(
-        virtual="virtual" in layers,
-        added="added_light" in layers,
-        ratio="shadow_ratio" in layers,
-        mirror_ball="mirror_ball" in layers or "reflected" in layers,
-    )

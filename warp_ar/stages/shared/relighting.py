@@ -7,11 +7,6 @@ from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.features import LOCAL, MEASURED, Features
 from warp_ar.stages.shared.picture import frame_reads
 
-SUMMED = "summed_area"
-"""Resource: the frame's summed-area table."""
-SUMMED_CUT = "summed_area_cut"
-"""Resource: that of what 8 bits cut off, for frames of more."""
-
 
 def relight_reads(features: Features) -> tuple[str, ...]:
     """What the method of ``relight`` needs to know of the environment and the receiver."""
@@ -20,8 +15,6 @@ def relight_reads(features: Features) -> tuple[str, ...]:
     measured = method in MEASURED
     if method != "flat":
         reads += frame_reads(features) if measured else [*frame_reads(features), "key_lights"]
-    if method == "relief":
-        reads += [SUMMED, SUMMED_CUT] if features.request.linear else [SUMMED]
     if measured:
         reads.append(features.irradiance)
         reads += ["emitters"] * features.emitters

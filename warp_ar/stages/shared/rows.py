@@ -23,13 +23,3 @@ class GrowingRows:
         if rows[0] >= rows[1]:
             return previous
         return min(rows[0], previous[0]), max(rows[1], previous[1])
-
-
-def union_of(extents: list[Callable[[], Rows]]) -> Callable[[], Rows]:
-    """The rows from the first to the last of several extents, of which some may be empty."""
-
-    def union() -> Rows:
-        filled = [rows for rows in (extent() for extent in extents) if rows[1] > rows[0]]
-        return (min(rows[0] for rows in filled), max(rows[1] for rows in filled)) if filled else (0, 0)
-
-    return union

@@ -27,17 +27,9 @@ class Method:
 
 
 METHODS: Mapping[str, Method] = {
-    "coarse8": Method(32, 4, 8, "estimated"),
     "coarse6": Method(32, 4, 6, "estimated"),
     "coarse": Method(32, 4, 5, "estimated"),
-    "bounce5": Method(64, 4, 5, "traced", 0.5),
-    "bounce4": Method(64, 4, 4, "traced", 0.5),
-    "bounce3": Method(64, 4, 3, "traced", 0.5),
     "bounce": Method(64, 4, 2, "traced", 0.5),
-    "bounce64": Method(64, 4, 2, "traced"),
-    "bounce128": Method(128, 4, 2, "traced"),
-    "bounce192": Method(192, 4, 2, "traced"),
-    "bounce256": Method(256, 4, 2, "traced"),
     "brute_force": Method(REFERENCE_SIZE[0] * REFERENCE_SIZE[1], 1, 1, "traced"),
 }
 """Cheapest first, after ``none``."""

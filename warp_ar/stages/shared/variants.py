@@ -14,7 +14,6 @@ from typing import Any, Final
 from warp_ar.errors import UsageError
 from warp_ar.kernels.objects.reflect import DiffuseForm, DistantLightConfig
 from warp_ar.kernels.objects.shade import ShadeConfig
-from warp_ar.kernels.picture.composite import CompositeConfig
 from warp_ar.kernels.rays.trace import TraceConfig
 from warp_ar.kernels.receiver.receiver import RelightConfig
 from warp_ar.stages.features import Features
@@ -59,11 +58,6 @@ def relight_variant(config: RelightConfig, features: Features, device: Any) -> R
     if not shares_kernels(device):
         return config
     return config.general(soft=_asks_soft(features), by_call=device.is_cpu)
-
-
-def composite_variant(config: CompositeConfig, device: Any) -> CompositeConfig:
-    """Layers to compile in."""
-    return config.general() if shares_kernels(device) else config
 
 
 def _form(features: Features) -> DiffuseForm:
