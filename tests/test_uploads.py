@@ -17,9 +17,9 @@ from tests.gltf_files import Gltf
 from tests.test_pipeline import make_scene
 from warp_ar.errors import SinkError, UsageError, WarpArError
 from warp_ar.light.captured import Light
-from warp_ar.output.places import files_of
 from warp_ar.scene import SourceSpec, dumps_scene, load_scene
 from warp_ar.scene.mesh_files import load_mesh
+from warp_ar.scene.scene_files import files_of
 from warp_ar.stages.quality import PRESETS
 from warp_ar.viewer import edits, uploads
 from warp_ar.viewer.bundle import pack_scene
@@ -108,9 +108,9 @@ def test_a_scene_is_shown_and_names_no_file_of_this_machine(files, wanted):
     own = dumps_scene(dataclasses.replace(scene, path=None))
     assert files.take("desk.toml", own.encode(), shown)[0](shown).scene.objects == scene.objects
     for spoiled in (own.replace("teapot", "secret"), own.replace("meshes", "..")):
-        with pytest.raises(UsageError, match="names the file"):
+        with pytest.raises(WarpArError, match="no file of this name came with the scene"):
             files.take("desk.toml", spoiled.encode(), shown)
-    with pytest.raises(UsageError, match="names the file"):
+    with pytest.raises(WarpArError, match="no file of this name came with the scene"):
         files.take("desk.toml", own.encode(), wanted)
 
 
@@ -279,8 +279,8 @@ def packed(**members):
         ({"scene.toml": "schema = 1", "..__evil.ply": "x"}, "nothing that a scene names"),
         ({"scene.toml": "schema = 1", "run.sh": "x"}, "run.sh is nothing"),
         ({"scene.toml": "schema = 1", "big.bin": bytes(1 << 27)}, "unpacks to 134,217,738 bytes"),
-        ({"scene.toml": 'schema = 1\nname = "/etc/passwd"'}, "names the file"),
-        ({"scene.toml": 'schema = 1\nname = "../../x.ply"'}, "names the file"),
+        ({"scene.toml": 'schema = 1\n[camera]\nfield_of_view = 60\ntransfer = "id_rsa"'}, "no file of this name"),
+        ({"scene.toml": 'schema = 1\n[camera]\nfield_of_view = 60\n[source]\npath = ".."'}, "no file of this name"),
         ({"scene.toml": "schema = 9"}, "desk.zip"),
     ],
 )

@@ -21,13 +21,14 @@ from warp_ar.command_line import EXIT_DONE, Parser, run_command
 from warp_ar.errors import SinkError, SourceError, UsageError, say
 from warp_ar.output.environment_file import write_environment
 from warp_ar.output.gltf_file import GLTF_SUFFIX, write_glb
-from warp_ar.output.places import check_places, check_replaceable, files_of
+from warp_ar.output.places import check_places, check_replaceable
 from warp_ar.output.shot import Shot, texture_files
 from warp_ar.output.sink import make_folder
 from warp_ar.output.stmap import distort_map, undistort_map, write_stmap
 from warp_ar.output.track_file import TRACK_SUFFIX, write_track
 from warp_ar.output.usd_file import USD_SUFFIXES, load_usd, write_usd
 from warp_ar.scene import Scene, load_scene
+from warp_ar.scene.scene_files import files_of
 from warp_ar.signature import is_signed
 
 SUFFIXES = (*USD_SUFFIXES, GLTF_SUFFIX, TRACK_SUFFIX)

@@ -13,6 +13,7 @@ import json
 import os
 import pathlib
 import re
+import secrets
 import stat
 import tomllib
 from collections.abc import Callable
@@ -249,12 +250,20 @@ def check_depth(depth: int, label: str, error: type[WarpArError]) -> None:
         raise error(too_much(f"{label}: it", depth, "levels of nesting", "nesting"))
 
 
-def write_whole(path: str | os.PathLike[str], write: bytes | Callable[[pathlib.Path], object]) -> None:
+def write_whole(
+    path: str | os.PathLike[str],
+    write: bytes | Callable[[pathlib.Path], object],
+    *,
+    suffix: str = "",
+    keep_links: bool = False,
+) -> None:
     """Write a file aside and give it its name when it is whole; what stood there stays until then.
 
     Args:
-        path: The file; a link is followed.
-        write: Its bytes, or what writes them to the path that it is given.
+        path: The file; a symbolic link is followed. The mode of a file that stood there is kept.
+        write: Its bytes, or a function that writes them to the path that it is given.
+        suffix: Ending of that path, for libraries that choose the format by it.
+        keep_links: Whether other hard links of the file get the new content too; for a user's own file that is amended.
 
     Raises:
         OSError: It cannot be written; nothing has changed.
@@ -263,23 +272,55 @@ def write_whole(path: str | os.PathLike[str], write: bytes | Callable[[pathlib.P
     kind = kind_of(path)
     if kind not in ("file", "nothing"):
         raise OSError(f"it is {'a folder' if kind == 'folder' else kind}, not a file")
-    part = part_of(path)
+    file, part = create_aside(path, suffix)
     try:
+        with os.fdopen(file, "wb") as stream:
+            if not callable(write):
+                stream.write(write)
         if callable(write):
             write(part)
-        else:
-            part.write_bytes(write)
-        part.replace(path)
+        before = os.stat(path) if kind == "file" else None
+        if before is not None and keep_links and before.st_nlink > 1:
+            path.write_bytes(part.read_bytes())  # the copy aside has shown that there is room
+            part.unlink()
+            return
+        if before is not None:
+            part.chmod(stat.S_IMODE(before.st_mode) & 0o777)
+        take_name(part, path)
     except BaseException:
         with contextlib.suppress(OSError):
             part.unlink()
         raise
 
 
-def part_of(path: pathlib.Path) -> pathlib.Path:
-    """Where a file is written until it is whole: hidden, beside it."""
+def create_aside(path: pathlib.Path, suffix: str = "") -> tuple[int, pathlib.Path]:
+    """Create an empty file beside a path: hidden, of a random name, and new, so that no link there is followed.
+
+    Args:
+        path: The name that the file is to take when it is whole (`take_name`).
+        suffix: Ending of its name until then.
+
+    Returns:
+        Its descriptor, open for reading and writing, and its path.
+
+    Raises:
+        OSError: It cannot be created.
+    """
     name = path.name if len(os.fsencode(path.name)) <= 200 else f"{path.stem[:40]}{path.suffix[:8]}"
-    return path.with_name(f".{name}.part")
+    part = path.with_name(f".{name}.{secrets.token_hex(8)}.part{suffix}")
+    flags = os.O_RDWR | os.O_CREAT | os.O_EXCL
+    for extra in ("O_NOFOLLOW", "O_CLOEXEC", "O_BINARY"):
+        flags |= getattr(os, extra, 0)
+    return os.open(part, flags, 0o666), part
+
+
+def take_name(part: pathlib.Path, path: pathlib.Path) -> None:
+    """Give a file that was written aside its name; the file that had it is gone.
+
+    Raises:
+        OSError: It cannot be renamed.
+    """
+    part.replace(path)
 
 
 def is_same_file(a: pathlib.Path, b: pathlib.Path) -> bool:

@@ -20,6 +20,7 @@ from pathlib import Path
 from warp_ar.calibration.card import write_card
 from warp_ar.command_line import EXIT_DONE, Parser, run_command
 from warp_ar.errors import SinkError, UsageError, printable, reason
+from warp_ar.files import take_name
 from warp_ar.scene import bundled_scenes, load_scene
 from warp_ar.scene.starter import starter_scene
 from warp_ar.tracking.card_layout import RINGS, SHEET, ball_center
@@ -80,7 +81,7 @@ def make_desk(folder: Path, source: str | int, radius: float) -> None:
             for name, paper, dpi in CARDS:
                 write_card(SHEET, made / name, paper, dpi)
             load_scene(made)
-            made.rename(folder)
+            take_name(made, folder)
     except OSError as error:
         raise SinkError(f"{folder}: cannot be made: {reason(error)}") from error
 

@@ -21,10 +21,11 @@ from warp_ar.errors import UsageError, WarpArError, printable, reason, say
 from warp_ar.files import write_whole
 from warp_ar.live_start import hurry_compilers, say_quick_check
 from warp_ar.output.encoders import parse_options
-from warp_ar.output.places import check_places, check_replaceable, files_of
+from warp_ar.output.places import check_places, check_replaceable
 from warp_ar.output.sink import make_folder
 from warp_ar.output.sinks import NullSink, Sink, open_sink
 from warp_ar.scene import Probe, Scene, load_scene
+from warp_ar.scene.scene_files import files_of
 from warp_ar.signature import PROGRAM
 from warp_ar.stages.quality import AUTO
 

@@ -6,8 +6,8 @@ import argparse
 from typing import Final
 
 from warp_ar.errors import WarpArError, say
-from warp_ar.output.places import files_of
 from warp_ar.scene import Scene, bundled_scenes
+from warp_ar.scene.scene_files import files_of
 
 ALWAYS: Final = ("camera.guessed", "object.outside")
 """Findings that are said beside the worst."""

@@ -32,9 +32,10 @@ from warp_ar.errors import SinkError, SourceError, UsageError, reason, say
 from warp_ar.exr_file import write_exr
 from warp_ar.files import write_whole
 from warp_ar.light.captured import Light
-from warp_ar.output.places import check_places, check_replaceable, files_of
+from warp_ar.output.places import check_places, check_replaceable
 from warp_ar.output.sink import make_folder
 from warp_ar.scene import Scene, load_scene
+from warp_ar.scene.scene_files import files_of
 from warp_ar.session import calibrated, with_light
 from warp_ar.signature import PROGRAM, sign_png
 from warp_ar.stages.quality import PRESETS

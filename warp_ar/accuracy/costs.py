@@ -26,6 +26,7 @@ from warp_ar.accuracy.cost_table import BETWEEN, MethodCost, Scales, Setting, ch
 from warp_ar.engine.graph import Plan
 from warp_ar.engine.pipeline import DEFAULT_FRAME_INTERVAL, TRACK, Pipeline, Result
 from warp_ar.engine.switcher import let_go
+from warp_ar.files import write_whole
 from warp_ar.scene import Pose, Scene
 from warp_ar.stages.quality import PRESETS, Quality
 from warp_ar.stages.recover import EVERY_FRAME
@@ -368,8 +369,6 @@ def write_costs(folder: Path, key: str, costs: Costs) -> None:
     everything[key] = dataclasses.asdict(costs)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        fresh = path.with_name(f"{path.name}.{os.getpid()}")
-        fresh.write_text(json.dumps(everything, indent=1), encoding="utf-8")
-        fresh.replace(path)
+        write_whole(path, json.dumps(everything, indent=1).encode())
     except OSError as error:
         print(f"warp_ar: cannot keep measured costs in {folder}: {error.strerror}", file=sys.stderr)

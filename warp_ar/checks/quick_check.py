@@ -9,7 +9,6 @@ import contextlib
 import dataclasses
 import hashlib
 import json
-import os
 import pickle
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -17,6 +16,7 @@ from typing import Final
 
 from warp_ar.cache_folder import cache_folder
 from warp_ar.checks.finding import Finding
+from warp_ar.files import write_whole
 from warp_ar.scene import Scene
 
 _PACKAGE: Final = Path(__file__).parents[1]
@@ -61,11 +61,9 @@ def quick_check(scene: Scene, given: str | int | Path | None, files: Iterable[Pa
         "findings": [(each.name, each.text, each.remedy) for each in checked.findings],
         "ball_seen": checked.ball_seen,
     }
-    part = kept.with_suffix(f".{os.getpid()}")
     with contextlib.suppress(OSError):  # a disk that is full or read-only only costs the time again
         kept.parent.mkdir(parents=True, exist_ok=True)
-        part.write_text(json.dumps(values), encoding="utf-8")
-        part.replace(kept)
+        write_whole(kept, json.dumps(values).encode())
     return checked
 
 

@@ -24,7 +24,7 @@ from typing import Any
 import filelock
 
 from warp_ar.errors import UsageError, WarpArError, reason
-from warp_ar.files import kind_of, parse_json, read_bytes, write_whole
+from warp_ar.files import kind_of, parse_json, read_bytes, take_name, write_whole
 
 MANIFEST, RUN, LOCK, RECORD, PROGRESS = "manifest.jsonl", "run.json", "lock", "record.json", "progress.json"
 ASIDE = ".aside"
@@ -296,7 +296,7 @@ def publish(part: Path, place: Path, key: str, values: Mapping[str, Any] | None 
     (part / RECORD).write_text(json.dumps(told), encoding="utf-8")
     place.parent.mkdir(parents=True, exist_ok=True)
     try:
-        part.rename(place)
+        take_name(part, place)
     except OSError as error:
         if error.errno not in (errno.EEXIST, errno.ENOTEMPTY) or record_at(place, key) is None:
             raise
@@ -309,7 +309,7 @@ def publish_file(part: Path, place: Path) -> None:
     with open(part, "r+b") as stream:
         os.fsync(stream.fileno())
     place.parent.mkdir(parents=True, exist_ok=True)
-    part.replace(place)
+    take_name(part, place)
     _sync_folder(place.parent)
 
 

@@ -29,6 +29,7 @@ from warp_ar.farm.records import Context, Outcome
 from warp_ar.farm.survey import lit_scene, survey_clip
 from warp_ar.farm.variations import NoPlace, draw_variation
 from warp_ar.farm.version import program_version
+from warp_ar.files import take_name
 from warp_ar.scene import SourceSpec, dumps_scene
 
 PART = "frames.mp4"
@@ -201,7 +202,7 @@ def _free_bytes(folder: Path) -> int:
 def _replace_models(part: Path, place: Path) -> None:
     """Move a folder of models to its place; what stood there goes."""
     shutil.rmtree(place, ignore_errors=True)
-    part.rename(place)
+    take_name(part, place)
 
 
 def _note(log: Path, line: str, more: str = "") -> None:

@@ -6,12 +6,10 @@ unless overwriting is asked for.
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from warp_ar.errors import SinkError, UsageError, reason
 from warp_ar.files import is_same_file, kind_of
@@ -91,15 +89,3 @@ def check_places(reads: Mapping[str, Sequence[Path]], writes: Mapping[str, Path]
             if inside or outside:
                 raise UsageError(f"{written} {place} would number frames beside {role} {path}; name another")
         entries.append((written, place))
-
-
-def files_of(value: Any) -> Iterator[Path]:
-    """Every path that a scene, or a part of one, names."""
-    if isinstance(value, Path):
-        yield value
-    elif isinstance(value, tuple):
-        for item in value:
-            yield from files_of(item)
-    elif dataclasses.is_dataclass(value):
-        for field in dataclasses.fields(value):
-            yield from files_of(getattr(value, field.name))

@@ -94,7 +94,7 @@ def write_usd(path: Path, shot: Shot) -> list[Path]:
         prim.SetCustomDataByKey("at", pxr.Gf.Vec3d(*at))
         prim.SetActive(False)
     try:
-        write_whole(path, lambda part: _export(stage, part, path.suffix))
+        write_whole(path, lambda part: _export(stage, part), suffix=path.suffix)
     except OSError as error:
         raise SinkError(f"{path} cannot be written: {reason(error)}") from error
     return written
@@ -111,15 +111,9 @@ def _write_dome(pxr: Any, stage: Any, path: str, file: Path) -> Any:
     return dome.GetPrim()
 
 
-def _export(stage: Any, part: Path, suffix: str) -> None:
-    """Write to a name that has the right ending, which tells the format, then to the one that is asked for."""
-    named = part.with_name(part.name + suffix)
-    try:
-        if not stage.GetRootLayer().Export(str(named)):
-            raise OSError(f"USD cannot write {named}")
-        part.write_bytes(named.read_bytes())
-    finally:
-        named.unlink(missing_ok=True)
+def _export(stage: Any, part: Path) -> None:
+    if not stage.GetRootLayer().Export(str(part)):
+        raise OSError(f"USD cannot write {part}")
 
 
 def _place(pxr: Any, prim: Any, placements: dict[int, Matrix]) -> None:

@@ -6,7 +6,7 @@ import contextlib
 import os
 from pathlib import Path
 
-from warp_ar.files import part_of
+from warp_ar.files import create_aside, take_name
 
 _MEDIA = {True: b"mdat", False: b"\x1f\x43\xb6\x75"}
 """What pictures begin with: a box of MP4, a cluster of Matroska."""
@@ -34,9 +34,8 @@ class WholeFragments:
             OSError: It cannot be made.
         """
         self._path, self._boxes = Path(os.path.realpath(path)), boxes
-        self._part: Path | None = part_of(self._path)
-        flags = os.O_RDWR | os.O_CREAT | os.O_TRUNC | getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0)
-        self._file = os.open(self._part, flags, 0o666)
+        self._part: Path | None
+        self._file, self._part = create_aside(self._path)
         self._pending = bytearray()
         self._start = self._size = self._at = 0  # of what is pending; of the file; where FFmpeg is
         self._closed = False
@@ -94,7 +93,7 @@ class WholeFragments:
         if self._part is not None and (_MEDIA[self._boxes] in data):
             # Where an open file cannot be renamed, it takes its name when it is closed.
             with contextlib.suppress(PermissionError):
-                self._part.replace(self._path)
+                take_name(self._part, self._path)
                 self._part = None
 
     def close(self) -> None:
@@ -104,12 +103,17 @@ class WholeFragments:
         self._closed = True
         if self.error is None:
             self._flush(everything=True)
+        own = os.fstat(self._file)
         os.close(self._file)
         try:
             if self._part is not None and self._size and self.error is None:
-                self._part.replace(self._path)
+                take_name(self._part, self._path)
             elif self._part is not None:
                 self._part.unlink(missing_ok=True)
+            elif not os.path.samestat(own, os.stat(self._path)):
+                raise OSError("another file took its name while it was written, as by a second run with this output")
+        except FileNotFoundError:
+            self.error = self.error or OSError("it, or its folder, was removed while it was written")
         except OSError as error:
             self.error = self.error or error
 

@@ -54,7 +54,7 @@ def amend_scene(
         made = made.replace("\n".join(["", *key_comment(section, key), ""]), "\n")
     loads_scene(made, path)
     try:
-        write_whole(path, made.encode())
+        write_whole(path, made.encode(), keep_links=True)
     except OSError as error:
         raise SinkError(f"{path}: cannot be written: {reason(error)}") from error
 

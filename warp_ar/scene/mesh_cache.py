@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import hashlib
-import os
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from warp_ar.cache_folder import cache_folder
+from warp_ar.files import write_whole
 from warp_ar.scene import geometry, mesh_files, mesh_materials
 
 _CODE = (
@@ -55,11 +55,9 @@ def load_kept_mesh(path: Path) -> geometry.Mesh:
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile), np.load(kept) as values:
         return _unpacked({name: values[name] for name in values.files})
     mesh = mesh_files.load_mesh(path)
-    part = kept.with_suffix(f".{os.getpid()}.npz")
     with contextlib.suppress(OSError):  # a disk that is full or read-only only costs the time again
         kept.parent.mkdir(parents=True, exist_ok=True)
-        np.savez(part, **_packed(mesh))
-        part.replace(kept)
+        write_whole(kept, lambda part: np.savez(part, **_packed(mesh)), suffix=".npz")
     return mesh
 
 

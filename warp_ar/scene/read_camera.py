@@ -10,7 +10,7 @@ from warp_ar.files import is_file
 from warp_ar.scene.calibration_file import load_calibration
 from warp_ar.scene.description import Camera, Exposure, PoseSpec, SourceSpec
 from warp_ar.scene.exif import camera_by_exif
-from warp_ar.scene.keys import INTRINSICS
+from warp_ar.scene.keys import INTRINSICS, keys_of
 from warp_ar.scene.messages import MOST_PIXELS, SMALLEST
 from warp_ar.scene.pose_file import check_rotation, load_poses, pose_of_position, rotation_of_quaternion
 from warp_ar.scene.scene_table import SceneTable
@@ -26,7 +26,8 @@ def _exif_camera(table: SceneTable, source: object, transfer: str | Path) -> Cam
     path = source.get("path") if isinstance(source, dict) else None
     if not isinstance(path, str):
         table.fail("calibration", '"exif" reads the pictures of the scene: give [source] path; else a file or numbers')
-    return camera_by_exif(table.folder / path, transfer)
+    pictures = SceneTable(table.label, table.files, "source", source, keys_of(SourceSpec))
+    return camera_by_exif(pictures.resolve("path", "pictures"), transfer)
 
 
 def read_camera(table: SceneTable, source: object = None) -> Camera:
@@ -92,10 +93,13 @@ def read_source(table: SceneTable) -> SourceSpec:
         also = f"{given[0]} is given too; " if given else ""
         table.fail(key, f"{also}expected exactly one of path, camera and synthetic")
     path = table.resolve("path", "a folder of frames or a video") if "path" in table else None
+    camera = table.integer("camera", low=0, high=1023) if "camera" in table else None
+    if camera is not None and not table.files.has_camera(camera):
+        table.fail("camera", "a scene from outside opens no capture device; start the program with --source")
     # Whether the path is there is asked when the source is opened: another source may stand in for it.
     return SourceSpec(
         path=path,
-        camera=table.integer("camera", low=0, high=1023) if "camera" in table else None,
+        camera=camera,
         synthetic=table.text("synthetic", right="the name of a generated source") if "synthetic" in table else None,
         fps=table.number("fps", low=1e-3, high=1e5, unit="frames per second") if "fps" in table else None,
         exposures=table.vector("exposures", sizes=range(2, 9), low=1e-6, high=1e3, unit="seconds")

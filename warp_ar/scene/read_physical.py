@@ -121,7 +121,7 @@ def _read_proxy_material(parent: SceneTable) -> ProxyMaterial | None:
     if "material" not in parent:
         return None
     section, given = parent.name("material"), parent.data["material"]
-    table = SceneTable(parent.label, parent.folder, section, given, keys_of(ProxyMaterial))
+    table = SceneTable(parent.label, parent.files, section, given, keys_of(ProxyMaterial))
     reflectance = ProxyMaterial.reflectance
     if isinstance(table.data.get("reflectance"), list):
         reflectance = cast(RGB, table.vector("reflectance", low=0.0, high=1.0))

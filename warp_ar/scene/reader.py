@@ -36,6 +36,7 @@ from warp_ar.scene.messages import nearest
 from warp_ar.scene.read_camera import POSE_KEYS, read_camera, read_exposure, read_pose, read_source
 from warp_ar.scene.read_physical import read_captured, read_marker, read_probe, read_proxy
 from warp_ar.scene.read_virtual import read_light, read_object
+from warp_ar.scene.scene_files import SceneFiles
 from warp_ar.scene.scene_table import SceneTable
 
 _TOP_KEYS: Final = ("schema", "name")
@@ -80,11 +81,12 @@ def _desks_beside(path: Path) -> list[str]:
         return []
 
 
-def load_scene(path_or_name: str | Path) -> Scene:
+def load_scene(path_or_name: str | Path, files: SceneFiles | None = None) -> Scene:
     """Read a scene file.
 
     Args:
         path_or_name: A file, a folder that holds one, or the name of a bundled scene.
+        files: Files that it may name, of a scene from outside; all if left out.
 
     Raises:
         SceneError: No such scene, or something in it is wrong; one line names file, key, value and what would be right.
@@ -101,7 +103,7 @@ def load_scene(path_or_name: str | Path) -> Scene:
         path = bundled[str(path_or_name)]
     if path.suffix.lower() in FRAMES:
         raise SceneError(f"{path} is no scene; expected a scene file{FRAMES_GO}")
-    return loads_scene(read_text(path, SceneError, expected="TOML"), path)
+    return loads_scene(read_text(path, SceneError, expected="TOML"), path, files)
 
 
 def _check_top(top: SceneTable, data: dict[str, Any], label: str) -> None:
@@ -132,12 +134,12 @@ def _split_lights(lights: Any, label: str) -> tuple[Any, tuple[str, Any] | None]
 class _Sections:
     """The sections of a scene file, read one by one."""
 
-    def __init__(self, data: dict[str, Any], label: str, folder: Path) -> None:
-        self.data, self.label, self.folder = data, label, folder
+    def __init__(self, data: dict[str, Any], label: str, files: SceneFiles) -> None:
+        self.data, self.label, self.files = data, label, files
         self.marker: Marker | None = self.one("marker", keys_of(Marker), read_marker)
 
     def table(self, section: str, data: Any, keys: Sequence[str]) -> SceneTable:
-        return SceneTable(self.label, self.folder, section, data, keys)
+        return SceneTable(self.label, self.files, section, data, keys)
 
     def one(self, section: str, keys: Sequence[str], read: Callable[[SceneTable], _T]) -> _T | None:
         """What a section says that stands once; None without it."""
@@ -186,26 +188,27 @@ class _Sections:
             )
 
 
-def loads_scene(text: str, path: str | Path | None = None) -> Scene:
+def loads_scene(text: str, path: str | Path | None = None, files: SceneFiles | None = None) -> Scene:
     """Read a scene from text.
 
     Args:
         text: TOML.
         path: The file that the text stands for: named in errors, and its folder is where relative paths start. Without
             it they start at the current folder.
+        files: Files that it may name, of a scene from outside, and the folder where relative paths start.
 
     Raises:
         SceneError: As :func:`load_scene`.
     """
     path = None if path is None else Path(path)
     label = "scene" if path is None else str(path)
-    folder = Path.cwd() if path is None else path.parent.resolve()
+    files = files or SceneFiles(Path.cwd() if path is None else path.parent.resolve())
     data = parse_toml(text, label, SceneError)
     own = {key: data[key] for key in data if key not in _SECTIONS}
-    top = SceneTable(label, folder, "", own, (*_TOP_KEYS, *_SECTIONS))
+    top = SceneTable(label, files, "", own, (*_TOP_KEYS, *_SECTIONS))
     _check_top(top, data, label)
     lights, captured = _split_lights(data.get("light", []), label)
-    sections = _Sections({**data, "light": lights}, label, folder)
+    sections = _Sections({**data, "light": lights}, label, files)
     shining = sections.many("light", keys_of(Light, AreaLight), read_light)
     emitting = tuple(light.as_object() for light in shining if isinstance(light, AreaLight))
     objects = sections.objects()

@@ -153,14 +153,25 @@ class Table:
         """Three numbers."""
         return cast(Vec3, self.vector(key, default, low=low, unit=unit))
 
+    def find(self, text: str) -> Path | None:
+        """Return the path that a text names, links followed; None if this file must not name it."""
+        path = (self.folder / text).resolve()
+        path.exists()  # a name that is too long for the system is refused here
+        return path
+
     def resolve(self, key: str, right: str) -> Path:
-        """A path, links followed; whether anything is there is not asked."""
+        """Return a path, links followed; whether anything is there is not asked."""
         value = self.text(key, right=f"the path of {right}")
         try:
-            path = (self.folder / value).resolve()
-            path.exists()
+            path = self.find(value)
         except (OSError, RuntimeError, ValueError):  # too long, a loop of links, a zero byte
             self.fail(key, f"expected the path of {right}; this cannot be one")
+        if path is None:
+            self.fail(
+                key,
+                f"expected {right}; no file of this name came with the scene; open a scene with its own "
+                "files by python -m warp_ar.live, or drop a ZIP that holds them",
+            )
         return path
 
     def file(self, key: str, right: str) -> Path:

@@ -12,9 +12,9 @@ from typing import Any, Final, TypeVar
 
 from warp_ar.errors import SceneError, UsageError
 from warp_ar.files import read_bytes
-from warp_ar.output.places import files_of
 from warp_ar.scene import Scene, dumps_scene
 from warp_ar.scene.mesh_files import MESH_SUFFIXES, files_beside
+from warp_ar.scene.scene_files import files_of
 
 SCENE: Final = "scene.toml"
 MOST_MEMBERS: Final = 256

@@ -18,13 +18,13 @@ import cv2
 import numpy as np
 
 from warp_ar.errors import SceneError, SinkError, UsageError, WarpArError, reason
-from warp_ar.files import limits, parse_toml, too_much
+from warp_ar.files import limits, too_much
 from warp_ar.light.captured import Light
 from warp_ar.light.latlong_axes import from_axes
-from warp_ar.output.places import files_of
 from warp_ar.scene import CapturedLight, Object, load_scene, loads_scene
 from warp_ar.scene.mesh_assets import confine
 from warp_ar.scene.mesh_files import MESH_SUFFIXES, load_mesh
+from warp_ar.scene.scene_files import SceneFiles, files_of
 from warp_ar.viewer.bundle import unpack_scene
 from warp_ar.viewer.edits import Wanted, add_item
 
@@ -178,9 +178,8 @@ def _read_hdr(name: str, path: Path) -> Any:
 def _bundle_edit(name: str, data: bytes, folder: Path, wanted: Wanted) -> Edit:
     """A scene with all that it names."""
     path = unpack_scene(name, data, folder, MOST_BYTES)
-    own = {file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_file()}
-    _check_names(name, path.read_bytes(), {str(file) for file in files_of(wanted.scene)} | own)
-    scene = load_scene(path)
+    own = [file for file in folder.rglob("*") if file.is_file()]
+    scene = load_scene(path, _files(path.parent, own, wanted))
     for item in scene.objects:
         if item.file is not None and (count := len(load_mesh(item.file).faces)) > MOST_TRIANGLES:
             raise UsageError(f"{name}: a mesh has {count:,} triangles; at most {MOST_TRIANGLES:,} are taken")
@@ -189,34 +188,17 @@ def _bundle_edit(name: str, data: bytes, folder: Path, wanted: Wanted) -> Edit:
 
 
 def _scene_edit(name: str, data: bytes, wanted: Wanted) -> Edit:
-    text = _check_names(name, data, {str(path) for path in files_of(wanted.scene)})
-    scene = dataclasses.replace(loads_scene(text, name), path=wanted.scene.path)
-    return lambda w: Wanted(scene, w.quality, cameras=w.cameras), f"open {name}", f"{name}: the scene is shown."
-
-
-def _check_names(name: str, data: bytes, known: set[str]) -> str:
-    """The text of a scene file that names no files but those that are known."""
     try:
         text = data.decode()
     except ValueError as error:
         raise UsageError(f"{name}: not valid TOML: {str(error)[:160]}") from error
-    document = parse_toml(text, name, UsageError)
-    for value in _texts(document):
-        if value not in known and (re.search(r"[/\\]", value) or re.search(r"\.\w{2,5}$", value)):
-            raise UsageError(
-                f"{name} names the file {value[:60]!r}; a scene with files of its own is opened by "
-                "python -m warp_ar.live or dropped as a ZIP with them, a dropped one may name only those of the scene "
-                "that is shown"
-            )
-    return text
+    folder = Path() if wanted.scene.path is None else wanted.scene.path.parent
+    scene = dataclasses.replace(loads_scene(text, name, _files(folder, (), wanted)), path=wanted.scene.path)
+    return lambda w: Wanted(scene, w.quality, cameras=w.cameras), f"open {name}", f"{name}: the scene is shown."
 
 
-def _texts(value: Any) -> Iterable[str]:
-    if isinstance(value, str):
-        yield value
-    elif isinstance(value, list):
-        for item in value:
-            yield from _texts(item)
-    elif isinstance(value, dict):
-        for item in value.values():
-            yield from _texts(item)
+def _files(folder: Path, own: Iterable[Path], wanted: Wanted) -> SceneFiles:
+    """Return the files that a dropped scene may name: its own, and those of the scene that is shown."""
+    source = wanted.scene.source
+    cameras = () if source is None or source.camera is None else (source.camera,)
+    return SceneFiles.of(folder, [*own, *files_of(wanted.scene)], cameras)
