@@ -22,8 +22,7 @@ from tests.farm_rig import TICK, write_recording
 from warp_ar.farm import cli
 from warp_ar.farm.cli import main
 from warp_ar.farm.driver import Driver
-from warp_ar.farm.manifest import RunError
-from warp_ar.farm.status import read_status
+from warp_ar.farm.manifest import RunError, read_status
 
 TICKS = [0, 25, 40, 75, 100, 101, 150, 175, 230, 250, 275, 300]
 """Of a recording of variable rate."""
@@ -251,8 +250,7 @@ def test_what_killed_workers_left_is_gone_when_a_run_ends(finished, monkeypatch)
         (run / ".aside/good.segment-000000.1").mkdir(parents=True)
         raise RunError("the disk is full")
 
-    pool = types.SimpleNamespace(size=0, names=())
-    monkeypatch.setattr(cli, "_make_pool", lambda options, jobs, folder: pool)
+    monkeypatch.setattr(cli, "_employer", lambda options: lambda context: types.SimpleNamespace(names=()))
     monkeypatch.setattr(Driver, "run", work)
     assert main(["resume", str(run)]) == 1
     assert not (run / ".aside").exists()
@@ -291,4 +289,17 @@ def test_an_address_that_nothing_answers_at_is_told(folder):
     code, _, err = finish(farm("run", folder / "jobs.toml", "--output", folder / "no", "--ray", "127.0.0.1:1"))
     assert code == 2
     assert "--ray 127.0.0.1:1: " in err
+    assert not (folder / "no").exists(), "what cannot be begun leaves no folder"
     assert "start one with: ray start --head" in err
+
+
+def test_a_clip_that_was_replaced_is_refused_by_its_name(folder, finished, capsys):
+    clip = folder / "good.mp4"
+    kept = clip.read_bytes()
+    try:
+        clip.write_bytes(kept[:-1] + b"x")
+        assert main(["resume", str(finished[0]), "--workers", "1"]) == 2
+        assert f"{clip} is not the file, which " in capsys.readouterr().err
+    finally:
+        clip.write_bytes(kept)
+    assert main(["resume", str(finished[0]), "--workers", "1"]) == 1  # the other clip's failure

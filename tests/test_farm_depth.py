@@ -16,10 +16,9 @@ import pytest
 
 from tests.farm_rig import desk_frames, make_jobs
 from warp_ar.engine.layers import RADIANCE
-from warp_ar.farm.jobs import Job, job_of_clip, jobs_of_clip
+from warp_ar.farm.dataset import JobsError
+from warp_ar.farm.jobs import Context, Job, job_of_clip, jobs_of_clip
 from warp_ar.farm.lighting import Lighter
-from warp_ar.farm.records import Context
-from warp_ar.farm.tables import JobsError
 from warp_ar.farm.work import Work
 from warp_ar.kernels.color import decode_codes
 from warp_ar.output.sinks import open_sink
@@ -61,7 +60,7 @@ def run_all(folder: pathlib.Path, name: str, **run: Any) -> tuple[Any, pathlib.P
     with Work(Context(jobs, folder / name, "cpu")) as work:
         todo = [Job("survey")]
         for job in todo:
-            outcome = work.do(job, lambda _: None)
+            outcome = work.do(job)
             assert outcome.state == "done", outcome.reason
             if job.kind == "survey":
                 count = jobs_of_clip(jobs, 0, COUNT)
@@ -139,7 +138,7 @@ ENCODE = """
 import hashlib, sys
 from fractions import Fraction
 from tests.farm_rig import desk_frames
-from warp_ar.farm.part_video import PartSink
+from warp_ar.farm.video import PartSink
 from warp_ar.kernels.color import decode_codes
 for coding in ("8bit", "10bit"):
     with PartSink(sys.argv[1], [0, 25, 50, 75], Fraction(1, 600), 24.0, coding=coding) as sink:

@@ -1,60 +1,67 @@
-"""The driver against workers that do, fail, crash and are killed as a test says."""
+"""The driver against workers that do, fail and die as a test says."""
 
 from __future__ import annotations
 
 import json
-import signal
+import shutil
+from concurrent.futures import BrokenExecutor, Future
 
 import pytest
 
 from tests.farm_rig import make_jobs
-from warp_ar.farm.driver import INTERRUPTIONS, Driver
-from warp_ar.farm.jobs import Job
-from warp_ar.farm.manifest import RECORD, Manifest, RunError
-from warp_ar.farm.pool import Event
-from warp_ar.farm.records import Outcome
+from warp_ar.errors import UsageError
+from warp_ar.farm.driver import Driver
+from warp_ar.farm.jobs import Job, Outcome
+from warp_ar.farm.manifest import RECORD, Manifest, RunError, describe_inputs
 
 VERSION = "warp_ar 1"
 FRAMES = 10
+DIES = "dies"
 
 
 class Workers:
-    """A pool whose workers do as ``behave(job, how often it was given before)`` says: an outcome or an exit code."""
+    """A pool whose workers do as ``behave(job, times it was given before)`` says: an outcome, or they die."""
+
+    died, tries = BrokenExecutor, 5
 
     def __init__(self, jobs, folder, behave=lambda job, before: None, size=3, version=VERSION):
-        self.size, self.names = size, ["cpu"] * size
+        self.names = ["cpu"] * size
         self.jobs, self.folder, self.behave, self.version = jobs, folder, behave, version
-        self.events = [Event(worker, "ready", version) for worker in range(size)]
         self.given: list[Job] = []
-        self.most = 0
+        self.busy, self.most = set(), 0
         self.closed = False
 
-    def give(self, worker, job, arguments):
+    def start(self, worker):
+        self.busy.discard(worker)
+        return self.told(self.version)
+
+    def told(self, value):
+        future: Future = Future()
+        if value == DIES:
+            future.set_exception(BrokenExecutor("killed"))
+        else:
+            future.set_result(value)
+        return future
+
+    def submit(self, worker, job, arguments):
+        self.busy.add(worker)
+        self.most = max(self.most, len(self.busy))
         before = self.given.count(job)
         self.given.append(job)
         said = self.behave(job, before)
-        if isinstance(said, int):
-            self.events += [Event(worker, "died", said), Event(worker, "ready", self.version)]
-            return
-        if said is None:
-            said = self.do(job)
-        self.events.append(Event(worker, "outcome", said))
+        return self.told(self.do(job) if said is None else said)
 
     def do(self, job):
         place = self.folder / job.place(self.jobs)
         values = {"length": FRAMES, "found": FRAMES} if job.kind == "survey" else {"frames": 2}
         if job.kind in ("join", "index"):
             place.parent.mkdir(parents=True, exist_ok=True)
-            place.write_text("")
+            place.write_text("x")
         else:
             place.mkdir(parents=True)
+            (place / "data").write_text("x")
             (place / RECORD).write_text(json.dumps({**values, "job": job.key(self.jobs), "bytes": 1}))
         return Outcome("done", {**values, "bytes": 1})
-
-    def wait(self, seconds):
-        self.most = max(self.most, len(self.events))
-        events, self.events = self.events, []
-        return events
 
     def close(self):
         self.closed = True
@@ -66,11 +73,11 @@ def drive(jobs, folder, behave=lambda job, before: None, **options):
     pool = Workers(jobs, folder, behave, **options)
     said: list[str] = []
     try:
-        summary = Driver(jobs, folder, manifest, pool, VERSION, said.append).run()
+        failed = Driver(jobs, folder, manifest, pool, VERSION, said.append).run()
     finally:
         manifest.close()
         assert pool.closed
-    return pool, summary, said
+    return pool, failed, said
 
 
 @pytest.fixture
@@ -83,31 +90,31 @@ def keys(jobs, given):
 
 
 def test_every_job_is_given_once_and_joined_last(jobs, tmp_path):
-    pool, summary, _ = drive(jobs, tmp_path / "run")
+    pool, failed, _ = drive(jobs, tmp_path / "run")
     given = keys(jobs, pool.given)
     assert len(given) == len(set(given)) == 3 * (1 + 5 + 1)
     for name in "abc":
         mine = [key for key in given if key.startswith(name)]
         assert (mine[0], mine[-1]) == (f"{name}/survey", f"{name}/join")
-    assert not summary.failed
+    assert not failed
     assert pool.most == 3, "all workers must have been busy at once"
 
 
 def test_a_finished_run_has_nothing_left(jobs, tmp_path):
     drive(jobs, tmp_path / "run")
-    pool, summary, _ = drive(jobs, tmp_path / "run")
+    pool, failed, _ = drive(jobs, tmp_path / "run")
     assert pool.given == []
-    assert not summary.failed
+    assert not failed
 
 
 def test_a_poisoned_job_fails_alone_after_two_tries(jobs, tmp_path):
     def behave(job, before):
         return Outcome("failed", reason="frame 3 cannot be decoded") if job == Job("segment", 1, 2, 4, 6) else None
 
-    pool, summary, said = drive(jobs, tmp_path / "run", behave)
+    pool, failed, said = drive(jobs, tmp_path / "run", behave)
     given = keys(jobs, pool.given)
     assert given.count("b/segment-000002") == 2
-    assert summary.failed == {"b/segment-000002": "frame 3 cannot be decoded"}
+    assert failed == {"b/segment-000002": "frame 3 cannot be decoded"}
     assert said == ["b/segment-000002 failed: frame 3 cannot be decoded"]
     assert "b/join" not in given
     assert {"a/join", "c/join"} <= set(given)
@@ -116,45 +123,41 @@ def test_a_poisoned_job_fails_alone_after_two_tries(jobs, tmp_path):
 
 
 def test_a_survey_that_fails_takes_only_its_clip(jobs, tmp_path):
-    pool, summary, _ = drive(
+    pool, failed, _ = drive(
         jobs, tmp_path / "run", lambda job, _: Outcome("failed", reason="cut off") if job == Job("survey", 0) else None
     )
-    assert summary.failed == {"a/survey": "cut off"}
+    assert failed == {"a/survey": "cut off"}
     assert [key for key in keys(jobs, pool.given) if key.startswith("a")] == ["a/survey", "a/survey"]
 
 
 def test_a_second_try_may_succeed(jobs, tmp_path):
-    pool, summary, _ = drive(
+    pool, failed, _ = drive(
         jobs,
         tmp_path / "run",
         lambda job, before: Outcome("failed", reason="once") if job.kind == "join" and not before else None,
     )
-    assert not summary.failed
+    assert not failed
     assert keys(jobs, pool.given).count("a/join") == 2
 
 
-def test_a_job_that_crashes_its_worker_fails_after_two_tries(jobs, tmp_path):
-    crashing = Job("segment", 0, 1, 2, 4)
-    pool, summary, _ = drive(jobs, tmp_path / "run", lambda job, _: -signal.SIGSEGV if job == crashing else None)
-    assert pool.given.count(crashing) == 2
-    assert summary.failed == {"a/segment-000001": "its worker was ended by SIGSEGV"}
-
-
-def test_kills_from_outside_are_no_tries(jobs, tmp_path):
+def test_a_job_whose_worker_dies_is_given_again(jobs, tmp_path):
     killed = Job("segment", 0, 1, 2, 4)
 
     def behave(job, before):
-        return -signal.SIGKILL if job == killed and before < INTERRUPTIONS - 1 else None
+        return DIES if job == killed and before < Workers.tries - 1 else None
 
-    pool, summary, _ = drive(jobs, tmp_path / "run", behave)
-    assert not summary.failed
-    assert pool.given.count(killed) == INTERRUPTIONS
+    pool, failed, _ = drive(jobs, tmp_path / "run", behave)
+    assert not failed
+    assert pool.given.count(killed) == Workers.tries
 
 
-def test_a_job_that_is_always_killed_fails_in_the_end(jobs, tmp_path):
+def test_a_job_whose_workers_always_die_fails_alone(jobs, tmp_path):
     killed = Job("segment", 0, 1, 2, 4)
-    _, summary, _ = drive(jobs, tmp_path / "run", lambda job, _: -signal.SIGKILL if job == killed else None)
-    assert summary.failed == {"a/segment-000001": "its worker was ended by SIGKILL"}
+    pool, failed, _ = drive(jobs, tmp_path / "run", lambda job, _: DIES if job == killed else None)
+    assert pool.given.count(killed) == Workers.tries
+    assert list(failed) == ["a/segment-000001"]
+    assert failed["a/segment-000001"].startswith("its worker died 5 times")
+    assert {"b/join", "c/join"} <= set(keys(jobs, pool.given))
 
 
 def test_outputs_without_a_line_are_taken_over(jobs, tmp_path):
@@ -179,28 +182,20 @@ def test_a_survey_whose_record_is_damaged_is_done_again(jobs, tmp_path):
     lines = (run / "manifest.jsonl").read_text().splitlines()
     (run / "manifest.jsonl").write_text("".join(f"{line}\n" for line in lines if '"b/' not in line))
     (run / "b.mp4").unlink()
-    place = run / "clips/b"
-    (place / RECORD).write_text(json.dumps({"job": "b/survey", "length": "many"}))
-
-    def again(job, _):
-        if job.kind == "survey":
-            (place / RECORD).unlink()
-            place.rmdir()
-
-    pool, summary, _ = drive(jobs, run, again)
+    (run / "clips/b" / RECORD).write_text(json.dumps({"job": "b/survey", "length": "many", "bytes": 1}))
+    pool, failed, _ = drive(jobs, run)
     assert keys(jobs, pool.given) == ["b/survey", "b/join"]
-    assert not summary.failed
+    assert not failed
 
 
 def test_lines_without_outputs_are_forgotten(jobs, tmp_path):
     run = tmp_path / "run"
     drive(jobs, run)
     (run / "b.mp4").unlink()
-    (run / "parts/b/000003" / RECORD).unlink()
-    (run / "parts/b/000003").rmdir()
-    pool, summary, _ = drive(jobs, run)
+    shutil.rmtree(run / "parts/b/000003")
+    pool, failed, _ = drive(jobs, run)
     assert keys(jobs, pool.given) == ["b/segment-000003", "b/join"]
-    assert not summary.failed
+    assert not failed
 
 
 def test_a_full_disk_ends_the_run_and_says_how_to_go_on(jobs, tmp_path):
@@ -208,23 +203,73 @@ def test_a_full_disk_ends_the_run_and_says_how_to_go_on(jobs, tmp_path):
         drive(
             jobs, tmp_path / "run", lambda job, _: Outcome("full", reason="no room") if job.kind == "segment" else None
         )
-    pool, summary, _ = drive(jobs, tmp_path / "run")
-    assert not summary.failed
+    pool, failed, _ = drive(jobs, tmp_path / "run")
+    assert not failed
     assert len([key for key in keys(jobs, pool.given) if "segment" in key]) == 15
 
 
 def test_a_worker_of_another_version_ends_the_run(jobs, tmp_path):
-    with pytest.raises(RunError, match="worker 0 is warp_ar 2, the driver is warp_ar 1; install one version on all"):
+    with pytest.raises(RunError, match=r"worker \d is warp_ar 2, the driver is warp_ar 1; install one version on all"):
         drive(jobs, tmp_path / "run", version="warp_ar 2")
 
 
 def test_workers_that_never_get_ready_end_the_run(jobs, tmp_path):
-    class Dead(Workers):
-        def wait(self, seconds):
-            return [Event(1, "died", 1)]
+    with pytest.raises(RunError, match=r"worker \d died 3 times before it was ready; see .*worker-\d\.log"):
+        drive(jobs, tmp_path, version=DIES)
 
-    with pytest.raises(RunError, match=r"worker 1 died 3 times before it was ready; see .*worker-1\.log"):
-        Driver(jobs, tmp_path, Manifest(tmp_path, write=True), Dead(jobs, tmp_path), VERSION, print).run()
+
+def test_an_output_that_is_not_whole_is_made_again(jobs, tmp_path):
+    """Of a finished run a joined recording and a segment are cut to nothing; of another the survey is."""
+    run = tmp_path / "run"
+    drive(jobs, run)
+    (run / "b.mp4").write_text("")
+    (run / "parts/b/000003/data").write_text("")
+    pool, failed, _ = drive(jobs, run)
+    assert keys(jobs, pool.given) == ["b/segment-000003", "b/join"]
+    assert not failed
+    assert (run / "b.mp4").read_text() == (run / "parts/b/000003/data").read_text() == "x"
+
+
+def test_a_file_that_is_another_one_now_is_refused_by_its_name(jobs, tmp_path):
+    clip = tmp_path / "a.mp4"
+    clip.write_text("first")
+
+    def behave(job, before):
+        if job.kind != "survey":
+            return None
+        made = pools[-1].do(job)
+        return Outcome("done", {**made.values, "inputs": describe_inputs([clip])})
+
+    pools = []
+
+    class Kept(Workers):
+        def __init__(self, *arguments):
+            super().__init__(*arguments)
+            pools.append(self)
+
+    def run():
+        manifest = Manifest(tmp_path, write=True)
+        try:
+            return Driver(jobs, tmp_path, manifest, Kept(jobs, tmp_path, behave), VERSION, print).run()
+        finally:
+            manifest.close()
+
+    assert run() == {}
+    clip.write_text("first")  # another time, the same bytes
+    assert run() == {}
+    clip.write_text("other")
+    with pytest.raises(UsageError, match=r"a\.mp4 is not the file, which .* was begun with; put it back"):
+        run()
+    clip.unlink()
+    with pytest.raises(UsageError, match=r"a\.mp4 is gone"):
+        run()
+
+
+def test_frames_beyond_the_end_are_told(tmp_path):
+    jobs = make_jobs(tmp_path, [{"name": "a", "frames": [0, 100000]}])
+    _, failed, said = drive(jobs, tmp_path / "run")
+    assert not failed
+    assert said == ["clip a: frames = [0, 100000], but it ends with frame 9"]
 
 
 def test_variations_are_numbered_over_all_clips_and_indexed_once(tmp_path):
@@ -233,9 +278,9 @@ def test_variations_are_numbered_over_all_clips_and_indexed_once(tmp_path):
     told = []
 
     class Indexed(Workers):
-        def give(self, worker, job, arguments):
+        def submit(self, worker, job, arguments):
             told.append(arguments) if job.kind == "index" else None
-            super().give(worker, job, arguments)
+            return super().submit(worker, job, arguments)
 
     manifest = Manifest(tmp_path, write=True)
     Driver(jobs, tmp_path, manifest, Indexed(jobs, tmp_path), VERSION, print).run()
@@ -248,5 +293,5 @@ def test_variations_are_numbered_over_all_clips_and_indexed_once(tmp_path):
 def test_progress_says_where_things_stand(jobs, tmp_path):
     drive(jobs, tmp_path / "run")
     told = json.loads((tmp_path / "run/progress.json").read_text())
-    assert (told["clips"], told["clips_surveyed"], told["jobs_known"], told["jobs_open"]) == (3, 3, 15, 0)
+    assert (told["clips_surveyed"], told["jobs_known"], told["jobs_open"]) == (3, 15, 0)
     assert len(told["workers"]) == 3

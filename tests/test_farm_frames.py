@@ -12,7 +12,7 @@ from av.video.reformatter import VideoReformatter
 
 from tests.farm_rig import CLIPS, TICK, desk_frames, write_recording
 from warp_ar.errors import SourceError
-from warp_ar.farm.decoded_picture import DecodedPicture
+from warp_ar.farm.codes import DecodedPicture
 from warp_ar.farm.frames import index_frames, open_part, shown_ticks
 from warp_ar.sources.video_file import rgb_from_video
 

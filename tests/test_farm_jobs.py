@@ -8,8 +8,8 @@ import pytest
 
 from tests.farm_rig import CLIPS, make_jobs
 from warp_ar.errors import SceneError
+from warp_ar.farm.dataset import JobsError
 from warp_ar.farm.jobs import Job, job_of_clip, jobs_of_clip, parse_jobs, read_jobs
-from warp_ar.farm.tables import JobsError
 
 BALL = '[[dataset.object]]\nshape = "sphere"\nradius = 0.02\n'
 

@@ -12,9 +12,8 @@ import warp as wp
 
 from tests.farm_rig import SIZE, make_jobs, write_recording
 from warp_ar.engine.pipeline import Pipeline
-from warp_ar.farm.jobs import Job
+from warp_ar.farm.jobs import Context, Job
 from warp_ar.farm.labels import DEPTH_SCALE, _harmonics, run_lengths
-from warp_ar.farm.records import Context
 from warp_ar.farm.work import Work
 from warp_ar.kernels.picture.object_masks import trace_object_masks
 from warp_ar.scene import load_scene
@@ -47,10 +46,10 @@ def made(tmp_path_factory):
     work = Work(Context(jobs, folder / "run", "cpu"))
     todo = [Job("survey"), Job("variation", 0, 0, 0, 5), Job("variation", 0, 1, 0, 5)]
     for job in todo:
-        outcome = work.do(job, lambda _: None)
+        outcome = work.do(job)
         assert outcome.state == "done", outcome.reason
     assert outcome.values["frames"] == 3
-    outcome = work.do(Job("index"), lambda _: None, [job.place(jobs).as_posix() for job in todo[1:]])
+    outcome = work.do(Job("index"), [job.place(jobs).as_posix() for job in todo[1:]])
     assert outcome.state == "done", outcome.reason
     work.close()
     return folder / "run/dataset"

@@ -13,12 +13,11 @@ import pytest
 from tests.farm_rig import TICK, desk_frames, make_jobs, write_recording
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SourceError, UsageError
-from warp_ar.farm import device_video
-from warp_ar.farm.jobs import Job, job_of_clip, jobs_of_clip
+from warp_ar.farm import codes as device_video
+from warp_ar.farm.jobs import Context, Job, job_of_clip, jobs_of_clip
 from warp_ar.farm.lighting import PIPELINES, Lighter
-from warp_ar.farm.part_video import PartSink
-from warp_ar.farm.records import Context
 from warp_ar.farm.survey import Survey, lit_scene
+from warp_ar.farm.video import PartSink
 from warp_ar.farm.work import Work
 from warp_ar.kernels.picture.video_color import rgb_factors
 from warp_ar.scene import Animation, Object, dumps_scene, load_scene
@@ -45,7 +44,7 @@ def folder(tmp_path_factory):
 
 def do_survey(jobs, run_folder):
     with Work(Context(jobs, run_folder, "cpu")) as work:
-        return work.do(Job("survey"), lambda _: None)
+        return work.do(Job("survey"))
 
 
 def surveyed(folder, **run):
@@ -165,7 +164,7 @@ def test_digests_are_those_of_pictures_before_they_are_encoded(folder, light):
         with Work(Context(jobs, run, "cpu")) as work:
             segments = [job_of_clip(jobs, 0, number, COUNT) for number in range(jobs_of_clip(jobs, 0, COUNT))]
             for job in (Job("survey"), *reversed(segments), Job("join")):
-                outcome = work.do(job, lambda _: None)
+                outcome = work.do(job)
                 assert outcome.state == "done", outcome.reason
         texts.append((run / "a.sha256").read_text())
     assert texts[0] == texts[1]

@@ -5,9 +5,8 @@ from __future__ import annotations
 import threading
 
 from tests.farm_rig import make_jobs, write_recording
-from warp_ar.farm.jobs import Job
-from warp_ar.farm.part_video import PartSink
-from warp_ar.farm.records import Context
+from warp_ar.farm.jobs import Context, Job
+from warp_ar.farm.video import PartSink
 from warp_ar.farm.work import Work
 from warp_ar.sources import video_file
 from warp_ar.sources.sources import open_source
@@ -24,7 +23,7 @@ def test_frames_are_decoded_and_lit_while_one_is_encoded(tmp_path, monkeypatch):
     jobs = make_jobs(tmp_path, [{"scene": "torus", "path": "a.mp4"}])
     decoded, lit = threading.Semaphore(0), threading.Semaphore(0)
     waited = []
-    convert, store = video_file.rgb_from_video, PartSink._store
+    convert, store, write = video_file.rgb_from_video, PartSink._store, PartSink.write
 
     def noted_convert(*arguments):
         decoded.release()
@@ -36,11 +35,16 @@ def test_frames_are_decoded_and_lit_while_one_is_encoded(tmp_path, monkeypatch):
             waited.extend(lit.acquire(timeout=PATIENCE) for _ in range(AHEAD - 1))
         store(self, index, image)
 
+    def noted_write(self, image):
+        write(self, image)
+        lit.release()
+
     with Work(Context(jobs, tmp_path / "run", "cpu")) as work:
-        assert work.do(Job("survey"), lambda _: None).state == "done"
+        assert work.do(Job("survey")).state == "done"
         monkeypatch.setattr(video_file, "rgb_from_video", noted_convert)
         monkeypatch.setattr(PartSink, "_store", slow_store)
-        outcome = work.do(Job("segment", 0, 0, 0, COUNT), lambda _: lit.release())
+        monkeypatch.setattr(PartSink, "write", noted_write)
+        outcome = work.do(Job("segment", 0, 0, 0, COUNT))
     assert outcome.state == "done", outcome.reason
     assert waited == [True] * (3 * AHEAD - 1)
 

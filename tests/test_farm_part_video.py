@@ -12,8 +12,8 @@ import pytest
 
 from tests.farm_rig import TICK, desk_frames, write_recording
 from warp_ar.errors import SourceError
-from warp_ar.farm import part_video
-from warp_ar.farm.part_video import PartSink, join_parts
+from warp_ar.farm import video as part_video
+from warp_ar.farm.video import PartSink, join_parts
 
 MOST_ERROR = 0.15
 """Codes in the mean by which a quicker encoding may err more; at 1080p it was 0.1 at most."""

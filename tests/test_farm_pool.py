@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 
 import pytest
 
+from tests.farm_rig import make_jobs
 from warp_ar.errors import UsageError
-from warp_ar.farm import pool
-from warp_ar.farm.pool import ProcessPool, Teller, cores_of, devices_of, is_from_outside, keeping_to, words_of_exit
-from warp_ar.farm.ray_pool import _knock, share_of_gpu
-from warp_ar.farm.records import Context
+from warp_ar.farm.jobs import Context, Job, program_version
+from warp_ar.farm.pools import ProcessPool, _knock, cores_of, devices_of, keeping_to, share_of_gpu
+
+PATIENCE = 120.0
+"""Seconds within which a worker starts."""
 
 
 @pytest.mark.parametrize(
@@ -26,14 +29,7 @@ from warp_ar.farm.records import Context
 )
 def test_cores_are_shared_out_evenly(monkeypatch, cores, workers, expected):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: cores, raising=False)
-    monkeypatch.setattr(pool, "_first_sibling", lambda core: core)
     assert cores_of(["cpu"] * workers) == expected
-
-
-def test_threads_of_a_core_are_in_one_part(monkeypatch):
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
-    monkeypatch.setattr(pool, "_first_sibling", lambda core: core % 4)
-    assert cores_of(["cuda:0", "cuda:1"]) == [[0, 4, 1, 5], [2, 6, 3, 7]]
 
 
 @pytest.mark.parametrize(
@@ -47,7 +43,6 @@ def test_threads_of_a_core_are_in_one_part(monkeypatch):
 )
 def test_workers_of_a_gpu_share_its_part_of_the_cores(monkeypatch, cores, devices, expected):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: cores, raising=False)
-    monkeypatch.setattr(pool, "_first_sibling", lambda core: core)
     assert cores_of([f"cuda:{gpu}" for gpu in devices]) == expected
 
 
@@ -64,35 +59,8 @@ def test_cores_are_kept_to_for_a_while():
 def test_workers_on_cpu_are_as_many_as_asked_or_one_per_four_cores(monkeypatch):
     assert devices_of("cpu", 3) == ["cpu"] * 3
     for cores, workers in ((2, 1), (8, 2), (64, 16)):
-        monkeypatch.setattr("warp_ar.farm.pool.usable_cores", lambda cores=cores: cores)
+        monkeypatch.setattr("warp_ar.farm.pools.usable_cores", lambda cores=cores: cores)
         assert devices_of("cpu", None) == ["cpu"] * workers
-
-
-@pytest.mark.parametrize(
-    ("code", "outside", "words"),
-    [
-        (-signal.SIGKILL, True, "its worker was ended by SIGKILL"),
-        (-signal.SIGTERM, True, "its worker was ended by SIGTERM"),
-        (-signal.SIGSEGV, False, "its worker was ended by SIGSEGV"),
-        (3, False, "its worker ended with exit code 3"),
-        (0, False, "its worker ended with exit code 0"),
-        (-200, False, "its worker was ended by signal 200"),
-    ],
-)
-def test_a_crash_is_told_from_a_kill(code, outside, words):
-    assert is_from_outside(code) is outside
-    assert words_of_exit(code) == words
-
-
-def test_frames_are_told_now_and_then(monkeypatch):
-    now = [100.0]
-    monkeypatch.setattr("warp_ar.farm.pool.time.monotonic", lambda: now[0])
-    told: list[int] = []
-    teller = Teller(told.append)
-    for frame in range(1, 11):
-        now[0] += 0.2
-        teller(frame)
-    assert told == [3, 6, 9]
 
 
 @pytest.mark.parametrize(
@@ -113,17 +81,26 @@ def test_an_address_of_no_cluster_is_told_at_once(address, words):
 def test_workers_see_no_interrupt_even_as_they_begin(tmp_path):
     """Ctrl-C reaches all processes of a terminal: one that imports would end with a traceback."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [])
-    pool = ProcessPool(Context(None, tmp_path, "cpu"), ["cpu", "cpu"])
+    others = set(multiprocessing.active_children())
+    pool = ProcessPool(Context(make_jobs(tmp_path, [{}]), tmp_path, "cpu"), ["cpu", "cpu"])
+    started = [pool.start(worker) for worker in range(2)]
     try:
-        for process, _ in pool._workers:
+        mine = set(multiprocessing.active_children()) - others
+        assert len(mine) == 2
+        for process in mine:
             with open(f"/proc/{process.pid}/status", encoding="ascii") as file:
                 held = next(int(line.split()[1], 16) for line in file if line.startswith("SigBlk"))
             assert held >> (signal.SIGINT - 1) & 1
             assert not held >> (signal.SIGTERM - 1) & 1
-        assert all(process.is_alive() for process, _ in pool._workers)
+        assert [future.result(PATIENCE) for future in started] == [program_version()] * 2
+        for process in mine:
+            process.kill()
+        with pytest.raises(pool.died):
+            pool.submit(0, Job("survey"), None).result(PATIENCE)
+        assert pool.start(0).result(PATIENCE) == program_version(), "another takes its place"
     finally:
         pool.close()
-    assert not any(process.is_alive() for process, _ in pool._workers)
+    assert set(multiprocessing.active_children()) <= others
     assert signal.pthread_sigmask(signal.SIG_BLOCK, []) == before
 
 

@@ -11,10 +11,9 @@ import pytest
 from tests.farm_rig import desk_frames, make_jobs
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.farm import survey
-from warp_ar.farm.jobs import Job, scene_of
-from warp_ar.farm.part_video import PartSink
-from warp_ar.farm.records import Context
+from warp_ar.farm.jobs import Context, Job, scene_of
 from warp_ar.farm.survey import Survey
+from warp_ar.farm.video import PartSink
 from warp_ar.farm.work import Work
 from warp_ar.kernels.environment.change import CHANGE_FLOOR, CHANGE_SHARE
 from warp_ar.sources.sources import open_source
@@ -40,7 +39,7 @@ def folder(tmp_path_factory):
 
 def surveyed(jobs, run):
     with Work(Context(jobs, run, "cpu")) as work:
-        outcome = work.do(Job("survey"), lambda _: None)
+        outcome = work.do(Job("survey"))
     assert outcome.state == "done", outcome.reason
     return Survey(run / Job("survey").place(jobs))
 
@@ -114,6 +113,6 @@ def test_what_goes_wrong_beside_fails_the_survey(folder, tmp_path, monkeypatch):
     monkeypatch.setattr(survey._Look, "take", fail)
     jobs = make_jobs(folder, [{"scene": "desk", "path": "a.mp4"}])
     with Work(Context(jobs, tmp_path / "run", "cpu")) as work:
-        outcome = work.do(Job("survey"), lambda _: None)
+        outcome = work.do(Job("survey"))
     assert outcome.state == "failed"
     assert "no room" in outcome.reason

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from tests.farm_rig import make_jobs
-from warp_ar.farm import variations
-from warp_ar.farm.variations import NoPlace, _overlap, draw_variation, in_kindred_order, local_points, receiver_of
+from warp_ar.farm import dataset as variations
+from warp_ar.farm.dataset import NoPlace, _overlap, draw_variation, in_kindred_order, local_points, receiver_of
 from warp_ar.scene import Pose, load_scene
 from warp_ar.scene.geometry import rotation_matrix
 
@@ -140,7 +140,7 @@ def test_too_many_objects_for_the_region_are_told(tmp_path):
 
 def test_any_way_up_is_any_way_up_evenly():
     """The mean of a rotation over all of them is zero; a third of 1 is each entry's variance."""
-    from warp_ar.farm.variations import _angles, _random_rotation
+    from warp_ar.farm.dataset import _angles, _random_rotation
 
     random = np.random.default_rng(5)
     turns = [_random_rotation(random) for _ in range(3000)]

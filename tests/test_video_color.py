@@ -11,9 +11,8 @@ import warp as wp
 from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
 
 from tests.farm_rig import desk_frames, write_recording
-from warp_ar.farm import device_video
-from warp_ar.farm.decoded_picture import LEAST_SIZE, DecodedPicture, can_convert
-from warp_ar.farm.device_video import SLOTS, DeviceVideo
+from warp_ar.farm import codes as device_video
+from warp_ar.farm.codes import LEAST_SIZE, SLOTS, DecodedPicture, DeviceVideo, can_convert
 from warp_ar.kernels.picture.video_color import rgb_factors, rgb_from_yuv, yuv_from_rgb, yuv_layout
 from warp_ar.output.video_sink import rgb_to_yuv
 from warp_ar.sources.video_file import rgb_from_video

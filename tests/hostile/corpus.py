@@ -14,7 +14,7 @@ import numpy as np
 import OpenEXR
 
 from warp_ar.farm.jobs import parse_jobs, read_jobs
-from warp_ar.farm.status import read_status, status_lines
+from warp_ar.farm.manifest import read_status, status_lines
 from warp_ar.kernels.color import decode_table
 from warp_ar.light.captured import Light, find_emitters
 from warp_ar.output.shot import Shot

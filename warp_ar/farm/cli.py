@@ -4,16 +4,26 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 from warp_ar.begin import importing
 from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, run_command
 from warp_ar.errors import UsageError, printable, say
-from warp_ar.farm.jobs import parse_jobs, read_jobs
-from warp_ar.farm.manifest import Manifest, RunError, begin_run, clear_aside, load_run, locked
-from warp_ar.farm.status import read_status, status_lines, words_of_seconds
+from warp_ar.farm.driver import Driver
+from warp_ar.farm.jobs import Context, parse_jobs, program_version, read_jobs
+from warp_ar.farm.manifest import (
+    Manifest,
+    RunError,
+    begin_run,
+    clear_aside,
+    load_run,
+    locked,
+    read_status,
+    status_lines,
+    words_of_seconds,
+)
+from warp_ar.farm.pools import Pool, ProcessPool, RayPool, cores_of, devices_of, keeping_to
 
 MOST_WORKERS = 4096
 
@@ -88,37 +98,27 @@ def tell_status(options: argparse.Namespace) -> int:
 
 
 def begin(options: argparse.Namespace) -> int:
-    """``farm run``."""
-    from warp_ar.farm.version import program_version
-
+    """Begin a run, and work through it; what cannot be begun leaves no folder."""
     data = read_jobs(options.jobs)
-    # Before a folder is made: what cannot be begun leaves none.
     parse_jobs(data, str(options.jobs))
-    if options.ray is None:
-        from warp_ar.farm.pool import devices_of
-
-        devices_of(options.device, options.workers)
+    connect = _employer(options)
     begin_run(options.output, data, program_version())
-    return work(options, options.output)
+    return work(options, options.output, connect)
 
 
 def resume(options: argparse.Namespace) -> int:
-    """``farm resume``."""
+    """Go on with a run."""
     load_run(options.folder)
-    return work(options, options.folder)
+    return work(options, options.folder, _employer(options))
 
 
-def work(options: argparse.Namespace, folder: Path) -> int:
+def work(options: argparse.Namespace, folder: Path, employ: Callable[[Context], Pool]) -> int:
     """Work through what is open of a run.
 
     Raises:
         RunError: The run is damaged, or cannot go on.
-        UsageError: There is none in the folder, or another version of the program began it.
+        UsageError: There is none in the folder, or another version of the program or other files began it.
     """
-    with importing():
-        from warp_ar.farm.driver import Driver
-        from warp_ar.farm.version import program_version
-
     data, version = load_run(folder)
     mine = program_version()
     if version != mine:
@@ -134,28 +134,23 @@ def work(options: argparse.Namespace, folder: Path) -> int:
             if getattr(options, "failed", False):
                 for key in list(manifest.failed):
                     manifest.add("again", key, reason="resumed with --failed")
-            pool = _make_pool(options, jobs, folder)
-            summary = Driver(jobs, folder, manifest, pool, mine, say).run()
+            pool = employ(Context(jobs, folder.absolute(), "cpu"))
+            failed = Driver(jobs, folder, manifest, pool, mine, say).run()
         finally:
             manifest.close()
             clear_aside(folder)  # what workers that were killed left takes room, and is nobody's
-    return _tell(folder, summary.failed)
+    return _tell(folder, failed)
 
 
-def _make_pool(options: argparse.Namespace, jobs: Any, folder: Path) -> Any:
-    """Start the workers."""
-    from warp_ar.farm.pool import ProcessPool, devices_of
-    from warp_ar.farm.records import Context
-
-    context = Context(jobs, folder.absolute(), "cpu")
+def _employer(options: argparse.Namespace) -> Callable[[Context], Pool]:
+    """Return what makes the workers of a run; here it is found out whether there can be any."""
     if options.ray is None:
-        return ProcessPool(context, devices_of(options.device, options.workers))
-    from warp_ar.farm.ray_pool import RayPool
-
-    pool = RayPool(context, options.ray or None, options.workers)
+        devices = devices_of(options.device, options.workers)
+        return lambda context: ProcessPool(context, devices)
+    pool = RayPool(options.ray or None, options.workers)
     if page := pool.dashboard():
         say(f"Ray's page: http://{page}")
-    return pool
+    return pool.employ
 
 
 def _tell(folder: Path, failed: dict[str, str]) -> int:
@@ -175,13 +170,12 @@ def plan(options: argparse.Namespace) -> int:
     """Count jobs, try a few, and say what all would take."""
     with importing():
         from warp_ar.farm.plan import make_plan
-        from warp_ar.farm.pool import cores_of, devices_of, keeping_to
 
     jobs = parse_jobs(read_jobs(options.jobs), str(options.jobs))
     devices = devices_of(options.device, options.workers)
     cores = cores_of(devices)
     with keeping_to(cores[0]):  # as a worker has them
-        found = make_plan(jobs, devices[0], say, sorted({core for own in cores for core in own}))
+        found = make_plan(jobs, devices[0], say)
     # Workers that share a core are no faster than one that has it.
     at_once = len({core for own in cores for core in own} or devices) if devices[0] == "cpu" else len(devices)
     for problem in found.problems:
@@ -189,8 +183,8 @@ def plan(options: argparse.Namespace) -> int:
     kind = "segments" if jobs.dataset is None else "variations"
     print(f"{found.clips} clips, {found.jobs} {kind}, {found.frames} frames to light, {found.surveyed} to survey")
     print(
-        f"a frame: {found.frame_ms:.1f} ms lit and written, {found.survey_ms:.1f} ms surveyed; a job: "
-        f"{found.job_ms:.0f} ms beside its frames, at quality {jobs.settings.quality} on {devices[0]}"
+        f"a frame: {found.frame_ms:.1f} ms lit and written, {found.survey_ms:.1f} ms surveyed, at quality "
+        f"{jobs.settings.quality} on {devices[0]}"
     )
     for count in sorted({1, len(devices)}):
         print(f"{count} worker{'s' if count > 1 else ''}: {words_of_seconds(found.seconds(min(count, at_once)))}")

@@ -16,7 +16,7 @@ from av.codec.hwaccel import HWAccel
 from av.video.reformatter import VideoReformatter
 
 from warp_ar.errors import SourceError, reason
-from warp_ar.farm.decoded_picture import DecodedPicture, can_convert
+from warp_ar.farm.codes import DecodedPicture, can_convert
 from warp_ar.sources.frame_folder import FrameFolder
 from warp_ar.sources.source import DEFAULT_FPS, Frame, RecordedSource
 from warp_ar.sources.sources import open_source

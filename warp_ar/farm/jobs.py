@@ -9,13 +9,15 @@ from __future__ import annotations
 import dataclasses
 import functools
 import glob
+import hashlib
+import importlib.metadata
 import re
 from pathlib import Path
 from typing import Any
 
+import warp_ar
 from warp_ar.errors import SceneError
-from warp_ar.farm.catalogue import Dataset, check_dataset, read_dataset
-from warp_ar.farm.tables import JobsError, JobTable
+from warp_ar.farm.dataset import Dataset, JobsError, JobTable, check_dataset, read_dataset
 from warp_ar.files import is_file, is_folder, parse_toml, read_text
 from warp_ar.output.encoders import CODINGS
 from warp_ar.scene import CapturedLight, Scene, load_calibration, load_scene
@@ -327,3 +329,61 @@ def source_of(jobs: JobFile, clip: int) -> tuple[Path, float | None]:
     assert own is not None
     assert own.path is not None
     return own.path, own.fps
+
+
+def inputs_of(jobs: JobFile, clip: int) -> list[Path]:
+    """Return the files and folders that a clip's pictures rest on: recording, scene, calibration, light, meshes."""
+    spec, scene = jobs.clips[clip], scene_of(jobs, clip)
+    named: list[Path | None] = [source_of(jobs, clip)[0], Path(spec.scene), spec.calibration]
+    named += [None if scene.captured is None else scene.captured.file]
+    named += [*(item.file for item in scene.objects), *(proxy.file for proxy in scene.proxies)]
+    named += [] if jobs.dataset is None else [kind.item.file for kind in jobs.dataset.catalogue]
+    return [path for path in dict.fromkeys(named) if path is not None and path.exists()]
+
+
+@dataclasses.dataclass(frozen=True)
+class Context:
+    """What all jobs of a run share."""
+
+    jobs: JobFile
+    folder: Path
+    """Of the run."""
+    device: str
+    """``cpu`` or ``cuda:N``."""
+    worker: int = 0
+    """Number of the worker."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What became of a job."""
+
+    state: str
+    """``done``, ``failed``, or ``full``: the disk is."""
+    values: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """Of the manifest's line."""
+    reason: str = ""
+    """What went wrong, on one line."""
+
+
+_LIBRARIES = ("warp-lang", "numpy", "opencv-contrib-python-headless", "av")
+"""Of what else pictures and their bytes depend on."""
+
+
+@functools.cache
+def program_version() -> str:
+    """Version of the package, a digest of its code, and the libraries' versions, on one line."""
+    root = Path(warp_ar.__file__).parent
+    digest = hashlib.sha256()
+    for folder in (root, root / "kernels"):  # a link, which rglob does not follow
+        for path in sorted(folder.rglob("*.py")):
+            digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
+    parts = [f"warp_ar {_version('warp-ar')} {digest.hexdigest()[:12]}"]
+    return ", ".join([*parts, *(f"{name} {_version(name)}" for name in _LIBRARIES)])
+
+
+def _version(name: str) -> str:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return "?"

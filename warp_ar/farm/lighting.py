@@ -20,11 +20,9 @@ from warp_ar.device import exclusive, resolve_device
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.engine.result import Result
 from warp_ar.errors import UsageError
-from warp_ar.farm.decoded_picture import DecodedPicture
-from warp_ar.farm.device_video import DeviceVideo
+from warp_ar.farm.codes import DecodedPicture, DeviceVideo, LitPicture
 from warp_ar.farm.frames import CONVERTERS, open_part
 from warp_ar.farm.jobs import Job, JobFile, lit_range, scene_of, source_of
-from warp_ar.farm.lit_picture import LitPicture
 from warp_ar.farm.survey import Survey, keep_depth, lit_scene
 from warp_ar.scene import Pose, Scene
 from warp_ar.scene.kinds import skeleton

@@ -16,14 +16,16 @@ import hashlib
 import json
 import math
 import os
+import secrets
 import shutil
-from collections.abc import Iterator, Mapping
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import filelock
 
-from warp_ar.errors import UsageError, WarpArError, reason
+from warp_ar.errors import UsageError, WarpArError, printable, reason
 from warp_ar.files import kind_of, parse_json, read_bytes, take_name, write_whole
 
 MANIFEST, RUN, LOCK, RECORD, PROGRESS = "manifest.jsonl", "run.json", "lock", "record.json", "progress.json"
@@ -95,7 +97,7 @@ class Manifest:
         match line["state"]:
             case "done":
                 self.done[key] = {
-                    name: line.get(name) for name in ("frames", "bytes", "length", "found") if name in line
+                    name: line.get(name) for name in ("frames", "bytes", "length", "inputs") if name in line
                 }
                 self.failed.pop(key, None)
             case "failed":
@@ -263,9 +265,8 @@ def clear_aside(folder: Path) -> None:
 
 @contextlib.contextmanager
 def aside(folder: Path, token: str) -> Iterator[Path]:
-    """An empty folder for outputs that are not whole yet; it is gone afterwards, wherever they were moved to."""
-    path = folder / ASIDE / token
-    shutil.rmtree(path, ignore_errors=True)
+    """Yield an empty folder for outputs that are not whole yet; it is gone afterwards, wherever they were moved to."""
+    path = folder / ASIDE / f"{token}.{secrets.token_hex(4)}"
     path.mkdir(parents=True)
     try:
         yield path
@@ -323,6 +324,144 @@ def _sync_folder(path: Path) -> None:
 
 
 def record_at(place: Path, key: str) -> dict[str, Any] | None:
-    """The record of whole outputs of a job, or None."""
+    """Return the record that lies with outputs of a job; None where there is none."""
     told = read_kept(place / RECORD)
     return told if told is not None and told.get("job") == key else None
+
+
+def bytes_of(place: Path) -> int | None:
+    """Return the bytes of a file, or of all files of a folder but its record; None where there is neither."""
+    try:
+        if not place.is_dir():
+            return place.stat().st_size
+        return sum(path.stat().st_size for path in place.rglob("*") if path.is_file() and path != place / RECORD)
+    except OSError:
+        return None
+
+
+def describe_inputs(paths: Iterable[Path]) -> dict[str, list[Any]]:
+    """Return size, time of change in nanoseconds and SHA-256 of files, and of the files of folders, by their paths."""
+    files = [file for path in paths for file in (sorted(path.iterdir()) if path.is_dir() else [path])]
+    return {str(file): [*_stamp(file), _digest(file)] for file in files if file.is_file()}
+
+
+def changed_input(inputs: Mapping[str, Sequence[Any]]) -> str | None:
+    """Say which of the files that ``describe_inputs`` told of is another one now; None where all are the same.
+
+    A file is read only where its time of change is another.
+    """
+    for name, (size, changed, digest) in inputs.items():
+        try:
+            now = _stamp(Path(name))
+            if now[0] != size or (now[1] != changed and _digest(Path(name)) != digest):
+                return f"{name} is not the file"
+        except OSError:
+            return f"{name} is gone: it is a file"
+    return None
+
+
+def _stamp(path: Path) -> tuple[int, int]:
+    found = path.stat()
+    return found.st_size, found.st_mtime_ns
+
+
+def _digest(path: Path) -> str:
+    with open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+STALE_SECONDS = 15.0
+"""Since the last word of a driver whose lock cannot be asked for, after which it is taken to be gone."""
+
+
+def read_status(folder: Path) -> dict[str, Any]:
+    """What is done, what has failed, and what is being done.
+
+    Raises:
+        UsageError: There is no run.
+        RunError: It cannot be read.
+    """
+    data, version = load_run(folder)
+    manifest = Manifest(folder, write=False)
+    progress = read_kept(folder / PROGRESS) or {}
+    if not _is_progress(progress):
+        progress = {}
+    kinds: dict[str, int] = {}
+    for key in manifest.done:
+        kind = key.rsplit("/", 1)[1].split("-")[0]
+        kinds[kind] = kinds.get(kind, 0) + 1
+    return {
+        "version": version,
+        "clips": len(data["clip"]),
+        "done": kinds,
+        "frames": sum(
+            int(record.get("frames") or 0)
+            for key, record in manifest.done.items()
+            if key.rsplit("/", 1)[1].startswith(("segment", "variation"))
+        ),
+        "bytes": sum(int(record.get("bytes") or 0) for record in manifest.done.values()),
+        "failed": manifest.failed,
+        "progress": progress,
+        "running": _is_running(folder, progress),
+    }
+
+
+def _is_progress(told: dict[str, Any]) -> bool:
+    """Whether a driver's word of where things stand is whole."""
+
+    def is_number(value: object) -> bool:
+        return isinstance(value, int | float) and math.isfinite(value)
+
+    workers = told.get("workers")
+    numbers = [told.get(name) for name in ("time", "jobs_open", "jobs_known", "clips_surveyed")]
+    if not isinstance(workers, list) or not all(map(is_number, numbers)):
+        return False
+    left = told.get("seconds_left")
+    return (left is None or is_number(left)) and all(
+        isinstance(worker, dict)
+        and isinstance(worker.get("job"), str | None)
+        and is_number(worker.get("fps"))
+        and "device" in worker
+        for worker in workers
+    )
+
+
+def _is_running(folder: Path, progress: dict[str, Any]) -> bool:
+    """Whether a driver is at work: by its lock, and where that cannot be asked for by when it was last heard of."""
+    locked = is_locked(folder)
+    if locked is None:
+        return not progress.get("ended") and abs(time.time() - float(progress.get("time", 0))) < STALE_SECONDS
+    return locked and bool(progress) and not progress.get("ended")
+
+
+def status_lines(folder: Path, status: dict[str, Any]) -> list[str]:
+    """The same in words."""
+    done = ", ".join(f"{count} {kind}{'s' if count != 1 else ''}" for kind, count in sorted(status["done"].items()))
+    lines = [f"{folder}: {status['clips']} clips; done: {done or 'nothing yet'}"]
+    lines.append(
+        f"{status['frames']} frames lit, {status['bytes'] / 1e6:.1f} MB written, {len(status['failed'])} jobs failed"
+    )
+    lines += [f"failed: {key}: {why}" for key, why in sorted(status["failed"].items())[:20]]
+    if len(status["failed"]) > 20:
+        lines.append(f"and {len(status['failed']) - 20} more; all are in {folder / 'manifest.jsonl'}")
+    progress = status["progress"]
+    if not status["running"]:
+        nothing = progress.get("ended") and not progress["jobs_open"]
+        hint = "nothing that is known is open" if nothing else f"go on with: farm resume {folder}"
+        return [printable(line) for line in (*lines, f"no driver is at work; {hint}")]
+    lines.append(
+        f"{progress['jobs_open']} of {progress['jobs_known']} jobs open, {progress['clips_surveyed']} clips surveyed"
+    )
+    for number, worker in enumerate(progress["workers"]):
+        what = worker["job"] or "waiting"
+        lines.append(f"worker {number} on {worker['device']}: {worker['fps']:.1f} frames/s, {what}")
+    left = progress.get("seconds_left")
+    lines.append("time left: too early to say" if left is None else f"time left: {words_of_seconds(left)}")
+    return [printable(line) for line in lines]
+
+
+def words_of_seconds(seconds: float) -> str:
+    """A duration."""
+    if seconds < 120:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"

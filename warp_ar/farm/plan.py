@@ -1,30 +1,28 @@
-"""What a run would take: jobs counted, and three of them tried on a few frames; nothing else is run."""
+"""The time and the bytes that a run would take: jobs counted, and three of them tried on a few frames."""
 
 from __future__ import annotations
 
 import dataclasses
+import statistics
 import tempfile
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 from warp_ar.errors import WarpArError
 from warp_ar.farm.frames import index_frames
-from warp_ar.farm.jobs import Job, JobFile, job_of_clip, jobs_of_clip, lit_range, source_of
+from warp_ar.farm.jobs import Context, Job, JobFile, Outcome, job_of_clip, jobs_of_clip, lit_range, source_of
 from warp_ar.farm.manifest import RunError
-from warp_ar.farm.pool import keeping_to
-from warp_ar.farm.records import Context
 from warp_ar.farm.work import Work
 
 PROBES = 3
-"""Jobs that are tried."""
+"""Clips of which a job is tried."""
 FRAMES = 16
 """Frames of each."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """What a run would take, on one worker unless it says otherwise."""
+    """What a run would take, on workers that are all as fast as the one that was tried."""
 
     clips: int
     jobs: int
@@ -35,12 +33,8 @@ class Plan:
     """Frames that are looked at once before."""
     survey_ms: float
     """Milliseconds of such a frame."""
-    clip_ms: float
-    """Milliseconds of a survey beside its frames."""
     frame_ms: float
     """Milliseconds of a frame that is lit and written."""
-    job_ms: float
-    """Milliseconds of a job beside its frames."""
     bytes: float
     """Of all outputs."""
     survey_bytes: float
@@ -49,115 +43,69 @@ class Plan:
     """Clips that cannot be read, and why."""
 
     def seconds(self, workers: int) -> float:
-        """Seconds on so many workers that are all as fast as the one that was tried; a clip is surveyed by one."""
-        surveys = (self.surveyed * self.survey_ms + self.clips * self.clip_ms) if self.surveyed else 0.0
-        lighting = self.frames * self.frame_ms + self.jobs * self.job_ms
-        return (surveys / min(workers, self.clips) + lighting / min(workers, self.jobs)) / 1e3
+        """Return the seconds that so many workers take; a clip is surveyed by one."""
+        surveys = self.surveyed * self.survey_ms / min(workers, self.clips)
+        return (surveys + self.frames * self.frame_ms / min(workers, self.jobs)) / 1e3
 
 
-def make_plan(jobs: JobFile, device: str, say: Callable[[str], None], cores: Sequence[int] = ()) -> Plan:
+def make_plan(jobs: JobFile, device: str, say: Callable[[str], None]) -> Plan:
     """Count jobs and try a few.
 
     Args:
         jobs: The job file.
         device: ``cpu`` or ``cuda:N``.
         say: Called with a line for people now and then.
-        cores: Of all workers, which a survey may use; empty: those that this thread keeps to.
 
     Raises:
         RunError: No job can be tried.
     """
     lengths: dict[int, int] = {}
     problems = []
-    for clip in range(len(jobs.clips)):
+    count = lit = surveyed = 0
+    copies, every = (1, 1) if jobs.dataset is None else (jobs.dataset.variations, jobs.dataset.every)
+    for clip, spec in enumerate(jobs.clips):
         try:
-            lengths[clip] = index_frames(*source_of(jobs, clip)).length
-            lit_range(jobs.clips[clip], lengths[clip])
+            length = index_frames(*source_of(jobs, clip)).length
+            first, end = lit_range(spec, length)
         except WarpArError as error:
-            lengths.pop(clip, None)
-            problems.append(f"{jobs.clips[clip].name}: {error}")
-    count = sum(jobs_of_clip(jobs, clip, length) for clip, length in lengths.items())
-    every = 1 if jobs.dataset is None else jobs.dataset.every
-    lit = surveyed = 0
-    for clip, length in lengths.items():
-        first, end = lit_range(jobs.clips[clip], length)
-        surveyed += 0 if jobs.settings.light == "preroll" else end - first
-        copies = 1 if jobs.dataset is None else jobs.dataset.variations
+            problems.append(f"{spec.name}: {error}")
+            continue
+        lengths[clip] = length
+        count += jobs_of_clip(jobs, clip, length)
         lit += copies * -(-(end - first) // every)
         if jobs.settings.light == "preroll":
             lit += (jobs_of_clip(jobs, clip, length) - 1) * jobs.settings.preroll
-    step = max(1, len(lengths) // PROBES)
-    trials = [_try(jobs, clip, lengths[clip], device, say, cores) for clip in list(lengths)[::step][:PROBES]]
-    if not trials:
+        else:
+            surveyed += end - first
+    if not lengths:
         raise RunError(f"no clip can be tried: {problems[0] if problems else 'there is none'}")
-    survey_ms, clip_ms, frame_ms, job_ms, size, kept = (
-        sum(values) / len(trials) for values in zip(*trials, strict=True)
-    )
-    found = survey_ms, clip_ms, frame_ms, job_ms, lit * size, surveyed * kept
-    return Plan(len(lengths), count, lit, surveyed, *found, tuple(problems))
+    trials = [_try(jobs, clip, lengths[clip], device, say) for clip in list(lengths)[:: -(-len(lengths) // PROBES)]]
+    survey_ms, frame_ms, size, kept = (statistics.fmean(values) for values in zip(*trials, strict=True))
+    return Plan(len(lengths), count, lit, surveyed, survey_ms, frame_ms, lit * size, surveyed * kept, tuple(problems))
 
 
 def _try(
-    jobs: JobFile, clip: int, length: int, device: str, say: Callable[[str], None], cores: Sequence[int]
-) -> tuple[float, float, float, float, float, float]:
+    jobs: JobFile, clip: int, length: int, device: str, say: Callable[[str], None]
+) -> tuple[float, float, float, float]:
     """Do the first job of a clip on a few frames, twice: the second time all is compiled and read.
 
     Returns:
-        Milliseconds of a surveyed frame, of a survey beside its frames, of a lit frame, of a job beside its frames;
-        bytes of a lit frame, and of a surveyed one.
+        Milliseconds of a surveyed frame and of a lit one; bytes of a lit frame and of a surveyed one.
     """
     first, end = lit_range(jobs.clips[clip], length)
     few = dataclasses.replace(jobs.clips[clip], end=min(end, first + FRAMES))
-    clips = (*jobs.clips[:clip], few, *jobs.clips[clip + 1 :])
-    tried = dataclasses.replace(jobs, clips=clips)
-    with tempfile.TemporaryDirectory(prefix="warp_ar-plan-") as name:
-        work = Work(Context(tried, Path(name), device))
-        try:
-            job = job_of_clip(tried, clip, 0, length)
-            with keeping_to(cores):
-                whole = _time(work, Job("survey", clip))
-                again = Path(name) / Job("survey", clip).place(tried)
-                again.rename(again.with_name("first"))
-                survey, kept, _, looked_since = _time(work, Job("survey", clip))
-            times = []
-            for _ in range(2):
-                seconds, size, frames, begun = _time(work, job)
-                times.append((seconds, size, frames, begun))
-                place = Path(name) / job.place(tried)
-                place.rename(place.with_name(f"{place.name}-{len(times)}"))
-        finally:
-            work.close()
-    seconds, size, frames, begun = times[1]
-    looked = max((few.end or 0) - first, 1)
-    say(f"{jobs.clips[clip].name}: {frames} frames in {seconds:.2f} s (the first time {whole[0] + times[0][0]:.2f} s)")
-    per_frame = (seconds - begun) / max(frames - 1, 1)
-    per_look = (survey - looked_since) / max(looked - 1, 1)
-    return (
-        1e3 * per_look,
-        1e3 * max(survey - looked * per_look, 0.0),
-        1e3 * per_frame,
-        1e3 * max(seconds - frames * per_frame, 0.0),
-        size / max(frames, 1),
-        kept / looked,
-    )
-
-
-def _time(work: Work, job: Job) -> tuple[float, float, int, float]:
-    """Seconds of a job, its bytes, its frames, and seconds until its first frame was done."""
-    start = time.perf_counter()
-    begun: list[float] = []
-
-    def tell(_: int) -> None:
-        if not begun:
-            begun.append(time.perf_counter() - start)
-
-    outcome = work.do(job, tell)
-    if outcome.state != "done":
-        raise RunError(f"{job.key(work.context.jobs)} cannot be tried: {outcome.reason}")
-    seconds = time.perf_counter() - start
-    return (
-        seconds,
-        float(outcome.values.get("bytes", 0)),
-        int(outcome.values.get("frames", 0)),
-        begun[0] if begun else 0.0,
-    )
+    tried = dataclasses.replace(jobs, clips=(*jobs.clips[:clip], few, *jobs.clips[clip + 1 :]))
+    found: list[Outcome] = []
+    with tempfile.TemporaryDirectory(prefix="warp_ar-plan-") as name, Work(Context(tried, Path(name), device)) as work:
+        survey, lighting = Job("survey", clip), job_of_clip(tried, clip, 0, length)
+        for job in (survey, survey, lighting, lighting):
+            place = Path(name) / job.place(tried)
+            if place.exists():
+                place.rename(place.with_name("first"))
+            found.append(work.do(job))
+            if found[-1].state != "done":
+                raise RunError(f"{job.key(tried)} cannot be tried: {found[-1].reason}")
+    seconds, sizes = ([float(outcome.values[key]) for outcome in found] for key in ("seconds", "bytes"))
+    looked, frames = max((few.end or 0) - first, 1), max(int(found[-1].values.get("frames", 0)), 1)
+    say(f"{few.name}: {frames} frames in {seconds[3]:.2f} s (the first time {seconds[0] + seconds[2]:.2f} s)")
+    return 1e3 * seconds[1] / looked, 1e3 * seconds[3] / frames, sizes[3] / frames, sizes[1] / looked

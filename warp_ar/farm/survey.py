@@ -44,7 +44,8 @@ from warp_ar.engine.pipeline import Pipeline
 from warp_ar.engine.result import Result
 from warp_ar.errors import SceneError, SourceError, reason
 from warp_ar.farm.frames import FrameIndex, index_frames, open_part
-from warp_ar.farm.jobs import JobFile, lit_range, scene_of, source_of
+from warp_ar.farm.jobs import JobFile, inputs_of, lit_range, scene_of, source_of
+from warp_ar.farm.manifest import describe_inputs
 from warp_ar.kernels.environment.change import CHANGE_FLOOR, CHANGE_SHARE
 from warp_ar.light.captured import Light, find_emitters
 from warp_ar.scene import CapturedLight, Pose, Scene
@@ -52,7 +53,7 @@ from warp_ar.sources.deep_frame import check_linear
 from warp_ar.sources.source import Frame, RecordedSource
 from warp_ar.sources.sources import open_source
 from warp_ar.stages.features import has_environment
-from warp_ar.tracking.tracking import Track, Tracker
+from warp_ar.tracking.tracking import Tracker
 
 Map = npt.NDArray[np.float32]
 
@@ -157,7 +158,7 @@ class _Writer:
             self._file.close()
 
 
-def survey_clip(jobs: JobFile, clip: int, folder: Path, device: str, tell: Callable[[int], None]) -> dict[str, Any]:
+def survey_clip(jobs: JobFile, clip: int, folder: Path, device: str) -> dict[str, Any]:
     """Survey a clip.
 
     Args:
@@ -165,7 +166,6 @@ def survey_clip(jobs: JobFile, clip: int, folder: Path, device: str, tell: Calla
         clip: Number of the clip.
         folder: Where to write; it is there, and empty.
         device: ``cpu`` or ``cuda:N``.
-        tell: Called with the frames that have been looked at.
 
     Returns:
         Frames of the clip, and those whose marker was found.
@@ -182,7 +182,7 @@ def survey_clip(jobs: JobFile, clip: int, folder: Path, device: str, tell: Calla
     writer = _Writer(folder)
     try:
         if jobs.settings.light != "preroll":
-            _look_at_frames(jobs, clip, look, index, writer, device, tell)
+            _look_at_frames(jobs, clip, look, index, writer, device)
         writer.add("ticks", index.ticks)
         writer.add("tick", [index.tick.numerator, index.tick.denominator])
         writer.add("seekable", index.seekable)
@@ -198,7 +198,8 @@ def survey_clip(jobs: JobFile, clip: int, folder: Path, device: str, tell: Calla
     found = int(np.isfinite(poses[first:end, 0]).sum())
     if jobs.settings.light != "preroll" and not found:
         raise SourceError(f"{path}: no marker was found in frames {first} to {end - 1}: nothing can be placed there")
-    return {"length": index.length, "found": found, "keys": len(look.keys)}
+    inputs = describe_inputs(inputs_of(jobs, clip))
+    return {"length": index.length, "found": found, "keys": len(look.keys), "inputs": inputs}
 
 
 @dataclasses.dataclass
@@ -224,7 +225,11 @@ class _Look:
         return self.scene.captured is None and has_environment(self.scene)
 
     def take(self, frame: int, result: Result, writer: _Writer) -> None:
-        """Wait for the light of a frame; where all of it is wanted, ``keep`` it."""
+        """Wait for the pose and the light of a frame; where all of its light is wanted, ``keep`` it."""
+        if result.pose is None:
+            _ = result.stages  # waits, and raises what went wrong
+            return
+        self.poses[frame] = (*result.pose.rotation.ravel(), *result.pose.translation)
         self.latest = None if result.environment is None else (result.environment, result.emitters)
         if self.latest is not None and self.jobs.settings.light == "follow":
             self.keep(frame, *self.latest, writer)
@@ -248,7 +253,6 @@ def _look_at_frames(
     index: FrameIndex,
     writer: _Writer,
     device: str,
-    tell: Callable[[int], None],
 ) -> None:
     """Follow the camera and the light through the clip."""
     path, fps = source_of(jobs, clip)
@@ -274,17 +278,11 @@ def _look_at_frames(
             follows_camera=False,
             linear=linear,
         )
-        with pipeline, ThreadPoolExecutor(1, "warp_ar-keep") as keeper:
-            waiting: collections.deque[Future[None]] = collections.deque()
-            for frame, result in _submitted(_tracked(source, pipeline), pipeline):
-                if result.pose is not None:
-                    look.poses[frame.index] = (*result.pose.rotation.ravel(), *result.pose.translation)
-                    waiting.append(keeper.submit(look.take, frame.index, result, writer))
-                while len(waiting) > WAITING:
-                    waiting.popleft().result()
-                tell(frame.index - first + 1)
-            while waiting:
-                waiting.popleft().result()
+        with pipeline:
+            tracked = _ahead(_tracker(source, pipeline), source, AHEAD)
+            submitted = (_submit(pipeline, frame, pose) for frame, pose in tracked)
+            for _ in _ahead(lambda lit: look.take(lit[0], lit[1], writer), submitted, WAITING):
+                pass
             look.saturation = pipeline.inputs.saturation.levels
     if look.latest is None:
         return
@@ -295,39 +293,39 @@ def _look_at_frames(
     Light(kept, np.ones(kept.shape[:2], np.float32), emitters).save(look.folder / LIGHT)
 
 
-def _submitted(tracked: Iterable[tuple[Frame, Track | None]], pipeline: Pipeline) -> Iterator[tuple[Frame, Result]]:
-    """Frames, each handed over to a pipeline; all are rendered when the last has been asked for."""
-    result: Result | None = None
-    for frame, track in tracked:
-        frame.image.flags.writeable = False  # so that it need not be copied to wait for its turn
-        given = pipeline.scene.pose
-        pose = track if given is None else Pose(*given.at(frame.index))
-        result = pipeline.submit(frame.deepest, time_seconds=frame.time, pose=pose)
-        yield frame, result
-    if result is not None:
-        _ = result.stages  # waits, and tells what went wrong
+def _ahead(function: Callable[[Any], Any], items: Iterable[Any], count: int) -> Iterator[Any]:
+    """Yield what a function, called by a thread, makes of items in their order; it is ahead by ``count`` at most."""
+    waiting: collections.deque[Future[Any]] = collections.deque()
+    with ThreadPoolExecutor(1, "warp_ar-survey") as thread:
+        try:
+            for item in items:
+                waiting.append(thread.submit(function, item))
+                if len(waiting) > count:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            thread.shutdown(cancel_futures=True)
 
 
-def _tracked(source: RecordedSource, pipeline: Pipeline) -> Iterator[tuple[Frame, Track | None]]:
-    """Frames with where their marker is, looked for some frames ahead; None: the pipeline looks, or nothing needs it.
+def _tracker(source: RecordedSource, pipeline: Pipeline) -> Callable[[Frame], tuple[Frame, Any]]:
+    """Return what finds the pose of a frame; None: the pipeline looks for the marker itself.
 
     Of frames of more than 8 bits the pipeline alone knows the codes that are looked at.
     """
-    if pipeline.scene.pose is not None or source.keeps_depth:
-        yield from ((frame, None) for frame in source)
-        return
+    given = pipeline.scene.pose
+    if given is not None:
+        return lambda frame: (frame, Pose(*given.at(frame.index)))
+    if source.keeps_depth:
+        return lambda frame: (frame, None)
     tracker = Tracker(pipeline.scene.marker, pipeline.camera)
-    waiting: collections.deque[tuple[Frame, Future[Track]]] = collections.deque()
-    with ThreadPoolExecutor(1, "warp_ar-track") as thread:
-        try:
-            for frame in source:
-                waiting.append((frame, thread.submit(tracker.track, frame.image, frame.time)))
-                if len(waiting) > AHEAD:
-                    ready, track = waiting.popleft()
-                    yield ready, track.result()
-            yield from ((ready, track.result()) for ready, track in waiting)
-        finally:
-            thread.shutdown(cancel_futures=True)
+    return lambda frame: (frame, tracker.track(frame.image, frame.time))
+
+
+def _submit(pipeline: Pipeline, frame: Frame, pose: Any) -> tuple[int, Result]:
+    """Hand a frame over to a pipeline."""
+    frame.image.flags.writeable = False  # so that it need not be copied to wait for its turn
+    return frame.index, pipeline.submit(frame.deepest, time_seconds=frame.time, pose=pose)
 
 
 def keep_depth(source: RecordedSource, scene: Scene) -> bool:

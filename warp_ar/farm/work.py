@@ -9,26 +9,36 @@ import hashlib
 import shutil
 import time
 import traceback
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import numpy.typing as npt
+import threadpoolctl
 
 from warp_ar.closing import Closing
 from warp_ar.engine.layers import RADIANCE
 from warp_ar.errors import WarpArError, reason
+from warp_ar.farm.dataset import NoPlace, draw_variation
 from warp_ar.farm.frames import mean_rate, shown_ticks
-from warp_ar.farm.jobs import AS_RECORDED, Job, job_of_clip, jobs_of_clip, lit_range, scene_of, source_of
-from warp_ar.farm.labels import LAYERS, LabelWriter
+from warp_ar.farm.jobs import (
+    AS_RECORDED,
+    Context,
+    Job,
+    Outcome,
+    job_of_clip,
+    jobs_of_clip,
+    lit_range,
+    program_version,
+    scene_of,
+    source_of,
+)
+from warp_ar.farm.labels import LAYERS, LabelWriter, write_dataset_files
 from warp_ar.farm.lighting import Lighter
 from warp_ar.farm.manifest import aside, is_no_space, publish, publish_file
-from warp_ar.farm.part_video import PartSink, join_parts
-from warp_ar.farm.records import Context, Outcome
 from warp_ar.farm.survey import lit_scene, survey_clip
-from warp_ar.farm.variations import NoPlace, draw_variation
-from warp_ar.farm.version import program_version
+from warp_ar.farm.video import PartSink, join_parts
 from warp_ar.files import take_name
 from warp_ar.scene import SourceSpec, dumps_scene
 
@@ -46,6 +56,8 @@ class Work(Closing):
 
     def __init__(self, context: Context) -> None:
         """Do nothing yet."""
+        cv2.setNumThreads(1)  # with more, to look for a marker takes more processor time and is no sooner done
+        threadpoolctl.threadpool_limits(1)  # results of BLAS depend on their number
         self.context = context
         self._lighter = Lighter(context.jobs, context.folder, context.device)
 
@@ -53,12 +65,15 @@ class Work(Closing):
         """Let threads go."""
         self._lighter.close()
 
-    def do(self, job: Job, tell: Callable[[int], None], arguments: Any = None) -> Outcome:
+    def version(self) -> str:
+        """Return the version of the program."""
+        return program_version()
+
+    def do(self, job: Job, arguments: Any = None) -> Outcome:
         """Do a job as a whole; what goes wrong is told, not raised.
 
         Args:
             job: The job.
-            tell: Called with the frames that are done.
             arguments: Of jobs that need to know more: the places of finished variations.
         """
         context = self.context
@@ -66,7 +81,7 @@ class Work(Closing):
         log = context.folder / "log" / f"{key}.log"
         try:
             log.parent.mkdir(parents=True, exist_ok=True)
-            values = self._do(job, tell, arguments)
+            values = self._do(job, arguments)
         except Exception as error:  # whatever it is, it is this job's alone, and its reason is kept
             known = isinstance(error, WarpArError | NoPlace)
             told = str(error) if known else f"{type(error).__name__}: {reason(error)}"
@@ -82,17 +97,17 @@ class Work(Closing):
         timing = {"seconds": round(seconds, 3), "ended": round(time.time(), 3), "worker": context.worker}
         return Outcome("done", {**values, **timing})
 
-    def _do(self, job: Job, tell: Callable[[int], None], arguments: Any) -> dict[str, Any]:
+    def _do(self, job: Job, arguments: Any) -> dict[str, Any]:
         context, jobs = self.context, self.context.jobs
         key, place = job.key(jobs), context.folder / job.place(jobs)
         with aside(context.folder, f"{key.replace('/', '.')}.{context.worker}") as part:
             match job.kind:
                 case "survey":
-                    values = survey_clip(jobs, job.clip, part, context.device, tell)
+                    values = survey_clip(jobs, job.clip, part, context.device)
                 case "segment":
-                    values = self._light_segment(job, part, tell)
+                    values = self._light_segment(job, part)
                 case "variation":
-                    values = self._light_variation(job, part, tell)
+                    values = self._light_variation(job, part)
                 case "join":
                     values = self._join(job, part / place.name)
                     for name in (place.with_suffix(DIGESTS).name, place.name):
@@ -101,9 +116,6 @@ class Work(Closing):
                     shutil.rmtree(context.folder / "parts" / jobs.clips[job.clip].name, ignore_errors=True)
                     return {**values, "bytes": place.stat().st_size}
                 case _:
-                    # Here: it loads what no other job needs.
-                    from warp_ar.farm.dataset_files import write_dataset_files
-
                     found = [Path(name) for name in arguments]
                     values = write_dataset_files(jobs, found, part, context.folder, program_version())
                     _replace_models(part / "models", place.parent / "models")
@@ -112,7 +124,7 @@ class Work(Closing):
                     return {**values, "bytes": place.stat().st_size}
             return {k: v for k, v in publish(part, place, key, values).items() if k != "job"}
 
-    def _light_segment(self, job: Job, part: Path, tell: Callable[[int], None]) -> dict[str, Any]:
+    def _light_segment(self, job: Job, part: Path) -> dict[str, Any]:
         survey = self._lighter.survey(job.clip)
         ticks, tick = shown_ticks(survey.index, source_of(self.context.jobs, job.clip)[1])
         count = 0
@@ -136,10 +148,9 @@ class Work(Closing):
                 if digests is not None:
                     digests.write(digest_of(lit.image if coded else lit.radiance) + "\n")
                 count += 1
-                tell(count)
         return {"frames": count}
 
-    def _light_variation(self, job: Job, part: Path, tell: Callable[[int], None]) -> dict[str, Any]:
+    def _light_variation(self, job: Job, part: Path) -> dict[str, Any]:
         jobs, dataset = self.context.jobs, self.context.jobs.dataset
         assert dataset is not None
         survey = self._lighter.survey(job.clip)
@@ -154,10 +165,9 @@ class Work(Closing):
         (part / "scene.toml").write_text(dumps_scene(shown), encoding="utf-8")
         with LabelWriter(part, drawn.scene, drawn.kinds, dataset.catalogue) as labels:
             lit_frames = self._lighter.light(job, drawn.scene, outputs=LAYERS, every=dataset.every)
-            for count, lit in enumerate(lit_frames, 1):
+            for lit in lit_frames:
                 if lit.result is not None:
                     labels.write(lit, survey.key_of(lit.frame.index) if len(survey.keys) else None)
-                tell(count)
             return {"frames": labels.finish()}
 
     def _join(self, job: Job, output: Path) -> dict[str, Any]:

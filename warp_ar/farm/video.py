@@ -19,7 +19,7 @@ import av
 import numpy.typing as npt
 
 from warp_ar.errors import SinkError, SourceError, reason
-from warp_ar.farm.lit_picture import LitPicture
+from warp_ar.farm.codes import LitPicture
 from warp_ar.output.encoders import Encoding, find_encoding, last_packets
 from warp_ar.output.sink import ThreadedSink, check_image, check_radiance
 from warp_ar.output.video_sink import (

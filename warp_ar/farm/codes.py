@@ -10,19 +10,72 @@ All that a frame takes of the device is on one stream, in order. Nobody waits bu
 from __future__ import annotations
 
 import fractions
+from collections.abc import Callable
 from typing import Any
 
 import av
 import numpy as np
 import numpy.typing as npt
 import warp as wp
-from av.video.reformatter import ColorRange
+from av.video.reformatter import ColorRange, Colorspace
 
 from warp_ar.device import exclusive, translating, wait_for
-from warp_ar.farm.decoded_picture import INTERLEAVED, DecodedPicture, matrix_of
-from warp_ar.farm.lit_picture import LitPicture
 from warp_ar.kernels.picture.video_color import rgb_factors, rgb_from_yuv, yuv_from_rgb, yuv_layout
 from warp_ar.output.video_sink import rgb_to_yuv
+from warp_ar.sources.deep_video import HD_HEIGHT
+
+LEAST_SIZE = 16
+"""Rows and columns below which FFmpeg's filters weigh samples at the border in another way than the device."""
+INTERLEAVED = "nv12"
+"""Format in which Cb and Cr lie in turn."""
+_PLANAR = ("yuv420p", "yuvj420p")
+_MATRICES = {int(Colorspace.ITU709): "bt709", int(Colorspace.ITU601): "bt601"}
+
+
+class DecodedPicture:
+    """A picture as its decoder gave it; it stands where a source has RGB."""
+
+    def __init__(self, picture: Any) -> None:
+        """Keep PyAV's picture, one that ``can_convert``."""
+        self.picture = picture
+        self.shape = (picture.height, picture.width, 3)
+
+
+def can_convert(picture: Any) -> bool:
+    """Whether a device can convert PyAV's picture to RGB as the host does."""
+    size = picture.height, picture.width
+    known = picture.format.name in (*_PLANAR, INTERLEAVED) and matrix_of(picture) is not None
+    return known and not picture.rotation and min(size) >= LEAST_SIZE and not any(n % 2 for n in size)
+
+
+def matrix_of(picture: Any) -> str | None:
+    """Name of a picture's matrix, as ``rgb_from_video`` takes it; None: another."""
+    if int(picture.colorspace) not in {int(known) for known in Colorspace}:
+        return "bt709" if picture.height >= HD_HEIGHT else "bt601"
+    return _MATRICES.get(int(picture.colorspace))
+
+
+class LitPicture:
+    """A lit picture on its way to the encoder: it has a shape and copies itself, as sinks want it."""
+
+    def __init__(self, shape: tuple[int, int, int], codes: npt.NDArray[np.uint8], wait: Callable[[], None]) -> None:
+        """``codes`` are there once ``wait`` returns."""
+        self.shape = shape
+        self._codes, self._wait = codes, wait
+
+    def copy(self) -> av.VideoFrame:
+        """PyAV's picture, yuv420p with memory of its own; waits for it."""
+        self._wait()
+        height, width = self.shape[:2]
+        picture = av.VideoFrame(width, height, "yuv420p")
+        start = 0
+        for plane in picture.planes:
+            rows, columns, pitch = plane.height, plane.width, plane.line_size
+            values = self._codes[start : start + rows * columns].reshape(rows, columns)
+            np.frombuffer(plane, np.uint8)[: rows * pitch].reshape(rows, pitch)[:, :columns] = values
+            start += rows * columns
+        return picture
+
 
 Codes = npt.NDArray[np.uint8]
 

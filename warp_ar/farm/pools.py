@@ -1,0 +1,331 @@
+"""Workers of a run: processes of this machine, each with its own cores, or actors of a Ray cluster.
+
+A worker takes jobs and gives back records; frames never pass through a pool. One executor of one process stands for
+each worker, so that the death of one loses the job of that one alone. BLAS and OpenCV have one thread each, so that
+results do not depend on how many workers there are.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import math
+import multiprocessing
+import multiprocessing.process
+import multiprocessing.resource_tracker
+import os
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Iterator, Sequence
+from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
+from pathlib import Path
+from typing import Any, Protocol
+
+from warp_ar.device import usable_cores
+from warp_ar.errors import UsageError, reason
+from warp_ar.farm.jobs import Context, Job, Outcome, program_version
+
+CORES = 4
+"""Of a worker on CPU: more of them leave stages of few rows waiting."""
+GPU_CORES = 2
+"""Of a worker on a GPU, which keeps about so many busy with decoding and encoding."""
+MOST_OF_GPU = 16
+"""Workers that share a GPU unless more are asked for: each holds its arrays there."""
+CONNECT_SECONDS = 30.0
+"""Within which a cluster must answer."""
+KNOCK_SECONDS = 5.0
+"""Within which a cluster's host must accept a connection."""
+
+
+class Pool(Protocol):
+    """Workers, wherever they are."""
+
+    names: Sequence[str]
+    """The device of each worker."""
+    died: type[BaseException]
+    """Error of a future whose worker has died."""
+    tries: int
+    """Deaths of its workers after which a job has failed."""
+
+    def start(self, worker: int) -> Future[str]:
+        """Start a worker, anew where it has died; the future gives the version of its program."""
+
+    def submit(self, worker: int, job: Job, arguments: Any) -> Future[Outcome]:
+        """Hand a job to a worker that has none."""
+
+    def close(self) -> None:
+        """End every worker at once."""
+
+
+def devices_of(device: str, workers: int | None) -> list[str]:
+    """Return the device of each worker, one GPU after another.
+
+    Args:
+        device: ``auto``, ``cpu`` or ``cuda``.
+        workers: Their number; None: one per four cores, on GPUs one per two, and at least one for each GPU.
+    """
+    from warp_ar.device import resolve_device
+
+    first = None if device == "cpu" else resolve_device(device)
+    if first is None or not first.is_cuda:
+        return ["cpu"] * (workers or max(1, usable_cores() // CORES))
+    import warp as wp
+
+    found = [str(gpu) for gpu in wp.get_cuda_devices()] if device in ("auto", "cuda") else [str(first)]
+    each = min(max(usable_cores() // GPU_CORES // len(found), 1), MOST_OF_GPU)
+    return [found[n % len(found)] for n in range(workers or each * len(found))]
+
+
+def cores_of(devices: Sequence[str]) -> list[list[int]]:
+    """Return the cores of each worker; none where the system does not let a process keep to some.
+
+    On CPU each has its own, as evenly as they go, and shared where there are more workers than cores. Workers of one
+    GPU share its part of them: while one waits for its GPU or its encoder, another goes on.
+    """
+    if not hasattr(os, "sched_getaffinity"):
+        return [[] for _ in devices]
+    cores = sorted(os.sched_getaffinity(0))
+    owners: list[Any] = list(range(len(devices))) if "cpu" in devices else list(devices)
+    place = {owner: n for n, owner in enumerate(dict.fromkeys(owners))}
+    if len(place) >= len(cores):
+        return [[cores[place[owner] % len(cores)]] for owner in owners]
+    ends = [round(n * len(cores) / len(place)) for n in range(len(place) + 1)]
+    return [cores[ends[place[owner]] : ends[place[owner] + 1]] for owner in owners]
+
+
+@contextlib.contextmanager
+def keeping_to(cores: Sequence[int]) -> Iterator[None]:
+    """Have threads that are started within keep to some cores; without any, change nothing."""
+    if not cores or not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, cores)
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)
+
+
+class ProcessPool:
+    """Workers as processes of this machine."""
+
+    died: type[BaseException] = BrokenExecutor
+    tries = 5
+
+    def __init__(self, context: Context, devices: Sequence[str]) -> None:
+        """Start nothing yet.
+
+        Args:
+            context: Of the run; each worker gets its own device and number.
+            devices: Of each worker.
+        """
+        self.names: Sequence[str] = list(devices)
+        self._context, self._cores = context, cores_of(devices)
+        self._executors: dict[int, ProcessPoolExecutor] = {}
+        self._processes: set[multiprocessing.process.BaseProcess] = set()
+
+    def start(self, worker: int) -> Future[str]:
+        """As ``Pool.start``."""
+        context = dataclasses.replace(self._context, device=self.names[worker], worker=worker)
+        every = sorted({core for own in self._cores for core in own})
+        executor = ProcessPoolExecutor(
+            1,
+            mp_context=multiprocessing.get_context("spawn"),
+            initializer=_begin,
+            initargs=(context, self._cores[worker], every),
+        )
+        self._executors[worker] = executor
+        before = set(multiprocessing.active_children())
+        with _interrupts_held():
+            future = executor.submit(program_version)  # starts the process
+        self._processes |= set(multiprocessing.active_children()) - before
+        return future
+
+    def submit(self, worker: int, job: Job, arguments: Any) -> Future[Outcome]:
+        """As ``Pool.submit``."""
+        try:
+            return self._executors[worker].submit(_do, job, arguments)
+        except BrokenExecutor as error:  # it died while it waited for a job
+            future: Future[Outcome] = Future()
+            future.set_exception(error)
+            return future
+
+    def close(self) -> None:
+        """As ``Pool.close``."""
+        for process in self._processes & set(multiprocessing.active_children()):
+            process.kill()
+        for executor in self._executors.values():
+            executor.shutdown(wait=True, cancel_futures=True)
+
+
+@contextlib.contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Keep interrupts of the terminal from processes that are started within: the driver decides what one ends."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    multiprocessing.resource_tracker.ensure_running()  # here: its start lets interrupts through again
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+_worker: tuple[Any, Sequence[int]] | None = None
+"""Of this process, if it is a worker: it does its jobs, and the cores of all workers."""
+
+
+def _begin(context: Context, cores: Sequence[int], every: Sequence[int]) -> None:
+    """Make this process a worker: one that ends with its driver, keeps to its cores and writes to its log."""
+    global _worker
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_driver, name="warp_ar-driver", daemon=True).start()
+    if cores:
+        os.sched_setaffinity(0, cores)
+    _write_to_log(context.folder / "log" / f"worker-{context.worker}.log")
+    from warp_ar.farm.work import Work  # here: a driver does without Warp
+
+    _worker = Work(context), every
+
+
+def _end_with_driver() -> None:
+    driver = multiprocessing.parent_process()
+    if driver is not None:
+        driver.join()
+        os._exit(1)
+
+
+def _do(job: Job, arguments: Any) -> Outcome:
+    """Do a job in this worker's process; a survey may use the cores of all, for others wait for its result."""
+    assert _worker is not None
+    work, every = _worker
+    with keeping_to(every if job.kind == "survey" else ()):
+        outcome: Outcome = work.do(job, arguments)
+    return outcome
+
+
+def _write_to_log(path: Path) -> None:
+    """Have all that is printed, by native code too, go to a file."""
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
+        for stream in (1, 2):
+            os.dup2(file, stream)
+        os.close(file)
+        sys.stdout = sys.stderr = open(2, "w", closefd=False)  # noqa: SIM115  (for as long as the process lives)
+
+
+class RayPool:
+    """Workers as actors: one per GPU of the cluster, or per core where it has none.
+
+    Ray decides where an actor runs, starts it again when it or its node dies, and gives it its job again.
+    """
+
+    tries = 1
+
+    def __init__(self, address: str | None, workers: int | None) -> None:
+        """Connect.
+
+        Args:
+            address: Of the cluster; None: the one that runs here, else one that is started for this run.
+            workers: Their number; None: as many as the cluster has GPUs, or cores.
+
+        Raises:
+            UsageError: Ray is not installed, or nothing answers at the address.
+        """
+        try:
+            import ray
+        except ImportError as error:
+            raise UsageError("--ray needs Ray: pip install 'warp-ar[farm]'") from error
+        self._ray = ray
+        _connect(ray, address)
+        self.died: type[BaseException] = ray.exceptions.RayError
+        found = ray.cluster_resources()
+        self._gpus = int(found.get("GPU", 0))
+        size = workers or self._gpus or max(1, int(found.get("CPU", 1)))
+        self.names: Sequence[str] = [f"ray {'cuda' if self._gpus else 'cpu'}"] * size
+        self._actors: list[Any] = []
+
+    def employ(self, context: Context) -> RayPool:
+        """Have the actors started for a run."""
+        from warp_ar.farm.work import Work
+
+        needs = {"num_gpus": share_of_gpu(len(self.names), self._gpus)} if self._gpus else {"num_cpus": 1}
+        # A node that is busy or gone comes back, or another does: so does the actor, and its job is given again.
+        actor = self._ray.remote(Work).options(max_restarts=-1, max_task_retries=ProcessPool.tries, **needs)
+        device = "cuda" if self._gpus else "cpu"
+        for worker in range(len(self.names)):
+            self._actors.append(actor.remote(dataclasses.replace(context, device=device, worker=worker)))
+        return self
+
+    def dashboard(self) -> str:
+        """Return the address of Ray's page; empty where it has none."""
+        with contextlib.suppress(Exception):
+            return str(self._ray.get_runtime_context().worker.node.webui_url or "")
+        return ""
+
+    def start(self, worker: int) -> Future[str]:
+        """As ``Pool.start``; Ray starts it."""
+        future: Future[str] = self._actors[worker].version.remote().future()
+        return future
+
+    def submit(self, worker: int, job: Job, arguments: Any) -> Future[Outcome]:
+        """As ``Pool.submit``."""
+        future: Future[Outcome] = self._actors[worker].do.remote(job, arguments).future()
+        return future
+
+    def close(self) -> None:
+        """As ``Pool.close``; the cluster goes on."""
+        for actor in self._actors:
+            self._ray.kill(actor, no_restart=True)
+        self._ray.shutdown()
+
+
+def share_of_gpu(workers: int, gpus: int) -> float:
+    """Return the part of a GPU that each worker takes, so that all find room; Ray counts ten-thousandths."""
+    on_one = -(-workers // gpus)
+    return 1 if on_one == 1 else math.floor(1e4 / on_one) / 1e4
+
+
+def _knock(address: str) -> None:
+    """Raise UsageError if nobody listens at ``HOST:PORT``: Ray itself takes half a minute to say so."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if not host or not port.isdecimal() or int(port) > 65535:
+        raise UsageError(f"--ray {address}: expected HOST:PORT, as `ray start --head` prints it")
+    try:
+        socket.create_connection((host, int(port)), KNOCK_SECONDS).close()
+    except OSError as error:
+        raise _no_cluster(address, error) from error
+
+
+def _no_cluster(address: str, error: BaseException) -> UsageError:
+    return UsageError(f"--ray {address}: no cluster answers ({reason(error)[:200]}); start one with: ray start --head")
+
+
+def _connect(ray: Any, address: str | None) -> None:
+    """Connect to a cluster, in a time that is bounded."""
+    options = {"logging_level": "ERROR", "log_to_driver": False}
+    if address is None:
+        try:
+            ray.init(address="auto", **options)
+        except ConnectionError:
+            ray.init(**options)
+        return
+    _knock(address)
+    future: Future[Any] = Future()
+
+    def connect() -> None:
+        try:
+            future.set_result(ray.init(address=address, **options))
+        except Exception as error:  # Ray raises whatever its transport does
+            future.set_exception(error)
+
+    threading.Thread(target=connect, name="warp_ar-ray", daemon=True).start()
+    try:
+        future.result(CONNECT_SECONDS)
+    except Exception as error:
+        raise _no_cluster(address, error) from error
