@@ -84,7 +84,7 @@ def test_what_belongs_to_a_stage_has_its_name(place: str) -> None:
 def test_the_contracts_name_every_room_and_let_no_stage_through() -> None:
     """``lint-imports`` holds the contracts of ``pyproject.toml``; they are only worth what they name."""
     linter = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"]
-    layers, independence, no_circle = linter["contracts"]
+    layers, independence, no_circle, farm = linter["contracts"]
     named = {name.strip() for layer in layers["layers"] for name in layer.split("|")}
     folders = {f"warp_ar.{path.parent.name}" for path in (ROOT / "warp_ar").glob("*/__init__.py")}
     files = {f"warp_ar.{path.stem}" for path in (ROOT / "warp_ar").glob("*.py")} - {"warp_ar.__init__"}
@@ -93,4 +93,5 @@ def test_the_contracts_name_every_room_and_let_no_stage_through() -> None:
     assert not excused & MODULES
     assert independence["modules"] == ["warp_ar.stages.*"]
     assert no_circle == {**no_circle, "type": "acyclic_siblings", "ancestors": ["warp_ar"]}
+    assert farm["source_modules"] == ["warp_ar.farm"]
     assert "exclude_type_checking_imports" not in linter, "a reader follows those imports too"
