@@ -14,7 +14,6 @@ import dataclasses
 import functools
 import math
 import threading
-import weakref
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -31,38 +30,6 @@ MOST_REGISTERS = 80
 They wait for memory most of their time. Left alone they take 120 to 255, with which a multiprocessor of 65,536 holds
 one or two blocks of 256 threads; with three it has others to go on with, and gains more than spilling costs.
 """
-
-UNCHECKED = "-disable-llvm-verifier -discard-value-names"
-"""Flags of Clang's that its own driver passes for every release build and Warp, which calls it without, does not.
-
-LLVM then does not check what Clang hands it, and gives its values no names. Binaries are the same to the byte.
-"""
-
-QUICK_TO_COMPILE = {"cpu_compiler_flags": f"-march=native -mllvm=-inline-threshold=500 -fno-slp-vectorize {UNCHECKED}"}
-"""Options of modules in which inlining everything gains a CPU nothing, and takes Clang half as long again to twice.
-
-Warp's own flags inline up to a cost of 9,000, which kernels with many rays in them need: with these, ``relight``,
-``shade`` and ``environment_shadow`` take a fifth longer. Either way values are rounded alike: Clang fuses products and
-sums within an expression of Warp's headers only, never across calls.
-"""
-
-_SLOW: weakref.WeakSet[wp.Kernel] = weakref.WeakSet()
-
-
-def slow_to_compile(kernel: wp.Kernel) -> wp.Kernel:
-    """Mark a kernel, the one of its module, that Clang takes seconds for and that pays for inlining in each frame.
-
-    Commands begin with versions of all kernels into which less is inlined; of this one the better version is compiled
-    first (``warp_ar.engine.tiers``).
-    """
-    _SLOW.add(kernel)
-    return kernel
-
-
-def is_slow_to_compile(kernel: wp.Kernel) -> bool:
-    """Whether a kernel is marked by ``slow_to_compile``."""
-    return kernel in _SLOW
-
 
 BLOCK = 256
 """Threads of a block, where nothing else is said."""

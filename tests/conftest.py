@@ -12,19 +12,9 @@ import hypothesis
 import pytest
 import warp as wp
 
-from warp_ar.engine import tiers, translation
-
 wp.config.log_level = wp.LOG_WARNING
-# A test runs its kernels once or twice: compiled quickly they give the same bits (tests/test_tiers.py).
-os.environ.setdefault("WARP_AR_TIERS", "quick")
-# So are those that a test launches by itself: the same kernel is then compiled once for tests, pipelines and commands.
-_WARP_FLAGS = wp.config.cpu_compiler_flags
-wp.config.cpu_compiler_flags = tiers.QUICK_FLAGS
-# As commands do. Half of what finds a kernel in the cache is looking through its functions, and the same ones are in
-# hundreds of kernels here. No test changes a function or a constant of a kernel (tests/hard_cases/mutations.py does, in
-# a copy and a process of its own).
-translation.remember_references()
-translation.drop_unused_adjoints()
+# A test runs its kernels once or twice: less is inlined, Clang takes two thirds of the time, and the bits are the same.
+wp.config.cpu_compiler_flags = "-march=native -mllvm=-inline-threshold=225 -fno-slp-vectorize"
 
 MOST_PROCESSES = 4
 """Processes that a run of a folder is spread over at most: each takes 1 to 3 GB."""
@@ -55,14 +45,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:
-    """Remove what Warp keeps for threads that compiled kernels; at Python's end it would warn of it.
-
-    So would OpenImageIO of all its objects, where a command that a test has run froze what was loaded: Python's end
-    then frees none of it.
-    """
-    from warp_ar.engine.modules import remove_header_folders
-
-    remove_header_folders()
+    """Let Python's end free all objects, where a command that a test has run froze what was loaded."""
     gc.unfreeze()
 
 
@@ -114,13 +97,6 @@ def device(request: pytest.FixtureRequest) -> Iterator[str]:
     """Run the test on the CPU and, where there is one, on the first CUDA device."""
     with wp.ScopedDevice(request.param):
         yield request.param
-
-
-@pytest.fixture
-def warp_flags(monkeypatch: pytest.MonkeyPatch) -> str:
-    """Warp's own flags of Clang, in force as they are outside of tests."""
-    monkeypatch.setattr(wp.config, "cpu_compiler_flags", _WARP_FLAGS)
-    return str(_WARP_FLAGS)
 
 
 @pytest.fixture(scope="session")

@@ -19,7 +19,7 @@ from warp_ar.begin import EXIT_INTERRUPTED, EXIT_TERMINATED, handling, importing
 from warp_ar.command_line import EXIT_DONE, loading
 from warp_ar.errors import UsageError, WarpArError, printable, reason, say
 from warp_ar.files import write_whole
-from warp_ar.live_start import hurry_compilers, say_quick_check
+from warp_ar.live_start import say_quick_check, start_device
 from warp_ar.output.encoders import parse_options
 from warp_ar.output.places import check_places, check_replaceable
 from warp_ar.output.sink import make_folder
@@ -283,7 +283,7 @@ def _light_clip(options: argparse.Namespace, loaded: Callable[[], None]) -> int:
     _check_places(options, scene)
     # Here, for they load Warp: the page is to be there before, and what is wrong with a scene is told before.
     with importing():
-        hurry_compilers(options.device)
+        start_device(options.device)
         from warp_ar.output.report import RunLog
 
     side, outputs, replaced = _open_side_files(options)

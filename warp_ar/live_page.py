@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from warp_ar.begin import EXIT_INTERRUPTED, EXIT_TERMINATED, importing
 from warp_ar.command_line import EXIT_DONE, EXIT_USAGE, Terminated, loading
 from warp_ar.errors import UsageError, WarpArError, printable, say
-from warp_ar.live_start import hurry_compilers, say_quick_check
+from warp_ar.live_start import say_quick_check, start_device
 from warp_ar.scene import Scene, load_scene
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ def _make_page_host(options: argparse.Namespace, scene: Scene, **callbacks: Any)
     with loading():
         from warp_ar.device import bound_arenas
 
-        hurry_compilers(options.device)
+        start_device(options.device)
         from warp_ar.viewer.host import Host
 
         bound_arenas()
@@ -142,10 +142,7 @@ def serve_page(options: argparse.Namespace) -> int:
     if not server.ended or code in (EXIT_INTERRUPTED, EXIT_TERMINATED):
         # A frame of the reference, or a kernel that is compiled, takes many seconds and cannot be stopped, and Python
         # would wait for its thread, or end it within native code, which aborts. All files are closed and temporary
-        # folders gone by now, but for a compiler's.
-        modules = sys.modules.get("warp_ar.engine.modules")
-        if modules is not None and hasattr(modules, "remove_header_folders"):  # else it is still being imported
-            modules.remove_header_folders()
+        # folders gone by now.
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)

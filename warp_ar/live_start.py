@@ -1,4 +1,4 @@
-"""What pictures on a page and frames in files begin with: a quick check of the set-up, and compilers put to work."""
+"""What pictures on a page and frames in files begin with: a quick check of the set-up, and the device."""
 
 from __future__ import annotations
 
@@ -38,20 +38,13 @@ def say_quick_check(options: argparse.Namespace, scene: Scene) -> bool:
     return checked.ball_seen
 
 
-def hurry_compilers(device: str) -> None:
-    """Start Warp; what can be done for its compilers beside the imports that follow, and before them, is."""
-    import warp as wp
+def start_device(name: str) -> None:
+    """Start Warp, and make a CUDA device's context beside the imports that follow.
 
+    Args:
+        name: As for ``resolve_device``.
+    """
     from warp_ar.device import open_ahead, start_warp
-    from warp_ar.engine.modules import parse_headers_ahead
-    from warp_ar.engine.nvrtc import compile_beside
-    from warp_ar.engine.tiers import begin_quickly
-    from warp_ar.engine.translation import take_shortcuts
 
     start_warp()
-    open_ahead(device)
-    take_shortcuts()
-    begin_quickly()
-    compile_beside()
-    if device == "cpu" or not wp.is_cuda_available():
-        parse_headers_ahead()
+    open_ahead(name)

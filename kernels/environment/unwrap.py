@@ -32,7 +32,7 @@ import warp as wp
 from warp_ar.kernels.camera import project
 from warp_ar.kernels.color import decode, is_saturated, saturation_codes
 from warp_ar.kernels.latlong import PI, direction_from_latlong, texel_solid_angle
-from warp_ar.kernels.launch import QUICK_TO_COMPILE, Rows, launch_rows
+from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.pixels import clip_levels, is_at_clipping, keep_linear
 from warp_ar.kernels.rays.shapes import FAR, intersect_box, intersect_plane, meets_mesh, to_rigid_point, to_rigid_vector
 from warp_ar.kernels.structs import BOX, MESH, PLANE, EnvironmentView, FrameParams, Probe, RayScene
@@ -200,7 +200,7 @@ def make_project_corners_kernel(config: ProjectConfig) -> wp.Kernel:
     kinds = config.occluders
     hidden_by_proxies = make_hidden_by_proxies(kinds)
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=QUICK_TO_COMPILE)
+    @wp.kernel(module="unique", enable_backward=False)
     def project_corners_kernel(
         # In:
         row_start: wp.int32,

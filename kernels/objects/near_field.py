@@ -40,7 +40,7 @@ import warp as wp
 from warp_ar.kernels.color import brightness
 from warp_ar.kernels.cooperative import sum_beside
 from warp_ar.kernels.environment.environment_samples import EnvironmentSample
-from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows, slow_to_compile
+from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
 from warp_ar.kernels.materials import material_at, roughness_at, surface_point
 from warp_ar.kernels.objects.near_field_rays import (
     SHARP,
@@ -119,7 +119,6 @@ def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
     distant_irradiance = make_distant_irradiance(config.distant)
     lobes = config.lobe_count
 
-    @slow_to_compile
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def near_field_kernel(
         row_start: wp.int32,

@@ -22,7 +22,7 @@ import math
 import warp as wp
 
 from warp_ar.kernels.edges import EdgeList, EdgeLists, holds_all, list_edge, listed_edges, sample_listed_edges
-from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows, slow_to_compile
+from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
 from warp_ar.kernels.materials import Surface, lobe_axis, make_reflect_direct, make_surface, reflect, specular_occlusion
 from warp_ar.kernels.objects.near_field import NearLight
 from warp_ar.kernels.objects.reflect import (
@@ -408,7 +408,6 @@ def make_shade_kernel(config: ShadeConfig, edges: str = SAMPLED) -> wp.Kernel:
     """
     shade_sample = make_shade_sample(config)
 
-    @slow_to_compile
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def shade_kernel(
         # In:

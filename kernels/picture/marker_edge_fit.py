@@ -12,9 +12,7 @@ from typing import Final
 
 import warp as wp
 
-from warp_ar.kernels.launch import QUICK_TO_COMPILE
-
-wp.set_module_options({"enable_backward": False, "max_unroll": 1, **QUICK_TO_COMPILE})
+wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
 MOST_POSES: Final = 2
 """Poses that are fitted in one call: a plane has two that look alike."""

@@ -11,7 +11,7 @@ import math
 
 import warp as wp
 
-from warp_ar.kernels.launch import QUICK_TO_COMPILE, Rows, launch_rows
+from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.pixel_order import own_pixel
 from warp_ar.kernels.rays.shapes import FAR, ROUNDING
 from warp_ar.kernels.rays.trace import TraceConfig, make_trace, meets_probe
@@ -127,7 +127,7 @@ def make_trace_pixels_kernel(config: TraceConfig) -> wp.Kernel:
     """Kernel of ``trace_pixels``, specialised to the kinds of shape that exist."""
     closest_visible = make_primary(config)
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=QUICK_TO_COMPILE)
+    @wp.kernel(module="unique", enable_backward=False)
     def trace_pixels_kernel(
         row_start: wp.int32,
         # In:

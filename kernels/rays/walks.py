@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import warp as wp
 
-from warp_ar.kernels.launch import Note, do_or_note, slow_to_compile
+from warp_ar.kernels.launch import Note, do_or_note
 from warp_ar.kernels.rays.called_walks import (
     ANY_OBJECT,
     ANY_PROXY,
@@ -81,7 +81,6 @@ def make_walks_kernel(detail: bool, stretched: bool) -> wp.Kernel:
     def write_addresses(table: wp.array[wp.uint64]):
         """Addresses of the walks."""
 
-    @slow_to_compile
     @wp.kernel(module="unique", enable_backward=False)
     def walks_kernel(
         # Out:

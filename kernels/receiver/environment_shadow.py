@@ -33,7 +33,7 @@ from warp_ar.kernels.cells import cell_pixel
 from warp_ar.kernels.environment.environment_samples import SampleSets, ball_of_sample, sample_toward
 from warp_ar.kernels.environment.probe_weights import probe_share
 from warp_ar.kernels.latlong import sample_latlong
-from warp_ar.kernels.launch import Rows, launch, launch_rows, slow_to_compile
+from warp_ar.kernels.launch import Rows, launch, launch_rows
 from warp_ar.kernels.materials import reflect
 from warp_ar.kernels.objects.reflect import DistantLight, look_up, make_find_in_frame
 from warp_ar.kernels.rays.shapes import FAR, intersect_sphere, surface_key
@@ -309,7 +309,6 @@ def make_environment_shadow_kernel(config: EnvironmentShadowConfig) -> wp.Kernel
     side = config.side
     secondary_count = config.secondary_count
 
-    @slow_to_compile
     @wp.kernel(module="unique", enable_backward=False)
     def environment_shadow_kernel(
         # In:

@@ -25,7 +25,7 @@ from typing import Literal
 
 import warp as wp
 
-from warp_ar.kernels.launch import MOST_REGISTERS, QUICK_TO_COMPILE, Rows, launch_rows
+from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
 from warp_ar.kernels.objects.reflect import DistantLightConfig
 from warp_ar.kernels.pixel_order import own_pixel
 from warp_ar.kernels.pixels import pixel_run
@@ -302,7 +302,7 @@ def make_spread_ratio_kernel(config: DistantLightConfig) -> wp.Kernel:
     visible_proxy = make_visible_proxy(config.trace, config.probes)
 
     @wp.kernel(
-        module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS, module_options=QUICK_TO_COMPILE
+        module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS
     )
     def spread_ratio_kernel(
         # In:

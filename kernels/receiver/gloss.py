@@ -38,7 +38,7 @@ import warp as wp
 
 from warp_ar.kernels.emitters import correct_parallax
 from warp_ar.kernels.environment.lobes import level_from_alpha, sample_levels
-from warp_ar.kernels.launch import MOST_REGISTERS, QUICK_TO_COMPILE, Rows, launch_rows
+from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
 from warp_ar.kernels.materials import MIN_ALPHA, ggx_lobe, reflect, schlick
 from warp_ar.kernels.objects.reflect import DistantLight, look_up, look_up_layer, make_find_in_frame
 from warp_ar.kernels.objects.shade import NearPoint, ShadeConfig, make_shade_hit
@@ -410,7 +410,7 @@ def make_gloss_kernel(config: GlossConfig) -> wp.Kernel:
     highlights = make_highlights(config) if config.lights else None
 
     @wp.kernel(
-        module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS, module_options=QUICK_TO_COMPILE
+        module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS
     )
     def gloss_kernel(
         # In:

@@ -22,7 +22,7 @@ from collections.abc import Sequence
 import warp as wp
 
 from warp_ar.kernels.cooperative import of_lane
-from warp_ar.kernels.launch import MOST_REGISTERS, QUICK_TO_COMPILE, Rows, launch_rows
+from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
 from warp_ar.kernels.materials import reflect
 from warp_ar.kernels.objects.reflect import DistantLight, look_up_layer, make_find_in_frame
 from warp_ar.kernels.objects.shade import NearPoint, ShadeConfig, make_shade_hit
@@ -198,7 +198,7 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
     mirrored_change = make_mirrored_change(config)
 
     @wp.kernel(
-        module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS, module_options=QUICK_TO_COMPILE
+        module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS
     )
     def mirror_ball_kernel(
         # In:

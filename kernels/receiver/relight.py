@@ -27,7 +27,7 @@ import warp as wp
 
 from warp_ar.kernels.cells import any_cell_above_zero
 from warp_ar.kernels.edges import EdgeList, EdgeLists, holds_all, list_edge, listed_edges, sample_listed_edges
-from warp_ar.kernels.launch import MOST_REGISTERS, QUICK_TO_COMPILE, Rows, launch_rows, slow_to_compile
+from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
 from warp_ar.kernels.pixel_order import own_pixel
 from warp_ar.kernels.rays.area_lights import make_area_count, make_area_sample
 from warp_ar.kernels.rays.shadow import (
@@ -186,7 +186,6 @@ def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
     closest_proxy = make_trace(config.trace).closest_proxy
     direct_lighting = make_direct_lighting(config)
 
-    @slow_to_compile
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def relight_kernel(
         # In:
@@ -300,7 +299,7 @@ def make_smooth_edges_kernel(config: RelightConfig, *, left: bool = False) -> wp
     sample_lighting = make_sample_lighting(config)
 
     @wp.kernel(
-        module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS, module_options=QUICK_TO_COMPILE
+        module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS
     )
     def smooth_edges_kernel(
         # In:

@@ -21,7 +21,7 @@ from warp_ar.kernels.camera import project
 from warp_ar.kernels.color import decode, is_saturated, saturation_codes
 from warp_ar.kernels.environment.unwrap import reflecting_normal
 from warp_ar.kernels.latlong import PI
-from warp_ar.kernels.launch import QUICK_TO_COMPILE, Rows, launch_rows
+from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.pixels import clip_levels, is_at_clipping, keep_linear
 from warp_ar.kernels.rays.shapes import FAR, ROUNDING
 from warp_ar.kernels.rays.trace import TraceConfig, make_trace, offset_origin
@@ -148,7 +148,7 @@ def make_observe_surfaces_kernel(proxies: tuple[int, ...], linear: bool = False)
     find_levels = clip_levels if linear else saturation_codes
     clips = is_at_clipping if linear else is_saturated
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=QUICK_TO_COMPILE)
+    @wp.kernel(module="unique", enable_backward=False)
     def observe_surfaces_kernel(
         # In:
         row_start: wp.int32,
@@ -255,7 +255,7 @@ def make_trace_transfer_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
     """Kernel of ``trace_transfer`` for the given kinds of proxy."""
     trace = make_trace(TraceConfig(objects=(), proxies=proxies))
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=QUICK_TO_COMPILE)
+    @wp.kernel(module="unique", enable_backward=False)
     def trace_transfer_kernel(
         # In:
         row_start: wp.int32,
@@ -346,7 +346,7 @@ def make_trace_emitters_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
     """Kernel of ``trace_emitters`` for the given kinds of proxy."""
     trace = make_trace(TraceConfig(objects=(), proxies=proxies))
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=QUICK_TO_COMPILE)
+    @wp.kernel(module="unique", enable_backward=False)
     def trace_emitters_kernel(
         # In:
         row_start: wp.int32,

@@ -12,7 +12,7 @@ import functools
 import warp as wp
 
 from warp_ar.kernels.latlong import direction_from_latlong, latlong_from_direction, texel_solid_angle
-from warp_ar.kernels.launch import QUICK_TO_COMPILE, Rows, launch_rows
+from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.rays.shapes import FAR
 from warp_ar.kernels.rays.trace import TraceConfig, make_trace
 from warp_ar.kernels.structs import Probe, RayScene
@@ -63,7 +63,7 @@ def make_leave_out_edges_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
     """Kernel for the given kinds of proxy."""
     trace = make_trace(TraceConfig(objects=(), proxies=proxies))
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=QUICK_TO_COMPILE)
+    @wp.kernel(module="unique", enable_backward=False)
     def leave_out_edges_kernel(
         # In:
         row_start: wp.int32,
@@ -142,7 +142,7 @@ def make_condense_cells_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
     """Kernel for the given kinds of proxy."""
     trace = make_trace(TraceConfig(objects=(), proxies=proxies))
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=QUICK_TO_COMPILE)
+    @wp.kernel(module="unique", enable_backward=False)
     def condense_cells_kernel(
         # In:
         row_start: wp.int32,

@@ -21,7 +21,7 @@ from warp_ar.calibration.saturation import PERIOD, WATCHED, SaturationLevels, ba
 from warp_ar.device import exclusive
 from warp_ar.engine.frame_constants import FrameBlock
 from warp_ar.engine.graph import INPUTS
-from warp_ar.engine.modules import load_at_once
+from warp_ar.engine.modules import load_modules
 from warp_ar.engine.scheduler import StageTiming
 from warp_ar.engine.transfer import Slot, Transfers
 from warp_ar.kernels.color import camera_table, decode_table, encode_table
@@ -448,6 +448,6 @@ def _make_host_scene(scene: Scene, device: Any) -> tuple[HostScene, list[Note]]:
     """A scene as rays meet it, and what is to be launched for it before the first frame."""
     shapes = {shape_kind(item) for item in scene.objects} | {shape_kind(item) for item in scene.proxies}
     if device.is_cpu and MESH in shapes:
-        load_at_once(build_wide_bvh_kernel, device)
+        load_modules([build_wide_bvh_kernel], device)
     with noting() as launches:
         return HostScene(scene, device), launches

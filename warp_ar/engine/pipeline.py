@@ -5,7 +5,6 @@ from __future__ import annotations
 import collections
 import dataclasses
 import difflib
-import itertools
 import math
 import os
 import time
@@ -25,7 +24,7 @@ from warp_ar.engine.frame_exchange import Borrowed, adopt_frame
 from warp_ar.engine.frame_inputs import FrameInputs, SeenFrame
 from warp_ar.engine.graph import make_plan
 from warp_ar.engine.layers import LayerArrays, layer_arrays, neutral_layers
-from warp_ar.engine.modules import Progress, begin_slowest
+from warp_ar.engine.modules import Progress
 from warp_ar.engine.result import TRACK, Rendered, Result, done_at_once
 from warp_ar.engine.scheduler import Scheduler, StageTiming
 from warp_ar.engine.short_frames import ShortFrames
@@ -140,8 +139,6 @@ class Pipeline(Closing):
         form = outputs, self.bracket.ratios, estimates, emitters, linear
         self.plan = make_plan(Request(self.scene, self.quality, self.size, *form))
         with translating(self.device), wp.ScopedDevice(self.device):
-            slowest = [kind.slowest_kernels(self.plan.features, self.device) for kind, _ in self.plan.stages]
-            begin_slowest(itertools.chain(*slowest), self.device)
             self._build(self._follows_gain(follows_camera, exposures), bands=bands, profile=profile, culling=culling)
 
     def _follows_gain(self, follows_camera: bool | None, exposures: Sequence[float]) -> bool:

@@ -252,11 +252,6 @@ class Stage(abc.ABC):
     def begin(self) -> None:  # noqa: B027  (most stages treat all frames alike)
         """Called once in every frame in which the stage runs, before any of its passes."""
 
-    @classmethod
-    def slowest_kernels(cls, features: Features, device: Any) -> tuple[Any, ...]:
-        """Those of its kernels that take NVRTC longest: they are begun before there are arrays to launch them with."""
-        return ()
-
     def host_kernels(self) -> tuple[Any, ...]:
         """Kernels that its steps on the host launch: they are compiled with the others."""
         return ()

@@ -119,11 +119,6 @@ class EnvironmentShadow(Stage):
         """Far from objects the environment is as it was."""
         return None if reach.shadows else "no virtual object is near anything in the picture"
 
-    @classmethod
-    def slowest_kernels(cls, features: Features, device: Any) -> tuple[Any, ...]:
-        """The one that follows what objects send."""
-        return (environment_shadow.make_environment_shadow_kernel(shadow_config(features, device)),)
-
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The ratio, and the estimates that it is averaged from."""
         width, height = self.request.size

@@ -122,11 +122,6 @@ class MirrorBall(Stage):
         unlit = _reads(self.features, lit=False)
         return tuple(name for name in self.wiring.reads if name in unlit)
 
-    @classmethod
-    def slowest_kernels(cls, features: Features, device: Any) -> tuple[Any, ...]:
-        """The one that traces and shades."""
-        return (mirror_ball.make_mirror_ball_kernel(mirror_variant(features, device)),)
-
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The change, and the table of reflectance where materials need it."""
         width, height = self.request.size

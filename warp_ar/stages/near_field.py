@@ -127,11 +127,6 @@ class NearField(Stage):
         """Without an object in the picture nothing shows its surroundings."""
         return None if reach.objects else OUT_OF_PICTURE
 
-    @classmethod
-    def slowest_kernels(cls, features: Features, device: Any) -> tuple[Any, ...]:
-        """The one that estimates."""
-        return (near_field.make_near_field_kernel(near_field_config(features, device)),)
-
     def arrays(self) -> Mapping[str, ArraySpec]:
         """Irradiance and what is mirrored, before and after averaging."""
         width, height = self.request.size

@@ -10,11 +10,7 @@ import warp as wp
 from warp_ar.kernels.launch import takes_few_blocks
 from warp_ar.kernels.objects.near_field import NearLight
 from warp_ar.kernels.objects.shade import (
-    LEFT,
-    LISTED,
     make_object_light,
-    make_sample_edges_kernel,
-    make_shade_kernel,
     shade,
 )
 from warp_ar.stages.base import (
@@ -82,14 +78,6 @@ class Shade(Stage):
     def idle(self, reach: Reach) -> str | None:
         """Without an object in the picture nothing is covered."""
         return None if reach.objects else OUT_OF_PICTURE
-
-    @classmethod
-    def slowest_kernels(cls, features: Features, device: Any) -> tuple[Any, ...]:
-        """All that shade."""
-        config = shade_variant(shade_config(features), features, device)
-        if device.is_cpu or config.edge_samples == 1:
-            return (make_shade_kernel(config),)
-        return make_shade_kernel(config, LEFT), make_sample_edges_kernel(config), make_shade_kernel(config, LISTED)
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The shaded objects, lists of edges and, for metallic-roughness, the table of its reflectance."""
