@@ -12,7 +12,6 @@ from warp_ar.engine.graph import make_plan
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SceneError
 from warp_ar.light.captured import (
-    REC_709,
     CapturedEmitter,
     Light,
     find_emitters,
@@ -23,6 +22,7 @@ from warp_ar.light.latlong_axes import DESCRIPTIONS, to_axes, world_from_marker
 from warp_ar.scene import dumps_scene, loads_scene
 from warp_ar.scene.geometry import rotation_matrix
 from warp_ar.session import with_light
+from warp_ar.signals import REC_709
 from warp_ar.stages.quality import PRESETS
 from warp_ar.stages.request import Request
 
@@ -131,7 +131,7 @@ def test_a_map_in_other_axes_is_turned(tmp_path, axes):
 @pytest.mark.parametrize(
     ("channels", "attributes", "message"),
     [
-        ({"Y": np.ones((4, 8), np.float32)}, {}, "R, G and B"),
+        ({"Z": np.ones((4, 8), np.float32)}, {}, "R, G and B"),
         ({"RGB": np.ones((4, 9, 3), np.float32)}, {}, "twice as wide"),
         ({"RGB": np.ones((4, 8, 3), np.float32)}, {"emitters": "[{}]"}, "emitters is damaged"),
         ({"RGB": np.ones((4, 8, 3), np.float32)}, {"emitters": "[" * 200_000}, "levels of nesting"),

@@ -37,7 +37,7 @@ def test_environment_from_separate_channels_and_half(tmp_path: pathlib.Path) -> 
     channels = {name: np.ascontiguousarray(small[..., index]) for index, name in enumerate("RGB")}
     channels["Z"] = channels["R"]
     OpenEXR.File({"type": OpenEXR.scanlineimage}, channels).write(str(tmp_path / "e.exr"))
-    assert np.array_equal(read_environment(tmp_path / "e.exr"), small.astype(np.float32))
+    assert np.array_equal(read_environment(tmp_path / "e.exr", axes="z-up"), small.astype(np.float32))
     OpenEXR.File({"type": OpenEXR.scanlineimage}, {"Z": channels["R"]}).write(str(tmp_path / "z.exr"))
     with pytest.raises(SinkError, match="R, G and B"):
         read_environment(tmp_path / "z.exr")

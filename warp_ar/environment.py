@@ -40,7 +40,8 @@ def make_parser() -> argparse.ArgumentParser:
         description="Write an environment in the axes and format of another program.",
     )
     add = parser.add_argument
-    add("environment", type=Path, metavar="FILE", help="a latlong OpenEXR, such as --save-environment of live writes")
+    add("environment", type=Path, metavar="FILE", help="a latlong .exr or .hdr, as live --save-environment writes")
+    add("--light-axes", choices=AXES, help="axes of FILE (default: as it says, else y-up of .exr and blender of .hdr)")
     add("--output", type=Path, required=True, metavar="FILE", help="an .exr, .hdr, or .json of spherical harmonics")
     text = "z-up (this program's own), blender (three.js too), y-up (OpenEXR, USD), opengl (default: y-up)"
     add("--axes", choices=AXES, default="y-up", help=text)
@@ -50,7 +51,7 @@ def make_parser() -> argparse.ArgumentParser:
     text = "where: longitude and latitude in degrees, altitude in metres"
     add("--place", type=float, nargs=3, metavar=("EAST", "NORTH", "ALTITUDE"), help=text)
     add("--white-luminance", type=float, metavar="CD", help="cd/m^2 of the value 1 (default: as the file says)")
-    text = "rec709 (this program's own), or acescg, by OpenColorIO, to .exr (default: rec709)"
+    text = "rec709 (this program's own), or acescg, to .exr (default: rec709)"
     add("--color-space", choices=tuple(COLOR_SPACES), default="rec709", help=text)
     add("--grey-card", action="store_true", help="scale the light: a grey card lying on the marker has 0.18")
     add("--overwrite", action="store_true", help="replace a file that this program did not write")
@@ -89,7 +90,7 @@ def convert(options: argparse.Namespace) -> int:
     }
     info = read_environment_info(options.environment)
     info = dataclasses.replace(info, **{name: value for name, value in given.items() if value is not None})
-    radiance = read_environment(options.environment)
+    radiance = read_environment(options.environment, axes=options.light_axes)
     if options.grey_card:
         radiance, info = _scaled(radiance, info)
     replaced = check_replaceable(output, overwrite=options.overwrite)

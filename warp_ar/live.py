@@ -18,6 +18,7 @@ from warp_ar.live_page import DEFAULT_PORT, serve_page
 from warp_ar.output.encoders import CODINGS, describe_encoders
 from warp_ar.output.sinks import FOLDER_CODINGS
 from warp_ar.scene import bundled_scenes
+from warp_ar.scene.description import LATLONG_AXES
 from warp_ar.stages.quality import AUTO, DEFAULT_BUDGET_MS, DEFAULT_PRESET, PRESETS
 from warp_ar.stages.request import LAYERS
 
@@ -49,7 +50,9 @@ def make_parser() -> argparse.ArgumentParser:
         metavar="FILE|exif",
         help="OpenCV camera calibration, YAML or JSON, instead of the scene's numbers; exif: the first picture's",
     )
-    add("--light", metavar="FILE", help="captured light (OpenEXR) instead of what a mirror ball in the frames shows")
+    add("--light", metavar="FILE", help="captured light (.exr, .hdr) instead of what a mirror ball in the frames shows")
+    text = "axes of --light (default: as the file says, else y-up of .exr and blender of .hdr)"
+    add("--light-axes", choices=LATLONG_AXES, help=text)
     add("--device", default="auto", metavar="auto|cpu|cuda:0", help="where the kernels run (default: auto)")
     add(
         "--quality",

@@ -48,7 +48,7 @@ def _page_scene(options: argparse.Namespace) -> Scene:
     scene = load_scene(options.scene)
     if options.calibration is not None:
         scene = calibrated(scene, options.calibration, options.source)
-    return scene if options.light is None else with_light(scene, options.light)
+    return scene if options.light is None else with_light(scene, options.light, options.light_axes)
 
 
 def _page_address(options: argparse.Namespace) -> Address:

@@ -35,6 +35,7 @@ from warp_ar.light.captured import Light
 from warp_ar.output.places import check_places, check_replaceable
 from warp_ar.output.sink import make_folder
 from warp_ar.scene import Scene, load_scene
+from warp_ar.scene.description import LATLONG_AXES
 from warp_ar.scene.scene_files import files_of
 from warp_ar.session import calibrated, with_light
 from warp_ar.signature import PROGRAM, sign_png
@@ -66,7 +67,9 @@ def make_parser() -> argparse.ArgumentParser:
     text = f"of the pipeline that finds the light: {', '.join(PRESETS)} (default: high)"
     add("--quality", default="high", metavar="NAME", help=text)
     add("--source", metavar="PATH|INDEX", help="frames from here, not the scene's own")
-    add("--light", metavar="FILE", help="captured light (OpenEXR) instead of what a mirror ball shows")
+    add("--light", metavar="FILE", help="captured light (OpenEXR, HDR) instead of what a mirror ball shows")
+    text = "axes of --light (default: as the file says, else y-up of .exr and blender of .hdr)"
+    add("--light-axes", choices=LATLONG_AXES, help=text)
     text = "look in the frame for how far the emitters of --light or of the scene's light file stand"
     add("--places", action="store_true", help=text)
     text = "write the light, with the distances that --places found: live --light reads them"
@@ -91,7 +94,7 @@ def trace(options: argparse.Namespace) -> int:
     if options.calibration is not None:
         scene = calibrated(scene, options.calibration, options.source)
     if options.light is not None:
-        scene = with_light(scene, options.light)
+        scene = with_light(scene, options.light, options.light_axes)
     if options.save_light is not None:
         _check_axes(scene)
     writes = {f"--{name}": getattr(options, name.replace("-", "_")) for name in ("output", "compare", "save-light")}

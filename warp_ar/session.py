@@ -65,25 +65,34 @@ def calibrated(scene: Scene, calibration: str | Path, source: str | int | Path |
     return dataclasses.replace(scene, camera=camera_by_exif(path, transfer))
 
 
-def with_light(scene: Scene, light: str | Path) -> Scene:
-    """The scene lit by a captured light instead of what a mirror ball in its frames shows.
+def with_light(scene: Scene, light: str | Path, axes: str | None = None) -> Scene:
+    """Return the scene lit by a captured light instead of what a mirror ball in its frames shows.
+
+    Args:
+        scene: The scene.
+        light: Latlong OpenEXR or Radiance HDR.
+        axes: Axes of that file; None: as it says, else by the convention of its format.
 
     Raises:
         SceneError: The file cannot be used.
     """
-    Light.load(light)
+    Light.load(light, axes)
     spec = scene.captured or CapturedLight(Path(light))
-    return dataclasses.replace(scene, captured=dataclasses.replace(spec, file=Path(light).resolve()))
+    return dataclasses.replace(scene, captured=dataclasses.replace(spec, file=Path(light).resolve(), axes=axes))
 
 
 def _chosen_scene(
-    scene: Scene | str | Path, source: str | int | Path | None, calibration: str | Path | None, light: str | Path | None
+    scene: Scene | str | Path,
+    source: str | int | Path | None,
+    calibration: str | Path | None,
+    light: str | Path | None,
+    light_axes: str | None,
 ) -> Scene:
     """The scene with the camera and the light that are given instead of its own."""
     scene = scene if isinstance(scene, Scene) else load_scene(scene)
     if calibration is not None:
         scene = calibrated(scene, calibration, source)
-    return scene if light is None else with_light(scene, light)
+    return scene if light is None else with_light(scene, light, light_axes)
 
 
 class Session(Closing):
@@ -108,6 +117,7 @@ class Session(Closing):
         source: str | int | Path | None = None,
         calibration: str | Path | None = None,
         light: str | Path | None = None,
+        light_axes: str | None = None,
         device: str = "auto",
         quality: str | Quality = DEFAULT_PRESET,
         budget_ms: float | None = None,
@@ -123,7 +133,9 @@ class Session(Closing):
                 the URL of a camera's stream.
             calibration: OpenCV calibration file instead of the scene's camera numbers, or ``exif``: by the EXIF of the
                 first picture.
-            light: Captured light instead of what a mirror ball shows: an OpenEXR.
+            light: Captured light instead of what a mirror ball shows: a latlong OpenEXR or Radiance HDR.
+            light_axes: Axes of that file, ``z-up``, ``blender``, ``y-up`` or ``opengl``; None: as it says, else y-up of
+                an OpenEXR and blender of an HDR.
             device: ``auto``, ``cpu`` or ``cuda:N``.
             quality: A preset's name, a value of one's own, or ``auto``: the least error within a budget.
             budget_ms: Milliseconds per frame for ``auto``; None means 33.
@@ -137,7 +149,7 @@ class Session(Closing):
             SourceError: The source cannot be opened.
             UsageError: Any other argument cannot be used.
         """
-        self.scene = _chosen_scene(scene, source, calibration, light)
+        self.scene = _chosen_scene(scene, source, calibration, light, light_axes)
         if budget_ms is not None and quality != AUTO:
             raise UsageError(f"a budget of {budget_ms:g} ms needs the quality {AUTO!r}, not {quality!r}")
         shown = self.scene.source.shown if source is None and self.scene.source is not None else None

@@ -90,17 +90,35 @@ def xyz_from_rgb(chromaticities: Chromaticities) -> Array:
     return np.asarray(xyz[:, :3] * np.linalg.solve(xyz[:, :3], xyz[:, 3]))
 
 
+def are_primaries(chromaticities: Chromaticities) -> bool:
+    """Return whether x and y of red, green, blue and white span a colour space."""
+    xy = np.asarray(chromaticities, np.float64).reshape(4, 2)
+    if not np.isfinite(xy).all() or (np.abs(xy) > 10.0).any() or (np.abs(xy[:, 1]) < 1e-6).any():
+        return False
+    columns = np.stack([xy[:3, 0], xy[:3, 1], 1.0 - xy[:3].sum(1)])
+    return bool(abs(np.linalg.det(columns)) > 1e-6 and xy[3, 1] > 0.0)
+
+
+_BRADFORD: Final = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
+"""Cone responses from CIE XYZ, by which white is adapted (ICC.1:2022, annex E)."""
+
+
 def rgb_from_rgb(source: Chromaticities, target: Chromaticities) -> Array:
-    """Matrix from linear RGB of one set of primaries to another; white stays white.
+    """Return the matrix from linear RGB of one set of primaries to another; white stays white.
+
+    Where the whites differ, the source's is adapted to the target's by Bradford's cone responses.
 
     Args:
-        source: Of what is converted.
-        target: Of the result. Its white is the source's: no adaptation is made where they differ.
+        source: Chromaticities of the values that are converted.
+        target: Chromaticities of the result.
 
     Returns:
         (3, 3), to be multiplied with columns.
     """
-    return np.asarray(np.linalg.solve(xyz_from_rgb(target), xyz_from_rgb(source)))
+    from_source, from_target = xyz_from_rgb(source), xyz_from_rgb(target)
+    cones = _BRADFORD @ np.stack([from_target.sum(1), from_source.sum(1)], 1)
+    adapted = np.linalg.solve(_BRADFORD, (cones[:, :1] / cones[:, 1:]) * (_BRADFORD @ from_source))
+    return np.asarray(np.linalg.solve(from_target, adapted))
 
 
 def converted(picture: npt.NDArray[Any], source: Chromaticities, target: Chromaticities) -> npt.NDArray[np.float32]:

@@ -4,7 +4,8 @@ The file is an OpenEXR latlong: channels R, G, B (linear, in camera values of th
 ``confidence`` (0 where nothing was seen and neighbours filled in, to 1). Attributes say how to read it: ``axes``,
 ``chromaticities``, ``whiteLevel`` (the value at which the capture's camera clipped), ``exposure`` (t ISO / (100 N^2), 0
 if not known), ``lowerBound`` (the share of the light that is a lower bound, because even the shortest exposure clips)
-and ``emitters``, JSON. A file without them is an environment of somebody else's.
+and ``emitters``, JSON. A file without them is of another program: its
+values are read as `exr_file.read_linear_picture` says, its axes as `latlong_axes.axes_of`.
 """
 
 from __future__ import annotations
@@ -22,17 +23,16 @@ import numpy as np
 import OpenEXR
 from numpy.typing import NDArray
 
-from warp_ar.errors import SceneError, SinkError, UsageError, reason
-from warp_ar.exr_file import exr_problem, write_exr
-from warp_ar.files import is_file, limits, parse_json, too_much, write_whole
-from warp_ar.light.latlong_axes import DESCRIPTIONS, from_axes, world_from_marker
+from warp_ar.errors import SceneError, SinkError, reason
+from warp_ar.exr_file import read_exr_header, read_linear_picture, write_exr
+from warp_ar.files import parse_json, write_whole
+from warp_ar.light.latlong_axes import DESCRIPTIONS, axes_of, from_axes, world_from_marker
+from warp_ar.signals import REC_709
 
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 
 AXES = DESCRIPTIONS["z-up"]
-REC_709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
-"""Chromaticities of red, green, blue and white that sRGB's primaries have."""
 BRIGHT = 6.0
 """Times the mean radiance from which on a texel is part of an emitter."""
 MOST_EMITTERS = 12
@@ -103,41 +103,28 @@ class Light:
             raise SinkError(f"{path} cannot be written: {reason(error)}") from error
 
     @classmethod
-    def load(cls, path: str | Path) -> Light:
-        """Read a captured light, or any latlong OpenEXR with channels R, G and B.
+    def load(cls, path: str | Path, axes: str | None = None) -> Light:
+        """Read a captured light, or any latlong OpenEXR or Radiance HDR.
 
-        A map in the axes of another program that this one knows is turned; one that does not say its axes is taken to
-        have those of a scene.
+        Args:
+            path: The file.
+            axes: One of ``AXES``; None: as the file says, else by the convention of its format (`axes_of`).
 
         Raises:
             SceneError: The file cannot be used.
         """
         path = Path(path)
-        header, channels = _read_exr(path)
-        if "RGB" not in channels and "RGBA" in channels:
-            channels["RGB"] = channels["RGBA"][..., :3]
-        if "RGB" not in channels and {"R", "G", "B"} <= channels.keys():
-            channels["RGB"] = np.stack([channels[name] for name in "RGB"], -1)
-        if "RGB" not in channels:
-            raise SceneError(f"{path} has channels {', '.join(channels)}; R, G and B are needed")
-        radiance = np.ascontiguousarray(channels["RGB"], np.float32)
-        height, width = radiance.shape[:2]
+        picture = read_linear_picture(path, SceneError, str(path))
+        height, width = picture.color.shape[:2]
         if width != 2 * height or height < 2:
             raise SceneError(f"{path} is {width}x{height}: a latlong environment is twice as wide as high")
-        axes = _axes_of(path, header)
-        # Maps in the wild hold negative pixels, infinities and NaN.
-        radiance = np.clip(np.nan_to_num(radiance, nan=0.0, posinf=1e6, neginf=0.0), 0.0, 1e6)
-        confidence = channels.get("confidence", np.ones((height, width), np.float32))
-        if confidence.shape != (height, width):
-            size = "x".join(map(str, confidence.shape[::-1]))
-            raise SceneError(f"{path}: its channel confidence is {size}; expected {width}x{height}, as the light is")
-        confidence = np.clip(np.nan_to_num(confidence), 0.0, 1.0).astype(np.float32)
+        axes = axes_of(picture, path, axes, SceneError, str(path))
+        radiance = np.clip(picture.color, 0.0, 1e6)  # maps in the wild hold negative pixels
+        header = picture.header
+        confidence = np.clip(picture.others.get("confidence", np.ones((height, width), np.float32)), 0.0, 1.0)
         emitters = _parse_emitters(path, header.get("emitters", "[]"))
         if axes != "z-up":
-            try:
-                radiance, confidence = (from_axes(channel, axes) for channel in (radiance, confidence))
-            except UsageError as error:
-                raise SceneError(f"{path}: {error}") from error
+            radiance, confidence = (from_axes(channel, axes) for channel in (radiance, confidence))
             emitters = tuple(_turned(emitter, world_from_marker(axes).T) for emitter in emitters)
         return cls(
             radiance,
@@ -245,42 +232,12 @@ def _triple(values: Sequence[float] | Array) -> tuple[float, float, float]:
     return x, y, z
 
 
-def _read_exr(path: Path) -> tuple[dict[str, Any], dict[str, Map]]:
-    if not is_file(path):
-        raise SceneError(f"there is no file {path}; a captured light is an OpenEXR file")
-    try:
-        with OpenEXR.File(str(path), header_only=True) as file:
-            low, high = (np.asarray(corner, np.int64) for corner in file.header()["dataWindow"])
-        width, height = (int(side) for side in high - low + 1)
-        if width * height > limits().picture_pixels:
-            raise SceneError(too_much(f"{path} is {width}x{height}: it", width * height, "pixels", "picture_pixels"))
-        with OpenEXR.File(str(path)) as file:
-            header = dict(file.header())
-            return header, {name: np.array(c.pixels, np.float32) for name, c in file.channels().items()}
-    except (RuntimeError, OSError, ValueError) as error:
-        if isinstance(error, SceneError):
-            raise
-        raise SceneError(f"{path} cannot be read as OpenEXR: {exr_problem(path, error)}") from error
-
-
-def _attribute(path: Path, header: dict[str, Any], name: str, default: float) -> float:
+def _attribute(path: Path, header: Mapping[str, Any], name: str, default: float) -> float:
     value = header.get(name, default)
     number = float(value) if isinstance(value, numbers.Real) else math.nan
     if not 0.0 <= number < math.inf:
         raise SceneError(f"{path}: its attribute {name} is {str(value)[:40]!r}; expected a finite number, 0 or more")
     return number
-
-
-def _axes_of(path: Path, header: Mapping[str, Any]) -> str:
-    """Name of the axes that a file says it has; the scene's own where it says nothing."""
-    said = header.get("axes")
-    if said is None:
-        return "z-up"
-    known = {text: name for name, text in DESCRIPTIONS.items()}
-    if str(said) not in known:
-        listed = "; ".join(known)
-        raise SceneError(f"{path}: its attribute axes is {str(said)[:120]!r}; expected one of: {listed}")
-    return known[str(said)]
 
 
 def _turned(emitter: CapturedEmitter, rotation: Array) -> CapturedEmitter:
@@ -289,12 +246,14 @@ def _turned(emitter: CapturedEmitter, rotation: Array) -> CapturedEmitter:
 
 
 def has_places(path: str | Path) -> bool:
-    """Whether a captured light says how far away an emitter is; False where the file cannot be read."""
+    """Return whether a captured light says how far away an emitter is; False where the file cannot be read."""
+    path = Path(path)
+    if path.suffix.lower() == ".hdr":
+        return False
     try:
-        with OpenEXR.File(str(path), header_only=True) as file:
-            emitters = _parse_emitters(Path(path), dict(file.header()).get("emitters", "[]"))
-        return any(emitter.distance is not None for emitter in emitters)
-    except (RuntimeError, OSError, ValueError, SceneError):
+        header = read_exr_header(path, SceneError, str(path))
+        return any(emitter.distance is not None for emitter in _parse_emitters(path, header.get("emitters", "[]")))
+    except SceneError:
         return False  # reading the light says why
 
 

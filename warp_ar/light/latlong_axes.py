@@ -5,16 +5,21 @@
 
 from __future__ import annotations
 
+import pathlib
+
 import numpy as np
 import numpy.typing as npt
+import OpenEXR
 
-from warp_ar.errors import UsageError
+from warp_ar.errors import UsageError, WarpArError
+from warp_ar.exr_file import LinearPicture, say_once
+from warp_ar.scene.description import LATLONG_AXES
+from warp_ar.signature import PROGRAM
 
 Radiance = npt.NDArray[np.float32]
 Array = npt.NDArray[np.float64]
 
-AXES = ("z-up", "blender", "y-up", "opengl")
-"""What a file's directions are told in; ``z-up`` is this program's own."""
+AXES = LATLONG_AXES
 
 DESCRIPTIONS = {
     "z-up": "latlong, row 0 toward +z (up), centre column toward +x, columns grow toward +y",
@@ -63,11 +68,54 @@ def to_axes(radiance: Radiance, axes: str) -> Radiance:
 
 
 def from_axes(radiance: Radiance, axes: str) -> Radiance:
-    """A latlong in other axes as this program's own; arguments and errors as `to_axes`."""
+    """Return a latlong in other axes as this program's own; arguments as `to_axes`.
+
+    A map of which a quarter is half a column more than a whole number is interpolated by half a texel.
+
+    Raises:
+        UsageError: There are no such axes, or the map's columns are an odd number.
+    """
     _check(axes)
     if axes == "z-up":
         return radiance
+    if axes != "blender" and radiance.shape[1] % 4 == 2:
+        doubled = np.repeat(radiance, 2, 1)
+        turned = np.roll(doubled, -_quarter(doubled, axes), 1)[:, ::-1]
+        return np.ascontiguousarray((turned[:, ::2] + turned[:, 1::2]) / 2, radiance.dtype)
     return np.ascontiguousarray(np.roll(radiance, -_quarter(radiance, axes), 1)[:, ::-1])
+
+
+def axes_of(picture: LinearPicture, path: pathlib.Path, asked: str | None, error: type[WarpArError], label: str) -> str:
+    """Return the axes that a latlong file is read in, and say which were taken where the file does not.
+
+    An OpenEXR may say so in its attribute ``axes``. Else an OpenEXR, with or without ``envmap``, has that format's own
+    convention, y-up; Radiance's format has none, and those files are read as Blender and three.js do.
+
+    Args:
+        picture: The file, as `read_linear_picture` gave it.
+        path: The file.
+        asked: Axes that the user says it has, or None.
+        error: Class of the error to raise.
+        label: Name of the file in messages.
+
+    Raises:
+        WarpArError: As ``error``: it holds the faces of a cube, or its attribute says axes that are not known.
+    """
+    if picture.header.get("envmap") == OpenEXR.ENVMAP_CUBE:
+        raise error(f"{label} holds the faces of a cube; a latlong is needed")
+    if asked is not None:
+        return asked
+    said = picture.header.get("axes")
+    if said is not None:
+        known = {text: name for name, text in DESCRIPTIONS.items()}
+        if str(said) not in known:
+            raise error(f"{label}: its attribute axes is {str(said)[:120]!r}; expected one of: {'; '.join(known)}")
+        return known[str(said)]
+    if picture.header.get("software") == PROGRAM:
+        return "z-up"
+    taken, whose = ("blender", "as Blender reads .hdr") if path.suffix.lower() == ".hdr" else ("y-up", "OpenEXR's own")
+    say_once(f"{label} does not say its axes: {taken} is taken, {whose}; --light-axes or [light] axes say another")
+    return taken
 
 
 def _quarter(radiance: Radiance, axes: str) -> int:

@@ -1,21 +1,16 @@
-"""Colour spaces of exported light: this program's own, Rec. 709's primaries, and ACEScg by OpenColorIO.
-
-OpenColorIO's built-in configuration of the ACES project for computer graphics has both, and adapts the white of one to
-that of the other. It comes with the extra ``color``.
-"""
+"""Colour spaces of exported light: this program's own, Rec. 709's primaries, and ACEScg."""
 
 from __future__ import annotations
 
-import functools
 import math
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from warp_ar.errors import UsageError
 from warp_ar.light.captured import latlong_directions, texel_solid_angles
-from warp_ar.signals import REC_709, Chromaticities
+from warp_ar.signals import REC_709, Chromaticities, converted
 
 Radiance = npt.NDArray[np.float32]
 
@@ -25,49 +20,17 @@ COLOR_SPACES: Final[dict[str, Chromaticities]] = {
 }
 """Chromaticities of red, green, blue and white, x and y each; ACEScg's are AP1 (ACES S-2014-004)."""
 
-_CONFIG = "ocio://cg-config-latest"
-_NAMES = {"rec709": "Linear Rec.709 (sRGB)", "acescg": "ACEScg"}
-
 
 def convert_light(radiance: Radiance, source: str, target: str) -> Radiance:
-    """Linear light, (height, width, 3), in another colour space of ``COLOR_SPACES``.
+    """Return linear light, (height, width, 3), in another colour space of ``COLOR_SPACES``, its white adapted.
 
     Raises:
-        UsageError: There is no such space, or OpenColorIO is not installed.
+        UsageError: There is no such space.
     """
     for name in (source, target):
         if name not in COLOR_SPACES:
             raise UsageError(f"color space {name!r}: expected {', '.join(COLOR_SPACES)}")
-    if source == target:
-        return radiance
-    picture = np.array(radiance, np.float32, order="C")
-    height, width = picture.shape[:2]
-    ocio = _load()
-    _processor(source, target).apply(ocio.PackedImageDesc(picture, width, height, 3))
-    return picture
-
-
-@functools.cache
-def _processor(source: str, target: str) -> Any:
-    config = _load().Config.CreateFromFile(_CONFIG)
-    return config.getProcessor(_NAMES[source], _NAMES[target]).getDefaultCPUProcessor()
-
-
-def _load() -> Any:
-    try:
-        import PyOpenColorIO
-    except ImportError as error:
-        raise UsageError('ACEScg needs OpenColorIO; install it with pip install "warp-ar[color]"') from error
-    return PyOpenColorIO
-
-
-def find_color_space(chromaticities: Any) -> str:
-    """Name of the space that a file's chromaticities are of; ``rec709`` where they are of none here, or not told."""
-    if chromaticities is not None:
-        for name, known in COLOR_SPACES.items():
-            if np.allclose(np.asarray(chromaticities, float), known, atol=1e-3):
-                return name
-    return "rec709"
+    return radiance if source == target else converted(radiance, COLOR_SPACES[source], COLOR_SPACES[target])
 
 
 def grey_card_scale(radiance: Radiance) -> float:

@@ -24,9 +24,10 @@ import numpy.typing as npt
 import OpenEXR
 
 from warp_ar.errors import SinkError, UsageError, reason
-from warp_ar.exr_file import exr_problem, write_exr
-from warp_ar.files import is_file, limits, too_much, write_whole
-from warp_ar.output.color_spaces import COLOR_SPACES, convert_light, find_color_space
+from warp_ar.exr_file import read_exr_header, read_linear_picture, write_exr
+from warp_ar.files import write_whole
+from warp_ar.light.latlong_axes import axes_of
+from warp_ar.output.color_spaces import COLOR_SPACES, convert_light
 from warp_ar.output.environment_axes import CUBES, DESCRIPTIONS, check_axes, from_axes, to_axes, to_cube
 from warp_ar.output.folder_sink import FolderSink
 from warp_ar.output.places import check_replaceable, earlier_frames
@@ -202,32 +203,22 @@ def _header(axes: str, layout: str, info: EnvironmentInfo, color_space: str) -> 
     return header
 
 
-def read_environment(path: str | pathlib.Path) -> npt.NDArray[np.float32]:
-    """Read an OpenEXR with channels R, G, B as float32 (height, width, 3); alpha and other channels are left out.
+def read_environment(path: str | pathlib.Path, *, axes: str | None = None) -> npt.NDArray[np.float32]:
+    """Read a latlong OpenEXR or Radiance HDR as float32 (height, width, 3), in this program's axes and primaries.
 
-    A file that `write_environment` wrote in other axes comes back in those of this program; one that does not say its
-    axes is taken to have them.
+    Args:
+        path: The file.
+        axes: One of ``AXES`` of `environment_axes`; None: as the file says, else by the convention of its format.
 
     Raises:
-        SinkError: The file is missing, no OpenEXR, a cube, or has no R, G and B.
+        SinkError: The file is missing, another kind of file, a cube, or has no R, G and B.
+        UsageError: There are no such axes.
     """
     path = pathlib.Path(path)
-    header, channels = _read(path)
-    if header.get("envmap") == OpenEXR.ENVMAP_CUBE:
-        raise SinkError(f"{path} holds the faces of a cube; a latlong is needed")
-    for name in ("RGB", "RGBA"):
-        if name in channels:
-            radiance = np.ascontiguousarray(channels[name][..., :3])
-            break
-    else:
-        if not {"R", "G", "B"} <= channels.keys():
-            raise SinkError(f"{path} has channels {', '.join(channels)}; R, G and B are needed")
-        radiance = np.stack([channels[name] for name in "RGB"], axis=-1)
-    said = str(header.get("axes", ""))
-    axes = next((axes for axes, text in DESCRIPTIONS.items() if text == said), "z-up")
-    radiance = convert_light(radiance, find_color_space(header.get("chromaticities")), "rec709")
+    picture = read_linear_picture(path, SinkError, str(path))
+    axes = axes_of(picture, path, axes, SinkError, str(path))
     try:
-        return from_axes(radiance, axes)
+        return from_axes(picture.color, axes)
     except UsageError as error:
         raise SinkError(f"{path} cannot be read: {error}") from error
 
@@ -239,7 +230,7 @@ def read_environment_info(path: str | pathlib.Path) -> EnvironmentInfo:
         SinkError: The file cannot be read, or its header holds a date or place that is none.
     """
     path = pathlib.Path(path)
-    header, _ = _read(path, header_only=True)
+    header = {} if path.suffix.lower() == ".hdr" else read_exr_header(path, SinkError, str(path))
 
     def positive(name: str) -> float | None:
         value = header.get(name)
@@ -264,25 +255,6 @@ def read_environment_info(path: str | pathlib.Path) -> EnvironmentInfo:
         )
     except UsageError as error:
         raise SinkError(f"{path}: {error}") from error
-
-
-def _read(path: pathlib.Path, *, header_only: bool = False) -> tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]:
-    """Header and channels of an OpenEXR of a size that may be read."""
-    if not is_file(path):
-        raise SinkError(f"there is no file {path}; an environment is an OpenEXR file")
-    try:
-        with OpenEXR.File(str(path), header_only=True) as file:
-            header = dict(file.header())
-        low, high = (np.asarray(corner, np.int64) for corner in header["dataWindow"])
-        width, height = (int(side) for side in high - low + 1)
-        if width * height > limits().picture_pixels:
-            raise SinkError(too_much(f"{path} is {width}x{height}: it", width * height, "pixels", "picture_pixels"))
-        if header_only:
-            return header, {}
-        with OpenEXR.File(str(path)) as file:
-            return header, {name: np.array(channel.pixels, np.float32) for name, channel in file.channels().items()}
-    except (RuntimeError, OSError, ValueError) as error:
-        raise SinkError(f"{path} cannot be read as OpenEXR: {exr_problem(path, error)}") from error
 
 
 def _check_environment(radiance: npt.NDArray[Any]) -> None:

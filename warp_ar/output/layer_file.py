@@ -29,10 +29,10 @@ from warp_ar.engine.layers import compose_layers
 from warp_ar.errors import SinkError, reason
 from warp_ar.exr_file import write_exr
 from warp_ar.files import write_whole
-from warp_ar.light.captured import REC_709
 from warp_ar.output.cryptomatte import matte_channels, matte_header
 from warp_ar.output.folder_sink import FolderSink
 from warp_ar.output.sink import make_folder
+from warp_ar.signals import REC_709
 from warp_ar.signature import PROGRAM, sign_png
 from warp_ar.stages.request import PICTURE_LAYERS
 

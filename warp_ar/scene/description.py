@@ -437,16 +437,23 @@ class AreaLight:
         )
 
 
+LATLONG_AXES: Final = ("z-up", "blender", "y-up", "opengl")
+"""Axes of latlong maps; ``z-up`` is this program's own. ``light.latlong_axes`` says what they mean."""
+
+
 @dataclasses.dataclass(frozen=True)
 class CapturedLight:
     """Light of the environment from a file instead of from a mirror ball in the frames."""
 
     file: Path
-    """OpenEXR latlong, as ``warp_ar.capture`` writes it; any other is taken to have the same axes."""
+    """Latlong OpenEXR or Radiance HDR, as ``warp_ar.capture`` writes it, or of another program."""
     scale: float = 1.0
     """Factor from the file's values to those of the frames' camera."""
     rotate: Vec3 = (0.0, 0.0, 0.0)
     """Degrees about the fixed x, then y, then z axis, from the file's axes to the scene's."""
+    axes: str | None = None
+    """Axes of the file: "z-up", "blender", "y-up" or "opengl"; if left out, as the file says, else y-up of an OpenEXR
+    and blender of an HDR."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,7 +9,17 @@ from typing import Any, Final, cast
 
 import cv2
 
-from warp_ar.scene.description import Board, CapturedLight, CharucoBoard, GridBoard, Marker, Probe, Proxy, ProxyMaterial
+from warp_ar.scene.description import (
+    LATLONG_AXES,
+    Board,
+    CapturedLight,
+    CharucoBoard,
+    GridBoard,
+    Marker,
+    Probe,
+    Proxy,
+    ProxyMaterial,
+)
 from warp_ar.scene.keys import PROXY_KEYS, keys_of
 from warp_ar.scene.materials import RGB
 from warp_ar.scene.mesh_files import MESH_SUFFIXES
@@ -140,7 +150,8 @@ def _read_mesh_path(table: SceneTable) -> Path:
 def read_captured(table: SceneTable) -> CapturedLight:
     """The ``[[light]]`` that is a file."""
     return CapturedLight(
-        table.file("file", "a captured light (OpenEXR)"),
+        table.file("file", "a captured light (OpenEXR or HDR)"),
         table.number("scale", CapturedLight.scale, low=SMALLEST),
         table.vec3("rotate", CapturedLight.rotate, unit="degrees"),
+        table.choice("axes", LATLONG_AXES) if "axes" in table else None,
     )

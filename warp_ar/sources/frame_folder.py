@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_ar.errors import SourceError
-from warp_ar.exr_file import read_linear_exr
+from warp_ar.exr_file import read_linear_picture
 from warp_ar.files import parse_json, read_text
 from warp_ar.pictures import foreign_words, read_picture
 from warp_ar.sources.deep_frame import Plate, finite_light, srgb8
@@ -119,7 +119,7 @@ def read_frame(path: pathlib.Path) -> tuple[Image, Plate | None]:
     """
     label = f"frame {path}"
     if path.suffix.lower() == LINEAR_SUFFIX:
-        light = finite_light(read_linear_exr(path, SourceError, label))
+        light = read_linear_picture(path, SourceError, label).color
     else:
         picture = read_picture(path, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH, SourceError, label)
         if picture.dtype == np.uint8:

@@ -53,7 +53,7 @@ class Captured(Stage):
         """Copy what was read; reading it is done here, once."""
         spec = self.request.scene.captured
         assert spec is not None
-        light = Light.load(spec.file)
+        light = Light.load(spec.file, spec.axes)
         turn = rotation_matrix(spec.rotate)
         self._radiance = spec.scale * light.resampled(self.request.quality.environment_height, turn)
 

@@ -19,7 +19,7 @@ from warp_ar.scene.scene_files import files_of
 SCENE: Final = "scene.toml"
 MOST_MEMBERS: Final = 256
 """Files of a ZIP that is taken."""
-_KINDS: Final = {*MESH_SUFFIXES, ".mtl", ".bin", ".exr", ".txt", ".json", ".usda", ".usdc", ".usd"} | {
+_KINDS: Final = {*MESH_SUFFIXES, ".mtl", ".bin", ".exr", ".hdr", ".txt", ".json", ".usda", ".usdc", ".usd"} | {
     *(".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".gif", ".ppm", ".ktx2")
 }
 """Endings of what a scene names."""

@@ -12,15 +12,12 @@ import re
 import shutil
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
-import cv2
 import numpy as np
 
 from warp_ar.errors import SceneError, SinkError, UsageError, WarpArError, reason
-from warp_ar.files import limits, too_much
 from warp_ar.light.captured import Light
-from warp_ar.light.latlong_axes import from_axes
 from warp_ar.scene import CapturedLight, Object, load_scene, loads_scene
 from warp_ar.scene.mesh_assets import confine
 from warp_ar.scene.mesh_files import MESH_SUFFIXES, load_mesh
@@ -143,14 +140,8 @@ def _rounded(values: Iterable[float]) -> tuple[float, float, float]:
 
 
 def _light_edit(name: str, path: Path) -> Edit:
-    file = path
-    if path.suffix == ".hdr":
-        # Pictures of environments are seen from inside; in this program's maps columns run the other way.
-        file = path.with_suffix(".exr")
-        radiance = from_axes(_read_hdr(name, path), "blender")
-        Light(radiance, np.ones(radiance.shape[:2], np.float32)).save(file)
-    light = Light.load(file)
-    captured = CapturedLight(file)
+    light = Light.load(path)
+    captured = CapturedLight(path)
     height, width = light.radiance.shape[:2]
     words = f"{name}: light of {width}x{height} directions stands for what the mirror ball shows. Undo takes it back."
     return (
@@ -158,21 +149,6 @@ def _light_edit(name: str, path: Path) -> Edit:
         f"light by {name}",
         words,
     )
-
-
-def _read_hdr(name: str, path: Path) -> Any:
-    """Linear RGB of a Radiance file, (h, w, 3); its header is looked at before anything is unpacked."""
-    data = path.read_bytes()
-    size = re.search(rb"\n-Y (\d{1,9}) \+X (\d{1,9})\n", data[:4096])
-    if not data.startswith(b"#?") or size is None:
-        raise SceneError(f"{name}: no Radiance picture with rows from the top (-Y ... +X ...)")
-    pixels = int(size[1]) * int(size[2])
-    if pixels > limits().picture_pixels:
-        raise SceneError(too_much(f"{name}: it", pixels, "pixels", "picture_pixels"))
-    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    if picture is None or picture.ndim != 3 or picture.dtype != np.float32:
-        raise SceneError(f"{name}: the Radiance picture is damaged")
-    return np.ascontiguousarray(picture[..., 2::-1])
 
 
 def _bundle_edit(name: str, data: bytes, folder: Path, wanted: Wanted) -> Edit:
