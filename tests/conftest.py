@@ -12,9 +12,11 @@ import hypothesis
 import pytest
 import warp as wp
 
+from warp_ar.device import CPU_COMPILER_FLAGS
+
 wp.config.log_level = wp.LOG_WARNING
-# A test runs its kernels once or twice: less is inlined, Clang takes two thirds of the time, and the bits are the same.
-wp.config.cpu_compiler_flags = "-march=native -mllvm=-inline-threshold=225 -fno-slp-vectorize"
+# Kernels that a test launches by itself are then the same as those of pipelines and commands: compiled once.
+wp.config.cpu_compiler_flags = CPU_COMPILER_FLAGS
 
 MOST_PROCESSES = 4
 """Processes that a run of a folder is spread over at most: each takes 1 to 3 GB."""

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import pathlib
+import shutil
 import subprocess
 import sys
+import threading
 
 import pytest
+
+from warp_ar.engine import modules
 
 SCRIPT = """
 import sys
@@ -14,7 +19,6 @@ import numpy as np
 import warp as wp
 
 wp.config.log_level = wp.LOG_ERROR
-wp.config.cpu_compiler_flags = "-march=native -mllvm=-inline-threshold=225 -fno-slp-vectorize"
 wp.init()
 
 @wp.kernel(module="unique", enable_backward=False)
@@ -42,7 +46,7 @@ def run(tmp_path: pathlib.Path, cache: pathlib.Path) -> str:
     return done.stdout.strip().splitlines()[-1]
 
 
-@pytest.mark.parametrize("damage", ["truncated", "empty", "noise", "folder"])
+@pytest.mark.parametrize("damage", ["truncated", "empty", "noise", "folder", "file"])
 def test_a_damaged_cache_is_compiled_again(tmp_path: pathlib.Path, damage: str) -> None:
     cache = tmp_path / "cache"
     assert run(tmp_path, cache) == "[(0, 1), (1, 1)]"
@@ -52,7 +56,33 @@ def test_a_damaged_cache_is_compiled_again(tmp_path: pathlib.Path, damage: str) 
     binary.unlink()
     if damage == "folder":
         binary.mkdir()
+    elif damage == "file":
+        shutil.rmtree(binary.parent)
+        binary.parent.write_bytes(data)
     else:
         binary.write_bytes({"truncated": data[: len(data) // 2], "empty": b"", "noise": bytes(range(256)) * 8}[damage])
     run(tmp_path, cache)
     assert run(tmp_path, cache) == "[]", "what was compiled again is kept"
+
+
+def test_who_interrupts_compiling_does_not_wait_for_all_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Modules whose turn has not come are left out; what is at work ends."""
+    compiled, interrupted = [], threading.Event()
+
+    def compile_module(variant: int) -> None:
+        assert variant == 0 or interrupted.wait(60.0)
+        compiled.append(variant)
+
+    def progress(done: int, total: int) -> None:
+        if done:
+            threading.Timer(0.2, interrupted.set).start()
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(modules, "_compile_one", compile_module)
+    monkeypatch.setattr(modules, "usable_cores", lambda: 1)
+    modules._compilers.cache_clear()
+    with pytest.raises(KeyboardInterrupt):
+        modules._compile(list(range(20)), progress)
+    modules._compilers(os.getpid()).shutdown()
+    modules._compilers.cache_clear()
+    assert len(compiled) <= 2

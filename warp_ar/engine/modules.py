@@ -5,6 +5,9 @@ Warp translates Python in one thread at a time; its compilers, Clang and NVRTC, 
 
 from __future__ import annotations
 
+import contextlib
+import functools
+import os
 import shutil
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -55,16 +58,22 @@ def _compile(variants: list[_Variant], progress: Progress | None) -> None:
     """Compile modules into the cache, as many at a time as there are cores."""
     if progress is not None:
         progress(0, len(variants))
-    with ThreadPoolExecutor(min(usable_cores(), len(variants)), "warp_ar-compile") as pool:
-        try:
-            jobs = [pool.submit(_compile_one, variant) for variant in variants]
-            for done, job in enumerate(as_completed(jobs), 1):
-                job.result()
-                if progress is not None:
-                    progress(done, len(variants))
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)  # an interrupt does not wait for the others
-            raise
+    pool = _compilers(os.getpid())
+    jobs = [pool.submit(_compile_one, variant) for variant in variants]
+    try:
+        for done, job in enumerate(as_completed(jobs), 1):
+            job.result()
+            if progress is not None:
+                progress(done, len(variants))
+    finally:
+        for job in jobs:
+            job.cancel()  # an interrupt does not wait for the others
+
+
+@functools.cache
+def _compilers(process: int) -> ThreadPoolExecutor:
+    """Return the threads that compile in this process, kept because each parses Warp's headers for over a second."""
+    return ThreadPoolExecutor(usable_cores(), "warp_ar-compile")
 
 
 def _compile_one(variant: _Variant) -> None:
@@ -83,10 +92,12 @@ def _load(variant: _Variant) -> None:
             wp.load_module(module, device=device, block_dim=size)
         except Exception:
             # Warp raises what the loader said, of no common class: the file may be truncated, empty or noise.
-            if not _is_cached(variant):
+            if not _folder_of(variant).exists():
                 raise
             folder = _folder_of(variant)
             shutil.rmtree(folder, ignore_errors=True)
+            with contextlib.suppress(OSError):
+                folder.unlink()  # there may be a file in the folder's place
             if folder.exists():
                 raise
             wp.load_module(module, device=device, block_dim=size)
