@@ -30,8 +30,8 @@ from warp_ar.scene import load_scene
 pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install '.[test]'")
 pytestmark = needs_browser
 
-BOX = 0.005
-"""Metres: what the page calls fitted is within it."""
+BOX = 0.015
+"""Metres: clicks that miss corners by up to 4 pixels, of 2 mm along the desk's depth; two ends add up."""
 
 
 STALE = """() => {
@@ -260,7 +260,7 @@ def test_an_animation_is_chosen_held_and_looped(open_tab: Callable[..., Tab], tm
     tab.until("document.getElementById('animation-pause').textContent === 'Play'", "what the undone edit says")
 
 
-def test_a_box_is_pointed_out_and_fitted(open_tab: Callable[..., Tab], artefacts: Path) -> None:
+def test_a_box_is_pointed_out_and_edited(open_tab: Callable[..., Tab], artefacts: Path) -> None:
     tab = open_tab()
     page = tab.page
     truth = page.evaluate("warpAr.scene.proxies.find(p => p.shape === 'box')")
@@ -287,7 +287,7 @@ def test_a_box_is_pointed_out_and_fitted(open_tab: Callable[..., Tab], artefacts
     page.click("#proxies li:last-child .pick")
     page.wait_for_timeout(300)
     page.screenshot(path=artefacts / "pointed.png")
-    assert "fitted to edges of the picture" in page.inner_text("#notices")
+    assert "as the four points have it" in page.inner_text("#notices")
     assert sorted(found["size"]) == pytest.approx(sorted(truth["size"]), abs=BOX)
     assert found["at"] == pytest.approx(truth["at"], abs=BOX)
     # It is moved and sized like anything else, and goes.

@@ -1,44 +1,145 @@
-"""Whether modelled walls and boxes lie where the picture shows edges."""
+"""Modelled walls and boxes beside the edges that the picture shows of them.
+
+Every visible edge of a shape is sampled; a sample is met where the picture has a step in colour across the edge. A
+shape that few samples meet is tried at places around its own: if many more meet it at one of them, it stands there.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Final
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from warp_ar.checks.finding import Finding
-from warp_ar.checks.outline_fit import refit_outline
-from warp_ar.scene import Camera, Pose, Scene
+from warp_ar.checks.pointed_shape import corners_of
+from warp_ar.scene import Camera, Pose, Proxy, Scene
+from warp_ar.scene.pixel_rays import project
 
 Image = NDArray[np.uint8]
+Array = NDArray[np.float64]
 
-MOVED: Final = 5.0
-"""Pixels by which a corner must be off: of a box that is right, 0.6."""
-ON: Final = 0.55
-"""Share of a shape's outline on edges of the picture from which on it is right: of a box that is, 0.7."""
+FARTHEST: Final = 0.03
+"""Distance in metres to which other places are tried, along x and y."""
+STEPS: Final = (0.003, 0.001)
+"""Distances in metres between places, first around the shape and then around the best place."""
+PIXELS: Final = 5.0
+"""Pixels by which a corner must be off: a box that is right is off by 0.6."""
+ON: Final = 0.6
+"""Share of samples that are met from which on a shape is right."""
 BETTER: Final = 0.15
-"""Share of the outline by which more of it must lie on edges elsewhere: one that is off along itself keeps 0.4."""
+"""Share by which more samples must be met elsewhere."""
 FEWEST: Final = 2
 """Views that must agree, or all where there are fewer."""
+STEP: Final = 6.0
+"""Codes per pixel of a step in colour: more than noise and wood have; less in dark pictures."""
+BRIGHT: Final = 110.0
+"""Mean code of a picture from which on ``STEP`` holds."""
+FAINTEST: Final = 2.0
+"""Codes per pixel of a step in the darkest picture: four standard deviations of a camera's noise."""
+_FACES: Final = ((0, 1, 2, 3), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7))
 
 
 def check_proxies(scene: Scene, camera: Camera, views: Sequence[tuple[Image, Pose]]) -> list[Finding]:
-    """Findings about boxes that stand on the desk, and walls, whose edges the picture has elsewhere."""
+    """Return findings about walls, and boxes that stand on the desk, whose edges the picture has elsewhere."""
     found = []
     for index, proxy in enumerate(scene.proxies):
-        fits = [refit for image, pose in views if (refit := refit_outline(image, camera, pose, proxy)) is not None]
-        worse = [fit for fit in fits if fit.moved > MOVED and fit.met_before < ON and fit.met > fit.met_before + BETTER]
+        kind, shape = _numbers(proxy)
+        if kind is None:
+            continue
+        tried = [one for image, pose in views if (one := _elsewhere(image, camera, pose, kind, shape)) is not None]
+        worse = [place for place, is_worse in tried if is_worse]
         if not worse or len(worse) < max(1, min(FEWEST, len(views))):
             continue
-        off = np.median([np.subtract(fit.proxy.at, proxy.at)[:2] for fit in worse], axis=0)
+        off = np.median(worse, axis=0)
         x, y = np.add(proxy.at[:2], off)
-        shown = np.median([fit.met_before for fit in worse])
         text = (
-            f"[[proxy]] {index}: {shown:.0%} of the {proxy.shape}'s outline lies on edges of the picture, which has it "
-            f"{1e3 * float(np.hypot(*off)):.0f} mm away"
+            f"[[proxy]] {index}: few edges of the picture lie on the outline of the {proxy.shape}; it has them "
+            f"{1e3 * math.hypot(*off):.0f} mm away"
         )
         remedy = f"point it out anew in the page, or write at = [{x:.3f}, {y:.3f}, {proxy.at[2]:g}]"
         found.append(Finding("proxy.edges", text, remedy))
     return found
+
+
+def _numbers(proxy: Proxy) -> tuple[str | None, Array]:
+    """Return kind and numbers, as ``corners_of`` takes them, of a wall or a box that stands on the desk."""
+    turn = math.radians(proxy.rotate[2])
+    x, y, z = proxy.at
+    if proxy.shape == "box" and proxy.rotate[:2] == (0.0, 0.0) and abs(z - proxy.size[2] / 2) < 0.1 * proxy.size[2]:
+        return "box", np.array([x, y, turn, *proxy.size])
+    if proxy.shape == "plane" and proxy.rotate[:2] == (90.0, 0.0) and abs(z - proxy.size[1] / 2) < 0.1 * proxy.size[1]:
+        return "wall", np.array([x, y, turn, *proxy.size])
+    return None, np.zeros(0)
+
+
+def _elsewhere(
+    image: Image, camera: Camera, pose: Pose, kind: str, shape: Array
+) -> tuple[tuple[float, float], bool] | None:
+    """Return the offset in metres at which most edges meet a shape, and if it is right there rather than where it is.
+
+    None where the shape is not whole in the picture: what is left of an outline that is cut off fits anywhere.
+    """
+    corners = corners_of(kind, shape)
+    eye = -pose.rotation.T @ pose.translation
+    seen = project(camera, pose.apply(corners))
+    inside = (seen > 2) & (seen < (image.shape[1] - 3, image.shape[0] - 3))
+    if eye[2] <= 0 or not inside.all():
+        return None
+    steps = _Steps(image)
+    edges = _edges(kind, corners, eye)
+
+    def met(x: float, y: float) -> float:
+        pixels = project(camera, pose.apply(corners + np.array([x, y, 0.0])))
+        return float(np.mean([steps.share(pixels[i], pixels[j]) for i, j in edges]))
+
+    before, best = met(0.0, 0.0), (0.0, 0.0)
+    if before >= ON:
+        return best, False
+    reach = FARTHEST
+    for step in STEPS:
+        grid = np.arange(-reach, reach + step / 2, step)
+        places = [(best[0] + x, best[1] + y) for x in grid for y in grid]
+        best = places[int(np.argmax([met(*place) for place in places]))]
+        reach = step
+    moved = project(camera, pose.apply(corners + np.array([*best, 0.0])))
+    far = float(np.linalg.norm(moved - seen, axis=1).max()) > PIXELS
+    return best, far and met(*best) > before + BETTER
+
+
+def _edges(kind: str, corners: Array, eye: Array) -> list[tuple[int, int]]:
+    """Return the edges that the camera sees: those of faces that are turned toward it."""
+    faces = [(0, 1, 2, 3)]
+    if kind == "box":
+        middle, centers = corners.mean(0), [corners[list(face)].mean(0) for face in _FACES]
+        towards = [(center - middle) @ (eye - center) > 0 for center in centers]
+        faces = [face for face, is_seen in zip(_FACES, towards, strict=True) if is_seen]
+    pairs = {tuple(sorted((face[k - 1], face[k]))) for face in faces for k in range(4)}
+    return [(i, j) for i, j in sorted(pairs)]
+
+
+class _Steps:
+    """Steps in colour of a picture."""
+
+    def __init__(self, image: Image) -> None:
+        smooth = cv2.GaussianBlur(image, (0, 0), 0.8).astype(np.float32)
+        # Scharr's kernel weighs 32 codes per pixel.
+        self._slopes = [cv2.Scharr(smooth, cv2.CV_32F, *axes) / 32.0 for axes in ((1, 0), (0, 1))]
+        self._least = max(STEP * min(float(image.mean()) / BRIGHT, 1.0), FAINTEST)
+
+    def share(self, start: Array, end: Array) -> float:
+        """Return the share of a straight edge between two pixels across which the picture has a step."""
+        length = float(np.linalg.norm(end - start))
+        if not length > 0.0:
+            return 0.0
+        normal = np.array([start[1] - end[1], end[0] - start[0]]) / length
+        along = np.linspace(0.0, 1.0, max(int(length / 4), 3) + 2)[1:-1]
+        at = start + along[:, None, None] * (end - start) + normal * np.array([-1.0, 0.0, 1.0])[:, None]
+        places = np.round(at).astype(int)
+        columns, rows = (np.clip(places[..., k], 0, self._slopes[0].shape[1 - k] - 1) for k in (0, 1))
+        slope = normal[0] * self._slopes[0][rows, columns] + normal[1] * self._slopes[1][rows, columns]
+        strength = np.sqrt((slope**2).mean(-1)).max(1)
+        return float((strength > self._least).mean())

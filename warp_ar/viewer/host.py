@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from warp_ar.checks.outline_fit import fit_outline
+from warp_ar.checks.pointed_shape import point_out
 from warp_ar.engine.pipeline import resolve_quality
 from warp_ar.errors import SourceError, UsageError, WarpArError
 from warp_ar.output.sinks import write_environment
@@ -202,15 +202,13 @@ class Host:
         lit = self._loop.latest
         if lit is None or lit.pose is None:
             raise UsageError("the marker is not seen, so no point of the picture has a place: show it first")
-        found = fit_outline(lit.frame, lit.camera, lit.pose, kind, points)
+        proxy = point_out(lit.camera, lit.pose, kind, points)
         self._controls.change(
-            lambda w: dataclasses.replace(w, scene=edits.add_item(w.scene, "proxy", found.proxy)), f"point out a {kind}"
+            lambda w: dataclasses.replace(w, scene=edits.add_item(w.scene, "proxy", proxy)), f"point out a {kind}"
         )
-        sides = " x ".join(f"{1e3 * side:.0f}" for side in found.proxy.size)
-        how = f"fitted to edges of the picture, within {2e3 * found.deviation:.0f} mm"
-        if not found.fitted:
-            how = f"not certain, for {found.doubt}. Look at its handles, or point it out anew from nearer and higher up"
-        self._notify(notice(f"{kind.capitalize()} of {sides} mm: {how}."))
+        sides = " x ".join(f"{1e3 * side:.0f}" for side in proxy.size)
+        text = f"{kind.capitalize()} of {sides} mm: as the four points have it; its numbers and handles edit it."
+        self._notify(notice(text))
 
     def _open_scene(self, name: str) -> None:
         if name not in bundled_scenes():

@@ -1,0 +1,157 @@
+"""Planes, walls and boxes from four points of one picture; no edge of the picture is looked for."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from warp_ar.errors import UsageError
+from warp_ar.scene import Camera, Pose, Proxy
+from warp_ar.scene.pixel_rays import project, undistorted
+
+Array = NDArray[np.float64]
+
+SMALLEST: Final = 0.004
+"""Shortest side of a shape, metres."""
+LARGEST: Final = 3.0
+"""Longest side of a shape and its largest distance from the marker, metres."""
+SQUARE: Final = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
+_ORDER: Final = {
+    "plane": "its four corners, around it",
+    "wall": "the left and right end of its foot, then its top right and top left corner",
+    "box": "both ends of an edge of its base, the corner of its top above the second, and the next one behind it",
+}
+
+
+def point_out(camera: Camera, pose: Pose, kind: str, points: Sequence[tuple[float, float]]) -> Proxy:
+    """Return the plane, wall or box whose corners lie nearest to four points of a picture.
+
+    Args:
+        camera: Camera of the picture.
+        pose: ``camera_from_world``.
+        kind: ``plane``: corners of a rectangle that lies on the desk, around it; ``wall``: the left and right end of
+            its foot, then its top right and top left corner; ``box``: the ends of an edge of its base, then the corner
+            of its top above the second, then the next corner of its top, behind: all four are seen.
+        points: Pixels.
+
+    Raises:
+        UsageError: The points outline no such shape.
+    """
+    pixels = np.asarray(points, float)
+    eye, rays = -pose.rotation.T @ pose.translation, undistorted(camera, pixels)
+    rays = np.column_stack([rays, np.ones(len(rays))]) @ pose.rotation
+    shape = {"plane": _start_plane, "wall": _start_wall, "box": _start_box}[kind](eye, rays)
+    _check(kind, shape)
+
+    def seen(numbers: Array) -> Array:
+        return project(camera, pose.apply(corners_of(kind, numbers)))
+
+    # A box's corners are counted from either end of the edge that was pointed out.
+    chosen = [int(np.linalg.norm(seen(shape) - pixel, axis=1).argmin()) for pixel in pixels]
+    for _ in range(6):  # Gauss-Newton: all four points count alike
+        now = seen(shape)[chosen]
+        steps = 1e-4 * np.eye(len(shape))
+        jacobian = np.stack([(seen(shape + step)[chosen] - now).ravel() / 1e-4 for step in steps], 1)
+        if not np.isfinite(jacobian).all():
+            break
+        moved = shape + np.linalg.lstsq(jacobian, (pixels - now).ravel(), rcond=None)[0]
+        if not _is_sound(moved):
+            break
+        shape = moved
+    return _proxy(kind, shape)
+
+
+def corners_of(kind: str, shape: Array) -> Array:
+    """Return a shape's corners in the world: four, or a box's base and then its top.
+
+    Args:
+        kind: ``plane``, ``wall`` or ``box``.
+        shape: x, y, angle about the vertical in radians, then two or three sides.
+    """
+    x, y, angle, width, second = shape[:5]
+    turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    if kind == "wall":
+        foot = np.array([[-width / 2, 0.0], [width / 2, 0.0]]) @ turn.T + (x, y)
+        return np.array([[*foot[0], 0.0], [*foot[1], 0.0], [*foot[1], second], [*foot[0], second]])
+    base = np.column_stack([(SQUARE * (width, second)) @ turn.T + (x, y), np.zeros(4)])
+    return base if kind == "plane" else np.concatenate([base, base + np.array([0.0, 0.0, shape[5]])])
+
+
+def _on_desk(eye: Array, rays: Array) -> Array:
+    """Return where rays meet the desk, (n, 2)."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        far = -eye[2] / rays[:, 2]
+    if not (np.isfinite(far) & (far > 0)).all():
+        raise UsageError("a point lies above the desk's horizon; point out corners that stand on the desk")
+    return np.asarray((eye + far[:, None] * rays)[:, :2], float)
+
+
+def _start_plane(eye: Array, rays: Array) -> Array:
+    """Return x, y, angle, width and depth of the rectangle nearest to four corners."""
+    corners = _on_desk(eye, rays)
+    sides = np.roll(corners, -1, 0) - corners
+    width, depth = (float(np.linalg.norm(sides[[k, k + 2]], axis=1).mean()) for k in (0, 1))
+    return np.array([*corners.mean(0), math.atan2(sides[0, 1], sides[0, 0]), width, depth])
+
+
+def _start_wall(eye: Array, rays: Array) -> Array:
+    """Return x, y of the foot's middle, angle, width and height."""
+    left, right = _on_desk(eye, rays[:2])
+    along = right - left
+    width = float(np.linalg.norm(along))
+    if width < SMALLEST:
+        raise UsageError("the wall's ends are at one place; point out its left and its right end")
+    normal, foot = np.array([along[1], -along[0], 0.0]) / width, np.array([*(left + right) / 2, 0.0])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        far = (foot - eye) @ normal / (rays[2:] @ normal)
+    return np.array([*foot[:2], math.atan2(along[1], along[0]), width, float(np.mean(eye[2] + far * rays[2:, 2]))])
+
+
+def _start_box(eye: Array, rays: Array) -> Array:
+    """Return x, y, angle, width, depth and height."""
+    a, b = _on_desk(eye, rays[:2])
+    along = b - a
+    width = float(np.linalg.norm(along))
+    if width < SMALLEST:
+        raise UsageError("two corners of the box are at one place; point out both ends of an edge of its base")
+    sideways = np.array([-along[1], along[0]]) / width
+    above, behind = rays[2:]
+    # The height at which the ray of the third point passes the second's upright.
+    far = float(above[:2] @ (b - eye[:2])) / max(float(above[:2] @ above[:2]), 1e-12)
+    height = float(eye[2] + far * above[2])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        last = eye + np.float64(height - eye[2]) / behind[2] * behind
+    depth = float((last[:2] - b) @ sideways)
+    middle = a + along / 2 + sideways * depth / 2
+    return np.array([*middle, math.atan2(along[1], along[0]), width, abs(depth), height])
+
+
+def _is_sound(shape: Array) -> bool:
+    sides = shape[3:]
+    return bool(
+        np.isfinite(shape).all()
+        and ((sides >= SMALLEST) & (sides <= LARGEST)).all()
+        and np.abs(shape[:2]).max() <= LARGEST
+    )
+
+
+def _check(kind: str, shape: Array) -> None:
+    if not _is_sound(shape):
+        sizes = " x ".join(f"{1e3 * side:.0f}" for side in shape[3:])
+        raise UsageError(f"the points make a {kind} of {sizes} mm; expected {_ORDER[kind]}")
+
+
+def _proxy(kind: str, shape: Array) -> Proxy:
+    x, y = (round(float(value), 5) for value in shape[:2])
+    turn = round((math.degrees(float(shape[2])) + 180) % 360 - 180, 3)
+    sides = tuple(round(float(value), 5) for value in shape[3:])
+    if kind == "plane":
+        return Proxy("plane", at=(x, y, 0.0), rotate=(0.0, 0.0, turn), size=sides)
+    if kind == "wall":
+        # A plane faces its own +z; turned up about x it faces -y.
+        return Proxy("plane", at=(x, y, round(sides[1] / 2, 5)), rotate=(90.0, 0.0, turn), size=sides)
+    return Proxy("box", at=(x, y, round(sides[2] / 2, 5)), rotate=(0.0, 0.0, turn), size=sides)
