@@ -196,3 +196,26 @@ def test_what_is_blurred_around_places_is_as_in_the_whole_picture(corner):
     whole = cv2.GaussianBlur(np.stack([table[picture[..., k], k] for k in range(3)], -1), (0, 0), BLUR)
     expected = cv2.remap(whole, x[:, None], y[:, None], cv2.INTER_LINEAR)[:, 0]
     np.testing.assert_allclose(_blurred(picture, table, places), expected, rtol=ORDER)
+
+
+@pytest.mark.parametrize(("part", "value"), [("size", 80.0), ("size", 10.0), ("radius", 1e-9), ("center", None)])
+def test_a_ball_whose_box_touches_the_picture_where_no_pixel_shows_it_tells_nothing(part, value):
+    """A marker in millimetres, one of ten metres, a ball of a nanometre, and one just beyond the picture's corner."""
+    scene, (image, pose) = load_scene("desk"), view()
+    table = decode_table(scene.camera.transfer).astype(np.float32)
+    ball = scene.probes[0]
+    if part == "size":
+        # All that is measured by the marker is as many times as far away.
+        pose = Pose(pose.rotation, pose.translation * (value / scene.marker.size))
+    elif part == "radius":
+        ball = dataclasses.replace(ball, radius=value)
+    else:
+        # Its outline passes the corner by, the square around its outline does not.
+        away, radius = 0.5, 0.03
+        reach = scene.camera.fx * radius / away
+        pixel = np.array([-0.8 * reach, -0.8 * reach]) - (scene.camera.cx, scene.camera.cy)
+        at = away * np.array([pixel[0] / scene.camera.fx, pixel[1] / scene.camera.fy, 1.0])
+        center = tuple((at - pose.translation) @ pose.rotation)
+        ball = dataclasses.replace(ball, center=center, radius=radius)
+    scene = dataclasses.replace(scene, probes=(ball,))
+    assert measure_reflectance(scene, scene.camera, ball, (image, pose), table) is None

@@ -220,7 +220,9 @@ def _nearest(proxies: tuple[Proxy, ...], origin: Array, rays: Array) -> tuple[Ar
 
 
 def _pixels_of(camera: Camera, pose: Pose, points: Array) -> Array:
-    """Where points (n, 3) are in the picture, (n, 2)."""
+    """Return where points (n, 3) are in the picture, (n, 2)."""
+    if len(points) == 0:  # OpenCV projects no points to None
+        return np.zeros((0, 2))
     zero: Any = np.zeros(3)
     pixels, _ = cv2.projectPoints(pose.apply(points), zero, zero, camera.matrix(), np.array(camera.distortion))
     return np.asarray(pixels.reshape(-1, 2), float)
