@@ -12,6 +12,8 @@ from warp_ar import environment
 from warp_ar.light.captured import Light
 from warp_ar.light.latlong_axes import from_axes
 from warp_ar.output.environment_file import read_environment
+from warp_ar.scene.geometry import Mesh
+from warp_ar.scene.mesh_files import load_mesh
 
 
 @pytest.fixture
@@ -41,3 +43,46 @@ def test_light_exr_chromaticities(cases: pathlib.Path) -> None:
     found = Light.load(cases / "light_exr_chromaticities" / "own_acescg.exr").radiance
     # The file's AP1 has five digits.
     np.testing.assert_allclose(found.reshape(-1, 3).max(0), (1.0, 0.0, 0.0), atol=2e-4)
+
+
+def areas(mesh: Mesh) -> np.ndarray:
+    """Signed areas of the triangles of a mesh in the x, y plane."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(float) for k in range(3))
+    return np.cross(b - a, c - a)[:, 2] / 2
+
+
+@pytest.mark.parametrize("name", ["c.off", "face.off"])
+def test_colours_of_an_off(cases: pathlib.Path, name: str) -> None:
+    mesh = load_mesh(cases / "mesh_colours_lost" / name)
+    # sRGB's 188 is 0.5029 of the light.
+    np.testing.assert_allclose(mesh.colors[:, :3], [(0.5029, 0.0, 1.0)] * 3, atol=1e-4)
+
+
+def test_vertex_colours_beside_a_material(cases: pathlib.Path) -> None:
+    mesh = load_mesh(cases / "mesh_colours_lost" / "vcm2.obj")
+    np.testing.assert_allclose(mesh.colors[:, :3], [(0.21404, 0.0, 1.0)] * 3, atol=1e-5)
+    assert mesh.materials[0].surface.base_color == (1.0, 1.0, 1.0)
+
+
+def test_an_stl_in_capitals_and_a_ply_with_lists_of_texture_coordinates(cases: pathlib.Path) -> None:
+    assert areas(load_mesh(cases / "mesh_colours_lost" / "upper.stl")) == pytest.approx([0.5])
+    mesh = load_mesh(cases / "mesh_colours_lost" / "wedge_quad.ply")
+    assert areas(mesh) == pytest.approx([0.5, 0.5, 0.5])
+    assert mesh.materials[0].base is not None
+    corners = {(*mesh.vertices[v, :2].tolist(), *mesh.uvs[v].tolist()) for v in mesh.faces.ravel()}
+    assert {(0, 0, 0, 0), (1, 0, 1, 0), (1, 1, 1, 1), (0, 1, 0, 1), (1, 0, 0, 0), (2, 0, 1, 0), (1, 1, 0, 1)} == corners
+
+
+def test_a_concave_polygon_keeps_its_area(cases: pathlib.Path) -> None:
+    found = areas(load_mesh(cases / "mesh_concave_polygons" / "concave.obj"))
+    assert found.sum() == pytest.approx(2.5)
+    assert (found > 0).all()
+
+
+def test_material_libraries_with_a_mark_and_two_of_them(cases: pathlib.Path) -> None:
+    folder = cases / "obj_material_libraries"
+    colors = {
+        name: [item.surface.base_color for item in load_mesh(folder / name).materials]
+        for name in ("bom.obj", "two.obj")
+    }
+    assert colors == {"bom.obj": [(1, 0, 0)], "two.obj": [(1, 0, 0), (0, 1, 0)]}

@@ -34,47 +34,42 @@ def confine(folder: Path) -> None:
 
 
 class Assets:
-    """Finds the files that a mesh file names, as trimesh's resolvers do: beside it, or relative to it.
+    """Files that a mesh file names: beside it, or relative to it."""
 
-    What is wrong with one is kept in ``problem``, for trimesh goes on without it.
-    """
-
-    def __init__(self, path: Path, *, library_first: bool) -> None:
-        """Read nothing yet.
-
-        Args:
-            path: The mesh file.
-            library_first: Whether the first file asked for is a material library (OBJ), which may be missing; all
-                others are textures.
-        """
-        self._path, self._library_due, self._pictures_follow = path, library_first, library_first
+    def __init__(self, path: Path) -> None:
+        """Find files for a mesh file; nothing is read yet."""
+        self._path = path
+        self._pictures_follow = path.suffix.lower() not in (".gltf", ".glb")
         self.known: dict[str, bytes] = {}
         """What was read, by the name that the mesh file has for it."""
-        self.problem: SceneError | None = None
-        self.missing: str | None = None
-        """The material library that it names and that is not there."""
         self._within = next((folder for folder in _CONFINED if path.resolve().is_relative_to(folder)), None)
 
     def get(self, name: str) -> bytes:
-        """Bytes of a file by the name that the mesh file has for it.
+        """Return the bytes of a picture or buffer by the name that the mesh file has for it.
 
         Raises:
             SceneError: It is missing, too large or no regular file.
         """
-        library, self._library_due = self._library_due, False
-        try:
-            return self._read(name, library)
-        except SceneError as error:
-            elsewhere = self._path.parent / name.strip()
-            missing = library and self._found(name) is None and not (self._reaches(elsewhere) and elsewhere.exists())
-            self.missing = name.strip() if missing else self.missing
-            self.problem = self.problem if self.problem or missing else error
-            raise
+        return self._read(name, False)
 
-    __getitem__ = get
+    def has(self, name: str) -> bool:
+        """Return whether there is a file of a name."""
+        return self._found(name) is not None
+
+    def library(self, name: str) -> bytes | None:
+        """Return a material library; None if it is not there.
+
+        Raises:
+            SceneError: It is too large, no regular file, or the mesh file may not name it.
+        """
+        place = self._path.parent / name.strip()
+        if self._found(name) is None and not (self._reaches(place) and place.exists()):
+            return None
+        return self._read(name, True)
 
     def _found(self, name: str) -> Path | None:
-        candidates = (name.strip(), name.strip().lstrip("/"), re.split(r"[/\\]", name)[-1])
+        plain = name.strip()
+        candidates = (plain, plain.replace("\\", "/"), plain.lstrip("/"), re.split(r"[/\\]", plain)[-1])
         paths = (self._path.parent / text for text in candidates)
         return next((path for path in paths if self._reaches(path) and is_file(path)), None)
 
@@ -109,9 +104,9 @@ def check_counts(path: Path, data: bytes) -> None:
         header = head.split(b"end_header")[0]
         counts = [int(digits[:18]) for digits in re.findall(rb"element\s+\S+\s+(\d+)", header)]
     elif suffix == ".off":
-        words = re.sub(rb"#[^\n]*", b"", head[:4096]).replace(b"OFF", b" ", 1).split()
+        words = re.sub(rb"\w*OFF", b" ", re.sub(rb"#[^\n]*", b"", head[:4096]), count=1).split()
         counts = [int(word[:18]) for word in words[:2] if word.isdigit()]
-    elif suffix == ".stl" and len(data) >= 84 and not head.lstrip().startswith(b"solid"):
+    elif suffix == ".stl" and len(data) >= 84 and not head.lstrip().lower().startswith(b"solid"):
         counts = [struct.unpack_from("<I", data, 80)[0]]
     for count in counts:
         _check_count(path, count)

@@ -30,10 +30,13 @@ _CODE = (
     "mesh_parts",
     "mtl",
     "node_animation",
+    "polygon_files",
 )
 """Modules of this package that decide how a file is read."""
 WHOLE = (".ply", ".stl", ".off", ".glb")
 """Formats without files beside them."""
+_HEADER = 1 << 16
+"""Bytes of a PLY within which it names a picture beside it."""
 MOST_BYTES = 256 << 20
 """Of a file that is kept."""
 
@@ -47,8 +50,11 @@ def load_kept_mesh(path: Path) -> geometry.Mesh:
     try:
         if path.suffix.lower() not in WHOLE or path.stat().st_size > MOST_BYTES:
             return mesh_files.load_mesh(path)
+        data = path.read_bytes()
+        if b"TextureFile" in data[:_HEADER]:
+            return mesh_files.load_mesh(path)
         code = b"".join(Path(__file__).with_name(f"{name}.py").read_bytes() for name in _CODE)
-        key = hashlib.sha256(code + path.read_bytes()).hexdigest()[:32]
+        key = hashlib.sha256(code + data).hexdigest()[:32]
     except OSError:
         return mesh_files.load_mesh(path)  # which says what is wrong
     kept = cache_folder() / "meshes" / f"{key}{path.suffix.lower()}.npz"

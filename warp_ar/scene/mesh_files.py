@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import io
 import logging
-import re
 import struct
 import zipfile
 import zlib
@@ -29,6 +28,7 @@ from warp_ar.scene.mesh_parts import LARGEST, MeshPart, join_parts
 from warp_ar.scene.moving_mesh import moving_mesh
 from warp_ar.scene.mtl import read_library_material
 from warp_ar.scene.node_animation import MovingMesh
+from warp_ar.scene.polygon_files import READERS
 from warp_ar.srgb import decode_srgb
 
 ByteArray = npt.NDArray[np.uint8]
@@ -42,6 +42,10 @@ GLTF_SUFFIXES: Final = (".glb", ".gltf")
 CREASE: Final = 40.0
 """Degrees: where a file of a drawing format (OBJ, STL, OFF) has no normals, an edge that turns more is sharp."""
 _DRAWN: Final = (".obj", ".stl", ".off")
+_STL_HEADER: Final = 80
+"""Bytes before the triangles of a binary STL."""
+_STL_TEXT: Final = 1 << 12
+"""Bytes within which a text has its first facet."""
 
 # What trimesh and Pillow have been seen to raise on damaged files; its readers do not document it.
 _LOADER_ERRORS: Final = (
@@ -139,7 +143,7 @@ def animations_of(path: Path) -> list[str]:
     """
     data = read_bytes(path, "mesh_bytes", SceneError)
     with _said_in_words(path):
-        return animation_names(path, read_gltf(path, data, Assets(path, library_first=False))[0])
+        return animation_names(path, read_gltf(path, data, Assets(path))[0])
 
 
 def _load(path: Path) -> tuple[Mesh, Assets]:
@@ -169,7 +173,7 @@ def _read_file(path: Path, animation: str | int | None = None) -> tuple[GltfCont
         raise SceneError(f"{path}: no such mesh file")
     data = read_bytes(path, "mesh_bytes", SceneError)
     suffix = path.suffix.lower()
-    assets = Assets(path, library_first=suffix == ".obj")
+    assets = Assets(path)
     check_counts(path, data)
     with _said_in_words(path):
         if suffix in GLTF_SUFFIXES:
@@ -184,19 +188,18 @@ def _read_file(path: Path, animation: str | int | None = None) -> tuple[GltfCont
 
 
 def _read_parts(path: Path, data: bytes, assets: Assets, images: list[ByteArray], notes: list[str]) -> list[MeshPart]:
-    """Parts of a file that trimesh reads."""
-    import trimesh  # here, since it takes half a second and most scenes need no file
-
+    """Return the parts of a file without a scene graph."""
     suffix = path.suffix.lower()
-    with np.errstate(all="ignore"):  # what is not finite is named when it is looked through
-        scene = trimesh.load_scene(io.BytesIO(data), file_type=suffix[1:], resolver=assets, process=False)
-    if suffix == ".obj" and assets.problem is not None:
-        raise assets.problem
-    if assets.missing is not None:
-        name = re.split(r"[/\\]", assets.missing)[-1][:60]
-        notes.append(f"the material library {name}, which is not there")
     crease = CREASE if suffix in _DRAWN else None
-    return _scene_parts(f"{path}", scene, images, notes, crease, assets)
+    with np.errstate(all="ignore"):  # what is not finite is named when it is looked through
+        if suffix in READERS:
+            return READERS[suffix](path, data, assets, images, notes, crease)
+        import trimesh  # here, since it takes half a second and most scenes need no file
+
+        if data[:_STL_HEADER].lower().lstrip().startswith(b"solid") and b"facet" in data[:_STL_TEXT].lower():
+            data = data.lower()  # trimesh knows the words in lower case alone
+        scene = trimesh.load_scene(io.BytesIO(data), file_type=suffix[1:], process=False)
+        return _scene_parts(f"{path}", scene, images, notes, crease)
 
 
 def mesh_from_trimesh(source: Any) -> Mesh:
@@ -217,7 +220,7 @@ def mesh_from_trimesh(source: Any) -> Mesh:
     images: list[ByteArray] = []
     notes: list[str] = []
     try:
-        parts = _scene_parts(label, scene, images, notes, CREASE, None)
+        parts = _scene_parts(label, scene, images, notes, CREASE)
     except SceneError:
         raise
     except _LOADER_ERRORS as error:
@@ -228,7 +231,7 @@ def mesh_from_trimesh(source: Any) -> Mesh:
 
 
 def _scene_parts(
-    label: str, scene: Any, images: list[ByteArray], notes: list[str], crease: float | None, assets: Assets | None
+    label: str, scene: Any, images: list[ByteArray], notes: list[str], crease: float | None
 ) -> list[MeshPart]:
     """Parts of a scene of trimesh, in its world."""
     known: dict[int, MeshMaterial | None] = {}
@@ -242,7 +245,7 @@ def _scene_parts(
             continue
         source = getattr(geometry.visual, "material", None)
         if id(source) not in known:
-            known[id(source)] = read_library_material(label, source, images, notes, assets)
+            known[id(source)] = read_library_material(label, source, images, notes)
         moved = _read_part(label, geometry, known[id(source)], crease).moved(np.asarray(transform, dtype=np.float64))
         if moved is not None:
             parts.append(moved)

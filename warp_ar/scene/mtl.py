@@ -11,6 +11,7 @@ References:
 from __future__ import annotations
 
 import math
+import re
 from typing import Any, Final, cast
 
 import cv2
@@ -47,17 +48,47 @@ _OPTIONS: Final = {"-bm": 1, "-blendu": 1, "-blendv": 1, "-cc": 1, "-clamp": 1, 
 """Options of a map, and how many words follow; -o, -s and -t have one to three numbers."""
 
 
-def read_library_material(
-    label: str, source: Any, images: list[ByteArray], notes: list[str], assets: Assets | None
-) -> MeshMaterial | None:
-    """A material of trimesh; None if it says nothing.
+def parse_library(text: str) -> dict[str, dict[str, Any]]:
+    """Return the materials of an OBJ's library by name: their words by key in lower case."""
+    found: dict[str, dict[str, Any]] = {}
+    values: dict[str, Any] = {}
+    for line in re.sub(r"\\[ \t]*\r?\n", " ", text).splitlines():
+        key, *words = re.sub(r"(^|\s)#.*", "", line).split() or [""]
+        if key.lower() == "newmtl":
+            name = " ".join(words)
+            values = {"name": name}
+            found.setdefault(name, values)
+        elif words:
+            values[key.lower()] = words
+    return found
+
+
+def read_library(
+    label: str, values: dict[str, Any], images: list[ByteArray], notes: list[str], assets: Assets
+) -> MeshMaterial:
+    """Return a material of `parse_library`.
 
     Args:
         label: The file, for messages.
+        values: Words of the material by key.
+        images: Pictures so far, RGBA; those of the material are added.
+        notes: What is not shown so far; what the material has of it is added.
+        assets: Finds the files that the library names.
+
+    Raises:
+        SceneError: A picture is missing or damaged.
+    """
+    return _Library(label, values, images, notes, assets).read(None)
+
+
+def read_library_material(label: str, source: Any, images: list[ByteArray], notes: list[str]) -> MeshMaterial | None:
+    """Return a material of trimesh; None if it says nothing.
+
+    Args:
+        label: The mesh, for messages.
         source: trimesh's material, or None.
         images: Pictures so far, RGBA; those of the material are added.
         notes: What is not shown so far; what the material has of it is added.
-        assets: Finds the files that a library names; None: it names none.
 
     Raises:
         SceneError: A picture is missing or damaged.
@@ -70,7 +101,8 @@ def read_library_material(
     image = _own_picture(label, source, images)
     if not values and image is None:
         return None
-    return _Library(label, source, values, images, notes, assets).read(image)
+    values = {"name": getattr(source, "name", ""), **values}
+    return _Library(label, values, images, notes, None).read(image)
 
 
 def _own_picture(label: str, source: Any, images: list[ByteArray]) -> TextureUse | None:
@@ -95,13 +127,12 @@ class _Library:
     def __init__(
         self,
         label: str,
-        source: Any,
         values: dict[str, Any],
         images: list[ByteArray],
         notes: list[str],
         assets: Assets | None,
     ) -> None:
-        self._label, self._source, self._values = label, source, values
+        self._label, self._values = label, values
         self._images, self._notes, self._assets = images, notes, assets
 
     def read(self, base: TextureUse | None) -> MeshMaterial:
@@ -109,6 +140,7 @@ class _Library:
         for key, words in _LEFT_OUT.items():
             if key in self._values and words not in self._notes:
                 self._notes.append(words)
+        base = base or self._use(self._picture("map_kd"))
         white = (1.0, 1.0, 1.0)
         diffuse = self._color("kd", white if base is not None else CHALK)
         specular = self._color("ks", (0.0, 0.0, 0.0))
@@ -140,7 +172,7 @@ class _Library:
             emission = white
         return MeshMaterial(
             surface=surface,
-            name=str(self._values.get("name", getattr(self._source, "name", "")) or "")[:80],
+            name=str(self._values.get("name") or "")[:80],
             alpha=cast(Any, alpha),
             opacity=opacity,
             emission=emission,

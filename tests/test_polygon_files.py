@@ -1,0 +1,201 @@
+"""Polygons of OBJ, PLY and OFF: areas and winding kept, and all that a file declares of colours arrives."""
+
+from __future__ import annotations
+
+import pathlib
+import struct
+
+import hypothesis
+import numpy as np
+import pytest
+from hypothesis import strategies as st
+
+from warp_ar.scene.geometry import Mesh, rotation_matrix
+from warp_ar.scene.mesh_files import load_mesh
+from warp_ar.scene.polygon_files import clip_ears
+
+SINGLE = 2e-5
+"""Rounding of areas of a few square metres in single precision."""
+
+
+def srgb(value: np.ndarray) -> np.ndarray:
+    value = np.asarray(value, float)
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+
+
+def star(radii: list[float]) -> np.ndarray:
+    """A polygon around the origin with corners at these distances: concave wherever one is much nearer."""
+    angle = np.arange(len(radii)) * 2 * np.pi / len(radii)
+    return np.stack([radii * np.cos(angle), radii * np.sin(angle), 0 * angle], 1)
+
+
+def area(points: np.ndarray) -> np.ndarray:
+    """Vector area of a polygon."""
+    return np.cross(points, np.roll(points, -1, 0)).sum(0) / 2
+
+
+def normals(mesh: Mesh) -> np.ndarray:
+    """Vector areas of triangles."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(float) for k in range(3))
+    return np.cross(b - a, c - a) / 2
+
+
+def polygon_text(kind: str, points: np.ndarray) -> str:
+    rows = "\n".join(" ".join(repr(float(x)) for x in row) for row in points)
+    count, index = len(points), " ".join(map(str, range(len(points))))
+    if kind == ".off":
+        return f"OFF\n{count} 1 0\n{rows}\n{count} {index}\n"
+    if kind == ".ply":
+        head = "ply\nformat ascii 1.0\nelement vertex {}\nproperty double x\nproperty double y\nproperty double z\n"
+        return head.format(count) + (
+            f"element face 1\nproperty list uchar int vertex_index\nend_header\n{rows}\n{count} {index}\n"
+        )
+    lines = "".join(f"v {row}\n" for row in rows.split("\n"))
+    return f"{lines}f {' '.join(str(-count + k) for k in range(count))}\n"
+
+
+@pytest.mark.parametrize("kind", [".obj", ".ply", ".off"])
+@hypothesis.settings(max_examples=25, deadline=None)
+@hypothesis.given(
+    st.lists(st.floats(0.2, 2.0), min_size=3, max_size=16),
+    st.tuples(*[st.floats(-180.0, 180.0)] * 3),
+    st.booleans(),
+)
+def test_area_and_winding_are_kept(
+    tmp_path_factory: pytest.TempPathFactory, kind: str, radii: list[float], turn: tuple, backwards: bool
+) -> None:
+    points = star(radii) @ rotation_matrix(turn).T
+    points = points[::-1] if backwards else points
+    path = tmp_path_factory.mktemp("a") / f"a{kind}"
+    path.write_text(polygon_text(kind, points))
+    found, whole = normals(load_mesh(path)), area(points)
+    along = found @ (whole / np.linalg.norm(whole))
+    assert len(found) == len(points) - 2
+    np.testing.assert_allclose(found.sum(0), whole, atol=SINGLE)
+    assert along.sum() == pytest.approx(np.abs(along).sum(), abs=SINGLE)
+
+
+def test_a_polygon_that_crosses_itself_ends() -> None:
+    bow = np.array([(0, 0, 0), (1, 1, 0), (1, 0, 0), (0, 1, 0), (0.5, 2, 0), (0.2, -1, 0)], float)
+    assert clip_ears(bow).shape == (4, 3)
+    assert clip_ears(np.zeros((7, 3))).shape == (5, 3)
+
+
+def ply(kind: str, vertices: list, faces: list, declared: str, of_faces: str, types: str = "") -> bytes:
+    head = f"ply\nformat {kind} 1.0\nelement vertex {len(vertices)}\nproperty float x\n"
+    head += (
+        "property float y\nproperty float z\n"
+        + declared
+        + f"element face {len(faces)}\nproperty list uchar int vertex_indices\n{of_faces}end_header\n"
+    )
+    if kind == "ascii":
+        rows = [*vertices, *([len(index), *index, *more] for index, more in faces)]
+        return (head + "\n".join(" ".join(map(str, row)) for row in rows) + "\n").encode()
+    order = "<" if "little" in kind else ">"
+    body = b"".join(struct.pack(order + "3f" + types, *row) for row in vertices)
+    for index, more in faces:
+        body += struct.pack(f"{order}B{len(index)}i{types}", len(index), *index, *more)
+    return head.encode() + body
+
+
+SQUARE = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)]
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian", "binary_big_endian"])
+@pytest.mark.parametrize(("type_", "code", "white"), [("uchar", "B", 255), ("ushort", "H", 65535), ("float", "f", 1)])
+@pytest.mark.parametrize("names", [("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue")])
+@pytest.mark.parametrize("polygons", [[(0, 1, 2, 3)], [(0, 1, 2), (0, 2, 3)], [(0, 1, 2, 3), (1, 2, 0)]])
+def test_colours_of_vertices_and_faces_of_a_ply(
+    tmp_path: pathlib.Path, kind: str, type_: str, code: str, white: int, names: tuple, polygons: list
+) -> None:
+    said = [round(share * white, 6) if white == 1 else int(share * white) for share in (1.0, 0.4, 0.2)]
+    linear = srgb(np.array(said) / white)
+    declared = "".join(f"property {type_} {name}\n" for name in names)
+    bare = [(index, ()) for index in polygons]
+    path = tmp_path / "a.ply"
+    path.write_bytes(
+        ply(kind, [(*p, *said) for p in SQUARE], [(i, m) for i, m in bare], declared, "", 3 * code)
+        if kind == "ascii"
+        else _binary(kind, polygons, said, declared, code, False)
+    )
+    np.testing.assert_allclose(load_mesh(path).colors[:, :3], [linear] * 4, atol=1e-6)
+    path.write_bytes(
+        ply(kind, SQUARE, [(index, said) for index in polygons], "", declared)
+        if kind == "ascii"
+        else _binary(kind, polygons, said, declared, code, True)
+    )
+    colors = load_mesh(path).colors
+    np.testing.assert_allclose(colors[:, :3], [linear] * len(colors), atol=1e-6)
+
+
+def _binary(kind: str, polygons: list, said: list, declared: str, code: str, of_faces: bool) -> bytes:
+    order = "<" if "little" in kind else ">"
+    color = struct.pack(order + 3 * code, *said)
+    head = ply(kind, [], [], "" if of_faces else declared, declared if of_faces else "").decode()
+    head = head.replace("vertex 0", "vertex 4").replace("face 0", f"face {len(polygons)}")
+    body = b"".join(struct.pack(order + "3f", *p) + (b"" if of_faces else color) for p in SQUARE)
+    for index in polygons:
+        body += struct.pack(f"{order}B{len(index)}i", len(index), *index) + (color if of_faces else b"")
+    return head.encode() + body
+
+
+def test_what_a_ply_declares_and_is_not_shown_is_named(tmp_path: pathlib.Path) -> None:
+    rows = [(*p, 5) for p in SQUARE]
+    (tmp_path / "a.ply").write_bytes(ply("ascii", rows, [((0, 1, 2), ())], "property float gloss\n", ""))
+    assert load_mesh(tmp_path / "a.ply").notes == ("the property gloss of each vertex",)
+
+
+TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\n"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "\ufeffmtllib a.mtl\n{}usemtl rot\u00e9\nf 1 2 3\n",
+        "mtllib none.mtl a.mtl # both\n{}usemtl rot\u00e9 # comment\nf 1 2 3 # behind\n",
+        "mtllib none.mtl\nmtllib a.mtl\n{}usemtl rot\u00e9\nf 1 2 \\\n 3\n",
+        "mtllib .\\a.mtl\n{}usemtl rot\u00e9\nf -4 -3 -2\n",
+    ],
+)
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
+def test_libraries_of_an_obj(tmp_path: pathlib.Path, text: str, encoding: str) -> None:
+    if encoding == "latin-1" and text.startswith("\ufeff"):
+        pytest.skip("a mark is UTF-8's")
+    (tmp_path / "a.mtl").write_bytes("newmtl rot\u00e9\nKd 1 0 0 # red\nNs 3\n".encode(encoding))
+    (tmp_path / "a.obj").write_bytes(text.format(TRIANGLE).encode(encoding))
+    mesh = load_mesh(tmp_path / "a.obj")
+    assert mesh.materials[0].surface.base_color == (1.0, 0.0, 0.0)
+    assert len(mesh.faces) == 1
+    assert [note for note in mesh.notes if "none.mtl" not in note] == []
+
+
+def test_materials_that_no_library_has_are_named(tmp_path: pathlib.Path) -> None:
+    (tmp_path / "a.mtl").write_text("newmtl a\nKd 1 0 0\n")
+    (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{TRIANGLE}usemtl a\nf 1 2 3\nusemtl b\nf 2 4 3\n")
+    mesh = load_mesh(tmp_path / "a.obj")
+    assert mesh.notes == ("the material b, which no library has",)
+    assert len(mesh.faces) == 2
+
+
+def test_colours_of_an_obj_in_255_steps(tmp_path: pathlib.Path) -> None:
+    rows = "".join(f"v {x} {y} 0 255 128 0\n" for x, y in ((0, 0), (1, 0), (0, 1)))
+    (tmp_path / "a.obj").write_text(rows + "f 1 2 3\n")
+    np.testing.assert_allclose(
+        load_mesh(tmp_path / "a.obj").colors[:, :3], [srgb(np.array([1, 128 / 255, 0]))] * 3, atol=1e-6
+    )
+
+
+@pytest.mark.parametrize(
+    ("head", "more", "face"),
+    [
+        ("OFF", "", "1.0 0.4 0.2"),
+        ("OFF", "", "255 102 51 255"),
+        ("COFF", "1.0 0.4 0.2 1.0", ""),
+        ("COFF", "255 102 51", ""),
+        ("CNOFF", "0 0 1 255 102 51 255", ""),
+    ],
+)
+def test_colours_of_an_off(tmp_path: pathlib.Path, head: str, more: str, face: str) -> None:
+    rows = "".join(f"{x} {y} {z} {more} # corner\n" for x, y, z in SQUARE)
+    (tmp_path / "a.off").write_text(f"{head} 4 1 0\n{rows}4 0 1 2 3 {face}\n")
+    np.testing.assert_allclose(load_mesh(tmp_path / "a.off").colors[:, :3] - srgb([1.0, 0.4, 0.2]), 0.0, atol=1e-6)
