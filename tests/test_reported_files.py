@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import json
 import pathlib
+import struct
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from warp_ar import environment
 from warp_ar.light.captured import Light
 from warp_ar.light.latlong_axes import from_axes
 from warp_ar.output.environment_file import read_environment
 from warp_ar.scene.geometry import Mesh
+from warp_ar.scene.gltf import decode_rgba
 from warp_ar.scene.mesh_files import load_mesh
 
 
@@ -86,3 +89,31 @@ def test_material_libraries_with_a_mark_and_two_of_them(cases: pathlib.Path) -> 
         for name in ("bom.obj", "two.obj")
     }
     assert colors == {"bom.obj": [(1, 0, 0)], "two.obj": [(1, 0, 0), (0, 1, 0)]}
+
+
+@pytest.mark.parametrize("depth", [1, 2, 4, 8, 16])
+def test_a_transparent_grey_of_a_png(depth: int) -> None:
+    import io
+    import zlib
+
+    def chunk(kind: bytes, body: bytes) -> bytes:
+        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+    white = (1 << depth) - 1
+    rows = [
+        int(f"{0:0{depth}b}{white:0{depth}b}".ljust(-(-2 * depth // 8) * 8, "0"), 2).to_bytes(-(-2 * depth // 8), "big")
+    ]
+    header = struct.pack(">IIBBBBB", 2, 1, depth, 0, 0, 0, 0)
+    data = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"tRNS", struct.pack(">H", white))
+    data += chunk(b"IDAT", zlib.compress(b"\0" + rows[0])) + chunk(b"IEND", b"")
+    found = decode_rgba(data, "a.png")
+    assert found.tolist() == [[[0, 0, 0, 255], [255, 255, 255, 0]]]
+    if depth == 8:
+        assert found.tolist() == np.asarray(Image.open(io.BytesIO(data)).convert("RGBA")).tolist()
+
+
+def test_texture_grey_trns(cases: pathlib.Path) -> None:
+    path = cases / "texture_grey_trns" / "grey_trns.png"
+    expected = np.asarray(Image.open(path).convert("RGBA"))
+    np.testing.assert_array_equal(decode_rgba(path.read_bytes(), "a.png"), expected)
+    assert (expected[..., 3] == 0).any()

@@ -10,6 +10,7 @@ References:
 from __future__ import annotations
 
 import dataclasses
+import struct
 from pathlib import Path
 from typing import Any, Final
 
@@ -26,6 +27,7 @@ from warp_ar.scene.gltf_materials import SUPPORTED, GltfMaterials
 from warp_ar.scene.mesh_assets import Assets, fail, image_bytes, objects, read_gltf
 from warp_ar.scene.mesh_parts import LARGEST, MeshPart
 from warp_ar.scene.node_animation import Anchor, NodeTrack
+from warp_ar.scene.texture_codes import encode_texture
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _UP: Final = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
@@ -426,6 +428,13 @@ def decode_rgba(data: bytes, label: str) -> npt.NDArray[np.uint8]:
     """
     # glTF: pictures lie as they are, whatever their EXIF says.
     picture = decode_picture(data, cv2.IMREAD_UNCHANGED, SceneError, label)
+    clear = transparent_code(data)
+    if clear is not None and picture.dtype in (np.uint8, np.uint16):
+        return _with_clear_code(picture, data, clear)
+    if picture.dtype in (np.float32, np.float64):
+        alpha = picture[..., 3:] if picture.ndim == 3 else picture[..., :0]
+        codes = encode_texture(np.clip(np.nan_to_num(picture), 0.0, 1.0), encoded=True)
+        picture = codes if not alpha.size else np.concatenate([codes[..., :3], np.uint8(255 * np.clip(alpha, 0, 1))], 2)
     if picture.dtype == np.uint16:
         picture = np.round(picture / 257.0).astype(np.uint8)
     if picture.dtype != np.uint8 or picture.ndim not in (2, 3):
@@ -439,3 +448,28 @@ def decode_rgba(data: bytes, label: str) -> npt.NDArray[np.uint8]:
     else:
         picture = picture[..., [2, 1, 0, 3]]
     return np.ascontiguousarray(picture, dtype=np.uint8)
+
+
+def transparent_code(data: bytes) -> tuple[int, ...] | None:
+    """Return the grey or the colour that is transparent in a PNG, which OpenCV leaves out; None if there is none."""
+    if not data.startswith(b"\x89PNG") or data[25:26] not in (b"\0", b"\2"):
+        return None
+    at = data.find(b"tRNS", 33)
+    count = 1 if data[25] == 0 else 3
+    if at < 0 or at > data.find(b"IDAT") or len(data) < at + 4 + 2 * count:
+        return None
+    return struct.unpack_from(f">{count}H", data, at + 4)
+
+
+def _with_clear_code(picture: npt.NDArray[Any], data: bytes, clear: tuple[int, ...]) -> npt.NDArray[np.uint8]:
+    """Return RGBA of 8 bits in which one code of a PNG is transparent."""
+    depth = data[24]
+    scale = 255 // ((1 << depth) - 1) if depth < 8 else 1  # grey of fewer bits was spread over 8
+    color = (
+        picture[..., None] if picture.ndim == 2 else picture[..., 2::-1] if picture.shape[2] > 2 else picture[..., :1]
+    )
+    same = (color[..., : len(clear)] == np.array(clear) * scale).all(2)
+    codes = np.round(color / 257.0) if color.dtype == np.uint16 else color
+    codes = np.broadcast_to(codes, (*codes.shape[:2], 3))
+    alpha = np.where(same, 0, 255)[..., None]
+    return np.ascontiguousarray(np.concatenate([codes, alpha], 2), dtype=np.uint8)

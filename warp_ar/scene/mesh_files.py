@@ -29,6 +29,7 @@ from warp_ar.scene.moving_mesh import moving_mesh
 from warp_ar.scene.mtl import read_library_material
 from warp_ar.scene.node_animation import MovingMesh
 from warp_ar.scene.polygon_files import READERS
+from warp_ar.scene.texture_codes import encode_texture
 from warp_ar.srgb import decode_srgb
 
 ByteArray = npt.NDArray[np.uint8]
@@ -86,7 +87,9 @@ def load_texture(path: str | Path) -> ByteArray:
         SceneError: The file is missing, no picture, or too large.
     """
     image = read_picture(path, cv2.IMREAD_COLOR_RGB, SceneError, f"{path}: the texture")
-    result: ByteArray = np.asarray(image, dtype=np.uint8)
+    if image.dtype.kind == "f":  # linear values
+        return encode_texture(np.clip(np.nan_to_num(image), 0.0, 1.0), encoded=True)
+    result: ByteArray = np.asarray(image / 257.0 if image.dtype == np.uint16 else image, dtype=np.uint8)
     return result
 
 
