@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import json
 import statistics
@@ -14,9 +13,10 @@ import pytest
 from tests.test_pipeline import Frames, frames, make_scene  # noqa: F401  (a fixture)
 from warp_ar.accuracy import budget as auto_quality
 from warp_ar.accuracy.budget import AutoPipeline
-from warp_ar.accuracy.controller import AIM, FIRST_WINDOW, HELD_SECONDS, LEAST, MEMORY, Controller
+from warp_ar.accuracy.controller import AIM, HELD_SECONDS, LEAST, MEMORY, WINDOW, Controller
 from warp_ar.accuracy.cost_table import Setting, chosen, load_errors, relevant_settings
 from warp_ar.accuracy.costs import Costs
+from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import UsageError
 from warp_ar.stages.quality import PRESETS
 
@@ -62,16 +62,14 @@ class Machine:
         *,
         known: Costs = COSTS,
         truth: Costs = COSTS,
-        timed: bool = True,
         running: Mapping[str, str] | None = BASE,
         errors: Mapping[str, Mapping[str, float]] = ERRORS,
     ) -> None:
         self.controller = Controller(known, errors, budget, running)
-        self._truth, self._timed = truth, timed
+        self._truth = truth
         self.shown = dict(self.controller.settings)
         self.load, self.now = 1.0, 0.0
         self.history: list[tuple[float, float, dict[str, str]]] = []
-        self.rejected = 0
         self.unfit = 0
         """Frames in which it held that nothing fits."""
         self._kept = [self.shown]
@@ -110,13 +108,7 @@ class Machine:
         return times
 
     def _show(self) -> None:
-        controller = self.controller
-        if self._timed:
-            controller.learn(controller.settings, self.cost(controller.settings))
-            if not controller.confirm():
-                self.rejected += 1
-                return
-        self._kept.append(dict(controller.settings))
+        self._kept.append(dict(self.controller.settings))
         self._go_over()
 
     def _go_over(self) -> None:
@@ -126,11 +118,6 @@ class Machine:
     def changes(self, since: float = 0.0) -> int:
         shown = [settings for now, _, settings in self.history if now > since]
         return sum(a != b for a, b in itertools.pairwise(shown))
-
-    def dearest(self, since: int = 1) -> float:
-        """Longest that settings take by themselves, from the ``since``-th change on."""
-        runs = [dict(settings) for settings, _ in itertools.groupby(self.history, key=lambda entry: entry[2])]
-        return max(self.cost(settings) for settings in runs[since:])
 
 
 def best_error(budget: float) -> float:
@@ -173,28 +160,8 @@ def test_settings_that_multiply_are_priced_so():
     assert COSTS.base + COSTS.excess(multiplying.settings) <= AIM * 130.0
 
 
-@pytest.mark.parametrize("budget", [110.0, 130.0, 200.0])
-def test_what_nobody_knew_is_found_out_before_it_is_shown(budget):
-    """Costs that add up, on a machine where they multiply."""
-    machine = Machine(budget, known=UNSCALED)
-    machine.run(30.0)
-    assert machine.rejected > 0, "it must have been tempted"
-    assert machine.rejected < 12, "what one trial tells must be believed of its neighbours"
-    assert machine.dearest() <= budget
-    assert machine.changes(15.0) == 0
-
-
-def test_the_first_choice_is_not_taken_for_being_cheaper_than_the_base():
-    """A method that promises to cost 1 ms and costs 8 leaves less than the base takes, and more than the budget."""
-    promised = {**COSTS.methods, "irradiance": {**COSTS.methods["irradiance"], "clusters": 1.0}}
-    machine = Machine(13.0, known=Costs(COSTS.base, promised, COSTS.scales))
-    machine.run(10.0)
-    assert machine.rejected > 0, "it must have been tempted"
-    assert machine.dearest() <= 13.0
-
-
-def test_without_trials_the_frames_tell():
-    machine = Machine(110.0, known=UNSCALED, timed=False)
+def test_frames_tell_what_costs_do_not():
+    machine = Machine(110.0, known=UNSCALED)
     machine.run(20.0)
     assert max(time for _, time, _ in machine.history) > 2 * 110.0, "it must have been tempted"
     late = machine.run(30.0)
@@ -234,12 +201,12 @@ def test_a_load_that_triples_is_answered_before_the_window_has_passed():
     machine.run(5.0)
     machine.load = 3.0
     before = dict(machine.controller.settings)
-    machine.run(FIRST_WINDOW / FPS)
+    machine.run(0.5 * WINDOW / FPS)
     assert machine.controller.settings != before
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_no_setting_moves_twice_in_half_a_second_or_by_two_methods(seed):
+def test_no_setting_moves_twice_in_half_a_second(seed):
     machine = Machine(33.0, seed)
     loads = np.random.default_rng(seed)
     machine.run(2.0)
@@ -247,13 +214,11 @@ def test_no_setting_moves_twice_in_half_a_second_or_by_two_methods(seed):
         machine.load = float(loads.choice([0.5, 1.0, 1.5, 3.0]))
         machine.run(2.0, noise=0.3)
     moved: dict[str, float] = {}
-    assert machine.changes() > 5, "the load must have moved it at all"
+    assert machine.changes() >= 3, "the load must have moved it"
     for (_, _, a), (now, _, b) in itertools.islice(itertools.pairwise(machine.history), int(2.0 * FPS), None):
         for setting in a:
             if a[setting] == b[setting]:
                 continue
-            methods = machine.controller._methods[setting]
-            assert abs(methods.index(a[setting]) - methods.index(b[setting])) == 1
             assert now - moved.get(setting, -1.0) >= HELD_SECONDS - 1e-9
             moved[setting] = now
 
@@ -359,48 +324,28 @@ def test_changes_over_and_keeps_the_light(frames: Frames, device: str, tmp_path)
     json.dumps(status)
 
 
-def test_what_takes_too_long_alone_is_never_shown(frames: Frames, tmp_path, monkeypatch) -> None:
-    """Costs by which everything fits, and a trial of the dearest that says otherwise."""
-    scene = make_scene()
-    settings = relevant_settings(scene, (320, 240))
-    tried = []
-
-    def trial(pipeline, image, pose, costs, settings):
-        tried.append(settings)
-        return 1e9 if settings["irradiance"] == "clusters" else costs.base
-
-    monkeypatch.setattr(auto_quality, "time_alone", trial)
-    costs = dataclasses.replace(even_costs(settings, base=20.0, step=0.1), work=20.0)
-    with AutoPipeline(scene, device="cpu", budget_ms=1e4, costs=costs, folder=tmp_path) as pipeline:
-        assert pipeline.status() == {"budget_ms": 1e4, "changes": []}
-        pipeline(frames[0])
-        assert pipeline.status()["changes"] == [], "one frame tells no load"
-        light(pipeline, frames[0])
-        status = pipeline.status()
-    assert tried[0]["irradiance"] == "clusters", "it must have been tempted"
-    assert status["rejected"][0]["settings"] == tried[0]
-    assert status["settings"] == status["changes"][0]["settings"] == tried[-1]
-    assert status["settings"]["irradiance"] != "clusters"
-
-
 def test_what_cannot_be_built_is_told_and_never_shown(frames: Frames, tmp_path, monkeypatch, capsys) -> None:
     """A device without room for what the budget would allow: the run goes on by other methods."""
     scene = make_scene()
     settings = relevant_settings(scene, (320, 240))
+    warm_up = Pipeline.warm_up
 
-    def trial(pipeline, image, pose, costs, settings):
-        if settings["irradiance"] == "clusters":
+    def no_room(pipeline, progress=None):
+        if pipeline.quality.method("irradiance") == "clusters":
             raise RuntimeError("Failed to allocate 12 bytes on device 'cuda:0'")
-        return costs.base
+        warm_up(pipeline, progress)
 
-    monkeypatch.setattr(auto_quality, "time_alone", trial)
-    costs = dataclasses.replace(even_costs(settings, base=20.0, step=0.1), work=20.0)
+    monkeypatch.setattr(Pipeline, "warm_up", no_room)
+    costs = even_costs(settings, base=20.0, step=0.1)
     with AutoPipeline(scene, device="cpu", budget_ms=1e4, costs=costs, folder=tmp_path) as pipeline:
-        light(pipeline, frames[0])
-        light(pipeline, frames[0], 2)
+        assert pipeline.status() == {"budget_ms": 1e4, "changes": []}
+        pipeline(frames[0])
+        assert pipeline.status()["changes"] == [], "one frame tells no load"
+        for _ in range(20):
+            light(pipeline, frames[0])
         status = pipeline.status()
         assert pipeline.quality.method("irradiance") != "clusters"
-    assert status["rejected"][0]["settings"]["irradiance"] == "clusters"
+    assert status["rejected"][0]["settings"]["irradiance"] == "clusters", "it must have been tempted"
     assert status["changes"]
     assert status["settings"]["irradiance"] != "clusters"
     assert capsys.readouterr().err.count("Failed to allocate 12 bytes") == len(status["rejected"])
@@ -412,12 +357,12 @@ def test_says_once_that_nothing_fits(frames: Frames, tmp_path, capsys) -> None:
     with AutoPipeline(
         scene, device="cpu", budget_ms=1e-3, costs=even_costs(settings, base=50.0), folder=tmp_path
     ) as pipeline:
-        light(pipeline, frames[0], 60)
+        light(pipeline, frames[0], 120)
         status = pipeline.status()
     assert not status["fits"]
     assert status["settings"] == {setting.name: setting.methods[0] for setting in settings}
     assert status["measured_ms"] > status["budget_ms"]
-    assert capsys.readouterr().err.count("nothing keeps to 0.001 ms here") == 1
+    assert capsys.readouterr().err.count("0.001 ms cannot be kept: ") == 1
 
 
 def test_costs_are_measured_once(frames: Frames, device: str, tmp_path, monkeypatch, capsys) -> None:

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import itertools
-import time
-
 import pytest
 
 from tests.test_pipeline import Frames, frames, make_scene  # noqa: F401  (a fixture)
 from warp_ar.accuracy import costs as costs_module
-from warp_ar.accuracy.cost_table import SETTINGS, chosen, relevant_settings, turn
-from warp_ar.accuracy.costs import BASE, Costs, measure_costs, read_costs, show_again, time_alone, write_costs
+from warp_ar.accuracy.cost_table import SETTINGS, chosen, relevant_settings
+from warp_ar.accuracy.costs import BASE, Costs, measure_costs, read_costs, show_again, write_costs
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.stages.quality import PRESETS
 
 SETTING = next(setting for setting in SETTINGS if setting.name == "irradiance")
 KEPT = Costs(
-    12.5, {"irradiance": {"sh2": 0.0, "clusters": 1.25}}, {"irradiance": {"clusters": {"prefilter": 2.0}}}, 2.5, 20.0
+    12.5, {"irradiance": {"sh2": 0.0, "clusters": 1.25}}, {"irradiance": {"clusters": {"prefilter": 2.0}}}, 2.5
 )
 
 
@@ -76,7 +73,6 @@ def test_measured_costs_cover_every_method_but_brute_force(frames: Frames, devic
     settings = [setting for setting in relevant_settings(scene, (320, 240)) if setting.name in names]
     costs = measure_costs(scene, frames[0], pose, device, (320, 240), settings)
     assert costs.base > costs.track > 0.0
-    assert costs.work > 0.0
     for setting in settings:
         assert set(costs.methods[setting.name]) == set(setting.methods) - {"brute_force"}
         assert costs.methods[setting.name][chosen(PRESETS["medium"], setting)] == 0.0
@@ -111,17 +107,3 @@ def test_a_frame_that_is_shown_again_keeps_every_stage_at_work(frames: Frames, d
             stages = show_again(pipeline, frames[0], pose, index).stages
             assert "visibility" in stages
             assert not [name for name, timing in stages.items() if timing.skipped], f"in frame {index}"
-
-
-def test_timed_alone_counts_all_but_what_recovery_does_beside(frames: Frames, monkeypatch) -> None:
-    """By a clock that grows by a millisecond whenever it is read, a stage takes a millisecond."""
-    ticks = itertools.count()
-    monkeypatch.setattr(costs_module, "WORK", lambda: next(ticks) * 1e-3)
-    scene = make_scene()
-    costs = Costs(12.0, {"recover": {"white_card": 0.0, "shading": 7.0}}, track=2.0, work=20.0)
-    for method, beside in (("white_card", 0.0), ("shading", 7.0)):
-        with Pipeline(scene, device="cpu", quality=turn(BASE, {"recover": method})) as pipeline:
-            own = time_alone(pipeline, frames[0], None, costs, {"recover": method, "irradiance": "clusters"})
-            others = len(pipeline.plan.stages) - 1
-            assert pipeline.scheduler.clock is time.perf_counter, "its own clock is back"
-        assert own == pytest.approx(2.0 + others * (12.0 - 2.0) / 20.0 + beside)

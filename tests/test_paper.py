@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from PIL import Image
 
+from bench import paper_figures
 from warp_ar import paper
-from warp_ar.accuracy import paper_figures
 from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, EXIT_USAGE
 from warp_ar.signature import is_signed
 

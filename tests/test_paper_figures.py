@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from warp_ar.accuracy import paper_figures
-from warp_ar.accuracy.paper_figures import FIGURES, READINGS, Context
+from bench import paper_figures
+from bench.paper_figures import FIGURES, READINGS, Context
 from warp_ar.kernels.picture.expose import BOXES
 from warp_ar.kernels.receiver.receiver import METHODS
 from warp_ar.kernels.receiver.receiver import READINGS as BLENDS

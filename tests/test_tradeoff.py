@@ -56,18 +56,6 @@ def test_nothing_of_somebody_elses_is_overwritten(tmp_path, monkeypatch, capsys,
     assert "presets.json is replaced: this program wrote it before" in capsys.readouterr().err
 
 
-def test_extra_lines_are_read_before_anything_is_measured(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(tradeoff, "measure", no_measurement)
-    lines = tmp_path / "tradeoff.jsonl"
-    for text, message in (("[1]", "expected an object"), ("{", "line 1 cannot be read"), ("[" * 100, "nesting")):
-        lines.write_text(text + "\n")
-        assert tradeoff.main(["darken", "--extra", str(lines)]) == EXIT_USAGE
-        assert message in capsys.readouterr().err
-    lines.write_text("{}\n")
-    assert tradeoff.main(["darken", "--presets", "--extra", str(lines), "--out", str(tmp_path)]) == EXIT_USAGE
-    assert "is the same as --extra" in capsys.readouterr().err
-
-
 def test_presets_alone(tmp_path, device):
     arguments = ["darken", "--presets", "--only", "paper,low", "--frames", "2", "--shrink", "4", "--device", device]
     assert tradeoff.main([*arguments, "--out", str(tmp_path)]) == EXIT_DONE

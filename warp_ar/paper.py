@@ -23,7 +23,6 @@ from rich.console import Console
 from rich.table import Table
 
 from warp_ar.accuracy.charts import require_plots, stand_alone
-from warp_ar.accuracy.paper_figures import FIGURES, READING_SCENES, Context, PaperFigure, compare_readings
 from warp_ar.accuracy.progress import WorkProgress
 from warp_ar.accuracy.report import MIN_COLUMNS
 from warp_ar.command_line import EXIT_DONE, Parser, run_command
@@ -31,6 +30,11 @@ from warp_ar.device import resolve_device
 from warp_ar.errors import SceneError, SinkError, SourceError, UsageError
 from warp_ar.output.own_files import OwnFiles
 from warp_ar.signature import COMMENT, software_exif
+
+try:
+    from bench.paper_figures import FIGURES, READING_SCENES, Context, PaperFigure, compare_readings
+except ImportError as error:
+    raise SystemExit("warp_ar: the paper's figures are made in a checkout, from its folder") from error
 
 READINGS = "readings"
 QUALITY = 88

@@ -19,7 +19,6 @@ import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
@@ -29,14 +28,12 @@ from warp_ar.accuracy.cases import SIZED, VERSIONS, Case, open_cases
 from warp_ar.accuracy.charts import require_plots
 from warp_ar.accuracy.cost_table import SETTINGS, Setting
 from warp_ar.accuracy.costs import WORK
-from warp_ar.accuracy.figures import figure_units, make_figures
 from warp_ar.accuracy.progress import Advance, WorkProgress
 from warp_ar.accuracy.report import MIN_COLUMNS, make_cost_table, make_preset_list, print_report, records
 from warp_ar.accuracy.runs import Clock
 from warp_ar.command_line import EXIT_DONE, Parser, run_command
 from warp_ar.device import resolve_device
 from warp_ar.errors import SceneError, SinkError, SourceError, UsageError
-from warp_ar.files import parse_json, read_text
 from warp_ar.output.own_files import OwnFiles
 from warp_ar.stages.quality import PRESETS
 
@@ -87,7 +84,6 @@ def make_parser() -> argparse.ArgumentParser:
         help="write tradeoff.jsonl, cost_table.json and tradeoff.html here (or presets.json)",
     )
     add("--overwrite", action="store_true", help="also replace files that this program did not write")
-    add("--extra", type=Path, metavar="FILE", help="JSON lines of python -m bench precision, for the page")
     return parser
 
 
@@ -153,8 +149,7 @@ def units_of(options: argparse.Namespace, asked: Asked) -> float:
     units = sum(work_units(case, settings, quick=options.quick, presets=options.only) for case, settings in asked)
     if options.out is None or options.presets:
         return units
-    units += tradeoff_page.page_units(len(settings) for _, settings in asked)
-    return units + (figure_units(options.truth) if options.stage is None else 0.0)
+    return units + tradeoff_page.page_units(len(settings) for _, settings in asked)
 
 
 def measure(
@@ -169,34 +164,16 @@ def measure(
     return reports
 
 
-def read_extra(path: Path | None) -> list[dict[str, Any]]:
-    """JSON lines of a bench.
-
-    Raises:
-        UsageError: The file cannot be read as such.
-    """
-    if path is None:
-        return []
-    lines = read_text(path, UsageError, f"--extra {path}", expected="JSON lines").splitlines()
-    found = [parse_json(line, f"--extra {path}: line {k}", UsageError) for k, line in enumerate(lines, 1) if line]
-    if not all(isinstance(record, dict) for record in found):
-        raise UsageError(f"--extra {path}: expected an object on each line, as python -m bench prints them")
-    return found
-
-
 def open_out(options: argparse.Namespace) -> OwnFiles:
     """The folder that is written to, looked at before anything is measured."""
     names = ("tradeoff.jsonl", *(("presets.json",) if options.presets else ("cost_table.json", "tradeoff.html")))
-    reads = {} if options.extra is None else {"--extra": [options.extra]}
-    return OwnFiles(options.out, names, overwrite=options.overwrite, reads=reads)
+    return OwnFiles(options.out, names, overwrite=options.overwrite)
 
 
 def write(
     options: argparse.Namespace,
     out: OwnFiles,
-    extra: Sequence[dict[str, Any]],
     device: str,
-    clock: Clock,
     reports: Sequence[CaseReport],
     advance: Advance,
 ) -> None:
@@ -208,11 +185,8 @@ def write(
         return
     table = make_cost_table(reports, device)
     out.write("cost_table.json", json.dumps(table, indent=1) + "\n")
-    whole = options.stage is None
-    made_figures = make_figures(device, options.frames, options.truth, options.shrink, clock, advance)
-    figures = list(made_figures) if whole else []
     made = table["made"] | {"clock": "processor time" if options.processor_time else "time"}
-    out.write("tradeoff.html", tradeoff_page.render(reports, figures, made, extra, advance))
+    out.write("tradeoff.html", tradeoff_page.render(reports, made, advance))
 
 
 def tradeoff(options: argparse.Namespace) -> int:
@@ -228,7 +202,6 @@ def tradeoff(options: argparse.Namespace) -> int:
     clock: Clock = WORK if options.processor_time else time.perf_counter
     console = Console()
     console.width = max(console.width, MIN_COLUMNS)
-    extra = read_extra(options.extra)
     out = None if options.out is None else open_out(options)
     asked = asked_cases(options, console)
     with WorkProgress(console, units_of(options, asked)) as progress:
@@ -236,7 +209,7 @@ def tradeoff(options: argparse.Namespace) -> int:
         for setting, methods in make_cost_table(reports, str(device))["dominated"].items():
             console.print(f"dominated in every case: {setting} {', '.join(methods)}", highlight=False)
         if out is not None:
-            write(options, out, extra, str(device), clock, reports, progress.advance)
+            write(options, out, str(device), reports, progress.advance)
             console.print(f"written to {options.out}", highlight=False)
     return EXIT_DONE
 

@@ -5,9 +5,8 @@ so they are measured here (``warp_ar.accuracy.costs``), on the first frame that 
 
 **Choice.** What to run is decided by ``warp_ar.accuracy.controller``, from what frames take.
 
-**Switching.** Each set of methods has a pipeline of its own (``warp_ar.engine.switcher``). A new one lights a few
-frames that nobody sees: that loads its kernels, and tells what it costs. If that fits, it lights the next frame; if
-not, the choice is made anew.
+**Switching.** Each set of methods has a pipeline of its own (``warp_ar.engine.switcher``), which lights the next frame
+once it is built and its kernels are loaded.
 """
 
 from __future__ import annotations
@@ -19,7 +18,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-import numpy as np
 import warp as wp
 
 from warp_ar.accuracy.controller import Controller
@@ -35,7 +33,6 @@ from warp_ar.accuracy.costs import (
     cost_key,
     measure_costs,
     read_costs,
-    time_alone,
     write_costs,
 )
 from warp_ar.cache_folder import cache_folder
@@ -49,8 +46,6 @@ from warp_ar.stages.quality import DEFAULT_BUDGET_MS, Quality
 from warp_ar.stages.request import Estimates
 
 _KEPT_PIPELINES = 6
-_NEVER_MS = 1e9
-"""What methods are taken to need that cannot be built here."""
 
 T = TypeVar("T")
 
@@ -158,7 +153,7 @@ class AutoPipeline(Closing):
             first = not self._changes
             changed = self._controller.observe(_spent_ms(result), self._clock())
             if changed or (first and self._controller.chosen):
-                self._want(image, found)
+                self._want()
             self._tell()
         return result
 
@@ -182,11 +177,10 @@ class AutoPipeline(Closing):
     def _wanted(self) -> Quality:
         return turn(BASE, self._base if self._controller is None else self._controller.settings)
 
-    def _want(self, image: Any, pose: Pose | None) -> None:
+    def _want(self) -> None:
         """Go over to the controller's settings, as soon as there is a pipeline for them."""
-        frame = np.array(_on_host(image))
         self._target = dataclasses.replace(self._target, quality=self._wanted())
-        if self._switcher.want(self._target, lambda pipeline: self._time_alone(pipeline, frame, pose)):
+        if self._switcher.want(self._target, Pipeline.warm_up):
             self._changes.append(self._record())
 
     def _record(self) -> dict[str, Any]:
@@ -199,40 +193,28 @@ class AutoPipeline(Closing):
             "expected_error": round(self._controller.expected_error, 5),
         }
 
-    def _time_alone(self, pipeline: Pipeline, image: Any, pose: Pose | None) -> float | None:
-        """Make a new pipeline ready to light frames; what it takes alone, if that can be told."""
-        costs = self._costs
-        if costs is None or costs.work <= 0.0:
-            pipeline.warm_up()
-            return None
-        settings = {setting.name: chosen(pipeline.quality, setting) for setting in self.settings}
-        return time_alone(pipeline, image, pose, costs, settings)
-
-    def _admit(self, pipeline: Pipeline, alone: float | None) -> bool:
-        """Whether a pipeline may light frames, now that it is known what it takes."""
-        controller = self._controller
-        assert controller is not None
-        if alone is not None:
-            controller.learn(controller.settings, alone)
-        record = self._record()
-        admitted = controller.confirm()
-        (self._changes if admitted else self._rejected).append(record)
-        return admitted
-
     def _swap(self) -> None:
-        """Go over to the wanted pipeline if it is ready; one that cannot be built is told, and not wanted again."""
-        if self._controller is None:
+        """Go over to the wanted pipeline if it is ready; one that cannot be built is told, and others are used."""
+        controller = self._controller
+        if controller is None:
             return
         try:
             latest = self._switcher.take(self._admit)
         except WarpArError as error:
             print(f"warp_ar: {error}; others are used", file=sys.stderr)
-            self._admit(self.pipeline, _NEVER_MS)
+            self._rejected.append(self._record())
+            controller.reject()
+            self._want()
             return
         assert latest is not None
         if latest is not self.pipeline:
             self.pipeline = latest
-            self._controller.shown(self._clock())
+            controller.shown(self._clock())
+
+    def _admit(self, _pipeline: Pipeline, _timing: Any) -> bool:
+        """Let a pipeline that was built light the next frame."""
+        self._changes.append(self._record())
+        return True
 
     def _tell(self) -> None:
         """Say once that the budget is too small."""
@@ -240,8 +222,8 @@ class AutoPipeline(Closing):
         if controller is not None and not controller.fits and not self._told:
             self._told = True
             print(
-                f"warp_ar: nothing keeps to {self.budget_ms:g} ms here: the cheapest methods take "
-                f"{controller.measured_ms:.1f} ms and are used",
+                f"warp_ar: {self.budget_ms:g} ms cannot be kept: {controller.measured_ms:.3g} ms at least, by the "
+                "cheapest methods, which are used",
                 file=sys.stderr,
             )
 

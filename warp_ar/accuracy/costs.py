@@ -60,8 +60,6 @@ class Costs:
     """How settings that stages share multiply what methods of those stages cost more than the base's."""
     track: float = 0.0
     """Milliseconds of ``base`` that tracking takes."""
-    work: float = 0.0
-    """Milliseconds of the base's stages on one thread, by ``WORK``; on CUDA, on the device. 0 if that is not known."""
 
     def excess(self, settings: Mapping[str, str]) -> float:
         """Milliseconds per frame that settings should take more than the base."""
@@ -172,7 +170,7 @@ def measure_steps(
     for table in scales.values():
         for scale in table.values():
             scale.update({name: 1.0 + shares[name] * (ratio - 1.0) for name, ratio in scale.items()})
-    return fill_between(Costs(track + pace * work, methods, scales, track, work))
+    return fill_between(Costs(track + pace * work, methods, scales, track))
 
 
 def _scale_others(
@@ -266,32 +264,6 @@ def show_again(pipeline: Pipeline, image: Any, pose: Pose | None, index: int) ->
     return pipeline(shown, time_seconds=index * DEFAULT_FRAME_INTERVAL, pose=pose)
 
 
-def time_alone(pipeline: Pipeline, image: Any, pose: Pose | None, costs: Costs, settings: Mapping[str, str]) -> float:
-    """Milliseconds per frame that a pipeline will take, in the measure of ``costs``, found beside other work.
-
-    Args:
-        pipeline: Has lit no frame; its kernels are loaded by this too.
-        image: uint8 RGB (height, width, 3).
-        pose: Of the camera in that frame, if the scene needs it.
-        costs: What the base takes.
-        settings: That the pipeline runs; what recovery works on its own thread is taken from ``costs``.
-    """
-    if not pipeline.device.is_cpu:
-        pipeline.warm_up()
-    works: list[float] = []
-    with pipeline.scheduler.alone(WORK):
-        # As many frames as recovery wants at once: those that are shown then need not wait for it.
-        for index in range(EVERY_FRAME):
-            result = show_again(pipeline, image, pose, index)
-            stages = {name: timing.milliseconds for name, timing in result.stages.items()}
-            works.append(sum(ms for name, ms in stages.items() if name not in (TRACK, NOW_AND_THEN)))
-            if index > 0 and sum(works) > _ENOUGH_MS:
-                break
-    pace = (costs.base - costs.track) / costs.work
-    recovers = {setting: method for setting, method in settings.items() if setting == NOW_AND_THEN}
-    return costs.track + pace * min(works[1:]) + costs.excess(recovers)
-
-
 def open_profiled(
     scene: Scene, device: str, quality: Quality, size: tuple[int, int] | None, clock: Callable[[], float]
 ) -> Pipeline:
@@ -352,7 +324,7 @@ def read_costs(folder: Path, key: str, settings: Sequence[Setting]) -> Costs | N
             }
             for setting, table in kept["scales"].items()
         }
-        return Costs(float(kept["base"]), methods, scales, float(kept["track"]), float(kept["work"])) if known else None
+        return Costs(float(kept["base"]), methods, scales, float(kept["track"])) if known else None
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None  # not there, or not ours: it is measured anew
 

@@ -16,7 +16,6 @@ from warp_ar.accuracy.case_report import SAME_ERROR, SAME_TIME, CaseReport, Whol
 from warp_ar.accuracy.cases import Image
 from warp_ar.accuracy.charts import SIZE, SMALL, Point, scatter
 from warp_ar.accuracy.cost_table import SETTINGS, WORDS
-from warp_ar.accuracy.figures import Figure
 from warp_ar.accuracy.metrics import flip_map
 from warp_ar.accuracy.pictures import Box, bounding_box, crop, error_colors
 from warp_ar.accuracy.progress import Advance, ignore
@@ -293,16 +292,6 @@ def _setting_section(report: CaseReport, rows: Sequence[Row]) -> str:
     )
 
 
-def _figure_section(shown: Figure) -> str:
-    image = shown.columns[0][1]
-    picked = shown.region if shown.region is not None else np.zeros(image.shape[:2], bool)
-    text = f"<p>{html.escape(shown.text)}</p>" if shown.text else ""
-    return (
-        f"<h3>{html.escape(shown.title)}</h3>{text}"
-        f"{strip(shown.columns, shown.reference, bounding_box(picked, image.shape[:2]))}"
-    )
-
-
 def _list_section(reports: Sequence[CaseReport]) -> str:
     """Every method of every setting over all cases: the cost table itself."""
     body = []
@@ -332,18 +321,6 @@ def _list_section(reports: Sequence[CaseReport]) -> str:
         '<th style="text-align:left">what it does</th>'
         "<th>ms per frame</th><th>error</th><th>scenes</th></tr></thead>"
         f"<tbody>{''.join(body)}</tbody></table></div></section>"
-    )
-
-
-def _arithmetic_section(extra: Sequence[Mapping[str, Any]]) -> str:
-    """Rows of the bench of arithmetic: the cheap form of every sum that matters beside the stable one."""
-    keys = ("row", "size", "form", "median_ms", "error", "unit")
-    rows = ([f"{line[key]:.3g}" if isinstance(line[key], float) else str(line[key]) for key in keys] for line in extra)
-    head = ("where", "size", "form", "ms", "error", "of what")
-    return (
-        '<section id="arithmetic"><h2>Arithmetic</h2><p>Sums in which numbers of very different size meet, each in its '
-        f'cheap and in its stable form.</p><div class="card">{table(head, ((row, False) for row in rows))}</div>'
-        "</section>"
     )
 
 
@@ -382,18 +359,14 @@ def _introduction(made: Mapping[str, Any]) -> str:
 
 def render(
     reports: Sequence[CaseReport],
-    figures: Sequence[Figure],
     made: Mapping[str, Any],
-    extra: Sequence[Any] = (),
     advance: Advance = ignore,
 ) -> str:
     """The whole page.
 
     Args:
         reports: One per case.
-        figures: The paper's figures, redone.
         made: On what it was measured: ``device``, ``warp``, and what ``clock`` counts, ``time`` or ``processor time``.
-        extra: Lines of the bench of arithmetic.
         advance: Told of every section that is written.
     """
 
@@ -404,23 +377,16 @@ def render(
     anchors = [(f"case{index}", report) for index, report in enumerate(reports)]
     whole = [(anchor, report) for anchor, report in anchors if report.wholes]
     limit = REAL_TIME if _is_by_clock(made) else None
-    lines = [line for line in extra if str(line.get("case", "")).startswith("precision")]
     parts = [
         _introduction(made),
         "<nav>",
         *(f'<a href="#{anchor}">{html.escape(report.case.name)}</a>' for anchor, report in anchors),
-        '<a href="#figures">The paper\'s figures</a>' if figures else "",
         '<a href="#list">The cost table</a>',
-        '<a href="#arithmetic">Arithmetic</a>' if lines else "",
         "</nav>",
         '<div class="many">' if whole else "",
         *(told(report.case.name, _glance(report, anchor, limit)) for anchor, report in whole),
         "</div>" if whole else "",
     ]
-    if figures:
-        parts.append('<section id="figures"><h2>The paper\'s figures, redone</h2>')
-        parts += [_figure_section(shown) for shown in figures]
-        parts.append("</section>")
     parts.append(_list_section(reports))
     for anchor, report in anchors:
         parts.append(f'<section id="{anchor}"><h2>{html.escape(report.case.name)}</h2>')
@@ -428,7 +394,5 @@ def render(
         for name, rows in itertools.groupby(report.rows, lambda row: row.setting):
             parts.append(told(f"{report.case.name}: {name}", _setting_section(report, list(rows))))
         parts.append("</section>")
-    if lines:
-        parts.append(_arithmetic_section(lines))
     parts.append("</main></body></html>\n")
     return "".join(parts)
