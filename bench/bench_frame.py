@@ -1,4 +1,4 @@
-"""Whole frames: frames per second, every stage beside its floor, and scenes of one effect.
+"""Whole frames: frames per second, and the time of every stage.
 
 On CPU stages are timed by the processor time of one core, which other programs hardly disturb; frames per second by the
 clock. On CUDA stages are timed by events on the device; the whole frame is one captured graph.
@@ -7,30 +7,22 @@ clock. On CUDA stages are timed by events on the device; the whole frame is one 
 from __future__ import annotations
 
 import collections
-import contextlib
 import dataclasses
 import functools
 import itertools
 import os
 import statistics
-import tempfile
 import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Iterator
 from typing import Any
 
 import cv2
 import numpy as np
-import trimesh
 import warp as wp
 
-from bench.common import copy_bandwidth, measure, report
-from warp_ar.engine.pipeline import TRACK, Pipeline
-from warp_ar.kernels.rays.shapes import intersect_mesh
-from warp_ar.kernels.structs import FrameParams, RayScene
-from warp_ar.output.sinks import open_sink
-from warp_ar.scene import Pose, Scene, bundled_scenes, load_scene
-from warp_ar.scene.shapes import torus_mesh
+from bench.common import measure, report
+from warp_ar.engine.pipeline import Pipeline
+from warp_ar.scene import Pose, Scene, load_scene
 from warp_ar.sources.sources import open_source
 from warp_ar.stages.quality import PRESETS, Quality
 from warp_ar.tracking.tracking import Tracker
@@ -46,13 +38,9 @@ STEPS_EVERY = 10
 """One of so many frames of a stream is asked how long its steps took: that takes a third of a millisecond."""
 WRITTEN = 12
 """Frames that a stream's source has written where they are sent from."""
-LAUNCH_MS = 1.1e-3
-"""Time of one node of a graph that does nothing."""
 SIZES = {"480p": (640, 480), "1080p": (1920, 1080), "4K": (3840, 2160)}
-TRIANGLES = (1_000, 100_000, 1_000_000)
 QUALITIES = {
     "medium": PRESETS["medium"],
-    "medium, light as clipped": PRESETS["medium"].with_methods(recover="clipped"),
     "high": PRESETS["high"],
 }
 
@@ -87,87 +75,6 @@ def clip(name: str, size: tuple[int, int], count: int = CLIP_FRAMES) -> Clip:
     return Clip(scene, images, poses)
 
 
-@contextlib.contextmanager
-def count_launches() -> Iterator[list[int]]:
-    """Count kernel launches and device copies."""
-    count = [0]
-    saved = {name: getattr(wp, name) for name in ("launch", "launch_tiled", "copy")}
-
-    def counted(function: Callable[..., Any]) -> Callable[..., Any]:
-        def call(*args: Any, **kwargs: Any) -> Any:
-            count[0] += 1
-            return function(*args, **kwargs)
-
-        return call
-
-    for name, function in saved.items():
-        setattr(wp, name, counted(function))
-    try:
-        yield count
-    finally:
-        for name, function in saved.items():
-            setattr(wp, name, function)
-
-
-@wp.kernel(enable_backward=False)
-def trace_only_kernel(
-    params: wp.array[FrameParams], rays: wp.array2d[wp.vec2], scene: RayScene, depth_out: wp.array2d[wp.float32]
-):
-    """Nothing but the rays of a rectangle through the first object's mesh."""
-    i, j = wp.tid()
-    rect = params[0].object_rect
-    ray = rays[rect[0] + i, rect[2] + j]
-    shape = scene.objects[0]
-    direction = wp.transpose(shape.rotation) * (params[0].world_from_camera * wp.vec3(ray[0], ray[1], 1.0))
-    origin = wp.transpose(shape.rotation) * (params[0].camera_position - shape.position) / shape.scale
-    met = intersect_mesh(shape, origin, direction / shape.scale, 1.0e3)
-    if met.t < 1.0e3:
-        depth_out[i, j] = met.t
-
-
-def _area(rect: Any) -> int:
-    return max(int(rect[1] - rect[0]), 0) * max(int(rect[3] - rect[2]), 0)
-
-
-def floors(pipeline: Pipeline, bandwidth: float) -> dict[str, float]:
-    """Least milliseconds of each stage: its bytes over the copy bandwidth, or its rays over the rate of bare rays."""
-    width, height = pipeline.size
-    pixels, arrays = width * height, pipeline.arrays
-    params = pipeline.inputs.block.host("params")[0]
-    objects, lit = _area(params["object_rect"]), _area(params["light_rect"])
-    texels = 2 * pipeline.quality.environment_height**2
-    moved = {
-        "unwrap": 28 * texels,
-        "accumulate": 84 * texels,
-        "fill": 28 * texels,
-        "key_lights": 12 * texels,
-        "irradiance": 12 * texels,
-        "prefilter": 28 * texels,
-        "visibility": 72 * objects,
-        "summed_area": 7 * pixels,
-        "relight": 39 * lit,
-        "shade": 84 * objects,
-        "composite": 6 * pixels + 12 * lit + 16 * objects,
-        "expose": 6 * pixels + 12 * lit + 16 * objects,
-    }
-    least = {name: 1e3 * count / bandwidth for name, count in moved.items()}
-    if pipeline.scene.objects and objects and pipeline.scene.objects[0].shape == "mesh":
-        rect = params["object_rect"]
-        shape = (int(rect[1] - rect[0]), int(rect[3] - rect[2]))
-        depth = wp.zeros(shape, dtype=wp.float32, device=pipeline.device)
-        inputs = [arrays["params"], arrays["rays"], arrays["ray_scene"]]
-
-        def trace() -> None:
-            wp.launch(trace_only_kernel, shape, inputs, [depth], device=pipeline.device)
-
-        bare = statistics.median(measure({"rays": trace}, pipeline.device)["rays"])
-        covered = int((arrays["hit_object"].numpy() >= 0).sum())
-        least["visibility"] = max(least["visibility"], bare)
-        least["shade"] = max(least["shade"], bare * covered / objects)  # one shadow ray per pixel that shows an object
-        least["relight"] = max(least["relight"], bare * lit / objects * 0.5)  # half of the rectangle is lit
-    return least
-
-
 def measure_stages(pipeline: Pipeline, frames: Clip, count: int) -> dict[str, list[float]]:
     """Milliseconds of each stage in every frame after warm-up, processor time of one core on CPU."""
     scheduler = pipeline._scheduler
@@ -183,31 +90,14 @@ def measure_stages(pipeline: Pipeline, frames: Clip, count: int) -> dict[str, li
     return times
 
 
-def bench_stages(label: str, frames: Clip, device: str, quality: Quality, count: int) -> float:
-    """One line per stage; returns the sum of their medians."""
+def bench_stages(label: str, frames: Clip, device: str, quality: Quality, count: int) -> None:
+    """One line per stage, and one of the sum of their medians."""
     bands = 1 if device == "cpu" else None
     with Pipeline(frames.scene, device=device, quality=quality, bands=bands, profile=True) as pipeline:
         times = measure_stages(pipeline, frames, count)
-        launches = {}
-        if pipeline.device.is_cuda:
-            for stage, passes in pipeline._scheduler._stages:
-                with count_launches() as counted:
-                    for step in passes:
-                        if not step.on_host:
-                            step.launch(None)
-                launches[stage.name] = counted[0]
-                for index, step in enumerate(step for step in passes if not step.on_host):
-                    launch = functools.partial(step.launch, None)
-                    report(f"pass {label} {stage.name} {index}", measure({"pass": launch}, device)["pass"], device)
-        least = floors(pipeline, copy_bandwidth(device))
-        for name, values in times.items():
-            floor = least.get(name, 0.0) + LAUNCH_MS * launches.get(name, 0)
-            ratio = statistics.median(values) / floor if floor else 0.0
-            more = {"floor_ms": round(floor, 5), "ratio": round(ratio, 2), "launches": launches.get(name)}
-            report(f"stage {label} {name}", values, device, **more)
-    total = sum(statistics.median(values) for values in times.values())
-    report(f"stages {label} sum", [total], device)
-    return total
+    for name, values in times.items():
+        report(f"stage {label} {name}", values, device)
+    report(f"stages {label} sum", [sum(statistics.median(values) for values in times.values())], device)
 
 
 def bench_graph(label: str, frames: Clip, device: str, quality: Quality, count: int) -> None:
@@ -304,24 +194,6 @@ def bench_stream(label: str, pipeline: Pipeline, frames: Clip, seconds: float, s
     report(f"stream {label}", each[5:], pipeline.device, **more)
 
 
-def bench_codec(label: str, frames: Clip, device: str) -> None:
-    """What the host alone does: find the marker, encode."""
-    tracker = Tracker(frames.scene.marker, frames.scene.camera)
-    times = []
-    for index, image in enumerate(frames.images[:24]):
-        start = time.perf_counter()
-        tracker.track(image, index / 24.0)
-        times.append((time.perf_counter() - start) * 1e3)
-    report(f"host {label} track", times[3:], device)
-    with tempfile.TemporaryDirectory() as folder:
-        height, width = frames.images[0].shape[:2]
-        start = time.perf_counter()
-        with open_sink(Path(folder) / "out.mp4", fps=24.0, size=(width, height)) as sink:
-            for image in frames.images[:24]:
-                sink.write(image)
-        report(f"host {label} encode", [(time.perf_counter() - start) * 1e3 / 24], device)
-
-
 def stream_frames(pipeline: Pipeline, frames: Clip, count: int) -> Iterator[tuple[float, float]]:
     """Light frames as a live source has it: each is begun before the one ahead of it is read.
 
@@ -348,37 +220,6 @@ def bench_cpu_frames(label: str, frames: Clip, quality: Quality, count: int) -> 
     report(f"frame {label}", wall, "cpu", fps=round(fps, 1), processor_ms=round(statistics.median(cpu), 2), load=load)
 
 
-def bench_effects(device: str, count: int) -> None:
-    """What a frame costs beyond its stages, for every bundled scene."""
-    for name in bundled_scenes():
-        scene = load_scene(name)
-        frames = clip(name, (scene.camera.width, scene.camera.height), 24)
-        with Pipeline(frames.scene, device=device, bands=1) as pipeline:
-            pipeline._scheduler.clock = time.thread_time
-            whole, parts = [], []
-            for index in range(WARM_UP + count):
-                at = index % len(frames.images)
-                start = time.thread_time()
-                result = pipeline(frames.images[at], time_seconds=index / 24.0, pose=frames.poses[at])
-                whole.append((time.thread_time() - start) * 1e3)
-                parts.append(sum(t.milliseconds for stage, t in result.stages.items() if stage != TRACK))
-        beyond = [a / b - 1.0 for a, b in zip(whole[WARM_UP:], parts[WARM_UP:], strict=True)]
-        stages = [stage.name for stage, _ in pipeline.plan.stages]
-        beyond_share = round(statistics.median(beyond), 3)
-        report(f"effect {name}", whole[WARM_UP:], device, beyond_stages=beyond_share, stages=stages)
-
-
-def with_triangles(frames: Clip, count: int, folder: Path) -> Clip:
-    """The clip with a torus of about ``count`` triangles in place of its first object."""
-    tolerance = 1.0
-    while len((mesh := torus_mesh(1.6, 0.7, tolerance)).faces) < count:
-        tolerance *= 0.8
-    path = folder / f"torus_{count}.ply"
-    trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_normals=mesh.normals, process=False).export(path)
-    item = dataclasses.replace(frames.scene.objects[0], file=path, at=(0.15, 0.055, 0.03))
-    return dataclasses.replace(frames, scene=dataclasses.replace(frames.scene, objects=(item,)))
-
-
 def main(device: str) -> None:
     """Everything above; parts of it where ``WARP_AR_BENCH`` names them, separated by commas."""
     parts = set(filter(None, os.environ.get("WARP_AR_BENCH", "").split(",")))
@@ -392,8 +233,6 @@ def main(device: str) -> None:
             bench_cpu_frames("480p medium", frames, PRESETS["medium"], 60)
         if wanted("stages"):
             bench_stages("480p medium", frames, device, PRESETS["medium"], 40)
-        if wanted("effects"):
-            bench_effects(device, 24)
     else:
         for size in SIZES:
             frames = clip("desk", SIZES[size])
@@ -405,11 +244,3 @@ def main(device: str) -> None:
                     bench_graph(label, frames, device, quality, 300)
                 if wanted("stages"):
                     bench_stages(label, frames, device, quality, 200)
-            if wanted("codec"):
-                bench_codec(size, frames, device)
-        if wanted("triangles"):
-            with tempfile.TemporaryDirectory() as folder:
-                for count in TRIANGLES:
-                    many = with_triangles(clip("desk", SIZES["1080p"]), count, Path(folder))
-                    bench_graph(f"1080p {count} triangles", many, device, QUALITIES["medium, light as clipped"], 200)
-                    bench_stages(f"1080p {count} triangles", many, device, QUALITIES["medium, light as clipped"], 60)

@@ -76,6 +76,8 @@ class Controller:
         self.measured_ms: float | None = None
         """Median of the last window."""
         self.settings: dict[str, str] = dict(self._best().settings if running is None else running)
+        self._lit = self.settings
+        """Those that frames were last said to be lit by."""
 
     @property
     def choices(self) -> list[Choice]:
@@ -129,13 +131,14 @@ class Controller:
 
     def shown(self, now: float) -> None:
         """Note that frames are lit by the present settings from now on."""
-        self._held_since, self.chosen = now, True
+        self._held_since, self.chosen, self._lit = now, True, self.settings
         self.restart()
 
     def reject(self) -> None:
-        """Go back to what costs less than the present settings, for these cannot be built here."""
-        self._never, self._entry_factor = self._cost(self.settings), None
-        self.settings = dict(self._best().settings)
+        """Choose anew, for the present settings cannot be built here: half-way back to those that frames are lit by."""
+        lit, cost = self._cost(self._lit), self._cost(self.settings)
+        self._never, self._entry_factor = (0.5 * (lit + cost) if cost > 1.01 * lit else lit), None
+        self.settings = dict(self._best().settings) if self._never > lit else dict(self._lit)
         self.restart()
 
     def observe(self, milliseconds: float, now: float) -> bool:

@@ -137,7 +137,16 @@ _MATERIALS: dict[str, tuple[type[Material], tuple[str, ...]]] = {
     "phong": (PhongMaterial, ("diffuse", "specular", "shininess")),
 }
 _COLORS = ("base_color", "diffuse", "specular")
-_LIGHT_KEYS = ("kind", "weight", "at", "target", "color", "intensity", "inner_angle", "outer_angle", "radius")
+_LIGHT_SPANS: dict[str, tuple[tuple[float, ...] | None, int, float, float]] = {
+    "at": (None, 3, -100.0, 100.0),
+    "target": ((0.0, 0.0, 0.0), 3, -100.0, 100.0),
+    "color": ((1.0, 1.0, 1.0), 3, 0.0, 1e3),
+    "intensity": ((1.0,), 1, 0.0, 1e6),
+    "inner_angle": ((15.0,), 1, 0.0, 80.0),
+    "outer_angle": ((8.0,), 1, 0.01, 9.0),
+    "radius": ((0.0,), 1, 0.0, 10.0),
+}
+"""Default (None: there is none), numbers, least and most of each parameter of a light; drawn in this order."""
 RESTS = ("upright", "any")
 """How an object stands: turned about the vertical alone, or any way up; its lowest point touches the desk."""
 MOST = 64
@@ -183,31 +192,21 @@ class LightSpec:
 
     kind: str
     weight: float
-    at: Span
-    target: Span
-    color: Span
-    intensity: Span
-    inner_angle: Span
-    outer_angle: Span
-    """Degrees beyond the inner angle."""
-    radius: Span
+    spans: tuple[tuple[str, Span], ...]
+    """Parameter and what it is drawn from; the outer angle is in degrees beyond the inner one."""
 
     def draw(self, random: np.random.Generator) -> Light:
-        """One light."""
-        at, target, color = (_vector(span.draw(random)) for span in (self.at, self.target, self.color))
+        """Draw one light."""
+        drawn = {name: tuple(round(v, 6) for v in span.draw(random)) for name, span in self.spans}
+        at, target, color = (_vector(drawn[name]) for name in ("at", "target", "color"))
         intensity, inner, outer, radius = (
-            round(span.draw_one(random), 6)
-            for span in (self.intensity, self.inner_angle, self.outer_angle, self.radius)
+            drawn[name][0] for name in ("intensity", "inner_angle", "outer_angle", "radius")
         )
         if self.kind == "point":
             return Light("point", intensity, color, at=at, radius=radius)
+        end = round(inner + outer, 6)
         return Light(
-            *("spot", intensity, color),
-            at=at,
-            target=target,
-            inner_angle=inner,
-            outer_angle=round(inner + outer, 6),
-            radius=radius,
+            *("spot", intensity, color), at=at, target=target, inner_angle=inner, outer_angle=end, radius=radius
         )
 
 
@@ -254,7 +253,7 @@ def read_dataset(label: str, folder: Path, data: object) -> Dataset:
     if not isinstance(entries, list):
         table.fail("light", "expected [[dataset.light]]")
     kinds = tuple(
-        _read_light(JobTable(label, folder, f"dataset.light[{index}]", entry, _LIGHT_KEYS))
+        _read_light(JobTable(label, folder, f"dataset.light[{index}]", entry, ("kind", "weight", *_LIGHT_SPANS)))
         for index, entry in enumerate(entries)
     )
     region = table.data.get("region")
@@ -331,22 +330,12 @@ def _read_material(outer: JobTable, data: object) -> MaterialSpec:
 
 
 def _read_light(table: JobTable) -> LightSpec:
-    kind = table.choice("kind", ("spot", "point"), "spot")
-
-    def fixed(*values: float) -> Span:
-        return Span(values, values)
-
-    return LightSpec(
-        kind=kind,
-        weight=table.number("weight", 1.0, low=0.0, high=1e6),
-        at=table.span("at", None, 3, low=-100.0, high=100.0),
-        target=table.span("target", fixed(0.0, 0.0, 0.0), 3, low=-100.0, high=100.0),
-        color=table.span("color", fixed(1.0, 1.0, 1.0), 3, low=0.0, high=1e3),
-        intensity=table.span("intensity", fixed(1.0), low=0.0, high=1e6),
-        inner_angle=table.span("inner_angle", fixed(15.0), low=0.0, high=80.0),
-        outer_angle=table.span("outer_angle", fixed(8.0), low=0.01, high=9.0),
-        radius=table.span("radius", fixed(0.0), low=0.0, high=10.0),
+    spans = tuple(
+        (name, table.span(name, None if default is None else Span(default, default), size, low=low, high=high))
+        for name, (default, size, low, high) in _LIGHT_SPANS.items()
     )
+    weight = table.number("weight", 1.0, low=0.0, high=1e6)
+    return LightSpec(table.choice("kind", ("spot", "point"), "spot"), weight, spans)
 
 
 def _fixed(
