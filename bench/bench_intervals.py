@@ -1,4 +1,4 @@
-"""Whether the intervals that calibrations state hold the truth: ``python -m bench intervals``.
+"""True if the intervals that calibrations state hold the truth: ``python -m bench intervals``.
 
 A hundred random set-ups each: cameras (focal length, axis, lens, noise, hand that holds the card), responses (gamma,
 S, printer, light) and mirror balls (camera, lens, room, radius, place on the cross, way of the film). An interval of

@@ -113,7 +113,7 @@ def compare(name: str, single: NDArray[Any], merged: NDArray[Any], lower_bound: 
 
 
 def tells(merged: NDArray[Any]) -> bool:
-    """Whether a bracket's light, (h, 2 h, 3) in a photograph's camera values, is above where that clips."""
+    """Return whether a bracket's light, (h, 2 h, 3) in a photograph's camera values, is above where that clips."""
     return float(merged.max()) > BRIGHTER / REFLECTANCE
 
 

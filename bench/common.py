@@ -174,7 +174,7 @@ class KeptLines:
         path.write_text("".join(json.dumps(record) + "\n" for record in self.records), encoding="utf-8")
 
     def has(self, **key: Any) -> bool:
-        """Whether a record with these values is kept."""
+        """Return whether a record with these values is kept."""
         return any(all(record.get(name) == value for name, value in key.items()) for record in self.records)
 
     def add(self, record: Mapping[str, Any]) -> None:

@@ -437,7 +437,7 @@ class Reading:
     methods: Mapping[str, str]
     """What it changes of the preset ``paper``."""
     video: bool = False
-    """Whether everything is computed in video values, as if the camera were linear."""
+    """True if everything is computed in video values, as if the camera were linear."""
 
 
 _BLEND = "what the multiplicative factor is taken from"
@@ -481,7 +481,7 @@ def compare_readings(
 
 
 def _matters(reading: Reading, case: Case) -> bool:
-    """Whether a case can tell a reading from others."""
+    """Return whether a case can tell a reading from others."""
     if reading.section == "4.3":
         return case.darker
     return bool(case.scene.objects if reading.section == "3.1" else case.scene.lights) and not case.darker

@@ -71,7 +71,7 @@ class Block:
     """Degrees about the upright axis."""
     color: Array
     modelled: bool
-    """Whether the program is told of it."""
+    """True if the program is told of it."""
 
     @property
     def rotation(self) -> Array:

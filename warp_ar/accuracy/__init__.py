@@ -1,1 +1,1 @@
-"""What accuracy costs: errors, times, the budget that a quality keeps, and the report of both."""
+"""Accuracy and its cost: errors, times, the budget that a quality keeps, and the report of both."""

@@ -51,7 +51,7 @@ T = TypeVar("T")
 
 
 class _OfTheLatest(Generic[T]):
-    """What the pipeline that lights the next frame says of itself."""
+    """A property of the pipeline that lights the next frame."""
 
     def __init__(self, get: Callable[[Pipeline], T]) -> None:
         self._get = get
@@ -228,7 +228,7 @@ class AutoPipeline(Closing):
             )
 
     def status(self) -> dict[str, Any]:
-        """What was chosen, what it should cost and err, and every change, as plain data."""
+        """Return the choice, its expected cost and error, and every change, as plain data."""
         controller = self._controller
         if controller is None:
             return {"budget_ms": self.budget_ms, "changes": []}

@@ -80,7 +80,7 @@ class CaseReport:
 
 
 def is_complete(case: Case, settings: Sequence[Setting]) -> bool:
-    """Whether everything that a case can turn is turned: only then are equal time and equal error looked for."""
+    """Return whether everything that a case can turn is turned: only then are equal time and equal error looked for."""
     return {setting.name for setting in settings_of(case)} == {setting.name for setting in settings}
 
 

@@ -40,13 +40,13 @@ class Case:
     frames: tuple[Frame, ...]
     poses: tuple[Pose | None, ...]
     truth: Mapping[int, Image]
-    """What the camera would have seen, by frame; empty where that is not known."""
+    """Pictures that the camera would have taken, by frame; empty where that is not known."""
     regions: Mapping[int, Mask] = dataclasses.field(default_factory=dict)
     """Pixels that anything virtual changes, or that clip, where the truth says so."""
 
     @property
     def darker(self) -> bool:
-        """Whether what matters is what clips: at another exposure all else is scaled, and errs by rounding alone."""
+        """Return whether only clipped pixels matter: at another exposure all others are scaled, to rounding."""
         return is_darker(self.scene)
 
     @property
@@ -132,7 +132,7 @@ def _complete(scene: Scene, camera: Image, truth: Image) -> tuple[Image, Mask]:
 
 
 def is_darker(scene: Scene) -> bool:
-    """Whether a scene asks for a shorter exposure and nothing else that the frame does not show."""
+    """Return whether a scene asks for a shorter exposure and nothing else that the frame does not show."""
     scale = scene.exposure.scale
     return not isinstance(scale, str) and scale < 1.0 and not scene.objects and not scene.lights
 

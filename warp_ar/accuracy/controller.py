@@ -70,7 +70,7 @@ class Controller:
         self._never = math.inf
         """Milliseconds from which on nothing can be built."""
         self.chosen = running is None
-        """Whether the first choice has been made."""
+        """True if the first choice has been made."""
         self.fits = True
         """False: frames take longer than the budget, and no settings are known to take less."""
         self.measured_ms: float | None = None

@@ -1,4 +1,4 @@
-"""What a quality can turn, what each turn costs and how far off it is, and what to choose for a budget.
+"""Settings of a quality, the cost and the error of each, and the choice for a budget.
 
 A **setting** is a stage with several methods, or a number or way of ``Quality`` that several stages share. A **cost**
 is what one method of one setting costs in milliseconds and errs in FLIP. Both add up over stages: costs because stages
@@ -53,7 +53,7 @@ class Setting:
 
     @property
     def converges(self) -> bool:
-        """Whether its methods approximate one object, which the last of them gives; others are models of their own."""
+        """Return whether its methods approximate the last of them; others are models of their own."""
         return self.name in _SHARED or any(stage.converges for stage in STAGES if stage.name == self.name)
 
 
@@ -110,7 +110,7 @@ WORDS: Mapping[str, tuple[str, Mapping[str, str]]] = {
     **_SHARED,
     **{stage.name: (stage.subject, stage.methods) for stage in _CHOICES},
 }
-"""What every setting and every method is, for tables."""
+"""Descriptions of every setting and every method, for tables."""
 NUMBERS = ("environment_height", "edge_samples")
 """Settings that are numbers of ``Quality``, not methods."""
 

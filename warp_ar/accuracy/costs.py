@@ -1,4 +1,4 @@
-"""What every method costs on this device: measured on one frame, and kept in the user's cache folder.
+"""The cost of every method on this device: measured on one frame, and kept in the user's cache folder.
 
 Costs depend on the device and on the scene. They are measured one setting at a time from a base, and hold together by
 what settings share: a method's milliseconds more than the base's are multiplied where another setting gives its stage
@@ -33,7 +33,7 @@ from warp_ar.stages.recover import EVERY_FRAME
 from warp_ar.tracking.tracking import Tracker
 
 BASE = PRESETS["medium"]
-"""What costs are measured from, and what runs until something is chosen."""
+"""Preset that costs are measured from, and that runs until something is chosen."""
 MEASURED_FRAMES = 6
 """Frames that tell what a method costs."""
 _WARM_UP = 1
@@ -50,14 +50,14 @@ _CACHE_FILE = "costs.json"
 
 @dataclasses.dataclass(frozen=True)
 class Costs:
-    """What a device takes for a scene."""
+    """The times of a device for a scene."""
 
     base: float
     """Milliseconds per frame of the preset that methods were measured from, tracking included."""
     methods: Mapping[str, Mapping[str, float]]
     """By setting and method: milliseconds per frame more than the base takes."""
     scales: Scales = dataclasses.field(default_factory=dict)
-    """How settings that stages share multiply what methods of those stages cost more than the base's."""
+    """Factors by which settings that stages share multiply the excess costs of methods of those stages."""
     track: float = 0.0
     """Milliseconds of ``base`` that tracking takes."""
 
@@ -281,7 +281,7 @@ def worked_ms(seconds: float, clock: Callable[[], float]) -> float:
 
 
 def cost_key(plan: Plan, device: Any, settings: Sequence[Setting]) -> str:
-    """What costs depend on: device and cores, versions, what the scene calls for, the frames' size, the methods."""
+    """Return a digest of all that costs depend on: device, versions, stages, scene, the frames' size, the methods."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     scene = plan.request.scene
     parts = [

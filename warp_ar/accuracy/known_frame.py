@@ -30,9 +30,9 @@ class KnownFrame:
     scene: Scene
     """With its camera at the frame's size."""
     image: Image
-    """What the camera saw."""
+    """The camera's picture."""
     lit: Image
-    """What the pipeline made of it."""
+    """The pipeline's picture."""
     pose: Pose
     """``camera_from_world``."""
     light: Light
@@ -158,7 +158,7 @@ def light_up_to(
 
 
 def _known_frame(pipeline: Pipeline, frame: Frame, result: Result, seconds: float, where: str) -> KnownFrame:
-    """What is known of the frame that a pipeline lit last, ``seconds`` after the first.
+    """Return the data of the frame that a pipeline lit last, ``seconds`` after the first.
 
     Raises:
         SourceError: It is not shown, or shows no marker; ``where`` names it.

@@ -1,4 +1,4 @@
-"""How far one result is from another: numbers for arrays, FLIP for pictures.
+"""Distances between results: numbers for arrays, FLIP for pictures.
 
 Errors of arrays are relative to the reference's own size, so that they compare across scenes and exposures:
 
@@ -46,7 +46,7 @@ _kept_maps: collections.OrderedDict[bytes, npt.NDArray[np.float32]] = collection
 
 @dataclasses.dataclass(frozen=True)
 class ArrayError:
-    """What separates an array from its reference."""
+    """Distances of an array from its reference."""
 
     relative_rmse: float
     """Root mean square error over root mean square of the reference."""

@@ -31,7 +31,7 @@ def error_colors(errors: npt.NDArray[Any]) -> Image:
 
 
 def bounding_box(region: npt.NDArray[np.bool_], shape: tuple[int, int]) -> Box:
-    """Where a region lies, a little wider, in the shape of a crop and inside the picture; all of it if it is empty."""
+    """Return the box of a region, widened to the shape of a crop inside the picture; all of it where it is empty."""
     height, width = shape
     rows, columns = np.nonzero(region)
     if len(rows) == 0:

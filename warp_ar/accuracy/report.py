@@ -1,4 +1,4 @@
-"""What was measured of cases, as tables in a terminal, JSON lines and the cost table."""
+"""Measurements of cases, as tables in a terminal, JSON lines and the cost table."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from warp_ar.stages.quality import PRESETS, Quality
 
 Clock = Callable[[], float]
 BASE = PRESETS["high"]
-"""What the other settings stay on while one is turned."""
+"""Preset of all settings but the one that is turned."""
 WARM_UP = 3
 """Frames that are not timed: modules load, caches fill."""
 TIMED = 5
@@ -44,7 +44,7 @@ _OUTPUT = {
     "area_light": "added_light",
     "expose": "image",
 }
-"""What a setting's stage writes; settings that are not here change the size of what is written."""
+"""Output of a setting's stage; settings that are not here change the size of what is written."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Outcome:
     stages: Mapping[str, float]
     """Median milliseconds of every stage, the marker's tracking left out."""
     output: npt.NDArray[Any] | None
-    """What the setting's stage had written at the end."""
+    """Output of the setting's stage at the end."""
 
     @property
     def milliseconds(self) -> float:
@@ -193,7 +193,7 @@ def run_in_turn(
 
 
 def _read_output(pipeline: Pipeline, setting: Setting) -> npt.NDArray[Any] | None:
-    """What the setting's stage has written, in a form that all its methods share."""
+    """Return the output of the setting's stage, in a form that all its methods share."""
     name = _OUTPUT.get(setting.name)
     if name is None:
         return None

@@ -57,7 +57,7 @@ class Row:
     apart: float = 0.0
     """The same against the picture at the last method."""
     error: float = 0.0
-    """What counts: ``apart`` where the setting converges or no truth is known, else ``flip`` above the best
+    """Error that counts: ``apart`` where the setting converges or no truth is known, else ``flip`` above the best
     method's."""
     dominated: bool = False
     """Another method costs no more and errs no more."""
@@ -173,7 +173,7 @@ def count_work(case: Case, outcomes: dict[str, Outcome], device: str, clock: Clo
 
 
 def _is_dominated(row: Row, rows: Sequence[Row]) -> bool:
-    """Whether another method costs no more and errs no more, in the picture and in what the stage writes.
+    """Return whether another method costs no more and errs no more, in the picture and in what the stage writes.
 
     What measurements cannot tell apart counts as equal; of equals the first in the methods stays.
     """

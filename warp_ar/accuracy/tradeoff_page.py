@@ -330,7 +330,7 @@ def page_units(settings: Iterable[int]) -> float:
 
 
 def _is_by_clock(made: Mapping[str, Any]) -> bool:
-    """Whether milliseconds are those of the clock, not of processors."""
+    """Return whether milliseconds are those of the clock, not of processors."""
     return bool(made.get("clock", "time") == "time")
 
 

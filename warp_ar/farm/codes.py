@@ -42,7 +42,7 @@ class DecodedPicture:
 
 
 def can_convert(picture: Any) -> bool:
-    """Whether a device can convert PyAV's picture to RGB as the host does."""
+    """Return whether a device can convert PyAV's picture to RGB as the host does."""
     size = picture.height, picture.width
     known = picture.format.name in (*_PLANAR, INTERLEAVED) and matrix_of(picture) is not None
     return known and not picture.rotation and min(size) >= LEAST_SIZE and not any(n % 2 for n in size)
@@ -129,7 +129,7 @@ class DeviceVideo:
             wp.load_module("warp_ar.kernels.picture.video_color", device)
         self._count = 0
         self.left = True
-        """Whether chroma of pictures that are sent lies at the left one of two columns, else between them."""
+        """True if chroma of pictures that are sent lies at the left one of two columns, else between them."""
 
     def send(self, decoded: DecodedPicture) -> Any:
         """RGB of a picture on the device, (height, width) of ``wp.vec3ub``; the next one overwrites it."""
@@ -190,7 +190,7 @@ class DeviceVideo:
         return False
 
     def _are_codes_of(self, picture: av.VideoFrame, image: npt.NDArray[np.uint8]) -> bool:
-        """Whether the host makes the same codes of a picture in RGB."""
+        """Return whether the host makes the same codes of a picture in RGB."""
         tick = fractions.Fraction(1, 30)
         source = av.VideoFrame.from_ndarray(image, format="rgb24")
         source.pts, source.time_base = 0, tick

@@ -1,4 +1,4 @@
-"""What ``[dataset]`` of a job file says, and the scene of each variation, drawn from a seed.
+"""The table ``[dataset]`` of a job file, and the scene of each variation, drawn from a seed.
 
 Objects, materials, lights and exposures have distributions. A variation's random numbers come from (seed, number of the
 clip, number of the variation) alone: which worker draws it, and when, changes nothing. Objects stand on the receiver,
@@ -148,7 +148,7 @@ _LIGHT_SPANS: dict[str, tuple[tuple[float, ...] | None, int, float, float]] = {
 }
 """Default (None: there is none), numbers, least and most of each parameter of a light; drawn in this order."""
 RESTS = ("upright", "any")
-"""How an object stands: turned about the vertical alone, or any way up; its lowest point touches the desk."""
+"""Ways in which an object stands: turned about the vertical alone, or any way up; its lowest point touches the desk."""
 MOST = 64
 """Objects, or lights, of a picture."""
 
@@ -182,7 +182,7 @@ class ObjectSpec:
     rest: str
     """One of ``RESTS``."""
     weight: float
-    """How often it is chosen, against the others."""
+    """Weight with which it is chosen, against the others."""
     material: MaterialSpec
 
 
@@ -212,7 +212,7 @@ class LightSpec:
 
 @dataclasses.dataclass(frozen=True)
 class Dataset:
-    """What ``[dataset]`` says."""
+    """The values of ``[dataset]``."""
 
     variations: int
     """Of each clip."""
@@ -423,7 +423,7 @@ class Drawn:
 
 @dataclasses.dataclass(frozen=True)
 class Receiver:
-    """Where objects of a clip may stand."""
+    """The area on which objects of a clip may stand."""
 
     height: float
     """z of the receiver in metres."""
@@ -464,7 +464,7 @@ def draw_variation(base: Scene, dataset: Dataset, clip: int, variation: int, pos
 
 @dataclasses.dataclass(frozen=True)
 class _Chosen:
-    """What is drawn first of a variation."""
+    """The first draws of a variation."""
 
     kinds: list[int]
     """Of its objects, numbers in the catalogue; some may find no place."""
@@ -599,7 +599,7 @@ def local_points(item: Object) -> Points:
 
 
 def receiver_of(scene: Scene, dataset: Dataset) -> Receiver:
-    """Where objects may stand: on the first level plane that is modelled, or at the marker's height."""
+    """Return the area on which objects may stand: the first level plane that is modelled, or the marker's."""
     plane = next((p for p in scene.proxies if p.shape == "plane" and _is_level(p)), None)
     height = 0.0 if plane is None else plane.at[2]
     region = dataset.region
@@ -648,7 +648,7 @@ def _inflated(outline: Points, margin: float) -> Points:
 
 
 def _overlap(a: Points, b: Points) -> bool:
-    """Whether two convex outlines overlap: no side of either separates them."""
+    """Return whether two convex outlines overlap: no side of either separates them."""
     for outline, other in ((a, b), (b, a)):
         side = np.roll(outline, -1, 0) - outline
         normal = np.stack([side[:, 1], -side[:, 0]], -1)
@@ -675,7 +675,7 @@ def _box(points: Points) -> Points:
 
 
 def _is_in_view(scene: Scene, poses: Sequence[Pose], points: Points) -> bool:
-    """Whether the middle of an object is in the picture of at least half of the cameras."""
+    """Return whether the middle of an object is in the picture of at least half of the cameras."""
     if not poses:
         return True
     middle = 0.5 * (points.min(0) + points.max(0))[None]
@@ -685,7 +685,7 @@ def _is_in_view(scene: Scene, poses: Sequence[Pose], points: Points) -> bool:
 
 
 def _hides(scene: Scene, poses: Sequence[Pose], marker: Sequence[Points | None], points: Points) -> bool:
-    """Whether an object, taken for the box around it, may hide the marker from one of the cameras."""
+    """Return whether an object, taken for the box around it, may hide the marker from one of the cameras."""
     corners = _box(points)
     for pose, seen in zip(poses, marker, strict=False):
         pixels = _project(scene, pose, corners)

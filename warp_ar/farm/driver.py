@@ -100,7 +100,7 @@ class Driver:
             )
 
     def _is_done(self, job: Job) -> bool:
-        """Whether a job's outputs are there and whole; a line without them, or they without a line, are put right."""
+        """Return whether a job's outputs are there and whole; a manifest that says otherwise is put right."""
         key, place = job.key(self._jobs), self._folder / job.place(self._jobs)
         line = self._manifest.done.get(key)
         record = line if job.kind in ("join", "index") else record_at(place, key)

@@ -28,14 +28,14 @@ CONVERTERS = 2
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FrameIndex:
-    """Where the frames of a recording stand in time."""
+    """Time stamps of the frames of a recording."""
 
     ticks: npt.NDArray[np.int64]
     """Time stamp of every frame, (n,), growing."""
     tick: fractions.Fraction
     """Seconds of a tick."""
     seekable: bool
-    """Whether the time stamps are those of the file, so that a reader can go to one."""
+    """True if the time stamps are those of the file, so that a reader can go to one."""
 
     @property
     def length(self) -> int:

@@ -29,16 +29,16 @@ LIGHTS = ("follow", "fixed", "preroll")
 clip's end, or by what each segment finds for itself from some frames before it on."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 DECODERS = ("cpu", "gpu")
-"""What decodes recordings: the processor, or the GPU's decoding unit where it has one for their coding."""
+"""Decoders of recordings: the processor, or the GPU's decoding unit where it has one for their coding."""
 AS_RECORDED = "recorded"
-"""What recordings are written in, of ``CODINGS`` and this one: as deep as they came."""
+"""Coding beside ``CODINGS`` that recordings are written in: as deep as they came."""
 _RUN_KEYS = ("quality", "light", "segment_frames", "preroll", "decode", "coding", "digests")
 _CLIP_KEYS = ("name", "scene", "path", "light", "calibration", "frames")
 
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """What holds for all clips."""
+    """Settings of all clips."""
 
     quality: str = DEFAULT_PRESET
     """A preset's name."""
@@ -53,7 +53,7 @@ class Settings:
     coding: str = AS_RECORDED
     """Of what is written: one of ``CODINGS``, or ``AS_RECORDED``."""
     digests: bool = False
-    """Whether digests of recordings' pictures are kept, as they were before they were encoded."""
+    """True if digests of recordings' pictures are kept, as they were before they were encoded."""
 
     def gpu_of(self, device: str) -> int | None:
         """Number of the GPU that decodes for a worker on a device; None: the processor does."""
@@ -82,7 +82,7 @@ class Clip:
 
 @dataclasses.dataclass(frozen=True)
 class JobFile:
-    """What a job file says."""
+    """The contents of a job file."""
 
     settings: Settings
     clips: tuple[Clip, ...]
@@ -112,7 +112,7 @@ class Job:
         return f"{name}/{self.kind}" + (f"-{self.number:06d}" if self.kind in ("segment", "variation") else "")
 
     def place(self, jobs: JobFile) -> Path:
-        """Where its result lies, relative to the run's folder: a folder, or the last file of several."""
+        """Return the place of its result, relative to the run's folder: a folder, or the last file of several."""
         name = jobs.clips[self.clip].name
         match self.kind:
             case "survey":
@@ -128,7 +128,7 @@ class Job:
 
 
 def jobs_of_clip(jobs: JobFile, clip: int, length: int) -> int:
-    """How many segments or variations a clip has.
+    """Return the number of segments or variations of a clip.
 
     Args:
         jobs: The job file.
@@ -197,7 +197,7 @@ def _resolved(label: str, folder: Path, index: int, clip: object) -> list[dict[s
 
 
 def parse_jobs(data: dict[str, Any], label: str) -> JobFile:
-    """What ``read_jobs`` read, checked: every scene is loaded, every file looked for.
+    """Check what ``read_jobs`` read: every scene is loaded, every file looked for.
 
     Args:
         data: Of the file.
@@ -343,7 +343,7 @@ def inputs_of(jobs: JobFile, clip: int) -> list[Path]:
 
 @dataclasses.dataclass(frozen=True)
 class Context:
-    """What all jobs of a run share."""
+    """Data that all jobs of a run share."""
 
     jobs: JobFile
     folder: Path
@@ -356,14 +356,14 @@ class Context:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """What became of a job."""
+    """The result of a job."""
 
     state: str
     """``done``, ``failed``, or ``full``: the disk is."""
     values: dict[str, Any] = dataclasses.field(default_factory=dict)
     """Of the manifest's line."""
     reason: str = ""
-    """What went wrong, on one line."""
+    """The error, on one line."""
 
 
 _LIBRARIES = ("warp-lang", "numpy", "opencv-contrib-python-headless", "av")

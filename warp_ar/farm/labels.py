@@ -1,4 +1,4 @@
-"""What is known of every picture of a data set, in the folders and files of BOP, with a COCO file beside them.
+"""Labels of every picture of a data set, in the folders and files of BOP, with a COCO file beside them.
 
 A variation is a BOP scene: ``rgb``, ``depth``, ``mask`` (whole silhouettes) and ``mask_visib``, ``scene_gt.json``,
 ``scene_gt_info.json`` and ``scene_camera.json``; beside them ``normals``, ``scene_light.json`` (the light of each
@@ -116,7 +116,7 @@ class LabelWriter:
         self._tables["gt_info"][str(number)] = infos
 
     def _trace(self, pipeline: Pipeline) -> npt.NDArray[np.uint64]:
-        """Which objects are behind each pixel."""
+        """Return the objects behind each pixel, a bit each."""
         arrays = pipeline.arrays
         with exclusive(pipeline.device), wp.ScopedDevice(pipeline.device):
             if self._masks is None:
@@ -224,7 +224,7 @@ class LabelWriter:
 
 
 def categories(catalogue: Sequence[ObjectSpec]) -> list[dict[str, Any]]:
-    """What labels mean, as COCO has it."""
+    """Return the categories of labels, as COCO has them."""
     return [{"id": index + 1, "name": spec.name, "supercategory": "object"} for index, spec in enumerate(catalogue)]
 
 
@@ -443,7 +443,7 @@ and by virtual lights. Labels come from the geometry that was rendered; nobody d
 def _datasheet(
     jobs: JobFile, dataset: Dataset, places: Sequence[Path], counts: collections.Counter[str], version: str
 ) -> str:
-    """What the data set is, how it was made, and what it is not."""
+    """Return the datasheet: contents, making and limits of the data set."""
     rows = (
         f"| {number} | {spec.name} | {spec.item.shape} | {counts[f'category {number}']} |"
         for number, spec in enumerate(dataset.catalogue, 1)

@@ -1,4 +1,4 @@
-"""How a worker lights the frames of a job: pipelines that are kept between jobs, and what they are given."""
+"""Lighting of the frames of a job: pipelines that are kept between jobs, and their inputs."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ class Lighter(Closing):
         self._videos.clear()
 
     def survey(self, clip: int) -> Survey:
-        """What the survey of a clip found."""
+        """Return the survey of a clip."""
         if self._survey is None or self._survey[0] != clip:
             self._survey = clip, Survey(self._folder / Job("survey", clip).place(self._jobs))
         return self._survey[1]
@@ -180,7 +180,7 @@ class Lighter(Closing):
                 yield Lit(frame, pose, call(frame.deepest, time_seconds=frame.time, pose=pose), pipeline)
 
     def _may_convert(self, job: Job) -> bool:
-        """Whether the device may convert a job's pictures.
+        """Return whether the device may convert a job's pictures.
 
         Not where light is gathered from them, or markers that something rides on are looked for: that is done with the
         host's picture.
@@ -223,7 +223,7 @@ class Lighter(Closing):
         return Lit(frame, pose, result, pipeline, video.fetch(picture), kept)
 
     def _video_for(self, first: Frame) -> DeviceVideo | None:
-        """What converts a job's pictures, by its first one; None: the device does not convert it as the host does."""
+        """Return the converter of a job's pictures, by its first one; None: the host converts it otherwise."""
         decoded: Any = first.image
         if not isinstance(decoded, DecodedPicture):
             return None

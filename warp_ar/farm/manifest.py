@@ -1,4 +1,4 @@
-"""What has been done, kept so that nothing is lost and nothing done twice.
+"""The record of a run, kept so that nothing is lost and nothing done twice.
 
 ``manifest.jsonl`` has one line for each job that is done or has failed for good, and one for each try that failed. A
 line is appended by one write and synchronised; a line that a crash cut off is cut away when the file is opened again.
@@ -42,7 +42,7 @@ class RunError(WarpArError):
 
 
 def is_no_space(error: BaseException | None) -> bool:
-    """Whether an error, or what caused it, is a full disk."""
+    """Return whether an error, or what caused it, is a full disk."""
     while error is not None:
         if getattr(error, "errno", None) in _NO_SPACE:
             return True
@@ -171,7 +171,7 @@ def _kept(path: Path) -> bytes | None:
 
 
 def read_kept(path: Path) -> dict[str, Any] | None:
-    """What a run keeps as one JSON object; None where there is none, or it is damaged."""
+    """Return a JSON object that a run keeps; None where there is none, or it is damaged."""
     with contextlib.suppress(RunError, ValueError):
         told = parse_json((_kept(path) or b"").decode(), str(path), RunError)
         return told if isinstance(told, dict) else None
@@ -201,7 +201,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def is_locked(folder: Path) -> bool | None:
-    """Whether a driver has a run, whatever the clocks say; None where the folder does not let that be found out."""
+    """Return whether a driver has a run, whatever the clocks say; None where the folder does not tell."""
     if not (folder / LOCK).exists():
         return False
     try:
@@ -236,7 +236,7 @@ def begin_run(folder: Path, data: dict[str, Any], version: str) -> None:
 
 
 def load_run(folder: Path) -> tuple[dict[str, Any], str]:
-    """What a run is to do, and the version that began it.
+    """Return the jobs of a run, and the version that began it.
 
     Raises:
         UsageError: There is no run in the folder.
@@ -375,7 +375,7 @@ STALE_SECONDS = 15.0
 
 
 def read_status(folder: Path) -> dict[str, Any]:
-    """What is done, what has failed, and what is being done.
+    """Return jobs that are done, that have failed, and that are being done.
 
     Raises:
         UsageError: There is no run.
@@ -407,7 +407,7 @@ def read_status(folder: Path) -> dict[str, Any]:
 
 
 def _is_progress(told: dict[str, Any]) -> bool:
-    """Whether a driver's word of where things stand is whole."""
+    """Return whether a driver's word of where things stand is whole."""
 
     def is_number(value: object) -> bool:
         return isinstance(value, int | float) and math.isfinite(value)
@@ -427,7 +427,7 @@ def _is_progress(told: dict[str, Any]) -> bool:
 
 
 def _is_running(folder: Path, progress: dict[str, Any]) -> bool:
-    """Whether a driver is at work: by its lock, and where that cannot be asked for by when it was last heard of."""
+    """Return whether a driver is at work: by its lock, else by the time of its last word."""
     locked = is_locked(folder)
     if locked is None:
         return not progress.get("ended") and abs(time.time() - float(progress.get("time", 0))) < STALE_SECONDS

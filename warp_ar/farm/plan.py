@@ -22,7 +22,7 @@ FRAMES = 16
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """What a run would take, on workers that are all as fast as the one that was tried."""
+    """The time and space of a run, on workers that are all as fast as the one that was tried."""
 
     clips: int
     jobs: int

@@ -74,7 +74,7 @@ that does not compress."""
 
 
 class Survey:
-    """What a survey found; maps are read when they are asked for."""
+    """The result of a survey; maps are read when they are asked for."""
 
     def __init__(self, folder: Path) -> None:
         """Open the survey of a folder.
@@ -101,7 +101,7 @@ class Survey:
             raise SourceError(f"{self._path} cannot be read: {reason(error)}; remove its folder and resume") from error
 
     def pose(self, frame: int) -> Pose | None:
-        """Where the camera stood; None where the marker was lost."""
+        """Return the camera's pose; None where the marker was lost."""
         row = self.poses[frame]
         return None if np.isnan(row[0]) else Pose(row[:9].reshape(3, 3), row[9:])
 
@@ -204,7 +204,7 @@ def survey_clip(jobs: JobFile, clip: int, folder: Path, device: str) -> dict[str
 
 @dataclasses.dataclass
 class _Look:
-    """What is gathered while frames flow."""
+    """Poses and light, gathered while frames flow."""
 
     jobs: JobFile
     scene: Scene
@@ -221,7 +221,7 @@ class _Look:
 
     @property
     def captures(self) -> bool:
-        """Whether the light is the frames' own, not a file's."""
+        """Return whether the light is the frames' own, not a file's."""
         return self.scene.captured is None and has_environment(self.scene)
 
     def take(self, frame: int, result: Result, writer: _Writer) -> None:

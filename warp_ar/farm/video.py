@@ -46,7 +46,7 @@ _LANGUAGES = ("language", "title", "handler_name")
 
 
 def part_encoding(coding: str = "8bit") -> Encoding:
-    """How segments are encoded: H.264 in 8 bits, else H.265; the same bytes on every machine.
+    """Return the encoding of segments: H.264 in 8 bits, else H.265; the same bytes on every machine.
 
     Args:
         coding: One of ``CODINGS``.

@@ -1,4 +1,4 @@
-"""What a worker does with a job, in whatever process or actor it runs: files in, files out, a record back."""
+"""A worker's jobs, in whatever process or actor it runs: files in, files out, a record back."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from warp_ar.scene import SourceSpec, dumps_scene
 PART = "frames.mp4"
 """A segment's frames."""
 DIGESTS = ".sha256"
-"""What the file of pictures' digests is called after its video: a line each, in hexadecimal digits."""
+"""Ending of the file of pictures' digests: a line each, in hexadecimal digits."""
 
 LEAST_FREE = 1 << 20
 """Bytes below which a disk is full, whatever a library says of its failure."""
