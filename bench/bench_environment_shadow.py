@@ -12,7 +12,7 @@ from warp_ar.engine.pipeline import Pipeline
 from warp_ar.scene import load_scene
 from warp_ar.sources.sources import open_source
 from warp_ar.stages.quality import PRESETS
-from warp_ar.stages.shared.shadow_methods import METHODS
+from warp_ar.stages.shared.environment_sets import METHODS
 
 CASES = tuple((scene, method) for scene in ("torus", "mirror") for method in METHODS if method != "brute_force")
 

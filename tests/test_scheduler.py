@@ -450,13 +450,6 @@ def test_a_pass_waits_for_what_it_reads(monkeypatch: pytest.MonkeyPatch) -> None
     assert (found["d0"], found["d1"], found["d2"]) == (set(), {"c0", "d0"}, {"a0", "d1"})
 
 
-def test_a_pass_may_run_beside_the_one_before(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = launch_order(monkeypatch, a=[{}, {"beside_last": True}, {}], c=[{}, {"beside_last": True}])
-    assert (found["a0"], found["a1"], found["a2"]) == (set(), set(), {"a0", "a1"})
-    assert found["b0"] == {"a2"}
-    assert found["d0"] == {"a2", "c0", "c1"}
-
-
 def test_what_is_done_beforehand_leaves_the_graph_whole() -> None:
     """The same graph serves frames with it and without; a step of the host between launches cuts it."""
     first, second = (types.SimpleNamespace(name=name) for name in ("first", "second"))

@@ -12,7 +12,7 @@ from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import UsageError
 from warp_ar.scene import load_scene
 from warp_ar.sources.sources import open_source
-from warp_ar.stages.shared import variants
+from warp_ar.stages.shared import lighting
 
 
 @pytest.mark.parametrize(("name", "quality"), [("wire_coincident", "low"), ("torus", "medium")])
@@ -23,7 +23,7 @@ def test_a_shared_kernel_gives_the_same_picture(monkeypatch: pytest.MonkeyPatch,
         images = [frame.image.copy() for frame in itertools.islice(source, 3)]
     lit = []
     for shared in (True, False):
-        monkeypatch.setattr(variants, "shares_kernels", lambda device, shared=shared: shared)
+        monkeypatch.setattr(lighting, "shares_kernels", lambda device, shared=shared: shared)
         for stage in ("mirror_ball", "unwrap"):
             monkeypatch.setattr(f"warp_ar.stages.{stage}.shares_kernels", lambda device, shared=shared: shared)
         with Pipeline(scene, device="cpu", quality=quality, estimates="synchronous") as pipeline:
@@ -34,11 +34,11 @@ def test_a_shared_kernel_gives_the_same_picture(monkeypatch: pytest.MonkeyPatch,
 
 def test_a_variable_decides_for_all_devices(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     target = wp.get_device(device)
-    monkeypatch.delenv(variants.VARIABLE, raising=False)
-    assert variants.shares_kernels(target) == target.is_cpu
+    monkeypatch.delenv(lighting.VARIABLE, raising=False)
+    assert lighting.shares_kernels(target) == target.is_cpu
     for value, shared in (("shared", True), ("specialised", False)):
-        monkeypatch.setenv(variants.VARIABLE, value)
-        assert variants.shares_kernels(target) == shared
-    monkeypatch.setenv(variants.VARIABLE, "general")
+        monkeypatch.setenv(lighting.VARIABLE, value)
+        assert lighting.shares_kernels(target) == shared
+    monkeypatch.setenv(lighting.VARIABLE, "general")
     with pytest.raises(UsageError, match="WARP_AR_KERNELS = 'general': expected shared or specialised"):
-        variants.shares_kernels(target)
+        lighting.shares_kernels(target)

@@ -466,28 +466,17 @@ class Scheduler:
         stream = self._stream
         begun = stream.record_event()
         written: dict[str, Any] = {}
-        self._streams += [wp.Stream(self.device) for _ in range(2 * len(part) - len(self._streams))]
+        self._streams += [wp.Stream(self.device) for _ in range(len(part) - len(self._streams))]
         for index, (stage, passes) in enumerate(_in_launch_order(part)):
-            own, other = self._streams[2 * index : 2 * index + 2]
+            own = self._streams[index]
             own.wait_event(begun)
             awaited = [name for name in stage.wiring.reads if name in written]
-            before, beside = begun, None
             for step in passes:
-                if step.beside_last:
-                    other.wait_event(before)
-                    self._launch_on(other, step)
-                    beside = other.record_event()
-                    continue
-                if beside is not None:
-                    own.wait_event(beside)
                 reads = stage.wiring.reads if step.reads is None else step.reads
                 for name in [name for name in awaited if name in reads]:
                     own.wait_event(written[name])
                     awaited.remove(name)
-                before, beside = own.record_event(), None
                 self._launch_on(own, step)
-            if beside is not None:
-                own.wait_event(beside)
             done = own.record_event()
             written.update(dict.fromkeys(stage.wiring.writes, done))
             stream.wait_event(done)

@@ -90,8 +90,6 @@ class Pass:
     beforehand: bool = False
     """On CUDA a pass on the host that is done before anything of the frame is launched: what comes before it in the
     frame has nothing to do with what it changes, and so the graph need not be cut for it."""
-    beside_last: bool = False
-    """On CUDA it runs beside the pass before it, whose results it does not read; what that waits for is there."""
 
 
 def clearing(array: Any) -> Pass:

@@ -10,7 +10,7 @@ import warp as wp
 from warp_ar.kernels.picture import composite
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
-from warp_ar.stages.shared.layers import layers_of
+from warp_ar.stages.shared.picture import layers_of
 
 
 class Composite(Stage):

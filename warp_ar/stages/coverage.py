@@ -10,7 +10,7 @@ from warp_ar.kernels.structs import vec8
 from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.base import NOT_ASKED, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
-from warp_ar.stages.shared.variants import trace_variant
+from warp_ar.stages.shared.lighting import trace_variant
 
 
 class Coverage(Stage):

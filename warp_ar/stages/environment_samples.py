@@ -11,9 +11,14 @@ from warp_ar.kernels.environment import environment_samples, pyramid
 from warp_ar.kernels.environment.environment_samples import EnvironmentSample
 from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
-from warp_ar.stages.shared.environment_sets import lists_texels, sample_count, sample_names, sample_slots
+from warp_ar.stages.shared.environment_sets import (
+    REFERENCE_SIZE,
+    lists_texels,
+    sample_count,
+    sample_names,
+    sample_slots,
+)
 from warp_ar.stages.shared.settled import settled_environment
-from warp_ar.stages.shared.shadow_methods import REFERENCE_SIZE
 
 
 class EnvironmentSamples(Stage):

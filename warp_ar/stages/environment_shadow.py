@@ -27,17 +27,15 @@ from warp_ar.stages.base import (
     Wiring,
 )
 from warp_ar.stages.features import Features
-from warp_ar.stages.shared.distant_light import (
+from warp_ar.stages.shared.environment_sets import METHODS, Method, lists_texels, sample_names, sample_slots
+from warp_ar.stages.shared.lighting import (
     distant_light_arrays,
     distant_light_reads,
+    distant_variant,
     make_distant_light,
     make_other_balls,
 )
-from warp_ar.stages.shared.environment_sets import lists_texels, sample_names, sample_slots
-from warp_ar.stages.shared.picture import find_picture, frame_reads
-from warp_ar.stages.shared.rows import GrowingRows
-from warp_ar.stages.shared.shadow_methods import METHODS, Method
-from warp_ar.stages.shared.variants import distant_variant
+from warp_ar.stages.shared.picture import GrowingRows, find_picture, frame_reads
 
 
 def find_stride(method: Method, rows: int) -> int:

@@ -11,9 +11,7 @@ from warp_ar.kernels.picture import expose
 from warp_ar.kernels.structs import make_picture
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
-from warp_ar.stages.shared.clipped import box_reads, clipped_evidence
-from warp_ar.stages.shared.layers import layers_of
-from warp_ar.stages.shared.picture import frame_reads
+from warp_ar.stages.shared.picture import box_reads, clipped_evidence, frame_reads, layers_of
 
 
 class Expose(Stage):

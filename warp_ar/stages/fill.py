@@ -13,9 +13,9 @@ from warp_ar.kernels.environment import change, fill, fill_frame
 from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring, unobserved
 from warp_ar.stages.features import Features
+from warp_ar.stages.shared.lighting import trace_variant
 from warp_ar.stages.shared.picture import find_picture, frame_reads
 from warp_ar.stages.shared.probe_maps import KEPT, other_names
-from warp_ar.stages.shared.variants import trace_variant
 
 
 class Fill(Stage):

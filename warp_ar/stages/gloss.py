@@ -12,11 +12,15 @@ from warp_ar.kernels.receiver import gloss
 from warp_ar.scene.kinds import light_kind, proxies_face, trace_config
 from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
-from warp_ar.stages.shared.distant_light import distant_light_arrays, distant_light_reads, make_distant_light
-from warp_ar.stages.shared.picture import find_picture, frame_reads
-from warp_ar.stages.shared.rows import GrowingRows
-from warp_ar.stages.shared.shading import mirrored_shading
-from warp_ar.stages.shared.variants import shade_variant, trace_variant
+from warp_ar.stages.shared.lighting import (
+    distant_light_arrays,
+    distant_light_reads,
+    make_distant_light,
+    mirrored_shading,
+    shade_variant,
+    trace_variant,
+)
+from warp_ar.stages.shared.picture import GrowingRows, find_picture, frame_reads
 
 SAMPLES: Mapping[str, int] = {"single": 4, "smooth": 16, "brute_force": 256}
 """Rays per pixel of a rough receiver, by the method of ``mirror_ball``."""

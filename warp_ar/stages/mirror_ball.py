@@ -15,17 +15,21 @@ from warp_ar.kernels.receiver.receiver import RelightConfig, make_receiver
 from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring, clearing
 from warp_ar.stages.features import Features
-from warp_ar.stages.shared.distant_light import (
+from warp_ar.stages.shared.lighting import (
     distant_light_arrays,
     distant_light_reads,
     make_distant_light,
     make_other_balls,
+    mirrored_shading,
+    relight_config,
+    relight_reads,
+    relight_variant,
+    shade_config,
+    shade_variant,
+    shares_kernels,
+    trace_variant,
 )
-from warp_ar.stages.shared.picture import find_picture, frame_reads
-from warp_ar.stages.shared.relighting import relight_config, relight_reads
-from warp_ar.stages.shared.rows import GrowingRows
-from warp_ar.stages.shared.shading import mirrored_shading, shade_config
-from warp_ar.stages.shared.variants import relight_variant, shade_variant, shares_kernels, trace_variant
+from warp_ar.stages.shared.picture import GrowingRows, find_picture, frame_reads
 
 SAMPLES: Mapping[str, int] = {"single": 1, "smooth": 4, "brute_force": 64}
 """Rays per pixel, by method; cheapest first, after ``none``."""

@@ -32,9 +32,13 @@ from warp_ar.stages.base import (
     Wiring,
 )
 from warp_ar.stages.features import Features
-from warp_ar.stages.shared.distant_light import distant_light_arrays, distant_light_reads, make_distant_light
+from warp_ar.stages.shared.lighting import (
+    distant_light_arrays,
+    distant_light_reads,
+    distant_variant,
+    make_distant_light,
+)
 from warp_ar.stages.shared.picture import find_picture, find_visible, frame_reads
-from warp_ar.stages.shared.variants import distant_variant
 
 SIDE = 4
 """Pixels along a tile."""

@@ -30,8 +30,8 @@ from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring, unobserved
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.host_copies import HostCopies
+from warp_ar.stages.shared.lighting import trace_variant
 from warp_ar.stages.shared.probe_maps import KEPT
-from warp_ar.stages.shared.variants import trace_variant
 
 EVERY_FRAME = 3
 """Frames at a stream's start that are each estimated from: clips of a few frames get all that recovery can do."""

@@ -19,12 +19,9 @@ from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring, clearing
 from warp_ar.stages.features import Features, sheds_light
 from warp_ar.stages.request import Request
-from warp_ar.stages.shared.distant_light import make_other_balls
 from warp_ar.stages.shared.environment_sets import SAMPLES
-from warp_ar.stages.shared.picture import find_picture
-from warp_ar.stages.shared.relighting import relight_config, relight_reads
-from warp_ar.stages.shared.rows import GrowingRows
-from warp_ar.stages.shared.variants import relight_variant
+from warp_ar.stages.shared.lighting import make_other_balls, relight_config, relight_reads, relight_variant
+from warp_ar.stages.shared.picture import GrowingRows, find_picture
 
 
 @dataclasses.dataclass(frozen=True)

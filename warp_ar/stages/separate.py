@@ -12,8 +12,7 @@ from warp_ar.kernels.structs import make_picture
 from warp_ar.stages.base import NOT_ASKED, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
 from warp_ar.stages.request import LAYERS, PICTURE_LAYERS
-from warp_ar.stages.shared.clipped import box_reads, clipped_evidence
-from warp_ar.stages.shared.layers import layers_of
+from warp_ar.stages.shared.picture import box_reads, clipped_evidence, layers_of
 
 SOURCES: Mapping[str, str] = {
     "objects": "virtual",

@@ -28,11 +28,14 @@ from warp_ar.stages.base import (
     clearing,
 )
 from warp_ar.stages.features import Features
-from warp_ar.stages.shared.distant_light import distant_light_arrays, distant_light_reads, make_distant_light
-from warp_ar.stages.shared.picture import find_visible
-from warp_ar.stages.shared.rows import GrowingRows
-from warp_ar.stages.shared.shading import shade_config
-from warp_ar.stages.shared.variants import shade_variant
+from warp_ar.stages.shared.lighting import (
+    distant_light_arrays,
+    distant_light_reads,
+    make_distant_light,
+    shade_config,
+    shade_variant,
+)
+from warp_ar.stages.shared.picture import GrowingRows, find_visible
 
 
 class Shade(Stage):

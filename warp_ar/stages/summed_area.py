@@ -10,8 +10,7 @@ import warp as wp
 from warp_ar.kernels.picture import summed_area
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring
 from warp_ar.stages.features import Features
-from warp_ar.stages.shared.clipped import SUMMED, SUMMED_CUT, box_reads
-from warp_ar.stages.shared.picture import frame_reads
+from warp_ar.stages.shared.picture import SUMMED, SUMMED_CUT, box_reads, frame_reads
 
 
 class SummedArea(Stage):

@@ -12,8 +12,8 @@ from warp_ar.kernels.receiver.surfaces import make_surfaces, make_trace_surfaces
 from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.base import NOT_ASKED, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
+from warp_ar.stages.shared.lighting import trace_variant
 from warp_ar.stages.shared.picture import find_visible
-from warp_ar.stages.shared.variants import trace_variant
 
 
 class Surfaces(Stage):

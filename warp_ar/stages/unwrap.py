@@ -12,9 +12,9 @@ from warp_ar.kernels.environment.probe_weights import measure_seen
 from warp_ar.kernels.structs import BOX, MESH, PLANE
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring, unobserved
 from warp_ar.stages.features import Features
+from warp_ar.stages.shared.lighting import shares_kernels
 from warp_ar.stages.shared.picture import frame_reads
 from warp_ar.stages.shared.probe_maps import OTHERS, find_view, other_maps, other_names, other_views
-from warp_ar.stages.shared.variants import shares_kernels
 
 _KINDS = {"plane": PLANE, "box": BOX, "mesh": MESH}
 

@@ -24,9 +24,8 @@ from warp_ar.stages.base import (
     Wiring,
 )
 from warp_ar.stages.features import Features
-from warp_ar.stages.shared.picture import find_visible
-from warp_ar.stages.shared.rows import GrowingRows
-from warp_ar.stages.shared.variants import trace_variant
+from warp_ar.stages.shared.lighting import trace_variant
+from warp_ar.stages.shared.picture import GrowingRows, find_visible
 
 
 class Visibility(Stage):

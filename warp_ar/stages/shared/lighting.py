@@ -1,0 +1,195 @@
+"""Light as stages hand it to their kernels, and the variants of kernels that they compile."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Iterable, Mapping
+from typing import Any, Final
+
+import warp as wp
+
+from warp_ar.errors import UsageError
+from warp_ar.kernels.environment.interpolated_irradiance import OtherBalls
+from warp_ar.kernels.objects.reflect import DiffuseForm, DistantLight, DistantLightConfig
+from warp_ar.kernels.objects.shade import ShadeConfig
+from warp_ar.kernels.rays.trace import TraceConfig
+from warp_ar.kernels.receiver.receiver import RelightConfig
+from warp_ar.kernels.split_sum import integrate_dfg
+from warp_ar.kernels.structs import METALLIC_ROUGHNESS
+from warp_ar.scene.kinds import light_kind, trace_config
+from warp_ar.stages.base import Arrays, ArraySpec
+from warp_ar.stages.features import LOCAL, MEASURED, Features
+from warp_ar.stages.shared.picture import frame_reads
+
+VARIABLE: Final = "WARP_AR_KERNELS"
+"""Environment variable that decides for all devices: ``shared`` or ``specialised``. It is there for measuring."""
+
+
+def shares_kernels(device: Any) -> bool:
+    """Whether kernels on ``device`` are those of any scene.
+
+    Raises:
+        UsageError: The environment variable has another value.
+    """
+    asked = os.environ.get(VARIABLE, "")
+    if asked not in ("", "shared", "specialised"):
+        raise UsageError(f"{VARIABLE} = {asked!r}: expected shared or specialised")
+    return asked == "shared" if asked else bool(device.is_cpu)
+
+
+def trace_variant(config: TraceConfig, device: Any) -> TraceConfig:
+    """Kinds of shape to compile in."""
+    return config.general(by_call=device.is_cpu) if shares_kernels(device) else config
+
+
+def distant_variant(features: Features, device: Any) -> DistantLightConfig:
+    """Shapes, materials and forms of light to compile in."""
+    if not shares_kernels(device):
+        return features.distant
+    return features.distant.general(_form(features), by_call=device.is_cpu)
+
+
+def shade_variant(config: ShadeConfig, features: Features, device: Any) -> ShadeConfig:
+    """As ``distant_variant``, and kinds of virtual light."""
+    if not shares_kernels(device):
+        return config
+    return config.general(_form(features), soft=_asks_soft(features), by_call=device.is_cpu)
+
+
+def relight_variant(config: RelightConfig, features: Features, device: Any) -> RelightConfig:
+    """Shapes and shadows to compile in."""
+    if not shares_kernels(device):
+        return config
+    return config.general(soft=_asks_soft(features), by_call=device.is_cpu)
+
+
+def _form(features: Features) -> DiffuseForm:
+    return "sh" if features.irradiance == "irradiance_sh" else "map"
+
+
+def _asks_soft(features: Features) -> bool:
+    return features.request.quality.method("light_shadow") == "soft"
+
+
+# Roughness by cosine; bilinear between them, the table stays within 1e-3 of the integral.
+DFG_SIZE = 32
+
+
+def distant_light_reads(features: Features) -> tuple[str, ...]:
+    """Resources that hold the forms of the environment that objects reflect."""
+    config = features.distant
+    diffuse = () if config.diffuse == "none" else (f"irradiance_{config.diffuse}",)
+    specular = ("prefilter_levels",) if config.specular else ()
+    placed = config.emitters and bool(diffuse or specular)
+    return (*diffuse, *specular, *(("emitters",) if placed else ()), *_other_reads(features))
+
+
+def _other_reads(features: Features) -> tuple[str, ...]:
+    """The same of the balls after the first, and the places of all."""
+    config = features.distant
+    if not config.several or (config.diffuse == "none" and not config.specular):
+        return ()
+    diffuse = () if config.diffuse == "none" else ("others_irradiance",)
+    specular = ("others_levels",) if config.specular else ()
+    return (*diffuse, *specular, *(("others_emitters",) if config.emitters else ()), "probe_places")
+
+
+def distant_light_arrays(features: Features, stage: str) -> Mapping[str, ArraySpec]:
+    """What a stage owns for ``make_distant_light``: for metallic-roughness, the table of its reflectance."""
+    return (
+        {f"{stage}_dfg": ArraySpec((DFG_SIZE, DFG_SIZE), wp.vec2)}
+        if METALLIC_ROUGHNESS in features.distant.models
+        else {}
+    )
+
+
+def make_distant_light(features: Features, arrays: Arrays, stage: str) -> DistantLight:
+    """The environment as kernels of a stage with ``distant_light_arrays`` read it; the table is made here, once."""
+    config = features.distant
+    distant = DistantLight()
+    if config.diffuse == "sh":
+        distant.irradiance_sh = arrays["irradiance_sh"]
+    if config.diffuse == "map":
+        distant.irradiance_map = arrays["irradiance_map"]
+    if config.specular:
+        distant.levels = arrays["prefilter_levels"]
+    distant.level_height = features.request.quality.environment_height
+    if METALLIC_ROUGHNESS in config.models:
+        table = arrays[f"{stage}_dfg"]
+        integrate_dfg(table)
+        distant.dfg = table
+    distant.probes = arrays["probes"]
+    if config.emitters:
+        distant.emitters = arrays["emitters"]
+    if names := _other_reads(features):
+        distant.others = make_other_balls(features, arrays, names)
+    return distant
+
+
+def make_other_balls(features: Features, arrays: Arrays, names: Iterable[str]) -> OtherBalls:
+    """The light at the balls after the first, as far as these resources hold it."""
+    fields = {
+        "probe_places": "places",
+        "others_irradiance": features.irradiance,
+        "others_levels": "levels",
+        "others_environment": "environment",
+        "others_emitters": "emitters",
+    }
+    others = OtherBalls()
+    for name in names:
+        if name in fields:
+            setattr(others, fields[name], arrays[name])
+    return others
+
+
+def shade_config(features: Features) -> ShadeConfig:
+    """What the shading of a request's objects calls for."""
+    return ShadeConfig(
+        distant=features.distant,
+        lights=tuple(sorted({light_kind(light) for light in features.request.scene.lights})),
+        edge_samples=features.request.quality.edge_samples,
+        soft=features.soft_lights,
+        near_field=bool(features.near_field),
+        area_samples=features.area_samples,
+    )
+
+
+def mirrored_shading(features: Features) -> ShadeConfig:
+    """The same in what balls and receivers mirror: without what surrounds the objects at close range."""
+    return dataclasses.replace(shade_config(features), near_field=False, edge_samples=1)
+
+
+def relight_reads(features: Features) -> tuple[str, ...]:
+    """What the method of ``relight`` needs to know of the environment and the receiver."""
+    method = features.relight_method
+    reads = ["pose", "lights", "objects"]
+    measured = method in MEASURED
+    if method != "flat":
+        reads += frame_reads(features) if measured else [*frame_reads(features), "key_lights"]
+    if measured:
+        reads.append(features.irradiance)
+        reads += ["emitters"] * features.emitters
+        if features.others:
+            reads += ["others_irradiance", "probe_places", *(["others_emitters"] * features.emitters)]
+    if features.ambient_visibility:
+        reads.append("environment_samples")
+    return tuple(reads)
+
+
+def relight_config(features: Features) -> RelightConfig:
+    """What the relighting of a request's receiver calls for."""
+    method = features.relight_method
+    return RelightConfig(
+        "reflectance" if method in LOCAL else method,
+        trace_config(features.request.scene),
+        "sh" if features.irradiance == "irradiance_sh" else "map",
+        bool(features.request.scene.probes),
+        features.soft_lights,
+        method in MEASURED and features.emitters,
+        features.ambient_visibility,
+        features.bounced,
+        features.request.quality.edge_samples,
+        several=method in MEASURED and features.others > 0,
+        area_samples=features.area_samples,
+    )
