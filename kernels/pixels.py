@@ -1,4 +1,4 @@
-"""What a pixel of the camera's frame shows, as linear radiance.
+"""Linear radiance of a pixel of the camera's frame.
 
 A frame of 8-bit codes is decoded by its table. Of a frame that came with more than 8 bits the linear picture lies
 beside the codes: where there is one, it is read in their place. The array is empty where there is none, which all

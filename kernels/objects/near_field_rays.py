@@ -70,7 +70,7 @@ SAME_SURFACE = wp.constant(wp.float32(0.5))
 
 @dataclasses.dataclass(frozen=True)
 class NearFieldConfig:
-    """What is compiled into the kernel."""
+    """Compile-time configuration of the kernel."""
 
     distant: DistantLightConfig
     """Kinds of shape and forms of light."""
@@ -83,11 +83,11 @@ class NearFieldConfig:
     side: int
     """Pixels along a tile."""
     ratio: bool
-    """Whether objects shade the receiver."""
+    """True if objects shade the receiver."""
     added: bool
-    """Whether virtual lights light the receiver."""
+    """True if virtual lights light the receiver."""
     known: bool = False
-    """Whether irradiance is that of the environment, as it is known, and what the samples that meet something change;
+    """True if irradiance is that of the environment, as it is known, and what the samples that meet something change;
     else the sum of all samples."""
 
 

@@ -57,21 +57,21 @@ class DistantLightConfig:
     models: tuple[int, ...]
     """Sorted material models of the objects."""
     textures: bool
-    """Whether any material has a texture or emits, or any object's triangles have materials of their own."""
+    """True if any material has a texture or emits, or any object's triangles have materials of their own."""
     diffuse: DiffuseForm
     """Where the environment's irradiance comes from: nine coefficients, a latlong map, or nowhere."""
     specular: bool
-    """Whether the prefiltered environment is read."""
+    """True if the prefiltered environment is read."""
     probes: bool
-    """Whether there are mirror balls, which hide the receiver."""
+    """True if there are mirror balls, which hide the receiver."""
     emitters: bool = False
-    """Whether emitters of the environment are known by their places."""
+    """True if emitters of the environment are known by their places."""
     captured: bool = False
-    """Whether the environment is known without mirror balls, from a file."""
+    """True if the environment is known without mirror balls, from a file."""
     several: bool = False
-    """Whether the light is interpolated between that of several mirror balls."""
+    """True if the light is interpolated between that of several mirror balls."""
     gathered: bool = True
-    """Whether rays that happen to meet what emits bring its light; else ``area_lights`` are looked for themselves."""
+    """True if rays that happen to meet what emits bring its light; else ``area_lights`` are looked for themselves."""
 
     def general(self, form: DiffuseForm, *, by_call: bool = False) -> DistantLightConfig:
         """For any scene with as many mirror balls, textures or not: forms that it does not call for may be empty.
@@ -134,7 +134,7 @@ def knows_irradiance(distant: DistantLight) -> wp.bool:
 
 @wp.func
 def knows_levels(distant: DistantLight) -> wp.bool:
-    """Whether this scene calls for the prefiltered environment."""
+    """Return whether this scene calls for the prefiltered environment."""
     return distant.levels.shape[0] > 0
 
 

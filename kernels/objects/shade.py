@@ -74,7 +74,7 @@ ALONE = wp.constant(-1)
 
 @dataclasses.dataclass(frozen=True)
 class ShadeConfig:
-    """What a scene calls for; everything else is not compiled in."""
+    """Features that a scene calls for; others are not compiled in."""
 
     distant: DistantLightConfig
     """Kinds of shape, of material and of the environment."""
@@ -83,9 +83,9 @@ class ShadeConfig:
     edge_samples: int
     """Samples per pixel along edges: a square number; 1 leaves edges hard."""
     soft: bool = False
-    """Whether lights with a radius cast soft shadows."""
+    """True if lights with a radius cast soft shadows."""
     near_field: bool = False
-    """Whether ``near_field`` says what surrounds the objects."""
+    """True if ``near_field`` says what surrounds the objects."""
     area_samples: int = 0
     """Samples of what emits, per point; ``area_lights.POINT_SAMPLES``: as lights at points; 0: nothing emits."""
 
@@ -128,7 +128,7 @@ def make_object_light(
 
 @wp.struct
 class NearPoint:
-    """What ``near_field`` knows of a point of an object."""
+    """Near field at a point of an object."""
 
     known: wp.bool  # False: the distant environment is all that the point receives
     irradiance: wp.vec3
@@ -307,7 +307,7 @@ def differs(
     visible: VisibleObjects,
     hit: Hit,
 ) -> wp.bool:
-    """Whether a neighbour sees another surface than this pixel."""
+    """Return whether a neighbour sees another surface than this pixel."""
     other = wp.int32(-1)
     if inside_rect(i, j, rect):
         other = visible.objects[i, j]

@@ -72,10 +72,10 @@ NEAREST = wp.constant(wp.float32(2.0))
 
 @dataclasses.dataclass(frozen=True)
 class DeclipConfig:
-    """What is compiled into the last kernel."""
+    """Compile-time configuration of the last kernel."""
 
     ball: bool = False
-    """Whether the light recovered from the ball is looked up."""
+    """True if the light recovered from the ball is looked up."""
     proxies: tuple[int, ...] = ()
     """Kinds of proxy in the scene."""
 

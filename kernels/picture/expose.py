@@ -136,7 +136,7 @@ def surrounding_mean(clipped: ClippedEvidence, row: wp.int32, col: wp.int32, sca
 
 @wp.func
 def is_light(clipped: ClippedEvidence) -> wp.bool:
-    """Whether the frame is linear light that says by itself how bright what is above 1 is."""
+    """Return whether the frame is linear light that says by itself how bright what is above 1 is."""
     return clipped.levels.shape[0] > 0 and clipped.levels[0][0] > 1.0
 
 

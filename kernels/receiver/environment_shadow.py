@@ -71,7 +71,7 @@ SUMS = wp.constant(4)
 
 @wp.func
 def may_be_one_sided(objects: wp.array[Shape]) -> wp.bool:
-    """Whether the closest hit may pass what hides the environment: triangles that are seen from one side only.
+    """Return whether the closest hit may pass what hides the environment: triangles that are seen from one side only.
 
     They throw shadows from both sides, and ``occluded_by_objects`` knows no other.
     """

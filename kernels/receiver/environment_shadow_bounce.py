@@ -80,7 +80,7 @@ def caustic_alpha(shape: Shape, point: wp.vec3) -> wp.float32:
 
 @wp.struct
 class Sent:
-    """What an object reflects along a ray."""
+    """Light that an object reflects along a ray."""
 
     distant: wp.vec3  # radiance that it has from the environment
     receiver: wp.vec3  # radiance that it would have from a receiver without shadows
@@ -263,7 +263,7 @@ def make_bounced(config: DistantLightConfig) -> wp.Function:
 
 @wp.struct
 class Before:
-    """What lies before a cell's surface, for ``estimated``."""
+    """Surroundings in front of a cell's surface, for ``estimated``."""
 
     up: wp.vec3  # the surface's normal, on the side that light comes from
     from_receiver: wp.vec3  # irradiance that a surface above it has from below
@@ -305,7 +305,7 @@ class Meeting:
 
 @wp.struct
 class ReflectedLight:
-    """What objects send to a point of the receiver, times its weight."""
+    """Light that objects send to a point of the receiver, times its weight."""
 
     sent: wp.vec3  # of the environment
     returned: wp.vec3  # of what the receiver sent them

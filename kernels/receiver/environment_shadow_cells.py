@@ -59,7 +59,7 @@ DEPTH_STEP = wp.constant(wp.float32(0.03))
 
 @dataclasses.dataclass(frozen=True)
 class EnvironmentShadowConfig:
-    """What is compiled into the kernels."""
+    """Compile-time configuration of the kernels."""
 
     distant: DistantLightConfig
     """Kinds of shape and forms of light."""
@@ -68,11 +68,11 @@ class EnvironmentShadowConfig:
     side: int
     """Cells along a tile; there are side^2 sets."""
     bounce: Literal["estimated", "traced"]
-    """How what objects reflect onto the receiver is found."""
+    """Method by which light from objects onto the receiver is found."""
     secondary: float = 1.0
     """Share of a set, its first samples, whose rays ask what an object that they meet sends; others stop there."""
     emitters: bool = False
-    """Whether some samples are emitters at a known distance."""
+    """True if some samples are emitters at a known distance."""
     partials: int = 1
     """Partial sums per cell, a thread each: a divisor of count; the size of each is up to 64, or a multiple of it."""
 
@@ -144,14 +144,14 @@ def first_of_set(i: wp.int32, j: wp.int32, side: wp.int32, count: wp.int32) -> w
 
 @wp.func
 def can_matter(row: wp.int32, column: wp.int32, margin: wp.int32, rect: wp.vec4i) -> wp.bool:
-    """Whether the filter may read a cell estimated at this pixel: it reads ``margin`` beyond the rectangle."""
+    """Return whether the filter may read a cell estimated at this pixel: it reads ``margin`` beyond the rectangle."""
     wide = wp.vec4i(rect[0] - margin, rect[1] + margin, rect[2] - margin, rect[3] + margin)
     return rect[0] < rect[1] and inside_rect(row, column, wide)
 
 
 @wp.func
 def any_shaded(shaded: wp.array2d[wp.int32], frame_index: wp.int32, rows: wp.vec2i, columns: wp.vec2i) -> wp.bool:
-    """Whether a tile of cells from the first to the last row and column is noted in this frame."""
+    """Return whether a tile of cells from the first to the last row and column is noted in this frame."""
     for a in range(wp.max(rows[0], 0) / SHADED_TILE, wp.min(rows[1] / SHADED_TILE + 1, shaded.shape[0])):
         for b in range(wp.max(columns[0], 0) / SHADED_TILE, wp.min(columns[1] / SHADED_TILE + 1, shaded.shape[1])):
             if shaded[a, b] == frame_index:

@@ -78,7 +78,7 @@ SMOOTHED = wp.constant(2)
 
 @wp.struct
 class Gloss:
-    """How a proxy's surface mirrors."""
+    """Mirror reflection of a proxy's surface."""
 
     reflectance: wp.vec3  # F0: specular reflectance where it is seen from ahead; 0: the proxy is matt
     roughness: wp.float32  # perceptual; alpha is its square
@@ -94,7 +94,7 @@ class GlossLayers:
 
 @dataclasses.dataclass(frozen=True)
 class GlossConfig:
-    """What is compiled into the kernel."""
+    """Compile-time configuration of the kernel."""
 
     trace: TraceConfig
     """Kinds of shape in the scene."""
@@ -103,16 +103,16 @@ class GlossConfig:
     lights: tuple[int, ...] = ()
     """Sorted kinds of virtual light."""
     shade: ShadeConfig | None = None
-    """How virtual objects look; None: there are none."""
+    """Shading of virtual objects; None: there are none."""
     emitters: bool = False
-    """Whether emitters of the environment are known by their places."""
+    """True if emitters of the environment are known by their places."""
     faces: bool = False
-    """Whether one proxy may mirror another, whose light changes."""
+    """True if one proxy may mirror another, whose light changes."""
 
 
 @wp.func
 def may_mirror(scene: RayScene, point: wp.vec3, direction: wp.vec3, reach: wp.float32) -> wp.bool:
-    """Whether an object's sphere may be within an angle of a ray, ``reach`` in radians."""
+    """Return whether an object's sphere may be within an angle of a ray, ``reach`` in radians."""
     for index in range(scene.objects.shape[0]):
         shape = scene.objects[index]
         # A torus gives its two radii: their sum is no more than this.
@@ -140,7 +140,7 @@ class Sight:
 
 @wp.struct
 class Reflected:
-    """What one ray brings, by its weight."""
+    """Light that one ray brings, times its weight."""
 
     change: wp.vec3
     before: wp.vec3  # what the receiver reflected there, where that was asked for

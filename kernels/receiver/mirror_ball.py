@@ -46,16 +46,16 @@ SHARED = (4, 16)
 
 @dataclasses.dataclass(frozen=True)
 class MirrorBallConfig:
-    """What is compiled into the kernel."""
+    """Compile-time configuration of the kernel."""
 
     trace: TraceConfig
     """Kinds of shape in the scene."""
     shade: ShadeConfig | None = None
-    """How virtual objects look; None: there are none."""
+    """Shading of virtual objects; None: there are none."""
     relight: RelightConfig | None = None
     """How the receiver responds to virtual light; None: there is no virtual light, or no proxy for it."""
     ratio: bool = False
-    """Whether virtual objects shade the receiver under the environment."""
+    """True if virtual objects shade the receiver under the environment."""
 
 
 @wp.func

@@ -58,7 +58,7 @@ class Reading:
     blend: Literal["text", "shader"] = "text"
     """The three cases of the text, or the printed shader's lerp, which differs where alpha is negative."""
     weighted: bool = False
-    """Whether alpha is multiplied by the directionality of the environment's light (section 4.4)."""
+    """True if alpha is multiplied by the directionality of the environment's light (section 4.4)."""
 
 
 READINGS: Mapping[str, Reading] = MappingProxyType(
@@ -78,28 +78,28 @@ PRIOR_WEIGHT = wp.constant(wp.float32(0.002 * math.pi))
 
 @dataclasses.dataclass(frozen=True)
 class RelightConfig:
-    """What is compiled into the kernel."""
+    """Compile-time configuration of the kernel."""
 
     method: str
-    """How the receiver responds: one of ``METHODS`` or ``READINGS``."""
+    """Response of the receiver: one of ``METHODS`` or ``READINGS``."""
     trace: TraceConfig
     """Kinds of shape in the scene."""
     irradiance: Literal["sh", "map"] = "sh"
     """Form of the environment's irradiance, for ``reflectance``."""
     probes: bool = False
-    """Whether there are mirror balls, which hide the receiver and throw shadows of virtual light."""
+    """True if there are mirror balls, which hide the receiver and throw shadows of virtual light."""
     soft: bool = False
-    """Whether lights with a radius cast soft shadows; those of mirror balls stay hard."""
+    """True if lights with a radius cast soft shadows; those of mirror balls stay hard."""
     emitters: bool = False
-    """Whether ``reflectance`` knows emitters of the environment by their places."""
+    """True if ``reflectance`` knows emitters of the environment by their places."""
     ambient_visibility: bool = False
-    """Whether ``reflectance`` knows which part of the environment reaches a point."""
+    """True if ``reflectance`` knows which part of the environment reaches a point."""
     bounced: bool = False
-    """Whether light that lit proxies send to each other is known."""
+    """True if light that lit proxies send to each other is known."""
     edge_samples: int = 1
     """Samples per pixel along the edges of shadows and of proxies: a square number; 1 leaves edges hard."""
     several: bool = False
-    """Whether the light of several mirror balls is interpolated."""
+    """True if the light of several mirror balls is interpolated."""
     area_samples: int = 0
     """Samples of what emits, per point; ``area_lights.POINT_SAMPLES``: as lights at points; 0: nothing emits."""
 
@@ -203,7 +203,7 @@ def look_up_bounced(scene: RayScene, receiver: Receiver, hit: Hit, row: wp.int32
 
 @wp.struct
 class Matter:
-    """What a point of the receiver is taken to be."""
+    """Material of a point of the receiver."""
 
     kd: wp.vec3  # reflectance
     m: wp.float32  # the multiplicative factor: intensity of the video

@@ -83,7 +83,7 @@ class Patch:
 
 @dataclasses.dataclass(frozen=True)
 class CellConfig:
-    """What is compiled into the kernels."""
+    """Compile-time configuration of the kernels."""
 
     relight: RelightConfig
     """Of the direct light: kinds of shape, and form of the environment's irradiance."""
@@ -115,7 +115,7 @@ def visible_shares_of(lost: wp.vec3, whole: wp.vec3) -> wp.vec3:
 
 @wp.func
 def meets_ball(away: wp.vec3, radius: wp.float32, direction: wp.vec3) -> wp.bool:
-    """Whether a direction leads from a point into the ball around ``away``, or the point is in it."""
+    """Return whether a direction leads from a point into the ball around ``away``, or the point is in it."""
     beside = wp.dot(away, away) - radius * radius
     along = wp.dot(away, direction)
     return beside <= 0.0 or (along > 0.0 and along * along > beside)
@@ -123,7 +123,7 @@ def meets_ball(away: wp.vec3, radius: wp.float32, direction: wp.vec3) -> wp.bool
 
 @wp.func
 def in_lit_cells(cell_row: wp.int32, cell_col: wp.int32, stride: wp.int32, rect: wp.vec4i) -> wp.bool:
-    """Whether a pixel of the rectangle may look a cell up."""
+    """Return whether a pixel of the rectangle may look a cell up."""
     reach = wp.vec4i(rect[0] - 2 * stride, rect[1] + 2 * stride, rect[2] - 2 * stride, rect[3] + 2 * stride)
     return rect[0] < rect[1] and inside_rect(cell_row * stride, cell_col * stride, reach)
 
@@ -168,7 +168,7 @@ def bound_solids(scene: RayScene) -> wp.vec4:
 
 @wp.struct
 class Hider:
-    """What stands between a point of the receiver and a sample of the environment."""
+    """Obstacle between a point of the receiver and a sample of the environment."""
 
     hides: wp.bool
     radiance: wp.vec3  # that it sends along the sample's direction
@@ -221,7 +221,7 @@ def make_find_hider(config: CellConfig) -> wp.Function:
 
 @wp.func
 def is_shone_on(lights: wp.array[Light], hit: Hit) -> wp.bool:
-    """Whether a virtual light shines on a point, were nothing in the way."""
+    """Return whether a virtual light shines on a point, were nothing in the way."""
     for index in range(lights.shape[0]):
         light = sample_light(lights[index], hit.point)
         if wp.dot(hit.geometric_normal, light.wi) > 0.0 and wp.max(light.irradiance_normal) > 0.0:

@@ -65,7 +65,7 @@ _BALL = wp.constant(-2 << (_MASKED + 1))
 
 @wp.struct
 class DirectLighting:
-    """What virtual light does at a point of the receiver."""
+    """Virtual light at a point of the receiver."""
 
     added: wp.vec3  # radiance
     visibility: wp.int32  # whether any light arrives, and which do not: see ``is_edge``
@@ -237,7 +237,7 @@ def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
 
 @wp.func
 def is_edge(visibility: wp.array2d[wp.int32], rect: wp.vec4i, row: wp.int32, column: wp.int32) -> wp.bool:
-    """Whether virtual light may change within a pixel, or between it and the next one.
+    """Return whether virtual light may change within a pixel, or between it and the next one.
 
     That is where something stands before a light without penumbra for one of them alone, or where they see different
     surfaces and any light arrives. Balls have light of their own, which ``mirror_ball`` adds.

@@ -22,7 +22,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Surface:
-    """What a ray from the camera meets first."""
+    """First surface that a ray from the camera meets."""
 
     index: wp.int32  # objects, then proxies, then mirror balls; -1: nothing that is modelled
     depth: wp.float32  # metres along the camera's axis, infinite where there is nothing

@@ -84,7 +84,7 @@ class Pass:
     on_host: bool = False
     """Works on the host between launches: it cannot be part of a captured graph, which is cut where it is enabled."""
     enabled: Callable[[], bool] | None = None
-    """Whether the pass takes part in this frame, asked once, after ``Stage.begin``; None means always."""
+    """Predicate of the frames in which the pass takes part, asked once, after ``Stage.begin``; None means always."""
     reads: tuple[str, ...] | None = None
     """What of the stage's resources it reads: on CUDA it begins when that is there. None means all."""
     beforehand: bool = False
@@ -99,25 +99,25 @@ def clearing(array: Any) -> Pass:
 
 @dataclasses.dataclass(frozen=True)
 class Numerics:
-    """What to expect of a stage's numbers.
+    """Expected numerical error of a stage.
 
     Errors are those of float32 arithmetic alone, over the largest value of the output, or in 8-bit codes: what a method
     leaves out (the distance of an emitter, the lobes of an order-2 series) is the cost table's matter.
     """
 
     precision: str
-    """What it computes in."""
+    """Number format of the computation."""
     bound: float
     """Worst error by analysis; tests check it wherever a float64 twin exists."""
     cause: str
-    """Where that error comes from."""
+    """Cause of that error."""
     measured: float
     """Worst error against a float64 twin on CPU; in a checkout ``python -m tests.hard_cases.measure_errors`` measures
     it anew."""
     rows: tuple[int, ...]
     """Rows of the atlas of hard cases that concern it."""
     codes: bool = False
-    """Whether errors are in 8-bit codes."""
+    """True if errors are in 8-bit codes."""
 
     @property
     def expected(self) -> str:
@@ -197,15 +197,15 @@ class Stage(abc.ABC):
     methods: ClassVar[Mapping[str, str]] = {"default": ""}
     """Ways to do the work, cheapest first, and what tables say of each."""
     summary: ClassVar[str]
-    """What it does, in one line for ``explain``."""
+    """Work of the stage, in one line for ``explain``."""
     subject: ClassVar[str] = ""
     """What its methods are about, for tables; only where there is a choice."""
     unread: ClassVar[str] = ""
     """Why a plan can do without it where nothing reads what it writes."""
     converges: ClassVar[bool] = False
-    """Whether its methods approximate one result, which the last of them gives; others are models of their own."""
+    """True if its methods approximate one result, which the last of them gives; others are models of their own."""
     numerics: ClassVar[Numerics]
-    """How precisely it computes."""
+    """Precision of its results."""
     settings: ClassVar[tuple[str, ...]] = ()
     """Settings of ``Quality`` that it shares with other stages and that change its work: ``environment_height``,
     ``edge_samples``, ``light_shadow``."""
@@ -215,7 +215,7 @@ class Stage(abc.ABC):
     """Its arrays that carry over from frame to frame, and so to the pipeline of another quality."""
 
     follows: ClassVar[bool] = False
-    """Whether it runs in every frame, read or not: what it remembers is a sum over all of them."""
+    """True if it runs in every frame, read or not: what it remembers is a sum over all of them."""
 
     def __init__(self, features: Features, wiring: Wiring) -> None:
         self.features, self.wiring = features, wiring
@@ -280,7 +280,7 @@ class Stage(abc.ABC):
         """Let go of what the stage holds beside arrays: its threads."""
 
     def changed(self, name: str) -> bool:
-        """Whether the last run changed the written resource ``name`` enough for its readers to run again."""
+        """Return whether the last run changed the written resource ``name`` enough for its readers to run again."""
         return True
 
     def resume(self, other: Stage) -> None:  # noqa: B027  (most stages remember nothing on the host)

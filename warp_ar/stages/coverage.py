@@ -1,4 +1,4 @@
-"""Which surfaces share a pixel, and how much of it each covers."""
+"""Surfaces that share a pixel, and the part of it that each covers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How bright the camera's clipped pixels really were."""
+"""Radiance of the camera's clipped pixels."""
 
 from __future__ import annotations
 

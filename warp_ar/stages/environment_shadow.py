@@ -1,4 +1,4 @@
-"""What virtual objects do to the environment on the receiver."""
+"""Shadows of virtual objects in the environment, on the receiver."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def shadow_cells(features: Features) -> tuple[int, int]:
 
 
 def shadow_config(features: Features, device: Any) -> EnvironmentShadowConfig:
-    """What the kernels are compiled for."""
+    """Return the compile-time configuration of the kernels."""
     method = METHODS[EnvironmentShadow.method_for(features)]
     partials = 1 if device.is_cpu else count_partials(*shadow_cells(features))
     return EnvironmentShadowConfig(

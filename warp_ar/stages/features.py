@@ -48,7 +48,7 @@ class Features:
     """Frozen answers for one request."""
 
     request: Request
-    """What they were found for."""
+    """Request that they answer."""
     environment: bool
     """The environment is known."""
     observed: bool
@@ -213,12 +213,12 @@ def _near_method(scene: Scene, quality: Quality) -> str:
 
 
 def has_environment(scene: Scene) -> bool:
-    """Whether a mirror ball or a file tells of the environment."""
+    """Return whether a mirror ball or a file tells of the environment."""
     return bool(scene.probes) or scene.captured is not None
 
 
 def interpolates(scene: Scene, quality: Quality) -> bool:
-    """Whether the light of several balls is interpolated: something is lit by it, by no sphere map's method.
+    """Return whether the light of several balls is interpolated: something is lit by it, by no sphere map's method.
 
     That are objects, and receivers whose reflectance is measured by it. A sphere map is a texture of one ball.
     """
@@ -229,7 +229,7 @@ def interpolates(scene: Scene, quality: Quality) -> bool:
 
 
 def sheds_light(scene: Scene) -> bool:
-    """Whether any virtual light exists: one that is nothing else, or an object that emits."""
+    """Return whether any virtual light exists: one that is nothing else, or an object that emits."""
     return bool(scene.lights) or any(map(emits_light, scene.objects))
 
 

@@ -1,4 +1,4 @@
-"""What polished receivers show of what is virtual."""
+"""Reflections of virtual content in polished receivers."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class Gloss(Stage):
         return [Pass(one, rows=height, extent=extent) for one, extent in zip((mirror, smooth), extents, strict=True)]
 
     def _config(self, device: Any) -> gloss.GlossConfig:
-        """What the kernel is compiled for."""
+        """Return the compile-time configuration of the kernel."""
         features, scene = self.features, self.request.scene
         shading = mirrored_shading(features) if scene.objects else None
         return gloss.GlossConfig(

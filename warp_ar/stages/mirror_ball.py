@@ -1,4 +1,4 @@
-"""What mirror balls show of what is virtual."""
+"""Reflections of virtual content in mirror balls."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How far what each pixel shows has moved since the frame before."""
+"""Motion of each pixel's surface since the frame before."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What surrounds virtual objects at close range."""
+"""Surroundings of virtual objects at close range."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class RayCounts:
     mirror: int
     """Of a mirror, a square number."""
     known: bool
-    """Whether samples only say what differs from the environment's irradiance, as it is known."""
+    """True if samples only say what differs from the environment's irradiance, as it is known."""
 
 
 RAYS: Mapping[str, RayCounts] = MappingProxyType(
@@ -78,7 +78,7 @@ def lobe_widths(material: MeshMaterial) -> tuple[float, float]:
 
 
 def near_field_config(features: Features, device: Any) -> near_field.NearFieldConfig:
-    """What the kernels are compiled for."""
+    """Return the compile-time configuration of the kernels."""
     layers = features.layers
     rays = RAYS[features.near_field]
     materials = scene_materials(features.request.scene)

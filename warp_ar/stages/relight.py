@@ -26,7 +26,7 @@ from warp_ar.stages.shared.picture import GrowingRows, find_picture
 
 @dataclasses.dataclass(frozen=True)
 class Grain:
-    """How finely cells of the receiver are estimated."""
+    """Resolution at which cells of the receiver are estimated."""
 
     samples: int
     """Of the environment, for ambient visibility."""
@@ -141,7 +141,7 @@ class Relight(Stage):
         return passes
 
     def _receiver(self, config: RelightConfig, arrays: Arrays) -> Receiver:
-        """What kernels read of the receiver."""
+        """Return the receiver as kernels read it."""
         names = {
             "key_lights": "key_lights",
             "irradiance": self.features.irradiance,

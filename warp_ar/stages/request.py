@@ -1,4 +1,4 @@
-"""What a plan is made for."""
+"""Requests: the input of a plan."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Layer:
     neutral: float | None
     """Its value where it changes or says nothing; None: the frame itself."""
     summary: str
-    """What it is, with its unit."""
+    """Meaning and unit."""
 
 
 LAYERS: Mapping[str, Layer] = MappingProxyType(
@@ -52,10 +52,10 @@ soon as a process beside the frames has it, so that no frame waits and pictures 
 
 @dataclasses.dataclass(frozen=True)
 class Request:
-    """What a plan is made for; equal requests give equal plans."""
+    """Input of a plan; equal requests give equal plans."""
 
     scene: Scene
-    """What the user wants to see."""
+    """Scene to show."""
     quality: Quality
     """The method of every stage, and its numbers."""
     size: tuple[int, int]
@@ -67,9 +67,9 @@ class Request:
     estimates: Estimates = "delayed"
     """When light that is estimated from a frame takes effect."""
     emitters: bool = False
-    """Whether a captured light comes with its emitters' places, as ``Pipeline.take_light`` gives them."""
+    """True if a captured light comes with its emitters' places, as ``Pipeline.take_light`` gives them."""
     linear: bool = False
-    """Whether frames come as linear radiance too, of more than 8 bits."""
+    """True if frames come as linear radiance too, of more than 8 bits."""
 
     @property
     def resources(self) -> tuple[str, ...]:
@@ -78,9 +78,9 @@ class Request:
 
     @property
     def asks_for_layers(self) -> bool:
-        """Whether a layer is one of the outputs."""
+        """True if a layer is one of the outputs."""
         return not LAYERS.keys().isdisjoint(self.outputs)
 
     def asks_for(self, resource: str) -> bool:
-        """Whether a resource is one of the outputs."""
+        """Return whether a resource is one of the outputs."""
         return resource in self.resources

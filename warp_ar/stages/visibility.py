@@ -1,4 +1,4 @@
-"""What of the virtual objects each pixel sees."""
+"""Virtual object that each pixel sees."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ REFERENCE_SIZE: Final = (32, 64)
 
 @dataclasses.dataclass(frozen=True)
 class Method:
-    """How many rays, for how many pixels."""
+    """Rays per estimate, and estimates per frame."""
 
     count: int
     """Samples of the environment per estimate."""
@@ -23,7 +23,7 @@ class Method:
     stride: int
     """Pixels from one estimate to the next in frames of ``STRIDE_ROWS`` rows."""
     bounce: Literal["estimated", "traced"]
-    """How what objects reflect onto the receiver is found."""
+    """Method by which light from objects onto the receiver is found."""
     secondary: float = 1.0
     """Share of the rays that look for it: light that takes rays to find is smooth, and half of them find it."""
 

@@ -27,7 +27,7 @@ VARIABLE: Final = "WARP_AR_KERNELS"
 
 
 def shares_kernels(device: Any) -> bool:
-    """Whether kernels on ``device`` are those of any scene.
+    """Return whether kernels on ``device`` are those of any scene.
 
     Raises:
         UsageError: The environment variable has another value.
