@@ -17,9 +17,9 @@ import pytest
 
 from tests.viewer_rig import PATIENCE, Page, run, served
 from warp_ar.errors import UsageError
+from warp_ar.viewer.address import load_context, make_certificate, make_context
 from warp_ar.viewer.gate import MOST_PER_ADDRESS
 from warp_ar.viewer.server import own_headers
-from warp_ar.viewer.tls import load_context, make_certificate, make_context
 
 SECRET = "5ec2e7"
 HEADER_SECONDS = 0.7

@@ -19,9 +19,8 @@ from warp_ar.scene.object_shapes import part_placements
 from warp_ar.sources.synthetic import Synthetic
 from warp_ar.stages.quality import PRESETS
 from warp_ar.viewer import edits
-from warp_ar.viewer.animations import names_of, play_record, set_play
 from warp_ar.viewer.controls import Controls, Feed
-from warp_ar.viewer.edits import Wanted
+from warp_ar.viewer.edits import Wanted, names_of, play_record, set_play
 from warp_ar.viewer.protocol import ProtocolError, parse_text
 
 DURATION = 2.0

@@ -30,9 +30,9 @@ from warp_ar.light.captured import latlong_directions, texel_solid_angles
 from warp_ar.output.environment_axes import AXES, FACES, to_cube
 from warp_ar.output.environment_harmonics import basis
 from warp_ar.scene import Pose
-from warp_ar.viewer import shared_light
+from warp_ar.viewer import routes
 from warp_ar.viewer.light_record import LightState, describe, encode_picture, key_light
-from warp_ar.viewer.shared_light import MOST_LISTENERS, check_origin
+from warp_ar.viewer.routes import MOST_LISTENERS, check_origin
 
 ROOT = Path(__file__).resolve().parents[1]
 # A lamp of 4 degrees within a map of 64 rows: half a texel is 1.4 degrees.
@@ -252,7 +252,7 @@ async def test_the_token_is_asked_for() -> None:
 
 @run
 async def test_who_has_asked_counts_as_a_viewer_for_a_while(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shared_light, "WATCH_SECONDS", 0.3)
+    monkeypatch.setattr(routes, "WATCH_SECONDS", 0.3)
     async with served() as site:
         await known_light(site)
         await known_light(site)

@@ -6,6 +6,7 @@ import math
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,13 +17,18 @@ from tests.viewer_rig import Running, page_scene, rendered_cards
 from warp_ar.errors import UsageError
 from warp_ar.scene import Camera, Pose, load_calibration
 from warp_ar.tracking.card_layout import SHEET
-from warp_ar.viewer import protocol
-from warp_ar.viewer.calibration import CalibrationSession
-from warp_ar.viewer.encoding import encode_jpeg
+from warp_ar.viewer.camera import CalibrationSession
 from warp_ar.viewer.frames import Lit
+from warp_ar.viewer.protocol import Picture
+from warp_ar.viewer.server import encode_jpeg
 
 # A dozen views of the board in noisy pictures of 480x360, measured 0.3 %.
 CALIBRATED_ERROR = 0.01
+
+
+def calibration_of(running: Running) -> dict[str, Any]:
+    """What a new viewer is told of the calibration."""
+    return next(message for message in running.host.greetings() if message["type"] == "calibration")
 
 
 def test_a_calibration_that_tells_too_little_is_not_used() -> None:
@@ -79,28 +85,28 @@ def test_a_camera_is_calibrated_while_it_is_lit(tmp_path: Path) -> None:
         with pytest.raises(UsageError, match="start the calibration"):
             running.edit(type="calibrate", step="finish")
         with pytest.raises(UsageError, match="no camera was calibrated"):
-            running.host.camera_file()
+            running.host.downloads(full_paths=False)["camera.yml"][1]()
         running.edit(type="camera", width=size[0], height=size[1])
         running.edit(type="calibrate", step="start")
         longest = 1.0  # seconds until a view counted: on a busy machine one that does not is waited for as much longer
         for count, image in enumerate(views):
-            before, began = running.host.calibration_message()["views"], time.monotonic()
+            before, began = calibration_of(running)["views"], time.monotonic()
             while (waited := time.monotonic() - began) < 5.0 * longest:
-                running.host.push(protocol.Picture(count, 1000.0, encode_jpeg(image)), "me")
+                running.host.push(Picture(count, 1000.0, encode_jpeg(image)), "me")
                 time.sleep(0.1)
-                if running.host.calibration_message()["views"] > before:
+                if calibration_of(running)["views"] > before:
                     longest = max(longest, waited)
                     break
-        assert running.host.calibration_message()["views"] >= 10
+        assert calibration_of(running)["views"] >= 10
         running.edit(type="calibrate", step="finish")
-        report = running.host.calibration_message()["report"]
+        report = calibration_of(running)["report"]
         assert report["focal"] == pytest.approx(truth.fx, rel=CALIBRATED_ERROR)
-        (tmp_path / "camera.yml").write_bytes(running.host.camera_file())
+        (tmp_path / "camera.yml").write_bytes(running.host.downloads(full_paths=False)["camera.yml"][1]())
         camera = load_calibration(tmp_path / "camera.yml")
         assert camera.fx == pytest.approx(report["focal"])
 
         def lit_so() -> Lit | None:
-            running.host.push(protocol.Picture(99, 1000.0, encode_jpeg(views[0])), "me")
+            running.host.push(Picture(99, 1000.0, encode_jpeg(views[0])), "me")
             return next((lit for lit in running.frames[-3:] if lit.camera.fx == camera.fx), None)
 
         lit = running.until(lit_so)
@@ -114,4 +120,4 @@ def test_a_camera_is_calibrated_while_it_is_lit(tmp_path: Path) -> None:
         running.until(lambda: running.host.state_message()["lens"] != "calibrated")
         running.edit(type="redo")
         running.until(lambda: running.host.state_message()["lens"] == "calibrated")
-        assert running.host.card("a4").startswith(b"%PDF")
+        assert running.host.downloads(full_paths=False)["card-a4.pdf"][1]().startswith(b"%PDF")

@@ -10,7 +10,7 @@ import pytest
 from tests.viewer_rig import rendered_cards
 from warp_ar.scene import Camera, Marker, load_scene
 from warp_ar.sources.sources import open_source
-from warp_ar.viewer.intrinsics import FocalEstimator, guessed_camera
+from warp_ar.viewer.camera import FocalEstimator, guessed_camera
 
 # A corner's noise of 0.2 pixels over a dozen views tells the focal length to about 1 %.
 FOCAL_ERROR = 0.03

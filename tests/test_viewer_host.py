@@ -23,10 +23,9 @@ from warp_ar.scene import Animation, Camera, loads_scene
 from warp_ar.sources.sources import Synthetic
 from warp_ar.tracking.card_layout import SHEET
 from warp_ar.tracking.tracking import TrackState
-from warp_ar.viewer import protocol
-from warp_ar.viewer.encoding import encode_jpeg
 from warp_ar.viewer.lighting import FIRST, Lighting, make_target
-from warp_ar.viewer.protocol import ProtocolError
+from warp_ar.viewer.protocol import Command, Picture, ProtocolError
+from warp_ar.viewer.server import encode_jpeg
 
 # JPEG at quality 85 against the picture, mean absolute difference of a synthetic desk in levels; measured 1.4.
 JPEG_ERROR = 4.0
@@ -306,12 +305,12 @@ def test_comparisons() -> None:
 def test_recording_is_a_video(tmp_path: Path) -> None:
     with Running(page_scene()) as running:
         with pytest.raises(UsageError, match="nothing was recorded"):
-            running.host.recording()
+            running.host.downloads(full_paths=False)["recording.mp4"][1]()
         running.edit(type="record", on=True)
         running.next(5)
         running.edit(type="record", on=False)
         path = tmp_path / "copy.mp4"
-        path.write_bytes(running.host.recording())
+        path.write_bytes(running.host.downloads(full_paths=False)["recording.mp4"][1]())
         video = cv2.VideoCapture(str(path))
         ok, picture = video.read()
         video.release()
@@ -327,10 +326,10 @@ def test_the_browsers_camera_is_the_source_until_it_leaves(tmp_path: Path) -> No
         assert host.camera_size("me") == SIZE
         assert host.camera_size("you") is None
         with pytest.raises(UsageError, match="another viewer"):
-            host.edit(protocol.UseCamera(*SIZE), "you")
+            host.edit(Command("camera", {"width": SIZE[0], "height": SIZE[1]}), "you")
         count = 0
         while not any(lit.stamp is not None for lit in running.frames):
-            host.push(protocol.Picture(count, 1000.0 + count, encode_jpeg(frames[count % 30])), "me")
+            host.push(Picture(count, 1000.0 + count, encode_jpeg(frames[count % 30])), "me")
             count += 1
             time.sleep(0.05)
             assert count < PATIENCE / 0.05
@@ -340,9 +339,9 @@ def test_the_browsers_camera_is_the_source_until_it_leaves(tmp_path: Path) -> No
         assert all(message["wait"] >= 0.0 for message in told)
         sent = frames[int(lit.stamp - 1000.0) % 30]
         assert np.abs(lit.frame.astype(int) - sent).mean() < JPEG_ERROR, "the stamp belongs to another frame"
-        host.push(protocol.Picture(1, 5.0, jpeg()), "me")  # of another size: left aside
+        host.push(Picture(1, 5.0, jpeg()), "me")  # of another size: left aside
         with pytest.raises(ProtocolError, match="decoded"):
-            host.push(protocol.Picture(2, 5.0, b"\xff\xd8 nothing"), "me")
+            host.push(Picture(2, 5.0, b"\xff\xd8 nothing"), "me")
         start = len(running.frames)
         host.leave_camera("you")
         assert host.camera_size("me") == SIZE
@@ -360,7 +359,7 @@ def test_the_card_is_not_taken_for_a_single_marker() -> None:
         running.edit(type="camera", width=size[0], height=size[1])
 
         def shown() -> dict[str, str] | None:
-            running.host.push(protocol.Picture(1, 1000.0, encode_jpeg(views[0])), "me")
+            running.host.push(Picture(1, 1000.0, encode_jpeg(views[0])), "me")
             time.sleep(0.1)
             missing: dict[str, str] | None = running.host.state_message()["missing"]
             return missing
@@ -376,7 +375,7 @@ def test_the_card_is_not_taken_for_a_single_marker() -> None:
 
 def test_downloads_of_the_light_and_the_picture(tmp_path: Path) -> None:
     with Running(page_scene()) as running:
-        running.until(lambda: running.host.light() is not None)
+        running.until(lambda: running.host.light_state is not None)
         path = tmp_path / "light.exr"
         path.write_bytes(running.host.environment_exr())
         assert read_environment(path).shape == (64, 128, 3)

@@ -24,20 +24,18 @@ from warp_ar.errors import SinkError, SourceError, UsageError
 from warp_ar.output.sinks import VideoSink
 from warp_ar.sources.sources import Synthetic
 from warp_ar.stages.quality import PRESETS
-from warp_ar.viewer import browser_camera, protocol
 from warp_ar.viewer import budget as budget_setting
+from warp_ar.viewer import camera as camera_module
 from warp_ar.viewer import setup as setup_checks
-from warp_ar.viewer.browser_camera import BrowserCamera
 from warp_ar.viewer.budget import BudgetSetting
-from warp_ar.viewer.calibration import CalibrationSession
-from warp_ar.viewer.controls import Controls, Feed
+from warp_ar.viewer.camera import BrowserCamera, CalibrationSession, FocalEstimate
+from warp_ar.viewer.controls import Controls, Feed, NoCamera
 from warp_ar.viewer.edits import Wanted
+from warp_ar.viewer.frames import Recorder
 from warp_ar.viewer.host import Host
-from warp_ar.viewer.intrinsics import FocalEstimate
 from warp_ar.viewer.lighting import Lighting
-from warp_ar.viewer.no_camera import NoCamera
-from warp_ar.viewer.page_files import DROPS
-from warp_ar.viewer.recorder import Recorder
+from warp_ar.viewer.protocol import Command, Picture
+from warp_ar.viewer.routes import DROPS
 from warp_ar.viewer.server import Server
 
 # How long the one of two threads is given that comes too early where nothing holds it back.
@@ -105,12 +103,12 @@ def test_a_budget_and_a_preset_that_are_asked_for_at_once(resting: Host, monkeyp
     def slow(budget: float | None) -> None:
         switch(budget)
         if not others:
-            others.append(threading.Thread(target=resting.edit, args=(protocol.SetQuality("paper"),)))
+            others.append(threading.Thread(target=resting.edit, args=(Command("quality", {"name": "paper"}),)))
             others[0].start()
             others[0].join(AHEAD)
 
     monkeypatch.setattr(resting._budget, "switch", slow)
-    resting.edit(protocol.Budget(20.0))
+    resting.edit(Command("budget", {"ms": 20.0}))
     others[0].join(PATIENCE)
     assert (resting._budget.budget is not None) == BudgetSetting.rules(resting.wanted().quality)
 
@@ -185,7 +183,7 @@ class LateEstimator:
 @pytest.mark.parametrize("adopted", [True, False])
 def test_an_estimate_that_comes_late_is_not_the_next_source_s(monkeypatch: pytest.MonkeyPatch, adopted: bool) -> None:
     """A viewer that goes while its picture is looked at: the scene's own source keeps the scene's camera."""
-    monkeypatch.setattr(browser_camera, "FocalEstimator", LateEstimator)
+    monkeypatch.setattr(camera_module, "FocalEstimator", LateEstimator)
     told: list[Any] = []
     controls = make_controls(told.append)
     camera = BrowserCamera(controls, told.append)
@@ -199,7 +197,7 @@ def test_an_estimate_that_comes_late_is_not_the_next_source_s(monkeypatch: pytes
 
     assert isinstance(camera._estimator, LateEstimator)
     camera._estimator.leave = leave
-    camera.push(protocol.Picture(1, 1.0, jpeg(*SIZE)), "me")
+    camera.push(Picture(1, 1.0, jpeg(*SIZE)), "me")
     controls.adopt()
     assert controls.feed.camera is None
     assert not camera.estimated
@@ -209,13 +207,13 @@ def test_an_estimate_that_comes_late_is_not_the_next_source_s(monkeypatch: pytes
 
 def test_an_estimate_is_of_the_camera_that_comes_next(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its pictures are looked at before the frame in hand is lit, after which it is the source."""
-    monkeypatch.setattr(browser_camera, "FocalEstimator", LateEstimator)
+    monkeypatch.setattr(camera_module, "FocalEstimator", LateEstimator)
     controls = make_controls(lambda message: None)
     camera = BrowserCamera(controls, lambda message: None)
     camera.use(*SIZE, "me")
     assert isinstance(camera._estimator, LateEstimator)
     camera._estimator.leave = lambda: None
-    camera.push(protocol.Picture(1, 1.0, jpeg(*SIZE)), "me")
+    camera.push(Picture(1, 1.0, jpeg(*SIZE)), "me")
     assert controls.feed.camera is None, "the scene's own source has the scene's camera"
     controls.adopt()
     assert controls.feed.camera is not None
@@ -233,7 +231,7 @@ def test_a_camera_can_be_left_where_the_scene_has_no_source() -> None:
         running.until(lambda: host.no_camera is not None)
         assert any("names no source" in str(message.get("text")) for message in running.messages)
         running.until(lambda: host.state_message()["missing"])
-        host.edit(protocol.UseCamera(*SIZE), "you")
+        host.edit(Command("camera", {"width": SIZE[0], "height": SIZE[1]}), "you")
         assert host.camera_size("you") == SIZE
 
 

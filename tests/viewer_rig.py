@@ -24,12 +24,11 @@ from warp_ar.calibration.card import card_size, draw_card
 from warp_ar.scene import Camera, Marker, Scene, SourceSpec
 from warp_ar.scene.pixel_rays import pixel_rays
 from warp_ar.viewer.address import Address
-from warp_ar.viewer.encoding import encode_jpeg
 from warp_ar.viewer.frames import Lit
 from warp_ar.viewer.gate import HEADER_SECONDS
 from warp_ar.viewer.host import Host
 from warp_ar.viewer.protocol import ProtocolError, parse_text
-from warp_ar.viewer.server import Server
+from warp_ar.viewer.server import Server, encode_jpeg
 
 SIZE = (320, 240)
 PATIENCE = 180.0  # seconds that anything may take on a busy machine

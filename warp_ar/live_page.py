@@ -53,9 +53,8 @@ def _page_scene(options: argparse.Namespace) -> Scene:
 
 def _page_address(options: argparse.Namespace) -> Address:
     """Where the page is served, and with which token and certificate."""
-    from warp_ar.viewer.address import EVERYWHERE, LOOPBACK, Address, own_address
-    from warp_ar.viewer.shared_light import check_origin
-    from warp_ar.viewer.tls import load_context, make_context
+    from warp_ar.viewer.address import EVERYWHERE, LOOPBACK, Address, load_context, make_context, own_address
+    from warp_ar.viewer.routes import check_origin
 
     known = options.token is not None or options.host in LOOPBACK
     tls = None

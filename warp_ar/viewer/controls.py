@@ -1,22 +1,154 @@
-"""What viewers ask for: the one state that the page's threads share, and its lock."""
+"""State that the page's threads share: the source, the wanted scene, its edits and the lock of all these.
+
+A desk of one's own names the camera of its machine. Where there is none, a picture says so until a browser's camera
+comes.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final
 
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from warp_ar.checks.finding import Finding
 from warp_ar.errors import SourceError, UsageError
 from warp_ar.scene import Camera, Scene, SourceSpec
+from warp_ar.sources.source import Frame, Source
 from warp_ar.sources.sources import MOST_INDEX, QueueSource, Source, open_source
 from warp_ar.stages.quality import PRESETS
 from warp_ar.viewer.edits import Wanted, wanted_record
-from warp_ar.viewer.history import History
 from warp_ar.viewer.messages import Notify
-from warp_ar.viewer.no_camera import NoCamera
+
+MOST_EDITS: Final = 100
+"""Edits that can be undone."""
+TOGETHER_SECONDS: Final = 1.0
+"""Changes of one value that follow each other so soon are one edit: a drag, a slider."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Edit:
+    label: str
+    """What was done, in words."""
+    other: Wanted
+    """What is wanted on the other side of the edit."""
+
+
+class History:
+    """Edits in order. Not locked: whoever owns it holds a lock."""
+
+    def __init__(self) -> None:
+        self._done: list[_Edit] = []
+        self._undone: list[_Edit] = []
+        self._last = -TOGETHER_SECONDS
+
+    @property
+    def undo_label(self) -> str | None:
+        """What would be undone; None where nothing can be."""
+        return self._done[-1].label if self._done else None
+
+    @property
+    def redo_label(self) -> str | None:
+        """What would be done again; None where nothing can be."""
+        return self._undone[-1].label if self._undone else None
+
+    def note(self, label: str, before: Wanted, now: float) -> None:
+        """Note an edit.
+
+        Args:
+            label: What it does, in words; successive edits with the same words may become one.
+            before: What was wanted before it.
+            now: Seconds on a clock that does not jump.
+        """
+        self._undone.clear()
+        same = bool(self._done) and self._done[-1].label == label and now - self._last < TOGETHER_SECONDS
+        self._last = now
+        if not same:
+            self._done = [*self._done, _Edit(label, before)][-MOST_EDITS:]
+
+    def undo(self, wanted: Wanted) -> Wanted | None:
+        """What was wanted before the last edit; None where there is none."""
+        return self._move(wanted, self._done, self._undone)
+
+    def redo(self, wanted: Wanted) -> Wanted | None:
+        """What was wanted before the last undo; None where there is none."""
+        return self._move(wanted, self._undone, self._done)
+
+    def _move(self, wanted: Wanted, source: list[_Edit], target: list[_Edit]) -> Wanted | None:
+        if not source:
+            return None
+        edit = source.pop()
+        target.append(_Edit(edit.label, wanted))
+        self._last = -TOGETHER_SECONDS
+        # The quality is no edit: a budget chooses it too.
+        return dataclasses.replace(edit.other, quality=wanted.quality)
+
+    def drop(self, before: Wanted) -> None:
+        """Forget the last edit if ``before`` is what was wanted before it: it could not be made."""
+        if self._done and dataclasses.replace(self._done[-1].other, quality=before.quality) == before:
+            self._done.pop()
+
+    def clear(self) -> None:
+        """Forget all."""
+        self._done.clear()
+        self._undone.clear()
+
+
+REMEDY: Final = "press “My camera”, which opens the camera of the machine that shows this page"
+_WORDS: Final = ("No camera here.", 'Press "My camera".')
+_GREY, _WHITE = 64, 235
+_PICTURE_SECONDS: Final = 0.5
+"""Between pictures, which are all the same."""
+
+
+class NoCamera(Source):
+    """One grey picture with words, again and again."""
+
+    live = True
+    length = None
+    fps = 1.0 / _PICTURE_SECONDS
+
+    def __init__(self, size: tuple[int, int], error: SourceError) -> None:
+        """Say what is wrong.
+
+        Args:
+            size: (width, height) of the picture, pixels.
+            error: Why the capture device cannot be opened.
+        """
+        self.size, self.description, self.error = size, "no camera", error
+        self.finding = Finding("source.absent", str(error).partition(";")[0], REMEDY)
+        """What is wrong, and what to do on the page."""
+        self._closed = threading.Event()
+
+    def __iter__(self) -> Iterator[Frame]:
+        """The picture, until the source is closed."""
+        image, start, index = _picture(self.size), time.monotonic(), 0
+        while not self._closed.is_set():
+            yield Frame(index, time.monotonic() - start, image)
+            index += 1
+            self._closed.wait(_PICTURE_SECONDS)
+
+    def close(self) -> None:
+        """End the pictures."""
+        self._closed.set()
+
+
+def _picture(size: tuple[int, int]) -> npt.NDArray[np.uint8]:
+    """Words in the middle of a grey picture, RGB (height, width, 3)."""
+    image = np.full((size[1], size[0], 3), _GREY, np.uint8)
+    scale = size[0] / 640
+    for line, words in enumerate(_WORDS):
+        (width, height), _ = cv2.getTextSize(words, cv2.FONT_HERSHEY_SIMPLEX, scale, 2)
+        place = ((size[0] - width) // 2, size[1] // 2 + round((2.0 * line - 0.5) * height))
+        cv2.putText(image, words, place, cv2.FONT_HERSHEY_SIMPLEX, scale, (_WHITE,) * 3, 2, cv2.LINE_AA)
+    return image
+
 
 CAMERA: Final = "camera"
 """What a picture is compared with when it is not another preset."""

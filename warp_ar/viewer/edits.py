@@ -1,8 +1,12 @@
-"""Scenes as the page edits them: whatever it changes is checked as a scene file is."""
+"""Scenes as the page edits them; every change is checked as a scene file is.
+
+Animations of glTF files are chosen, started, held and made faster without a jump of the pose.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final, cast
@@ -10,7 +14,7 @@ from typing import Any, Final, cast
 import numpy as np
 
 from warp_ar.checks.check_print import card_scale
-from warp_ar.errors import UsageError
+from warp_ar.errors import SceneError, UsageError
 from warp_ar.scene import (
     Camera,
     CharucoBoard,
@@ -24,19 +28,84 @@ from warp_ar.scene import (
     MirrorMaterial,
     Object,
     PhongMaterial,
+    Play,
     Probe,
     Proxy,
     Scene,
     dumps_scene,
     loads_scene,
 )
-from warp_ar.scene.object_materials import mesh_of
+from warp_ar.scene.mesh_files import GLTF_SUFFIXES, animations_of
+from warp_ar.scene.object_materials import file_stamp, mesh_of, moving_mesh_of
 from warp_ar.stages import STAGES
 from warp_ar.stages.quality import Quality
 from warp_ar.tracking.card_layout import RINGS, SHEET, ball_center
-from warp_ar.viewer import protocol
-from warp_ar.viewer.animations import play_record, set_play
-from warp_ar.viewer.protocol import EFFECTS
+from warp_ar.viewer.protocol import EFFECTS, Command
+
+NONE = -1
+"""Number of no animation: everything stands as the file's nodes do."""
+_DIGITS = 4
+"""Of seconds that the page sets, in scene files: a tenth of a millisecond."""
+
+
+def names_of(item: Object) -> tuple[str, ...]:
+    """Names of the animations of an object's file, by number; one without a name is told by its number."""
+    if item.file is None or item.mesh is not None or item.file.suffix.lower() not in GLTF_SUFFIXES:
+        return ()
+    return _names(item.file, file_stamp(item.file))
+
+
+@functools.lru_cache(maxsize=64)
+def _names(path: Path, stamp: tuple[int, int]) -> tuple[str, ...]:
+    try:
+        return tuple(name or f"Animation {number}" for number, name in enumerate(animations_of(path)))
+    except SceneError:
+        return ()  # the scene that shows the object says what is wrong
+
+
+def play_record(item: Object) -> dict[str, Any]:
+    """What the page shows of an object's animations."""
+    names = names_of(item)
+    if not names:
+        return {}
+    play = item.play
+    if play is None:
+        return {"animations": names, "animation": NONE, "speed": Play.speed, "loop": Play.loop, "paused": False}
+    number = names.index(play.animation) if isinstance(play.animation, str) else play.animation
+    shown = {"speed": play.speed, "loop": play.loop, "paused": play.paused}
+    return {"animations": names, "animation": number, **shown}
+
+
+def set_play(item: Object, key: str, value: float, seconds: float) -> Object:
+    """The object with one value of its animation changed; its pose at that moment stays.
+
+    Args:
+        item: An object with a glTF file.
+        key: ``animation``: its number, ``NONE`` for none, which begins at once; ``speed``; ``loop``; ``paused``: 0 goes
+            on from the pose that is held, or anew if that is the last one.
+        value: Number or flag.
+        seconds: Of the frame that is shown, since the first.
+
+    Raises:
+        UsageError: The object's file has no such animation, or it plays none.
+    """
+    names = names_of(item)
+    if key == "animation":
+        number = int(value)
+        if not NONE <= number < len(names):
+            raise UsageError(f"animation {number}: the file has {len(names)}, counted from 0")
+        begun = Play(animation=number, start=round(seconds, _DIGITS))
+        return dataclasses.replace(item, play=None if number == NONE else begun)
+    moving = moving_mesh_of(item)
+    if item.play is None or moving is None:
+        raise UsageError("the object plays no animation: choose one first")
+    at = item.play.time_at(seconds, moving.duration)
+    if key == "paused" and not value and not item.play.loop and at >= moving.duration:
+        at = 0.0
+    changed: Any = value if key == "speed" else bool(value)
+    held = dataclasses.replace(item.play, offset=round(at, _DIGITS), start=round(seconds, _DIGITS))
+    return dataclasses.replace(item, play=dataclasses.replace(held, **{key: changed}))
+
 
 MOST_PARTS: Final = 16
 """Objects, lights or proxies in a scene that the page may add to."""
@@ -360,38 +429,44 @@ def set_animation(scene: Scene, index: int, key: str, value: float, seconds: flo
     return _with_list(scene, "object", tuple(items))
 
 
-def make_edit(
-    command: protocol.Command, original: Wanted, seconds: float = 0.0
-) -> tuple[Callable[[Wanted], Wanted], str] | None:
-    """What a command makes of what is wanted, and its name in words; None if it is no edit.
+Edit = Callable[[Wanted], Wanted]
+
+
+def make_edit(command: Command, original: Wanted, seconds: float = 0.0) -> tuple[Edit, str] | None:
+    """Return the edit that a command asks for, and its name in words; None if the command is no edit.
 
     Args:
-        command: What the page asks for.
+        command: Command of a page.
         original: The scene before any edit.
-        seconds: Of the newest frame, since the first.
+        seconds: Time of the newest frame since the first.
     """
-    match command:
-        case protocol.Set(part, index, key, value):
-            return lambda w: dataclasses.replace(w, scene=set_value(w.scene, part, index, key, value)), (
-                f"set {key} of {_named(part, index)}"
-            )
-        case protocol.Animate(index, key, value):
-            return lambda w: dataclasses.replace(w, scene=set_animation(w.scene, index, key, value, seconds)), (
-                f"set the {'pause' if key == 'paused' else key} of {_named('object', index)}"
-            )
-        case protocol.Add(part, kind):
-            return lambda w: dataclasses.replace(w, scene=add_part(w.scene, part, kind)), f"add {kind}"
-        case protocol.Remove(part, index):
-            return lambda w: w.without_part(part, index), f"remove {_named(part, index)}"
-        case protocol.Show(part, index, on):
-            return lambda w: w.with_part_shown(part, index, on), f"{'show' if on else 'hide'} {_named(part, index)}"
-        case protocol.Effect(name, on):
-            return lambda w: w.with_effect(name, on), f"switch {name.replace('_', ' ')} {'on' if on else 'off'}"
-        case protocol.Method(stage, method):
-            return lambda w: w.with_method(stage, method), f"choose the method of {stage.replace('_', ' ')}"
-        case protocol.UseCard(radius, ruler):
-            return lambda w: dataclasses.replace(w, scene=use_card(w.scene, radius, ruler)), "use the printed card"
-        case protocol.Reset():
+    fields = command.fields
+    part, index = fields.get("part", "object"), fields.get("index", 0)
+    words = _named(part, index)
+
+    def of_scene(change: Callable[..., Scene], *arguments: Any) -> Edit:
+        return lambda w: dataclasses.replace(w, scene=change(w.scene, *arguments))
+
+    match command.type:
+        case "set":
+            return of_scene(set_value, *fields.values()), f"set {fields['key']} of {words}"
+        case "animate":
+            what = "pause" if fields["key"] == "paused" else fields["key"]
+            return of_scene(set_animation, *fields.values(), seconds), f"set the {what} of {words}"
+        case "add":
+            return of_scene(add_part, *fields.values()), f"add {fields['kind']}"
+        case "remove":
+            return lambda w: w.without_part(**fields), f"remove {words}"
+        case "show":
+            return lambda w: w.with_part_shown(**fields), f"{'show' if fields['on'] else 'hide'} {words}"
+        case "effect":
+            name = fields["name"].replace("_", " ")
+            return lambda w: w.with_effect(**fields), f"switch {name} {'on' if fields['on'] else 'off'}"
+        case "method":
+            return lambda w: w.with_method(**fields), f"choose the method of {fields['stage'].replace('_', ' ')}"
+        case "card":
+            return of_scene(use_card, *fields.values()), "use the printed card"
+        case "reset":
             return lambda w: dataclasses.replace(original, quality=w.quality, cameras=w.cameras), "undo all edits"
     return None
 

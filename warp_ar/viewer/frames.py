@@ -1,11 +1,14 @@
-"""The page's frames: taken from the source when they are due, lit, handed out."""
+"""Frames of the page: taken from the source when they are due, lit, recorded, handed out."""
 
 from __future__ import annotations
 
 import collections
+import contextlib
 import dataclasses
+import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Final
 
 import cv2
@@ -14,23 +17,92 @@ import numpy.typing as npt
 
 from warp_ar.device import exclusive
 from warp_ar.engine.pipeline import Pipeline, Result
-from warp_ar.errors import WarpArError
+from warp_ar.errors import UsageError, WarpArError
+from warp_ar.output.sinks import VideoSink
 from warp_ar.scene import Camera, Pose
 from warp_ar.sources.sources import Frame, Source
 from warp_ar.stages.quality import PRESETS
 from warp_ar.tracking.tracking import TrackState
-from warp_ar.viewer.browser_camera import BrowserCamera, Image, Pushed
 from warp_ar.viewer.budget import BudgetSetting
-from warp_ar.viewer.calibration import CalibrationSession
+from warp_ar.viewer.camera import BrowserCamera, CalibrationSession, Image, Pushed, guessed_camera
 from warp_ar.viewer.controls import CONVERGING, Controls
 from warp_ar.viewer.convergence import Convergence
 from warp_ar.viewer.edits import Wanted
-from warp_ar.viewer.intrinsics import guessed_camera
 from warp_ar.viewer.light_record import LightState
 from warp_ar.viewer.lighting import Lighting
 from warp_ar.viewer.messages import Notify, failure
-from warp_ar.viewer.recorder import Recorder
 from warp_ar.viewer.setup import SetupChecks
+
+MOST_FRAMES: Final = 9000
+"""After so many a recording ends by itself: five minutes at 30 a second."""
+
+
+class Recorder:
+    """One recording at a time. Methods may be called from any thread."""
+
+    def __init__(self, folder: Path) -> None:
+        """Start without a recording.
+
+        Args:
+            folder: Where the video is kept; the newest recording replaces the one before.
+        """
+        self._path = folder / "recording.mp4"
+        self._lock = threading.Lock()
+        self._sink: VideoSink | None = None
+        self._count = 0
+
+    @property
+    def count(self) -> int | None:
+        """Frames recorded so far; None while nothing is recorded."""
+        return None if self._sink is None else self._count
+
+    def start(self, fps: float) -> None:
+        """Record from now on; a recording that runs goes on."""
+        with self._lock:
+            if self._sink is None:
+                self._path.unlink(missing_ok=True)
+                self._sink, self._count = VideoSink(self._path, fps=fps), 0
+
+    def stop(self) -> None:
+        """Finish the recording, if there is one."""
+        with self._lock:
+            self._finish()
+
+    def _finish(self) -> None:
+        if self._sink is not None:
+            sink, self._sink = self._sink, None
+            sink.close()
+
+    def add(self, image: npt.NDArray[np.uint8]) -> None:
+        """Record a frame, if a recording runs.
+
+        Raises:
+            WarpArError: It cannot be recorded, such as one of another size; the recording has ended.
+        """
+        with self._lock:
+            if self._sink is None:
+                return
+            try:
+                self._sink.write(image)
+            except WarpArError:
+                with contextlib.suppress(WarpArError):
+                    self._finish()
+                raise
+            self._count += 1
+            if self._count >= MOST_FRAMES:
+                self._finish()
+
+    def video(self) -> bytes:
+        """The finished recording, an MP4.
+
+        Raises:
+            UsageError: There is none.
+        """
+        with self._lock:  # a file that is being finished is not whole yet
+            if self._sink is not None or not self._path.is_file():
+                raise UsageError("nothing was recorded, or it has not ended")
+            return self._path.read_bytes()
+
 
 PLAY_RATE: Final = 30.0
 """Frames a second of clips that tell no rate."""
@@ -123,10 +195,8 @@ class FrameLoop:
         """The reference of a held frame."""
         self.latest: Lit | None = None
         """The newest frame."""
-        self.light: npt.NDArray[np.float32] | None = None
-        """The environment, latlong linear RGB, as it was a moment ago; None while it is not known."""
         self.light_state: LightState | None = None
-        """The same with what is known of it."""
+        """The environment as it was a moment ago, with what is known of it; None while it is not known."""
 
     @property
     def fps(self) -> float:
@@ -362,7 +432,7 @@ class FrameLoop:
         self._light_time = now
         light = pipeline.arrays.get("environment")
         if light is None:
-            self.light = self.light_state = None
+            self.light_state = None
             return
         with exclusive(pipeline.device):
             values = np.array(light.numpy())
@@ -371,11 +441,10 @@ class FrameLoop:
             scale = pipeline.arrays.get("expose_scale")
             exposure = 1.0 if scale is None else float(scale.numpy()[0])
         status = pipeline.arrays.get("recover_status")
-        # Black until the ball has been seen once.
-        self.light = values if values.any() else None
         known = {} if status is None else status()
         places = tuple(probe.center for probe in pipeline.scene.probes[: len(others) + 1])
-        self.light_state = None if self.light is None else LightState(values, exposure, known, others, places)
+        seen = values.any()  # black until the ball has been seen once
+        self.light_state = LightState(values, exposure, known, others, places) if seen else None
 
     def _watch_cost(self, pipeline: Pipeline, frame: Frame, result: Result, light_ms: float) -> None:
         """Learn what the preset costs; under a budget, choose the methods that it asks for."""

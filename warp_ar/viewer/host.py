@@ -12,30 +12,25 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
-import numpy.typing as npt
 
 from warp_ar.checks.pointed_shape import point_out
 from warp_ar.engine.pipeline import resolve_quality
 from warp_ar.errors import SourceError, UsageError, WarpArError
 from warp_ar.output.sinks import write_environment
-from warp_ar.scene import Scene, bundled_scenes, dumps_scene, load_scene
+from warp_ar.scene import Camera, Scene, bundled_scenes, dumps_scene, load_scene
 from warp_ar.stages.quality import AUTO, DEFAULT_PRESET, PRESETS, Quality
-from warp_ar.viewer import calibration, edits, protocol
-from warp_ar.viewer.browser_camera import BrowserCamera
+from warp_ar.viewer import edits
 from warp_ar.viewer.budget import BudgetSetting
-from warp_ar.viewer.bundle import pack_scene
-from warp_ar.viewer.calibration import CalibrationSession
-from warp_ar.viewer.controls import Controls, Feed, open_feed
+from warp_ar.viewer.camera import BrowserCamera, CalibrationSession, card_pdf, written
+from warp_ar.viewer.controls import Controls, Feed, NoCamera, open_feed
 from warp_ar.viewer.edits import Wanted
-from warp_ar.viewer.frames import FrameLoop, Helpers, Lit
+from warp_ar.viewer.frames import FrameLoop, Helpers, Lit, Recorder
 from warp_ar.viewer.light_record import LightState
 from warp_ar.viewer.lighting import Lighting, make_target
 from warp_ar.viewer.messages import Notify, failure, notice
-from warp_ar.viewer.no_camera import NoCamera
-from warp_ar.viewer.recorder import Recorder
+from warp_ar.viewer.protocol import Command
 from warp_ar.viewer.setup import SetupChecks
-from warp_ar.viewer.uploads import DroppedFiles
+from warp_ar.viewer.uploads import DroppedFiles, pack_scene
 
 
 class Host:
@@ -96,8 +91,29 @@ class Host:
         self._setup = SetupChecks(self._controls, self._looker, notify, Path(self._folder.name))
         helpers = Helpers(self._lighting, self._budget, self._camera, self._calibration, self._recorder, self._setup)
         self._loop = FrameLoop(self._controls, helpers, frames=frames, publish=publish, notify=notify)
+        self._doing: dict[str, Callable[..., None]] = {
+            "undo": self._controls.undo,
+            "redo": self._controls.redo,
+            "outline": self._point_out,
+            "quality": self._choose_quality,
+            "budget": self._set_budget,
+            "scene": self._open_scene,
+            "compare": self._controls.set_compare,
+            "play": self._controls.play,
+            "record": self._record,
+            "calibrate": self._calibration.step,
+            "setup": self._setup.step,
+        }
         self.run = self._loop.run
         """Light frames until told to stop; blocks."""
+        self.stop = self._controls.stop
+        """End ``run`` after the frame in hand."""
+        self.watch = self._controls.watch
+        """Count one viewer more (1) or less (-1): without any, no frame is lit."""
+        self.push, self.camera_size = self._camera.push, self._camera.size
+        """Take a picture of a browser's camera; size of the pictures that a viewer may push."""
+        self.scene_message, self.plan_message = self._controls.scene_message, self._lighting.plan_message
+        """Messages of the scene as it is edited, and of the stages that run."""
 
     # ------------------------------------------------------------------------------------------------- what viewers ask
 
@@ -117,85 +133,49 @@ class Host:
         """The source in one line, without its folder."""
         return self._controls.feed.source.description.rsplit("/", 1)[-1]
 
-    def watch(self, change: int) -> None:
-        """One viewer more (1) or less (-1): without any, no frame is lit."""
-        self._controls.watch(change)
-
-    def stop(self) -> None:
-        """End ``run`` after the frame in hand."""
-        self._controls.stop()
-
     def wanted(self) -> Wanted:
         """What viewers see now, or will once it is built."""
         return self._controls.wanted
 
-    def edit(self, command: protocol.Command, owner: object = None) -> None:
-        """Do what a page asks for.
+    def edit(self, command: Command, owner: object = None) -> None:
+        """Carry out a command of a page.
 
         Args:
-            command: What.
-            owner: Who asks; matters for the camera only.
+            command: Command, checked.
+            owner: Viewer that asks; matters for the camera only.
 
         Raises:
             WarpArError: It cannot be done; nothing has changed.
         """
-        controls = self._controls
-        match command:
-            case protocol.Undo():
-                controls.undo()
-            case protocol.Redo():
-                controls.redo()
-            case protocol.Outline(kind, points):
-                self._point_out(kind, points)
-            case protocol.SetQuality(name):
-                self._set_budget(self._budget.last_budget if name == AUTO else None, name)
-            case protocol.Budget(ms):
-                self._set_budget(ms, self._preset.name)
-            case protocol.OpenScene(name):
-                self._open_scene(name)
-            case _:
-                if (made := edits.make_edit(command, self._original, self._loop.seconds)) is not None:
-                    controls.change(*made)
-                else:
-                    self._control(command, owner)
+        if (made := edits.make_edit(command, self._original, self._loop.seconds)) is not None:
+            self._controls.change(*made)
+        elif command.type in ("camera", "no_camera"):
+            use = self._camera.use if command.type == "camera" else self.leave_camera
+            use(**command.fields, owner=owner)
+        else:
+            self._doing[command.type](**command.fields)
+            if command.type in ("compare", "play", "record", "quality", "budget"):
+                self._notify(self.state_message())
 
-    def _control(self, command: protocol.Command, owner: object) -> None:
-        """Do what is no edit of the scene."""
-        match command:
-            case protocol.Compare(other):
-                self._controls.set_compare(other)
-            case protocol.Play(on):
-                self._controls.play(on)
-            case protocol.Record(on):
-                if on:
-                    self._recorder.start(self._controls.feed.source.fps)
-                else:
-                    self._recorder.stop()
-            case protocol.UseCamera(width, height):
-                self._camera.use(width, height, owner)
-                return
-            case protocol.LeaveCamera():
-                self.leave_camera(owner)
-                return
-            case protocol.Calibrate(step):
-                self._calibration.step(step)
-                return
-            case protocol.Setup(step):
-                self._setup.step(step)
-                return
-        self._notify(self.state_message())
+    def _record(self, on: bool) -> None:
+        if on:
+            self._recorder.start(self._controls.feed.source.fps)
+        else:
+            self._recorder.stop()
 
-    def _set_budget(self, budget: float | None, preset: str) -> None:
-        """Keep to a budget, or with None show a preset."""
+    def _choose_quality(self, name: str) -> None:
+        self._set_budget(self._budget.last_budget if name == AUTO else None, name)
+
+    def _set_budget(self, ms: float | None, preset: str | None = None) -> None:
+        """Keep to a budget, or with None show a preset: the last one that was chosen, if none is named."""
         with self._controls.changed:  # of two viewers who ask at once, both parts are those of one
-            if budget is None:
-                quality = self._preset = resolve_quality(preset)
+            if ms is None:
+                quality = self._preset = resolve_quality(preset or self._preset.name)
             else:
                 running = self._controls.wanted.quality
                 quality = running if self._budget.rules(running) else self._budget.start_quality()
-            self._budget.switch(budget)
+            self._budget.switch(ms)
             self._controls.change(lambda w: dataclasses.replace(w, quality=quality))
-        self._notify(self.state_message())
 
     def _point_out(self, kind: str, points: tuple[tuple[float, float], ...]) -> None:
         """Model a part of the desk that four points of the newest frame outline."""
@@ -226,7 +206,7 @@ class Host:
     # ----------------------------------------------------------------------------------------------- the page's camera
 
     def leave_camera(self, owner: object) -> None:
-        """Back to the scene's own source, if ``owner``'s camera is the source."""
+        """Go back to the scene's own source, if ``owner``'s camera is the source."""
         if not self._camera.is_of(owner):
             return
         scene = self._controls.wanted.scene
@@ -239,22 +219,11 @@ class Host:
             feed = Feed(NoCamera((scene.camera.width, scene.camera.height), absent))
         self._camera.leave(feed)
 
-    def camera_size(self, owner: object) -> tuple[int, int] | None:
-        """Size of the pictures that ``owner`` may push now; None if it is not the source."""
-        return self._camera.size(owner)
-
-    def push(self, taken: protocol.Picture, owner: object) -> None:
-        """Take a picture of a browser's camera; blocks while it is decoded.
-
-        Raises:
-            ProtocolError: It cannot be decoded.
-        """
-        self._camera.push(taken, owner)
-
-    def _use_calibrated(self, camera: Any) -> None:
+    def _use_calibrated(self, camera: Camera) -> None:
         known = self._controls.camera_of(self._controls.feed)
         self._camera.stop_estimating()
-        self._controls.change(lambda w: w.with_camera(calibration.with_transfer(camera, known)), "calibrate the camera")
+        camera = dataclasses.replace(camera, transfer=known.transfer)  # which a board does not tell
+        self._controls.change(lambda w: w.with_camera(camera), "calibrate the camera")
 
     def drop(self, name: str, data: bytes) -> str:
         """Take a file that a viewer dropped onto the picture; what is to be said about it.
@@ -269,36 +238,31 @@ class Host:
 
     # ------------------------------------------------------------------------------------------------ what can be saved
 
-    def camera_file(self) -> bytes:
-        """The calibrated camera as OpenCV's YAML.
+    def downloads(self, *, full_paths: bool) -> dict[str, tuple[str, Callable[[], bytes]]]:
+        """Return the type and the maker of every file that can be saved, by its name.
 
-        Raises:
-            UsageError: None was calibrated.
+        A maker raises a WarpArError where there is no such file yet.
+
+        Args:
+            full_paths: Write the paths of a scene's files in full, as for ``scene_toml``.
         """
-        return self._calibration.camera_file()
-
-    def card(self, paper: str) -> bytes:
-        """The card to print, a PDF of a paper that ``input.card`` knows."""
-        return calibration.card_pdf(paper)
-
-    def response_file(self) -> bytes:
-        """The response that was measured by the card's greys, as text.
-
-        Raises:
-            UsageError: None was measured.
-        """
-        return self._setup.response_file()
-
-    def recording(self) -> bytes:
-        """The finished recording, an MP4.
-
-        Raises:
-            UsageError: There is none.
-        """
-        return self._recorder.video()
+        return {
+            "frame.png": ("image/png", self.snapshot),
+            "environment.exr": ("image/x-exr", self.environment_exr),
+            "scene.toml": ("application/toml", lambda: self.scene_toml(full_paths=full_paths).encode()),
+            "scene.zip": (
+                "application/zip",
+                lambda: pack_scene(make_target(self._controls.wanted, self._controls.feed).scene),
+            ),
+            "recording.mp4": ("video/mp4", self._recorder.video),
+            "camera.yml": ("application/yaml", self._calibration.camera_file),
+            "response.txt": ("text/plain", self._setup.response_file),
+            "card-a4.pdf": ("application/pdf", lambda: card_pdf("a4")),
+            "card-letter.pdf": ("application/pdf", lambda: card_pdf("letter")),
+        }
 
     def snapshot(self) -> bytes:
-        """The newest frame as a PNG.
+        """Return the newest frame as a PNG.
 
         Raises:
             UsageError: There was none.
@@ -306,27 +270,23 @@ class Host:
         latest = self._loop.latest
         if latest is None:
             raise UsageError("no frame has been lit yet")
-        return bytes(cv2.imencode(".png", latest.image[..., ::-1])[1])
+        return cv2.imencode(".png", latest.image[..., ::-1])[1].tobytes()
 
     def environment_exr(self) -> bytes:
-        """The environment as an EXR.
+        """Return the environment as an EXR.
 
         Raises:
             UsageError: It is not known.
         """
-        light = self._loop.light
-        if light is None:
+        state = self._loop.light_state
+        if state is None:
             raise UsageError(
                 "the environment is not captured: no stage of this scene reads it, or the marker was not seen"
             )
-        return calibration.written("environment.exr", lambda path: write_environment(path, light))
-
-    def light_state(self) -> LightState | None:
-        """The environment with what is known of it; None while it is not captured."""
-        return self._loop.light_state
+        return written("environment.exr", lambda path: write_environment(path, state.radiance))
 
     def scene_toml(self, *, full_paths: bool) -> str:
-        """The scene as it is shown, as a scene file.
+        """Return the scene as it is shown, as a scene file.
 
         Args:
             full_paths: Write the paths of files in full; else relative to the scene's folder where they lie in it.
@@ -337,15 +297,12 @@ class Host:
         folder = None if full_paths or scene.path is None else scene.path.parent
         return dumps_scene(dataclasses.replace(scene, path=None), folder)
 
-    def scene_bundle(self) -> bytes:
-        """The scene as it is shown, with all files that it names, as a ZIP.
-
-        Raises:
-            WarpArError: One of them cannot be read any more.
-        """
-        return pack_scene(make_target(self._controls.wanted, self._controls.feed).scene)
-
     # ---------------------------------------------------------------------------------------------------- what is told
+
+    @property
+    def light_state(self) -> LightState | None:
+        """The environment as it was a moment ago, and what is known of it; None while it is not captured."""
+        return self._loop.light_state
 
     def greetings(self) -> list[dict[str, Any]]:
         """All that a new viewer should know."""
@@ -353,22 +310,10 @@ class Host:
             self.plan_message(),
             self.scene_message(),
             self._budget.record(),
-            self.calibration_message(),
+            self._calibration.message(),
             self._setup.message(),
             self.state_message(),
         ]
-
-    def scene_message(self) -> dict[str, Any]:
-        """The scene as it is edited."""
-        return self._controls.scene_message()
-
-    def plan_message(self) -> dict[str, Any]:
-        """The stages that run, and why the others do not."""
-        return self._lighting.plan_message()
-
-    def calibration_message(self) -> dict[str, Any]:
-        """How far the calibration of the camera has come."""
-        return self._calibration.message()
 
     def state_message(self) -> dict[str, Any]:
         """What changes by itself."""
@@ -409,10 +354,6 @@ class Host:
         if feed.camera is not None:
             return "estimated" if self._camera.estimated else "guessed"
         return "given" if wanted.scene.camera.field_of_view is None else "guessed"
-
-    def light(self) -> npt.NDArray[np.float32] | None:
-        """The environment, latlong linear RGB, as it was a moment ago."""
-        return self._loop.light
 
     def close(self, *, wait_seconds: float | None = None, frames_ended: bool = True) -> bool:
         """Let the source, the pipelines and all temporary files go.

@@ -18,7 +18,7 @@ from warp_ar.output.environment_harmonics import BASIS, project_radiance
 from warp_ar.output.radiance_hdr import encode_hdr
 from warp_ar.scene import Pose
 from warp_ar.signature import PROGRAM
-from warp_ar.viewer.calibration import written
+from warp_ar.viewer.camera import written
 
 _DEGREES: Final = (0, 1, 1, 1, 2, 2, 2, 2, 2)
 _LOBE: Final = np.array([cosine_lobe(degree) for degree in _DEGREES])

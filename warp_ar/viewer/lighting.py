@@ -20,7 +20,7 @@ from warp_ar.sources.sources import Frame
 from warp_ar.stages import STAGES
 from warp_ar.stages.quality import PRESETS
 from warp_ar.stages.request import Request
-from warp_ar.viewer.browser_camera import Image
+from warp_ar.viewer.camera import Image
 from warp_ar.viewer.controls import CAMERA, Controls, Feed
 from warp_ar.viewer.edits import Wanted
 from warp_ar.viewer.messages import Notify, failure, notice

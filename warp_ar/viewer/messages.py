@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import sys
 import traceback
 from collections.abc import Callable
@@ -16,6 +17,8 @@ Notify = Callable[[dict[str, Any]], None]
 
 _LONGEST: Final = 400
 """Characters of a notice about a fault: an exception's text may be a whole file."""
+_FOLDERS: Final = re.compile(r"(?<![\w:/.])(?:[A-Za-z]:\\|/)(?:[^\s/\\:;,'\"()]+[/\\])+")
+"""Folders of an absolute path: those of this machine are not for viewers; the file's name stays."""
 
 
 def notice(text: str, *, bad: bool = False) -> dict[str, Any]:
@@ -34,10 +37,11 @@ def failure(error: BaseException, then: str = "the frames go on") -> dict[str, A
         then: What happens next, where the error is a fault.
     """
     if isinstance(error, WarpArError):
-        return notice(str(error), bad=True)
+        return notice(_FOLDERS.sub("", str(error)), bad=True)
     with contextlib.suppress(OSError, ValueError):  # nobody may read it any more
         traceback.print_exception(error, file=sys.stderr)
-    return notice(f"this failed: {type(error).__name__}: {reason(error)[:_LONGEST]}; {then}", bad=True)
+    words = _FOLDERS.sub("", reason(error)[:_LONGEST])
+    return notice(f"this failed: {type(error).__name__}: {words}; {then}", bad=True)
 
 
 def begin(helper: Executor, notify: Notify, work: Callable[..., None], *arguments: Any) -> Future[None]:

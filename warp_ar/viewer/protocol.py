@@ -1,8 +1,8 @@
-"""What the page and the server may say to each other.
+"""Messages between the page and the server.
 
 From the page come text messages, JSON objects with a ``type``, and binary messages, pictures of the browser's camera.
-Nothing that comes in is trusted: a message that is not exactly one of those below raises ``ProtocolError``, whose text
-is the reason with which its sender is dropped.
+Nothing that comes in is trusted: a message that is not exactly one of ``_MESSAGES`` raises ``ProtocolError``, whose
+text is the reason with which its sender is dropped.
 
 From the server come text messages, and binary ones: four bytes, the length of a JSON header (little endian), the
 header, then the pictures that it names, one after another.
@@ -15,13 +15,13 @@ import json
 import math
 import struct
 from collections.abc import Callable, Mapping
-from typing import Any, Final, TypeAlias
+from typing import Any, Final
 
 from warp_ar.errors import WarpArError
 from warp_ar.pictures import jpeg_segments
 
 SCHEMA: Final = 3
-"""Number of what both sides may say, told in ``hello``; it grows when keys change."""
+"""Version of the messages, told in ``hello``; it grows when keys change."""
 MAX_TEXT: Final = 4096
 """Longest text message from a page in bytes: an edit takes under 200."""
 MAX_PICTURE: Final = 1 << 20
@@ -30,22 +30,21 @@ SMALLEST_CAMERA: Final = (64, 48)
 LARGEST_CAMERA: Final = (1920, 1080)
 
 EFFECTS: Final = ("objects", "lights", "environment", "receiver", "exposure", "relief", "environment_shadow")
-"""What the page can switch off."""
+"""Effects that the page can switch off."""
 PARTS: Final = ("object", "light", "proxy", "probe", "exposure", "marker")
-"""What of a scene the page can edit."""
+"""Parts of a scene that the page can edit."""
 ANIMATED: Final = ("animation", "speed", "loop", "paused")
-"""What of an object's animation the page can change."""
+"""Values of an object's animation that the page can change."""
 KINDS: Final = {
     "object": ("sphere", "box", "torus"),
     "light": ("point", "spot", "directional"),
     "proxy": ("plane", "box"),
 }
-"""What the page can add. Meshes are files, and the page names no file."""
-_ALL_KINDS: Final = tuple(dict.fromkeys(kind for kinds in KINDS.values() for kind in kinds))
+"""Kinds of each part that the page can add. Meshes are files, and the page names no file."""
 OUTLINES: Final = ("plane", "wall", "box")
-"""What of the desk can be pointed out by four points of the picture."""
+"""Shapes of the desk that can be pointed out by four points of the picture."""
 SETUP_STEPS: Final = ("check", "ball", "response")
-"""What of a set-up the page can have looked at."""
+"""Steps of a set-up: ``check`` all of it, measure the ``ball`` or the camera's ``response``."""
 
 
 class ProtocolError(WarpArError, ValueError):
@@ -53,217 +52,23 @@ class ProtocolError(WarpArError, ValueError):
 
 
 @dataclasses.dataclass(frozen=True)
-class Ack:
-    """Frame ``id`` is on the screen."""
-
-    id: int
-
-
-@dataclasses.dataclass(frozen=True)
-class Ping:
-    """Asks for the server's clock; ``sent`` comes back."""
-
-    sent: float
-
-
-@dataclasses.dataclass(frozen=True)
-class Set:
-    """Give a key of a scene's part a value, as the scene file would."""
-
-    part: str
-    index: int
-    key: str
-    value: Any
-
-
-@dataclasses.dataclass(frozen=True)
-class Animate:
-    """Change how an object plays an animation of its file; a flag is 0 or 1."""
-
-    index: int
-    key: str
-    value: float
-
-
-@dataclasses.dataclass(frozen=True)
-class Add:
-    """Put something new into the scene."""
-
-    part: str
-    kind: str
-
-
-@dataclasses.dataclass(frozen=True)
-class Remove:
-    """Take something away."""
-
-    part: str
-    index: int
-
-
-@dataclasses.dataclass(frozen=True)
-class Show:
-    """Show or hide one object or light."""
-
-    part: str
-    index: int
-    on: bool
-
-
-@dataclasses.dataclass(frozen=True)
-class Effect:
-    """Switch an effect."""
-
-    name: str
-    on: bool
-
-
-@dataclasses.dataclass(frozen=True)
-class SetQuality:
-    """Choose a preset."""
-
-    name: str
-
-
-@dataclasses.dataclass(frozen=True)
-class Method:
-    """Choose the method of one stage; an empty name goes back to the preset's."""
-
-    stage: str
-    method: str
-
-
-@dataclasses.dataclass(frozen=True)
-class Budget:
-    """Milliseconds per frame that the preset may cost; None leaves the preset alone."""
-
-    ms: float | None
-
-
-@dataclasses.dataclass(frozen=True)
-class Compare:
-    """Show ``other`` beside the picture: nothing, the camera's frame or another preset."""
-
-    other: str
-
-
-@dataclasses.dataclass(frozen=True)
-class Play:
-    """Let frames flow, or hold the one in hand."""
-
-    on: bool
-
-
-@dataclasses.dataclass(frozen=True)
-class OpenScene:
-    """Show a bundled scene."""
-
-    name: str
-
-
-@dataclasses.dataclass(frozen=True)
-class Outline:
-    """Model a part of the desk that four points of the picture outline, in pixels."""
-
-    kind: str
-    points: tuple[tuple[float, float], ...]
-
-
-@dataclasses.dataclass(frozen=True)
-class UseCard:
-    """The printed card is the marker, and a mirror ball stands on its cross."""
-
-    radius: float
-    """Of the ball, metres."""
-    ruler: float
-    """What the print's rulers of 100 mm measure, metres."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Setup:
-    """Look at the set-up: ``check`` all of it, or measure the ``ball`` or the camera's ``response``."""
-
-    step: str
-
-
-@dataclasses.dataclass(frozen=True)
-class Undo:
-    """Take the last edit back."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Redo:
-    """Make the edit again that was taken back last."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Reset:
-    """Undo every edit."""
-
-
-@dataclasses.dataclass(frozen=True)
-class UseCamera:
-    """The page's camera becomes the source; its pictures follow."""
-
-    width: int
-    height: int
-
-
-@dataclasses.dataclass(frozen=True)
-class LeaveCamera:
-    """Back to the scene's own source."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Calibrate:
-    """Look out for the printed board (``start``), leave it at that (``stop``), or use what was seen (``finish``)."""
-
-    step: str
-
-
-@dataclasses.dataclass(frozen=True)
-class Record:
-    """Start or stop recording."""
-
-    on: bool
+class Command:
+    """Text message of a page, checked."""
+
+    type: str
+    """One of ``_MESSAGES``."""
+    fields: Mapping[str, Any]
+    """Its other keys."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Picture:
-    """One picture of the browser's camera."""
+    """Picture of a browser's camera."""
 
     id: int
     taken: float
     """Milliseconds on the browser's own clock."""
     jpeg: bytes
-
-
-Command: TypeAlias = (
-    Ack
-    | Ping
-    | Set
-    | Animate
-    | Add
-    | Remove
-    | Show
-    | Effect
-    | SetQuality
-    | Method
-    | Budget
-    | Compare
-    | Play
-    | OpenScene
-    | Outline
-    | UseCard
-    | Setup
-    | Undo
-    | Redo
-    | Reset
-    | UseCamera
-    | LeaveCamera
-    | Calibrate
-    | Record
-)
 
 
 def _number(low: float, high: float) -> Callable[[Any], float]:
@@ -306,7 +111,7 @@ def _flag(value: Any) -> bool:
 
 
 def _value(value: Any) -> Any:
-    """What a key of a scene may be given: a finite number, two or three of them, or a short word."""
+    """Return a scene key's value: a finite number, two or three of them, or a short word."""
     if isinstance(value, str):
         return _name(value)
     numbers = value if isinstance(value, list) and 2 <= len(value) <= 3 else [value]
@@ -321,7 +126,7 @@ def _optional(check: Callable[[Any], float]) -> Callable[[Any], float | None]:
 
 
 def _points(value: Any) -> tuple[tuple[float, float], ...]:
-    """Four points of a picture."""
+    """Return four points of a picture, pixels."""
     if not isinstance(value, list) or len(value) != 4:
         raise ProtocolError("expected four points")
     check = _number(-1e5, 1e5)
@@ -331,39 +136,49 @@ def _points(value: Any) -> tuple[tuple[float, float], ...]:
 
 
 _INDEX = _integer(0, 63)
-_ID = _integer(0, 1 << 53)
+_NAME = {"name": _name}
+_ON = {"on": _flag}
 
-_MESSAGES: Final[Mapping[str, tuple[Callable[..., Command], Mapping[str, Callable[[Any], Any]]]]] = {
-    "ack": (Ack, {"id": _ID}),
-    "ping": (Ping, {"sent": _number(0.0, 1e15)}),
-    "set": (Set, {"part": _choice(*PARTS), "index": _INDEX, "key": _name, "value": _value}),
-    "animate": (Animate, {"index": _INDEX, "key": _choice(*ANIMATED), "value": _number(-1.0, 1e3)}),
-    "add": (Add, {"part": _choice(*KINDS), "kind": _choice(*_ALL_KINDS)}),
-    "remove": (Remove, {"part": _choice(*KINDS), "index": _INDEX}),
-    "show": (Show, {"part": _choice(*KINDS), "index": _INDEX, "on": _flag}),
-    "effect": (Effect, {"name": _choice(*EFFECTS), "on": _flag}),
-    "quality": (SetQuality, {"name": _name}),
-    "method": (Method, {"stage": _name, "method": _name}),
-    "budget": (Budget, {"ms": _optional(_number(1.0, 10000.0))}),
-    "compare": (Compare, {"other": _name}),
-    "play": (Play, {"on": _flag}),
-    "scene": (OpenScene, {"name": _name}),
-    "outline": (Outline, {"kind": _choice(*OUTLINES), "points": _points}),
-    "card": (UseCard, {"radius": _number(0.0, 10.0), "ruler": _number(0.0, 10.0)}),
-    "setup": (Setup, {"step": _choice(*SETUP_STEPS)}),
-    "undo": (Undo, {}),
-    "redo": (Redo, {}),
-    "reset": (Reset, {}),
-    "camera": (
-        UseCamera,
-        {
-            "width": _integer(SMALLEST_CAMERA[0], LARGEST_CAMERA[0]),
-            "height": _integer(SMALLEST_CAMERA[1], LARGEST_CAMERA[0]),
-        },
-    ),
-    "no_camera": (LeaveCamera, {}),
-    "calibrate": (Calibrate, {"step": _choice("start", "stop", "finish")}),
-    "record": (Record, {"on": _flag}),
+_MESSAGES: Final[Mapping[str, Mapping[str, Callable[[Any], Any]]]] = {
+    # The frame of this number is on the screen.
+    "ack": {"id": _integer(0, 1 << 53)},
+    # Asks for the server's clock; ``sent`` comes back.
+    "ping": {"sent": _number(0.0, 1e15)},
+    # Gives a key of a scene's part a value, as the scene file would.
+    "set": {"part": _choice(*PARTS), "index": _INDEX, "key": _name, "value": _value},
+    # Changes how an object plays an animation of its file; a flag is 0 or 1.
+    "animate": {"index": _INDEX, "key": _choice(*ANIMATED), "value": _number(-1.0, 1e3)},
+    "add": {"part": _choice(*KINDS), "kind": _name},
+    "remove": {"part": _choice(*KINDS), "index": _INDEX},
+    "show": {"part": _choice(*KINDS), "index": _INDEX, **_ON},
+    "effect": {"name": _choice(*EFFECTS), **_ON},
+    "quality": _NAME,
+    # Chooses the method of one stage; an empty name goes back to the preset's.
+    "method": {"stage": _name, "method": _name},
+    # Milliseconds per frame that the preset may cost; null leaves the preset alone.
+    "budget": {"ms": _optional(_number(1.0, 10000.0))},
+    # Shows something beside the picture: nothing, the camera's frame, a preset, the reference.
+    "compare": {"other": _name},
+    # Lets frames flow, or holds the one in hand.
+    "play": _ON,
+    "scene": _NAME,
+    # Models a part of the desk that four points of the picture outline, in pixels.
+    "outline": {"kind": _choice(*OUTLINES), "points": _points},
+    # Makes the printed card the marker: the ball's radius and what its rulers of 100 mm measure, metres.
+    "card": {"radius": _number(0.0, 10.0), "ruler": _number(0.0, 10.0)},
+    "setup": {"step": _choice(*SETUP_STEPS)},
+    "undo": {},
+    "redo": {},
+    "reset": {},
+    # Makes the page's camera the source; its pictures follow.
+    "camera": {
+        "width": _integer(SMALLEST_CAMERA[0], LARGEST_CAMERA[0]),
+        "height": _integer(SMALLEST_CAMERA[1], LARGEST_CAMERA[0]),
+    },
+    "no_camera": {},
+    # Looks out for the printed board, leaves it at that, or uses what was seen.
+    "calibrate": {"step": _choice("start", "stop", "finish")},
+    "record": _ON,
 }
 
 
@@ -372,7 +187,7 @@ def _refuse_constant(name: str) -> Any:
 
 
 def parse_text(text: str) -> Command:
-    """The command of a text message.
+    """Return the command of a text message.
 
     Raises:
         ProtocolError: It is none.
@@ -388,7 +203,7 @@ def parse_text(text: str) -> Command:
     kind = message.get("type") if isinstance(message, dict) else None
     if not isinstance(kind, str) or kind not in _MESSAGES:
         raise ProtocolError("text message has no known type")
-    make, checks = _MESSAGES[kind]
+    checks = _MESSAGES[kind]
     if message.keys() != {"type", *checks}:
         raise ProtocolError(f"{kind} takes {', '.join(checks) or 'nothing'}")
     fields = {}
@@ -399,14 +214,14 @@ def parse_text(text: str) -> Command:
             raise ProtocolError(f"{kind}: {key}: {error}") from error
     if kind == "add" and fields["kind"] not in KINDS[fields["part"]]:
         raise ProtocolError(f"add: kind: expected one of {', '.join(KINDS[fields['part']])}")
-    return make(**fields)
+    return Command(kind, fields)
 
 
 _PICTURE_HEADER: Final = struct.Struct("<dI")
 
 
 def parse_picture(data: bytes, size: tuple[int, int]) -> Picture:
-    """The picture of a binary message: when it was taken (float64), its number (uint32), then a JPEG of ``size``.
+    """Return the picture of a binary message: time (float64), number (uint32), then a JPEG of ``size``.
 
     Raises:
         ProtocolError: It is none.
@@ -426,7 +241,7 @@ def parse_picture(data: bytes, size: tuple[int, int]) -> Picture:
 
 
 def jpeg_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height that a JPEG of three 8-bit components says it has, before decoding; None if it is none."""
+    """Return width and height in the header of a JPEG of three 8-bit components; None if it is none."""
     if data[:2] != b"\xff\xd8":
         return None
     for marker, at in jpeg_segments(data):
@@ -440,19 +255,19 @@ def jpeg_size(data: bytes) -> tuple[int, int] | None:
 
 
 def pack(header: Mapping[str, Any], *pictures: bytes) -> bytes:
-    """A binary message of the server; ``sizes`` in its header are those of the pictures."""
+    """Return a binary message of the server; ``sizes`` in its header are those of the pictures."""
     text = json.dumps({**header, "sizes": [len(picture) for picture in pictures]}, separators=(",", ":")).encode()
     return b"".join((struct.pack("<I", len(text)), text, *pictures))
 
 
 class Bucket:
-    """A bound on a rate: holds ``burst`` tokens, ``rate`` more per second come back."""
+    """Bound on a rate: holds ``burst`` tokens, ``rate`` more per second come back."""
 
     def __init__(self, rate: float, burst: float) -> None:
         self._rate, self._burst, self._left, self._last = rate, burst, burst, 0.0
 
     def take(self, amount: float, now: float) -> bool:
-        """Whether ``amount`` may pass at ``now`` (seconds)."""
+        """Return True if ``amount`` may pass at ``now`` (seconds), and take it."""
         self._left = min(self._burst, self._left + max(now - self._last, 0.0) * self._rate)
         self._last = now
         if self._left < amount:

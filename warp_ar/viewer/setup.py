@@ -154,7 +154,7 @@ class SetupChecks:
         except (WarpArError, IndexError):
             self.missing = None  # the source has changed meanwhile
 
-    def step(self, name: str) -> None:
+    def step(self, step: str) -> None:
         """Begin to look at the frames, or to measure by them, as soon as there are enough.
 
         Raises:
@@ -162,10 +162,10 @@ class SetupChecks:
         """
         if self._step is not None:
             raise UsageError("the frames are being looked at already: wait until that is done")
-        if name not in self._work:
-            raise UsageError(f"no step {name!r}; expected {', '.join(self._work)}")
-        self._step, self._waits = name, True
-        self._failed.pop(name, None)
+        if step not in self._work:
+            raise UsageError(f"no step {step!r}; expected {', '.join(self._work)}")
+        self._step, self._waits = step, True
+        self._failed.pop(step, None)
         self._notify(self.message())
 
     def _begin(self) -> None:

@@ -1,4 +1,4 @@
-"""The light as other programs take it from the page's server: ``/light.json``, pictures, and a channel of changes.
+"""Routes of the page's server: the page's files, downloads, uploads, and the light for other programs.
 
     GET /light.json                 harmonics, key light, interval, exposure, pose
     GET /light.exr, /light.hdr      the environment: ``?axes=``, ``?layout=cube``, ``?size=``, ``?ball=``
@@ -14,18 +14,110 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import importlib.resources
 import json
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
 
 from aiohttp import WSMsgType, web
 
-from warp_ar.errors import UsageError, WarpArError
+from warp_ar.errors import SinkError, UsageError, WarpArError
 from warp_ar.output.environment_axes import AXES, FACES, LAYOUTS
 from warp_ar.viewer.backend import Backend
+from warp_ar.viewer.messages import failure
+from warp_ar.viewer.uploads import MOST_BYTES
 
 if TYPE_CHECKING:
     from warp_ar.viewer.light_record import LightState
+
+
+DROP_SECONDS: Final = 60.0
+"""How long a dropped file may be on its way."""
+DROPS: Final = 4
+"""Files that may be on their way at once: a slow one does not hold up the others."""
+_TYPES: Final = {
+    "html": "text/html; charset=utf-8",
+    "css": "text/css; charset=utf-8",
+    "js": "text/javascript; charset=utf-8",
+    "svg": "image/svg+xml",
+}
+
+
+class PageFiles:
+    """The routes of one server."""
+
+    def __init__(self, app: web.Application, backend: Backend) -> None:
+        """Add them to the server's application."""
+        self._backend = backend
+        self._coming = 0
+        # Read once: no request's path ever becomes a file's.
+        folder = importlib.resources.files("warp_ar.viewer") / "static"
+        self._static = {item.name: item.read_bytes() for item in folder.iterdir() if item.name.split(".")[-1] in _TYPES}
+        app.add_routes(
+            [
+                web.get("/", self._page),
+                web.get("/static/{name}", self._file),
+                web.get("/download/{name}", self._download),
+                web.post("/drop/{name}", self._drop_file),
+            ]
+        )
+
+    async def _page(self, request: web.Request) -> web.Response:
+        return web.Response(body=self._static["index.html"], headers={"Content-Type": _TYPES["html"]})
+
+    async def _file(self, request: web.Request) -> web.Response:
+        name = request.match_info["name"]
+        if name not in self._static:
+            raise web.HTTPNotFound(text="no such file\n")
+        return web.Response(body=self._static[name], headers={"Content-Type": _TYPES[name.split(".")[-1]]})
+
+    async def _download(self, request: web.Request) -> web.Response:
+        host = await self._backend.started()
+        makers = host.downloads(full_paths=self._backend.address.loopback)
+        name = request.match_info["name"]
+        if name not in makers:
+            raise web.HTTPNotFound(text="no such download\n")
+        kind, make = makers[name]
+        try:
+            body = await self._backend.aside(make)
+        except WarpArError as error:
+            raise web.HTTPConflict(text=f"{error}\n") from error
+        headers = {"Content-Type": kind, "Content-Disposition": f'attachment; filename="{name}"'}
+        return web.Response(body=body, headers=headers)
+
+    async def _drop_file(self, request: web.Request) -> web.Response:
+        """Take a file that was dropped onto the picture; its answer says in words what became of it."""
+        host = await self._backend.started()
+        name = request.match_info["name"]
+        if self._coming >= DROPS:
+            return web.Response(status=429, text=f"{DROPS} files are on their way already: wait until one is there\n")
+        self._coming += 1
+        try:
+            # Its own bound, for all other requests have none worth the name; and not for ever.
+            async with asyncio.timeout(DROP_SECONDS):
+                parts, size = [], 0
+                async for part in request.content.iter_chunked(1 << 16):
+                    size += len(part)
+                    if size > MOST_BYTES:
+                        refused = web.Response(status=413, text=f"{size:,} bytes and more; {MOST_BYTES:,} are taken\n")
+                        refused.force_close()
+                        return refused
+                    parts.append(part)
+            words = await self._backend.aside(host.drop, name, b"".join(parts))
+        except TimeoutError:
+            return web.Response(status=408, text="the file took too long\n")
+        except ConnectionError:
+            return web.Response(
+                status=400, text="the file did not come whole\n"
+            )  # nobody hears it: the sender has gone
+        except SinkError as error:
+            return web.Response(status=507, text=f"{error}\n")
+        except Exception as error:
+            return web.Response(status=422, text=failure(error, "nothing was changed")["text"] + "\n")
+        finally:
+            self._coming -= 1
+        return web.Response(text=f"{words}\n")
+
 
 WATCH_SECONDS: Final = 5.0
 """How long a request keeps frames going."""
@@ -58,7 +150,7 @@ class SharedLight:
     async def _state(self) -> LightState:
         host = await self._backend.started()
         self._keep_watching()
-        state = host.light_state()
+        state = host.light_state
         if state is None:
             raise web.HTTPConflict(
                 text="the environment is not captured: no stage of this scene reads it, or the marker was not seen\n"
@@ -151,7 +243,7 @@ class SharedLight:
         sent: tuple[Any, ...] = ()
         while not socket.closed:
             host = self._backend.host
-            state, latest = host.light_state(), host.latest
+            state, latest = host.light_state, host.latest
             pose = None if latest is None else latest.pose
             now = (state, None if pose is None else (*pose.rotation.ravel(), *pose.translation))
             if state is not None and (not sent or now[0] is not sent[0] or now[1] != sent[1]):
