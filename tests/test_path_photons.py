@@ -92,7 +92,8 @@ def change_of(tracer: PathTracer) -> tuple[npt.NDArray[np.float64], npt.NDArray[
         kinds = int(tracer._follows_lights) + int(tracer._follows_emitters)
         paths = tracer._followed * kinds * math.ceil(path_tracer.PATHS_OF_LIGHTS * pixels)
         change += sums * pixels / paths
-        variance += (squares - sums**2 / paths) * (pixels / paths) ** 2
+        # Sums are whole numbers: where one path alone came, rounding may leave less than nothing.
+        variance += np.maximum(squares - sums**2 / paths, 0.0) * (pixels / paths) ** 2
     return change, np.sqrt(variance)
 
 

@@ -442,8 +442,8 @@ def test_a_difference_on_a_polished_receiver_is_the_whole_scene(roughness: float
     light = latlong_sky()
     scenes = [polish(boxes(virtual), roughness, 0.4) for virtual in (False, True)]
     frame = trace(scenes[0], light, ABOVE, device, reflectances=RHO, samples=512)
-    whole = trace(scenes[1], light, ABOVE, device, reflectances=RHO, samples=256, seed=1)
-    picture = trace(scenes[1], light, ABOVE, device, frame=frame.radiance, samples=128, seed=2)
+    whole = trace(scenes[1], light, ABOVE, device, reflectances=RHO, samples=1024, seed=1)
+    picture = trace(scenes[1], light, ABOVE, device, frame=frame.radiance, samples=512, seed=2)
     off = picture.radiance - whole.radiance
     matt = trace(boxes(True), light, ABOVE, device, frame=frame.radiance, samples=128, seed=2)
     error = np.sqrt(picture.error**2 + whole.error**2 + frame.error**2)

@@ -23,7 +23,6 @@ from warp_ar.kernels.color import brightness
 from warp_ar.kernels.materials import Surface
 from warp_ar.kernels.rays.shadow import has_penumbra, sample_light
 from warp_ar.kernels.rays.trace import TraceConfig, make_trace, offset_origin
-from warp_ar.kernels.reference.path_guides import draw_guide, guide_count, guide_density, guided_bin
 from warp_ar.kernels.reference.path_sampling import (
     NO_DENSITY,
     STREAMS,
@@ -35,7 +34,6 @@ from warp_ar.kernels.reference.path_sampling import (
     draw_reflected,
     draw_sky,
     lights_in_the_way,
-    lobe_chance,
     near_radiance,
     random_triple,
     reflect_direct,
@@ -65,8 +63,6 @@ SURE_VERTICES = wp.constant(2)
 """Surfaces before Russian roulette begins."""
 MOST_SURVIVAL = wp.constant(wp.float32(0.95))
 """Chance to go on, at most."""
-GUIDED = wp.constant(wp.float32(0.5))
-"""Share of directions that a matt surface draws toward objects and balls."""
 PICK = wp.constant(0)
 SCATTER = wp.constant(1)
 SKY = wp.constant(2)
@@ -100,7 +96,6 @@ class PathState:
     changes_only: wp.bool  # whether it carries the difference that virtual content makes
     without: wp.bool  # whether it meets no virtual content
     without_near: wp.bool  # whether light straight from near emitters is no part of what its ray brings
-    tile: wp.int32  # of the frame, by what was learned for which the next direction is drawn; or -1
 
 
 @wp.struct
@@ -119,9 +114,6 @@ class PathPair:
     radiance: wp.vec3  # that it brings to the camera, or the difference that virtual content makes
     light: wp.vec3  # what the white surface would send without virtual content
     rays: wp.int32  # that were traced for it
-    guided: wp.int32  # bin of ``path_guides`` in which its first direction lies, or -1
-    drawn: wp.float32  # density of that direction
-    straight: wp.vec3  # ``radiance`` that does not come from there
 
 
 @wp.struct
@@ -136,40 +128,11 @@ class DirectionSample:
     per: wp.float32  # that this is divided by: the density, or 1
 
 
-# Toward objects. A difference begins where a path meets a virtual object, and most of what mirrors and metals throw
-# onto matt surfaces comes by few directions. So a matt surface draws one direction in ``GUIDED`` toward the bounding
-# sphere of a virtual object or a ball, or to where one of these mirrors light (``path_guides``). The density of every
-# direction is then that of the mixture, (1 - q) p + q g.
 @wp.func
-def guided_chance(scene: LocalScene, surface: Surface, path: PathState) -> wp.float32:
-    """Chance of a direction to be drawn toward an object or a ball."""
-    if path.without or guide_count(scene.guides, path.changes_only) == 0 or surface.model == wp.static(int(MIRROR)):
-        return 0.0
-    return GUIDED * (1.0 - lobe_chance(surface))
-
-
-@wp.func
-def next_density(
-    scene: LocalScene, hit: Hit, surface: Surface, wo: wp.vec3, wi: wp.vec3, path: PathState
-) -> wp.float32:
-    """Density with which ``draw_next`` gives a direction."""
-    chance = guided_chance(scene, surface, path)
-    density = (1.0 - chance) * surface_density(surface, hit.normal, wo, wi)
-    if chance > 0.0:
-        density += chance * guide_density(scene.guides, scene.sky, hit.point, wi, path.changes_only, path.tile)
-    return density
-
-
-@wp.func
-def draw_next(scene: LocalScene, hit: Hit, surface: Surface, wo: wp.vec3, path: PathState, key: PathKey) -> wp.vec3:
-    """Direction in which a path goes on; zero where it leads into the surface."""
+def draw_next(hit: Hit, surface: Surface, wo: wp.vec3, path: PathState, key: PathKey) -> wp.vec3:
+    """Draw the direction in which a path goes on; zero where it leads into the surface."""
     u = random_triple(key, path.depth, SCATTER)
     pick = random_triple(key, path.depth, PICK)
-    chance = guided_chance(scene, surface, path)
-    if pick[2] < chance:
-        return draw_guide(
-            scene.guides, scene.sky, hit.point, pick[2] / chance, wp.vec2(u[0], u[1]), path.changes_only, path.tile
-        )
     return draw_reflected(surface, hit.normal, hit.geometric_normal, wo, pick[0], wp.vec2(u[0], u[1]))
 
 
@@ -333,7 +296,6 @@ def extend_path(
     following.direction = wi
     following.density = density
     following.depth += 1
-    following.tile = -1
     following.without_near = without_near
     return following
 
@@ -490,7 +452,7 @@ def are_near_followed(scene: LocalScene, kind: wp.int32, surface: Surface, pair:
 
 
 @wp.func
-def leave_surface(scene: LocalScene, hit: Hit, pair: PathPair, direct: DirectLight, following: PathState) -> PathPair:
+def leave_surface(pair: PathPair, direct: DirectLight, following: PathState) -> PathPair:
     """The path goes from a surface to its next ray, with the light that the surface reflects of what reaches it."""
     out = bring_direct(pair, direct)
     out.path = following
@@ -498,9 +460,6 @@ def leave_surface(scene: LocalScene, hit: Hit, pair: PathPair, direct: DirectLig
     out.path.without = pair.path.without
     out.next = wp.where(wp.max(following.throughput) > 0.0, RAY, ENDED)
     if is_first_white(pair) and out.next == RAY:
-        out.guided = guided_bin(scene.guides, hit.point, out.path.direction)
-        out.drawn = out.path.density
-        out.straight = out.radiance
         out = begin_without(out)
     return out
 
@@ -538,7 +497,7 @@ def make_scatter(trace: TraceConfig) -> wp.Function:
             is_next = index == lights
             drawn = DirectionSample()
             if is_next:
-                drawn.direction = draw_next(scene, hit, surface, wo, path, key)
+                drawn.direction = draw_next(hit, surface, wo, path, key)
             else:
                 drawn = draw_toward_light(scene, hit, surface, wo, path, index, without_near, key)
             wi = drawn.direction
@@ -553,7 +512,7 @@ def make_scatter(trace: TraceConfig) -> wp.Function:
                     hidden = occluded_by_objects(scene.rays, start, wi, drawn.distance)
             density = NO_DENSITY
             if reaches and not is_mirror and (is_next or drawn.density >= 0.0):
-                density = next_density(scene, hit, surface, wo, wi, path)
+                density = surface_density(surface, hit.normal, wo, wi)
             if reaches and is_next:
                 following = extend_path(path, start, wi, reflected, density, without_near, key)
             elif reaches:
@@ -561,7 +520,7 @@ def make_scatter(trace: TraceConfig) -> wp.Function:
                     balance(drawn.times * drawn.density, density) / drawn.per * wp.cw_mul(reflected, drawn.radiance)
                 )
                 direct = add_direct(direct, arriving, index < 0, hidden, path, with_virtual)
-        return leave_surface(scene, hit, out, direct, following)
+        return leave_surface(out, direct, following)
 
     return scatter
 

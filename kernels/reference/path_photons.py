@@ -53,7 +53,6 @@ from warp_ar.kernels.reference.path_following import (
     reflected_from,
     survival,
 )
-from warp_ar.kernels.reference.path_guides import cone_versine
 from warp_ar.kernels.reference.path_sampling import (
     PathKey,
     Sky,
@@ -77,7 +76,7 @@ from warp_ar.kernels.reference.path_vertices import (
     make_look_up_material,
 )
 from warp_ar.kernels.sampling import frame_from_normal
-from warp_ar.kernels.structs import DIRECTIONAL, LAMBERT, MIRROR, FrameParams, Light
+from warp_ar.kernels.structs import DIRECTIONAL, LAMBERT, MIRROR, SPHERE, FrameParams, Light
 
 wp.set_module_options({"enable_backward": False})
 
@@ -90,6 +89,8 @@ UNIT = wp.constant(wp.float32(16777216.0))
 """Of what is summed."""
 MOST = wp.constant(wp.float32(8192.0))
 """That a path adds at most: of its own pixel's radiance, were it the only one of a pass."""
+LEAST_VERSINE = wp.constant(wp.float32(1.0e-6))
+"""Of the cone toward an object: half an angle of 0.08 degrees."""
 COUNTERS = 1024
 """Sums of rays."""
 
@@ -139,6 +140,28 @@ def follows_lights(
     return len(lights) > 0 and is_polished_one(objects, materials) and not sized
 
 
+def spheres_around(objects: npt.NDArray[np.void]) -> npt.NDArray[np.float32]:
+    """Return centre and radius of a sphere around each object, (n, 4).
+
+    Args:
+        objects: Records of ``structs.Shape`` where they stand.
+    """
+    radius = np.where(objects["kind"] == SPHERE, objects["extent"][:, 0], np.linalg.norm(objects["extent"], axis=1))
+    return np.concatenate([objects["position"], (objects["scale"] * radius)[:, None]], axis=1).astype(np.float32)
+
+
+@wp.func
+def cone_versine(sphere: wp.vec4, point: wp.vec3) -> wp.float32:
+    """Return 1 - cosine of the half angle under which a sphere is seen; 2, all directions, from within."""
+    away = wp.vec3(sphere[0], sphere[1], sphere[2]) - point
+    square = wp.dot(away, away)
+    radius = sphere[3] * sphere[3]
+    if square <= radius:
+        return 2.0
+    sine = radius / square
+    return wp.max(sine / (1.0 + wp.sqrt(1.0 - sine)), LEAST_VERSINE)
+
+
 @wp.func
 def versine_between(a: wp.vec3, b: wp.vec3) -> wp.float32:
     """1 - cosine between unit vectors, without its cancellation."""
@@ -167,9 +190,9 @@ def toward_sphere(sphere: wp.vec4, point: wp.vec3) -> wp.vec3:
 @wp.func
 def draw_start(scene: LocalScene, at: wp.vec3, u: wp.vec3) -> wp.vec3:
     """Direction in which a path leaves a light: toward a virtual object."""
-    count = scene.guides.virtual_spheres
+    count = scene.spheres.shape[0]
     k = wp.min(wp.int32(u[2] * wp.float32(count)), count - 1)
-    sphere = scene.guides.spheres[k]
+    sphere = scene.spheres[k]
     return draw_in_cone(toward_sphere(sphere, at), cone_versine(sphere, at), wp.vec2(u[0], u[1]))
 
 
@@ -177,9 +200,9 @@ def draw_start(scene: LocalScene, at: wp.vec3, u: wp.vec3) -> wp.vec3:
 def start_density(scene: LocalScene, at: wp.vec3, direction: wp.vec3) -> wp.float32:
     """Density with which ``draw_start`` gives a direction, per steradian."""
     density = float(0.0)
-    count = scene.guides.virtual_spheres
+    count = scene.spheres.shape[0]
     for k in range(count):
-        sphere = scene.guides.spheres[k]
+        sphere = scene.spheres[k]
         most = cone_versine(sphere, at)
         if versine_between(toward_sphere(sphere, at), direction) <= most:
             density += 1.0 / (2.0 * wp.pi * most * wp.float32(count))

@@ -1,7 +1,7 @@
 """The picture that the local scene would give, by following paths of light: the judge of what is approximated.
 
 A path starts at the camera (``path_vertices``: what it meets; ``path_following``: how it goes on). ``trace_paths``
-takes samples, of which ``path_samples`` makes the moments of every pixel, and ``path_picture`` the picture of these:
+takes samples, of which ``path_picture`` makes the moments of every pixel, and the picture of these:
 
     find_shown -> trace_paths (IRRADIANCE) -> map_reflectance -> trace_paths (DIFFERENCE) -> finish_picture.
 
@@ -17,25 +17,114 @@ import warp as wp
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
 from warp_ar.kernels.rays.trace import TraceConfig
 from warp_ar.kernels.reference.path_following import ENDED, SURFACE, PathPair, end_without, make_visit, meet
-from warp_ar.kernels.reference.path_samples import Round
-from warp_ar.kernels.reference.path_sampling import PathKey
-from warp_ar.kernels.reference.path_starts import (
-    DIFFERENCE,
-    IRRADIANCE,
-    WHOLE,
-    begin_path,
-    camera_ray,
-    sample_key,
-    see,
-    write_sample,
+from warp_ar.kernels.reference.path_picture import Round
+from warp_ar.kernels.reference.path_sampling import NO_DENSITY, PathKey, sky_radiance
+from warp_ar.kernels.reference.path_vertices import (
+    BALL,
+    NOTHING,
+    OBJECT,
+    PROXY,
+    LocalScene,
+    Vertex,
+    is_glossy,
+    is_turned,
+    make_find_vertex,
 )
-from warp_ar.kernels.reference.path_vertices import PROXY, LocalScene, is_turned, make_find_vertex
-from warp_ar.kernels.reference.path_wavefront import Wave, follow_in_waves
+from warp_ar.kernels.sampling import pcg3d_hash, uniform_from_bits
 from warp_ar.kernels.structs import FrameParams
 
 __all__ = ["DIFFERENCE", "IRRADIANCE", "WHOLE", "find_shown", "trace_paths"]
 
 wp.set_module_options({"enable_backward": False})
+
+
+WHOLE, DIFFERENCE, IRRADIANCE = 0, 1, 2
+"""What is asked of pixels: radiance of the scene; what virtual content changes in the frame; or only what makes
+reflectance known."""
+
+
+@wp.func
+def sample_key(samples: Round, k: wp.int32, seed: wp.int32, first: wp.int32, done: wp.array2d[wp.int32]) -> PathKey:
+    """What makes the random numbers of sample ``k`` of a round its own."""
+    pixel = samples.pixels[k]
+    i = pixel / done.shape[1]
+    j = pixel % done.shape[1]
+    key = PathKey()
+    key.pixel = wp.uint32(pixel)
+    key.seed = wp.uint32(seed)
+    key.sample = wp.uint32(first + done[i, j] + k - (samples.ends[pixel] - samples.counts[pixel]))
+    return key
+
+
+@wp.func
+def camera_ray(params: FrameParams, rays: wp.array2d[wp.vec2], key: PathKey) -> wp.vec3:
+    """Direction through a random point of a pixel, unit."""
+    # A stream of its own: the vertices of the path use those from 0 on.
+    bits = pcg3d_hash(key.pixel, key.sample, ~key.seed)
+    pixel = wp.int32(key.pixel)
+    ray = rays[pixel / rays.shape[1], pixel % rays.shape[1]]
+    x = ray[0] + (uniform_from_bits(bits[0]) - 0.5) / params.focal[0]
+    y = ray[1] + (uniform_from_bits(bits[1]) - 0.5) / params.focal[1]
+    return wp.normalize(params.world_from_camera * wp.vec3(x, y, 1.0))
+
+
+@wp.func
+def begin_path(origin: wp.vec3, direction: wp.vec3, asked: wp.int32, lobe: wp.bool) -> PathPair:
+    """A path on the camera's ray."""
+    pair = PathPair()
+    pair.path.throughput = wp.vec3(1.0, 1.0, 1.0)
+    pair.path.origin = origin
+    pair.path.direction = direction
+    pair.path.density = NO_DENSITY
+    pair.lobe = lobe
+    pair.only_light = asked == wp.static(IRRADIANCE)
+    return pair
+
+
+@wp.func
+def see(
+    scene: LocalScene, asked: wp.int32, vertex: Vertex, pair: PathPair, k: wp.int32, samples_out: Round
+) -> PathPair:
+    """What the camera's ray meets: whether there is a path to follow; writes what needs none."""
+    out = pair
+    out.next = ENDED
+    whole = asked == wp.static(WHOLE)
+    z = wp.vec3(0.0, 0.0, 0.0)
+    if whole and vertex.kind == NOTHING:
+        z = sky_radiance(scene.sky, pair.path.direction, NO_DENSITY)
+    elif whole or vertex.kind == OBJECT:
+        out.next = wp.where(pair.only_light, ENDED, SURFACE)
+    else:
+        pixel = samples_out.pixels[k]
+        z = scene.radiance[pixel / scene.radiance.shape[1], pixel % scene.radiance.shape[1]]
+        out.path.changes_only = True
+        # A face that is seen from behind is not the surface that the camera sees.
+        if vertex.kind == PROXY and not is_turned(vertex, pair.path.direction):
+            out.white = True
+            out.glossy = is_glossy(scene, vertex)
+            out.next = SURFACE
+        elif vertex.kind == BALL and not pair.only_light:
+            out.next = SURFACE
+    if not pair.lobe:
+        samples_out.z[k] = z
+        samples_out.g[k] = wp.vec3(0.0, 0.0, 0.0)
+        samples_out.e[k] = wp.vec3(0.0, 0.0, 0.0)
+        samples_out.shows[k] = wp.where(out.white, 1.0, 0.0)
+        samples_out.rays[k] = 0
+    return out
+
+
+@wp.func
+def write_sample(pair: PathPair, k: wp.int32, samples_out: Round):
+    """Write what a path that has ended tells of its pixel, as ``add_sample`` takes it."""
+    samples_out.rays[k] = samples_out.rays[k] + pair.rays
+    if not pair.white or (pair.lobe and not pair.only_light):
+        samples_out.z[k] = samples_out.z[k] + pair.radiance
+    elif pair.lobe:
+        samples_out.g[k] = pair.light  # what the frame shows mirrored
+    else:
+        samples_out.g[k] = pair.radiance
+        samples_out.e[k] = pair.light
 
 
 # One loop for all rays of a sample, its camera's as well: so what finds a surface is in the kernel once. A warp of a
@@ -142,7 +231,6 @@ def trace_paths(
     seed: int,
     first: int,
     part: Rows | None = None,
-    wave: Wave | None = None,
 ) -> None:
     """Trace the samples of a round.
 
@@ -157,12 +245,7 @@ def trace_paths(
         seed: Of the random numbers.
         first: Number of a pixel's first sample among those of the seed.
         part: First sample, and one past the last, on CPU; None means all.
-        wave: Of ``make_wave``: all samples are traced kernel after kernel. None: each by one thread, in a loop.
     """
-    if wave is not None:
-        more = {"count": count, "asked": asked, "seed": seed, "first": first}
-        follow_in_waves(trace, params, scene, done, wave, samples_out, **more)
-        return
     inputs = [params, scene, asked, seed, first, done]
     kernel = make_trace_paths_kernel(trace)
     launch_rows(kernel, (count,), inputs, [samples_out], rows=part, device=done.device)

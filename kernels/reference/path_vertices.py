@@ -16,7 +16,6 @@ from warp_ar.kernels.objects.shade import face_viewer
 from warp_ar.kernels.rays.shapes import FAR, ROUNDING, intersect_sphere
 from warp_ar.kernels.rays.trace import TraceConfig, make_trace
 from warp_ar.kernels.receiver.mirror_ball import nearest_ball
-from warp_ar.kernels.reference.path_guides import Guides
 from warp_ar.kernels.reference.path_sampling import ALL_MODELS, Sky
 from warp_ar.kernels.structs import (
     LAMBERT,
@@ -51,7 +50,7 @@ class LocalScene:
     near_followed: wp.bool  # likewise light of near emitters
     probes: wp.array[Probe]
     sky: Sky
-    guides: Guides
+    spheres: wp.array[wp.vec4]  # centre and radius, around virtual objects; paths from lights start toward them
     dfg: wp.array2d[wp.vec2]  # of ``integrate_dfg``
     proxy_reflectance: wp.array[wp.vec3]  # of each proxy, where no pixel tells
     gloss: wp.array[wp.vec4]  # of each proxy: F0 and perceptual roughness; empty: all are matt

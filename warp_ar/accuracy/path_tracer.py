@@ -25,14 +25,23 @@ from warp_ar.errors import UsageError
 from warp_ar.kernels import structs
 from warp_ar.kernels.color import decode_table, encode_table
 from warp_ar.kernels.reference import path_tracer
-from warp_ar.kernels.reference.path_guides import make_guides
-from warp_ar.kernels.reference.path_learning import learn_directions, make_squares
-from warp_ar.kernels.reference.path_photons import follow_lights, follows_lights, is_polished_one, make_light_image
-from warp_ar.kernels.reference.path_picture import finish_picture, make_moments, map_reflectance
-from warp_ar.kernels.reference.path_samples import add_samples, list_samples, make_round
+from warp_ar.kernels.reference.path_photons import (
+    follow_lights,
+    follows_lights,
+    is_polished_one,
+    make_light_image,
+    spheres_around,
+)
+from warp_ar.kernels.reference.path_picture import (
+    add_samples,
+    finish_picture,
+    list_samples,
+    make_moments,
+    make_round,
+    map_reflectance,
+)
 from warp_ar.kernels.reference.path_sampling import make_sky
 from warp_ar.kernels.reference.path_vertices import LocalScene
-from warp_ar.kernels.reference.path_wavefront import MOST_SLOTS, Wave, make_wave
 from warp_ar.kernels.split_sum import integrate_dfg
 from warp_ar.light.captured import Light
 from warp_ar.scene import Pose, Scene
@@ -61,8 +70,6 @@ MOST_CUDA_SAMPLES = 1 << 25
 """Of a round on a GPU, where a pass has no more, and memory has ``SAMPLE_BYTES`` free for each."""
 SAMPLE_BYTES = 512
 """That must be free for each: several times what it takes."""
-SLOT_BYTES = 2048
-"""That must be free for each path of those that are followed side by side: four times what it takes."""
 PATHS_OF_LIGHTS = 0.25
 """Paths from virtual lights per pixel and pass, and from near emitters."""
 FIRST_ROUND = 16
@@ -221,9 +228,6 @@ class PathTracer:
         shape = (self.camera.height, self.camera.width)
         self._moments = make_moments(shape, self.device)
         self._round = make_round(shape, self.device)
-        self._wave: Wave | None = None
-        objects = self._local.guides.virtual_spheres if self._linear is not None else 0
-        self._squares = make_squares(shape, objects, self.device)
         self._shares = wp.ones(shape, dtype=wp.float32, device=self.device)
         self._image_of_lights = make_light_image(
             shape if self._follows_lights or self._follows_emitters else (0, 0), self.device
@@ -262,7 +266,7 @@ class PathTracer:
         local.sky = make_sky(radiance, device, emitters)
         self._follows_emitters = known and local.sky.near_share > 0.0 and is_polished_one(objects, materials)
         local.near_followed = self._follows_emitters
-        local.guides = make_guides(objects, local.rays.materials.numpy(), balls, device)
+        local.spheres = wp.array(spheres_around(objects), dtype=wp.vec4, device=device)
         local.dfg = wp.zeros((DFG_SIZE, DFG_SIZE), dtype=wp.vec2, device=device)
         integrate_dfg(local.dfg)
         rays = wp.array(pixel_rays(self.camera), dtype=wp.vec2, device=device)
@@ -301,7 +305,7 @@ class PathTracer:
     def _end_round(self, passes: int) -> None:
         """Take the samples of some passes into the moments."""
         with translating(self.device), wp.ScopedDevice(self.device):
-            add_samples(self._round, self._moments, self._squares)
+            add_samples(self._round, self._moments)
         self._passes += passes
 
     def _follow(self, asked: int, first: int, count: int, at_once: int) -> Iterator[None]:
@@ -309,12 +313,11 @@ class PathTracer:
 
         ``first`` is the number of a pixel's first sample in the moments.
         """
-        self._make_wave(count)
 
         def trace(part: tuple[int, int] | None) -> None:
             path_tracer.trace_paths(
                 self._trace, self._params, self._local, self._moments.samples, self._round,
-                count=count, asked=asked, seed=self.seed, first=first, part=part, wave=self._wave,
+                count=count, asked=asked, seed=self.seed, first=first, part=part,
             )  # fmt: skip
 
         yield from self._in_parts(path_tracer.trace_paths, trace, count, at_once)
@@ -368,19 +371,6 @@ class PathTracer:
             return MOST_SAMPLES
         return int(min(MOST_CUDA_SAMPLES, self.device.free_memory // SAMPLE_BYTES))
 
-    def _make_wave(self, count: int) -> None:
-        """On a GPU, room for the paths that are followed side by side in a round of so many samples."""
-        if self.device.is_cpu:
-            return
-        there = 0 if self._wave is None else self._wave.stages.shape[0]
-        # Fewer where memory has little: what a path waits for is a slot.
-        slots = max(min(MOST_SLOTS, count, int(self.device.free_memory) // SLOT_BYTES), 1)
-        if slots <= there:
-            return
-        self._wave = None
-        with translating(self.device), wp.ScopedDevice(self.device):
-            self._wave = make_wave(slots, len(self.scene.lights), self.device)
-
     def _brings_lights(self, asked: int) -> bool:
         """Whether a pass has paths from virtual lights as well."""
         return (self._follows_lights or self._follows_emitters) and asked == path_tracer.DIFFERENCE
@@ -430,24 +420,15 @@ class PathTracer:
         self._passes = 0
 
     def _share(self) -> None:
-        """Learn from the samples so far, wherever there are ``FIRST_ROUND``, twice as many, and so on.
-
-        That is which pixels get how many of those to come, and in which directions objects throw light onto surfaces.
-        """
+        """Share the samples to come among pixels by the noise so far, at ``FIRST_ROUND``, twice as many, and so on."""
         rounds, rest = divmod(self.samples, FIRST_ROUND)
         if rest or not rounds or rounds & (rounds - 1):
             return
-        moments, guides = self._moments, self._local.guides
+        moments = self._moments
         with exclusive(self.device), wp.ScopedDevice(self.device):
             self._finish()
             found = (np.array(a.numpy()) for a in (self._radiance, self._sampled, moments.samples, moments.proxies))
             self._shares = wp.array(sample_shares(*found), dtype=wp.float32, device=self.device)
-        tiles, bins = self._squares.shape
-        if bins:
-            with translating(self.device), wp.ScopedDevice(self.device):
-                if guides.learned is None:
-                    guides.learned = wp.empty((tiles, bins + 1), dtype=wp.float32, device=self.device)
-                learn_directions(self._squares, guides.learned, width=self.camera.width)
         self._passes = 0
 
     def _finish(self) -> None:
