@@ -50,7 +50,7 @@ def ball(*at: float, **more: Any) -> Object:
         (ball(0.0, 0.0, -1.0), "behind the camera"),
         (ball(0.0, 0.0, 0.0), None),  # the camera is in it
         (ball(0.8, 0.0, 1.0, scale=4.0), None),
-        (ball(0.8, 0.0, 1.0, animate=Animation("orbit")), None),
+        (ball(0.8, 0.0, 1.0, animate=Animation((0.0, 0.0, 30.0))), None),
         (ball(0.8, 0.0, 1.0, marker=Marker(size=0.05, id=7)), None),
         (ball(0.8, 0.0, 1.0, material=EmissiveMaterial(intensity=1.0)), None),
         (Object("box", size=(0.1, 1.2, 0.1), at=(0.8, 0.0, 1.0), rotate=(0.0, 0.0, 90.0)), None),

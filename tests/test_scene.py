@@ -329,17 +329,21 @@ def test_objects_stand_still_without_animation() -> None:
 
 def test_object_turns_in_place_and_about_a_pivot() -> None:
     spin = sc.Animation(turn=(0, 0, 90))
-    rotation, position = sc.Object("box", at=(1, 0, 5), rotate=(90, 0, 0), animate=spin).pose_at(1.0)
+    rotation, position = sc.Object("box", size=(1.0, 1.0, 1.0), at=(1, 0, 5), rotate=(90, 0, 0), animate=spin).pose_at(
+        1.0
+    )
     np.testing.assert_allclose(rotation, rotation_matrix((0, 0, 90)) @ rotation_matrix((90, 0, 0)), atol=ROUNDING)
     np.testing.assert_allclose(position, (1, 0, 5), atol=ROUNDING)
     orbit = dataclasses.replace(spin, pivot=(0.0, 0.0, 0.0))
-    np.testing.assert_allclose(sc.Object("box", at=(1, 0, 5), animate=orbit).pose_at(1.0)[1], (0, 1, 5), atol=ROUNDING)
+    np.testing.assert_allclose(
+        sc.Object("box", size=(1.0, 1.0, 1.0), at=(1, 0, 5), animate=orbit).pose_at(1.0)[1], (0, 1, 5), atol=ROUNDING
+    )
 
 
 def test_sway_is_a_sine() -> None:
     sway = sc.Animation(sway=(0, 0, 0.2), period=3.0)
     for seconds in (0.0, 0.75, 1.5, 2.25, 3.0, 3000.75):
-        height = sc.Object("box", at=(1, 2, 3), animate=sway).pose_at(seconds)[1][2]
+        height = sc.Object("box", size=(1.0, 1.0, 1.0), at=(1, 2, 3), animate=sway).pose_at(seconds)[1][2]
         assert height == pytest.approx(3.0 + 0.2 * math.sin(2 * math.pi * (seconds % 3.0) / 3.0), abs=1e-12)
 
 

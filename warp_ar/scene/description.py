@@ -15,7 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_ar.errors import SceneError
+from warp_ar.scene.checks import check_choice, check_number, check_vector, fail
 from warp_ar.scene.geometry import Mesh, rotation_matrix
+from warp_ar.scene.keys import AREA_LIGHT_KEYS, LIGHT_KEYS, OBJECT_KEYS, PROXY_KEYS
 from warp_ar.scene.materials import OF_THE_FILE, RGB, EmissiveMaterial, Material
 
 Vec3: TypeAlias = tuple[float, float, float]
@@ -213,6 +215,12 @@ class Probe:
     marker: Marker | None = None
     """A marker or board of its own, in whose frame its centre is: it may be moved; lost, its last light remains."""
 
+    def __post_init__(self) -> None:
+        """Raise a SceneError that names the first value that cannot be."""
+        check_vector(self, "center")
+        check_number(self, "radius", above=0.0)
+        check_vector(self, "reflectance", low=0.0, high=1.0)
+
 
 @dataclasses.dataclass(frozen=True)
 class ProxyMaterial:
@@ -223,6 +231,11 @@ class ProxyMaterial:
     reflectance: RGB = (0.04, 0.04, 0.04)
     """Specular reflectance where it is seen from ahead, glTF's F0; 0.04 is lacquer or glass. A file may give one number
     for grey."""
+
+    def __post_init__(self) -> None:
+        """Raise a SceneError that names the first value that cannot be."""
+        check_number(self, "roughness", low=0.0, high=1.0)
+        check_vector(self, "reflectance", low=0.0, high=1.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -243,6 +256,14 @@ class Proxy:
     """A marker or board of its own, in whose frame it stands; while that is lost it is not there."""
     material: ProxyMaterial | None = None
     """How it mirrors what is virtual; matt if left out."""
+
+    def __post_init__(self) -> None:
+        """Raise a SceneError that names the first value that cannot be."""
+        check_choice(self, "shape", PROXY_KEYS)
+        check_vector(self, "at")
+        check_vector(self, "rotate")
+        if self.shape == "mesh" and self.file is None:
+            fail(self, "file", "a mesh needs its file")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -337,6 +358,20 @@ class Object:
     mesh: Mesh | None = dataclasses.field(default=None, repr=False)
     """A mesh in memory instead of a file, as ``object_from_trimesh`` gives; a scene file cannot say it."""
 
+    def __post_init__(self) -> None:
+        """Raise a SceneError that names the first value that cannot be."""
+        check_choice(self, "shape", OBJECT_KEYS)
+        check_vector(self, "at")
+        check_vector(self, "rotate")
+        check_number(self, "scale", above=0.0)
+        if self.shape == "mesh" and self.file is None and self.mesh is None:
+            fail(self, "file", "a mesh needs its file, or a mesh in memory as object_from_trimesh gives")
+        for key in OBJECT_KEYS[self.shape]:
+            if key not in ("file", "size"):
+                check_number(self, key, above=0.0)
+        if self.shape == "torus" and self.minor_radius >= self.major_radius:
+            fail(self, "minor_radius", f"expected less than major_radius, {self.major_radius:g}")
+
     def pose_at(self, seconds: float) -> tuple[FloatMatrix, FloatMatrix]:
         """Rotation R (3, 3) and position (3,) in metres, ``seconds`` after the first frame."""
         rotation = rotation_matrix(self.rotate)
@@ -377,6 +412,21 @@ class Light:
     """How it moves."""
     marker: Marker | None = None
     """A marker or board of its own, in whose frame it stands; while that is lost it is not there."""
+
+    def __post_init__(self) -> None:
+        """Raise a SceneError that names the first value that cannot be."""
+        check_choice(self, "kind", LIGHT_KEYS)
+        check_number(self, "intensity", low=0.0)
+        check_vector(self, "color", low=0.0)
+        check_vector(self, "at")
+        check_vector(self, "attenuation", low=0.0)
+        check_number(self, "radius", low=0.0)
+        if self.kind == "spot" and self.target is None and self.direction is None:
+            fail(self, "target", "a spot light needs a target or a direction")
+        if self.direction is not None:
+            check_vector(self, "direction")
+            if not any(self.direction):
+                fail(self, "direction", "expected the way the light travels, such as (0, 0, -1)")
 
     def pose_at(self, seconds: float) -> tuple[FloatMatrix, FloatMatrix]:
         """Position (3,) in metres and unit direction (3,) that the light travels, ``seconds`` after the first frame.
@@ -422,6 +472,12 @@ class AreaLight:
     marker: Marker | None = None
     """A marker or board of its own, in whose frame it stands; while that is lost it is not there."""
 
+    def __post_init__(self) -> None:
+        """Raise a SceneError that names the first value that cannot be."""
+        check_choice(self, "kind", AREA_LIGHT_KEYS)
+        check_number(self, "intensity", low=0.0)
+        check_vector(self, "color", low=0.0)
+
     def as_object(self) -> Object:
         """The object that it is in a ``Scene``."""
         return Object(
@@ -454,6 +510,13 @@ class CapturedLight:
     axes: str | None = None
     """Axes of the file: "z-up", "blender", "y-up" or "opengl"; if left out, as the file says, else y-up of an OpenEXR
     and blender of an HDR."""
+
+    def __post_init__(self) -> None:
+        """Raise a SceneError that names the first value that cannot be."""
+        check_number(self, "scale", above=0.0)
+        check_vector(self, "rotate")
+        if self.axes is not None:
+            check_choice(self, "axes", LATLONG_AXES)
 
 
 @dataclasses.dataclass(frozen=True)

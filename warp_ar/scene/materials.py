@@ -6,6 +6,8 @@ import dataclasses
 from pathlib import Path
 from typing import Final, TypeAlias
 
+from warp_ar.scene.checks import check_number, check_reflectance, check_vector
+
 RGB: TypeAlias = tuple[float, float, float]
 Color: TypeAlias = RGB | Path
 """Linear RGB, or the path of a texture (sRGB-encoded picture)."""
@@ -22,6 +24,12 @@ class PhongMaterial:
     shininess: float = 32.0
     """Exponent of the lobe, from 0 (widest) on."""
 
+    def __post_init__(self) -> None:
+        """Raise a SceneError that names the first value that cannot be."""
+        check_reflectance(self, "diffuse")
+        check_reflectance(self, "specular")
+        check_number(self, "shininess", low=0.0)
+
 
 @dataclasses.dataclass(frozen=True)
 class MetallicRoughnessMaterial:
@@ -34,6 +42,12 @@ class MetallicRoughnessMaterial:
     roughness: float = 0.5
     """0 (mirror) to 1 (matt)."""
 
+    def __post_init__(self) -> None:
+        """Raise a SceneError that names the first value that cannot be."""
+        check_reflectance(self, "base_color")
+        check_number(self, "metallic", low=0.0, high=1.0)
+        check_number(self, "roughness", low=0.0, high=1.0)
+
 
 @dataclasses.dataclass(frozen=True)
 class LambertMaterial:
@@ -42,6 +56,10 @@ class LambertMaterial:
     base_color: Color = (0.8, 0.8, 0.8)
     """Diffuse reflectance."""
 
+    def __post_init__(self) -> None:
+        """Raise a SceneError that names the first value that cannot be."""
+        check_reflectance(self, "base_color")
+
 
 @dataclasses.dataclass(frozen=True)
 class MirrorMaterial:
@@ -49,6 +67,10 @@ class MirrorMaterial:
 
     base_color: Color = (1.0, 1.0, 1.0)
     """Reflectance, the same at every angle."""
+
+    def __post_init__(self) -> None:
+        """Raise a SceneError that names the first value that cannot be."""
+        check_reflectance(self, "base_color")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,6 +85,11 @@ class EmissiveMaterial:
     """Picture that multiplies the radiance: sRGB-encoded, or linear radiance (HDR, OpenEXR)."""
     two_sided: bool = False
     """Whether the back of an open surface emits too; else it is not there from behind, but throws a shadow."""
+
+    def __post_init__(self) -> None:
+        """Raise a SceneError that names the first value that cannot be."""
+        check_vector(self, "color", low=0.0)
+        check_number(self, "intensity", low=0.0)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,6 +11,9 @@ from warp_ar.errors import UsageError
 
 Array = NDArray[np.float64]
 
+_NOT_A_ROTATION = 1e-3
+"""Largest difference of R^T R from 1 of a rotation in a few digits."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Pose:
@@ -25,13 +28,18 @@ class Pose:
         """Check the shapes.
 
         Raises:
-            UsageError: The rotation is not (3, 3), or the translation not (3,).
+            UsageError: The rotation is not (3, 3) or no rotation, or the translation not (3,).
         """
         for name, value, shape in (("rotation", self.rotation, (3, 3)), ("translation", self.translation, (3,))):
             if np.shape(value) != shape:
                 given = f"has the shape {np.shape(value)}" if hasattr(value, "shape") else f"is {type(value).__name__}"
                 right = f"expected an array {shape}, such as M[:3, :3] and M[:3, 3] of a 4x4 matrix M"
                 raise UsageError(f"Pose: {name} {given}; {right}")
+        turned = np.asarray(self.rotation, np.float64)
+        off = np.abs(turned.T @ turned - np.eye(3)).max()
+        if np.isfinite(turned).all() and (off > _NOT_A_ROTATION or np.linalg.det(turned) < 0.0):
+            right = "expected a rotation matrix: orthonormal rows, no scale, no mirror image"
+            raise UsageError(f"Pose: rotation {np.round(turned, 4).tolist()}: {right}")
 
     def inverse(self) -> Pose:
         """The motion back: from ``camera_from_world`` to ``world_from_camera``."""
