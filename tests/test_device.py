@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import threading
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -137,3 +141,41 @@ def test_nobody_looks_at_an_event_while_a_graph_is_captured() -> None:
         one.join(60.0)
         assert not one.is_alive()
     assert (event.asked, event.captured) == (1, 0)
+
+
+START = """
+import warp as wp
+from warp_ar.device import resolve_device
+
+@wp.kernel(enable_backward=False)
+def one_kernel(values_out: wp.array[wp.int32]):
+    values_out[wp.tid()] = 1
+
+values = wp.zeros(2, dtype=wp.int32, device=resolve_device("cpu"))
+wp.launch(one_kernel, 2, [], [values], device="cpu")
+print(values.numpy().tolist(), wp.config.kernel_cache_dir)
+"""
+
+
+@pytest.mark.parametrize("variable", ["WARP_CACHE_PATH", "XDG_CACHE_HOME", "HOME", "empty"])
+def test_a_cache_that_cannot_be_written_is_a_temporary_folder_and_one_line(tmp_path: Path, variable: str) -> None:
+    script, file = tmp_path / "script.py", tmp_path / "file"
+    script.write_text(START)
+    file.write_text("no folder")
+    environment = {name: value for name, value in os.environ.items() if "CACHE" not in name}
+    environment["PYTHONPATH"] = str(Path(__file__).parents[1])
+    environment["HOME"] = str(tmp_path / "home")
+    environment["WARP_CACHE_PATH" if variable == "empty" else variable] = "" if variable == "empty" else str(file)
+    command = [sys.executable, str(script)]
+    run = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    values, folder = run.stdout.strip().rsplit(" ", 1)
+    assert values == "[1, 1]"
+    if variable == "empty":
+        assert run.stderr == ""
+        assert folder.startswith(environment["HOME"])
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "home", "script.py"]
+    else:
+        (line,) = run.stderr.splitlines()
+        assert line.startswith("warp_ar: the cache of kernels cannot be written")
+        assert not Path(folder).exists(), "it goes with the run"

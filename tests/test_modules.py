@@ -12,6 +12,7 @@ import threading
 import pytest
 
 from warp_ar.engine import modules
+from warp_ar.errors import UsageError
 
 SCRIPT = """
 import sys
@@ -86,3 +87,12 @@ def test_who_interrupts_compiling_does_not_wait_for_all_of_it(monkeypatch: pytes
     modules._compilers(os.getpid()).shutdown()
     modules._compilers.cache_clear()
     assert len(compiled) <= 2
+
+
+def test_a_full_disk_of_the_cache_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    def compile_module(variant: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(modules, "_compile_one", compile_module)
+    with pytest.raises(UsageError, match=r"kernels cannot be written to .*No space left on device.*WARP_CACHE_PATH"):
+        modules._compile([0], None)

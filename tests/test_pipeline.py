@@ -7,7 +7,9 @@ import dataclasses
 import math
 import os
 import re
+import threading
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -360,6 +362,22 @@ def test_a_closed_pipeline_says_so(frames: Frames) -> None:
             call()
 
 
+def test_threads_that_call_one_pipeline_take_turns(frames: Frames, device: str) -> None:
+    results: list[Any] = []
+    with Pipeline(make_scene(), device=device, quality="low", size=SIZE) as pipeline:
+
+        def light(calls: int) -> None:
+            results.extend(pipeline(frames[call % len(frames)]).image.shape for call in range(calls))
+
+        threads = [threading.Thread(target=light, args=(20,), daemon=True) for _ in range(3)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(60.0)
+        assert not any(thread.is_alive() for thread in threads)
+    assert results == [(SIZE[1], SIZE[0], 3)] * 60
+
+
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
 def test_a_forked_child_is_told_at_once(frames: Frames) -> None:
@@ -372,11 +390,18 @@ def test_a_forked_child_is_told_at_once(frames: Frames) -> None:
                 pipeline(frames[0])
             except UsageError as error:
                 os.write(write, str(error).encode())
+            try:
+                Pipeline(make_scene(), device="cpu", quality="low", size=SIZE)
+            except UsageError as error:
+                os.write(write, b"; another: " + str(error).encode())
             finally:
                 os._exit(0)
         os.close(write)
         with os.fdopen(read, "rb") as told:
-            assert b"fork" in told.read()
+            first, another = told.read().split(b"; another: ")
+        for text in (first, another):
+            assert b"fork" in text
+            assert b"start processes by spawn" in text
         os.waitpid(child, 0)
         run(pipeline, frames[1:2])  # the parent goes on
 

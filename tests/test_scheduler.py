@@ -306,6 +306,30 @@ def test_two_owners_of_one_resource_are_an_error() -> None:
         arrays.add("x", None)
 
 
+def test_a_frame_calls_launchers_under_a_debugger(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A breakpoint in one is hit, and the frame is the same."""
+    called: list[str] = []
+    plan = plan_of(monkeypatch, chain("a", "b"), ("b",))
+    arrays = inputs("cpu")
+    scheduler = Scheduler(plan, arrays, wp.get_device("cpu"), bands=2)
+    scheduler.run()
+    arrays.touch("frame")
+
+    def trace(frame: types.FrameType, event: str, argument: object) -> None:
+        if frame.f_code.co_name == "launch_rows":
+            called.append(event)
+
+    before = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        scheduler.run()
+    finally:
+        sys.settrace(before)
+    assert called == ["call", "call"]
+    np.testing.assert_array_equal(arrays["b"].numpy(), np.full(SIZE, 2))
+    scheduler.close()
+
+
 def test_stages_without_a_common_input_run_side_by_side(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each waits for the other; one thread after another would never end."""
     meeting = threading.Barrier(2, timeout=10.0)

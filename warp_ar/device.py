@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import ctypes
 import os
+import shutil
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Iterator
@@ -13,7 +16,7 @@ from typing import Any, Final
 
 import warp as wp
 
-from warp_ar.errors import UsageError
+from warp_ar.errors import UsageError, say
 
 _ARENA_MAX = -8
 """``M_ARENA_MAX`` of glibc's ``malloc.h``."""
@@ -29,6 +32,8 @@ ASK_EVERY = 1e-4
 """Seconds between two looks at an event that is waited for."""
 LONGEST_ASKING = 0.25
 """Seconds after which CUDA itself is made to wait."""
+_STARTED: list[int] = []
+"""The process in which Warp was started, if it was."""
 _OPENING: list[threading.Thread] = []
 """The thread that makes a device's context, if one does."""
 
@@ -142,11 +147,41 @@ def _native_stderr_silenced() -> Iterator[None]:
 
 
 def start_warp() -> None:
-    """Initialise Warp quietly, with the flags of Clang that this package's kernels take; again it does nothing."""
+    """Initialise Warp quietly, with the flags of Clang that this package's kernels take; again it does nothing.
+
+    Raises:
+        UsageError: This process is a fork of one that has started Warp.
+    """
     wp.config.cpu_compiler_flags = CPU_COMPILER_FLAGS
+    if _STARTED and os.getpid() not in _STARTED:
+        raise UsageError(
+            f"Warp was started in process {_STARTED[0]}, of which this one is a fork without its threads and its "
+            "device; start processes by spawn"
+        )
     wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
+    with _TRANSLATION:
+        if not _STARTED:
+            _init_warp()
+            _STARTED.append(os.getpid())
+
+
+def _init_warp() -> None:
+    """Initialise Warp; where its cache of kernels cannot be written, kernels go to a temporary folder."""
+    if not os.environ.get("WARP_CACHE_PATH", "unset"):
+        del os.environ["WARP_CACHE_PATH"]  # Warp would take an empty one for the current folder
     with _native_stderr_silenced():
+        try:
+            wp.init()
+            folder = wp.config.kernel_cache_dir
+            with tempfile.TemporaryFile(dir=folder):
+                return
+        except OSError as error:
+            problem = error
+        folder = tempfile.mkdtemp(prefix="warp_ar_kernels_")
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        os.environ["WARP_CACHE_PATH"] = wp.config.kernel_cache_dir = folder  # of processes that this one starts, too
         wp.init()
+    say(f"the cache of kernels cannot be written ({problem}); kernels of this run are kept in {folder} until it ends")
 
 
 def open_ahead(name: str) -> None:
@@ -172,7 +207,7 @@ def resolve_device(name: str = "auto") -> Any:
     """Warp device for ``name``: ``auto`` (CUDA where present, else CPU), ``cpu``, ``cuda`` or ``cuda:N``.
 
     Raises:
-        UsageError: The name is no device of this machine.
+        UsageError: The name is no device of this machine, or this process is a fork of one that has started Warp.
     """
     start_warp()
     for thread in _OPENING:

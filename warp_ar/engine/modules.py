@@ -17,6 +17,7 @@ from typing import Any
 import warp as wp
 
 from warp_ar.device import compiling, exclusive, usable_cores
+from warp_ar.errors import UsageError
 
 Progress = Callable[[int, int], None]
 """Receives the number of compiled modules and of all that must be compiled, first 0; not called if none must be."""
@@ -62,7 +63,14 @@ def _compile(variants: list[_Variant], progress: Progress | None) -> None:
     jobs = [pool.submit(_compile_one, variant) for variant in variants]
     try:
         for done, job in enumerate(as_completed(jobs), 1):
-            job.result()
+            try:
+                job.result()
+            except OSError as error:
+                folder = wp.config.kernel_cache_dir
+                raise UsageError(
+                    f"kernels cannot be written to {folder} ({error.strerror or error}): free space there, or set "
+                    "WARP_CACHE_PATH to another folder"
+                ) from error
             if progress is not None:
                 progress(done, len(variants))
     finally:

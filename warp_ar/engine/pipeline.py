@@ -5,12 +5,14 @@ from __future__ import annotations
 import collections
 import dataclasses
 import difflib
+import functools
 import math
 import os
+import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, cast
+from typing import Any, Concatenate, ParamSpec, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -52,6 +54,9 @@ AHEAD = 2
 DEFAULT_FRAME_INTERVAL = 1.0 / 30.0
 """Seconds between frames whose caller gives no time."""
 
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
+
 
 def resolve_quality(quality: str | Quality) -> Quality:
     """Quality value for a preset's name.
@@ -66,6 +71,17 @@ def resolve_quality(quality: str | Quality) -> Quality:
         hint = f"did you mean {close[0]}? " if close else ""
         raise UsageError(f"quality {quality!r} is no preset; {hint}expected {', '.join(PRESETS)}")
     return PRESETS[quality]
+
+
+def _in_turn(method: Callable[Concatenate[Pipeline, _P], _R]) -> Callable[Concatenate[Pipeline, _P], _R]:
+    """Have threads that call methods of one pipeline take turns."""
+
+    @functools.wraps(method)
+    def call(self: Pipeline, /, *arguments: _P.args, **named: _P.kwargs) -> _R:
+        with self._turn:
+            return method(self, *arguments, **named)
+
+    return call
 
 
 class Pipeline(Closing):
@@ -130,6 +146,7 @@ class Pipeline(Closing):
         check_estimates(estimates)
         outputs = check_frames(exposures, outputs, linear)
         self._closed, self._process = False, os.getpid()
+        self._turn = threading.RLock()
         self.device, self.quality = resolve_device(device), resolve_quality(quality)
         self.camera = scene.camera if size is None else scene.camera.scaled_to(*size)
         self.scene = dataclasses.replace(scene, camera=self.camera)
@@ -188,6 +205,7 @@ class Pipeline(Closing):
         short = self.plan.needs("short_frames")
         self._short = ShortFrames(self.plan.features, self._arrays, self.device) if short else None
 
+    @_in_turn
     def close(self) -> None:
         """Stop the worker threads; arrays go when the last result that refers to them does."""
         if self._closed or os.getpid() != self._process:
@@ -204,7 +222,7 @@ class Pipeline(Closing):
         if os.getpid() != self._process:
             raise UsageError(
                 f"the pipeline was made in process {self._process}, of which this one is a fork without its "
-                "threads and its device; make another one here, or start processes by spawn"
+                "threads and its device; start processes by spawn"
             )
 
     @property
@@ -217,6 +235,7 @@ class Pipeline(Closing):
         """Every named array of the pipeline, on its device."""
         return self._arrays
 
+    @_in_turn
     def update(self, scene: Scene) -> bool:
         """Show another scene from the next frame on, if it differs in numbers alone.
 
@@ -262,6 +281,7 @@ class Pipeline(Closing):
         self._check_usable()
         self._scheduler.warm_up(progress)
 
+    @_in_turn
     def continue_from(self, other: Pipeline) -> None:
         """Go on where another pipeline stopped: its clock and, where they fit, its track and its light."""
         self._check_usable()
@@ -280,6 +300,7 @@ class Pipeline(Closing):
         if self._short is not None and other._short is not None:
             self._short.resume(other._short)
 
+    @_in_turn
     def restart(self, *, saturation: npt.NDArray[np.float64] | None = None) -> None:
         """Take the next frame for one of a clip that starts at 0 seconds, as if no other had been lit before it.
 
@@ -308,6 +329,7 @@ class Pipeline(Closing):
             self.inputs.fix_saturation(saturation)
         self._scheduler.restart()
 
+    @_in_turn
     def start_clock(self, seconds: float) -> None:
         """Have animations begin at a time before the first frame; left out, they begin with it.
 
@@ -324,6 +346,7 @@ class Pipeline(Closing):
         self._start_time = self._last_time = seconds
         self._lit_time = math.inf  # no frame came before
 
+    @_in_turn
     def take_light(self, radiance: npt.NDArray[np.float32], emitters: npt.NDArray[Any] | None = None) -> None:
         """Light the frames to come by another environment than the captured one that the scene names.
 
@@ -343,6 +366,7 @@ class Pipeline(Closing):
         stage.replace(radiance, emitters)
         self._arrays.touch("captured_light")
 
+    @_in_turn
     def __call__(
         self,
         image: npt.NDArray[np.uint8] | Any,
@@ -384,6 +408,7 @@ class Pipeline(Closing):
             return self.inputs.transfers.new_frame()
         return np.empty((self.size[1], self.size[0], 3), np.uint8)
 
+    @_in_turn
     def submit(
         self,
         image: npt.NDArray[np.uint8] | Any,

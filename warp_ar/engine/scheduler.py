@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import itertools
+import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
@@ -267,7 +268,9 @@ class Scheduler:
         self._look()
         if not self.device.is_cpu:
             return self._run_captured(receive)
-        return self._run_eager() if self._crew is None or self._alone else self._run_side_by_side(self._crew)
+        if self._crew is None or self._alone or sys.gettrace() is not None:
+            return self._run_eager()  # under a debugger launchers are called, so that their breakpoints are hit
+        return self._run_side_by_side(self._crew)
 
     def _look(self) -> None:
         """Find out what this frame needs."""
