@@ -59,7 +59,7 @@ def test_the_frames_own_harmonics_agree(device: str) -> None:
     from warp_ar.kernels.environment.irradiance import make_sh_tables, project_irradiance_sh
 
     radiance = wp.array(noise(), dtype=wp.vec3, device=device)
-    tables = make_sh_tables(8, 16, 2, device)
+    tables = make_sh_tables(8, 16, device)
     out = wp.zeros(9, dtype=wp.vec3, device=device)
     rows = wp.zeros((8, 5), dtype=wp.vec3, device=device)
     project_irradiance_sh(radiance, tables, rows, out)

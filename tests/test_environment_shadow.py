@@ -32,6 +32,8 @@ from warp_ar.scene import load_scene
 from warp_ar.stages.quality import PRESETS
 from warp_ar.stages.request import Request
 
+ROUNDING = 3e-7  # two roundings of values below 1 in float32
+
 # --- Ratio ------------------------------------------------------------------------------------------------------------
 
 
@@ -221,7 +223,8 @@ def test_half_of_a_set_speaks_for_all_of_it(device, bounce):
     assert abs((half - whole).mean()) < MEAN_ERROR
     assert np.abs(half - whole).max() < SET_ERROR
     black = [run(draw(environment), item, bounce=bounce, secondary=share) for share in (1.0, 0.5)]
-    np.testing.assert_array_equal(*black)
+    # The two are kernels of their own, in which a compiler joins products and sums differently.
+    np.testing.assert_allclose(*black, atol=ROUNDING)
 
 
 @pytest.mark.parametrize("bounce", ["estimated", "traced"])

@@ -204,7 +204,7 @@ def test_silhouettes_are_those_of_each_object_alone(device):
             trace_object_masks(arrays["params"], arrays["rays"], arrays["ray_scene"], out)
             return out.numpy()
 
-    from tests.test_farm_draws import looking_down
+    from tests.test_farm_variations import looking_down
 
     pose = looking_down(0.1, -0.5, 0.3)
     together = masks(items)

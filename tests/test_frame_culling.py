@@ -291,7 +291,7 @@ def test_reasons_are_those_of_the_frame() -> None:
     assert reasons["shade"] == "no virtual object is in the picture"
     assert reasons["relight"] == "virtual light falls on nothing in the picture"
     assert reasons["mirror_ball"] == "no mirror ball is in the picture"
-    assert reasons["recover"] == "nothing reads its environment or emitters in this frame"
+    assert reasons["irradiance"] == "nothing reads its irradiance_map in this frame"
     assert {"unwrap", "accumulate", "expose"}.isdisjoint(reasons)
     off = run(PATHS["light"][:4], "cpu", "every", culling=True)[-1]
     assert off.stages["relight"].left_out == "no virtual light has any power"

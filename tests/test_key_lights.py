@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from tests.error_model import check_error
 from tests.reference import key_lights as reference
 from tests.reference import latlong
 from warp_ar.kernels.environment import key_lights
@@ -77,6 +78,7 @@ def test_agrees_with_the_twin(device, height, width):
     length = np.linalg.norm(flow)
     assert light["directionality"] == pytest.approx(min(2 * length / total, 1.0), abs=SUMS)
     np.testing.assert_allclose(light["direction"] * length, flow, atol=SUMS * total)
+    check_error("key_lights", light["direction"] * length / total, flow / total)
 
 
 @pytest.mark.parametrize("ratio", [1.0, 0.98, 0.5, 0.1])

@@ -68,7 +68,7 @@ import threading
 import numpy as np
 import warp as wp
 from warp_ar.device import start_warp
-from warp_ar.kernels import irradiance
+from warp_ar.kernels.environment import irradiance
 
 faulthandler.enable()
 start_warp()
@@ -104,7 +104,7 @@ def test_tiles_beside_other_kernels() -> None:
 
 def test_kernels_with_tiles_have_modules_of_their_own() -> None:
     found = []
-    for module in pkgutil.iter_modules(warp_ar.kernels.__path__, "warp_ar.kernels."):
+    for module in pkgutil.walk_packages(warp_ar.kernels.__path__, "warp_ar.kernels."):
         for item in vars(importlib.import_module(module.name)).values():
             if isinstance(item, wp.Kernel) and "wp.tile" in inspect.getsource(item.func):
                 found.append(item.key)

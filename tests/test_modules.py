@@ -41,7 +41,8 @@ print(heard)
 def run(tmp_path: pathlib.Path, cache: pathlib.Path) -> str:
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)
-    environment = {"WARP_CACHE_PATH": str(cache), "PATH": "/usr/bin:/bin", "PYTHONPATH": str(pathlib.Path.cwd())}
+    paths = os.pathsep.join(filter(None, (str(pathlib.Path.cwd()), os.environ.get("PYTHONPATH"))))
+    environment = {**os.environ, "WARP_CACHE_PATH": str(cache), "PYTHONPATH": paths}
     done = subprocess.run([sys.executable, str(script)], env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout.strip().splitlines()[-1]

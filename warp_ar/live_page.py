@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import contextlib
 import functools
 import gc
 import os
 import secrets
 import signal
 import sys
+import tempfile
 import threading
 import webbrowser
 from pathlib import Path
@@ -140,8 +142,11 @@ def serve_page(options: argparse.Namespace) -> int:
         gc.unfreeze()  # whoever called goes on with a collector that sees all
     if not server.ended or code in (EXIT_INTERRUPTED, EXIT_TERMINATED):
         # A frame of the reference, or a kernel that is compiled, takes many seconds and cannot be stopped, and Python
-        # would wait for its thread, or end it within native code, which aborts. All files are closed and temporary
-        # folders gone by now.
+        # would wait for its thread, or end it within native code, which aborts. All files are closed by now,
+        # and temporary folders gone, but for those in which Warp keeps parsed headers for each thread that compiles.
+        for folder in [one for one in gc.get_objects() if isinstance(one, tempfile.TemporaryDirectory)]:
+            with contextlib.suppress(OSError):
+                folder.cleanup()
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)

@@ -212,10 +212,9 @@ def _write_to_log(path: Path) -> None:
     """Have all that is printed, by native code too, go to a file."""
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
-        for stream in (1, 2):
-            os.dup2(file, stream)
-        os.close(file)
+        with open(path, "ab") as file:
+            for stream in (1, 2):
+                os.dup2(file.fileno(), stream)
         sys.stdout = sys.stderr = open(2, "w", closefd=False)  # noqa: SIM115  (for as long as the process lives)
 
 
