@@ -67,7 +67,7 @@ def test_example_is_read(key, folder):
         # Every way to give it becomes R and t.
         assert np.isfinite(scene.pose.at(0)[0]).all()
         return
-    if key.section == "light" and key.name in ("file", "scale", "rotate"):
+    if key.section == "light" and key.name in ("file", "scale", "rotate", "axes"):
         assert str(getattr(scene.captured, key.name)).endswith(value if isinstance(value, str) else str(value))
         return
     if key.section == "light" and not scene.lights:

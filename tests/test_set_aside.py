@@ -10,9 +10,11 @@ import stat
 import numpy as np
 import pytest
 
+from warp_ar.command_line import Terminated
 from warp_ar.errors import SinkError
-from warp_ar.files import create_aside, write_whole
+from warp_ar.files import create_new, name_aside, write_whole
 from warp_ar.output.video_sink import VideoSink
+from warp_ar.output.whole_fragments import WholeFragments
 
 ROOT = pathlib.Path(__file__).parents[1] / "warp_ar"
 RENAMERS = {"os.replace", "os.rename", "os.renames", "shutil.move", "os.link", "os.symlink"}
@@ -38,17 +40,32 @@ def test_a_link_under_the_earlier_name_of_files_set_aside_is_not_followed(tmp_pa
 
 
 def test_names_are_random_and_files_are_new(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    names = set()
-    for _ in range(20):
-        file, part = create_aside(tmp_path / "a.json")
-        os.close(file)
-        names.add(part.name)
-    assert len(names) == 20
+    assert len({name_aside(tmp_path / "a.json") for _ in range(20)}) == 20
     monkeypatch.setattr("warp_ar.files.secrets.token_hex", lambda count: "0" * 2 * count)
     (tmp_path / f".b.json.{'0' * 16}.part").symlink_to(tmp_path / "victim")
     with pytest.raises(FileExistsError):
-        create_aside(tmp_path / "b.json")
+        create_new(name_aside(tmp_path / "b.json"))
+    with pytest.raises(FileExistsError):
+        write_whole(tmp_path / "b.json", b"{}")
     assert not (tmp_path / "victim").exists()
+
+
+def test_a_signal_right_after_a_file_is_created_leaves_nothing(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    create = os.open
+
+    def end(*given: object, **more: object) -> int:
+        os.close(create(*given, **more))  # type: ignore[arg-type]
+        raise Terminated
+
+    monkeypatch.setattr("warp_ar.files.os.open", end)
+    with pytest.raises(Terminated):
+        write_whole(tmp_path / "run.json", b"{}")
+    with pytest.raises(Terminated):
+        WholeFragments(tmp_path / "clip.mp4", boxes=True)
+    monkeypatch.undo()
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_nothing_is_left_beside_and_the_mode_stays(tmp_path: pathlib.Path) -> None:

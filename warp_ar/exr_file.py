@@ -82,7 +82,11 @@ def read_linear_picture(path: pathlib.Path, error: type[WarpArError], label: str
 
 
 def read_exr_header(path: pathlib.Path, error: type[WarpArError], label: str) -> dict[str, Any]:
-    """Read the attributes of an OpenEXR's first part; arguments and errors as `read_linear_picture`."""
+    """Read the attributes of an OpenEXR's first part; arguments as `read_linear_picture`.
+
+    Raises:
+        WarpArError: As ``error``: there is no such file, it is too large or cannot be read.
+    """
     if not is_file(path):
         raise error(f"there is no file {label}")
     try:

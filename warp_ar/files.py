@@ -272,9 +272,10 @@ def write_whole(
     kind = kind_of(path)
     if kind not in ("file", "nothing"):
         raise OSError(f"it is {'a folder' if kind == 'folder' else kind}, not a file")
-    file, part = create_aside(path, suffix)
+    part = name_aside(path, suffix)
+    # The name is known before the file is there: a signal between the two leaves nothing.
     try:
-        with os.fdopen(file, "wb") as stream:
+        with os.fdopen(create_new(part), "wb") as stream:
             if not callable(write):
                 stream.write(write)
         if callable(write):
@@ -293,25 +294,30 @@ def write_whole(
         raise
 
 
-def create_aside(path: pathlib.Path, suffix: str = "") -> tuple[int, pathlib.Path]:
-    """Create an empty file beside a path: hidden, of a random name, and new, so that no link there is followed.
+def name_aside(path: pathlib.Path, suffix: str = "") -> pathlib.Path:
+    """Return the path, hidden and of a random name, for a file that is to take another one's name when it is whole.
 
     Args:
-        path: The name that the file is to take when it is whole (`take_name`).
+        path: That name (`take_name`).
         suffix: Ending of its name until then.
-
-    Returns:
-        Its descriptor, open for reading and writing, and its path.
-
-    Raises:
-        OSError: It cannot be created.
     """
     name = path.name if len(os.fsencode(path.name)) <= 200 else f"{path.stem[:40]}{path.suffix[:8]}"
-    part = path.with_name(f".{name}.{secrets.token_hex(8)}.part{suffix}")
+    return path.with_name(f".{name}.{secrets.token_hex(8)}.part{suffix}")
+
+
+def create_new(path: pathlib.Path) -> int:
+    """Create an empty file where none is; no link there is followed.
+
+    Returns:
+        Its descriptor, open for reading and writing.
+
+    Raises:
+        OSError: It cannot be created, or something has that name.
+    """
     flags = os.O_RDWR | os.O_CREAT | os.O_EXCL
     for extra in ("O_NOFOLLOW", "O_CLOEXEC", "O_BINARY"):
         flags |= getattr(os, extra, 0)
-    return os.open(part, flags, 0o666), part
+    return os.open(path, flags, 0o666)
 
 
 def take_name(part: pathlib.Path, path: pathlib.Path) -> None:

@@ -6,7 +6,7 @@ import contextlib
 import os
 from pathlib import Path
 
-from warp_ar.files import create_aside, take_name
+from warp_ar.files import create_new, name_aside, take_name
 
 _MEDIA = {True: b"mdat", False: b"\x1f\x43\xb6\x75"}
 """What pictures begin with: a box of MP4, a cluster of Matroska."""
@@ -34,8 +34,14 @@ class WholeFragments:
             OSError: It cannot be made.
         """
         self._path, self._boxes = Path(os.path.realpath(path)), boxes
-        self._part: Path | None
-        self._file, self._part = create_aside(self._path)
+        part = name_aside(self._path)
+        self._part: Path | None = part
+        try:
+            self._file = create_new(part)
+        except BaseException:  # a signal, when the file may be there already
+            with contextlib.suppress(OSError):
+                part.unlink()
+            raise
         self._pending = bytearray()
         self._start = self._size = self._at = 0  # of what is pending; of the file; where FFmpeg is
         self._closed = False

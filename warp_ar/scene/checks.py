@@ -18,7 +18,11 @@ from warp_ar.scene.messages import nearest
 
 
 def fail(item: object, key: str, right: str) -> NoReturn:
-    """Raise the error that names class, field, value and what would be right."""
+    """Raise the error that names class, field, value and what would be right.
+
+    Raises:
+        SceneError: Always.
+    """
     value = repr(getattr(item, key))
     shown = value if len(value) <= 80 else f"{value[:60]}..."
     raise SceneError(f"{type(item).__name__}: {key} = {shown}: {right}")

@@ -342,7 +342,11 @@ def read_obj(
 def read_off(
     path: Path, data: bytes, assets: Assets, images: list[ByteArray], notes: list[str], crease: float | None
 ) -> list[MeshPart]:
-    """Read an OFF: colours, normals and texture coordinates of vertices (COFF, NOFF, STOFF), colours of faces."""
+    """Read an OFF: colours, normals and texture coordinates of vertices (COFF, NOFF, STOFF), colours of faces.
+
+    Raises:
+        ValueError: It is binary, of another dimension than three, cut off, or no OFF.
+    """
     lines = [line.split("#")[0].split() for line in decode_text(data).splitlines()]
     lines = [line for line in lines if line]
     kind = re.fullmatch(r"(ST)?(C)?(N)?(4)?(n)?OFF", lines[0][0]) if lines else None

@@ -219,6 +219,7 @@ _EXAMPLES: Final[dict[tuple[str, str], tuple[str, str, str]]] = {
     ("light", "file"): ("-", '"light.exr"', ""),
     ("light", "scale"): ("-", "0.5", 'file = "light.exr"'),
     ("light", "rotate"): ("degrees", "[0.0, 0.0, 30.0]", 'file = "light.exr"'),
+    ("light", "axes"): ("-", '"y-up"', 'file = "light.exr"'),
     ("pose", "R"): ("-", "[1, 0, 0, 0, 0, -1, 0, 1, 0]", "t = [0.0, 0.1, 0.6]"),
     ("pose", "t"): ("metres", "[0.0, 0.1, 0.6]", "R = [1, 0, 0, 0, 0, -1, 0, 1, 0]"),
     ("pose", "quaternion"): ("-", "[0.7, 0.7, 0.0, 0.0]", "t = [0.0, 0.1, 0.6]"),
