@@ -298,3 +298,40 @@ def test_a_box_is_pointed_out_and_edited(open_tab: Callable[..., Tab], artefacts
     tab.until("!warpAr.scene.proxies.some(p => p.shape === 'box')")
     page.click("#undo")
     tab.until("warpAr.scene.proxies.some(p => p.shape === 'box')")
+
+
+SIZES = [(1280, 800), (390, 844), (844, 390)]
+"""Windows of a desktop, and of a phone upright and on its side."""
+
+INSIDE = """() => {
+  const { top, left, bottom, right } = document.querySelector("#notices .notice").getBoundingClientRect();
+  return top >= 0 && left >= 0 && bottom <= innerHeight && right <= innerWidth;
+}"""
+DRAG_OVER = """() => {
+  const dataTransfer = new DataTransfer();
+  dataTransfer.items.add(new File(["-"], "corner.exe"));
+  const event = (name) => new DragEvent(name, { dataTransfer, bubbles: true, cancelable: true });
+  const figure = document.getElementById("figure");
+  figure.dispatchEvent(event("dragover"));
+  const zone = getComputedStyle(figure, "::after").content;
+  figure.dispatchEvent(event("drop"));
+  return zone;
+}"""
+
+
+def test_notices_are_inside_the_window_and_stay(open_tab: Callable[..., Tab], artefacts: Path) -> None:
+    """They stood below the fold, and bad ones went by themselves."""
+    tab = open_tab()
+    page = tab.page
+    assert "Drop" in page.evaluate(DRAG_OVER), "where a file may be dropped is not shown"
+    tab.until("document.getElementById('notices').textContent.includes('corner.exe: expected')")
+    for width, height in SIZES:
+        page.set_viewport_size({"width": width, "height": height})
+        page.wait_for_timeout(200)
+        assert page.evaluate(INSIDE), (width, height)
+        page.screenshot(path=artefacts / f"notice_{width}x{height}.png")
+    page.wait_for_timeout(9000)
+    assert page.locator(".notice.bad").count() == 1
+    page.click("#notices [aria-label=Close]")
+    assert page.locator("#notices .notice").count() == 0
+    tab.errors = [error for error in tab.errors if "422" not in error]  # the refused one, which was asked for

@@ -203,7 +203,6 @@ function notice(text, bad = false) {
   box.append(line, close);
   holder.prepend(box);
   while (holder.children.length > 3) holder.lastElementChild.remove();
-  if (bad) setTimeout(() => box.remove(), 9000);
   return box;
 }
 
