@@ -18,8 +18,13 @@ import OpenEXR
 import pytest
 
 from warp_ar import explain, live
+from warp_ar.ball.ball_solve import rough_circle
+from warp_ar.checks.check_ball import is_printed
+from warp_ar.checks.check_pictures import take_look
 from warp_ar.output.sinks import read_environment
-from warp_ar.sources.sources import Synthetic
+from warp_ar.scene import Marker, Pose, load_scene
+from warp_ar.scene.description import CharucoBoard
+from warp_ar.sources.sources import Synthetic, open_source
 
 FRAMES = 4
 
@@ -427,6 +432,49 @@ def test_a_ball_that_is_never_seen_ends_with_1(tmp_path: Path, capsys: pytest.Ca
     assert "[probe]" in said[0]
     assert "no mirror ball was found" in said[-1]
     assert len(list((tmp_path / "out").iterdir())) == 2
+
+
+def test_where_the_ball_is_painted_out_no_light_of_a_ball_is_used(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    desk = load_scene("desk")
+    assert desk.source is not None
+    assert desk.source.path is not None
+    (tmp_path / "frames").mkdir()
+    with open_source(desk.source.path) as clip:
+        look = take_look(desk, clip, 24, 8)
+    for index, (image, pose) in enumerate(look.views):
+        circle = rough_circle(look.camera, pose, desk.probes[0])
+        assert circle is not None
+        x, y, radius = circle
+        mask = np.zeros(image.shape[:2], np.uint8)
+        cv2.circle(mask, (round(x), round(y)), round(1.15 * radius), 255, -1)
+        painted = cv2.inpaint(image, mask, 3, cv2.INPAINT_TELEA)
+        cv2.imwrite(str(tmp_path / "frames" / f"{index:04d}.png"), painted[..., ::-1])
+    assert desk.path is not None
+    text = desk.path.read_text().replace("clips/desk.mp4", "frames")
+    scene = tmp_path / "scene.toml"
+    scene.write_text(text.replace("meshes/", f"{desk.path.parent}/meshes/"))
+    report = tmp_path / "run.json"
+    options = ("--headless", "--quality", "paper", "--output", tmp_path / "out")
+    assert live.main([str(option) for option in (scene, *options, "--report", report)]) == 1
+    said = capsys.readouterr().err.splitlines()
+    assert "no light of a ball is used" in said[-1]
+    told = json.loads(report.read_text())
+    assert "no mirror ball was found" in told["balls_missing"]
+    assert "unwrap" not in told["stages_run"]
+    options = ("--headless", "--quality", "paper", "--overwrite", "--save-environment", tmp_path / "light.exr")
+    assert live.main([str(option) for option in (scene, *options)]) == 1
+    assert "no mirror ball was found" in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_a_circle_within_the_printed_board_is_no_ball() -> None:
+    marker = Marker(board=CharucoBoard(5, 7, 0.035, 0.026), size=0.026)
+    camera = load_scene("desk").camera
+    pose = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
+    assert is_printed(marker, camera, pose, (camera.cx, camera.cy, 20.0))
+    assert not is_printed(marker, camera, pose, (camera.cx - 150.0, camera.cy, 20.0))
+    assert not is_printed(marker, camera, pose, (camera.cx, camera.cy, 200.0))
 
 
 def test_a_picture_that_never_changes_ends_with_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import dataclasses
 import itertools
 import json
 import signal
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
 
 # A clip that shows no marker for this many frames is not going to: say so instead of running on.
 MARKER_PATIENCE = 100
+NO_BALL = "no mirror ball was found where [probe] has it"
 
 
 class RunError(WarpArError):
@@ -138,7 +140,7 @@ def _check_run(log: RunLog, session: Session, evidence: _Evidence) -> None:
         camera = scene.camera.scaled_to(*session.source.size)
         if not ball_is_seen(scene, camera, evidence.views):
             raise RunError(
-                "no mirror ball was found where [probe] has it, so its light is not that of the desk; "
+                f"{NO_BALL}, so its light is not that of the desk; "
                 "check center and radius, and see python -m warp_ar.doctor"
             )
     if log.count > 0 and not evidence.changed and (scene.objects or scene.lights):
@@ -293,6 +295,10 @@ def _light_clip(options: argparse.Namespace, loaded: Callable[[], None]) -> int:
         session = stack.enter_context(_open_session(options, scene, outputs))
         balls = _ball_report(scene, session)
         ball_seen = say_quick_check(options, session.scene)
+        if not ball_seen and options.light is None and _are_balls_missing(options, session.scene):
+            session.close()
+            session = stack.enter_context(_open_session_without_balls(options, session.scene, outputs))
+            balls["balls_missing"] = f"{NO_BALL}; no light of a ball is used"
         for note in session.bracket_notes:
             say(note)
         traced = None
@@ -314,6 +320,8 @@ def _light_clip(options: argparse.Namespace, loaded: Callable[[], None]) -> int:
                 _light_frames(options, session, log, (sink, camera), side, stop, evidence, traced)
             if stop.code is None:
                 _check_run(log, session, evidence)
+            if "balls_missing" in balls and stop.code is None:
+                raise RunError(f"{balls['balls_missing']}; check center and radius, and see python -m warp_ar.doctor")
             for words in reflectances_told(session.scene.probes, session.pipeline.arrays.get("recover_status")):
                 say(words)
         except WarpArError as error:
@@ -328,6 +336,28 @@ def _light_clip(options: argparse.Namespace, loaded: Callable[[], None]) -> int:
     if not options.headless:
         _tell_end(options, session, log, camera)
     return EXIT_DONE if stop.code is None else stop.code
+
+
+def _are_balls_missing(options: argparse.Namespace, scene: Scene) -> bool:
+    from warp_ar.checks.checkup import are_balls_missing
+
+    try:
+        return are_balls_missing(scene, options.source)
+    except WarpArError:
+        return False  # the run meets it too, and says it
+
+
+def _open_session_without_balls(options: argparse.Namespace, scene: Scene, outputs: tuple[str, ...]) -> Session:
+    """Open a session that takes no light from where the scene has mirror balls that are not there.
+
+    Raises:
+        RunError: What is to be written is the light of a ball.
+    """
+    lone = argparse.Namespace(**{**vars(options), "calibration": None, "refine_ball": False})
+    try:
+        return _open_session(lone, dataclasses.replace(scene, probes=()), outputs)
+    except (UsageError, ValueError) as error:
+        raise RunError(f"{NO_BALL}: {error}") from error
 
 
 def _open_session(options: argparse.Namespace, scene: Scene, outputs: tuple[str, ...]) -> Session:

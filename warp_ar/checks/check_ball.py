@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Final
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,7 +19,8 @@ from warp_ar.ball.ground_seen import ground_is_seen
 from warp_ar.checks.check_pictures import Look
 from warp_ar.checks.finding import Finding
 from warp_ar.errors import UsageError
-from warp_ar.scene import Camera, Pose, Probe, Scene
+from warp_ar.scene import Camera, Marker, Pose, Probe, Scene
+from warp_ar.tracking.marker_pattern import printed_cells
 
 Image = NDArray[np.uint8]
 
@@ -81,15 +83,15 @@ def _check_ball(
     if not seen:
         text = f"{label}: the ball is outside the picture"
         return [Finding("ball.outside", text, "move camera or ball until all of it is in view; check center")]
-    ground = _ground(scene, probe)
+    ground = standing_ground(scene, probe)
     insides = [_inside_of(image, circle) for image, circle in seen]
     contrast = float(np.median([_contrast(part) for part in insides]))
     spread = look.views[:: -(-len(look.views) // SIDES)]
     if ground is not None and ground_is_seen(spread, look.camera, probe, ground):
-        return [_why_lost(look, views, label, contrast)]
+        return [_why_lost(scene.marker, look, views, label, contrast)]
     outlines = [pair for pair in agreeing_outlines(views, look.camera, probe, ground) if pair[0].support > LOST]
     if len(outlines) < max(1, len(seen) // 2):
-        return [_why_lost(look, views, label, contrast)]
+        return [_why_lost(scene.marker, look, views, label, contrast)]
     found = []
     solution = solve_ball(outlines, look.camera, probe, ground)
     pixels = float(np.median([outline.radius for outline, _ in outlines]))
@@ -136,8 +138,8 @@ def _check_reflectance(
     return [Finding("ball.reflectance", text, remedy)]
 
 
-def _ground(scene: Scene, probe: Probe) -> float | None:
-    """What the ball stands on, where the scene says that it stands on it."""
+def standing_ground(scene: Scene, probe: Probe) -> float | None:
+    """Return the height in metres of what the ball stands on; None where the scene has it above nothing or afloat."""
     ground = ground_below(probe, scene.proxies)
     return ground if ground is not None and probe.center[2] - probe.radius - ground < 0.3 * probe.radius else None
 
@@ -162,6 +164,12 @@ def _compare(probe: Probe, solution: BallSolution, label: str, command: str) -> 
     return []
 
 
+def is_in_view(look: Look, pose: Pose, probe: Probe) -> bool:
+    """Return whether a ball's place is in the picture of a camera there."""
+    circle = rough_circle(look.camera, pose, probe)
+    return circle is not None and _inside(look, circle)
+
+
 def _inside(look: Look, circle: tuple[float, float, float]) -> bool:
     x, y, r = circle
     return -0.5 * r < x < look.camera.width + 0.5 * r and -0.5 * r < y < look.camera.height + 0.5 * r
@@ -175,7 +183,20 @@ def _inside_of(image: Image, circle: tuple[float, float, float]) -> NDArray[np.f
     return image[mask].astype(float) if mask.any() else np.zeros((1, 3))
 
 
-def _why_lost(look: Look, views: tuple[tuple[Image, Pose], ...], label: str, contrast: float) -> Finding:
+def is_printed(marker: Marker, camera: Camera, pose: Pose, circle: tuple[float, float, float]) -> bool:
+    """Return whether a circle (x, y, radius), pixels, lies within the printed marker or board."""
+    corners = pose.apply(printed_cells(marker)[3])
+    if (corners[:, 2] < 1e-3).any():
+        return False
+    zero = np.zeros(3)
+    outline = cv2.projectPoints(corners, zero, zero, camera.matrix(), np.array(camera.distortion))[0]
+    x, y, radius = circle
+    return cv2.pointPolygonTest(outline.astype(np.float32), (x, y), measureDist=True) > 0.9 * radius
+
+
+def _why_lost(
+    marker: Marker, look: Look, views: tuple[tuple[Image, Pose], ...], label: str, contrast: float
+) -> Finding:
     """What there is instead of the ball: elsewhere, flat paint, or nothing."""
     command = "check center and radius, and that nothing hides the ball"
     if contrast < 0.5 * DULL:
@@ -184,6 +205,8 @@ def _why_lost(look: Look, views: tuple[tuple[Image, Pose], ...], label: str, con
     try:
         outline = find_ball(views[0][0], look.camera)
     except UsageError:
+        return Finding("ball.unfound", f"{label}: no ball is seen where the scene has it", command)
+    if is_printed(marker, look.camera, views[0][1], (*outline.center, outline.radius)):
         return Finding("ball.unfound", f"{label}: no ball is seen where the scene has it", command)
     x, y = outline.center
     where = f"({x:.0f}, {y:.0f}), {2 * outline.radius:.0f} pixels wide"

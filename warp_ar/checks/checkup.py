@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from warp_ar.ball.ball_solve import find_outlines
-from warp_ar.checks.check_ball import LOST, check_balls
+from warp_ar.ball.ground_seen import ground_is_seen
+from warp_ar.checks.check_ball import LOST, check_balls, is_in_view, standing_ground
 from warp_ar.checks.check_objects import check_objects, written_poses
 from warp_ar.checks.check_pictures import Look, check_pictures, take_look
 from warp_ar.checks.check_print import check_print
@@ -141,10 +142,33 @@ def _check_look(scene: Scene, look: Look, views: int, before: list[Finding]) -> 
 
 
 def ball_is_seen(scene: Scene, camera: Camera, views: Iterable[tuple[Any, Pose]]) -> bool:
-    """Whether any of some posed RGB frames shows any of the scene's mirror balls."""
-    return any(  # frame by frame, up to the first that does: looking takes a third of a second
-        outline.support > LOST
-        for view in views
-        for probe in scene.probes
-        for outline, _ in find_outlines([view], camera, probe)
-    )
+    """Return whether any of some posed RGB frames shows any of the scene's mirror balls."""
+    views = list(views)
+    for probe in scene.probes:
+        ground = standing_ground(scene, probe)
+        if ground is not None and ground_is_seen(views, camera, probe, ground):
+            continue  # edges of what lies there may look like a rim
+        # Frame by frame, up to the first that does: looking takes a third of a second.
+        if any(outline.support > LOST for view in views for outline, _ in find_outlines([view], camera, probe)):
+            return True
+    return False
+
+
+def are_balls_missing(scene: Scene, given: str | int | Path | None) -> bool:
+    """Return whether the first frames of a recording show where the mirror balls should be, and none is there.
+
+    Args:
+        scene: The scene.
+        given: Its frames, unless they are the scene's own.
+
+    Raises:
+        SceneError: The camera was calibrated for another aspect ratio.
+        SourceError: The frames cannot be read.
+    """
+    source = source_of(scene, given)
+    if not scene.probes or not scene.has_marker or not isinstance(source, str | Path) or not Path(source).exists():
+        return False
+    look = _read(scene, source, None, None)
+    views = [view for view in look.views if any(is_in_view(look, view[1], probe) for probe in scene.probes)]
+    views = views[:: -(-len(views) // FEW_VIEWS) or 1]
+    return bool(views) and not ball_is_seen(scene, look.camera, views)
