@@ -21,6 +21,7 @@ from warp_ar import explain, live
 from warp_ar.ball.ball_solve import rough_circle
 from warp_ar.checks.check_ball import is_printed
 from warp_ar.checks.check_pictures import take_look
+from warp_ar.output.places import folder_to_oneself
 from warp_ar.output.sinks import read_environment
 from warp_ar.scene import Marker, Pose, load_scene
 from warp_ar.scene.description import CharucoBoard
@@ -466,6 +467,17 @@ def test_where_the_ball_is_painted_out_no_light_of_a_ball_is_used(
     options = ("--headless", "--quality", "paper", "--overwrite", "--save-environment", tmp_path / "light.exr")
     assert live.main([str(option) for option in (scene, *options)]) == 1
     assert "no mirror ball was found" in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_a_second_run_into_one_folder_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene, out = write_scene(tmp_path), tmp_path / "out"
+    out.mkdir()
+    with folder_to_oneself(out):
+        assert run(scene, "--headless", "--frames", 2, "--output", out) == 2
+        assert "is in use" in capsys.readouterr().err.splitlines()[-1]
+    assert list(out.iterdir()) == []
+    assert run(scene, "--headless", "--frames", 2, "--output", out) == 0
+    assert sorted(path.name for path in out.iterdir()) == ["0000.png", "0001.png"]
 
 
 def test_a_circle_within_the_printed_board_is_no_ball() -> None:

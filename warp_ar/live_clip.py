@@ -19,10 +19,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from warp_ar.begin import EXIT_INTERRUPTED, EXIT_TERMINATED, handling, importing
 from warp_ar.command_line import EXIT_DONE, loading
 from warp_ar.errors import UsageError, WarpArError, printable, reason, say
-from warp_ar.files import write_whole
+from warp_ar.files import is_folder, write_whole
 from warp_ar.live_start import say_quick_check, start_device
 from warp_ar.output.encoders import parse_options
-from warp_ar.output.places import check_places, check_replaceable
+from warp_ar.output.places import check_places, check_replaceable, folder_to_oneself
 from warp_ar.output.sink import make_folder
 from warp_ar.output.sinks import NullSink, Sink, open_sink
 from warp_ar.scene import Probe, Scene, load_scene
@@ -310,6 +310,8 @@ def _light_clip(options: argparse.Namespace, loaded: Callable[[], None]) -> int:
         _compile(session, shown=not options.headless)
         loaded()
         sink = _open_output(options, session)
+        if options.output is not None and is_folder(options.output):
+            stack.enter_context(folder_to_oneself(Path(options.output)))
         camera = _open_camera(options, session)
         for words in (*replaced, sink.replaced):
             if words:

@@ -6,10 +6,13 @@ unless overwriting is asked for.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+
+import filelock
 
 from warp_ar.errors import SinkError, UsageError, reason
 from warp_ar.files import is_same_file, kind_of
@@ -89,3 +92,26 @@ def check_places(reads: Mapping[str, Sequence[Path]], writes: Mapping[str, Path]
             if inside or outside:
                 raise UsageError(f"{written} {place} would number frames beside {role} {path}; name another")
         entries.append((written, place))
+
+
+@contextlib.contextmanager
+def folder_to_oneself(folder: Path) -> Iterator[None]:
+    """Keep other runs from writing frames into a folder; the lock's file is removed at the end.
+
+    Raises:
+        UsageError: Another run has it.
+    """
+    lock = filelock.FileLock(folder / ".warp_ar.lock", timeout=0, mode=0o666)
+    try:
+        lock.acquire()
+    except filelock.Timeout as error:
+        raise UsageError(f"{folder} is in use: another run writes frames into it; give another --output") from error
+    except (OSError, NotImplementedError):
+        yield  # a disk that cannot lock still takes frames
+        return
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):
+            os.unlink(lock.lock_file)
+        lock.release()
