@@ -12,6 +12,7 @@ import warp as wp
 from bench.common import measure, report
 from tests.kernel_rig import records, shape
 from warp_ar.kernels import color
+from warp_ar.kernels.edges import EdgeLists
 from warp_ar.kernels.environment import environment_samples
 from warp_ar.kernels.environment.environment_samples import EnvironmentSample
 from warp_ar.kernels.launch import count_partials
@@ -100,7 +101,7 @@ def _cells(world: World, out: wp.array) -> dict[str, Callable[[], None]]:
 
 
 def _edges(world: World) -> dict[str, Callable[[], None]]:
-    """Edges at 4 and 16 samples."""
+    """Edges at 4 and 16 samples: each pixel's one after another, or listed and side by side."""
     contenders: dict[str, Callable[[], None]] = {}
     device = world.device
     for samples in (4, 16):
@@ -108,13 +109,16 @@ def _edges(world: World) -> dict[str, Callable[[], None]]:
         config = RelightConfig("reflectance", trace, "sh", True, edge_samples=samples)
         visibility, out = wp.zeros((H, W), wp.int32, device=device), wp.zeros((H, W), wp.vec3, device=device)
         receiver = make_receiver(config, world.picture, **world.known)
+        count = wp.zeros(1, wp.int32, device=device)
+        edges = wp.zeros(H * W // 16, wp.vec2i, device=device)
+        lists = EdgeLists.of(count, edges, wp.zeros(len(edges) * samples, wp.vec4, device=device))
         inputs = config, world.params, world.scene, world.lights, receiver
         relight.relight(*inputs, out, visibility)
-        call = functools.partial(relight.smooth_edges, *inputs, visibility, out)
-        before = out.numpy()
-        call()
-        assert 100 < (out.numpy() != before).any(-1).sum() < H * W // 16
-        contenders[f"edges, {samples} samples"] = call
+        for name, own in (("in place", None), ("listed", lists)):
+            call = functools.partial(relight.smooth_edges, *inputs, visibility, out, edge_lists=own)
+            call()
+            contenders[f"edges, {samples} samples, {name}"] = call
+        assert 100 < int(count.numpy()[0]) < len(edges)
     return contenders
 
 

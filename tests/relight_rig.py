@@ -5,6 +5,7 @@ import warp as wp
 
 from tests.kernel_rig import constant_environment, records, shape, tables
 from tests.reference import relight as reference
+from warp_ar.kernels.edges import EdgeLists
 from warp_ar.kernels.rays.trace import TraceConfig
 from warp_ar.kernels.receiver import relight
 from warp_ar.kernels.receiver.receiver import RelightConfig, make_receiver
@@ -110,6 +111,7 @@ def run_edges(
     detail=1,
     soft=False,
     rows=None,
+    listed=0,
 ):
     """``relight`` on a white desk in a white environment, and ``smooth_edges`` where samples are more than one.
 
@@ -139,8 +141,12 @@ def run_edges(
     out, visibility = wp.zeros((height, width), dtype=wp.vec3), wp.zeros((height, width), dtype=wp.int32)
     relight.relight(*inputs, out, visibility)
     if samples > 1:
+        lists = None
+        if listed:
+            sizes = ((1, wp.int32), (listed, wp.vec2i), (listed * samples, wp.vec4))
+            lists = EdgeLists.of(*(wp.zeros(size, dtype=kind) for size, kind in sizes))
         for band in rows or (None,):
-            relight.smooth_edges(*inputs, visibility, out, rows=band)
+            relight.smooth_edges(*inputs, visibility, out, edge_lists=lists, rows=band)
     return out.numpy()
 
 

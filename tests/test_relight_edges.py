@@ -97,6 +97,18 @@ def test_bands_give_the_same_edges(device):
     assert (whole == banded).all()
 
 
+@pytest.mark.parametrize("listed", [5, H * W])
+def test_listed_edges_are_the_same(device, listed):
+    """Sampled on their own, or in place where the list does not hold them all."""
+    lights = [point((-0.1, 0.05, 0.5))]
+    box = shape(BOX, (0.0, 0.1, 0.04), (0.1, 0.06, 0.04)) | {"rotation": turn_z(0.3)}
+    ball = {"center": (0.1, -0.05, 0.03), "radius": 0.03, "reflectance": (0.6, 0.6, 0.6)}
+    expected, got = (run_edges(4, lights, [HANGING], (DESK, box), [ball], listed=n) for n in (0, listed))
+    hard = run_edges(1, lights, [HANGING], (DESK, box), [ball])
+    assert (expected != hard).any(-1).sum() > 50
+    np.testing.assert_allclose(got, expected, rtol=0 if device == "cpu" else 1e-6)
+
+
 def test_edge_samples_must_be_a_square_number():
     with pytest.raises(ValueError, match="edge_samples is 3; expected a square number"):
         RelightConfig("flat", TraceConfig((), (PLANE,)), edge_samples=3)

@@ -14,6 +14,7 @@ from tests.kernel_rig import TEXTURES
 from tests.reference import shade as reference
 from tests.test_visibility import GENERAL, World
 from warp_ar.kernels import structs
+from warp_ar.kernels.edges import EdgeLists
 from warp_ar.kernels.environment.lobes import lobe_texels
 from warp_ar.kernels.objects.reflect import DistantLight, DistantLightConfig
 from warp_ar.kernels.objects.shade import ShadeConfig, make_object_light, shade
@@ -104,6 +105,7 @@ def render(
     rect=(0, 48, 0, 64),
     bands=(None,),
     eye=(0.0, 0.0, 0.0),
+    listed=0,
 ):
     """Trace and shade a frame of a camera at ``eye`` that looks along +z; (48, 64, 4)."""
     params = np.zeros(1, np.dtype(structs.FrameParams.numpy_dtype()))
@@ -118,9 +120,14 @@ def render(
     light_array = lights(device=device) if light_array is None else light_array
     visible = make_visible(found, hits)
     trace_pixels(config.distant.trace, params, rays, scene, visible)
+    lists = None
+    if listed:
+        samples = wp.zeros(listed * config.edge_samples, dtype=wp.vec4, device=device)
+        count, edges = (wp.zeros(n, dtype=t, device=device) for n, t in ((1, wp.int32), (listed, wp.vec2i)))
+        lists = EdgeLists.of(count, edges, samples)
     for rows in bands:
         inputs = (params, rays, scene, make_object_light(surroundings, light_array), visible)
-        shade(config, *inputs, virtual, rows=rows)
+        shade(config, *inputs, virtual, edge_lists=lists, rows=rows)
     return virtual.numpy()
 
 
@@ -188,6 +195,19 @@ def test_near_vertical_edge_has_every_shade(device):
     scene = scene_of(world, WHITE["lambert"], device=device)
     alpha = render(scene, dataclasses.replace(EVERYTHING, edge_samples=16), device)[..., 3]
     assert len(np.unique(np.round(alpha * 16))) >= 16
+
+
+@pytest.mark.parametrize("edge_samples", [4, 16])
+@pytest.mark.parametrize("listed", [5, 3000])
+def test_listed_edges_are_the_same(device, edge_samples, listed):
+    """Edges sampled on their own, or in place where the list does not hold them all, are as edges sampled at once."""
+    scene = scene_of(ball(device), WHITE["plastic"], device=device)
+    config = dataclasses.replace(EVERYTHING, edge_samples=edge_samples)
+    expected = render(scene, config, device)
+    assert ((expected[..., 3] > 0.0) & (expected[..., 3] < 1.0)).sum() > 20
+    image = render(scene, config, device, listed=listed)
+    np.testing.assert_array_equal(image[..., 3], expected[..., 3])
+    np.testing.assert_array_max_ulp(image, expected, CONTRACTION_ULPS["cpu" if device == "cpu" else "cuda"])
 
 
 # --- The float64 twin -------------------------------------------------------------------------------------------------

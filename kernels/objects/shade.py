@@ -21,6 +21,7 @@ import math
 
 import warp as wp
 
+from warp_ar.kernels.edges import EdgeList, EdgeLists, holds_all, list_edge, listed_edges, sample_listed_edges
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
 from warp_ar.kernels.materials import Surface, lobe_axis, make_reflect_direct, make_surface, reflect, specular_occlusion
 from warp_ar.kernels.objects.near_field import NearLight
@@ -70,6 +71,8 @@ MIN_FACING = wp.constant(wp.float32(1.0e-3))
 
 ALONE = wp.constant(-1)
 """Number of the one sample of a pixel without an edge."""
+SAMPLED, LISTED, LEFT = "sampled", "listed", "left"
+"""What becomes of edges in a kernel of ``make_shade_kernel``."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -394,8 +397,15 @@ def make_shade_sample(config: ShadeConfig) -> wp.Function:
 
 
 @functools.cache
-def make_shade_kernel(config: ShadeConfig) -> wp.Kernel:
-    """Return the kernel of ``shade``, specialised to ``config``; equal configs share one kernel."""
+def make_shade_kernel(config: ShadeConfig, edges: str = SAMPLED) -> wp.Kernel:
+    """Kernel of ``shade``, specialised to ``config``, and to what becomes of ``edges``.
+
+    Args:
+        config: What the scene calls for.
+        edges: ``SAMPLED`` in place; ``LISTED``, and nothing else done about them; or ``LEFT``: only where the list did
+            not hold all are they sampled in place, all of them. Which ones it held depends on the order of threads, and
+            kernels that are compiled separately differ in the last place.
+    """
     shade_sample = make_shade_sample(config)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
@@ -409,8 +419,12 @@ def make_shade_kernel(config: ShadeConfig) -> wp.Kernel:
         visible: VisibleObjects,
         # Out:
         virtual_out: wp.array2d[wp.vec4],
+        list_out: EdgeList,
     ):
         i, j = wp.tid()
+        if wp.static(edges == LEFT):
+            if holds_all(list_out):
+                return
         result = wp.vec4(0.0)
         samples = wp.int32(0)
         rect = params[0].object_rect
@@ -432,15 +446,51 @@ def make_shade_kernel(config: ShadeConfig) -> wp.Kernel:
                     column = j + wp.where(k == 2, -1, 0) + wp.where(k == 3, 1, 0)
                     if differs(row, column, found, reach, rect, visible, hit):
                         samples = wp.static(config.edge_samples)
+            if wp.static(edges == LISTED):
+                if samples > 1:
+                    list_edge(i, j, list_out)
+                    return
             pixel = wp.vec2i(i, j)
             for number in range(samples):
-                sample = wp.where(samples == 1, ALONE, number)
+                sample = wp.where(wp.static(edges == LISTED) or samples == 1, ALONE, number)
                 result += shade_sample(params, rays, scene, light, visible, pixel, sample, hit)
             if samples > 1:
                 result = result / wp.float32(samples)
+        if wp.static(edges == LEFT):
+            if samples <= 1:
+                return
         virtual_out[i, j] = result
 
     return shade_kernel
+
+
+@functools.cache
+def make_sample_edges_kernel(config: ShadeConfig) -> wp.Kernel:
+    """Kernel that shades every sample of the edges that were listed."""
+    shade_sample = make_shade_sample(config)
+
+    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
+    def sample_edges_kernel(
+        # In:
+        threads: wp.int32,
+        params: wp.array[FrameParams],
+        rays: wp.array2d[wp.vec2],
+        scene: RayScene,
+        light: ObjectLight,
+        visible: VisibleObjects,
+        listed: EdgeList,
+        # Out:
+        samples_out: wp.array[wp.vec4],
+    ):
+        item = wp.tid()
+        stop = listed_edges(listed) * wp.static(config.edge_samples)
+        while item < stop:
+            pixel = listed.edges[item / wp.static(config.edge_samples)]
+            sample = item % wp.static(config.edge_samples)
+            samples_out[item] = shade_sample(params, rays, scene, light, visible, pixel, sample, Hit())
+            item += threads
+
+    return sample_edges_kernel
 
 
 def shade(
@@ -452,10 +502,14 @@ def shade(
     visible: VisibleObjects,
     virtual_out: wp.array2d[wp.vec4],
     *,
+    edge_lists: EdgeLists | None = None,
     cleared: bool = False,
     rows: Rows | None = None,
 ) -> None:
     """Shade what ``trace_pixels`` found.
+
+    Given ``edge_lists``, edges are sampled on their own, with the same result but for the last places, where CUDA's
+    compiler contracts a product and a sum in one of the kernels alone.
 
     Args:
         config: What the scene calls for; what it leaves out may be None.
@@ -465,16 +519,20 @@ def shade(
         light: From ``make_object_light``; what is near is needed if ``config.near_field``.
         visible: (H, W) as ``trace_pixels`` writes.
         virtual_out: (H, W) premultiplied linear RGB and coverage; zero outside ``params.object_rect``.
+        edge_lists: Scratch, for a launch over all rows.
         cleared: Whether ``virtual_out`` is zero, so that on CUDA it need not be written outside.
         rows: Band of rows; None means all.
     """
-    launch_rows(
-        make_shade_kernel(config),
-        rays.shape,
-        [params, rays, scene, light, visible],
-        [virtual_out],
-        rows=rows,
-        device=rays.device,
-        rectangle_first=True,
-        alone=cleared,
+    inputs = [params, rays, scene, light, visible]
+    device = rays.device
+    if edge_lists is None or config.edge_samples == 1:
+        launch_rows(make_shade_kernel(config), rays.shape, inputs, [virtual_out, EdgeList()], rows=rows, device=device)
+        return
+    edge_lists.listed.count.zero_()
+    outputs = [virtual_out, edge_lists.listed]
+    given = {"rows": rows, "device": device, "rectangle_first": True, "alone": cleared}
+    for kernel in (make_shade_kernel(config, LISTED), make_shade_kernel(config, LEFT)):
+        launch_rows(kernel, rays.shape, inputs, outputs, **given)
+    sample_listed_edges(
+        make_sample_edges_kernel(config), inputs, edge_lists, config.edge_samples, virtual_out, weighted=False
     )

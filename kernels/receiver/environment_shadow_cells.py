@@ -301,7 +301,9 @@ def make_spread_ratio_kernel(config: DistantLightConfig) -> wp.Kernel:
     """Kernel of ``spread_ratio``, specialised to ``config``."""
     visible_proxy = make_visible_proxy(config.trace, config.probes)
 
-    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
+    @wp.kernel(
+        module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS
+    )
     def spread_ratio_kernel(
         # In:
         row_start: wp.int32,

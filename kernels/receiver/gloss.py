@@ -409,7 +409,9 @@ def make_gloss_kernel(config: GlossConfig) -> wp.Kernel:
     see_receiver, draw_ray, follow = make_see_receiver(config), make_draw_ray(config), make_follow(config)
     highlights = make_highlights(config) if config.lights else None
 
-    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
+    @wp.kernel(
+        module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS
+    )
     def gloss_kernel(
         # In:
         row_start: wp.int32,

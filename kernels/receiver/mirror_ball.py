@@ -197,7 +197,9 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
     """Kernel specialised to ``config``; equal configs share one kernel."""
     mirrored_change = make_mirrored_change(config)
 
-    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
+    @wp.kernel(
+        module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS
+    )
     def mirror_ball_kernel(
         # In:
         row_start: wp.int32,

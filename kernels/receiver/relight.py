@@ -26,6 +26,7 @@ import math
 import warp as wp
 
 from warp_ar.kernels.cells import any_cell_above_zero
+from warp_ar.kernels.edges import EdgeList, EdgeLists, holds_all, list_edge, listed_edges, sample_listed_edges
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
 from warp_ar.kernels.pixel_order import own_pixel
 from warp_ar.kernels.rays.area_lights import make_area_count, make_area_sample
@@ -293,11 +294,13 @@ def make_sample_lighting(config: RelightConfig) -> wp.Function:
 
 
 @functools.cache
-def make_smooth_edges_kernel(config: RelightConfig) -> wp.Kernel:
-    """Return the kernel that samples edges, specialised to ``config``."""
+def make_smooth_edges_kernel(config: RelightConfig, *, left: bool = False) -> wp.Kernel:
+    """Kernel that samples edges in place; if ``left``, only where the list did not hold all."""
     sample_lighting = make_sample_lighting(config)
 
-    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
+    @wp.kernel(
+        module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS
+    )
     def smooth_edges_kernel(
         # In:
         row_start: wp.int32,
@@ -306,10 +309,14 @@ def make_smooth_edges_kernel(config: RelightConfig) -> wp.Kernel:
         lights: wp.array[Light],
         receiver: Receiver,
         visibility: wp.array2d[wp.int32],
+        listed: EdgeList,
         # Out:
         added_out: wp.array2d[wp.vec3],
     ):
         i, j = wp.tid()
+        if wp.static(left):
+            if holds_all(listed):
+                return
         rect = params[0].light_rect
         pixel = own_pixel(i, j, row_start, rect, added_out.shape[0], added_out.shape[1])
         i = pixel[0]
@@ -328,6 +335,56 @@ def make_smooth_edges_kernel(config: RelightConfig) -> wp.Kernel:
             added_out[i, j] = wp.vec3(total[0], total[1], total[2]) / total[3]
 
     return smooth_edges_kernel
+
+
+@wp.kernel(enable_backward=False)
+def list_edges_kernel(
+    # In:
+    row_start: wp.int32,
+    params: wp.array[FrameParams],
+    visibility: wp.array2d[wp.int32],
+    # Out:
+    list_out: EdgeList,
+):
+    """List the pixels that ``is_edge`` finds."""
+    i, j = wp.tid()
+    rect = params[0].light_rect
+    pixel = own_pixel(i, j, row_start, rect, visibility.shape[0], visibility.shape[1])
+    i = pixel[0]
+    j = pixel[1]
+    if i < 0:
+        return
+    if inside_rect(i, j, rect):
+        if is_edge(visibility, rect, i, j):
+            list_edge(i, j, list_out)
+
+
+@functools.cache
+def make_sample_edges_kernel(config: RelightConfig) -> wp.Kernel:
+    """Kernel that takes every sample of the edges that were listed."""
+    sample_lighting = make_sample_lighting(config)
+
+    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
+    def sample_lighting_edges_kernel(
+        # In:
+        threads: wp.int32,
+        params: wp.array[FrameParams],
+        scene: RayScene,
+        lights: wp.array[Light],
+        receiver: Receiver,
+        listed: EdgeList,
+        # Out:
+        samples_out: wp.array[wp.vec4],
+    ):
+        item = wp.tid()
+        stop = listed_edges(listed) * wp.static(config.edge_samples)
+        while item < stop:
+            edge = listed.edges[item / wp.static(config.edge_samples)]
+            sample = item % wp.static(config.edge_samples)
+            samples_out[item] = sample_lighting(params, scene, lights, receiver, edge[0], edge[1], sample)
+            item += threads
+
+    return sample_lighting_edges_kernel
 
 
 def relight(
@@ -380,6 +437,7 @@ def smooth_edges(
     visibility: wp.array2d[wp.int32],
     added_out: wp.array2d[wp.vec3],
     *,
+    edge_lists: EdgeLists | None = None,
     rows: Rows | None = None,
 ) -> None:
     """Average ``config.edge_samples`` samples in pixels along the edges of shadows and of lit proxies.
@@ -392,16 +450,20 @@ def smooth_edges(
         receiver: Likewise.
         visibility: (H, W) as ``relight`` writes.
         added_out: (H, W) as ``relight`` writes; changed along edges.
+        edge_lists: Scratch, for a launch over all rows: edges are then sampled on their own.
         rows: Band of rows; None means all.
     """
-    rays = receiver.picture.rays
-    launch_rows(
-        make_smooth_edges_kernel(config),
-        rays.shape,
-        [params, scene, lights, receiver, visibility],
-        [added_out],
-        rows=rows,
-        device=rays.device,
-        rectangle_first=True,
-        alone=True,
+    shape, device = receiver.picture.rays.shape, receiver.picture.rays.device
+    inputs = [params, scene, lights, receiver]
+    if edge_lists is None:
+        kernel = make_smooth_edges_kernel(config)
+        launch_rows(kernel, shape, [*inputs, visibility, EdgeList()], [added_out], rows=rows, device=device)
+        return
+    edge_lists.listed.count.zero_()
+    whole = {"rows": None, "device": device, "rectangle_first": True, "alone": True}
+    launch_rows(list_edges_kernel, shape, [params, visibility], [edge_lists.listed], **whole)
+    kernel = make_smooth_edges_kernel(config, left=True)
+    launch_rows(kernel, shape, [*inputs, visibility, edge_lists.listed], [added_out], **whole)
+    sample_listed_edges(
+        make_sample_edges_kernel(config), inputs, edge_lists, config.edge_samples, added_out, weighted=True
     )

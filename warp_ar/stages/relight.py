@@ -19,6 +19,7 @@ from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring, clearing
 from warp_ar.stages.features import Features, sheds_light
 from warp_ar.stages.request import Request
+from warp_ar.stages.shared.edge_lists import edge_arrays, make_edge_lists
 from warp_ar.stages.shared.environment_sets import SAMPLES
 from warp_ar.stages.shared.lighting import make_other_balls, relight_config, relight_reads, relight_variant
 from warp_ar.stages.shared.picture import GrowingRows, find_picture
@@ -99,6 +100,7 @@ class Relight(Stage):
         specs = {"added_light": ArraySpec((height, width), wp.vec3)}
         if self.request.quality.edge_samples > 1:
             specs["relight_visibility"] = ArraySpec((height, width), wp.int32)
+            specs |= edge_arrays(self.request, self.name)
         if self.features.ambient_visibility:
             cells = _cells(self.request, _grain(self.features).ambient)
             specs["relight_ambient_visibility"] = ArraySpec(cells, wp.vec3)
@@ -132,11 +134,14 @@ class Relight(Stage):
         passes += self._cell_passes(config, inputs, arrays, device)
         passes.append(Pass(launch, rows=height, extent=GrowingRows(light_rows)))
         if config.edge_samples > 1:
+            lists = make_edge_lists(arrays, device, self.name)
 
             def smooth(rows: Rows | None) -> None:
-                relight.smooth_edges(config, *inputs, visibility, added, rows=rows)
+                relight.smooth_edges(config, *inputs, visibility, added, edge_lists=lists, rows=rows)
 
-            relight.make_smooth_edges_kernel(config)
+            relight.make_smooth_edges_kernel(config, left=lists is not None)
+            if lists is not None:
+                relight.make_sample_edges_kernel(config)
             passes.append(Pass(smooth, rows=height, extent=light_rows))
         return passes
 

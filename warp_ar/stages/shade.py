@@ -28,6 +28,7 @@ from warp_ar.stages.base import (
     clearing,
 )
 from warp_ar.stages.features import Features
+from warp_ar.stages.shared.edge_lists import edge_arrays, make_edge_lists
 from warp_ar.stages.shared.lighting import (
     distant_light_arrays,
     distant_light_reads,
@@ -82,10 +83,11 @@ class Shade(Stage):
         return None if reach.objects else OUT_OF_PICTURE
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """The shaded objects and, for metallic-roughness, the table of its reflectance."""
+        """The shaded objects, lists of edges and, for metallic-roughness, the table of its reflectance."""
         width, height = self.request.size
         return {
             "virtual": ArraySpec((height, width), wp.vec4),
+            **edge_arrays(self.request, self.name),
             **distant_light_arrays(self.features, self.name),
         }
 
@@ -93,6 +95,7 @@ class Shade(Stage):
         """One pass over the rows where objects are or were."""
         config = shade_config(self.features)
         variant = shade_variant(config, self.features, device)
+        lists = make_edge_lists(arrays, device, self.name)
         near = NearLight()
         for name in self.features.near_names if config.near_field else ():
             setattr(near, name.removeprefix("near_"), arrays[name])
@@ -100,10 +103,10 @@ class Shade(Stage):
         light = make_object_light(distant, arrays["light_array"] if config.lights else None, near)
         inputs = arrays["params"], arrays["rays"], arrays["ray_scene"], light, find_visible(arrays)
 
-        cleared = takes_few_blocks(arrays["virtual"].shape, device)
+        cleared = lists is not None and takes_few_blocks(arrays["virtual"].shape, device)
 
         def launch(rows: Rows | None) -> None:
-            shade(variant, *inputs, arrays["virtual"], cleared=cleared, rows=rows)
+            shade(variant, *inputs, arrays["virtual"], edge_lists=lists, cleared=cleared, rows=rows)
 
         first = [clearing(arrays["virtual"])] if cleared else []
         return [*first, Pass(launch, rows=self.request.size[1], extent=GrowingRows(arrays["object_rows"]))]

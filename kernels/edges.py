@@ -1,0 +1,126 @@
+"""Edges that are sampled on their own.
+
+Samples of edges take many times as long as the pixels around them. On a CPU they are taken in place; on CUDA that
+holds up whole warps, and edges are listed first, their samples taken side by side and averaged afterwards.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import warp as wp
+
+from warp_ar.kernels.launch import launch
+
+wp.set_module_options({"enable_backward": False})
+
+EDGE_THREADS = 1 << 16
+"""Threads that share the samples of all edges."""
+
+
+@wp.struct
+class EdgeList:
+    """The pixels in which edges lie."""
+
+    count: wp.array[wp.int32]  # (1,): edges found, which may be more than there are places
+    edges: wp.array[wp.vec2i]  # (n,): row and column of each
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class EdgeLists:
+    """Scratch arrays for edges that are sampled on their own; where they do not hold all, all are sampled in place."""
+
+    listed: EdgeList
+    """Edges found."""
+    samples: wp.array[wp.vec4]
+    """(n * edge_samples,): radiance, and coverage or how much the sample counts."""
+
+    @classmethod
+    def of(cls, count: wp.array, edges: wp.array, samples: wp.array) -> "EdgeLists":
+        """Of arrays (1,) int32, (n,) vec2i and (n * edge_samples,) vec4."""
+        listed = EdgeList()
+        listed.count, listed.edges = count, edges
+        return cls(listed, samples)
+
+
+@wp.func
+def list_edge(i: wp.int32, j: wp.int32, list_out: EdgeList):
+    """Put a pixel on the list, if there is environment; it is counted in any case."""
+    place = wp.atomic_add(list_out.count, 0, 1)
+    if place < list_out.edges.shape[0]:
+        list_out.edges[place] = wp.vec2i(i, j)
+
+
+@wp.func
+def holds_all(listed: EdgeList) -> wp.bool:
+    """Whether the list had a place for every edge."""
+    return listed.count[0] <= listed.edges.shape[0]
+
+
+@wp.func
+def listed_edges(listed: EdgeList) -> wp.int32:
+    """Edges in the list; none where it did not hold all."""
+    return wp.where(holds_all(listed), listed.count[0], 0)
+
+
+@functools.cache
+def make_average_edges_kernel(weighted: bool) -> wp.Kernel:
+    """Kernel that averages the samples of every listed edge, in their order.
+
+    Args:
+        weighted: Whether the fourth component says how much a sample counts, 0 or 1, and the mean goes without it; else
+            it is one of the values.
+    """
+    value_type = wp.vec3 if weighted else wp.vec4
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def average_edges_kernel(
+        # In:
+        threads: wp.int32,
+        count: wp.int32,
+        listed: EdgeList,
+        samples: wp.array[wp.vec4],
+        # Out:
+        values_out: wp.array2d[value_type],
+    ):
+        item = wp.tid()
+        stop = listed_edges(listed)
+        while item < stop:
+            total = wp.vec4(0.0)
+            for sample in range(count):
+                total += samples[item * count + sample]
+            edge = listed.edges[item]
+            if wp.static(weighted):
+                if total[3] > 0.0:
+                    values_out[edge[0], edge[1]] = wp.vec3(total[0], total[1], total[2]) / total[3]
+            else:
+                values_out[edge[0], edge[1]] = total / wp.float32(count)
+            item += threads
+
+    return average_edges_kernel
+
+
+def sample_listed_edges(
+    kernel: wp.Kernel,
+    inputs: Sequence[Any],
+    lists: EdgeLists,
+    count: int,
+    values_out: wp.array,
+    *,
+    weighted: bool,
+) -> None:
+    """Take the samples of all edges that were listed, side by side, and write their means.
+
+    Args:
+        kernel: Takes the number of threads, ``inputs``, and the listed edges, and writes samples.
+        inputs: Of the kernel.
+        lists: Edges; its samples are written.
+        count: Samples of an edge.
+        values_out: (H, W) vec3 if ``weighted``, else vec4; written where an edge is.
+        weighted: As ``make_average_edges_kernel`` has it.
+    """
+    device = values_out.device
+    launch(kernel, EDGE_THREADS, [EDGE_THREADS, *inputs, lists.listed], [lists.samples], device=device)
+    averaging = [EDGE_THREADS, count, lists.listed, lists.samples]
+    launch(make_average_edges_kernel(weighted), EDGE_THREADS, averaging, [values_out], device=device)
