@@ -9,7 +9,7 @@ from warp_ar.kernels.environment import environment_samples
 from warp_ar.kernels.environment.environment_samples import EnvironmentSample, SampleSets
 from warp_ar.kernels.objects.reflect import DistantLight, DistantLightConfig
 from warp_ar.kernels.rays.trace import TraceConfig
-from warp_ar.kernels.receiver import environment_shadow, environment_shadow_cells
+from warp_ar.kernels.receiver import environment_shadow, environment_shadow_filter, environment_shadow_wavefront
 from warp_ar.kernels.receiver.environment_shadow_cells import (
     EnvironmentShadowConfig,
     ShadowCells,
@@ -114,6 +114,7 @@ def run(
     out=None,
     emitters=False,
     partials=1,
+    as_wavefront=False,
     others=None,
     loaded=None,
     single_sided=0,
@@ -146,11 +147,14 @@ def run(
     shape = -(-H // stride), -(-W // stride)
     cells = shadow_cells(shape, stride)
     rays = wp.array(RAYS, dtype=wp.vec2)
-    sums = wp.empty(environment_shadow.partial_sums_shape(partials, *shape), dtype=wp.vec3)
+    wave = environment_shadow_wavefront.make_wavefront(config, *shape, rays.device) if as_wavefront else None
+    assert as_wavefront == (wave is not None)
     picture = make_picture(frame, tables()[0], rays)
     sets = SampleSets()
     sets.directions, sets.flux, sets.samples = drawn
-    environment_shadow.shade_environment(config, params, picture, scene, surroundings, sets, cells, sums, rows=rows)
+    environment_shadow.shade_environment(
+        config, params, picture, scene, surroundings, sets, cells, wave=wave, rows=rows
+    )
     if not filtered:
         return cells.ratio.numpy()[..., :3], cells.surface.numpy()
     # Around cells that are not shaded nothing is averaged, and tiles in which no cell differs from 1 are passed by.
@@ -158,8 +162,8 @@ def run(
     out = wp.full((H, W), wp.vec3(9.0, 9.0, 9.0), dtype=wp.vec3) if out is None else out
     passed = wp.full((H, W), wp.vec3(9.0, 9.0, 9.0), dtype=wp.vec3)
     for some, target in ((every, out), (skipped, passed)):
-        environment_shadow_cells.filter_ratio(config, params, some, rows=rows)
-        environment_shadow_cells.spread_ratio(config, params, rays, scene, surroundings.probes, some, target)
+        environment_shadow_filter.filter_ratio(config, params, some, rows=rows)
+        environment_shadow_filter.spread_ratio(config, params, rays, scene, surroundings.probes, some, target)
     np.testing.assert_array_equal(skipped.filtered.numpy(), every.filtered.numpy())
     np.testing.assert_array_equal(passed.numpy(), out.numpy())
     return out.numpy()

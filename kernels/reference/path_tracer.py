@@ -129,7 +129,7 @@ def write_sample(pair: PathPair, k: wp.int32, samples_out: Round):
 
 # One loop for all rays of a sample, its camera's as well: so what finds a surface is in the kernel once. A warp of a
 # GPU waits for the longest of its 32 paths; threads that went on with samples of a shared counter were no faster
-# .
+#.
 @functools.cache
 def make_trace_paths_kernel(trace: TraceConfig) -> wp.Kernel:
     """Kernel of ``trace_paths`` for the kinds of shape in ``trace``."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
 import warp as wp
@@ -11,7 +11,8 @@ from warp_ar.kernels.cells import cell_shape, cell_stride
 from warp_ar.kernels.environment.environment_samples import SampleSets
 from warp_ar.kernels.launch import count_partials
 from warp_ar.kernels.receiver import environment_shadow
-from warp_ar.kernels.receiver import environment_shadow_cells as filters
+from warp_ar.kernels.receiver import environment_shadow_filter as filters
+from warp_ar.kernels.receiver import environment_shadow_wavefront as wavefront
 from warp_ar.kernels.receiver.environment_shadow_cells import EnvironmentShadowConfig, ShadowCells, shaded_shape
 from warp_ar.stages.base import (
     NO_BALL,
@@ -36,6 +37,9 @@ from warp_ar.stages.shared.lighting import (
     make_other_balls,
 )
 from warp_ar.stages.shared.picture import GrowingRows, find_picture, frame_reads
+
+DRAWN = ("pose", "objects", "environment_samples", "probe_places")
+"""What says where the samples are and what hides them."""
 
 
 def find_stride(method: Method, rows: int) -> int:
@@ -135,9 +139,14 @@ class EnvironmentShadow(Stage):
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Estimates, then their mean."""
         config = shadow_config(self.features, device)
-        environment_shadow.make_environment_shadow_kernel(config)
+        wave = None if device.is_cpu else wavefront.make_wavefront(config, *arrays[f"{self.name}_ratio"].shape, device)
+        if wave is None:
+            environment_shadow.make_environment_shadow_kernel(config)
         filters.make_filter_ratio_kernel(config.side)
-        filters.make_spread_ratio_kernel(config.distant)
+        if filters.spreads_apart(find_stride(METHODS[self.method], self.request.size[1]), device):
+            filters.make_spread_mixed_kernel(config.distant)
+        else:
+            filters.make_spread_ratio_kernel(config.distant)
         distant = make_distant_light(self.features, arrays, self.name)
         distant.environment = arrays["environment"]
         if self.features.others:
@@ -147,11 +156,10 @@ class EnvironmentShadow(Stage):
         sets = SampleSets()
         sets.directions, sets.flux, sets.samples = (arrays[name] for name in sample_names(self.features))
 
-        shape = environment_shadow.partial_sums_shape(config.partials, *cells.surface.shape)
-        sums = wp.empty(shape, dtype=wp.vec3, device=device)
+        given = params, picture, scene, distant, sets
 
         def estimate(rows: Rows | None) -> None:
-            environment_shadow.shade_environment(config, params, picture, scene, distant, sets, cells, sums, rows=rows)
+            environment_shadow.shade_environment(config, *given, cells, rows=rows)
 
         def average(rows: Rows | None) -> None:
             filters.filter_ratio(config, params, cells, rows=rows)
@@ -168,10 +176,29 @@ class EnvironmentShadow(Stage):
             reach = config.side  # the filter looks beyond the rows that it writes
             return max(start // stride - reach, 0), min(-(-stop // stride) + reach, count)
 
+        estimates = [Pass(estimate, rows=count, extent=cell_rows)]
+        if wave is not None:
+            estimates = self._wavefront(config, given, cells, wave)
         return [
-            Pass(estimate, rows=count if config.partials == 1 else None, extent=cell_rows),
+            *estimates,
             Pass(average, rows=count, extent=cell_rows),
             Pass(spread, rows=self.request.size[1], extent=GrowingRows(shadow_rows)),
+        ]
+
+    def _wavefront(
+        self, config: EnvironmentShadowConfig, given: wavefront.Given, cells: ShadowCells, wave: wavefront.Wavefront
+    ) -> list[Pass]:
+        """Estimates, kernel by kernel: rays need not wait for the light's filtered forms, nor for each other."""
+
+        def launcher(one: Callable[..., None]) -> Callable[[Rows | None], None]:
+            return lambda rows: one(config, given, cells, wave)
+
+        drawn = tuple(name for name in self.wiring.reads if name in DRAWN)
+        return [
+            Pass(launcher(wavefront.find_occluded), reads=drawn),
+            Pass(launcher(wavefront.sum_light)),
+            Pass(launcher(wavefront.trace_secondary)),
+            Pass(launcher(wavefront.reduce_partials)),
         ]
 
     def _cells(self, arrays: Arrays) -> ShadowCells:

@@ -1,0 +1,390 @@
+"""The estimates of cells, averaged and spread to pixels.
+
+A mean over one tile's worth of cells, with the edge cells of a window of ``side + 1`` at half weight, counts each set
+of samples the same and is centred. A window half as wide has half the blur and twice the noise. It takes over where the
+two means differ by more than noise: at contacts and at the edges of an emitter's shadow. Few cells of many samples,
+averaged so, are nearer to the truth than many of few at twice the rays. Cells on another surface do not count; a pixel
+between cells of several surfaces looks for its own.
+
+Tiles of cells in which a ray met an object note the frame's number: elsewhere the ratio is 1, and need not be averaged.
+Nor need it be spread to pixels where it stays within ``NEGLIGIBLE`` of 1; that is made exactly 1.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import warp as wp
+
+from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch, launch_rows
+from warp_ar.kernels.objects.reflect import DistantLightConfig
+from warp_ar.kernels.pixel_order import own_pixel
+from warp_ar.kernels.rays.shapes import FACES, MESH_KEY, surface_key
+from warp_ar.kernels.rays.visibility import inside_rect, make_visible_proxy
+from warp_ar.kernels.receiver.environment_shadow_cells import (
+    SHADED_TILE,
+    WARP_LANES,
+    EnvironmentShadowConfig,
+    ShadowCells,
+    any_shaded,
+)
+from warp_ar.kernels.structs import FrameParams, Probe, RayScene
+
+wp.set_module_options({"enable_backward": False})
+
+CONTRAST = wp.constant(wp.float32(0.03))
+"""Least difference of a narrow and a wide mean at which the narrow one takes over."""
+NOISE = wp.constant(wp.float32(1.0))
+"""The same, in standard errors of the narrow mean."""
+NEGLIGIBLE = wp.constant(wp.float32(1.0 / 512.0))
+"""Change of the environment that no 8-bit picture shows: a quarter of a code at most, taken for none."""
+LEAST_APART = 10
+"""Pixels along a cell from which those between surfaces have a kernel of their own on CUDA."""
+CPU_RUN = 32
+"""Pixels of a row that one thread of a CPU does: it looks once whether any of them can be shaded."""
+DEPTH_STEP = wp.constant(wp.float32(0.03))
+"""Relative change of depth from which neighbours on a mesh belong to different parts of it."""
+
+
+@wp.func
+def window_weight(offset: wp.int32, reach: wp.int32) -> wp.float32:
+    """Of a cell in a window around another: whole inside, half at its edge, nothing beyond."""
+    distance = wp.abs(offset)
+    if distance < wp.max(reach, 1):
+        return 1.0
+    if distance == reach:
+        return 0.5
+    return 0.0
+
+
+@functools.cache
+def make_filter_ratio_kernel(side: int) -> wp.Kernel:
+    """Kernel of ``filter_ratio`` for tiles of so many cells along."""
+    wide, narrow = side // 2, side // 4
+    width = 2 * wide + 1
+
+    # The loops stay loops: written out, with weights that are known, they take compilers seconds and gain nothing.
+    @wp.kernel(module="unique", enable_backward=False, module_options={"max_unroll": 1})
+    def filter_ratio_kernel(
+        # In:
+        row_start: wp.int32,
+        params: wp.array[FrameParams],
+        # Out:
+        cells_out: ShadowCells,
+    ):
+        """Mean over neighbours on the same surface: one tile's worth, or a quarter of it where that differs.
+
+        What is hidden decides: what objects bounce is too noisy to tell.
+        """
+        i, j = wp.tid()
+        i += row_start
+        surface = cells_out.surface
+        shaded = cells_out.shaded
+        ratio = cells_out.ratio
+        bounced = cells_out.bounced
+        key = surface[i, j]
+        if key < 0:
+            return
+        if shaded.shape[0] > 0:
+            rows = wp.vec2i(i - wp.static(wide), i + wp.static(wide))
+            if not any_shaded(shaded, params[0].frame_index, rows, wp.vec2i(j - wp.static(wide), j + wp.static(wide))):
+                cells_out.filtered[i, j] = wp.vec3(1.0, 1.0, 1.0)
+                return
+        depth = ratio[i, j][3]
+        # Means of all neighbours, and of the nearer ones; the fourth component sums the weights.
+        far_left = wp.vec4(0.0)
+        near_left = wp.vec4(0.0)
+        squares = wp.vec4(0.0)
+        far_sent = wp.vec3(0.0)
+        near_sent = wp.vec3(0.0)
+        for a in range(wp.static(width)):
+            ni = i + a - wp.static(wide)
+            wide_row = window_weight(ni - i, wp.static(wide))
+            narrow_row = window_weight(ni - i, wp.static(narrow))
+            for b in range(wp.static(width)):
+                nj = j + b - wp.static(wide)
+                if ni >= 0 and nj >= 0 and ni < surface.shape[0] and nj < surface.shape[1]:
+                    if surface[ni, nj] == key:
+                        value = ratio[ni, nj]
+                        # A mesh has no faces to tell apart: neighbours much nearer or farther are another part of it.
+                        if key % FACES != MESH_KEY or wp.abs(value[3] - depth) <= DEPTH_STEP * depth:
+                            value[3] = 1.0
+                            weight = wide_row * window_weight(nj - j, wp.static(wide))
+                            near = narrow_row * window_weight(nj - j, wp.static(narrow))
+                            sent = bounced[ni, nj]
+                            far_left += weight * value
+                            far_sent += weight * sent
+                            if near > 0.0:
+                                near_left += near * value
+                                squares += near * wp.cw_mul(value, value)
+                                near_sent += near * sent
+        left = wp.vec3(far_left[0], far_left[1], far_left[2]) / far_left[3]
+        mean = left + far_sent / far_left[3]
+        if wp.static(wide > 1):
+            sharp = wp.vec3(near_left[0], near_left[1], near_left[2]) / near_left[3]
+            # Cells that differ among themselves are noise, or the middle of an edge, where both means agree.
+            count = near_left[3]
+            spread = wp.vec3(squares[0], squares[1], squares[2]) / count - wp.cw_mul(sharp, sharp)
+            error = wp.sqrt(wp.max(wp.max(spread), 0.0) / count)
+            share = wp.clamp(wp.max(wp.abs(sharp - left)) / wp.max(CONTRAST, NOISE * error) - 0.5, 0.0, 1.0)
+            mean += share * (sharp + near_sent / near_left[3] - mean)
+        if wp.max(wp.abs(mean - wp.vec3(1.0, 1.0, 1.0))) < NEGLIGIBLE:
+            mean = wp.vec3(1.0, 1.0, 1.0)
+        elif cells_out.changed.shape[0] > 0:
+            cells_out.changed[i / SHADED_TILE, j / SHADED_TILE] = params[0].frame_index
+        cells_out.filtered[i, j] = mean
+
+    return filter_ratio_kernel
+
+
+@wp.func
+def between_surfaces(surface: wp.array2d[wp.int32], row: wp.int32, column: wp.int32) -> wp.vec2i:
+    """The surface of the first of four cells, and 1 where another is on another."""
+    key = surface[wp.clamp(row, 0, surface.shape[0] - 1), wp.clamp(column, 0, surface.shape[1] - 1)]
+    mixed = wp.bool(False)
+    for corner in range(1, 4):
+        ni = wp.clamp(row + corner / 2, 0, surface.shape[0] - 1)
+        nj = wp.clamp(column + corner % 2, 0, surface.shape[1] - 1)
+        mixed = mixed or surface[ni, nj] != key
+    return wp.vec2i(key, wp.where(mixed, 1, 0))
+
+
+@wp.func
+def ratio_between(cells: ShadowCells, key: wp.int32, y: wp.float32, x: wp.float32) -> wp.vec3:
+    """From cells to a pixel between them: bilinear among those on its surface."""
+    filtered = cells.filtered
+    surface = cells.surface
+    row = wp.int32(wp.floor(y))
+    column = wp.int32(wp.floor(x))
+    total = wp.vec3(0.0)
+    weights = float(0.0)
+    for corner in range(4):
+        ni = wp.clamp(row + corner / 2, 0, surface.shape[0] - 1)
+        nj = wp.clamp(column + corner % 2, 0, surface.shape[1] - 1)
+        weight = 1.0 - wp.abs(y - wp.float32(row + corner / 2))
+        weight *= 1.0 - wp.abs(x - wp.float32(column + corner % 2))
+        if weight > 0.0 and surface[ni, nj] == key:
+            total += weight * filtered[ni, nj]
+            weights += weight
+    if weights == 0.0:
+        # None of the four is on this surface: those around them.
+        for a in range(wp.max(row - 1, 0), wp.min(row + 3, surface.shape[0])):
+            for b in range(wp.max(column - 1, 0), wp.min(column + 3, surface.shape[1])):
+                if surface[a, b] == key:
+                    total += filtered[a, b]
+                    weights += 1.0
+    if weights > 0.0:
+        return total / weights
+    return wp.vec3(1.0, 1.0, 1.0)
+
+
+@functools.cache
+def make_spread_ratio_kernel(config: DistantLightConfig) -> wp.Kernel:
+    """Kernel of ``spread_ratio``, specialised to ``config``."""
+    visible_proxy = make_visible_proxy(config.trace, config.probes)
+
+    @wp.kernel(
+        module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS
+    )
+    def spread_ratio_kernel(
+        # In:
+        row_start: wp.int32,
+        params: wp.array[FrameParams],
+        rays: wp.array2d[wp.vec2],
+        scene: RayScene,
+        probes: wp.array[Probe],
+        cells: ShadowCells,
+        run: wp.int32,
+        # Out:
+        shadow_ratio_out: wp.array2d[wp.vec3],
+    ):
+        """A run of pixels of one row; those between surfaces look for their own."""
+        i, place = wp.tid()
+        rect = params[0].shadow_rect
+        begin = place * run
+        if run == 1:
+            pixel = own_pixel(i, place, row_start, rect, shadow_ratio_out.shape[0], shadow_ratio_out.shape[1])
+            i = pixel[0]
+            begin = pixel[1]
+        else:
+            i += row_start
+        changed = cells.changed
+        stride = cells.stride
+        stop = wp.min(begin + run, shadow_ratio_out.shape[1])
+        # Cell c was estimated at pixel c * stride + stride / 2.
+        y = wp.float32(i - stride / 2) / wp.float32(stride)
+        row = wp.int32(wp.floor(y))
+        columns = wp.vec2i(begin / stride - 2, stop / stride + 2)  # as far as a pixel looks for its surface
+        # To look costs a thread as much as one pixel does.
+        touched = run == 1 or changed.shape[0] == 0
+        if not touched:
+            touched = any_shaded(changed, params[0].frame_index, wp.vec2i(row - 1, row + 2), columns)
+        for j in range(begin, stop):
+            value = wp.vec3(1.0, 1.0, 1.0)
+            if touched and inside_rect(i, j, rect):
+                x = wp.float32(j - stride / 2) / wp.float32(stride)
+                found = between_surfaces(cells.surface, row, wp.int32(wp.floor(x)))
+                key = found[0]
+                if found[1] != 0:
+                    hit = visible_proxy(params[0], rays[i, j], scene, probes)
+                    key = wp.int32(-1)
+                    if hit.shape >= 0:
+                        key = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
+                if key >= 0:
+                    value = ratio_between(cells, key, y, x)
+            shadow_ratio_out[i, j] = value
+
+    return spread_ratio_kernel
+
+
+@wp.kernel(enable_backward=False)
+def spread_even_kernel(
+    # In:
+    row_start: wp.int32,
+    params: wp.array[FrameParams],
+    cells: ShadowCells,
+    # Out:
+    shadow_ratio_out: wp.array2d[wp.vec3],
+):
+    """A pixel, unless cells of several surfaces surround it."""
+    i, j = wp.tid()
+    rect = params[0].shadow_rect
+    pixel = own_pixel(i, j, row_start, rect, shadow_ratio_out.shape[0], shadow_ratio_out.shape[1])
+    i = pixel[0]
+    j = pixel[1]
+    stride = cells.stride
+    value = wp.vec3(1.0, 1.0, 1.0)
+    if inside_rect(i, j, rect):
+        y = wp.float32(i - stride / 2) / wp.float32(stride)
+        x = wp.float32(j - stride / 2) / wp.float32(stride)
+        found = between_surfaces(cells.surface, wp.int32(wp.floor(y)), wp.int32(wp.floor(x)))
+        if found[1] != 0:
+            return
+        if found[0] >= 0:
+            value = ratio_between(cells, found[0], y, x)
+    shadow_ratio_out[i, j] = value
+
+
+@functools.cache
+def make_spread_mixed_kernel(config: DistantLightConfig) -> wp.Kernel:
+    """Kernel for the pixels that ``spread_even_kernel`` leaves, specialised to ``config``."""
+    visible_proxy = make_visible_proxy(config.trace, config.probes)
+
+    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
+    def spread_mixed_kernel(
+        # In:
+        params: wp.array[FrameParams],
+        rays: wp.array2d[wp.vec2],
+        scene: RayScene,
+        probes: wp.array[Probe],
+        cells: ShadowCells,
+        across: wp.int32,
+        # Out:
+        shadow_ratio_out: wp.array2d[wp.vec3],
+    ):
+        """The pixels between four cells, if those are on several surfaces: a warp's threads take them in turn."""
+        index = wp.tid()
+        lane = index % WARP_LANES
+        row = (index / WARP_LANES) / across - 1
+        column = (index / WARP_LANES) % across - 1
+        stride = cells.stride
+        if between_surfaces(cells.surface, row, column)[1] == 0:
+            return
+        rect = params[0].shadow_rect
+        pixel = lane
+        while pixel < stride * stride:
+            i = row * stride + stride / 2 + pixel / stride
+            j = column * stride + stride / 2 + pixel % stride
+            pixel += WARP_LANES
+            inside = i >= 0 and j >= 0 and i < shadow_ratio_out.shape[0] and j < shadow_ratio_out.shape[1]
+            if inside and inside_rect(i, j, rect):
+                value = wp.vec3(1.0, 1.0, 1.0)
+                hit = visible_proxy(params[0], rays[i, j], scene, probes)
+                if hit.shape >= 0:
+                    key = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
+                    if key >= 0:
+                        y = wp.float32(i - stride / 2) / wp.float32(stride)
+                        x = wp.float32(j - stride / 2) / wp.float32(stride)
+                        value = ratio_between(cells, key, y, x)
+                shadow_ratio_out[i, j] = value
+
+    return spread_mixed_kernel
+
+
+def filter_ratio(
+    config: EnvironmentShadowConfig,
+    params: wp.array[FrameParams],
+    cells_out: ShadowCells,
+    *,
+    rows: Rows | None = None,
+) -> None:
+    """Average the estimates over tiles, along surfaces only; exactly 1 where nothing is shaded, or next to nothing.
+
+    Args:
+        config: As that of ``shade_environment``.
+        params: (1,) FrameParams: frame_index.
+        cells_out: From ``shade_environment``; filtered and changed are written. Without shaded, every cell is averaged.
+        rows: Band of rows of the cells; None means all.
+    """
+    surface = cells_out.surface
+    launch_rows(
+        make_filter_ratio_kernel(config.side), surface.shape, [params], [cells_out], rows=rows, device=surface.device
+    )
+
+
+def spread_ratio(
+    config: EnvironmentShadowConfig,
+    params: wp.array[FrameParams],
+    rays: wp.array2d[wp.vec2],
+    scene: RayScene,
+    probes: wp.array[Probe],
+    cells: ShadowCells,
+    shadow_ratio_out: wp.array2d[wp.vec3],
+    *,
+    rows: Rows | None = None,
+) -> None:
+    """Give every pixel its ratio.
+
+    Args:
+        config: As that of ``shade_environment``.
+        params: (1,) FrameParams: camera, shadow_rect, frame_index.
+        rays: (H, W) undistorted (x / z, y / z) of each pixel's centre.
+        scene: Proxies.
+        probes: Mirror balls; needed if ``config.distant.probes``.
+        cells: From ``filter_ratio``. Without changed, every pixel is looked at.
+        shadow_ratio_out: (H, W) factor on the frame; 1 outside the rectangle and where no proxy is seen.
+        rows: Band of rows; None means all. On CUDA, where cells are large, all are done in any case.
+    """
+    height, width = shadow_ratio_out.shape
+    device = rays.device
+    if spreads_apart(int(cells.stride), device):
+        whole = {"rows": None, "device": device, "rectangle_first": True}
+        launch_rows(spread_even_kernel, (height, width), [params, cells], [shadow_ratio_out], **whole)
+        down, across = (_last_cell(size, int(cells.stride)) + 2 for size in (height, width))
+        given = [params, rays, scene, probes, cells, across]
+        threads = down * across * WARP_LANES
+        launch(make_spread_mixed_kernel(config.distant), threads, given, [shadow_ratio_out], device=device)
+        return
+    run = CPU_RUN if device.is_cpu else 1
+    launch_rows(
+        make_spread_ratio_kernel(config.distant),
+        (height, -(-width // run)),
+        [params, rays, scene, probes, cells, run],
+        [shadow_ratio_out],
+        rows=rows,
+        device=device,
+        rectangle_first=run == 1,
+    )
+
+
+def spreads_apart(stride: int, device: wp.DeviceLike) -> bool:
+    """Whether pixels between surfaces are left to a kernel of their own.
+
+    On CUDA, where a warp would wait for their rays, and all other pixels would have fewer registers for them.
+    """
+    return not wp.get_device(device).is_cpu and stride >= LEAST_APART
+
+
+def _last_cell(size: int, stride: int) -> int:
+    """The last cell that is estimated at or before the last of so many rows; -1: all are before the first."""
+    return (size - 1 - stride // 2) // stride
