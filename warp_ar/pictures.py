@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import io
 import os
 import struct
+import tempfile
 from collections.abc import Iterator
 from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
+import OpenImageIO
+import PIL.Image
+from PIL import ImageCms
 
 from warp_ar.errors import WarpArError, reason
 from warp_ar.files import limits, read_bytes, too_much
@@ -84,6 +89,11 @@ def decode_picture(data: bytes, flags: int, error: type[WarpArError], label: str
         WarpArError: As ``error``: it is empty, cut off, damaged, of another format or too large.
     """
     check_picture(data, error, label)
+    asked = flags
+    if data[:4] in _TIFF_STARTS:
+        tags = _tiff_tags(data)
+        if tags.get(284) == 2 or tags.get(339) == 3 or tags.get(277, 1) not in (1, 3):
+            return _in_color(_read_tiff(data, tags.get(274, 1), flags, error, label), data, flags)
     turns = bool(flags & cv2.IMREAD_COLOR_RGB) and data[:4] in _TIFF_STARTS
     if turns:
         flags = flags & ~cv2.IMREAD_COLOR_RGB | cv2.IMREAD_COLOR_BGR
@@ -95,7 +105,82 @@ def decode_picture(data: bytes, flags: int, error: type[WarpArError], label: str
         raise error(f"{label} cannot be decoded: {reason(problem)}") from problem
     if picture is None:
         raise error(f"{label} cannot be decoded: damaged, cut off, or no image")
-    return np.asarray(picture)
+    return _in_color(np.asarray(picture), data, asked)
+
+
+def _in_color(picture: npt.NDArray[Any], data: bytes, flags: int) -> npt.NDArray[Any]:
+    """Return a picture that is asked for in RGB in sRGB, by the ICC profile of its file."""
+    if not flags & cv2.IMREAD_COLOR_RGB or flags < 0 or picture.ndim != 3 or picture.dtype.kind != "u":
+        return picture
+    return srgb_by_profile(picture, icc_profile(data))
+
+
+def icc_profile(data: bytes) -> bytes:
+    """Return the ICC profile that a picture file carries; empty if none."""
+    try:
+        with PIL.Image.open(io.BytesIO(data)) as header:
+            return header.info.get("icc_profile") or b""
+    except (OSError, ValueError, SyntaxError, PIL.Image.DecompressionBombError, struct.error):
+        return b""
+
+
+def srgb_by_profile(picture: npt.NDArray[Any], profile: bytes) -> npt.NDArray[Any]:
+    """Return the codes of sRGB of a picture whose codes an ICC profile explains.
+
+    Profiles of sRGB itself, of other spaces than RGB (OpenCV has converted those), and damaged ones change nothing.
+    Codes of 16 bits are converted by their upper 8, to within one code of 8 bits.
+
+    Args:
+        picture: RGB, (height, width, 3), uint8 or uint16.
+        profile: The file's; empty: none.
+    """
+    if not profile or picture.shape[2] != 3:
+        return picture
+    try:
+        source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        name = ImageCms.getProfileDescription(source)
+        if source.profile.xcolor_space.strip() != "RGB" or "sRGB" in name:
+            return picture
+        way = ImageCms.buildTransform(source, ImageCms.createProfile("sRGB"), "RGB", "RGB")
+    except (ImageCms.PyCMSError, OSError, ValueError):
+        return picture
+    deep = picture.dtype == np.uint16
+    codes = (picture >> 8).astype(np.uint8) if deep else picture
+    image = ImageCms.applyTransform(PIL.Image.fromarray(np.ascontiguousarray(codes)), way)
+    converted = np.array(image, np.uint8)
+    if not deep:
+        return converted
+    rest = picture.astype(np.int32) - 257 * codes.astype(np.int32)
+    return np.clip(257 * converted.astype(np.int32) + rest, 0, 65535).astype(np.uint16)
+
+
+def _read_tiff(data: bytes, orientation: int, flags: int, error: type[WarpArError], label: str) -> npt.NDArray[Any]:
+    """Return a TIFF in planes, of floats or with transparency, which OpenCV reads wrong or not at all; upright."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = os.path.join(folder, "picture.tif")  # OpenImageIO's Python reads files alone
+        with open(path, "wb") as file:
+            file.write(data)
+        config = OpenImageIO.ImageSpec()
+        config["oiio:UnassociatedAlpha"] = 1
+        reader = OpenImageIO.ImageInput.open(path, config)
+        if reader is None:
+            raise error(f"{label} cannot be decoded: {' '.join(OpenImageIO.geterror().split())}")
+        pixels = reader.read_image(OpenImageIO.UNKNOWN)
+        problem = " ".join(reader.geterror().split())
+        reader.close()
+    if pixels is None:
+        raise error(f"{label} cannot be decoded: {problem or 'damaged or cut off'}")
+    pixels = np.asarray(pixels)
+    if orientation >= 5:
+        pixels = pixels.swapaxes(0, 1)
+    rows = slice(None, None, -1 if orientation in (3, 4, 7, 8) else 1)
+    columns = slice(None, None, -1 if orientation in (2, 3, 6, 7) else 1)
+    pixels = pixels[rows, columns]
+    if flags < 0:
+        order = [2, 1, 0, *range(3, pixels.shape[2])] if pixels.shape[2] > 2 else slice(None)
+        return np.ascontiguousarray(pixels[..., order])
+    color = pixels[..., :3] if pixels.shape[2] > 2 else np.repeat(pixels[..., :1], 3, 2)
+    return np.ascontiguousarray(color if flags & cv2.IMREAD_COLOR_RGB else color[..., ::-1])
 
 
 def check_picture(data: bytes, error: type[WarpArError], label: str) -> None:
@@ -163,23 +248,31 @@ def _bmp(data: bytes) -> Size:
     return abs(width), abs(height)
 
 
-def _tiff(data: bytes) -> Size | None:
+def _tiff_tags(data: bytes) -> dict[int, int]:
+    """Return the first value of those tags of a TIFF's first picture that are whole numbers."""
     order = "<" if data[:2] == b"II" else ">"
     big = struct.unpack_from(order + "H", data, 2)[0] == 43
     start = struct.unpack_from(order + ("Q" if big else "I"), data, 8 if big else 4)[0]
     count = struct.unpack_from(order + ("Q" if big else "H"), data, start)[0]
-    size, at = {}, start + (8 if big else 2)
+    room, tags, at = 8 if big else 4, {}, start + (8 if big else 2)
     for _ in range(min(count, 4096)):
         tag, kind = struct.unpack_from(order + "HH", data, at)
-        if tag in (256, 257, 322, 323):  # width and height of the picture, and of its tiles
-            form = {1: "B", 3: "H", 4: "I", 16: "Q"}.get(kind)
-            if form is None:
-                return None
-            size[tag] = struct.unpack_from(order + form, data, at + (12 if big else 8))[0]
+        (length,) = struct.unpack_from(order + ("Q" if big else "I"), data, at + 4)
+        form = {1: "B", 3: "H", 4: "I", 16: "Q"}.get(kind)
+        if form is not None and length:
+            place = at + 4 + room
+            if length * struct.calcsize(form) > room:
+                (place,) = struct.unpack_from(order + ("Q" if big else "I"), data, place)
+            tags[tag] = struct.unpack_from(order + form, data, place)[0] if place + 8 <= len(data) else 0
         at += 20 if big else 12
-    if 256 not in size or 257 not in size:
+    return tags
+
+
+def _tiff(data: bytes) -> Size | None:
+    tags = _tiff_tags(data)
+    if 256 not in tags or 257 not in tags:
         return None
-    return max(size[256], size.get(322, 0)), max(size[257], size.get(323, 0))
+    return max(tags[256], tags.get(322, 0)), max(tags[257], tags.get(323, 0))
 
 
 def _webp(data: bytes) -> Size | None:

@@ -35,6 +35,7 @@ from numpy.typing import NDArray
 from warp_ar.kernels.color import decode_table
 from warp_ar.scene import Camera, Marker, Pose, Probe, Proxy, Scene
 from warp_ar.scene.geometry import rotation_matrix
+from warp_ar.scene.pixel_rays import undistorted
 from warp_ar.sources.sources import Source
 from warp_ar.tracking.tracking import Tracker, TrackState
 
@@ -158,7 +159,7 @@ class BallView:
         camera = self.camera
         flat = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
         if any(camera.distortion):
-            flat = cv2.undistortPoints(pixels[:, None], camera.matrix(), np.array(camera.distortion))[:, 0]
+            flat = undistorted(camera, pixels)
         d = np.column_stack([flat, np.ones(len(flat))])
         d /= np.linalg.norm(d, axis=1, keepdims=True)
         return np.asarray(d @ self._world_from_camera.T, np.float64)

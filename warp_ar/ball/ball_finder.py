@@ -31,6 +31,7 @@ from warp_ar.ball.ball_rim import (
 )
 from warp_ar.errors import UsageError
 from warp_ar.scene import Camera
+from warp_ar.scene.pixel_rays import undistorted
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -164,10 +165,9 @@ def silhouettes(camera: Camera, spheres: Array, count: int = PIECES) -> tuple[Ar
 
 def sphere_of_circle(camera: Camera, x: float, y: float, radius: float) -> Array:
     """Centre over radius, (3,), of the ball whose silhouette is about a circle in the picture."""
-    distortion = np.array(camera.distortion)
     around = ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))
-    circle = np.array([[[x + dx * radius, y + dy * radius]] for dx, dy in around], float)
-    flat = cv2.undistortPoints(circle, camera.matrix(), distortion)[:, 0]
+    circle = np.array([[x + dx * radius, y + dy * radius] for dx, dy in around], float)
+    flat = undistorted(camera, circle)
     rays = np.column_stack([flat, np.ones(4)])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     # Opposite rays of the cone: its axis halves them.

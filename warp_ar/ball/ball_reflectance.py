@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from warp_ar.scene import Camera, Pose, Probe, Proxy, Scene
 from warp_ar.scene.geometry import rotation_matrix
+from warp_ar.scene.pixel_rays import undistorted
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -154,9 +155,7 @@ def _mirrored_points(scene: Scene, camera: Camera, probe: Probe, pose: Pose) -> 
     if (low >= high).any():
         return nothing
     pixels = np.stack(np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1])), -1).reshape(-1, 2)
-    local = cv2.undistortPoints(
-        pixels[:, None].astype(float), camera.matrix(), np.asarray(camera.distortion, float)
-    ).reshape(-1, 2)
+    local = undistorted(camera, pixels)
     rays = _unit(np.column_stack([local, np.ones(len(local))]) @ pose.rotation)
     along = rays @ (eye - center)
     within = along**2 - float((eye - center) @ (eye - center)) + radius**2

@@ -82,17 +82,20 @@ def recognise_board(image: Image) -> Marker | None:
             off, _ = _explain(found, corners, marker.board.columns, 0, ratio)
             if off < _OFF * side:
                 return marker
-    # A board whose top row starts with a marker has OpenCV's older layout, which it no longer makes.
-    tried = [(*_explain(found, corners, columns, 0, None), columns) for columns in _LAYOUTS]
-    off, ratio, columns = min(tried)
+    # A board whose top row starts with a marker has OpenCV's layout before 4.6.
+    tried = [
+        (*_explain(found, corners, columns, first, None), columns, first) for columns in _LAYOUTS for first in (0, 1)
+    ]
+    off, ratio, columns, first = min(tried)
     if off > _OFF * side or not 0.3 < ratio < 0.97:
         return None
     rows = max(3, math.ceil(2 * (max(d.id for d in found) + 1) / columns))
     rows += columns * rows // 2 <= max(d.id for d in found)
+    rows += first and rows % 2  # an odd number of rows begins with a black square in both layouts
     name = smallest_dictionary(name, columns * rows // 2 - 1)
     if columns * rows // 2 > len(find_dictionary(name).bytesList):
         return None
-    return Marker(dictionary=name, board=CharucoBoard(columns, rows, 1.0, round(ratio, 3)))
+    return Marker(dictionary=name, board=CharucoBoard(columns, rows, 1.0, round(ratio, 3), bool(first)))
 
 
 def _explain(
@@ -104,7 +107,7 @@ def _explain(
         found: The markers.
         corners: Their corners in the picture, (n, 4, 2).
         columns: Squares along x.
-        first: Whether the board's first square is white.
+        first: 1 if the board's first square is white, else 0.
         ratio: The markers' share of a square; None: find it, in a way that needs no more than two homographies.
     """
     squares = [(row, column) for row in range(64) for column in range(columns) if (row + column + first) % 2 == 1]

@@ -101,7 +101,7 @@ def _files_in(path: Path) -> Iterator[Path]:
     """A file, or those of a folder."""
     yield path
     if path.is_dir():
-        yield from sorted(path.iterdir())
+        yield from sorted(entry for entry in path.iterdir() if not entry.name.startswith("."))
 
 
 def _stamp(path: Path) -> bytes:

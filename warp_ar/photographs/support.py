@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from warp_ar.errors import UsageError
 from warp_ar.scene import Camera, Pose
+from warp_ar.scene.pixel_rays import undistorted
 
 Array = NDArray[np.float64]
 
@@ -97,7 +98,7 @@ def plane_from_contact(
     center = np.array(sphere, float)
 
     def normal(pixel: Array) -> Array | None:
-        flat = cv2.undistortPoints(pixel.reshape(1, 1, 2), camera.matrix(), np.array(camera.distortion))[0, 0]
+        flat = undistorted(camera, pixel.reshape(1, 2))[0]
         ray = np.array([*flat, 1.0]) / math.hypot(*flat, 1.0)
         b = float(ray @ center)
         disc = b * b - float(center @ center) + 1.0

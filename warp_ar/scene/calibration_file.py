@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any, Final, NoReturn
 
 import cv2
+import numpy as np
+import numpy.typing as npt
 
 from warp_ar.errors import SceneError
 from warp_ar.files import bracket_depth, check_depth, indentation_depth, is_file, read_text, tag_depth
@@ -21,8 +23,16 @@ _SIZE_NAMES: Final = ("image_size", "imageSize", "image_Size", "calibImageDimens
 _MATRIX_NAMES: Final = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "CameraMatrix", "K", "mtx", "intrinsics")
 _DISTORTION_NAMES: Final = (
     *("distortion_coefficients", "Distortion_Coefficients", "distortionCoefficients", "dist_coeffs", "distCoeffs"),
-    *("dist_coeff", "dist", "distortion", "D"),
+    *("dist_coeff", "dist", "distortion", "D", "distortion_coeffs"),
 )
+_MODEL_NAMES: Final = ("distortion_model", "camera_model", "model", "camera_type", "projection_model")
+_PINHOLES: Final = ("plumb_bob", "rational_polynomial", "radtan", "pinhole", "opencv", "perspective", "brown_conrady")
+_FISHEYES: Final = ("equidistant", "fisheye", "kannala_brandt", "opencv_fisheye", "kannala_brandt4", "equi")
+_NOT_DISTORTION: Final = ("distortion_model", "fisheye_model")
+WIDEST: Final = 80.0
+"""Degrees from the axis to which a fisheye's picture is followed; a pinhole's rays end at 90."""
+FISHEYE_ERROR: Final = 0.25
+"""Pixels by which the rational model may miss a fisheye's anywhere in the picture."""
 
 
 def load_calibration(path: str | Path, transfer: str | Path = "srgb") -> Camera:
@@ -54,6 +64,9 @@ def load_calibration(path: str | Path, transfer: str | Path = "srgb") -> Camera:
                 "distortion": _DISTORTION_NAMES,
             }.items()
         }
+        keys = tuple(storage.root().keys()) if storage.root().isMap() else ()
+        models = [storage.getNode(key).string() for key in _MODEL_NAMES if key in keys]
+        fisheye = "fisheye_model" in keys and storage.getNode("fisheye_model").real() != 0.0
         storage.release()
     except (
         cv2.error,
@@ -79,12 +92,84 @@ def load_calibration(path: str | Path, transfer: str | Path = "srgb") -> Camera:
         fail(_MATRIX_NAMES, k, "focal lengths must be above 0 (pixels)")
     if any(abs(k[i]) > 1e-9 * k[0] for i in (1, 3, 6, 7)) or abs(k[8] - 1.0) > 1e-9:
         fail(_MATRIX_NAMES, k, "expected [fx, 0, cx, 0, fy, cy, 0, 0, 1]: a camera without skew")
+    known = {name.lower() for name in (*_DISTORTION_NAMES, *_NOT_DISTORTION)}
+    for key in keys:
+        if ("dist" in key.lower() and key.lower() not in known) or key.lower() in ("xi", "mirror_parameters"):
+            raise SceneError(f"{path}: {key}: not understood; expected {_DISTORTION_NAMES[0]}: k1 k2 p1 p2 [k3 ...]")
+    for model in models:
+        plain = model.lower().replace("-", "_").replace(" ", "_")
+        if plain in _FISHEYES:
+            fisheye = True
+        elif plain not in _PINHOLES:
+            raise SceneError(
+                f"{path}: camera model {model!r} is not understood; expected {', '.join((*_PINHOLES, *_FISHEYES))}"
+            )
     distortion = found["distortion"] or Camera.distortion
+    if fisheye:
+        if len(distortion) != 4 or not all(map(math.isfinite, distortion)):
+            fail(_DISTORTION_NAMES, distortion, "expected 4 finite values of a fisheye (k1 k2 k3 k4)")
+        shape = int(size[0]), int(size[1])
+        try:
+            terms = rational_of_fisheye(*shape, np.reshape(k, (3, 3)), distortion)
+        except SceneError as error:
+            raise SceneError(f"{path}: {error}") from error
+        return Camera(*shape, k[0], k[4], k[2], k[5], terms, transfer)
     if len(distortion) > 8 and not any(distortion[8:]):
         distortion = distortion[:8]
     if len(distortion) not in (4, 5, 8) or not all(map(math.isfinite, distortion)):
         fail(_DISTORTION_NAMES, distortion, "expected 4, 5 or 8 finite values (k1 k2 p1 p2 [k3 [k4 k5 k6]])")
     return Camera(int(size[0]), int(size[1]), k[0], k[4], k[2], k[5], tuple(distortion), transfer)
+
+
+def rational_of_fisheye(
+    width: int, height: int, matrix: npt.NDArray[np.float64], terms: Sequence[float]
+) -> tuple[float, ...]:
+    """Return OpenCV's k1 k2 p1 p2 k3 k4 k5 k6 that project as a fisheye does, over the whole picture.
+
+    A fisheye [KB06] puts a point at the angle t from the axis at f (t + k1 t^3 + k2 t^5 + k3 t^7 + k4 t^9). With r =
+    tan t, the radial factor (t + ...) / r is fitted by (1 + a1 r^2 + a2 r^4 + a3 r^6) / (1 + b1 r^2 + b2 r^4 + b3 r^6):
+    atan(r) / r has Pade approximants that converge for all r.
+
+    References:
+        [KB06] J. Kannala and S. Brandt. A generic camera model and calibration method for conventional, wide-angle, and
+        fish-eye lenses. PAMI 2006.
+
+    Args:
+        width: Width of the picture in pixels.
+        height: Height of the picture in pixels.
+        matrix: Camera matrix, (3, 3).
+        terms: k1 k2 k3 k4 of the fisheye.
+
+    Raises:
+        SceneError: The picture looks farther from the axis than ``WIDEST``, the terms fold it over, or no rational
+            model meets it within ``FISHEYE_ERROR``.
+    """
+    corners = np.array([[x, y] for x in (-0.5, width - 0.5) for y in (-0.5, height - 0.5)])
+    farthest = float(np.linalg.norm((corners - matrix[:2, 2]) / (matrix[0, 0], matrix[1, 1]), axis=1).max())
+    theta = np.linspace(0.0, math.radians(WIDEST), 2001)[1:]
+    turned = theta * (1.0 + sum(term * theta ** (2 * n + 2) for n, term in enumerate(terms)))
+    count = int(np.searchsorted(turned, farthest)) + 1
+    if (np.diff(turned[:count]) <= 0.0).any() or (count >= len(theta) and turned[-1] < farthest):
+        raise SceneError(
+            f"the fisheye's picture reaches farther than {WIDEST:g} degrees from its axis, which no pinhole follows; "
+            "undistort it first, or calibrate a crop of its middle"
+        )
+    theta, turned = theta[:count], turned[:count]
+    radius = np.tan(theta)
+    wanted, square = turned / radius, radius**2
+    powers = np.stack([square, square**2, square**3], 1)
+    weight = np.ones(len(theta))
+    for _ in range(20):  # of the linearised equation, reweighted by its denominator
+        rows = np.concatenate([powers, -wanted[:, None] * powers], 1) * (weight * radius)[:, None]
+        scale = np.abs(rows).max(0)
+        found = np.linalg.lstsq(rows / scale, (wanted - 1.0) * weight * radius, rcond=1e-15)[0] / scale
+        weight = 1.0 / np.abs(1.0 + powers @ found[3:])
+    factor = (1.0 + powers @ found[:3]) / (1.0 + powers @ found[3:])
+    off = float(np.abs(factor * radius - turned).max()) * max(matrix[0, 0], matrix[1, 1])
+    if not off < FISHEYE_ERROR:
+        raise SceneError(f"the fisheye's model is met within {off:.2f} pixels only; expected {FISHEYE_ERROR:g}")
+    k1, k2, k3, k4, k5, k6 = map(float, found)
+    return k1, k2, 0.0, 0.0, k3, k4, k5, k6
 
 
 def _checked_text(path: Path) -> str:

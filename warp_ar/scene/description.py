@@ -139,6 +139,8 @@ class CharucoBoard:
     """Side of a square in metres."""
     marker_length: float
     """Side of a marker in metres."""
+    legacy: bool = False
+    """Layout of OpenCV before 4.6, as calib.io prints it: a board of an even number of rows begins with a marker."""
 
     @property
     def marker_count(self) -> int:
@@ -151,7 +153,8 @@ class CharucoBoard:
         return self.columns * self.square_length, self.rows * self.square_length
 
     def __str__(self) -> str:
-        return f"charuco {self.columns}x{self.rows} {self.square_length!r} {self.marker_length!r}"
+        kind = "charuco-legacy" if self.legacy else "charuco"
+        return f"{kind} {self.columns}x{self.rows} {self.square_length!r} {self.marker_length!r}"
 
 
 @dataclasses.dataclass(frozen=True)

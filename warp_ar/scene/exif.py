@@ -8,6 +8,7 @@ import logging
 import math
 import re
 import struct
+import sys
 from pathlib import Path
 from typing import Any, Final
 
@@ -25,6 +26,8 @@ SENSOR_SHAPES: Final = (1.0, 4 / 3, 3 / 2, 16 / 9, 5 / 4, 18 / 9, 19.5 / 9, 20 /
 """Ratios of sides that cameras have; a picture of another one has been cut."""
 SHAPE_TOLERANCE: Final = 0.012
 """Relative: cameras round sides to multiples of 16."""
+AGREEING: Final = 0.15
+"""Logarithm within which two focal lengths agree: the 35 mm equivalent is a whole number, and rounds by diagonals."""
 LEAST_SIDE: Final = 400
 """Pixels along the shorter side below which a picture is a cut-out or a thumbnail."""
 _TURNED: Final = (5, 6, 7, 8)
@@ -91,11 +94,27 @@ class PhotoInfo:
         """Focal length in pixels, None where EXIF does not tell or the picture was cut."""
         if not self.is_whole:
             return None
-        if self.focal_pixels is not None:
-            return self.focal_pixels
         if self.focal_35mm is None:
-            return None
-        return self.focal_35mm / FULL_FRAME_DIAGONAL * math.hypot(self.width, self.height)
+            return self.focal_pixels
+        by_35mm = self.focal_35mm / FULL_FRAME_DIAGONAL * math.hypot(self.width, self.height)
+        return by_35mm if self.focal_pixels is None or self.contradiction else self.focal_pixels
+
+    @property
+    def contradiction(self) -> str:
+        """Words on two tags that give different focal lengths; empty where they agree.
+
+        Programs that resize pictures rewrite the size that the sensor's resolution refers to; the equivalent for 35 mm
+        film does not depend on it.
+        """
+        if self.focal_35mm is None or self.focal_pixels is None:
+            return ""
+        by_35mm = self.focal_35mm / FULL_FRAME_DIAGONAL * math.hypot(self.width, self.height)
+        if abs(math.log(by_35mm / self.focal_pixels)) < AGREEING:
+            return ""
+        return (
+            f"EXIF contradicts itself: focal length {self.focal_pixels:.0f} pixels by the sensor's resolution, "
+            f"{by_35mm:.0f} by the 35 mm equivalent, which is taken"
+        )
 
     def camera(self, transfer: str | Path = "srgb") -> Camera | None:
         """Pinhole camera with the axis through the picture's middle; None where the focal length is not known."""
@@ -125,10 +144,11 @@ def read_exif(path: str | Path) -> PhotoInfo:
         width, height = height, width
     resolution = _number(tags, "EXIF FocalPlaneXResolution")
     unit = {2: 25.4, 3: 10.0, 4: 1.0}.get(int(_number(tags, "EXIF FocalPlaneResolutionUnit") or 2), 25.4)
-    focal, told_width = _number(tags, "EXIF FocalLength"), _number(tags, "EXIF ExifImageWidth")
+    focal = _number(tags, "EXIF FocalLength")
+    sides = [_number(tags, f"EXIF ExifImage{side}") or 0.0 for side in ("Width", "Length")]
     pixels = None
-    if resolution and focal and told_width:
-        pixels = focal * resolution / unit * max(width, height) / told_width
+    if resolution and focal and sides[0]:
+        pixels = focal * resolution / unit * max(width, height) / max(sides)
     return PhotoInfo(
         width,
         height,
@@ -148,11 +168,15 @@ def camera_by_exif(path: Path, transfer: str | Path = "srgb") -> Camera:
         SceneError: It has no focal length, or was cut.
     """
     if path.is_dir():
-        pictures = sorted(p for p in path.iterdir() if p.suffix.lower() in (".jpg", ".jpeg", ".tif", ".tiff", ".png"))
+        endings = (".jpg", ".jpeg", ".tif", ".tiff", ".png")
+        shown = (entry for entry in path.iterdir() if not entry.name.startswith("."))
+        pictures = sorted(entry for entry in shown if entry.suffix.lower() in endings)
         if not pictures:
             raise SceneError(f"{path}: holds no photograph to read EXIF from")
         path = pictures[0]
     info = read_exif(path)
+    if info.contradiction:
+        print(f"{path}: {info.contradiction}", file=sys.stderr)
     camera = info.camera(transfer)
     if camera is None:
         why = "tells no focal length" if info.is_whole else f"is of {info.width}x{info.height}, a part of a photograph"

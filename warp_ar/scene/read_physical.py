@@ -80,7 +80,7 @@ def _ids(marker: Marker) -> set[int]:
 def _read_board(table: SceneTable) -> Board:
     words = table.text("board", right=_BOARDS).split()
     match = re.fullmatch(r"([0-9]{1,4})x([0-9]{1,4})", words[1]) if len(words) == 4 else None
-    if match is None or words[0] not in ("charuco", "grid"):
+    if match is None or words[0] not in ("charuco", "charuco-legacy", "grid"):
         table.fail("board", f"expected {_BOARDS}")
     columns, rows = int(match[1]), int(match[2])
     try:
@@ -97,7 +97,7 @@ def _read_board(table: SceneTable) -> Board:
         table.fail("board", "a ChArUco board has at least 2x2 squares")
     if second >= first:
         table.fail("board", "a marker must be smaller than its square; the square's length comes first")
-    return CharucoBoard(columns, rows, first, second)
+    return CharucoBoard(columns, rows, first, second, words[0] == "charuco-legacy")
 
 
 def read_probe(table: SceneTable) -> Probe:

@@ -244,13 +244,13 @@ def existing_path(path: pathlib.Path) -> pathlib.Path:
 
 
 def names_in(folder: pathlib.Path) -> list[str]:
-    """Names of all that a folder holds, sorted.
+    """Return the names of all that a folder holds, sorted, without hidden files such as macOS's ``._NAME``.
 
     Raises:
         SourceError: It cannot be read.
     """
     try:
-        return sorted(entry.name for entry in folder.iterdir())
+        return sorted(entry.name for entry in folder.iterdir() if not entry.name.startswith("."))
     except OSError as error:
         raise SourceError(f"{folder} cannot be read: {reason(error)}") from error
 

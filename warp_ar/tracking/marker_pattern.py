@@ -98,8 +98,9 @@ def make_pattern(dictionary: str, id: int, size: float, board: CharucoBoard | Gr
             for number, corners in zip(np.ravel(printed.getIds()), printed.getObjPoints(), strict=True)
         }
         if isinstance(board, CharucoBoard):
-            # The top left square is black, in OpenCV's layout since 4.6.
-            squares = (np.add.outer(np.arange(board.rows), np.arange(board.columns)) % 2).astype(bool)
+            # The top left square is black, but for boards of an even number of rows in OpenCV's layout before 4.6.
+            first = int(board.legacy and board.rows % 2 == 0)
+            squares = (np.add.outer(np.arange(board.rows), np.arange(board.columns) + first) % 2).astype(bool)
             square = board.square_length
             margin = (square - size) / 2
             edges += _cell_edges(squares, -width / 2, height / 2, square, min(margin, square / 2))

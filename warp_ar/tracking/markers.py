@@ -59,7 +59,9 @@ def make_board(marker: Marker) -> Any:
             f"marker board: {board} needs {board.marker_count} markers; {marker.dictionary} has {available}"
         )
     if isinstance(board, CharucoBoard):
-        return cv2.aruco.CharucoBoard((board.columns, board.rows), board.square_length, board.marker_length, dictionary)
+        made = cv2.aruco.CharucoBoard((board.columns, board.rows), board.square_length, board.marker_length, dictionary)
+        made.setLegacyPattern(board.legacy)
+        return made
     return cv2.aruco.GridBoard((board.columns, board.rows), board.marker_length, board.separation, dictionary)
 
 

@@ -1,0 +1,243 @@
+"""Pictures and calibrations as other programs write them: profiles, layouts, hidden files, fisheyes, old boards."""
+
+from __future__ import annotations
+
+import io
+import json
+
+import cv2
+import numpy as np
+import OpenImageIO
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image, ImageCms, TiffImagePlugin
+
+from warp_ar.calibration.camera_calibration import BoardViews
+from warp_ar.errors import SceneError
+from warp_ar.pictures import srgb_by_profile
+from warp_ar.scene import CharucoBoard, Marker, loads_scene
+from warp_ar.scene.calibration_file import load_calibration
+from warp_ar.scene.exif import camera_by_exif, read_exif
+from warp_ar.scene.pixel_rays import project, undistorted
+from warp_ar.sources.frame_folder import read_frame
+from warp_ar.sources.sources import open_source
+from warp_ar.tracking.marker_pattern import make_pattern
+
+PIXELS = 0.1
+"""Error of the rational model that stands for a fisheye's, pixels."""
+CODES = 2
+"""Codes that ImageCms and a matrix in floats may differ by: it computes in tables of 8 bits."""
+
+# Adobe RGB (1998): gamma 563/256; to linear Rec. 709 primaries.
+ADOBE = np.array([[1.39836, -0.39836, 0.0], [0.0, 1.0, 0.0], [0.0, -0.04293, 1.04293]])
+
+
+def adobe_profile():
+    """Return an ICC profile of Adobe RGB, by its tags: D50 colorants and a gamma."""
+
+    def s15(value):
+        return int(round(value * 65536)).to_bytes(4, "big", signed=True)
+
+    def xyz(*values):
+        return b"XYZ \0\0\0\0" + b"".join(map(s15, values))
+
+    curve = b"curv\0\0\0\0" + (1).to_bytes(4, "big") + (563).to_bytes(2, "big") + b"\0\0"
+    text = b"desc\0\0\0\0" + (10).to_bytes(4, "big") + b"Adobe RGB\0" + bytes(78) + b"\0\0"
+    tags = {
+        b"desc": text,
+        b"cprt": b"text\0\0\0\0none\0\0\0\0",
+        b"wtpt": xyz(0.9642, 1.0, 0.8249),
+        b"rXYZ": xyz(0.60974, 0.31111, 0.01947),
+        b"gXYZ": xyz(0.20528, 0.62567, 0.06087),
+        b"bXYZ": xyz(0.14919, 0.06322, 0.74457),
+        b"rTRC": curve,
+        b"gTRC": curve,
+        b"bTRC": curve,
+    }
+    table, body, at = len(tags).to_bytes(4, "big"), b"", 128 + 4 + 12 * len(tags)
+    for name, data in tags.items():
+        data += bytes(-len(data) % 4)
+        table += name + (at + len(body)).to_bytes(4, "big") + len(data).to_bytes(4, "big")
+        body += data
+    head = bytearray(128)
+    head[0:4] = (at + len(body)).to_bytes(4, "big")
+    head[8:12], head[12:24], head[36:40] = b"\x02\x10\0\0", b"mntrRGB XYZ ", b"acsp"
+    head[68:80] = s15(0.9642) + s15(1.0) + s15(0.8249)
+    return bytes(head) + table + body
+
+
+def as_srgb(codes):
+    """Return sRGB codes of Adobe RGB's, by its definition."""
+    light = np.clip((codes / 255.0) ** (563 / 256) @ ADOBE.T, 0.0, 1.0)
+    return 255.0 * np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(st.tuples(*[st.integers(30, 225)] * 3), min_size=1, max_size=20))
+def test_a_profile_is_followed(colors):
+    codes = np.array([colors], np.uint8)
+    found = srgb_by_profile(codes, adobe_profile())
+    assert np.abs(found - as_srgb(codes)).max() <= CODES
+    deep = srgb_by_profile(codes.astype(np.uint16) * 257, adobe_profile())
+    assert np.abs(deep / 257.0 - as_srgb(codes)).max() <= CODES
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif", ".webp"])
+def test_a_frame_with_a_profile_is_read_in_srgb(tmp_path, suffix):
+    codes = np.full((32, 32, 3), (160, 90, 47), np.uint8)
+    kind = {"quality": 100} if suffix in (".jpg", ".webp") else {}
+    Image.fromarray(codes).save(tmp_path / f"a{suffix}", icc_profile=adobe_profile(), **kind)
+    found, _ = read_frame(tmp_path / f"a{suffix}")
+    assert np.abs(found[16, 16] - as_srgb(codes[0, 0])).max() <= 2 * CODES  # and the coding's own rounding
+    own = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    Image.fromarray(codes).save(tmp_path / f"b{suffix}", icc_profile=own, **kind)
+    assert np.abs(read_frame(tmp_path / f"b{suffix}")[0][16, 16].astype(int) - codes[0, 0]).max() <= CODES
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    st.sampled_from(["uint8", "uint16", "float"]), st.sampled_from(["contig", "separate"]), st.sampled_from([1, 3, 4])
+)
+def test_any_tiff_is_read(tmp_path_factory, kind, planes, channels):
+    rng = np.random.default_rng(channels)
+    unit = rng.uniform(0.0, 1.0, (6, 8, channels)).astype(np.float32)
+    scale = {"uint8": 255, "uint16": 65535, "float": 1}[kind]
+    values = unit if kind == "float" else np.round(unit * scale).astype(kind)
+    path = tmp_path_factory.mktemp("tiff") / "a.tif"
+    spec = OpenImageIO.ImageSpec(8, 6, channels, kind)
+    spec["planarconfig"], spec["oiio:UnassociatedAlpha"] = planes, 1
+    out = OpenImageIO.ImageOutput.create(str(path))
+    assert out.open(str(path), spec)
+    assert out.write_image(values)
+    out.close()
+    image, plate = read_frame(path)
+    wanted = np.repeat(values, 3, 2) if channels == 1 else values[..., :3]
+    np.testing.assert_array_equal(image if plate is None else plate.picture, wanted)
+
+
+def test_hidden_files_are_no_frames(tmp_path):
+    for number in range(3):
+        cv2.imwrite(str(tmp_path / f"IMG_{number}.jpg"), np.full((16, 16, 3), 40, np.uint8))
+        (tmp_path / f"._IMG_{number}.jpg").write_bytes(b"\0\x05\x16\x07" + bytes(80))
+    with open_source(tmp_path) as source:
+        assert len(list(source)) == 3
+
+
+def photograph(path, size, told, film=None):
+    """Write a JPEG of a 50 mm lens on a sensor of 24 mm of which EXIF tells a size in pixels."""
+    exif = Image.Exif()
+    inner = exif.get_ifd(0x8769)
+    inner[0x920A] = TiffImagePlugin.IFDRational(50, 1)
+    inner[0xA002], inner[0xA003] = told
+    inner[0xA20E] = TiffImagePlugin.IFDRational(120000, 47)
+    inner[0xA210] = 3
+    if film:
+        inner[0xA405] = film
+    Image.new("RGB", size).save(path, exif=exif)
+
+
+def test_resolution_of_the_sensor_holds_for_its_long_side(tmp_path):
+    right = 50 * 6000 / 23.5 * 1200 / 6000
+    for size, told in (((1200, 800), (6000, 4000)), ((800, 1200), (4000, 6000)), ((1200, 800), (4000, 6000))):
+        photograph(tmp_path / "a.jpg", size, told)
+        assert read_exif(tmp_path / "a.jpg").focal_length() == pytest.approx(right, rel=1e-3)
+
+
+def test_a_size_that_was_rewritten_is_seen(tmp_path, capsys):
+    photograph(tmp_path / "a.jpg", (1200, 800), (1200, 800), 77)
+    assert camera_by_exif(tmp_path / "a.jpg").fx == pytest.approx(50 * 1200 / 23.5, rel=0.01)
+    assert "contradicts itself" in capsys.readouterr().err
+
+
+def calibration(path, **more):
+    head = {"image_width": 640, "image_height": 480, "camera_matrix": [[400, 0, 320], [0, 400, 240], [0, 0, 1]]}
+    path.write_text(json.dumps(head | more))
+    return path
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.tuples(st.floats(-0.1, 0.1), st.floats(-0.02, 0.02), st.floats(-0.005, 0.005), st.floats(-0.002, 0.002)),
+    st.sampled_from([{"distortion_model": "equidistant"}, {"fisheye_model": 1}, {"camera_model": "fisheye"}]),
+)
+def test_a_fisheye_projects_as_it_says(tmp_path_factory, terms, said):
+    path = calibration(tmp_path_factory.mktemp("c") / "c.json", distortion_coefficients=list(terms), **said)
+    camera = load_calibration(path)
+    pixels = np.random.default_rng(1).uniform(0, 1, (200, 2)) * (639, 479)
+    flat = cv2.fisheye.undistortPoints(pixels[:, None], camera.matrix(), np.array(terms))[:, 0]
+    assert np.abs(project(camera, np.column_stack([flat, np.ones(200)])) - pixels).max() < PIXELS
+    assert np.abs(undistorted(camera, pixels) - flat).max() < PIXELS / 400 * 4  # a pixel is 4 times wider at the rim
+
+
+def test_the_fisheye_of_a_case(tmp_path):
+    camera = load_calibration(
+        calibration(tmp_path / "c.json", fisheye_model=1, distortion_coefficients=[-0.1, 0.01, 0.02, -0.01])
+    )
+    assert project(camera, np.array([[0.5, 0.3, 1.0]]))[0] == pytest.approx([496.2, 345.7], abs=0.06)
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        ({"distortion_model": "fov", "D": [0.9]}, "camera model 'fov'"),
+        ({"camera_model": "omni", "xi": 1.2}, "xi: not understood"),
+        ({"distortion_parameters": [-0.3, 0.1, 0, 0]}, "distortion_parameters: not understood"),
+        ({"distortion_model": "equidistant", "D": [0.1, 0, 0, 0, 0]}, "4 finite values of a fisheye"),
+        ({"fisheye_model": 1, "D": [2.0, 0, 0, 0], "image_width": 4000}, "farther than|pixels only"),
+    ],
+)
+def test_other_models_are_refused_by_name(tmp_path, more, said):
+    with pytest.raises(SceneError, match=said):
+        load_calibration(calibration(tmp_path / "c.json", **more))
+
+
+def test_distortion_coeffs_are_read(tmp_path):
+    found = load_calibration(calibration(tmp_path / "c.json", distortion_coeffs=[-0.3, 0.1, 0, 0, 0]))
+    assert found.distortion == (-0.3, 0.1, 0.0, 0.0, 0.0)
+
+
+def board_picture(columns, rows, legacy):
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
+    board = cv2.aruco.CharucoBoard((columns, rows), 1.0, 0.75, dictionary)
+    board.setLegacyPattern(legacy)
+    return cv2.copyMakeBorder(
+        board.generateImage((80 * columns, 80 * rows)), 40, 40, 40, 40, cv2.BORDER_CONSTANT, value=255
+    )
+
+
+@pytest.mark.parametrize(("columns", "rows"), [(8, 6), (5, 4), (7, 6)])
+def test_boards_of_the_old_layout_are_found(columns, rows):
+    picture, focal = board_picture(columns, rows, True), 900.0
+    matrix, views = np.array([[focal, 0, 639.5], [0, focal, 359.5], [0, 0, 1.0]]), BoardViews()
+    rng = np.random.default_rng(1)
+    flat = np.array([[1 / 80, 0, -(columns / 2 + 0.5)], [0, 1 / 80, -(rows / 2 + 0.5)], [0, 0, 1.0]])
+    for _ in range(14):
+        turn = cv2.Rodrigues(rng.uniform(-0.6, 0.6, 3) * (1, 1, 0.3))[0]
+        place = np.array([rng.uniform(-1, 1), rng.uniform(-0.6, 0.6), rng.uniform(11, 16)])
+        map_ = matrix @ np.column_stack([turn[:, :2], place]) @ flat
+        views.add(cv2.warpPerspective(picture, map_, (1280, 720), borderValue=128, flags=cv2.INTER_AREA))
+    report = views.solve()
+    assert report.marker.board.legacy
+    assert report.marker.board.columns == columns
+    assert report.camera.fx == pytest.approx(focal, rel=0.01)
+    text = 'schema = 1\n[camera]\nfield_of_view = 60.0\n[source]\nsynthetic = "card"\n[marker]\nboard = "{}"\n'
+    board = CharucoBoard(columns, rows, 0.04, 0.03, legacy=True)
+    assert loads_scene(text.format(board)).marker.board == board
+
+
+def test_the_print_of_an_old_board_is_as_opencv_draws_it():
+    """The cells between the markers are dark where the picture of the board is: printed edges are fitted to them."""
+    for legacy in (False, True):
+        board = Marker("DICT_5X5_100", board=CharucoBoard(5, 4, 0.08, 0.06, legacy=legacy)).board
+        pattern = make_pattern("DICT_5X5_100", 0, 0.0, board)
+        picture = board_picture(5, 4, legacy)[40:-40, 40:-40]
+        at = np.round(pattern.cells[:, :2] * (1000, -1000) + (200, 160) - 0.5).astype(int)
+        shown = picture[np.clip(at[:, 1], 0, 319), np.clip(at[:, 0], 0, 399)] > 127
+        np.testing.assert_array_equal(shown, pattern.white > 0.5)
+
+
+def test_damaged_profiles_change_nothing():
+    codes = np.full((4, 4, 3), 90, np.uint8)
+    for data in (b"nothing", adobe_profile()[:140], io.BytesIO().getvalue()):
+        np.testing.assert_array_equal(srgb_by_profile(codes, data), codes)
