@@ -144,7 +144,7 @@ def serve_page(options: argparse.Namespace) -> int:
         # A frame of the reference, or a kernel that is compiled, takes many seconds and cannot be stopped, and Python
         # would wait for its thread, or end it within native code, which aborts. All files are closed by now,
         # and temporary folders gone, but for those in which Warp keeps parsed headers for each thread that compiles.
-        for folder in [one for one in gc.get_objects() if isinstance(one, tempfile.TemporaryDirectory)]:
+        for folder in [one for one in gc.get_objects() if type(one) is tempfile.TemporaryDirectory]:
             with contextlib.suppress(OSError):
                 folder.cleanup()
         sys.stdout.flush()

@@ -12,7 +12,6 @@ from typing import Any
 import cv2
 import numpy as np
 import numpy.typing as npt
-import OpenImageIO
 import PIL.Image
 from PIL import ImageCms
 
@@ -160,6 +159,8 @@ def _read_tiff(data: bytes, orientation: int, flags: int, error: type[WarpArErro
         path = os.path.join(folder, "picture.tif")  # OpenImageIO's Python reads files alone
         with open(path, "wb") as file:
             file.write(data)
+        import OpenImageIO  # here: at the end of any process that has loaded it, it reports what it leaks
+
         config = OpenImageIO.ImageSpec()
         config["oiio:UnassociatedAlpha"] = 1
         reader = OpenImageIO.ImageInput.open(path, config)

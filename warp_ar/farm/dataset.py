@@ -298,12 +298,12 @@ def _read_object(table: JobTable, index: int) -> ObjectSpec:
         else:
             lengths[key] = _fixed(table, key, 1, 1e-4, 10.0)[0]
     material = table.data.get("material", {"model": "metallic_roughness"})
-    item = Object(
-        shape,  # type: ignore[arg-type]
-        scale=table.number("scale", 1.0, low=1e-6, high=1e6),
-        rotate=_vector(_fixed(table, "rotate", 3, -360.0, 360.0, (0.0, 0.0, 0.0))),
-        **lengths,
-    )
+    scale = table.number("scale", 1.0, low=1e-6, high=1e6)
+    rotate = _vector(_fixed(table, "rotate", 3, -360.0, 360.0, (0.0, 0.0, 0.0)))
+    try:
+        item = Object(shape, scale=scale, rotate=rotate, **lengths)  # type: ignore[arg-type]
+    except SceneError as error:
+        table.fail("shape", str(error))
     return ObjectSpec(
         name=table.text("name", f"{shape}-{index + 1}" if item.file is None else item.file.stem),
         item=item,
