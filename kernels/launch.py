@@ -1,4 +1,4 @@
-"""How every launcher starts its kernel, over all rows or over one band of them, and how blocks wait for each other.
+"""How every launcher starts its kernel, over all rows or over one band of them.
 
 A Warp CPU launch uses one thread, so the scheduler splits a pass into bands of rows that threads take side by side.
 Every per-row kernel therefore takes ``row_start`` as its first input and adds it to its first thread index.
@@ -228,33 +228,3 @@ def launch_tiles(
             return wp.launch_tiled(kernel, dim=(stop - start, *dim[1:]), inputs=given, outputs=outputs, **more)
 
     do_or_note(Note(kernel, rows, do, functools.partial(do, True), block_dim=block_dim, tiles=True))
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    __syncthreads();
-#endif
-""")
-def wait_for_block():
-    """Goes on once all threads of the block are here and what they wrote can be read."""
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    __shared__ bool last;
-    __syncthreads();
-    if (threadIdx.x == 0) {
-        __threadfence();
-        last = atomicInc(reinterpret_cast<unsigned int*>(blocks_done.data), blocks - 1) == blocks - 1;
-    }
-    __syncthreads();
-    __threadfence();
-    return last;
-#else
-    const bool last = ++blocks_done.data[0] == blocks;
-    if (last) blocks_done.data[0] = 0;
-    return last;
-#endif
-""")
-def is_last_block(blocks_done: wp.array[wp.int32], blocks: wp.int32) -> wp.bool:
-    """Whether all other blocks got here before; the last one can read what all of them wrote. Sets the count back."""

@@ -20,7 +20,7 @@ ROOT = pathlib.Path(__file__).parents[1] / "warp_ar"
 RENAMERS = {"os.replace", "os.rename", "os.renames", "shutil.move", "os.link", "os.symlink"}
 OPENERS = {"files.py", "farm/manifest.py", "farm/pools.py"}
 """Files that may create files by descriptor; the farm's are a lock and a log inside its own folder."""
-PRIVATE = ("engine/better_kernels.py", "engine/modules.py", "farm/plan.py")
+PRIVATE = ("farm/plan.py",)
 """Files that rename inside a folder of the program's own, where nobody else writes."""
 FRAME = np.zeros((32, 32, 3), np.uint8)
 
