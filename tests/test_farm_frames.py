@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fractions
+import struct
 
 import av
 import cv2
@@ -110,3 +111,16 @@ def test_pictures_stay_as_they_were_decoded_where_that_is_asked_for(tmp_path):
         assert isinstance(b.image, DecodedPicture)
         assert b.image.shape == a.image.shape
         np.testing.assert_array_equal(rgb_from_video(VideoReformatter(), b.image.picture), a.image)
+
+
+def test_a_mirrored_recording_is_not_left_to_the_device(tmp_path):
+    """A mirror at the horizontal is no rotation, but no picture as it stands either."""
+    write_recording(tmp_path / "a.mp4", 12, ticks=UNEVEN)
+    data = bytearray((tmp_path / "a.mp4").read_bytes())
+    at = data.index(b"tkhd") + 44
+    data[at : at + 20] = struct.pack(">5i", 1 << 16, 0, 0, 0, -(1 << 16))
+    (tmp_path / "b.mp4").write_bytes(data)
+    index = index_frames(tmp_path / "b.mp4", None)
+    with open_part(tmp_path / "b.mp4", index, 0, 2, None, decoded=True) as source:
+        for a, b in zip(read(tmp_path / "a.mp4", 0, 2), source, strict=True):
+            np.testing.assert_array_equal(b.image, a.image[::-1])

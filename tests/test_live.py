@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fractions
 import json
 import os
 import re
@@ -138,6 +139,24 @@ def test_video_and_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     text = capsys.readouterr().out
     assert "left out" in text
     assert "unwrap" in text
+
+
+def test_a_recording_s_times_are_kept(tmp_path: Path) -> None:
+    stamps = [0, 33, 66, 100, 600, 633, 666, 700]
+    with Synthetic("card") as card, av.open(str(tmp_path / "card.mp4"), "w") as container:
+        stream = container.add_stream("libx264", rate=30, options={"crf": "10"})
+        (stream.width, stream.height), stream.pix_fmt = card.size, "yuv420p"
+        stream.time_base = stream.codec_context.time_base = fractions.Fraction(1, 1000)
+        for stamp, frame in zip(stamps, card, strict=False):
+            picture = av.VideoFrame.from_ndarray(frame.image, format="rgb24")
+            picture.pts, picture.time_base = stamp, stream.time_base
+            container.mux(stream.encode(picture))
+        container.mux(stream.encode(None))
+    scene, video = write_scene(tmp_path, body=OBJECT, source='path = "card.mp4"'), tmp_path / "lit.mp4"
+    assert run(scene, "--headless", "--output", video) == 0
+    with av.open(str(video)) as container:
+        shown = [1e3 * float(picture.time) for picture in container.decode(video=0)]
+    assert shown == pytest.approx(stamps, abs=0.1)
 
 
 def test_the_frame_passes_untouched_where_nothing_is_asked_for(tmp_path: Path) -> None:

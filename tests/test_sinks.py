@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import fractions
 import pathlib
 import shutil
 import subprocess
@@ -216,6 +217,20 @@ def test_video_holds_every_frame_at_its_rate(tmp_path: pathlib.Path, name: str) 
         assert int(context.color_range) == 1
         assert stream.average_rate == 25
         assert container.duration == pytest.approx(2 * av.time_base, rel=1e-3)
+
+
+@pytest.mark.parametrize("name", VIDEOS)
+def test_times_of_a_variable_rate_are_kept(tmp_path: pathlib.Path, name: str) -> None:
+    times = [0.0, 0.033, 0.066, 0.1, 0.6, 0.633, 0.633, 1.2]
+    with open_sink(tmp_path / name, fps=8.9, tick=fractions.Fraction(1, 16000)) as sink:
+        for index, seconds in enumerate(times):
+            sink.write_at(flat(20 * index), seconds)
+    with av.open(str(tmp_path / name)) as container:
+        shown = [float(picture.time) for picture in container.decode(video=0)]
+    # Two frames at one time are a tick apart; Matroska's is a millisecond.
+    assert shown == pytest.approx(times, abs=1.1e-3)
+    assert all(np.diff(shown) > 0)
+    assert levels(tmp_path / name) == pytest.approx([20 * index for index in range(8)], abs=VIDEO_LEVELS)
 
 
 @pytest.mark.parametrize("fps", [23.976, 29.97, 12.5, 60])

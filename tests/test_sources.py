@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import fractions
 import json
 import math
 import pathlib
+import shutil
 import struct
+import subprocess
 import threading
 import time
 import wave
@@ -20,7 +23,7 @@ import pytest
 from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
 
 from warp_ar.errors import SourceError, UsageError
-from warp_ar.sources import live_source
+from warp_ar.sources import live_source, video_file
 from warp_ar.sources.deep_video import TO_RGB
 from warp_ar.sources.source import FRAMES_AHEAD
 from warp_ar.sources.sources import Frame, FrameFolder, QueueSource, Source, Synthetic, VideoFile, open_source
@@ -413,6 +416,72 @@ def test_rotation_is_honoured(tmp_path: pathlib.Path, matrix: tuple[int, int, in
         image = next(iter(source)).image
     assert np.abs(image.astype(int) - upright).mean() < VIDEO_LEVELS
     assert image.flags.c_contiguous
+
+
+@pytest.mark.parametrize("matrix", [(-1, 0, 0, 1), (1, 0, 0, -1), (0, 1, 1, 0), (0, -1, -1, 0)])
+def test_mirrors_of_a_display_matrix_are_honoured(tmp_path: pathlib.Path, matrix: tuple[int, int, int, int]) -> None:
+    picture = np.zeros((32, 64, 3), np.uint8)
+    picture[:16, :32] = 250
+    path = write_video(tmp_path / "clip.mp4", [picture] * 3)
+    turn(path, matrix)
+    # Where the matrix puts each pixel, moved back into the picture.
+    a, b, c, d = matrix
+    y, x = np.mgrid[:32, :64]
+    column, row = a * x + c * y, b * x + d * y
+    expected = np.zeros((32, 64, 3) if a else (64, 32, 3), np.uint8)
+    expected[row - row.min(), column - column.min()] = picture
+    with open_source(path) as source:
+        assert source.size == (expected.shape[1], expected.shape[0])
+        image = next(iter(source)).image
+    assert np.abs(image.astype(int) - expected).mean() < VIDEO_LEVELS
+    assert image.flags.c_contiguous
+
+
+@pytest.mark.parametrize(("shape", "width"), [((2, 1), 128), ((4, 3), 85), ((1, 2), 32), ((1280, 1281), 64)])
+def test_pixels_become_square(tmp_path: pathlib.Path, shape: tuple[int, int], width: int) -> None:
+    with av.open(str(tmp_path / "clip.mp4"), "w") as container:
+        stream = container.add_stream("libx264", rate=24, options={"crf": "10"})
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        stream.codec_context.sample_aspect_ratio = fractions.Fraction(*shape)
+        picture = np.zeros((48, 64, 3), np.uint8)
+        picture[:, :32] = 250
+        container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        container.mux(stream.encode(None))
+    with open_source(tmp_path / "clip.mp4") as source:
+        assert source.size == (width, 48)
+        assert ("square" in source.note) == (width != 64)
+        image = next(iter(source)).image
+    assert image.shape == (48, width, 3)
+    assert abs(int((image[:, :, 1] > 125).mean(0).sum()) - width // 2) <= 1
+    turn(tmp_path / "clip.mp4", (0, 1, -1, 0))
+    with open_source(tmp_path / "clip.mp4") as source:
+        assert source.size == (48, width)
+
+
+def test_pixel_shapes_beyond_the_limit_are_refused(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_video(tmp_path / "clip.mp4", noise(2))
+    monkeypatch.setattr(video_file, "pixel_shape", lambda stream: fractions.Fraction(10**6))
+    assert "64000000x48" in error_of(path)
+
+
+@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs ffmpeg, which cuts by an edit list")
+def test_frames_that_an_edit_list_leaves_out_are_none(tmp_path: pathlib.Path) -> None:
+    write_video(tmp_path / "whole.mp4", noise(60))
+    cut = ["ffmpeg", "-v", "error", "-ss", "1", "-i", "whole.mp4", "-t", "0.5", "-c", "copy", "cut.mp4"]
+    subprocess.run(cut, cwd=tmp_path, check=True)
+    with open_source(tmp_path / "cut.mp4") as source, av.open(str(tmp_path / "cut.mp4")) as container:
+        shown = sum(1 for _ in container.decode(video=0))
+        frames = list(source)
+        assert container.streams.video[0].frames > shown == len(frames) == source.length
+    assert [frame.time for frame in frames] == pytest.approx([index / 24 for index in range(shown)], abs=1e-3)
+
+
+def test_frames_counted_but_not_shown_are_no_damage(shared: pathlib.Path) -> None:
+    path = shared / "cases" / "video_edit_list" / "desk_trim.mp4"
+    if not path.exists():
+        pytest.skip(f"needs {path.name}")
+    with open_source(path) as source:
+        assert sum(1 for _ in source) == source.length == 12
 
 
 @pytest.mark.parametrize("kept", [0.25, 0.6, 0.97])

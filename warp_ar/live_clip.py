@@ -262,6 +262,7 @@ def _open_output(options: argparse.Namespace, session: Session) -> Sink:
         transfer=str(session.scene.camera.transfer),
         encoder=options.encoder,
         encoder_options=parse_options(options.encoder_option),
+        tick=session.source.tick,
     )
 
 
@@ -299,8 +300,9 @@ def _light_clip(options: argparse.Namespace, loaded: Callable[[], None]) -> int:
             session.close()
             session = stack.enter_context(_open_session_without_balls(options, session.scene, outputs))
             balls["balls_missing"] = f"{NO_BALL}; no light of a ball is used"
-        for note in session.bracket_notes:
-            say(note)
+        for note in (*session.bracket_notes, session.source.note):
+            if note:
+                say(note)
         traced = None
         if options.samples is not None:
             with importing():  # the path tracer's kernels, which no other run declares
@@ -411,7 +413,7 @@ def _light_frames(
                 image = traced(frame, result)
             evidence.add(frame.image, result)
             start = time.perf_counter()
-            sink.write(image if options.coding == "8bit" else result.radiance)
+            sink.write_at(image if options.coding == "8bit" else result.radiance, frame.time)
             camera.write(image)
             encode_ms = (time.perf_counter() - start) * 1e3
             side.write(frame.image, result, session.scene)

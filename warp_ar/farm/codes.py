@@ -22,7 +22,7 @@ from av.video.reformatter import ColorRange, Colorspace
 from warp_ar.device import exclusive, translating, wait_for
 from warp_ar.kernels.picture.video_color import rgb_factors, rgb_from_yuv, yuv_from_rgb, yuv_layout
 from warp_ar.output.video_sink import rgb_to_yuv
-from warp_ar.sources.deep_video import HD_HEIGHT
+from warp_ar.sources.deep_video import HD_HEIGHT, turn_of
 
 LEAST_SIZE = 16
 """Rows and columns below which FFmpeg's filters weigh samples at the border in another way than the device."""
@@ -45,7 +45,7 @@ def can_convert(picture: Any) -> bool:
     """Return whether a device can convert PyAV's picture to RGB as the host does."""
     size = picture.height, picture.width
     known = picture.format.name in (*_PLANAR, INTERLEAVED) and matrix_of(picture) is not None
-    return known and not picture.rotation and min(size) >= LEAST_SIZE and not any(n % 2 for n in size)
+    return known and not any(turn_of(picture)) and min(size) >= LEAST_SIZE and not any(n % 2 for n in size)
 
 
 def matrix_of(picture: Any) -> str | None:

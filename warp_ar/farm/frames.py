@@ -86,7 +86,7 @@ class VideoPart(VideoFile):
 
     def _taken(self, reformatter: VideoReformatter, picture: Any) -> Taken:
         """As ``VideoFile``'s, or the picture as it is."""
-        if self._decoded_only and can_convert(picture):
+        if self._decoded_only and self._shape == 1 and can_convert(picture):
             return cast(Any, DecodedPicture(picture)), picture.time, None
         return super()._taken(reformatter, picture)
 

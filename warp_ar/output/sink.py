@@ -70,6 +70,10 @@ class Sink(Closing):
                 written.
         """
 
+    def write_at(self, image: npt.NDArray[Any], seconds: float) -> None:
+        """Take the next frame, shown ``seconds`` after time 0, which only sinks that keep times heed; as `write`."""
+        self.write(image)
+
     @abstractmethod
     def close(self) -> None:
         """Write what waits, finish the file and end every thread; a second call does nothing.
@@ -215,6 +219,11 @@ class TeeSink(Sink):
         """Give the frame to every sink, in order."""
         for sink in self._sinks:
             sink.write(image)
+
+    def write_at(self, image: npt.NDArray[Any], seconds: float) -> None:
+        """Give the frame and its time to every sink, in order."""
+        for sink in self._sinks:
+            sink.write_at(image, seconds)
 
     def close(self) -> None:
         """Close every sink, in order; of several errors the last is raised, the others in its context."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fractions
 import os
 import pathlib
 from collections.abc import Mapping
@@ -43,6 +44,7 @@ def open_sink(
     transfer: str = "srgb",
     encoder: str | None = None,
     encoder_options: Mapping[str, str] | None = None,
+    tick: fractions.Fraction | None = None,
 ) -> Sink:
     """A sink for ``path``: a video for .mp4, .mkv and .mov, a folder of pictures for a name without an ending.
 
@@ -58,6 +60,7 @@ def open_sink(
         transfer: The camera's, by which 10- and 16-bit codes are encoded.
         encoder: FFmpeg's name of a video's; None: H.264 for 8 bits, H.265 for more.
         encoder_options: Its own, by FFmpeg's names.
+        tick: Seconds of the unit in which a video keeps the times of `Sink.write_at`; None: one frame's at ``fps``.
 
     Raises:
         SinkError: The path cannot be written, may not be replaced, or its ending is unknown; the encoder does not work.
@@ -71,7 +74,7 @@ def open_sink(
         if coding not in CODINGS:
             raise UsageError(f"coding {coding!r}: {path} is a video, which holds {', '.join(CODINGS)}")
         encoding = find_encoding(coding, encoder, encoder_options)
-        return VideoSink(path, fps=fps, size=size, overwrite=overwrite, encoding=encoding, transfer=transfer)
+        return VideoSink(path, fps=fps, size=size, overwrite=overwrite, encoding=encoding, transfer=transfer, tick=tick)
     try:
         is_folder = kind_of(path) == "folder"
     except OSError as error:

@@ -42,6 +42,10 @@ _TAGS = {
     "hlg": (Colorspace.BT2020, ColorPrimaries.BT2020, ColorTrc.ARIB_STD_B67),
 }
 """Matrix, primaries and transfer that a stream is tagged with."""
+_MATROSKA_TICK = fractions.Fraction(1, 1000)
+"""Seconds of the unit in which Matroska counts: two times within one would become equal."""
+_MPEG4_TICKS = 60000
+"""Ticks a second of MPEG-4 part 2, which counts them in 16 bits."""
 _FULL_CHROMA = "yuv444p10le"
 _WORDS = {"libx264": "H.264", "libx265": "H.265"}
 
@@ -63,6 +67,7 @@ class VideoSink(ThreadedSink):
         overwrite: Whether a file that this program did not write may be replaced.
         encoding: How it is encoded; None: H.264 in 8 bits.
         transfer: The camera's, by which 10-bit codes are encoded.
+        tick: Seconds of the unit in which times of `write_at` are kept; None: frame n is shown at n / fps.
 
     Raises:
         SinkError: The file cannot be written, may not be replaced, or has another ending; the encoder does not work.
@@ -78,6 +83,7 @@ class VideoSink(ThreadedSink):
         overwrite: bool = False,
         encoding: Encoding | None = None,
         transfer: str = "srgb",
+        tick: fractions.Fraction | None = None,
     ) -> None:
         self._path = pathlib.Path(path)
         if not (math.isfinite(fps) and fps > 0):
@@ -93,6 +99,14 @@ class VideoSink(ThreadedSink):
         make_folder(self._path.parent)
         self._fps = fps
         self._rate = fractions.Fraction(fps).limit_denominator(1001)
+        self._tick = 1 / self._rate if tick is None else tick
+        if self._encoding.encoder == "mpeg4" and self._tick.denominator > _MPEG4_TICKS:
+            self._tick = fractions.Fraction(1, _MPEG4_TICKS)
+        if tick is not None and self._path.suffix.lower() == ".mkv":
+            self._tick = max(self._tick, _MATROSKA_TICK)
+        self._times: dict[int, float] = {}
+        self._last_stamp = -1
+        self._timed = tick is not None
         self._broken = False
         self._container: Any = None
         self._file: WholeFragments | None = None
@@ -123,9 +137,22 @@ class VideoSink(ThreadedSink):
         if self._count == 1:
             self._describe()
 
+    def write_at(self, image: npt.NDArray[Any], seconds: float) -> None:
+        """Take the next frame, shown at ``seconds`` where times are kept; the first one settles the size."""
+        if self._timed:
+            self._times[self._count] = seconds
+        self.write(image)
+
+    def _stamp(self, index: int) -> int:
+        """Return the time stamp of the next frame in ticks, later than the one before it."""
+        seconds = self._times.pop(index, None)
+        stamp = fractions.Fraction(index / self._rate if seconds is None else seconds) / self._tick
+        self._last_stamp = max(round(stamp), self._last_stamp + 1)
+        return self._last_stamp
+
     def _start(self, width: int, height: int) -> None:
         movie = self._path.suffix.lower() != ".mkv"
-        flags = "hybrid_fragmented+frag_keyframe+empty_moov+default_base_moof"
+        flags = "hybrid_fragmented+frag_keyframe+empty_moov+default_base_moof+negative_cts_offsets"
         fragments = {"movflags": flags} if movie else {"cluster_time_limit": str(round(1000 * FRAGMENT_SECONDS))}
         group = max(1, round(FRAGMENT_SECONDS * self._fps))
         self._file = WholeFragments(self._path, boxes=movie)
@@ -135,8 +162,9 @@ class VideoSink(ThreadedSink):
         self._stream = add_stream(self._container, self._rate, width, height, self._encoding, {"g": str(group)})
         if movie and self._encoding.encoder in ("libx265", "hevc_nvenc", "hevc_videotoolbox"):
             tag_for_players(self._stream)
+        self._stream.time_base = self._stream.codec_context.time_base = self._tick
         self._container.start_encoding()
-        self._converter = rgb_to_yuv(width, height, 1 / self._rate, self._encoding.coding, self._encoding.pixel_format)
+        self._converter = rgb_to_yuv(width, height, self._tick, self._encoding.coding, self._encoding.pixel_format)
 
     def _store(self, index: int, image: npt.NDArray[Any]) -> None:
         if self._broken:
@@ -149,7 +177,7 @@ class VideoSink(ThreadedSink):
                 picture = av.VideoFrame.from_ndarray(image, format="rgb24")
             else:
                 picture = yuv_picture(signal_of(image, self._encoding.coding, self._transfer), self._encoding.coding)
-            picture.pts, picture.time_base = index, 1 / self._rate
+            picture.pts, picture.time_base = self._stamp(index), self._tick
             self._converter.push(picture)
             picture = self._converter.pull()
             self._container.mux(self._stream.encode(picture))

@@ -8,18 +8,22 @@ four tenths of a percent.
 
 from __future__ import annotations
 
+import fractions
 import functools
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import av
+import cv2
 import numpy as np
 import numpy.typing as npt
+from av.sidedata.sidedata import Type as SideDataType
 from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc, Interpolation, VideoReformatter
 
 from warp_ar.signals import P3_D65, REC_709, REC_2020, converted, light_of_hlg, light_of_pq, light_of_srgb
 from warp_ar.sources.deep_frame import CLIP_MARGINS, Plate, srgb8
 
 Float = npt.NDArray[np.float32]
+_Picture = TypeVar("_Picture", bound=npt.NDArray[Any])
 
 _LUMA: Final = {
     int(Colorspace.ITU709): (0.2126, 0.0722),
@@ -39,6 +43,9 @@ HD_HEIGHT = 720
 TO_RGB = Interpolation.BILINEAR | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
 
 _STEPS = 65536
+
+# Encoders tell the rounding of a size as a pixel's shape: 854x480 for 16:9 has pixels of 1280:1281.
+_NEARLY_SQUARE = 0.005
 
 
 def depth_of(context: Any) -> str:
@@ -62,9 +69,59 @@ def curve_of(context: Any) -> str:
     return {int(ColorTrc.SMPTE2084): "pq", int(ColorTrc.ARIB_STD_B67): "hlg"}.get(int(context.color_trc), "")
 
 
-def plate_from_video(reformatter: VideoReformatter, picture: Any) -> Plate:
-    """Upright plate of a decoded picture, by the picture's own matrix, range, transfer and primaries."""
-    signal = _upright(_signal(reformatter, picture), picture)
+def pixel_shape(stream: Any) -> fractions.Fraction:
+    """Return the width of a stream's pixels over their height; 1 where that is unknown or a rounding away from it."""
+    shape = fractions.Fraction(stream.sample_aspect_ratio or 1)
+    return shape if shape > 0 and abs(shape - 1) > _NEARLY_SQUARE else fractions.Fraction(1)
+
+
+def square_width(width: int, shape: fractions.Fraction) -> int:
+    """Return the columns of a picture whose pixels have been made square."""
+    return max(1, round(width * shape))
+
+
+def turn_of(picture: Any) -> tuple[bool, bool, bool]:
+    """Return what brings a decoded picture upright: transpose it, then flip its columns, then its rows.
+
+    The display matrix of its container or stream takes (x, y) to (a x + c y, b x + d y); the nearest of the eight that
+    keep pixels is taken.
+    """
+    said = next((data for data in picture.side_data if data.type == SideDataType.DISPLAYMATRIX), None)
+    if said is None:
+        return False, False, False
+    a, b, _, c, d = (int(value) for value in np.frombuffer(bytes(said), np.int32)[:5])
+    transposed = abs(b) + abs(c) > abs(a) + abs(d)
+    return (True, c < 0, b < 0) if transposed else (False, a < 0, d < 0)
+
+
+def presented(image: _Picture, picture: Any, shape: fractions.Fraction) -> _Picture:
+    """Return an image as its container presents it: of square pixels, turned and mirrored by its display matrix.
+
+    Args:
+        image: Of the decoded picture, (height, width, 3).
+        picture: PyAV's, decoded.
+        shape: As ``pixel_shape`` has it.
+    """
+    height, width = image.shape[:2]
+    if shape != 1:
+        how = cv2.INTER_LINEAR if shape > 1 else cv2.INTER_AREA
+        image = cv2.resize(image, (square_width(width, shape), height), interpolation=how)
+    transposed, columns, rows = turn_of(picture)
+    turned = image.swapaxes(0, 1) if transposed else image
+    return np.ascontiguousarray(turned[:: -1 if rows else 1, :: -1 if columns else 1])  # type: ignore[return-value]
+
+
+def plate_from_video(
+    reformatter: VideoReformatter, picture: Any, shape: fractions.Fraction = fractions.Fraction(1)
+) -> Plate:
+    """Return the plate of a decoded picture, by the picture's own matrix, range, transfer and primaries.
+
+    Args:
+        reformatter: The thread's.
+        picture: PyAV's.
+        shape: As ``pixel_shape`` has it.
+    """
+    signal = presented(_signal(reformatter, picture), picture, shape)
     transfer, wide = picture.color_trc, _WIDE.get(picture.color_primaries)
     if transfer not in (ColorTrc.SMPTE2084, ColorTrc.ARIB_STD_B67) and wide is None:
         return Plate(_steps(signal).astype(np.uint16))
@@ -90,11 +147,6 @@ def _light_table(transfer: int) -> Float:
         transfer, light_of_srgb
     )
     return curve(np.arange(_STEPS) / (_STEPS - 1.0)).astype(np.float32)
-
-
-def _upright(signal: Float, picture: Any) -> Float:
-    # Both count the angle counterclockwise.
-    return np.ascontiguousarray(np.rot90(signal, round(picture.rotation / 90)))
 
 
 def _signal(reformatter: VideoReformatter, picture: Any) -> Float:

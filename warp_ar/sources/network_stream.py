@@ -19,6 +19,7 @@ from av.video.reformatter import VideoReformatter
 
 from warp_ar.errors import SourceError, reason
 from warp_ar.files import limits, too_much
+from warp_ar.sources.deep_video import pixel_shape, square_width
 from warp_ar.sources.live_source import LiveSource
 from warp_ar.sources.source import DEFAULT_FPS, check_fps, check_size
 from warp_ar.sources.video_file import rgb_from_video
@@ -152,9 +153,11 @@ class NetworkStream(LiveSource):
             context = stream.codec_context
             if context is None:
                 raise SourceError(f"{self._name} has a video stream of no known codec; choose another encoding")
-            if context.width * context.height > limits().picture_pixels:
-                label = f"{self._name} is {context.width}x{context.height}: a frame of it"
-                raise SourceError(too_much(label, context.width * context.height, "pixels", "picture_pixels"))
+            shape = pixel_shape(stream)
+            width, height = max(context.width, square_width(context.width, shape)), context.height
+            if width * height > limits().picture_pixels:
+                label = f"{self._name} is {width}x{height}: a frame of it"
+                raise SourceError(too_much(label, width * height, "pixels", "picture_pixels"))
             context.options = {"max_pixels": str(limits().picture_pixels)}
             rate = float(stream.average_rate or stream.guessed_rate or 0.0)
             if rate > 0.0 and not self._told_fps:
@@ -174,7 +177,7 @@ class NetworkStream(LiveSource):
                 except av.InvalidDataError:
                     continue  # a damaged packet: the next whole picture mends it
                 for picture in pictures:
-                    yield rgb_from_video(reformatter, picture, self._memory_for)
+                    yield rgb_from_video(reformatter, picture, self._memory_for, shape)
                     last = time.monotonic()
 
     def close(self) -> None:

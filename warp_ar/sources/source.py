@@ -10,6 +10,7 @@ import collections
 import contextlib
 import dataclasses
 import difflib
+import fractions
 import functools
 import math
 import pathlib
@@ -69,6 +70,9 @@ class Source(Closing):
     fps: float
     """Nominal rate in frames per second."""
 
+    tick: fractions.Fraction | None = None
+    """Seconds that times of its frames are whole multiples of, where a recording tells them; None: ``fps`` tells."""
+
     length: int | None
     """Number of frames in one pass where it is known; a video's is what its header says, or its duration tells."""
 
@@ -77,6 +81,9 @@ class Source(Closing):
 
     description: str
     """One line for people."""
+
+    note: str = ""
+    """What is done to its frames that people may not expect, one line; empty: nothing is."""
 
     deep: str = ""
     """Its pictures have more than 8 bits: ``codes`` of the camera, or linear ``light``; empty: they have not."""

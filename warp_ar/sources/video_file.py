@@ -1,9 +1,10 @@
-"""A video file as frames, upright and in the colours that its stream names."""
+"""A video file as frames: those that its container presents, as it presents them."""
 
 from __future__ import annotations
 
 import collections
 import contextlib
+import fractions
 import math
 import pathlib
 import threading
@@ -20,7 +21,17 @@ from av.video.reformatter import Colorspace, VideoReformatter
 from warp_ar.errors import SourceError, reason
 from warp_ar.files import limits, too_much
 from warp_ar.sources.deep_frame import Plate, codes8
-from warp_ar.sources.deep_video import HD_HEIGHT, TO_RGB, curve_of, depth_of, plate_from_video
+from warp_ar.sources.deep_video import (
+    HD_HEIGHT,
+    TO_RGB,
+    curve_of,
+    depth_of,
+    pixel_shape,
+    plate_from_video,
+    presented,
+    square_width,
+    turn_of,
+)
 from warp_ar.sources.source import DEFAULT_FPS, Frame, RecordedSource, check_fps, check_size, existing_path
 
 Image = npt.NDArray[np.uint8]
@@ -41,7 +52,10 @@ _OPTIONS = {"format_whitelist": _FORMATS, "protocol_whitelist": "file"}
 
 
 class VideoFile(RecordedSource):
-    """A video file, its first video stream, turned upright as its metadata says.
+    """A video file, its first video stream, as its container presents it.
+
+    Frames that an edit list leaves out are none, the display matrix turns and mirrors, and pixels that are not square
+    are resampled to square ones, the rows kept.
 
     Colour is converted with the stream's own matrix and range; one that names none is taken as BT.709 from 720 rows up,
     else BT.601: what players do, and encoders expect. Frame times are the file's own (a variable rate is kept), counted
@@ -84,7 +98,8 @@ class VideoFile(RecordedSource):
             rate = float(stream.average_rate or stream.guessed_rate or DEFAULT_FPS)
             seconds = float(container.duration or 0) / av.time_base
             self.fps = fps or rate
-            self.length = int(stream.frames) or round(seconds * rate) or None
+            self.length = _frames_shown(stream) or round(seconds * rate) or None
+            self.tick = None if self._retimed else stream.time_base
             codec = stream.codec_context.name
             self.deep = depth_of(stream.codec_context)
             self.curve = curve_of(stream.codec_context) if self.deep else ""
@@ -94,6 +109,9 @@ class VideoFile(RecordedSource):
         height, width, _ = first[0].shape
         self.size = (width, height)
         self.description = f"{self._path} ({codec}, {width}x{height}, {self.fps:g} fps)"
+        if self._shape != 1:
+            x, y = self._shape.as_integer_ratio()
+            self.note = f"{self._path} has pixels of {x}:{y}; its frames are resampled to {width}x{height}, square ones"
 
     def _open(self, **how: Any) -> Any:
         """The file's container; ``how``: more of PyAV's arguments."""
@@ -117,7 +135,9 @@ class VideoFile(RecordedSource):
         stream = container.streams.video[0]
         if stream.codec_context is None:
             raise SourceError(f"{self._path} has a video stream of no known codec; choose another encoding")
+        self._shape = pixel_shape(stream)
         width, height = stream.codec_context.width, stream.codec_context.height
+        width = max(width, square_width(width, self._shape))
         if width * height > limits().picture_pixels:
             label = f"{self._path} is {width}x{height}: a frame of it"
             raise SourceError(too_much(label, width * height, "pixels", "picture_pixels"))
@@ -180,9 +200,11 @@ class VideoFile(RecordedSource):
                 if first is None or picture.pts >= first:
                     yield picture
                 count += 1
-        # An MP4's header counts its samples exactly; a file cut between two of them ends like a whole one.
-        if not damage and first is None and "mp4" in container.format.name and packets < stream.frames:
-            damage = f"the file is cut off: its header promises {stream.frames} frames"
+        # An MP4's index lists its samples exactly, without those that an edit list makes needless; a file cut between
+        # two of them ends like a whole one.
+        promised = min(stream.frames, len(stream.index_entries))
+        if not damage and first is None and "mp4" in container.format.name and packets < promised:
+            damage = f"the file is cut off: its index promises {promised} frames"
         if damage:
             # Threads and reordering hold frames back; those before the damage are still good.
             with contextlib.suppress(av.FFmpegError):
@@ -194,11 +216,17 @@ class VideoFile(RecordedSource):
     def _taken(self, reformatter: VideoReformatter, picture: Any) -> Taken:
         """8-bit RGB of a picture, its time stamp, and its plate if that is kept."""
         if self.deep != "light":
-            plate = plate_from_video(reformatter, picture) if self.deep and self.keeps_depth else None
-            return rgb_from_video(reformatter, picture, self._memory_for), picture.time, plate
-        plate = plate_from_video(reformatter, picture)
+            plate = plate_from_video(reformatter, picture, self._shape) if self.deep and self.keeps_depth else None
+            return rgb_from_video(reformatter, picture, self._memory_for, self._shape), picture.time, plate
+        plate = plate_from_video(reformatter, picture, self._shape)
         image = codes8(plate, "srgb") if plate.codes is None else plate.codes
         return image, picture.time, plate if self.keeps_depth else None
+
+
+def _frames_shown(stream: Any) -> int:
+    """Return how many frames a header promises, without those that an edit list leaves out; 0 where it is unknown."""
+    left_out = sum(entry.is_discard for entry in stream.index_entries)
+    return min(stream.frames, len(stream.index_entries) - left_out) if left_out else int(stream.frames)
 
 
 def _convert_beside(
@@ -232,14 +260,18 @@ def _convert_beside(
 
 
 def rgb_from_video(
-    reformatter: VideoReformatter, picture: Any, memory: Callable[[int, int], Image | None] | None = None
+    reformatter: VideoReformatter,
+    picture: Any,
+    memory: Callable[[int, int], Image | None] | None = None,
+    shape: fractions.Fraction = fractions.Fraction(1),
 ) -> Image:
-    """Upright 8-bit RGB of a decoded picture, with the picture's own colour matrix and range.
+    """Return 8-bit RGB of a decoded picture as it is presented, with the picture's own colour matrix and range.
 
     Args:
         reformatter: The thread's.
         picture: Of PyAV.
         memory: Gives memory for a picture of a height and width, or None: it is then made anew.
+        shape: As ``pixel_shape`` has it.
     """
     matrix = None
     if picture.colorspace not in {int(known) for known in Colorspace}:
@@ -247,14 +279,13 @@ def rgb_from_video(
     in_planes = picture.format.name in _IN_PLANES and picture.height % 2 == 0
     wanted = "gbrp" if in_planes else "rgb24"
     converted = reformatter.reformat(picture, format=wanted, src_colorspace=matrix, interpolation=TO_RGB, threads=1)
-    turns = round(picture.rotation / 90)
     if in_planes:
-        out = memory(picture.height, picture.width) if memory is not None and turns == 0 else None
+        stored = shape == 1 and not any(turn_of(picture))
+        out = memory(picture.height, picture.width) if memory is not None and stored else None
         rgb = _interleaved(converted, out)
     else:
         rgb = np.asarray(converted.to_ndarray(), np.uint8)
-    # Both count the angle counterclockwise.
-    return np.ascontiguousarray(np.rot90(rgb, turns))
+    return presented(rgb, picture, shape)
 
 
 def _interleaved(picture: Any, out: Image | None) -> Image:
