@@ -28,7 +28,7 @@ from warp_ar.kernels.recovery.recover_cells import CELL_COLUMNS, CELL_ROWS
 from warp_ar.light.captured import texel_solid_angles
 from warp_ar.light.config import CONFIG
 from warp_ar.light.evidence import spread_directions
-from warp_ar.light.least_missing import least_missing
+from warp_ar.light.priors import least_missing
 
 Map = NDArray[np.float32]
 

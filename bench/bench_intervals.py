@@ -18,8 +18,8 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-import imageio.v3
 import numpy as np
+import PIL.Image
 
 from bench.common import commit
 from tests.printed_card import PrintedCard, linear_of, poses, smooth_curve
@@ -29,7 +29,7 @@ from warp_ar.ball.ball import posed_frames
 from warp_ar.ball.ball_measure import measure_ball
 from warp_ar.calibration.camera_calibration import calibrate_camera
 from warp_ar.calibration.card import write_card
-from warp_ar.calibration.grey_response import measure_grey_response
+from warp_ar.calibration.response import measure_grey_response
 from warp_ar.scene import Camera, Pose, Probe, Proxy
 from warp_ar.sources.sources import open_source
 from warp_ar.tracking.card_layout import SHEET, ball_center
@@ -113,7 +113,7 @@ def film(desk: RandomDesk, rng: np.random.Generator, folder: Path) -> None:
     for k in range(FRAMES):
         turn = middle + half * np.sin(k / 2)
         eye = np.array([far * np.cos(turn), 0.06 + far * np.sin(turn), high + 0.04 * np.cos(k)])
-        imageio.v3.imwrite(folder / f"{k:02d}.png", desk.photograph(eye, (0.0, 0.06, 0.0)))
+        PIL.Image.fromarray(desk.photograph(eye, (0.0, 0.06, 0.0))).save(folder / f"{k:02d}.png")
 
 
 def measured(seed: int) -> Figures:

@@ -20,8 +20,7 @@ from bench.common import paired_ratio, report
 from warp_ar import LAYERS
 from warp_ar.engine.layers import RADIANCE
 from warp_ar.engine.pipeline import Pipeline
-from warp_ar.output.layer_file import write_layers
-from warp_ar.output.side_files import layer_frame
+from warp_ar.output.layer_file import layer_frame, write_layers
 
 WARM_UP = 3
 PLAIN = "picture"

@@ -66,7 +66,7 @@ class Primary:
         self.tracer = tracer
         self.shape = tracer.camera.height, tracer.camera.width
         self.depth = wp.zeros(self.shape, dtype=wp.float32, device=tracer.device)
-        self.kernel = make_primary_kernel(tracer._trace)
+        self.kernel = make_primary_kernel(tracer._config)
 
     def launch(self, rows: tuple[int, int] | None) -> None:
         """A band of rows."""

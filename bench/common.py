@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import functools
 import importlib.util
 import json
-import os
 import shutil
 import statistics
-import subprocess
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -17,8 +14,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_ar.accuracy.report import commit
 from warp_ar.device import capturing
-from warp_ar.kernels.launch import noting
 
 WARM_UP = 3
 RUNS = 30
@@ -33,43 +30,11 @@ def find_chromium() -> str | None:
     return chromium
 
 
-@functools.cache
-def commit() -> str:
-    """Short hash of the checkout, with a + where it has uncommitted changes; ``unknown`` outside one.
-
-    ``WARP_AR_COMMIT`` says it where the files were taken without their history.
-    """
-    if "WARP_AR_COMMIT" in os.environ:
-        return os.environ["WARP_AR_COMMIT"]
-    root = Path(__file__).resolve().parent
-    try:
-        out = subprocess.run(
-            ["git", "describe", "--always", "--dirty=+"], cwd=root, capture_output=True, text=True, check=True
-        )
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
-    return out.stdout.strip()
-
-
 def time_thread(function: Callable[[], object], device: Any) -> float:
     """Milliseconds of one call by this thread's processor time, which other programs hardly disturb; CPU only."""
     start = time.thread_time()
     function()
     return (time.thread_time() - start) * 1e3
-
-
-def recorded(function: Callable[[], object]) -> Callable[[], object]:
-    """What launches of ``function`` do, recorded once, as frames have it done: packing arguments does not count."""
-    with noting() as notes:
-        function()
-    launches = [note.record() for note in notes if note.record is not None]
-    assert len(launches) == len(notes) > 0
-
-    def replay(notes: Any = notes) -> None:  # notes hold the arrays
-        for each in launches:
-            each.launch()
-
-    return replay
 
 
 def time_once(function: Callable[[], object], device: Any) -> float:
@@ -124,14 +89,6 @@ def paired_ratio(times: Mapping[str, list[float]], over: str, under: str) -> flo
     return statistics.median(a / b for a, b in zip(times[over], times[under], strict=True))
 
 
-@functools.cache
-def copy_bandwidth(device: str, size: int = 1 << 26) -> float:
-    """Measured bytes per second of a plain copy (read plus written) on ``device``."""
-    source, target = wp.zeros(size, dtype=wp.uint8, device=device), wp.empty(size, dtype=wp.uint8, device=device)
-    times = measure({"copy": lambda: wp.copy(target, source)}, device, one_thread=True)["copy"]
-    return 2.0 * size / (statistics.median(times) * 1e-3)
-
-
 def report(case: str, milliseconds: list[float], device: Any, **more: Any) -> None:
     """Print one JSON line: the case's median and spread, and whatever ``more`` says."""
     low, median, high = np.percentile(milliseconds, [10, 50, 90])
@@ -147,12 +104,6 @@ def report(case: str, milliseconds: list[float], device: Any, **more: Any) -> No
         "commit": commit(),
     }
     print(json.dumps(record), flush=True)
-
-
-def report_map(stage: str, height: int, milliseconds: list[float], texel_bytes: int, device: str) -> None:
-    """Print one JSON line for a stage on a map of so many rows, with its share of the copy bandwidth."""
-    rate = texel_bytes * 2 * height**2 / (float(np.median(milliseconds)) * 1e-3) / copy_bandwidth(device)
-    report(f"{stage}_{height}", milliseconds, device, of_copy_bandwidth=round(rate, 4))
 
 
 class KeptLines:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import statistics
+import time
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
@@ -20,13 +21,12 @@ import numpy.typing as npt
 
 from warp_ar.accuracy.cases import Case, Image, Mask, open_scene
 from warp_ar.accuracy.charts import Point, lines, scatter
-from warp_ar.accuracy.cost_table import SETTINGS, Setting, light_only, turn
-from warp_ar.accuracy.costs import WORK
-from warp_ar.accuracy.metrics import array_error, latlong_weights
+from warp_ar.accuracy.cost_table import turn
+from warp_ar.accuracy.measure import picture_error, region_of, run, run_in_turn
 from warp_ar.accuracy.pictures import bounding_box, halves, sheet
-from warp_ar.accuracy.runs import NORMALS, run, run_in_turn
-from warp_ar.accuracy.sweep import picture_error, region_of
+from warp_ar.engine.pipeline import Pipeline
 from warp_ar.kernels.color import decode_table
+from warp_ar.light.captured import texel_solid_angles
 from warp_ar.scene.pixel_rays import pixel_rays
 from warp_ar.stages.quality import PRESETS, Quality
 
@@ -40,6 +40,8 @@ CARD = 0.85
 """Half the side of a printed card, in sides of its marker."""
 BAND = 2
 """Rows above and below a profile's that it is the mean of."""
+NORMALS = (24, 48)
+"""Rows and columns of orientations at which irradiance is compared."""
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 
@@ -92,14 +94,14 @@ def _compare(
 ) -> PaperFigure:
     """A picture at the paper's preset, at ours, and truly; ``plain`` turns the paper's preset into the usual way.
 
-    Times are the work of one thread on CPU, which other programs hardly disturb.
+    Times are the work of all threads, which other programs hardly disturb.
 
     Where the paper prints the plain way and its own as halves of one picture, ``above`` says how.
     """
     case = context.case(scene)
     qualities = {"plain": turn(PRESETS["paper"], plain)} if plain else {}
     qualities |= {"paper": PRESETS["paper"], **{name: PRESETS[name] for name in OURS}}
-    times, images = run_in_turn(case, qualities, context.device, WORK)
+    times, images = run_in_turn(case, qualities, context.device, time.process_time)
     index = case.shown[-1]
     camera, truth = case.frames[index].image, case.truth[index]
     region = region_of(case, index, truth)
@@ -184,20 +186,19 @@ def figure_9(context: Context) -> PaperFigure:
 # ------------------------------------------------------------------------------------------------------ the environment
 
 
-def _setting(name: str) -> Setting:
-    return next(setting for setting in SETTINGS if setting.name == name)
-
-
 def _maps(context: Context, case: Case, quality: Quality) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
-    """Environment and irradiance at the end of a case's frames."""
-    maps = []
-    # A filter that reads the environment's map keeps it in the plan.
-    whole = turn(quality, {"irradiance": "clusters"})
-    for name, shown in (("recover", whole), ("irradiance", quality)):
-        outcome = run(case, shown, context.device, _setting(name), between=light_only(shown), timed=1)
-        assert outcome.output is not None
-        maps.append(outcome.output)
-    return maps[0], maps[1]
+    """Return environment and irradiance at the end of a case's frames."""
+    maps: dict[str, npt.NDArray[Any]] = {}
+
+    def keep(pipeline: Pipeline) -> None:
+        for name in ("environment", "irradiance_map"):
+            if name in pipeline.arrays:
+                maps[name] = pipeline.arrays[name].numpy().astype(np.float64)
+
+    # A filter that reads the environment's map keeps it in the plan; the paper's own does not.
+    for shown in (turn(quality, {"irradiance": "clusters"}), quality):
+        run(case, shown, context.device, keep)
+    return maps["environment"], cv2.resize(maps["irradiance_map"], NORMALS[::-1], interpolation=cv2.INTER_LINEAR)
 
 
 def _shown(radiance: npt.NDArray[Any], size: tuple[int, int]) -> Image:
@@ -224,9 +225,10 @@ def figure_3(context: Context) -> PaperFigure:
     }
     rows = []
     for name, (environment, irradiance) in found.items():
-        weights = latlong_weights(*environment.shape[:2])[..., None]
-        mean = (environment * weights).sum((0, 1)) / weights.sum()
-        off = array_error(irradiance, lobe, latlong_weights(*NORMALS)).relative_rmse
+        weights = texel_solid_angles(len(environment))[..., None]
+        mean = (environment * weights).sum((0, 1)) / (weights.sum() * environment.shape[1])
+        area = texel_solid_angles(NORMALS[0])[..., None]
+        off = np.sqrt((area * (irradiance - lobe) ** 2).sum() / (area * lobe**2).sum())
         error = f"{off:.1%}" if name == "paper" else ""
         values = (mean @ _LUMINANCE, (environment @ _LUMINANCE).max(), irradiance[0].mean(0) @ _LUMINANCE)
         rows.append((name, *(f"{value:.3f}" for value in values), error))
@@ -315,7 +317,7 @@ def figure_5(context: Context) -> PaperFigure:
     model = camera.copy()
     model[edges & inside] = (40, 110, 230)
     flat = turn(PRESETS["paper"], {"relight": "flat"})
-    shown = run(case, flat, context.device, between=light_only(flat), timed=1).images[index]
+    shown = run(case, flat, context.device)[index]
     region = region_of(case, index, case.truth[index])
     row, columns = _profile_row(case, index, _lit_region(case, index))
     before = _luminance(case, camera)
@@ -369,8 +371,7 @@ def figure_6(context: Context) -> PaperFigure:
             "paper": PRESETS["paper"],
             "high": PRESETS["high"],
         }.items():
-            outcome = run(case, quality, context.device, between=light_only(quality), timed=1)
-            shown[label] = outcome.images[index]
+            shown[label] = run(case, quality, context.device)[index]
         before = _luminance(case, camera)
         physical = _band(before, row, columns)
         added = {label: _band(_luminance(case, image) - before, row, columns) for label, image in shown.items()}
@@ -441,7 +442,7 @@ class Reading:
 
 
 _BLEND = "what the multiplicative factor is taken from"
-_EXACT = {"unwrap": "bilinear", "irradiance": "sh2", "prefilter": "energy_mip"}
+_EXACT = {"unwrap": "area", "irradiance": "sh2", "prefilter": "energy_mip"}
 READINGS: tuple[Reading, ...] = (
     Reading("3.1", "the environment map", "OpenGL's sphere map, boxes over its texture (taken)", {}),
     Reading("3.1", "the environment map", "exact places on the ball, spherical harmonics, mixed mips", _EXACT),
@@ -462,7 +463,7 @@ READING_SCENES = ("desk", "torus", "wire_coincident", "wire_opposing", "darken")
 
 
 def compare_readings(
-    context: Context, scenes: Sequence[str] = READING_SCENES, advance: Callable[[str], None] = lambda text: None
+    context: Context, scenes: Sequence[str] = READING_SCENES
 ) -> list[tuple[Reading, dict[str, float]]]:
     """FLIP to the truth of the preset ``paper``, by scene, for every reading that matters there."""
     found: list[tuple[Reading, dict[str, float]]] = [(reading, {}) for reading in READINGS]
@@ -475,7 +476,6 @@ def compare_readings(
             key = (*sorted(reading.methods.items()), reading.video)
             if key not in known:
                 known[key] = _reading_error(context, case, reading)
-                advance(f"{scene}: {reading.answer}")
             errors[scene] = known[key]
     return found
 
@@ -493,5 +493,5 @@ def _reading_error(context: Context, case: Case, reading: Reading) -> float:
     if reading.video:
         camera = dataclasses.replace(case.scene.camera, transfer="linear")
         read = dataclasses.replace(case, scene=dataclasses.replace(case.scene, camera=camera))
-    images = run(read, quality, context.device, between=light_only(quality), timed=1).images
+    images = run(read, quality, context.device)
     return picture_error(case, case.truth, images)

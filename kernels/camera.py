@@ -11,7 +11,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def distort(point: wp.vec2, k: vec8) -> wp.vec2:
-    """Where the lens puts a normalised image point: OpenCV's rational model, k = k1 k2 p1 p2 k3 k4 k5 k6."""
+    """Return where the lens maps a normalised image point: OpenCV's rational model, k1 k2 p1 p2 k3 k4 k5 k6."""
     x = point[0]
     y = point[1]
     r2 = x * x + y * y

@@ -20,7 +20,7 @@ def cell_pixel(cell: wp.int32, stride: wp.int32, size: wp.int32) -> wp.int32:
 
 @wp.func
 def cell_place(pixel: wp.int32, stride: wp.int32, size: wp.int32) -> wp.float32:
-    """Which cell is estimated at a row or column: whole numbers at ``cell_pixel``, even between, none beyond."""
+    """Return the cell estimated at a row or column: whole numbers at ``cell_pixel``, even between, none beyond."""
     last = (size - 1) / stride
     low = wp.clamp((pixel - stride / 2) / stride, 0, last)
     here = cell_pixel(low, stride, size)
@@ -83,7 +83,7 @@ def any_cell_above_zero(
     row: wp.int32,
     col: wp.int32,
 ) -> wp.bool:
-    """Whether any cell that ``look_up_cells`` may read for a pixel holds more than zero."""
+    """Return whether any cell that ``look_up_cells`` may read for a pixel holds more than zero."""
     i0 = wp.int32(cell_place(row, stride, size[0]))
     j0 = wp.int32(cell_place(col, stride, size[1]))
     for a in range(2):

@@ -42,7 +42,7 @@ _NEXT = wp.constant(ENCODE_KEYS)
 _THRESHOLDS = wp.constant(2 * ENCODE_KEYS)
 
 SATURATION_ENTRY = wp.constant(256)
-"""Where a ``camera_table`` holds the codes at which channels saturate."""
+"""Entry of a ``camera_table`` that holds the codes at which channels saturate."""
 # Video codecs and JPEG bring a clipped 255 back as 254 now and then.
 BELOW_SATURATION = wp.constant(wp.float32(-1.0))
 # Chroma at half the resolution (4:2:0) lowers the clipped blue of a small emitter to 239 to 252 (measured in H.264).
@@ -181,9 +181,7 @@ def encode_codes(transfer: str | pathlib.Path, light: np.ndarray) -> np.ndarray:
 
 
 def camera_table(
-    transfer: str | pathlib.Path,
-    saturation: np.ndarray | tuple[int, int, int] = (255, 255, 255),
-    contrast: float = 0.0,
+    transfer: str | pathlib.Path, saturation: np.ndarray | tuple[int, int, int] = (255, 255, 255), contrast: float = 0.0
 ) -> np.ndarray:
     """``decode_table``, and behind it the codes at which the camera's channels saturate.
 
@@ -225,9 +223,7 @@ def without_contrast(
 
 
 def encode_table(
-    transfer: str | pathlib.Path,
-    contrast: float = 0.0,
-    saturation: np.ndarray | tuple[int, int, int] = (255, 255, 255),
+    transfer: str | pathlib.Path, contrast: float = 0.0, saturation: np.ndarray | tuple[int, int, int] = (255, 255, 255)
 ) -> np.ndarray:
     """Table for the device function ``encode``; arguments and errors as ``camera_table``.
 
@@ -290,14 +286,13 @@ def _decode_values(transfer: str | pathlib.Path) -> np.ndarray:
         )
     text = read_text(path, SceneError, expected="256 lines of three linear values")
     lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
+    expected = f"{path}: a measured response is 256 lines of three linear values"
     try:
         values = np.array([[float(word) for word in line.replace(",", " ").split()] for line in lines])
     except ValueError as error:
-        raise SceneError(f"{path}: a measured response is 256 lines of three linear values: {error}") from None
+        raise SceneError(f"{expected}: {error}") from None
     if values.shape != (256, 3):
-        raise SceneError(
-            f"{path}: a measured response is 256 lines of three linear values, this has shape {values.shape}"
-        )
+        raise SceneError(f"{expected}, this has shape {values.shape}")
     if not np.isfinite(values).all() or (values < 0.0).any():
         raise SceneError(f"{path}: the values of a measured response must be finite and not negative")
     falling = np.argwhere(np.diff(values, axis=0) < 0.0)

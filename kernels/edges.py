@@ -54,7 +54,7 @@ def list_edge(i: wp.int32, j: wp.int32, list_out: EdgeList):
 
 @wp.func
 def holds_all(listed: EdgeList) -> wp.bool:
-    """Whether the list had a place for every edge."""
+    """Return whether the list had a place for every edge."""
     return listed.count[0] <= listed.edges.shape[0]
 
 
@@ -102,13 +102,7 @@ def make_average_edges_kernel(weighted: bool) -> wp.Kernel:
 
 
 def sample_listed_edges(
-    kernel: wp.Kernel,
-    inputs: Sequence[Any],
-    lists: EdgeLists,
-    count: int,
-    values_out: wp.array,
-    *,
-    weighted: bool,
+    kernel: wp.Kernel, inputs: Sequence[Any], lists: EdgeLists, count: int, values_out: wp.array, *, weighted: bool
 ) -> None:
     """Take the samples of all edges that were listed, side by side, and write their means.
 

@@ -116,7 +116,7 @@ def seen_from(emitter: Emitter, place: wp.vec3) -> Emitter:
 
 @wp.func
 def solid_angle_gain(emitters: wp.array[Emitter], point: wp.vec3, direction: wp.vec3) -> wp.float32:
-    """How much larger what is seen along a unit direction is from a point than in the environment.
+    """Ratio of the solid angle of what a point sees along a unit direction to that in the environment.
 
     (D / |r|)^2 where an emitter stands, 1 far from all, between them by the weights of ``correct_parallax``.
     """

@@ -1,4 +1,4 @@
-"""How every launcher starts its kernel, over all rows or over one band of them.
+"""Launches of kernels, over all rows or over one band of them.
 
 A Warp CPU launch uses one thread, so the scheduler splits a pass into bands of rows that threads take side by side.
 Every per-row kernel therefore takes ``row_start`` as its first input and adds it to its first thread index.
@@ -38,7 +38,7 @@ MOST_BLOCKS = 4096
 
 
 def takes_few_blocks(shape: Sequence[int], device: wp.DeviceLike) -> bool:
-    """Whether a launch over all of a shape with ``rectangle_first`` has a limited number of blocks.
+    """Return whether a launch over all of a shape with ``rectangle_first`` has a limited number of blocks.
 
     What its rectangle does not reach is then better cleared before, while the device has little to do.
     """
@@ -51,9 +51,9 @@ ENOUGH_THREADS = 1 << 20
 """Threads from which more make a CUDA device slower: each finds the cell's point and picks its samples anew."""
 
 
-def count_partials(rows: int, columns: int, most: int = MAX_PARTIALS) -> int:
-    """Threads of a CUDA device per cell: as many as it takes to fill it, up to ``most``, a power of 2."""
-    partials = most
+def count_partials(rows: int, columns: int, device: wp.DeviceLike, most: int = MAX_PARTIALS) -> int:
+    """Threads per cell: on CUDA as many as it takes to fill the device, up to ``most``, a power of 2; one on CPU."""
+    partials = 1 if wp.get_device(device).is_cpu else most
     while partials > 1 and partials * rows * columns > ENOUGH_THREADS:
         partials //= 2
     return partials
@@ -76,7 +76,7 @@ class Note:
     block_dim: int = 256
     """Threads of a block, on CUDA."""
     tiles: bool = False
-    """Whether it may not meet another that uses tiles."""
+    """True if it may not meet another that uses tiles."""
 
 
 _NOTES = threading.local()
@@ -102,6 +102,13 @@ def do_or_note(note: Note) -> None:
         notes.append(note)
 
 
+def device_of(device: wp.DeviceLike, arguments: Sequence[Any]) -> Any:
+    """Return a device, or where none is given that of the first array among a kernel's arguments."""
+    if device is None:
+        device = next((one.device for one in arguments if isinstance(one, wp.array)), None)
+    return wp.get_device(device)
+
+
 def launch(
     kernel: wp.Kernel,
     dim: int | Sequence[int],
@@ -113,8 +120,9 @@ def launch(
     block_dim: int = 256,
 ) -> None:
     """Launch a kernel that is not split, as ``wp.launch`` does."""
+    device = device_of(device, [*outputs, *inputs])
     given = {"dim": dim, "inputs": inputs, "outputs": outputs, "device": device, "stream": stream}
-    given["block_dim"] = None if wp.get_device(device).is_cpu else block_dim
+    given["block_dim"] = None if device.is_cpu else block_dim
     do_or_note(
         Note(
             kernel,
@@ -138,7 +146,7 @@ def launch_rows(
     outputs: Sequence[Any],
     *,
     rows: Rows | None,
-    device: wp.DeviceLike,
+    device: wp.DeviceLike = None,
     stream: wp.Stream | None = None,
     rectangle_first: bool = False,
     alone: bool = False,
@@ -151,12 +159,13 @@ def launch_rows(
         inputs: Arguments after ``row_start`` and before the outputs.
         outputs: Arrays that the kernel writes.
         rows: Band to launch; None means all rows.
-        device: Where the arrays live.
+        device: Where the arrays live; None: as ``device_of`` says.
         stream: CUDA stream; None means the device's current one.
         rectangle_first: Whether the kernel takes ``own_pixel``: on CUDA a limited number of blocks does all rows, and
             those of its rectangle first.
         alone: Whether, where that is so (``takes_few_blocks``), other pixels need not be written.
     """
+    device = device_of(device, [*outputs, *inputs])
     whole = rows is None or tuple(rows) == (0, shape[0])
     limited = rectangle_first and whole and takes_few_blocks(shape, device)
 
@@ -175,6 +184,35 @@ def launch_rows(
         return wp.launch(kernel, dim=tuple(shape), **given, record_cmd=True)
 
     do_or_note(Note(kernel, rows, do, record))
+
+
+def row_launcher(
+    kernel: wp.Kernel | Callable[..., wp.Kernel],
+    *,
+    configs: int = 1,
+    outputs: int = 1,
+    like: Callable[..., wp.array] | None = None,
+    **options: bool,
+) -> Callable[..., None]:
+    """Return ``launcher(*configs, *inputs, *outputs, rows=None, **options)`` of a kernel that takes ``row_start``.
+
+    Args:
+        kernel: Kernel, or the factory that makes it of configurations, the launcher's first arguments.
+        configs: Number of these.
+        outputs: Number of the kernel's outputs, the launcher's last arguments.
+        like: Picks of the kernel's arguments the array of the launch's extent; None: the first output.
+        **options: As for ``launch_rows``, of all launches.
+    """
+
+    def launcher(*given: Any, rows: Rows | None = None, **more: bool) -> None:
+        made, arguments = kernel, given
+        if not isinstance(kernel, wp.Kernel):
+            made, arguments = kernel(*given[:configs]), given[configs:]
+        array = arguments[-outputs] if like is None else like(*arguments)
+        inputs, written = arguments[:-outputs], arguments[-outputs:]
+        launch_rows(made, array.shape, inputs, written, rows=rows, device=array.device, **options, **more)
+
+    return launcher
 
 
 # On CPU a module's tiles lie on the stack of the kernel that began last, for there is one pointer to them per module:
@@ -202,7 +240,7 @@ def launch_tiles(
     outputs: Sequence[Any],
     *,
     block_dim: int,
-    device: wp.DeviceLike,
+    device: wp.DeviceLike = None,
     rows: Rows | None = None,
 ) -> None:
     """Launch a kernel whose blocks work together, one block per element of ``dim``; on CPU never two at a time.
@@ -214,9 +252,10 @@ def launch_tiles(
         inputs: Arguments before the outputs.
         outputs: Arrays that the kernel writes.
         block_dim: Threads per block on CUDA; on CPU a block is one thread.
-        device: Where the arrays live.
+        device: Where the arrays live; None: as ``device_of`` says.
         rows: Band of blocks along the first axis; None means all, of a kernel that knows no bands.
     """
+    device = device_of(device, [*outputs, *inputs])
 
     def do(record_cmd: bool = False) -> wp.Launch | None:
         start, stop = rows if rows is not None and not record_cmd else (0, dim[0])
@@ -224,7 +263,7 @@ def launch_tiles(
             return None
         given = [start, *inputs] if rows is not None else list(inputs)
         more = {"block_dim": block_dim, "device": device, "record_cmd": record_cmd}
-        with _CPU_TILES if wp.get_device(device).is_cpu else contextlib.nullcontext():
+        with _CPU_TILES if device.is_cpu else contextlib.nullcontext():
             return wp.launch_tiled(kernel, dim=(stop - start, *dim[1:]), inputs=given, outputs=outputs, **more)
 
     do_or_note(Note(kernel, rows, do, functools.partial(do, True), block_dim=block_dim, tiles=True))

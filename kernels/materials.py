@@ -1,4 +1,4 @@
-"""What surfaces do with light: four reflection models under virtual lights and under the environment.
+"""Reflection of light by surfaces: four models under virtual lights and under the environment.
 
 Directions ``wi`` (to the light), ``wo`` (to the viewer) and ``normal`` are unit and point away from the surface. Every
 model is first reduced to a ``Surface``: a diffuse reflectance and a lobe. Under the environment that is
@@ -81,7 +81,7 @@ def material_at(scene: RayScene, hit: Hit) -> wp.int32:
 
 @wp.func
 def surface_point(scene: RayScene, hit: Hit, cos_o: wp.float32, spread: wp.float32) -> SurfacePoint:
-    """What pictures see of a hit; ``spread`` is the angle of the ray's cone, whose apex is where the ray starts.
+    """Return a hit as pictures see it; ``spread`` is the angle of the ray's cone, whose apex is where the ray starts.
 
     The pictures of a sphere and a box are as dense as on their largest circle and their mean side.
     """
@@ -112,7 +112,7 @@ def roughness_at(scene: RayScene, material: Material, point: SurfacePoint) -> wp
 
 @wp.func
 def emitted_radiance(scene: RayScene, material: Material, point: SurfacePoint) -> wp.vec3:
-    """What a point sends out itself, on a side that does."""
+    """Return the radiance that a point sends out itself, on a side that does."""
     if material.unlit != 0:
         base = wp.cw_mul(material.base_color, wp.vec3(point.color[0], point.color[1], point.color[2]))
         if material.base_texture >= 0:

@@ -1,4 +1,4 @@
-"""Which pixel a thread takes: on CUDA those of a rectangle come first, in tiles, and few blocks do all.
+"""Order in which threads take pixels: on CUDA those of a rectangle come first, in tiles, and few blocks do all.
 
 Much of what a frame shows lies in a rectangle that its virtual objects, lights or balls can reach; a pixel outside is
 written and no more. A captured graph has no other size than the frame's, and a block with the registers that rays need

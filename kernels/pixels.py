@@ -27,11 +27,7 @@ mat23 = wp.types.matrix(shape=(2, 3), dtype=wp.float32)
 
 @wp.func
 def pixel_radiance(
-    frame: wp.array2d[wp.vec3ub],
-    table: wp.array[wp.vec3],
-    linear: wp.array2d[wp.vec3],
-    row: wp.int32,
-    column: wp.int32,
+    frame: wp.array2d[wp.vec3ub], table: wp.array[wp.vec3], linear: wp.array2d[wp.vec3], row: wp.int32, column: wp.int32
 ) -> wp.vec3:
     """Radiance of a pixel: of the linear picture, or of the codes where that is empty."""
     if linear.shape[0] > 0:
@@ -47,7 +43,7 @@ def shown_radiance(picture: Picture, row: wp.int32, column: wp.int32) -> wp.vec3
 
 @wp.func
 def between_codes(table: wp.array[wp.vec3], value: wp.float32, code: wp.uint8, channel: wp.int32) -> wp.float32:
-    """How far a linear value lies from its 8-bit code, in codes; exactly 0 where it is that code's value."""
+    """Distance of a linear value from its 8-bit code, in codes; exactly 0 where it is that code's value."""
     here = wp.int32(code)
     beside = wp.where(value > table[here][channel], wp.min(here + 1, 255), wp.max(here - 1, 0))
     step = wp.abs(table[beside][channel] - table[here][channel])
@@ -58,13 +54,9 @@ def between_codes(table: wp.array[wp.vec3], value: wp.float32, code: wp.uint8, c
 
 @wp.func
 def cut_luma(
-    frame: wp.array2d[wp.vec3ub],
-    table: wp.array[wp.vec3],
-    linear: wp.array2d[wp.vec3],
-    row: wp.int32,
-    column: wp.int32,
+    frame: wp.array2d[wp.vec3ub], table: wp.array[wp.vec3], linear: wp.array2d[wp.vec3], row: wp.int32, column: wp.int32
 ) -> wp.float32:
-    """What the 8-bit luma (``summed_area.intensity``) of a pixel lacks of its linear picture's, in codes.
+    """Return the part of a linear picture's luma that its 8-bit luma (``summed_area.intensity``) lacks, in codes.
 
     Exactly 0 without a linear picture, and where that is what the codes say. Light above 1 counts as 1.
     """
@@ -91,7 +83,7 @@ def keep_linear(table: wp.array[wp.vec3], value: wp.vec3) -> wp.vec3:
 
 @wp.func
 def clip_levels(table: wp.array[wp.vec3]) -> mat23:
-    """Where the channels of a linear frame clip, and where beside another one that does."""
+    """Levels at which the channels of a linear frame clip, alone and beside another one that does."""
     return mat23(table[0][0], table[0][1], table[0][2], table[1][0], table[1][1], table[1][2])
 
 

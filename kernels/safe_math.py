@@ -1,4 +1,4 @@
-"""What keeps numbers in bounds: radiance and confidence that can be trusted, and ramps without corners."""
+"""Bounds on numbers: radiance and confidence that can be trusted, and ramps without corners."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ MAX_RADIANCE = wp.constant(wp.float32(1.0e8))
 
 @wp.func
 def is_finite(value: wp.vec3) -> wp.bool:
-    """Whether all three are numbers."""
+    """Return whether all three are numbers."""
     return wp.isfinite(value[0]) and wp.isfinite(value[1]) and wp.isfinite(value[2])
 
 

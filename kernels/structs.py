@@ -5,6 +5,8 @@ Lengths are metres in the world (marker) frame, angles radians, colours linear R
 
 from __future__ import annotations
 
+from typing import Any
+
 import warp as wp
 
 vec8 = wp.types.vector(length=8, dtype=wp.float32)
@@ -39,7 +41,7 @@ MIRRORED = wp.constant(2)
 
 @wp.struct
 class FrameParams:
-    """What changes per frame; kernels get an array of one."""
+    """Values that change per frame; kernels get an array of one."""
 
     camera_position: wp.vec3  # world
     world_from_camera: wp.mat33
@@ -179,12 +181,11 @@ class RayScene:
     area_lights: wp.array[AreaLight]  # the objects that do
     emitting_faces: wp.array[wp.vec3i]  # object; triangle of its mesh, -1: the whole sphere; 1: only its front emits
     emitting_shares: wp.array[wp.float32]  # of all that is emitted, by this face and those before it; the last is 1
-    walks: wp.uint64  # on CPU the address of its table of kernels/rays/called_walks.py; else 0
 
 
 @wp.struct
 class Hit:
-    """Where a ray meets the scene, in the world. Normals point out of the shape, whichever side the ray comes from."""
+    """Intersection of a ray with the scene, in the world. Normals point out of the shape, from either side."""
 
     t: wp.float32
     shape: wp.int32  # index of the object or proxy, -1 for none
@@ -207,20 +208,24 @@ class Picture:
     linear: wp.array2d[wp.vec3]  # linear radiance of a frame of more than 8 bits; empty: the codes are all
 
 
+def filled(record: Any, **values: Any) -> Any:
+    """Set the fields of a structure; one that is None stays as it is: empty."""
+    for name, value in values.items():
+        if value is not None:
+            setattr(record, name, value)
+    return record
+
+
 def make_picture(
     frame: wp.array | None, decode_table: wp.array | None, rays: wp.array | None, linear: wp.array | None = None
 ) -> Picture:
     """The arrays of a picture together; None for what a kernel does not read."""
-    picture = Picture()
-    for name, value in (("frame", frame), ("decode_table", decode_table), ("rays", rays), ("linear", linear)):
-        if value is not None:
-            setattr(picture, name, value)
-    return picture
+    return filled(Picture(), frame=frame, decode_table=decode_table, rays=rays, linear=linear)
 
 
 @wp.struct
 class EnvironmentView:
-    """What is seen of the environment, (h, w) each: in one frame, in merged exposures, or over frames."""
+    """Observation of the environment, (h, w) each: in one frame, in merged exposures, or over frames."""
 
     radiance: wp.array2d[wp.vec3]  # linear; 0 where confidence is 0
     confidence: wp.array2d[wp.float32]  # 0..1; 0 or NaN: not seen
@@ -229,9 +234,7 @@ class EnvironmentView:
 
 def make_environment_view(radiance: wp.array, confidence: wp.array, clipped: wp.array) -> EnvironmentView:
     """The arrays of a view together."""
-    view = EnvironmentView()
-    view.radiance, view.confidence, view.clipped = radiance, confidence, clipped
-    return view
+    return filled(EnvironmentView(), radiance=radiance, confidence=confidence, clipped=clipped)
 
 
 @wp.struct

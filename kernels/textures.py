@@ -28,7 +28,7 @@ MIN_SLANT = wp.constant(wp.float32(1.0 / 16.0))
 
 @wp.struct
 class SurfacePoint:
-    """Where a ray meets a surface, as pictures see it."""
+    """Point at which a ray meets a surface, as pictures see it."""
 
     uv: wp.vec2
     uv_second: wp.vec2

@@ -173,13 +173,11 @@ def axe_core() -> str:
     return (Path(package.__file__).parent / "axe.min.js").read_text()
 
 
-def serious_findings(page: Any) -> list[Any]:
-    """What axe-core, which the page must have, finds in it that hinders somebody."""
+def findings(page: Any) -> list[Any]:
+    """What axe-core, which the page must have, finds in it that hinders somebody, minor findings left out."""
     found = page.evaluate(f"axe.run({{runOnly: {list(WORKS)}}})")["violations"]
     return [
-        (one["id"], [node["html"] for node in one["nodes"]], one["help"])
-        for one in found
-        if one["impact"] in ("serious", "critical")
+        (one["id"], [node["html"] for node in one["nodes"]], one["help"]) for one in found if one["impact"] != "minor"
     ]
 
 

@@ -7,12 +7,13 @@ import os
 import pathlib
 import signal
 from collections.abc import Iterator
+from typing import Any
 
 import hypothesis
 import pytest
 import warp as wp
 
-from warp_ar.device import CPU_COMPILER_FLAGS
+from warp_ar.device import CPU_COMPILER_FLAGS, usable_cores
 
 wp.config.log_level = wp.LOG_WARNING
 # Kernels that a test launches by itself are then the same as those of pipelines and commands: compiled once.
@@ -31,6 +32,8 @@ hypothesis.settings.load_profile("ci")
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Options of this suite."""
     parser.addoption("--update-golden", action="store_true", help="write the golden frames anew instead of comparing")
+    parser.addoption("--all", action="store_true", help="tests marked slow as well, which a folder's run leaves out")
+    parser.addoption("--slow", action="store_true", help="the tests marked slow alone: what a plain run left out")
     parser.addoption("--long", action="store_true", help="hard cases at full length: millions of rays, 10,000 frames")
     parser.addoption("--atlas", type=pathlib.Path, metavar="FILE", help="write what covers which hard case, as JSON")
 
@@ -43,6 +46,7 @@ def pytest_configure(config: pytest.Config) -> None:
     for number in (signal.SIGINT, getattr(signal, "SIGHUP", signal.SIGINT)):
         if signal.getsignal(number) is signal.SIG_IGN:
             signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
+    config.addinivalue_line("markers", "slow: left out of runs of whole folders without --all")
     config.addinivalue_line("markers", "atlas(row, stage, method): hard case that a test covers; see hard_cases")
 
 
@@ -65,7 +69,7 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
         return
     if len(_devices()) > 1 or not all(pathlib.Path(argument).is_dir() for argument in config.args):
         return
-    processes = min(MOST_PROCESSES, _cores())
+    processes = min(MOST_PROCESSES, usable_cores())
     if processes > 1:
         # Tests differ in length by a factor of a thousand: whoever is done takes from the others.
         option.numprocesses, option.dist = processes, "worksteal"
@@ -73,12 +77,8 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Note in every report which hard cases a test covers."""
+    """Note in every report which hard cases a test covers; leave slow tests out of runs of whole folders."""
     from tests.hard_cases import atlas
 
     for item in items:
@@ -87,6 +87,28 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     # Every process of a run that is spread has collected the same.
     if config.getoption("--atlas") and getattr(config, "workerinput", {}).get("workerid", "gw0") == "gw0":
         atlas.write_collection(items, config.getoption("--atlas"))
+    if config.getoption("--slow"):
+        _deselect(config, items, [item for item in items if item.get_closest_marker("slow") is None])
+    elif _is_plain(config):
+        _deselect(config, items, [item for item in items if item.get_closest_marker("slow") is not None])
+
+
+def _deselect(config: pytest.Config, items: list[pytest.Item], left_out: list[pytest.Item]) -> None:
+    config.hook.pytest_deselected(items=left_out)
+    gone = set(left_out)
+    items[:] = [item for item in items if item not in gone]
+
+
+def _is_plain(config: pytest.Config) -> bool:
+    """Return True for a run of whole folders that asks for no slow tests."""
+    asked = config.getoption("--all") or config.getoption("--slow")
+    return not asked and all(pathlib.Path(argument).is_dir() for argument in config.args)
+
+
+def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
+    """Say what a plain run left out."""
+    if _is_plain(config):
+        terminalreporter.write_line("Tests marked slow were left out: --all runs everything, --slow these alone.")
 
 
 def _devices() -> list[str]:

@@ -10,11 +10,7 @@ from warp_ar.kernels.environment.environment_samples import EnvironmentSample, S
 from warp_ar.kernels.objects.reflect import DistantLight, DistantLightConfig
 from warp_ar.kernels.rays.trace import TraceConfig
 from warp_ar.kernels.receiver import environment_shadow, environment_shadow_filter, environment_shadow_wavefront
-from warp_ar.kernels.receiver.environment_shadow_cells import (
-    EnvironmentShadowConfig,
-    ShadowCells,
-    shaded_shape,
-)
+from warp_ar.kernels.receiver.environment_shadow import EnvironmentShadowConfig, ShadowCells, shaded_shape
 from warp_ar.kernels.structs import (
     LAMBERT,
     MESH,
@@ -152,9 +148,11 @@ def run(
     picture = make_picture(frame, tables()[0], rays)
     sets = SampleSets()
     sets.directions, sets.flux, sets.samples = drawn
-    environment_shadow.shade_environment(
-        config, params, picture, scene, surroundings, sets, cells, wave=wave, rows=rows
-    )
+    given = params, picture, scene, surroundings, sets
+    if wave is None:
+        environment_shadow.shade_environment(config, *given, cells, rows=rows)
+    else:
+        environment_shadow_wavefront.shade_wavefront(config, given, cells, wave)
     if not filtered:
         return cells.ratio.numpy()[..., :3], cells.surface.numpy()
     # Around cells that are not shaded nothing is averaged, and tiles in which no cell differs from 1 are passed by.

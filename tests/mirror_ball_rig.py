@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import warp as wp
 
@@ -101,12 +103,8 @@ def run(
     out=None,
     irradiance=None,
     config=None,
-    later=False,
 ):
-    """The change of radiance, (H, W, 3); objects are lit by ``lights`` and the even environment ``irradiance``.
-
-    If ``later``, shadows are added when the rest is known.
-    """
+    """The change of radiance, (H, W, 3); objects are lit by ``lights`` and the even environment ``irradiance``."""
     frame = grey_frame() if frame is None else frame
     trace = TraceConfig(kinds(objects), kinds(proxies))
     models = tuple(sorted({one["model"] for one in materials}))
@@ -133,12 +131,7 @@ def run(
     surroundings = even_light(np.ones(3) if irradiance is None else irradiance)
     given = config, params, scene, records(Light, *lights), surroundings, receiver
     ratio = None if ratio is None else wp.array(ratio.astype(np.float32), dtype=wp.vec3)
-    if later:
-        shows = wp.full((H, W), wp.vec2(7.0, 7.0), dtype=wp.vec2)
-        mirror_ball.mirror_ball(*given, None, out, shows_out=shows)
-        mirror_ball.shade_mirrored(params, receiver.picture, ratio, shows, out)
-    else:
-        mirror_ball.mirror_ball(*given, ratio, out, samples=samples, rows=rows)
+    mirror_ball.mirror_ball(*given, ratio, math.isqrt(samples), out, rows=rows)
     return out.numpy()
 
 

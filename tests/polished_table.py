@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 
 import cv2
@@ -15,7 +16,6 @@ from warp_ar.scene import loads_scene
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 330.0
 VIEWS = 7
-MIDDLE = VIEWS // 2
 RAYS = 8
 """Per pixel of the table, for what it mirrors."""
 HALF = np.array([0.8, 0.7])
@@ -94,10 +94,9 @@ class Film:
     views: list
     """RGB and ``camera_from_world``."""
     about: str
-    there: np.ndarray | None = None
-    """The view in the middle with the block that the program is not told of; None without one."""
 
-    def capture(self):
+    @functools.cached_property
+    def captured(self):
         """The environment as the ball shows it, nothing recovered."""
         quality = PRESETS["medium"].with_methods(recover="clipped")
         with Pipeline(self.scene, device="cpu", quality=quality, outputs=("environment",)) as pipeline:
@@ -127,23 +126,18 @@ def _photograph(exposed, rng):
     return np.round(255.0 * codes).astype(np.uint8)
 
 
+@functools.cache
 def film(
     seed,
     roughness,
     reflectance,
     *,
-    environment=None,
     clutter=False,
     spoil: Spoil | None = None,
-    standing: Callable[[np.ndarray], Block] | None = None,
 ) -> Film:
-    """Seven views, 44 degrees around a table with a card and a ball, by sRGB codes with a sensor's noise.
-
-    ``environment`` is ``FINE`` latlong radiance, turned as the seed says; None: a room. ``standing`` gives a block by
-    the ball's centre: it stands in one more picture, and in no view.
-    """
+    """Seven views, 44 degrees around a table with a card and a ball, by sRGB codes with a sensor's noise."""
     rng = np.random.default_rng(seed)
-    environment = room(rng) if environment is None else np.roll(environment, int(rng.integers(FINE[1])), axis=1)
+    environment = room(rng)
     radius, turn = float(rng.choice([0.03, 0.04, 0.05])), rng.uniform(0.0, 2.0 * np.pi)
     off = radius + 0.06 + rng.uniform(0.01, 0.06)
     ball = np.array([off * np.cos(turn), 0.6 * off * np.sin(turn), radius])
@@ -158,7 +152,7 @@ def film(
     target = np.array([*(0.5 * ball[:2]), 0.02])
     pixels = np.stack([*np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))], -1).reshape(-1, 2)
     local = np.column_stack([(pixels - [(WIDTH - 1) / 2, (HEIGHT - 1) / 2]) / FOCAL, np.ones(len(pixels))])
-    views, exposure, there = [], 0.0, None
+    views, exposure = [], 0.0
     for number, step in enumerate(np.linspace(-1.0, 1.0, VIEWS)):
         up, around = np.radians(elevation + 7.0 * np.sin(3.0 * step)), azimuth + np.radians(22.0) * step
         away = np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
@@ -171,12 +165,6 @@ def film(
         exposure = exposure or float(rng.uniform(0.25, 0.7) / np.percentile(linear.mean(-1), 75))
         exposed = exposure * linear if spoil is None else spoil(exposure * linear, number)
         views.append((_photograph(exposed, rng), Pose(rotation, -rotation @ eye)))
-        if standing is not None and number == MIDDLE:
-            both = [*blocks, standing(ball)]
-            more = PolishedWorld(environment, (ball, radius, BALL_REFLECTS), both, [], table, card)
-            own = np.random.default_rng(seed)  # of its own: the views are those of a film without it
-            more.polish(roughness, reflectance, own)
-            there = _photograph(exposure * more.trace(eye, rays).reshape(HEIGHT, WIDTH, 3), own)
     scene = loads_scene(
         f"schema = 1\n[camera]\nwidth = {WIDTH}\nheight = {HEIGHT}\nfx = {FOCAL}\nfy = {FOCAL}\n"
         f'cx = {(WIDTH - 1) / 2}\ncy = {(HEIGHT - 1) / 2}\ntransfer = "srgb"\n'
@@ -184,4 +172,4 @@ def film(
         f"[probe]\ncenter = {ball.tolist()}\nradius = {radius}\nreflectance = {[BALL_REFLECTS] * 3}\n"
         f'[[proxy]]\nshape = "plane"\nsize = {(2.0 * HALF).tolist()}\n'
     )
-    return Film(scene, views, f"{seed}: texture {amplitude}, from {elevation:.0f} degrees", there)
+    return Film(scene, views, f"{seed}: texture {amplitude}, from {elevation:.0f} degrees")

@@ -85,7 +85,7 @@ class View:
             tuple(sorted({int(item["kind"]) for item in objects})), kinds if scene is None else (BOX, PLANE, MESH)
         )
         self.relight = RelightConfig("reflectance", trace, "sh" if irradiance is None else "map", bool(probes), **forms)
-        self.config = receiver_cells.CellConfig(self.relight)
+        self.config = self.relight
         self.size = size
         self.params = records(
             FrameParams,
@@ -174,7 +174,7 @@ class View:
     def light(self, cells=None, rows=None, **forms):
         out = wp.full(self.size, wp.vec3(9.0, 9.0, 9.0), dtype=wp.vec3)
         config = dataclasses.replace(self.relight, **forms)
-        relight.relight(config, self.params, self.scene, self.lights, self.receiver(cells), out, rows=rows)
+        relight.relight(config, self.params, self.scene, self.lights, self.receiver(cells), out, None, rows=rows)
         return out.numpy()
 
 

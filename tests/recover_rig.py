@@ -12,13 +12,11 @@ from tests.reference import recover as reference
 from warp_ar.kernels import structs
 from warp_ar.kernels.recovery import recover as kernels
 from warp_ar.kernels.recovery.recover_cells import CELL_COLUMNS, CELL_ROWS, Cell
-from warp_ar.light import recovery
+from warp_ar.light import recovery, solving
 from warp_ar.light import surfaces as light_surfaces
-from warp_ar.light.solving_process import SolvingPool
 from warp_ar.scene import loads_scene
 from warp_ar.scene.kinds import trace_config
 from warp_ar.scene.ray_scene import HostScene
-from warp_ar.stages import recover as recover_stage
 
 SCENE = """
 schema = 1
@@ -60,9 +58,9 @@ def scene():
 
 def solve_here(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let this process make all estimates of a test: one that another test has left would count for itself."""
-    pool = SolvingPool(1)
-    pool.close()
-    monkeypatch.setattr(recover_stage, "POOL", pool)
+    process = solving.SolvingProcess()
+    process.close()
+    monkeypatch.setattr(solving, "PROCESS", process)
 
 
 def probes_of(device, center=(-0.12, 0.03, 0.035), radius=0.035, reflectance=0.85):
@@ -103,7 +101,7 @@ def cells_of(device, radiance=1.0, clipped=0.0):
 def transfer_of(device, points, cells, probes, scene, proxies=()):
     out = [wp.zeros((len(points), CELL_ROWS * CELL_COLUMNS), dtype=wp.float32, device=device) for _ in range(2)]
     traced = wp.zeros(len(points), dtype=wp.int32, device=device)
-    kernels.trace_transfer(points, seen(device, len(points)), cells, probes, scene, traced, *out, proxies=proxies)
+    kernels.trace_transfer(proxies, points, seen(device, len(points)), cells, probes, scene, traced, *out)
     return [array.numpy().astype(float) for array in out]
 
 
@@ -128,9 +126,7 @@ class DistantLight:
     def trace(self, emitters):
         out = wp.zeros((len(self.surfaces.points), len(emitters)), dtype=wp.float32, device=self.device)
         emitters = wp.array(emitters, dtype=wp.vec4, device=self.device)
-        kernels.trace_emitters(
-            self.points, self.seen, emitters, self.probes, self.host.ray_scene, out, proxies=self.proxies
-        )
+        kernels.trace_emitters(self.proxies, self.points, self.seen, emitters, self.probes, self.host.ray_scene, out)
         return out.numpy().astype(float)
 
     def equations(self, radiance, extra=0.0, exposure=1.0):

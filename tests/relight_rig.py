@@ -9,17 +9,7 @@ from warp_ar.kernels.edges import EdgeLists
 from warp_ar.kernels.rays.trace import TraceConfig
 from warp_ar.kernels.receiver import relight
 from warp_ar.kernels.receiver.receiver import RelightConfig, make_receiver
-from warp_ar.kernels.structs import (
-    PLANE,
-    POINT,
-    FrameParams,
-    KeyLight,
-    Light,
-    Probe,
-    RayScene,
-    Shape,
-    make_picture,
-)
+from warp_ar.kernels.structs import PLANE, POINT, FrameParams, KeyLight, Light, Probe, RayScene, Shape, make_picture
 
 H, W = 48, 64
 # Points on the desk are computed in float32, 1e-7 of a metre or so; lights are decimetres away and 1/d^2 doubles that.
@@ -97,7 +87,7 @@ def run(
         irradiance=surroundings,
         others=others,
     )
-    relight.relight(config, params, scene, records(Light, *lights), receiver, out, rows=rows)
+    relight.relight(config, params, scene, records(Light, *lights), receiver, out, None, rows=rows)
     return out.numpy()
 
 

@@ -1,18 +1,14 @@
 """A desk with mirror balls under a lamp nearby, rendered in float64, and the light anywhere on it.
 
 The lamp is a ball of one radiance above the desk's left half, the room behind it nearly dark: what a mirror ball shows
-depends on where it stands. The desk is matt, and a printed card may lie at the origin. Balls are not mirrored in each
-other, here as in what is taken to be true, and throw the lamp's shadow and mirror the lamp onto the desk only where a
-desk is told of them.
+depends on where it stands. The desk is matt. Balls are not mirrored in each other, and throw no shadow.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,59 +26,6 @@ class Desk:
     lamp: float = 1.1
     albedo: tuple[float, float, float] = (0.5, 0.4, 0.3)
     room: tuple[float, float, float] = (0.04, 0.05, 0.07)
-    card: float = 0.0
-    """Side of the black square of marker 0 of DICT_4X4_50; 0: there is no card."""
-    white: float = 0.85
-    ink: float = 0.04
-    balls: tuple[Ball, ...] = ()
-    """What stands between lamp and desk."""
-
-
-SHADOW = 64
-"""Points of the lamp that a shadow is found by: a share of it is known to a hundredth."""
-PAPER = 1.5
-"""Side of the card's paper, over that of its black square."""
-
-
-@functools.cache
-def _print() -> NDArray[np.uint8]:
-    pattern = cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), 0, 120)
-    return np.pad(np.asarray(pattern, np.uint8), 30, constant_values=255)
-
-
-def _albedo(desk: Desk, points: Array) -> Array:
-    """Of the desk and the card on it, (n, 3)."""
-    out = np.broadcast_to(np.array(desk.albedo), points.shape).copy()
-    half = 0.5 * PAPER * desk.card
-    on = np.abs(points[:, :2]).max(-1) < half
-    cells = len(_print())
-    j, i = ((0.5 * (s * points[on, k] / max(half, 1e-9) + 1.0) * cells).astype(int) for k, s in ((0, 1), (1, -1)))
-    out[on] = np.where(_print()[np.minimum(i, cells - 1), np.minimum(j, cells - 1)] > 0, desk.white, desk.ink)[:, None]
-    return out
-
-
-def _lit_share(desk: Desk, points: Array) -> Array:
-    """Share of the lamp that points of the desk see past the balls, (n,)."""
-    seen = np.ones((len(points), SHADOW), bool)
-    k = np.arange(SHADOW) + 0.5
-    ring, turn = np.sqrt(k / SHADOW), k * math.pi * (3.0 - math.sqrt(5.0))
-    # The disk that the lamp is from below; from the side it is a little too narrow.
-    lamp = np.array(desk.lamp_at) + desk.lamp_radius * np.column_stack(
-        [ring * np.cos(turn), ring * np.sin(turn), 0 * k]
-    )
-    for center, radius, _ in desk.balls:
-        # Only what lies near the line from the lamp through the ball.
-        away, toward = points - np.array(desk.lamp_at), np.array(center) - np.array(desk.lamp_at)
-        along = away @ toward / (toward @ toward)
-        near = np.flatnonzero(
-            np.linalg.norm(away - along[:, None] * toward, axis=-1) < (radius + desk.lamp_radius) * (1.0 + 2.0 * along)
-        )
-        d = lamp - points[near, None]
-        d /= np.linalg.norm(d, axis=-1, keepdims=True)
-        b = ((np.array(center) - points[near, None]) * d).sum(-1)
-        square = ((np.array(center) - points[near]) ** 2).sum(-1)[:, None]
-        seen[near] &= (b < 0.0) | (square - b * b > radius**2)
-    return np.asarray(seen.mean(-1), float)
 
 
 def _lamp_irradiance(desk: Desk, points: Array, normals: Array) -> Array:
@@ -91,54 +34,6 @@ def _lamp_irradiance(desk: Desk, points: Array, normals: Array) -> Array:
     squared = (toward * toward).sum(-1)
     cosine = (toward * normals).sum(-1) / np.sqrt(squared)
     return np.asarray(math.pi * desk.lamp * desk.lamp_radius**2 / squared * np.maximum(cosine, 0.0), float)
-
-
-def mirrored_irradiance(desk: Desk, points: Array) -> Array:
-    """Of the desk at points (n, 3) by the lamp's light that balls mirror, the lamp small: a point, (n,).
-
-    In the plane through lamp L, ball C and point, angles at C from CL: a ray leaves L at alpha(phi), meets the ball of
-    radius R at phi, its angle of incidence i = phi + alpha, and goes on toward psi = 2 phi + alpha. It passes the point
-    (rho, theta), where rho sin(psi - theta) = R sin i. With s from ball to point the flux of a tube of rays is spread
-    over rho sin(theta) (R cos(i) + s (2 + alpha')) dphi, where alpha' = R (D cos(phi) - R) / (D^2 + R^2 - 2 D R
-    cos(phi)) is dalpha/dphi and D = |CL|: irradiance of a surface that faces the ray is
-
-        I sin(alpha) alpha' / (rho sin(theta) (R cos(i) + s (2 + alpha'))).
-    """
-    out = np.zeros(len(points))
-    for center, radius, reflectance in desk.balls:
-        to_lamp, to_point = np.array(desk.lamp_at) - np.array(center), points - np.array(center)
-        far, rho = float(np.linalg.norm(to_lamp)), np.linalg.norm(to_point, axis=-1)
-        axis = to_lamp / far
-        across = to_point - np.outer(to_point @ axis, axis)
-        theta = np.arctan2(np.maximum(np.linalg.norm(across, axis=-1), 1e-9 * radius), to_point @ axis)
-        across /= np.linalg.norm(across, axis=-1, keepdims=True) + 1e-30
-
-        def leaving(phi: Array, far: float = far, radius: float = radius) -> Array:
-            """Angle alpha."""
-            return np.arctan2(radius * np.sin(phi), far - radius * np.cos(phi))
-
-        grazing = math.acos(radius / far)
-        low, high = np.zeros(len(points)), np.minimum(theta, grazing)
-        for _ in range(50):  # psi grows with phi; the mirrored ray of phi = 0 passes on the axis' side
-            middle = 0.5 * (low + high)
-            incidence = middle + leaving(middle)
-            inside = rho * np.sin(np.minimum(theta - incidence - middle, 0.5 * math.pi)) > -radius * np.sin(incidence)
-            low, high = np.where(inside, middle, low), np.where(inside, high, middle)
-        phi = 0.5 * (low + high)
-        alpha = leaving(phi)
-        incidence = phi + alpha
-        place = radius * (np.cos(phi)[:, None] * axis + np.sin(phi)[:, None] * across)
-        ray = to_point - place
-        s = np.linalg.norm(ray, axis=-1)
-        turned = radius * (far * np.cos(phi) - radius) / (far**2 + radius**2 - 2.0 * far * radius * np.cos(phi))
-        width = rho * np.sin(theta) * (radius * np.cos(incidence) + s * (2.0 + turned))
-        intensity = reflectance * desk.lamp * math.pi * desk.lamp_radius**2
-        shown = (rho > radius) & (phi < grazing - 1e-6)
-        # The other root of the equation, behind the ball, is no ray.
-        shown &= (ray * place).sum(-1) > 0.0
-        given = intensity * np.sin(alpha) * turned / width * np.maximum(-ray[:, 2] / s, 0.0)
-        out[shown] += given[shown]
-    return out
 
 
 def radiance(desk: Desk, origins: Array, directions: Array) -> Array:
@@ -150,8 +45,8 @@ def radiance(desk: Desk, origins: Array, directions: Array) -> Array:
     down = (d[:, 2] < 0.0) & (t > 0.0)
     points = o[down] + t[down, None] * d[down]
     up = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
-    direct = _lamp_irradiance(desk, points, up) * _lit_share(desk, points) + mirrored_irradiance(desk, points)
-    out[down] = _albedo(desk, points) / math.pi * (direct[:, None] + math.pi * np.array(desk.room))
+    direct = _lamp_irradiance(desk, points, up)
+    out[down] = np.array(desk.albedo) / math.pi * (direct[:, None] + math.pi * np.array(desk.room))
     off = o - np.array(desk.lamp_at)
     along = (off * d).sum(-1)
     seen = (along < 0.0) & (along**2 - (off * off).sum(-1) + desk.lamp_radius**2 > 0.0)

@@ -11,7 +11,7 @@ import warp as wp
 from tests.kernel_rig import SMALL_CAMERA
 from tests.reference import area_lights as twin
 from warp_ar.errors import SceneError
-from warp_ar.kernels.rays.area_lights import AreaSample, area_numbers, find_share, make_area_count, make_area_sample
+from warp_ar.kernels.rays.area_lights import AreaSample, area_numbers, make_area_count, make_area_sample
 from warp_ar.kernels.structs import RayScene
 from warp_ar.scene import AreaLight, Camera, EmissiveMaterial, Object, Scene, dumps_scene, loads_scene
 from warp_ar.scene.ray_scene import HostScene
@@ -64,12 +64,6 @@ def draw_kernel(
     i = wp.tid()
     samples_out[i] = area_sample(scene, points[i], wp.vec3(0.0, 0.0, 1.0), i % N, N, wp.float32((i / N) % 16) / 16.0)
     numbers_out[i] = area_numbers(i % N, N, wp.float32((i / N) % 16) / 16.0)
-
-
-@wp.kernel(enable_backward=False, module="unique")
-def find_kernel(shares: wp.array[wp.float32], picks: wp.array[wp.float32], found_out: wp.array[wp.int32]):
-    i = wp.tid()
-    found_out[i] = find_share(shares, picks[i])
 
 
 def host(*items: AreaLight | Object, device: str = "cpu") -> HostScene:
@@ -260,15 +254,6 @@ def test_linear_pictures_keep_their_range(device, tmp_path):
     assert found == pytest.approx(0.5 / 25.0 * picture.mean(), rel=0.05)
 
 
-def test_shares_are_found_at_their_borders(device):
-    shares = wp.array(np.array([0.25, 0.25, 0.75, 1.0], np.float32), dtype=wp.float32, device=device)
-    picks = np.array([0.0, 0.2499, 0.25, 0.7499, 0.75, 0.99999994], np.float32)
-    found = wp.zeros(len(picks), dtype=wp.int32, device=device)
-    inputs = [shares, wp.array(picks, dtype=wp.float32, device=device)]
-    wp.launch(find_kernel, len(picks), inputs, [found], device=device)
-    assert found.numpy().tolist() == [0, 0, 2, 2, 3, 3]
-
-
 TEXT = f"""schema = 1
 {SMALL_CAMERA}[marker]
 size = 0.08
@@ -310,13 +295,3 @@ def test_what_is_wrong_is_said_with_its_key(kind, keys, complaint):
         loads_scene(TEXT.format(kind=kind) + keys)
     assert complaint in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_the_page_knows_them():
-    from warp_ar.stages.quality import PRESETS
-    from warp_ar.viewer.edits import Wanted, wanted_record
-
-    scene = loads_scene(TEXT.format(kind="rect") + "size = [0.2, 0.1]")
-    (item,) = wanted_record(Wanted(scene, PRESETS["medium"]))["objects"]
-    assert (item["shape"], item["material"]["model"], item["material"]["intensity"]) == ("rect", "emissive", 2.0)
-    assert item["reach"] == pytest.approx(0.5 * np.hypot(0.2, 0.1))

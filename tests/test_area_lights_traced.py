@@ -35,6 +35,8 @@ from warp_ar.scene import (
 from warp_ar.scene.pixel_rays import pixel_rays
 from warp_ar.scene.ray_scene import HostScene
 
+pytestmark = pytest.mark.slow
+
 CAMERA = Camera(32, 24, 40.0, 40.0, 15.5, 11.5)
 NIGHT = np.zeros((8, 16, 3), np.float32)
 RHO = 0.6

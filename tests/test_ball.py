@@ -13,6 +13,8 @@ from warp_ar.ball.ball import BallView, fit_ball
 from warp_ar.scene import Camera, Marker, Pose, Probe, Proxy, Scene, load_scene
 from warp_ar.session import Session
 
+pytestmark = pytest.mark.slow
+
 FOUND_MM = 0.4
 """Blurred look-ups against area-sampled reflections, codes of 8 bits; measured 0.13."""
 FOUND_HARD_MM = 0.6

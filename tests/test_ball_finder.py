@@ -6,12 +6,15 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.photo_files import encode_srgb
 from tests.photo_room import exposed, photograph, sphere
 from tests.rendered_room import Room, look_at, render
 from warp_ar.ball.ball_finder import far_camera, find_ball, silhouette, silhouettes, sphere_of_circle
 from warp_ar.ball.ball_rim import gradients, radial_compression
 from warp_ar.errors import UsageError
 from warp_ar.scene import Camera
+
+pytestmark = pytest.mark.slow
 
 CLOSE = 0.5
 """Pixels: a fifth is the median over many pictures; of one, the worst of three unknowns is this."""
@@ -41,6 +44,16 @@ def test_outline_from_a_rough_circle(picture, off):
     assert np.allclose(toward, sphere() / np.linalg.norm(sphere()), atol=2e-3)
 
 
+@pytest.mark.parametrize("blur", [0.8, 1.1])
+def test_a_soft_picture_s_outline_says_how_far_it_may_be_off(blur):
+    linear = cv2.GaussianBlur(0.5 * photograph()[0], (0, 0), blur)
+    camera = photograph()[1]
+    x, y, r = ellipse(camera, sphere())
+    found = find_ball(encode_srgb(linear).astype(np.uint8), camera, (x, y, r))
+    error = np.array([found.center[0] - x, found.center[1] - y, found.radius - r])
+    assert (np.abs(error) < 2.0 * np.array(found.deviation)).all()
+
+
 def test_outline_from_nothing(picture):
     camera = photograph()[1]
     x, y, r = ellipse(camera, sphere())
@@ -61,18 +74,6 @@ def test_a_stand_and_a_wide_lens():
     assert np.abs([found.center[0] - x, found.center[1] - y, found.radius - r]).max() < CLOSE
     # Off the axis the silhouette is an ellipse: two half axes that a circle would mix up.
     assert found.axes[0] / found.axes[1] > 1.02
-
-
-def test_gradients_are_radial_inside_the_rim_alone(picture):
-    camera = photograph()[1]
-    slopes = gradients(picture)
-    points, normals = silhouette(camera, sphere())
-    _, _, r = ellipse(camera, sphere())
-    outlines = np.stack([points, points - 0.2 * r * normals, points + 0.3 * r * normals])
-    radii = r * np.array([1.0, 0.8, 1.3])
-    at_rim, inside, outside = radial_compression(slopes, outlines, np.broadcast_to(normals, outlines.shape), radii)
-    assert at_rim > 1.0
-    assert max(inside, outside) < 0.5 * at_rim
 
 
 def test_spheres_and_circles_agree():
@@ -113,8 +114,3 @@ def test_bad_circles_and_pictures_without_a_ball():
         find_ball(noise)
     with pytest.raises(UsageError, match="column, row and radius"):
         find_ball(noise, rough=(10.0, 10.0, 1.0))
-
-
-def test_whole_numbers_are_a_circle_too():
-    camera = far_camera(400, 300)
-    assert np.allclose(sphere_of_circle(camera, 120, 90, 50), sphere_of_circle(camera, 120.0, 90.0, 50.0))

@@ -9,9 +9,8 @@ import pytest
 from tests.test_drift import POSE, encode, linear_picture
 from tests.test_drift import SCENE as WITHOUT_ROOM
 from warp_ar import PRESETS, Pipeline
-from warp_ar.ball.ball_occlusion import CELLS, DARK, PATIENCE, BallCover
+from warp_ar.ball.ball_occlusion import PATIENCE, BallCover
 from warp_ar.calibration.saturation import ball_discs
-from warp_ar.kernels.color import decode_table
 from warp_ar.scene import Pose, loads_scene
 from warp_ar.sources.deep_frame import Plate
 
@@ -72,66 +71,6 @@ def watch_plates(images, plates):
         cover.observe(image, [disc(scene)], POSE, STEP * index, np.ones(3), plate)
         for index, (image, plate) in enumerate(zip(images, plates, strict=True))
     ]
-
-
-def test_cells_are_means_of_four_samples():
-    """Each where a disc's cell has it; cells that reach out of the picture are not seen."""
-    scene = loads_scene(SCENE)
-    cover, image = BallCover(scene, scene.camera), encode(picture(scene))
-    image = np.random.default_rng(1).integers(0, 256, image.shape, np.uint8)
-    table, gain = decode_table(scene.camera.transfer).astype(float), np.array([0.7, 0.8, 1.1])
-    height, width = image.shape[:2]
-    for x, y, radius in (disc(scene), (3.2, 60.7, 20.3), (width - 1.0, 2.0, 9.5), (50.0, 40.0, 0.2)):
-        side, found = 2.0 * max(radius, 1.0) / CELLS, []
-        for row in range(CELLS):
-            for column in range(CELLS):
-                if np.hypot(2 * (row + 0.5) / CELLS - 1, 2 * (column + 0.5) / CELLS - 1) >= 0.9:
-                    continue
-                places = [
-                    (round(y - max(radius, 1.0) + side * (row + v)), round(x - max(radius, 1.0) + side * (column + u)))
-                    for v in (0.25, 0.75)
-                    for u in (0.25, 0.75)
-                ]
-                if all(0 <= v < height and 0 <= u < width for v, u in places):
-                    codes = np.mean([image[place].astype(float) for place in places], axis=0)
-                    light = [np.interp(codes[c], np.arange(256), table[:, c]) for c in range(3)]
-                    found.append(np.log(light / gain + DARK))
-                else:
-                    found.append(np.full(3, np.nan))
-        np.testing.assert_allclose(cover._cells(image, (x, y, radius), gain), np.array(found).T, rtol=1e-12, atol=1e-12)
-
-
-def test_a_fast_camera_is_looked_at_no_more_than_a_hand_moves():
-    """Frames within 8 ms of a look take what it found; those of 60 and 120 a second are all looked at."""
-    scene = loads_scene(SCENE)
-    bare, hand = encode(picture(scene)), encode(with_hand(picture(scene), scene))
-    cover = BallCover(scene, scene.camera)
-    assert not cover.rests(0.0), "nothing has been seen yet"
-    for index, image in enumerate((bare, bare, hand)):
-        now = index / 120.0
-        assert not cover.rests(now)
-        cover.observe(image, [disc(scene)], POSE, now, np.ones(3))
-    assert cover.is_covered
-    assert cover.rests(now + 0.001)
-    assert cover.rests(now + 0.0079)
-    assert not cover.rests(now + 1 / 120.0)
-    assert not cover.rests(now), "a frame of the same time is another frame"
-    cover.forget()
-    assert not cover.rests(now + 0.001)
-
-
-def test_codes_of_8_bits_are_read_alike_from_a_plate():
-    """And from nothing else: the picture beside it is black."""
-    scene = loads_scene(SCENE)
-    bare = encode(picture(scene))
-    frames = [bare, bare, encode(with_hand(picture(scene), scene)), bare]
-    plates = [Plate(frame.astype(np.uint16) * 257) for frame in frames]
-    assert watch_plates([np.zeros_like(bare)] * 4, plates) == [False, False, True, False]
-    cover = BallCover(scene, scene.camera)
-    for gain in (np.ones(3), np.array([0.7, 0.8, 1.1])):
-        for x, y, radius in (disc(scene), (3.0, 60.0, 20.0)):  # the other one reaches out of the picture
-            codes, deep = (cover._cells(frames[2], (x, y, radius), gain, plate) for plate in (None, plates[2]))
-            np.testing.assert_array_equal(codes, deep)
 
 
 def test_a_white_hand_before_lamps_above_white_is_told_by_light():

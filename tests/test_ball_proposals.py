@@ -11,6 +11,8 @@ from warp_ar.ball.ball_finder import find_ball, lifted, silhouette
 from warp_ar.ball.ball_proposals import propose_circles
 from warp_ar.errors import UsageError
 
+pytestmark = pytest.mark.slow
+
 NEAR = 0.2
 """Share of the radius within which a proposal must be: a search begins there, which bears 0.22."""
 FOUND = 0.06

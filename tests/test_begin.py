@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import io
 import os
 import signal
 import subprocess
 import sys
 import threading
-import time
 
 import pytest
 
-from warp_ar import begin
 from warp_ar.__main__ import COMMANDS
 
-pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals as on POSIX")
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(os.name != "posix", reason="signals as on POSIX")]
 
 FIRST = "warp_ar.begin"
 """The module that commands begin with."""
@@ -83,34 +80,6 @@ def test_who_is_started_in_the_background_goes_on():
                 process.send_signal(signal.SIGINT)
         assert "desk" in process.stdout.read()
     assert process.returncode == 0
-
-
-class Terminal(io.StringIO):
-    """A stream that says it is a terminal, or not."""
-
-    def __init__(self, shown: bool) -> None:
-        super().__init__()
-        self.shown = shown
-
-    def isatty(self) -> bool:
-        return self.shown
-
-
-@pytest.mark.parametrize(
-    ("shown", "slow", "said"), [(True, True, "warp_ar: loading libraries\n"), (True, False, ""), (False, True, "")]
-)
-def test_imports_that_take_long_are_told_on_a_terminal(monkeypatch, shown, slow, said):
-    told = Terminal(shown)
-    monkeypatch.setattr(sys, "stderr", told)
-    monkeypatch.setattr(begin, "PATIENCE", 0.01 if slow else 60.0)
-    before = signal.getsignal(signal.SIGINT)
-    with begin.importing():
-        assert signal.getsignal(signal.SIGINT) is begin.end_at_once
-        until = time.monotonic() + (20.0 if said else 0.1)
-        while not told.getvalue() and time.monotonic() < until:
-            time.sleep(0.005)
-    assert told.getvalue() == said
-    assert signal.getsignal(signal.SIGINT) is before
 
 
 @pytest.mark.parametrize(("given", "expected"), [(None, "1"), ("3", "3")])

@@ -23,7 +23,7 @@ from warp_ar.output.layer_file import LayerFrame, LayerSink
 from warp_ar.output.shot import Shot
 from warp_ar.output.usd_file import write_usd
 from warp_ar.scene import Camera, Pose, load_scene
-from warp_ar.scene.pose_file import load_poses
+from warp_ar.scene.pose_file import load_pose_file
 
 BLENDER = os.environ.get("WARP_AR_BLENDER", "")
 LIGHT = 0.02  # relative: noise of 512 paths a pixel is 1 % and averaged, the ball's facets are 0.1 %
@@ -33,7 +33,10 @@ SCALE = 2.2  # of the camera: metres across
 PIXELS = 0.5  # of a picture that Blender renders: a sphere of three pixels, by its light's middle
 POSE = 2e-6  # Alembic and USD keep placements of Blender's float32
 FORMATS = pathlib.Path(__file__).parents[1] / "docs" / "formats.md"
-pytestmark = pytest.mark.skipif(not BLENDER, reason="needs Blender: name an interpreter with bpy in WARP_AR_BLENDER")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not BLENDER, reason="needs Blender: name an interpreter with bpy in WARP_AR_BLENDER"),
+]
 
 
 def run(command: list[str]) -> None:
@@ -159,7 +162,7 @@ def test_a_camera_in_alembic_becomes_usd_by_the_lines_of_the_docs(tmp_path: path
     lines = re.search(r"```python\n(# usd_of_alembic\.py.*?)```", FORMATS.read_text(), re.DOTALL)
     assert lines is not None
     run([BLENDER, "-c", lines[1], str(tmp_path / "a.abc"), str(tmp_path / "a.usda"), "25"])
-    poses = load_poses(tmp_path / "a.usda")
+    poses = load_pose_file(tmp_path / "a.usda").poses
     assert len(poses) == len(rows)
     for (rotation, translation), (place, (x, y, z)) in zip(poses, rows, strict=True):
         about = [cv2.Rodrigues(np.array(axis))[0] for axis in ((x, 0.0, 0.0), (0.0, y, 0.0), (0.0, 0.0, z))]

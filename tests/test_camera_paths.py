@@ -10,13 +10,12 @@ import pytest
 
 from tests.layer_rig import POSES, make_scene
 from warp_ar.errors import SceneError, SinkError
+from warp_ar.output.camera_files import track_angles, write_track
 from warp_ar.output.shot import Shot
-from warp_ar.output.track_file import track_angles, write_track
 from warp_ar.output.usd_file import write_usd
 from warp_ar.scene import Pose
-from warp_ar.scene.camera_paths import rotation_of_track
 from warp_ar.scene.geometry import rotation_matrix
-from warp_ar.scene.pose_file import load_poses
+from warp_ar.scene.pose_file import load_pose_file, rotation_of_track
 
 EXACT = 1e-9
 
@@ -39,7 +38,7 @@ def test_track_by_hand(tmp_path):
     path.write_text(
         json.dumps([{"transforms": [sample(pan=90.0, at=(1.0, 2.0, 3.0))]}, {"transforms": [sample(tilt=30)]}])
     )
-    (left, shift), (up, _) = load_poses(path)
+    (left, shift), (up, _) = load_pose_file(path).poses
     left, up = np.reshape(left, (3, 3)), np.reshape(up, (3, 3))
     np.testing.assert_allclose(left.T @ [0, 0, 1], [-1, 0, 0], atol=EXACT)
     np.testing.assert_allclose(left.T @ [0, 1, 0], [0, 0, -1], atol=EXACT)
@@ -53,7 +52,7 @@ def test_track_composes_its_transforms(tmp_path):
     path.write_text(
         json.dumps({"transforms": [sample(pan=90.0, at=(5.0, 0.0, 0.0)), sample(at=(0.0, 1.0, 0.5))]}) + "\n\n"
     )
-    ((rotation, translation),) = load_poses(path)
+    ((rotation, translation),) = load_pose_file(path).poses
     np.testing.assert_allclose(-np.reshape(rotation, (3, 3)).T @ translation, [4.0, 0.0, 0.5], atol=EXACT)
 
 
@@ -73,14 +72,14 @@ def shot():
 
 def test_what_is_exported_is_read_back(shot, tmp_path):
     write_track(tmp_path / "shot.jsonl", shot)
-    assert_poses(load_poses(tmp_path / "shot.jsonl"), POSES)
+    assert_poses(load_pose_file(tmp_path / "shot.jsonl").poses, POSES)
     first = json.loads((tmp_path / "shot.jsonl").read_text().splitlines()[0])
     assert first["timing"]["sampleRate"] == {"num": 24, "denom": 1}
     assert first["lens"]["pinholeFocalLength"] == pytest.approx(36.0 * 70.0 / 64.0)
     pytest.importorskip("pxr.Usd", reason="needs usd-core, of the extra exchange")
     for suffix in (".usda", ".usdc"):
         write_usd(tmp_path / f"shot{suffix}", shot)
-        assert_poses(load_poses(tmp_path / f"shot{suffix}"), POSES)
+        assert_poses(load_pose_file(tmp_path / f"shot{suffix}").poses, POSES)
     with pytest.raises(SinkError, match="cannot be written"):
         write_track(tmp_path / "missing" / "shot.jsonl", shot)
 
@@ -107,7 +106,7 @@ def test_usd_of_another_program(tmp_path):
     # Unturned it looks along its -z, y up: the marker's +y with z up. Doubled by its rig, 20 cm high, 40 cm back.
     level = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
     expected = [Pose(level, -level @ np.array([x, -0.4, 0.2])) for x in (0.0, 0.5, 1.0)]
-    assert_poses(load_poses(tmp_path / "maya.usda"), expected, atol=1e-6)
+    assert_poses(load_pose_file(tmp_path / "maya.usda").poses, expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("rate", [24, 25, 30, 60])
@@ -121,7 +120,9 @@ def test_usd_that_says_time_codes_alone(tmp_path, rate):
         f'def Camera "c" {{\n  double3 xformOp:translate.timeSamples = {{ {samples} }}\n'
         '  uniform token[] xformOpOrder = ["xformOp:translate"]\n}\n'
     )
-    assert [round(-translation[0], 6) for _, translation in load_poses(tmp_path / "a.usda")] == list(range(1, 9))
+    assert [round(-translation[0], 6) for _, translation in load_pose_file(tmp_path / "a.usda").poses] == list(
+        range(1, 9)
+    )
 
 
 def test_colmap_binary_says_what_its_text_does(tmp_path):
@@ -134,10 +135,10 @@ def test_colmap_binary_says_what_its_text_does(tmp_path):
         points = struct.pack("<ddq", 1.0, 2.0, -1) * number
         data += struct.pack("<I7dI", number, *values, 1) + name + b"\0" + struct.pack("<Q", number) + points
     (tmp_path / "images.bin").write_bytes(data)
-    assert load_poses(tmp_path / "images.bin") == load_poses(tmp_path / "images.txt")
+    assert load_pose_file(tmp_path / "images.bin").poses == load_pose_file(tmp_path / "images.txt").poses
     (tmp_path / "cut.bin").write_bytes(data[:100])
     with pytest.raises(SceneError, match=r"cut\.bin: cut off after 100 bytes"):
-        load_poses(tmp_path / "cut.bin")
+        load_pose_file(tmp_path / "cut.bin")
 
 
 @pytest.mark.parametrize(
@@ -160,5 +161,5 @@ def test_files_that_are_none_are_named(tmp_path, capfd, name, text, words):
         pytest.importorskip("pxr.Usd", reason="needs usd-core, of the extra exchange")
     (tmp_path / name).write_text(text)
     with pytest.raises(SceneError, match=words):
-        load_poses(tmp_path / name)
+        load_pose_file(tmp_path / name)
     assert capfd.readouterr().err == "", "what USD would print is no message of ours"

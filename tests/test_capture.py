@@ -1,6 +1,7 @@
 """The command: photographs of a mirror ball become light, and light a picture."""
 
 import argparse
+import re
 
 import cv2
 import numpy as np
@@ -8,15 +9,19 @@ import pytest
 
 from tests.photo_files import write_photo
 from tests.photo_room import GAIN, environment, exposed, project, write_bracket
+from tests.test_photo_bracket import s_curve
 from warp_ar.ball.ball_finder import find_ball
 from warp_ar.capture import main
 from warp_ar.checks.checkup import check_up
 from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, EXIT_USAGE
-from warp_ar.light.captured import Light, latlong_directions, texel_solid_angles
+from warp_ar.light.captured import Light, irradiance_above, latlong_directions, texel_solid_angles
 from warp_ar.live import main as live
 from warp_ar.live_start import say_quick_check
-from warp_ar.photo_capture import capture_light
+from warp_ar.photo_capture import _rows_of, capture_light
+from warp_ar.photographs.support import plane_from_contact
 from warp_ar.scene import load_scene
+
+pytestmark = pytest.mark.slow
 
 BRACKET = (15, 60, 250, 1000, 4000)
 LIT = 0.12
@@ -36,9 +41,14 @@ def irradiance(radiance):
     return np.maximum(normals @ d.T, 0.0) @ (area * radiance.reshape(-1, 3))
 
 
+def reduced(light):
+    """A captured map at the size of the true one."""
+    return cv2.resize(light.radiance, (64, 32), interpolation=cv2.INTER_AREA)
+
+
 def error(light, denominator):
     """Of the irradiance, in units of the photograph at 1 / denominator."""
-    found = irradiance(cv2.resize(light.radiance, (64, 32), interpolation=cv2.INTER_AREA))
+    found = irradiance(reduced(light))
     true = irradiance(environment() * GAIN / denominator)
     return np.linalg.norm(found - true) / np.linalg.norm(true)
 
@@ -56,6 +66,7 @@ def test_a_bracket_becomes_light_and_a_picture(bracket, tmp_path, capsys):
     said = capsys.readouterr()
     assert "light in camera values of photo_b.jpg" in said.out
     assert "ball at" in said.err
+    assert "the ball reflects 0.8" in said.err
     light = Light.load(tmp_path / "light.exr")
     assert light.exposure == pytest.approx(1 / 60)
     assert error(light, 60) < LIT
@@ -104,6 +115,27 @@ def test_what_clips_in_one_photograph_is_raised_and_said(bracket):
     assert np.linalg.norm(one - true) < np.linalg.norm(other - true)
 
 
+def test_light_too_low_for_the_table_is_raised(bracket):
+    """Lamps that clip lack most of the light: under it the wood would reflect more than all of it."""
+
+    def under(outline, camera):
+        return plane_from_contact(outline.sphere, camera, project([0.0, 0.0, 0.0]))
+
+    raised, plain = (
+        capture_light(bracket[:1], support=under, reflectance=REFLECTANCE, device="cpu", raises=raises)
+        for raises in (True, False)
+    )
+    told = r"the table would reflect (\d\.\d+) of this light"
+    assert all(float(re.search(told, " ".join(found.notes))[1]) > 1.0 for found in (raised, plain))
+    assert any("what clips was raised" in note and "none reflects more" in note for note in raised.notes)
+    assert any(note.endswith("the light is too low") for note in plain.notes)
+    true, one, other = (
+        irradiance_above(light).mean()
+        for light in (environment() * GAIN / BRACKET[0], raised.light.radiance, plain.light.radiance)
+    )
+    assert abs(np.log(one / true)) < 0.7 * abs(np.log(other / true))
+
+
 def test_a_disc_that_mirrors_nothing_is_said(tmp_path):
     """The ring on the card where the ball belongs, a plate, a ball that is painted over."""
     image = np.random.default_rng(0).normal(120.0, 40.0, (120, 160, 3))
@@ -114,20 +146,46 @@ def test_a_disc_that_mirrors_nothing_is_said(tmp_path):
     assert any("the picture is flat: is a ball there" in note for note in found.notes)
 
 
-def test_the_outline_is_drawn(bracket, tmp_path, capsys):
-    drawn = tmp_path / "outline.png"
-    arguments = [str(bracket[1]), "--device", "cpu", "--output", str(tmp_path / "light.exr"), "--outline", str(drawn)]
+def test_an_exact_circle_is_taken_and_drawn_and_axes_and_rows_are_as_asked(bracket, tmp_path, capsys):
+    circle = 272.0, 226.0, 48.5
+    arguments = [str(bracket[1]), "--device", "cpu", "--circle", *map(str, circle), "--height", "64"]
+    arguments += ["--output", str(tmp_path / "light.exr")]
     assert main(arguments) == EXIT_DONE
     said = capsys.readouterr()
     assert "looking for the ball in 1 photograph" in said.err
-    photo, picture = cv2.imread(str(bracket[1])), cv2.imread(str(drawn))
+    assert "one photograph tells no response: srgb is taken" in said.err
+    photo, picture = cv2.imread(str(bracket[1])), cv2.imread(str(tmp_path / "light.outline.png"))
     rows, columns = np.nonzero((picture != photo).any(2))
-    found = capture_light(bracket[1:2], device="cpu").outline
-    off = np.hypot(columns - found.center[0], rows - found.center[1]) - found.radius
-    assert np.abs(off).max() < 2.5
-    assert len(rows) > 2 * np.pi * found.radius
-    # What it wrote itself it replaces.
-    assert main(arguments) == EXIT_DONE
+    # Its ellipse, which the camera makes of a ball, is as large.
+    assert np.abs(np.hypot(columns - circle[0], rows - circle[1]) - circle[2]).max() < 2.5
+    assert len(rows) > 2 * np.pi * circle[2]
+    light = Light.load(tmp_path / "light.exr")
+    assert light.radiance.shape == (64, 128, 3)
+    preview = cv2.imread(str(tmp_path / "light.preview.png"))
+    assert preview.shape == light.radiance.shape
+    assert np.corrcoef(preview.mean(2).ravel(), np.log(light.radiance[..., ::-1].mean(2).ravel() + 0.01))[0, 1] > 0.8
+    # What it wrote itself it replaces; what is read is the same in other axes.
+    assert main([*arguments, "--axes", "opengl"]) == EXIT_DONE
+    other = Light.load(tmp_path / "light.exr")
+    np.testing.assert_array_equal(other.radiance, light.radiance)
+    np.testing.assert_allclose(other.emitters[0].direction, light.emitters[0].direction, atol=1e-5)
+
+
+def test_a_response_that_was_found_is_written_into_the_scene(tmp_path, capsys):
+    exposures = (15, 30, 60, 125, 250, 500)
+    photos = write_bracket(tmp_path, exposures, curve=s_curve)
+    x, y = project([0.0, 0.0, 0.0])
+    given = ["--contact", str(x), str(y), "--circle", "272", "226", "48.5", "--device", "cpu"]
+    files = ["--output", str(tmp_path / "light.exr"), "--scene", str(tmp_path / "photo.toml")]
+    assert main([*map(str, photos), *given, *files]) == EXIT_DONE
+    assert "the response is not srgb" in capsys.readouterr().err
+    scene = load_scene(tmp_path / "photo.toml")
+    assert scene.camera.transfer == tmp_path / "light.response.txt"
+
+
+@pytest.mark.parametrize(("radius", "rows"), [(20.0, 128), (250.0, 256), (1500.0, 2048), (5000.0, 2048)])
+def test_a_light_has_as_many_rows_as_its_ball_tells(radius, rows):
+    assert _rows_of(radius) == rows
 
 
 def test_a_photograph_too_dark_for_a_rim_is_shown_by_another(bracket):
@@ -207,8 +265,18 @@ def test_a_moved_photograph_is_left_out_and_said(tmp_path):
     photos = write_bracket(tmp_path, BRACKET)
     turned = np.ascontiguousarray(exposed(250)[::-1])
     write_photo(photos[2], turned, denominator=250)
-    found = capture_light(photos, device="cpu", shown=1)
-    assert any(photos[2].name in note and "left out" in note for note in found.notes)
+    write_photo(photos[3], np.roll(exposed(1000), (4, 5), (0, 1)), denominator=1000)
+    notes = capture_light(photos, device="cpu", shown=1).notes
+    assert any(note.startswith("photo_c.jpg is left out: it shows something else") for note in notes)
+    assert any(note.startswith("photo_d.jpg lies 6.4 pixels apart") and "was moved" in note for note in notes)
+
+
+def test_a_missing_exposure_is_said(tmp_path):
+    photos = write_bracket(tmp_path, BRACKET[:2])
+    write_photo(photos[1], exposed(BRACKET[1]))
+    notes = capture_light(photos, device="cpu").notes
+    assert "photo_b.jpg tells no exposure, so none is taken from EXIF" in notes
+    assert any("exposures are from the pixels alone" in note for note in notes)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (16, 12), (23, 400)])
@@ -253,6 +321,8 @@ def test_a_folder_is_no_photograph(tmp_path, capsys):
         (["--ball-radius", "35"], "1 at most; 35 mm are 0.035"),
         (["--contact", "nan", "100"], "--contact nan 100: expected pixels"),
         (["--outline", "outline.jpg"], "--outline outline.jpg: expected a name that ends in .png"),
+        (["--height", "8"], "--height 8: expected 16 to 4096 rows"),
+        (["--ball", "1", "2", "9", "--circle", "1", "2", "9"], "--ball is a rough circle and --circle an exact one"),
     ],
 )
 def test_bad_usage_is_one_line(bracket, tmp_path, capsys, arguments, message):

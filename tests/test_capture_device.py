@@ -15,6 +15,8 @@ from warp_ar.errors import SourceError, UsageError
 from warp_ar.sources import capture_device
 from warp_ar.sources.sources import CaptureDevice
 
+pytestmark = pytest.mark.slow
+
 
 class FakeCapture:
     """A camera that gives ``count`` frames and is then unplugged; waits at each one while ``gate`` is cleared."""
@@ -64,20 +66,6 @@ def test_device_drops_to_the_newest_and_reports_being_unplugged() -> None:
         with pytest.raises(SourceError, match=r"capture device 3 gave no frame for 0.3 s.*unplugged"):
             next(frames)
     assert capture.released
-
-
-def test_device_writes_its_frames_where_they_are_wanted() -> None:
-    """Memory of another size is left alone."""
-    memory = [np.zeros((6, 8, 3), np.uint8), np.zeros((10, 10, 3), np.uint8)]
-    given = list(memory)
-    with CaptureDevice(0, opener=lambda _: FakeCapture(1), grace=PATIENCE) as source:
-        source._stop.set()
-        source._thread.join()  # which would ask for memory, too
-        source.memory = lambda: given.pop(0)
-        images = [source._in_rgb(np.full((6, 8, 3), (code, 1, 200), np.uint8)) for code in (7, 8)]
-    assert [image[0, 0].tolist() for image in images] == [[200, 1, 7], [200, 1, 8]]
-    assert np.shares_memory(images[0], memory[0])
-    assert not np.shares_memory(images[1], memory[1])
 
 
 def test_device_survives_a_gap_shorter_than_its_grace() -> None:

@@ -26,6 +26,8 @@ from warp_ar.signals import REC_709
 from warp_ar.stages.quality import PRESETS
 from warp_ar.stages.request import Request
 
+pytestmark = pytest.mark.slow
+
 SCENE = """schema = 1
 [camera]
 width = 96
@@ -51,9 +53,6 @@ base_color = [0.5, 0.5, 0.5]
 [light]
 file = "light.exr"
 """
-
-
-PLACED = "position = [0.0, -0.5, 0.2]\nrotate = [-20.0, 0.0, 0.0]"
 
 
 def constant(value, height=16):
@@ -144,17 +143,6 @@ def test_files_that_are_no_light(tmp_path, channels, attributes, message):
     OpenEXR.File(attributes, channels).write(str(tmp_path / "a.exr"))
     with pytest.raises(SceneError, match=message):
         Light.load(tmp_path / "a.exr")
-
-
-def test_turning_moves_what_is_seen_where_it_belongs():
-    light = Light(smooth(64), np.ones((64, 128), np.float32))
-    turn = rotation_matrix([20.0, -35.0, 110.0])
-    d = latlong_directions(32)
-    # What arrives from R d in the new axes arrived from d in the old ones.
-    wanted = slope(d @ turn)
-    # Bilinear in a map of 64 rows, and a mean of four places a texel: second order in 2.8 degrees.
-    assert np.abs(light.resampled(32, turn) - wanted).max() < 4e-3
-    assert (light.resampled(64) == light.radiance).all()
 
 
 def test_emitters_are_found_with_their_power_and_across_the_seam():

@@ -9,24 +9,33 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.printed_card import PrintedCard
+from tests.rendered_room import look_at
+from warp_ar.checks import checkup
 from warp_ar.checks.check_objects import check_objects, find_outside, sphere_around, written_poses
 from warp_ar.checks.check_pictures import Look
+from warp_ar.checks.check_pictures import look_at as look_over
+from warp_ar.checks.check_print import card_scale, check_print
 from warp_ar.checks.check_scene import check_scene
 from warp_ar.checks.checkup import check_look
+from warp_ar.checks.finding import Finding
 from warp_ar.errors import SceneError
 from warp_ar.scene import (
     Animation,
     Camera,
     CapturedLight,
+    CharucoBoard,
     EmissiveMaterial,
     Marker,
     Object,
     Pose,
     PoseSpec,
     Scene,
+    load_scene,
     object_from_trimesh,
 )
 from warp_ar.scene.object_materials import mesh_of
+from warp_ar.tracking.card_layout import SHEET
 
 CAMERA = Camera(64, 48, 64.0, 64.0, 31.5, 23.5)
 AHEAD = Pose(np.eye(3), np.zeros(3))
@@ -115,3 +124,73 @@ def test_written_poses_are_looked_at_where_there_is_no_marker() -> None:
 def test_captured_light_and_what_emits_light_the_objects(more: dict[str, Any], dark: bool) -> None:
     scene = dataclasses.replace(Scene(CAMERA, objects=(ball(0.0, 0.0, 1.0),)), **more)
     assert ("probe.none" in [finding.name for finding in check_scene(scene)]) == dark
+
+
+# --- A card that was not printed at true scale is told by its paper ---------------------------------------------------
+
+
+CAMERA_CHECK_PRINT = Camera(640, 480, 600.0, 600.0, 321.0, 238.0)
+
+
+def encode(linear):
+    return np.clip(linear, 0, 1) ** (1 / 2.2)
+
+
+def findings(paper, scale, told=1.0, seed=0):
+    """What is found where the card is printed at ``scale`` and the scene says ``told``."""
+    rng = np.random.default_rng(seed)
+    card = PrintedCard(rng, paper=paper, scale=scale)
+    images = []
+    for k in range(3):
+        eye = np.array([0.12 * (k - 1), -0.42, 0.5 + 0.04 * k])
+        pose = Pose(*look_at(eye, np.array([0.0, 0.02, 0.0])))
+        images.append((card.photograph(CAMERA_CHECK_PRINT, pose, 0.7, encode), k / 24))
+    board = SHEET.board
+    lengths = (board.square_length * told, board.marker_length * told)
+    marker = dataclasses.replace(SHEET, board=CharucoBoard(board.columns, board.rows, *lengths))
+    look = look_over(marker, CAMERA_CHECK_PRINT, images)
+    assert len(look.views) == 3
+    return check_print(marker, CAMERA_CHECK_PRINT, look.views)
+
+
+@pytest.mark.parametrize(("paper", "scale"), [("a4", 0.97), ("letter", 0.97), ("a4", 0.94), ("letter", 1.04)])
+def test_other_scales_are_told(paper, scale):
+    (found,) = findings(paper, scale)
+    assert found.name == "card.print"
+    printed = float(found.text.split("printed at ")[1].split("%")[0])
+    assert printed == pytest.approx(100 * scale, abs=0.6)
+    assert f"be {printed:.1f} mm" in found.remedy
+
+
+@pytest.mark.parametrize(
+    ("paper", "scale", "told"), [("a4", 1.0, 1.0), ("letter", 1.0, 1.0), ("a4", 0.97, 0.97), ("letter", 1.005, 1.0)]
+)
+def test_what_the_scene_says_is_no_finding(paper, scale, told):
+    assert findings(paper, scale, told, seed=1) == []
+
+
+def test_other_markers_have_no_known_paper():
+    assert card_scale(Marker()) is None
+    assert card_scale(SHEET) == 1.0
+    assert card_scale(dataclasses.replace(SHEET, dictionary="DICT_5X5_50")) is None
+
+
+# --- The quick half of the checks tells where a mirror ball was seen --------------------------------------------------
+
+
+UNSEEN = ("source.empty", "marker.unseen", "units.ball", "ball.unfound", "ball.outside")
+
+
+@pytest.mark.parametrize("name", [*UNSEEN, "ball.dull"])
+def test_a_ball_is_seen_only_where_it_was_looked_for(monkeypatch, tmp_path, name):
+    monkeypatch.setattr(checkup, "check_up", lambda *_, **__: [Finding(name, "", "")])
+    found, seen = checkup.quick_check(load_scene("desk"), tmp_path)
+    assert [each.name for each in found] == [name]
+    assert seen == (name not in UNSEEN)
+
+
+def test_a_device_is_not_opened_twice(monkeypatch):
+    looked = []
+    monkeypatch.setattr(checkup, "check_up", lambda scene, source, **how: looked.append(source) or [])
+    assert not checkup.quick_check(load_scene("desk"), 0)[1]
+    assert looked == [None]

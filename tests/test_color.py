@@ -62,11 +62,6 @@ def test_every_code_survives_a_round_trip(device, transfer):
     np.testing.assert_array_equal(encode(transfer, decode(transfer, CODES)), CODES)
 
 
-def test_decode_gives_the_table(device, transfer):
-    codes = np.random.default_rng(0).integers(0, 256, (1000, 3)).astype(np.uint8)
-    np.testing.assert_array_equal(decode(transfer, codes), reference.decode(color.decode_table(transfer), codes))
-
-
 def test_ends_are_black_and_clipping(transfer):
     table = color.decode_table(transfer)
     assert (table[-1] == 1.0).all()
@@ -103,12 +98,6 @@ def test_encode_is_the_nearest_code(device, transfer):
     exact = unrounded(transfer, values.astype(np.float64))
     error = np.abs(encode(transfer, values).astype(np.float64) - exact)
     assert error.max() <= 0.5 + HALF_CODE_SLACK
-
-
-def test_encode_is_monotone(device, transfer):
-    values = np.sort(np.random.default_rng(2).random(300_000).astype(np.float32) ** 3)
-    codes = encode(transfer, np.repeat(values[:, None], 3, axis=1)).astype(np.int32)
-    assert (np.diff(codes, axis=0) >= 0).all()
 
 
 def test_what_is_no_colour_is_clamped(device, transfer):

@@ -14,9 +14,11 @@ from warp_ar.accuracy import path_tracer
 from warp_ar.accuracy.path_tracer import FIRST_LIGHT_SAMPLES, PathTracer
 from warp_ar.errors import UsageError
 from warp_ar.scene import Scene
-from warp_ar.viewer import convergence, frames
-from warp_ar.viewer.convergence import FULL_SCALE, false_colors
-from warp_ar.viewer.frames import Lit
+from warp_ar.viewer import host, lighting
+from warp_ar.viewer.host import Lit
+from warp_ar.viewer.lighting import FULL_SCALE, false_colors
+
+pytestmark = pytest.mark.slow
 
 COARSE_GOAL = 0.3  # relative standard error that a few samples reach
 
@@ -80,37 +82,6 @@ def test_a_held_frame_converges_to_the_reference() -> None:
         assert running.next().other is None
 
 
-def test_a_frame_that_is_held_at_once_gets_a_reference_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Played and held again before the next frame is lit: nothing flowed, and yet another frame is held."""
-    with Running(page_scene()) as running:
-        loop = running.host._loop
-        running.edit(type="compare", other="difference")
-        running.edit(type="play", on=False)
-        first = running.until(lambda: running.frames[-1].other is not None and running.frames[-1])
-        pace = loop._pace
-
-        def hold_next(due: float, step: float) -> float:
-            due = pace(due, step)
-            running.edit(type="play", on=False)
-            return due
-
-        monkeypatch.setattr(loop, "_pace", hold_next)
-        running.edit(type="play", on=True)
-        held = running.until(lambda: not np.array_equal(running.frames[-1].image, first.image) and running.frames[-1])
-        assert held.other is None, "the reference of another frame stands beside this one"
-        running.until(lambda: running.frames[-1].other is not None)
-        np.testing.assert_array_equal(running.frames[-1].image, held.image)
-        assert running.host.state_message()["convergence"]["samples"] >= 1
-
-
-def test_frames_stay_short_while_it_converges() -> None:
-    """A slice ends soon after its time: what viewers ask for meanwhile is done between two slices."""
-    tracer = PathTracer(boxes(True), latlong_sky(), None, ABOVE, device="cpu", reflectances=RHO, size=(480, 320))
-    tracer.sample_for(0.0)
-    ended = [tracer.sample_for(0.0) for _ in range(4)]
-    assert not any(ended), "a slice of no time traced the whole picture"
-
-
 EDITS = [
     {"type": "set", "part": "object", "index": 0, "key": "at", "value": [0.0, -0.08, 0.03]},
     {"type": "set", "part": "exposure", "index": 0, "key": "scale", "value": 0.5},
@@ -120,9 +91,9 @@ EDITS = [
 
 def few_samples(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let a held frame be done after few samples, whose error is still told."""
-    monkeypatch.setattr(convergence, "LEAST_SAMPLES", 2)
-    monkeypatch.setattr(convergence, "GOAL", COARSE_GOAL)
-    monkeypatch.setattr(convergence, "LIGHT_SAMPLES", FIRST_LIGHT_SAMPLES + 1)
+    monkeypatch.setattr(lighting, "LEAST_SAMPLES", 2)
+    monkeypatch.setattr(lighting, "GOAL", COARSE_GOAL)
+    monkeypatch.setattr(lighting, "LIGHT_SAMPLES", FIRST_LIGHT_SAMPLES + 1)
 
 
 def done(running: Running) -> dict[str, float] | None:
@@ -158,7 +129,7 @@ def test_every_hold_and_every_edit_converges_to_the_goal(monkeypatch: pytest.Mon
             told = running.until(lambda: done(running))
             assert told["error"] <= told["goal"] == 100.0 * COARSE_GOAL
             # The last picture comes a moment after what is told of it.
-            reference = running.host._loop.convergence._picture.image
+            reference = running.host.convergence._picture.image
             running.until(lambda reference=reference: shows_difference(running.frames[-1], reference))
         assert begun[-1][0] > begun[0][0], "another frame is held in the end"
         assert begun[1][1] != begun[2][1], "the exposure was edited"
@@ -172,7 +143,7 @@ def test_at_rest_the_picture_stays_that_of_its_reference(monkeypatch: pytest.Mon
         running.edit(type="play", on=False)
         running.until(lambda: done(running))
         rest, count = running.frames[-1], len(running.frames)
-        time.sleep(4.0 * frames._STILL_SECONDS)
+        time.sleep(4.0 * host._STILL_SECONDS)
         assert len(running.frames) == count, "lit anew at rest"
         running.edit(type="compare", other="difference")
         running.until(lambda: len(running.frames) > count)

@@ -1,4 +1,4 @@
-"""Costs: measured with everything at work, scaled where settings share a stage, kept in a folder."""
+"""Costs: measured with everything at work, kept in a folder."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from warp_ar.accuracy.costs import BASE, Costs, measure_costs, read_costs, show_
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.stages.quality import PRESETS
 
+pytestmark = pytest.mark.slow
+
 SETTING = next(setting for setting in SETTINGS if setting.name == "irradiance")
-KEPT = Costs(
-    12.5, {"irradiance": {"sh2": 0.0, "clusters": 1.25}}, {"irradiance": {"clusters": {"prefilter": 2.0}}}, 2.5
-)
+KEPT = Costs(12.5, {"irradiance": {"sh2": 0.0, "clusters": 1.25}}, 2.5)
 
 
 def test_costs_are_kept(tmp_path):
@@ -37,7 +37,6 @@ def test_costs_are_kept(tmp_path):
         '{"a": {"base": 1, "methods": {"irradiance": {}}}}',
         '{"a": {"base": 1, "methods": {"prefilter": {"energy_mip": 0}}}}',
         '{"a": {"base": 1, "methods": {"irradiance": {"sh2": 0}}}}',
-        '{"a": {"base": 1, "methods": {"irradiance": {"sh2": 0}}, "scales": [], "track": 0, "work": 1}}',
     ],
 )
 def test_costs_that_are_not_ours_are_measured_anew(tmp_path, text):
@@ -76,25 +75,6 @@ def test_measured_costs_cover_every_method_but_brute_force(frames: Frames, devic
     for setting in settings:
         assert set(costs.methods[setting.name]) == set(setting.methods) - {"brute_force"}
         assert costs.methods[setting.name][chosen(PRESETS["medium"], setting)] == 0.0
-    # The map's rows multiply what is done for each texel, and say nothing of what is not.
-    assert costs.scales.keys() == {"environment_height"}
-    scales = costs.scales["environment_height"]
-    assert all(own.keys() <= {"irradiance", "unwrap"} for own in scales.values())
-    assert all(scale == 1.0 for scale in scales["64"].values())
-    # Sixteen times the texels of the base, a quarter: no processor is as noisy as that. A GPU has all of them at once.
-    if device == "cpu":
-        assert scales["256"]["unwrap"] > scales["32"]["unwrap"]
-
-
-def test_what_shared_settings_do_multiplies():
-    costs = Costs(
-        10.0,
-        {"height": {"64": 0.0, "128": 6.0}, "prefilter": {"mip": 0.0, "fis": 5.0}, "shade": {"one": 0.0, "two": 1.0}},
-        {"height": {"128": {"prefilter": 4.0}}},
-    )
-    assert costs.excess({"height": "64", "prefilter": "fis", "shade": "two"}) == 6.0
-    assert costs.excess({"height": "128", "prefilter": "mip", "shade": "two"}) == 7.0
-    assert costs.excess({"height": "128", "prefilter": "fis", "shade": "two"}) == 27.0
 
 
 def test_a_frame_that_is_shown_again_keeps_every_stage_at_work(frames: Frames, device: str) -> None:

@@ -10,7 +10,6 @@ import math
 import pathlib
 import shutil
 import subprocess
-import types
 from typing import Any
 
 import av
@@ -20,17 +19,18 @@ import OpenEXR
 import pytest
 
 import warp_ar
-from warp_ar.calibration.saturation import ball_discs
 from warp_ar.errors import SinkError, SourceError, UsageError
 from warp_ar.kernels.color import decode_codes, encode_codes
-from warp_ar.output.encoders import describe_encoders, encoder_names, find_encoding, last_packets, parse_options
+from warp_ar.output.encoders import describe_encoders, encoder_names, find_encoding, parse_options
 from warp_ar.output.sinks import open_sink
 from warp_ar.scene import Pose
 from warp_ar.session import Session
 from warp_ar.signals import REC_709, REC_2020, hlg_of_light, light_of_hlg, light_of_pq, pq_of_light, rgb_from_rgb
-from warp_ar.sources.deep_frame import Plate, codes8, deep_table, srgb8
+from warp_ar.sources.deep_frame import Plate, srgb8
 from warp_ar.sources.sources import open_source
 from warp_ar.stages.quality import PRESETS
+
+pytestmark = pytest.mark.slow
 
 SIZE = (64, 48)
 STEP16 = 1.0 / 65535.0
@@ -178,14 +178,6 @@ def test_pictures_of_16_bits_keep_their_codes(tmp_path: pathlib.Path, suffix: st
     np.testing.assert_array_equal(frame.plate.picture, codes)
 
 
-def test_tiffs_of_floats_are_light(tmp_path: pathlib.Path) -> None:
-    pixels = light()
-    (tmp_path / "a.tif").write_bytes(cv2.imencode(".tif", pixels[..., ::-1])[1].tobytes())
-    deep, frame = read_one(tmp_path / "a.tif")
-    assert deep == "light"
-    np.testing.assert_array_equal(frame.plate.picture, pixels)
-
-
 def test_an_openexr_without_colour_is_refused(tmp_path: pathlib.Path) -> None:
     part = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     OpenEXR.File(part, {"Z": np.zeros((4, 4), np.float32)}).write(str(tmp_path / "a.exr"))
@@ -194,15 +186,6 @@ def test_an_openexr_without_colour_is_refused(tmp_path: pathlib.Path) -> None:
     (tmp_path / "b.exr").write_bytes(b"no picture")
     with pytest.raises(SourceError, match=r"b\.exr cannot be read as OpenEXR"):
         open_source(tmp_path / "b.exr")
-
-
-@pytest.mark.parametrize("transfer", ["srgb", "linear", "gamma:2.2"])
-def test_codes_of_any_depth_have_their_inverse(transfer: str) -> None:
-    codes = np.linspace(0.0, 1.0, 513)
-    np.testing.assert_allclose(encode_codes(transfer, decode_codes(transfer, codes)[:, 0]), codes, atol=1e-7)
-    np.testing.assert_array_equal(
-        deep_table(transfer)[::257], decode_codes(transfer, np.arange(256) / 255.0).astype(np.float32)
-    )
 
 
 def test_a_measured_response_is_read_between_its_codes(tmp_path: pathlib.Path) -> None:
@@ -261,26 +244,6 @@ def test_light_above_white_is_known_at_a_shorter_exposure(first: np.ndarray) -> 
     assert above.sum() > 1000
     np.testing.assert_allclose(image[above], srgb8(0.5 * light)[above], atol=1)
     assert np.abs(codes[above].astype(int) - srgb8(0.5 * light)[above]).mean() > 10, "8 bits do not hold it"
-
-
-def test_frames_tell_between_codes_of_8_bits_where_a_camera_saturates(first: np.ndarray) -> None:
-    """Step 950 of 10 bits, of a lamp that takes up half of the ball."""
-    with warp_ar.Pipeline("desk", device="cpu", size=(160, 120), outputs=("pose",)) as pipeline:
-        pose = pipeline(first).pose
-        (x, y, radius), *_ = ball_discs(pipeline.scene.probes, pipeline.camera, pose)
-    step = round(950 * 65535 / 1023)
-    deep = np.minimum(first.astype(np.uint16) * np.uint16(200), step)
-    v, u = np.mgrid[:120, :160]
-    deep[(np.hypot(u - x, v - y) < radius) & (u < x)] = step
-    levels = []
-    for frame, linear in ((deep, True), (codes8(Plate(deep), "srgb"), False)):
-        with warp_ar.Pipeline(
-            "desk", device="cpu", size=(160, 120), outputs=("environment",), linear=linear
-        ) as pipeline:
-            pipeline(frame, pose=pose)
-            levels.append(pipeline.inputs.saturation.levels)
-    np.testing.assert_allclose(levels[0], step / 257.0)
-    np.testing.assert_array_equal(levels[1], round(step / 257.0))
 
 
 def test_light_above_white_lights_as_it_is(first: np.ndarray) -> None:
@@ -434,23 +397,6 @@ def test_short_videos_of_10_bits_are_written(tmp_path: pathlib.Path, frames: int
     with av.open(str(tmp_path / "a.mp4")) as container:
         times = [float(packet.pts * packet.time_base) for packet in container.demux(video=0) if packet.size]
     assert np.subtract(sorted(times), min(times)) == pytest.approx([index / 25 for index in range(frames)])
-
-
-def test_x265_is_not_believed_when_two_frames_are_decoded() -> None:
-    """It computes that from memory that nothing has written: most values no file can hold, and some are late."""
-
-    def left_over(codec: str, frames: int) -> list[int]:
-        packets = [av.Packet(b"x") for _ in range(frames)]
-        for index, packet in enumerate(packets):
-            packet.pts, packet.dts = index, 2**62 + index
-        stream = types.SimpleNamespace(
-            codec_context=types.SimpleNamespace(name=codec), encode=lambda frame: [] if frame else packets
-        )
-        return [packet.dts for packet in last_packets(stream, frames)]
-
-    assert left_over("libx265", 1) == [0]
-    assert left_over("libx265", 2) == [0, 1]
-    assert left_over("libx265", 3)[0] == left_over("libx264", 2)[0] == 2**62
 
 
 def test_folders_of_16_bits_and_openexr_come_back(tmp_path: pathlib.Path) -> None:

@@ -9,12 +9,11 @@ import warp as wp
 
 from tests.simulated_camera import decode_srgb
 from warp_ar import Pipeline
-from warp_ar.kernels.color import ENCODE_KEYS, camera_table, decode_table, encode_table
 from warp_ar.kernels.environment.change import scale_radiance
 from warp_ar.scene import Pose, Scene, loads_scene
 from warp_ar.sources.deep_frame import Plate
-from warp_ar.tracking.drift import CONTRASTS, ExposureDrift, codes_around, still_points
-from warp_ar.tracking.marker_pattern import printed_cells
+from warp_ar.tracking.drift import CONTRASTS, ExposureDrift
+from warp_ar.tracking.markers import printed_cells
 
 SCENE = """schema = 1
 [camera]
@@ -99,15 +98,6 @@ def test_a_dark_desk_is_followed_by_its_linear_picture(gain):
     assert off[1] > 4.0 * off[0]
 
 
-def test_codes_of_8_bits_are_read_alike_from_a_plate():
-    scene, picture = loads_scene(SCENE), encode(linear_picture(loads_scene(SCENE)))
-    points = still_points(scene)[0]
-    plain = codes_around(picture, scene.camera, POSE, points)
-    deep = codes_around(picture, scene.camera, POSE, points, Plate(picture.astype(np.uint16) * 257))
-    assert np.isfinite(plain).any()
-    np.testing.assert_array_equal(plain, deep)
-
-
 def test_a_still_camera_is_left_alone():
     picture = linear_picture(loads_scene(SCENE))
     drift = follow([encode(picture), encode(picture * 1.01), encode(picture)])
@@ -154,16 +144,6 @@ def test_a_tone_curve_is_told_by_a_drift_where_ink_is_grey():
     assert bent.contrast >= 0.5
     assert bent.gain == pytest.approx([gains[-1]] * 3, rel=0.1)
     assert follow([encode(picture * gain) for gain in gains]).contrast == 0.0
-
-
-def test_tables_of_a_tone_curve_are_each_others_inverse():
-    values = camera_table("srgb", contrast=0.75)[:256]
-    codes = np.arange(256) / 255.0
-    plain = np.interp(values[:, 0], decode_table("srgb")[:, 0], codes)
-    assert plain + 0.75 * plain * (1 - plain) * (plain - 0.5) == pytest.approx(codes, abs=1e-3)
-    thresholds = encode_table("srgb", 0.75)[2 * ENCODE_KEYS : -1]
-    assert ((thresholds > values[:-1]) & (thresholds < values[1:])).all()
-    assert decode_srgb(np.array([0, 255], np.uint8)) == pytest.approx(values[[0, 255], 0])
 
 
 def test_remembered_light_is_scaled(device):

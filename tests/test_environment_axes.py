@@ -2,22 +2,38 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import math
+import pathlib
+import struct
 
+import cv2
 import numpy as np
+import OpenEXR
 import pytest
 
+from warp_ar import environment
 from warp_ar.errors import UsageError
+from warp_ar.light.captured import latlong_directions, texel_solid_angles
 from warp_ar.output.environment_axes import (
     AXES,
     CUBES,
+    basis,
     cube_directions,
+    encode_harmonics,
     from_axes,
+    project_radiance,
     sample_latlong,
     to_axes,
     to_cube,
     world_from_marker,
 )
+from warp_ar.output.environment_file import EnvironmentInfo, read_environment_info, write_environment
+from warp_ar.output.gltf_environment import EXTENSION, LARGEST, encode_rgbd, irradiance_coefficients, specular_cubes
+from warp_ar.output.gltf_file import write_glb
+from warp_ar.output.shot import Shot
+from warp_ar.scene import Pose, load_scene
 
 HEIGHT = 32
 EXACT = 1e-5  # float32 of the map
@@ -172,3 +188,255 @@ def test_a_cube_that_no_memory_holds_is_refused():
     """Before anything is allocated: of six faces of 10^9 texels a side NumPy itself gave a traceback."""
     with pytest.raises(UsageError, match=r"a cube of size 1000000000 has 6,000,000,000,000,000,000 texels; at most"):
         to_cube(np.ones((4, 8, 3), np.float32), "y-up", 1_000_000_000)
+
+
+# --- Spherical harmonics: closed forms, and another way to the same sums ----------------------------------------------
+
+
+ROUNDING = 1e-6  # float32 of the map; sums are in double precision
+# 200,000 directions of a bilinear sample: five standard errors of a mean of values about 0.3.
+MONTE_CARLO = 5 * 0.5 * 4 * math.pi / math.sqrt(200_000)
+
+
+def noise() -> np.ndarray:
+    return np.random.default_rng(3).random((8, 16, 3)).astype(np.float32)
+
+
+def test_a_constant_has_the_first_coefficient_alone() -> None:
+    coefficients = project_radiance(np.full((5, 10, 3), 0.5, np.float32))
+    expected = np.zeros((9, 3))
+    expected[0] = 0.5 * math.sqrt(4 * math.pi)
+    np.testing.assert_allclose(coefficients, expected, atol=ROUNDING)
+    content = json.loads(encode_harmonics(np.full((5, 10, 3), 0.5, np.float32), "z-up", 1.0))
+    received = basis(np.array([[0.6, 0.0, 0.8]])) @ np.array(content["irradiance"])
+    np.testing.assert_allclose(received, math.pi * 0.5, rtol=ROUNDING)  # white furnace
+
+
+def test_half_a_sky_lights_what_faces_it() -> None:
+    """L = 1 above: E(up) of order 2 is pi/2 + 2 pi/3 . 3/4 (the exact pi less orders above 2, which are odd)."""
+    sky = np.zeros((16, 32, 3), np.float32)
+    sky[:8] = 1.0
+    content = json.loads(encode_harmonics(sky, "y-up", 1.0))
+    up = np.array([[0.0, 1.0, 0.0]])
+    np.testing.assert_allclose(basis(up) @ np.array(content["irradiance"]), math.pi, rtol=ROUNDING)
+    np.testing.assert_allclose(basis(-up) @ np.array(content["irradiance"]), 0.0, atol=ROUNDING * 10)
+
+
+@pytest.mark.parametrize("axes", AXES)
+def test_sums_are_those_of_monte_carlo_in_the_files_world(axes: str) -> None:
+    directions = np.random.default_rng(4).normal(size=(200_000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    rows = np.minimum((np.arccos(directions[:, 2]) / math.pi * 8).astype(int), 7)
+    columns = ((np.arctan2(directions[:, 1], directions[:, 0]) / math.pi + 1) * 8).astype(int) % 16
+    light = noise()[rows, columns]
+    told = basis(directions @ world_from_marker(axes).T)
+    expected = 4 * math.pi * np.einsum("ni,nc->ic", told, light) / len(directions)
+    np.testing.assert_allclose(project_radiance(noise(), axes), expected, atol=MONTE_CARLO)
+
+
+def test_the_frames_own_harmonics_agree(device: str) -> None:
+    """The kernel that frames are lit by has the same basis, order and lobe."""
+    import warp as wp
+
+    from warp_ar.kernels.environment.irradiance import make_sh_tables, project_irradiance_sh
+
+    radiance = wp.array(noise(), dtype=wp.vec3, device=device)
+    tables = make_sh_tables(8, 16, device)
+    out = wp.zeros(9, dtype=wp.vec3, device=device)
+    rows = wp.zeros((8, 5), dtype=wp.vec3, device=device)
+    project_irradiance_sh(radiance, tables, rows, out)
+    content = json.loads(encode_harmonics(noise(), "z-up", 1.0))
+    np.testing.assert_allclose(out.numpy(), content["irradiance"], atol=1e-4)
+
+
+def test_a_turned_ramp_points_the_same_way() -> None:
+    """l = 1 is a vector: it turns with the world."""
+    z_up = project_radiance(noise())[[3, 1, 2]]
+    for axes in AXES:
+        np.testing.assert_allclose(
+            project_radiance(noise(), axes)[[3, 1, 2]], world_from_marker(axes) @ z_up, atol=ROUNDING
+        )
+
+
+# --- The command that writes an environment for another program -------------------------------------------------------
+
+
+@pytest.fixture
+def captured(tmp_path: pathlib.Path) -> pathlib.Path:
+    path = tmp_path / "captured.exr"
+    light = np.random.default_rng(0).random((8, 16, 3), np.float32)
+    write_environment(path, light, info=EnvironmentInfo(exposure=0.5))
+    return path
+
+
+def pixels(path: pathlib.Path) -> np.ndarray:
+    with OpenEXR.File(str(path)) as file:
+        return np.array(file.channels()["RGB"].pixels)
+
+
+def test_axes_time_and_place_are_written(captured: pathlib.Path) -> None:
+    output = captured.parent / "new" / "out.exr"
+    where = ["--place", "13.4", "52.5", "34", "--taken", "2026-05-01T12:00:00+02:00"]
+    assert environment.main([str(captured), "--output", str(output), *where]) == 0
+    np.testing.assert_array_equal(pixels(output), to_axes(pixels(captured), "y-up"))
+    info = read_environment_info(output)
+    assert (info.exposure, info.place[2]) == (0.5, 34.0)
+    assert info.taken.isoformat() == "2026-05-01T10:00:00+00:00"
+
+
+@pytest.mark.parametrize("name", ["out.hdr", "out.json", "out.exr"])
+def test_every_ending_is_written(captured: pathlib.Path, name: str) -> None:
+    output = captured.parent / name
+    assert environment.main([str(captured), "--output", str(output), "--axes", "blender"]) == 0
+    assert output.stat().st_size > 100
+
+
+def test_a_cube_has_the_size_asked_for(captured: pathlib.Path) -> None:
+    output = captured.parent / "out.exr"
+    assert environment.main([str(captured), "--output", str(output), "--layout", "cube", "--size", "5"]) == 0
+    assert pixels(output).shape == (30, 5, 3)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--output", "out.png"], "ends in '.png'; use .exr, .hdr, .json"),
+        (["--output", "out.exr", "--size", "5"], "add --layout cube"),
+        (["--output", "out.exr", "--layout", "cube", "--axes", "blender"], "expected y-up, opengl for a cube"),
+        (["--output", "out.exr", "--taken", "noon"], "'noon': expected a time"),
+        (["--output", "out.exr", "--taken", "2026-05-01T12:00:00"], "expected a time with its zone"),
+        (["--output", "captured.exr"], "is the same as the environment"),
+    ],
+)
+def test_wrong_options_are_one_line(
+    captured: pathlib.Path, capsys: pytest.CaptureFixture[str], options: list[str], message: str
+) -> None:
+    folder = captured.parent
+    options = [str(folder / option) if "." in option and "-" not in option else option for option in options]
+    assert environment.main([str(captured), *options]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert [path.name for path in folder.iterdir()] == ["captured.exr"]
+
+
+def test_a_missing_environment_is_one_line(tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert environment.main([str(tmp_path / "none.exr"), "--output", str(tmp_path / "o.exr")]) == 2
+    assert "there is no file" in capsys.readouterr().err
+
+
+# --- The environment within a glTF: its faces, its roughness, its harmonics, against sums that are written out here ---
+
+
+CONSTANT = 1e-5  # of weighted means in float64, kept in float32
+RGBD = 0.02  # a step of 8 bits in the brightest channel's 2.2th power, and of D's whole steps
+MONTE_CARLO_GLTF_ENVIRONMENT = 5.0  # standard errors
+# Directions that faces of a cube look along, as glTF's picture of the extension has them.
+FACES = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
+
+
+def y_up(direction: tuple[float, float, float]) -> np.ndarray:
+    """The marker's direction of one of glTF's world: y up is z up."""
+    x, y, z = direction
+    return np.array([x, -z, y], float)
+
+
+def glowing(toward: np.ndarray, height: int = 64) -> np.ndarray:
+    """A smooth light around a direction."""
+    cos_theta = latlong_directions(height) @ (toward / np.linalg.norm(toward))
+    return (0.2 + 5.0 * np.exp(8.0 * (cos_theta - 1.0)))[..., None].astype(np.float32) * np.float32([1.0, 0.5, 0.25])
+
+
+def test_a_constant_stays_constant() -> None:
+    for cube in specular_cubes(np.full((32, 64, 3), 0.7, np.float32)):
+        np.testing.assert_allclose(cube, 0.7, rtol=CONSTANT)
+
+
+@pytest.mark.parametrize("face", range(6))
+def test_faces_look_where_they_should(face: int) -> None:
+    cubes = specular_cubes(glowing(y_up(FACES[face])))
+    assert [cube.shape for cube in cubes] == [(6, size, size, 3) for size in (64, 32, 16)]
+    for cube in cubes:
+        assert cube[:, :, :, 0].reshape(6, -1).mean(1).argmax() == face
+
+
+def test_faces_are_mirrored_as_the_extension_asks() -> None:
+    """A light toward +z, a little to +x: on OpenGL's face +z, s grows toward +x; in the file it falls."""
+    sharp = specular_cubes(glowing(y_up((0.6, 0.0, 1.0))))[0]
+    row, column = np.unravel_index(sharp[4, :, :, 0].argmax(), (LARGEST, LARGEST))
+    assert column == pytest.approx((1.0 - 0.6) / 2.0 * LARGEST, abs=1.5)
+    assert row == pytest.approx(LARGEST / 2, abs=1.5)
+
+
+def test_roughness_is_ggx() -> None:
+    """By half vectors drawn from GGX itself, about the normal that is the direction of view."""
+    radiance = glowing(np.array([1.0, 0.3, 0.4]), 32)
+    cube = specular_cubes(radiance)[1]
+    alpha, size, rng = 0.25, cube.shape[1], np.random.default_rng(0)
+    u, v = rng.uniform(size=(2, 200_000))
+    cos_half = np.sqrt((1.0 - u) / (1.0 + (alpha**2 - 1.0) * u))
+    sin_half = np.sqrt(1.0 - cos_half**2)
+    half = np.stack([sin_half * np.cos(2 * math.pi * v), sin_half * np.sin(2 * math.pi * v), cos_half], -1)
+    local = 2.0 * cos_half[:, None] * half - np.array([0.0, 0.0, 1.0])
+    # The middle of face +x, half a texel off.
+    normal = y_up((1.0, -1.0 / size, 1.0 / size))
+    normal /= np.linalg.norm(normal)
+    side = np.cross([0.0, 0.0, 1.0], normal)
+    side /= np.linalg.norm(side)
+    toward = local @ np.stack([side, np.cross(normal, side), normal])
+    weight = np.maximum(local[:, 2], 0.0)
+    peak = np.array([1.0, 0.3, 0.4]) / np.linalg.norm([1.0, 0.3, 0.4])
+    seen = 0.2 + 5.0 * np.exp(8.0 * (toward @ peak - 1.0))
+    expected = (seen * weight).sum() / weight.sum()
+    error = math.sqrt(((seen - expected) ** 2 * weight**2).sum()) / weight.sum()
+    # File's column: mirrored; +x looks with s along -z.
+    found = cube[0, size // 2, size // 2, 0]
+    assert found == pytest.approx(expected, abs=MONTE_CARLO_GLTF_ENVIRONMENT * error + 0.01 * expected)
+
+
+def test_harmonics_give_irradiance_with_their_signs() -> None:
+    radiance = glowing(np.array([0.3, -0.5, 0.8]))
+    coefficients = irradiance_coefficients(radiance)
+    toward = latlong_directions(64).reshape(-1, 3)
+    area = np.broadcast_to(texel_solid_angles(64), (64, 128)).reshape(-1)
+    for direction in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (-0.6, 0.48, 0.64)):
+        cos_theta = np.clip(toward @ y_up(direction), 0.0, None)
+        expected = (cos_theta * area) @ radiance.reshape(-1, 3).astype(float)
+        x, y, z = direction
+        first = (0.282095, -0.488603 * y, 0.488603 * z, -0.488603 * x)
+        second = (1.092548 * x * y, -1.092548 * y * z, 0.315392 * (3 * z * z - 1), -1.092548 * x * z)
+        basis = np.array((*first, *second, 0.546274 * (x * x - y * y)))
+        # Nine harmonics leave 1 % of a cosine lobe's irradiance in the mean, some percent beside a light [RH01].
+        np.testing.assert_allclose(basis @ coefficients, expected, rtol=0.06)
+
+
+def test_pixels_are_rgbd() -> None:
+    radiance = np.random.default_rng(1).uniform(0.0, 1.0, (8, 8, 3)).astype(np.float32) ** 3 * 40.0
+    codes = (
+        cv2.imdecode(np.frombuffer(encode_rgbd(radiance), np.uint8), cv2.IMREAD_UNCHANGED)[..., [2, 1, 0, 3]] / 255.0
+    )
+    decoded = codes[..., :3] ** 2.2 / codes[..., 3:]
+    assert (np.abs(decoded - radiance) <= RGBD * radiance.max(-1, keepdims=True) + 1e-3).all()
+
+
+def test_a_file_holds_it(tmp_path) -> None:
+    scene = load_scene("desk")
+    radiance = glowing(np.array([0.0, 0.0, 1.0]))
+    shot = Shot(scene, 30.0, (Pose(np.eye(3), np.array([0.0, 0.0, 1.0])),), radiance=radiance)
+    write_glb(tmp_path / "shot.glb", shot)
+    data = (tmp_path / "shot.glb").read_bytes()
+    size = struct.unpack_from("<I", data, 12)[0]
+    tree, binary = json.loads(data[20 : 20 + size]), data[28 + size :]
+    assert EXTENSION in tree["extensionsUsed"]
+    assert tree["scenes"][0]["extensions"][EXTENSION] == {"light": 0}
+    light = tree["extensions"][EXTENSION]["lights"][0]
+    assert np.shape(light["irradianceCoefficients"]) == (9, 3)
+    assert np.shape(light["specularImages"]) == (3, 6)
+    up = tree["images"][light["specularImages"][0][2]]
+    view = tree["bufferViews"][up["bufferView"]]
+    png = binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
+    face = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert face.shape == (LARGEST, LARGEST, 4)
+    assert (face[32, 32, 2] / 255.0) ** 2.2 / (face[32, 32, 3] / 255.0) == pytest.approx(5.2, rel=RGBD)
+    write_glb(tmp_path / "dark.glb", dataclasses.replace(shot, radiance=None))
+    assert EXTENSION.encode() not in (tmp_path / "dark.glb").read_bytes()

@@ -16,6 +16,8 @@ from warp_ar.output.sinks import (
     write_environment,
 )
 
+pytestmark = pytest.mark.slow
+
 
 def test_environment_round_trip_is_exact(tmp_path: pathlib.Path) -> None:
     path = tmp_path / "new" / "0000.exr"

@@ -24,6 +24,8 @@ from warp_ar.farm.cli import main
 from warp_ar.farm.driver import Driver
 from warp_ar.farm.manifest import RunError, read_status
 
+pytestmark = pytest.mark.slow
+
 TICKS = [0, 25, 40, 75, 100, 101, 150, 175, 230, 250, 275, 300]
 """Of a recording of variable rate."""
 ROOT = pathlib.Path(__file__).resolve().parents[1]
@@ -169,7 +171,7 @@ def run_with_kills(jobs, run, kills, driver_kills):
     end = time.monotonic() + PATIENCE
     while process.poll() is None and time.monotonic() < end:
         time.sleep(0.1 + 0.5 * dice.random())
-        if not order or not (run / "progress.json").exists():
+        if not order or not (run / "manifest.jsonl").exists():
             continue
         if order[-1] == "driver":
             process.kill()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fractions
-import struct
 
 import av
 import cv2
@@ -13,9 +12,10 @@ from av.video.reformatter import VideoReformatter
 
 from tests.farm_rig import CLIPS, TICK, desk_frames, write_recording
 from warp_ar.errors import SourceError
-from warp_ar.farm.codes import DecodedPicture
 from warp_ar.farm.frames import index_frames, open_part, shown_ticks
 from warp_ar.sources.video_file import rgb_from_video
+
+pytestmark = pytest.mark.slow
 
 UNEVEN = [7, 30, 41, 100, 101, 150, 203, 260, 261, 300, 390, 391]
 """Time stamps of a variable rate, the first not 0."""
@@ -98,29 +98,3 @@ def test_pictures_as_a_decoding_unit_gives_them_become_the_same_colours(tmp_path
             assert (other.colorspace, other.color_range) == (picture.colorspace, picture.color_range)
             expected = rgb_from_video(VideoReformatter(), picture)
             np.testing.assert_array_equal(rgb_from_video(VideoReformatter(), other), expected)
-
-
-def test_pictures_stay_as_they_were_decoded_where_that_is_asked_for(tmp_path):
-    write_recording(tmp_path / "a.mp4", 12, ticks=UNEVEN)
-    index = index_frames(tmp_path / "a.mp4", None)
-    plain = read(tmp_path / "a.mp4", 3, 9)
-    with open_part(tmp_path / "a.mp4", index, 3, 9, None, decoded=True) as source:
-        decoded = list(source)
-    for a, b in zip(plain, decoded, strict=True):
-        assert (a.index, a.time) == (b.index, b.time)
-        assert isinstance(b.image, DecodedPicture)
-        assert b.image.shape == a.image.shape
-        np.testing.assert_array_equal(rgb_from_video(VideoReformatter(), b.image.picture), a.image)
-
-
-def test_a_mirrored_recording_is_not_left_to_the_device(tmp_path):
-    """A mirror at the horizontal is no rotation, but no picture as it stands either."""
-    write_recording(tmp_path / "a.mp4", 12, ticks=UNEVEN)
-    data = bytearray((tmp_path / "a.mp4").read_bytes())
-    at = data.index(b"tkhd") + 44
-    data[at : at + 20] = struct.pack(">5i", 1 << 16, 0, 0, 0, -(1 << 16))
-    (tmp_path / "b.mp4").write_bytes(data)
-    index = index_frames(tmp_path / "b.mp4", None)
-    with open_part(tmp_path / "b.mp4", index, 0, 2, None, decoded=True) as source:
-        for a, b in zip(read(tmp_path / "a.mp4", 0, 2), source, strict=True):
-            np.testing.assert_array_equal(b.image, a.image[::-1])

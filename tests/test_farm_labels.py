@@ -13,10 +13,12 @@ import warp as wp
 from tests.farm_rig import SIZE, make_jobs, write_recording
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.farm.jobs import Context, Job
-from warp_ar.farm.labels import DEPTH_SCALE, _harmonics, run_lengths
+from warp_ar.farm.labels import DEPTH_SCALE, run_lengths
 from warp_ar.farm.work import Work
 from warp_ar.kernels.picture.object_masks import trace_object_masks
 from warp_ar.scene import load_scene
+
+pytestmark = pytest.mark.slow
 
 DATASET = {
     "variations": 2,
@@ -160,12 +162,6 @@ def test_light_is_told_for_every_frame(made):
     light = table["scene_light"]["2"]
     assert np.array(light["environment_harmonics"]).shape == (9, 3)
     assert light["lights"][0]["position"] == [0.1, -0.2, 0.4]
-
-
-def test_harmonics_of_a_constant_light_are_one_number():
-    found = _harmonics(np.full((64, 128, 3), 2.0, np.float32))
-    assert found[0] == pytest.approx(np.full(3, 2.0 * 0.282095 * 4 * np.pi), rel=1e-5)
-    assert np.abs(found[1:]).max() < 1e-2  # midpoints of texels: the second order of 1 over 64 rows
 
 
 def test_the_datasheet_counts(made):

@@ -13,7 +13,9 @@ import pytest
 from tests.farm_rig import TICK, desk_frames, write_recording
 from warp_ar.errors import SourceError
 from warp_ar.farm import video as part_video
-from warp_ar.farm.video import PartSink, join_parts
+from warp_ar.farm.video import join_parts, open_part_sink
+
+pytestmark = pytest.mark.slow
 
 MOST_ERROR = 0.15
 """Codes in the mean by which a quicker encoding may err more; at 1080p it was 0.1 at most."""
@@ -27,9 +29,9 @@ def write_parts(folder, ticks, cuts, tick=TICK):
     for number, (first, end) in enumerate(itertools.pairwise(cuts)):
         parts.append(folder / f"part-{number}.mp4")
         starts.append(ticks[first])
-        with PartSink(parts[-1], ticks[first:end], tick, 24.0) as sink:
-            for image in desk_frames(len(ticks))[first:end]:
-                sink.write(image)
+        with open_part_sink(parts[-1], tick, 24.0, "8bit", "srgb") as sink:
+            for image, stamp in zip(desk_frames(len(ticks))[first:end], ticks[first:end], strict=True):
+                sink.write_at(image, float((stamp - ticks[first]) * tick))
     return parts, starts
 
 
@@ -112,9 +114,9 @@ def test_a_recording_without_sound_or_none_at_all(tmp_path):
 
 
 def test_odd_sizes_are_padded_as_in_other_videos(tmp_path):
-    with PartSink(tmp_path / "odd.mp4", [0, 25], TICK, 24.0) as sink:
-        for image in desk_frames(2):
-            sink.write(image[:101, :133])
+    with open_part_sink(tmp_path / "odd.mp4", TICK, 24.0, "8bit", "srgb") as sink:
+        for number, image in enumerate(desk_frames(2)):
+            sink.write_at(image[:101, :133], number / 24.0)
     assert decoded(tmp_path / "odd.mp4")[0].shape == (102, 134, 3)
 
 

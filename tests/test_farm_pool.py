@@ -10,8 +10,11 @@ import pytest
 
 from tests.farm_rig import make_jobs
 from warp_ar.errors import UsageError
-from warp_ar.farm.jobs import Context, Job, program_version
-from warp_ar.farm.pools import ProcessPool, _knock, cores_of, devices_of, keeping_to, share_of_gpu
+from warp_ar.farm import pools
+from warp_ar.farm.jobs import Context, Job
+from warp_ar.farm.pools import ProcessPool, _connect, cores_of, devices_of, keeping_to, share_of_gpu
+
+pytestmark = pytest.mark.slow
 
 PATIENCE = 120.0
 """Seconds within which a worker starts."""
@@ -73,18 +76,19 @@ def test_workers_on_cpu_are_as_many_as_asked_or_one_per_four_cores(monkeypatch):
 )
 def test_an_address_of_no_cluster_is_told_at_once(address, words):
     with pytest.raises(UsageError) as caught:
-        _knock(address)
+        _connect(None, address)
     assert str(caught.value).startswith(words)
 
 
 @pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="needs the masks of processes as Linux tells them")
-def test_workers_see_no_interrupt_even_as_they_begin(tmp_path):
+def test_workers_see_no_interrupt_and_another_takes_the_place_of_one_that_dies(tmp_path):
     """Ctrl-C reaches all processes of a terminal: one that imports would end with a traceback."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [])
     others = set(multiprocessing.active_children())
     pool = ProcessPool(Context(make_jobs(tmp_path, [{}]), tmp_path, "cpu"), ["cpu", "cpu"])
-    started = [pool.start(worker) for worker in range(2)]
+    job = Job("index")  # it fails at once: there is no data set
     try:
+        assert [pool.submit(worker, job, None).result(PATIENCE).state for worker in range(2)] == ["failed"] * 2
         mine = set(multiprocessing.active_children()) - others
         assert len(mine) == 2
         for process in mine:
@@ -92,16 +96,34 @@ def test_workers_see_no_interrupt_even_as_they_begin(tmp_path):
                 held = next(int(line.split()[1], 16) for line in file if line.startswith("SigBlk"))
             assert held >> (signal.SIGINT - 1) & 1
             assert not held >> (signal.SIGTERM - 1) & 1
-        assert [future.result(PATIENCE) for future in started] == [program_version()] * 2
-        for process in mine:
             process.kill()
-        with pytest.raises(pool.died):
-            pool.submit(0, Job("survey"), None).result(PATIENCE)
-        assert pool.start(0).result(PATIENCE) == program_version(), "another takes its place"
+        assert pool.submit(0, job, None).result(PATIENCE).state == "failed"
     finally:
         pool.close()
     assert set(multiprocessing.active_children()) <= others
     assert signal.pthread_sigmask(signal.SIG_BLOCK, []) == before
+
+
+@pytest.mark.parametrize(("begins", "told"), [(True, "its worker died 5 times"), (False, "died 3 times before it was")])
+def test_a_worker_that_always_dies_is_told(tmp_path, monkeypatch, begins, told):
+    monkeypatch.setattr(pools, "_begin", _do_nothing if begins else _die)
+    monkeypatch.setattr(pools, "_do", _die)
+    pool = ProcessPool(Context(make_jobs(tmp_path, [{}]), tmp_path, "cpu"), ["cpu"])
+    try:
+        future = pool.submit(0, Job("survey"), None)
+        found = future.result(PATIENCE).reason if begins else str(future.exception(PATIENCE))
+        assert told in found
+        assert str(tmp_path / "log/worker-0.log") in found
+    finally:
+        pool.close()
+
+
+def _do_nothing(*_):
+    pass
+
+
+def _die(*_):
+    os._exit(1)
 
 
 @pytest.mark.parametrize(("workers", "gpus"), [(1, 1), (2, 2), (1, 4), (3, 1), (7, 2), (16, 2), (48, 8)])

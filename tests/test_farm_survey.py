@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fractions
 import time
 
 import numpy as np
@@ -13,10 +12,12 @@ from warp_ar.engine.pipeline import Pipeline
 from warp_ar.farm import survey
 from warp_ar.farm.jobs import Context, Job, scene_of
 from warp_ar.farm.survey import Survey
-from warp_ar.farm.video import PartSink
 from warp_ar.farm.work import Work
 from warp_ar.kernels.environment.change import CHANGE_FLOOR, CHANGE_SHARE
+from warp_ar.output.sinks import open_sink
 from warp_ar.sources.sources import open_source
+
+pytestmark = pytest.mark.slow
 
 LIT, DARK = 8, 7
 """Frames with light that changes, and without any between them: long enough for the marker to be lost."""
@@ -31,7 +32,7 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("survey")
     images = [np.minimum(image, np.uint8(255 - 10 * n)) for n, image in enumerate(desk_frames(2 * LIT))]
     shown = [*images[:LIT], *([np.full_like(images[0], 40)] * DARK), *images[LIT:]]
-    with PartSink(folder / "a.mp4", list(range(len(shown))), fractions.Fraction(1, RATE), RATE) as sink:
+    with open_sink(folder / "a.mp4", fps=RATE) as sink:
         for image in shown:
             sink.write(image)
     return folder
@@ -106,7 +107,7 @@ def test_fixed_light_is_that_of_the_last_frame_with_a_marker(folder, tmp_path):
 def test_what_goes_wrong_beside_fails_the_survey(folder, tmp_path, monkeypatch):
     """In the last frame, too: nobody waits for its light unless it is kept."""
 
-    def fail(self, frame, result, writer):
+    def fail(self, frame, result):
         if frame == 2 * LIT + DARK - 1:
             raise OSError("no room")
 

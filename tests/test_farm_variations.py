@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from tests.farm_rig import make_jobs
-from warp_ar.farm import dataset as variations
-from warp_ar.farm.dataset import NoPlace, _overlap, draw_variation, in_kindred_order, local_points, receiver_of
+from warp_ar.farm.dataset import NoPlace, _overlap, draw_variation, local_points, receiver_of
 from warp_ar.scene import Pose, load_scene
 from warp_ar.scene.geometry import rotation_matrix
 
@@ -122,44 +121,8 @@ def test_what_would_hide_the_marker_finds_no_place(tmp_path):
                 draw_variation(scene, dataset, 0, 0, [low])
 
 
-def test_outlines_overlap_where_no_side_separates_them():
-    square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float)
-    assert _overlap(square, square + 0.9)
-    assert not _overlap(square, square + 1.1)
-    diamond = np.array([[0, -1], [1, 0], [0, 1], [-1, 0]], float)
-    assert not _overlap(square, diamond + 1.8)
-    assert _overlap(square, diamond + 1.4)
-
-
 def test_too_many_objects_for_the_region_are_told(tmp_path):
     section = {"objects": [9, 9], "region": [0.1, -0.12, 0.18, -0.05], "object": [OBJECTS[0]]}
     dataset = make_jobs(tmp_path, [{"scene": "desk"}], dataset=section).dataset
     with pytest.raises(NoPlace, match=r"of 9 objects find a place .* enlarge dataset.region"):
         draw_variation(load_scene("desk"), dataset, 0, 0, POSES)
-
-
-def test_any_way_up_is_any_way_up_evenly():
-    """The mean of a rotation over all of them is zero; a third of 1 is each entry's variance."""
-    from warp_ar.farm.dataset import _angles, _random_rotation
-
-    random = np.random.default_rng(5)
-    turns = [_random_rotation(random) for _ in range(3000)]
-    assert np.abs(np.mean(turns, 0)).max() < 5 * np.sqrt(1 / 3 / len(turns))
-    for turn in turns[:50]:
-        assert np.abs(rotation_matrix(_angles(turn)) - turn).max() < 1e-5
-
-
-def test_variations_of_the_same_kinds_follow_each_other(dataset, drawn, monkeypatch):
-    order = list(in_kindred_order(dataset, 0, len(drawn)))
-    assert sorted(order) == list(range(len(drawn)))
-    assert all(len(variation.kinds) >= 2 for variation in drawn)
-    kinds = [tuple(sorted(variations._draw_kinds(dataset, 0, number).kinds)) for number in order]
-    changes = sum(a != b for a, b in itertools.pairwise(kinds))
-    assert changes == len(set(kinds)) - 1 < len(kinds) - 1
-    # What is said of kinds beforehand is what is drawn, where all find their place.
-    for number, told in zip(order, kinds, strict=True):
-        if len(told) == len(drawn[number].kinds):
-            assert told == drawn[number].kinds
-    monkeypatch.setattr(variations, "CHUNK", 5)
-    chunked = list(in_kindred_order(dataset, 0, len(drawn)))
-    assert [sorted(chunked[n : n + 5]) for n in range(0, len(drawn), 5)] == [[*range(5)], [*range(5, 10)], [10, 11]]

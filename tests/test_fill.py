@@ -5,13 +5,16 @@ import warp as wp
 from tests.error_model import check_error
 from tests.reference import fill as reference
 from tests.reference import latlong
+from warp_ar.kernels import structs
+from warp_ar.kernels.color import decode_table
 from warp_ar.kernels.environment import fill
+from warp_ar.kernels.environment.fill_frame import FRAME_TRUST, OWN_SHADOW, fill_frame
+from warp_ar.scene import loads_scene
+from warp_ar.scene.kinds import trace_config
+from warp_ar.scene.ray_scene import HostScene
 
 # Float32 sums and exponentials, a few roundings each.
 ROUNDING = 2e-6
-# The same accumulated over the levels of a pyramid, or over a hundred frames.
-SUMS = 2e-5
-
 SIZES = [(32, 64), (64, 128), (7, 14), (5, 9), (1, 2), (1, 7), (3, 1), (1, 1), (16, 33), (2, 4)]
 
 
@@ -24,21 +27,6 @@ def filled(radiance, confidence, **options):
     fill.push_pull(levels, height, width, **options)
     fill.finish_fill(levels, out)
     return out.numpy()
-
-
-@pytest.mark.parametrize(("height", "width"), SIZES)
-def test_a_constant_environment_stays_constant_under_any_mask(device, height, width):
-    """Hard case 18, to the bit; what is masked out holds garbage."""
-    rng = np.random.default_rng(4)
-    surroundings = np.float32([0.1, 7.3, 1.2e-5])
-    one = np.zeros((height, width))
-    one[height // 2, width - 1] = 0.001
-    masks = [one, rng.random((height, width)), (rng.random((height, width)) > 0.9) * 1.0, np.ones((height, width))]
-    masks[2][0, 0] = 1.0
-    for mask in masks:
-        radiance = np.where(mask[..., None] > 0, surroundings, np.float32(1e6))
-        radiance[(mask == 0) & (rng.random((height, width)) < 0.3)] = np.nan
-        assert (filled(radiance, mask) == surroundings).all()
 
 
 @pytest.mark.parametrize(("height", "width"), SIZES)
@@ -126,12 +114,151 @@ def test_low_confidence_blends_smoothly(device):
     assert steps.max() < 0.1
 
 
-def test_extreme_values_stay_finite_and_not_negative(device):
-    """Hard case 6: a sun of 1e6 over 1e-4, negative and broken pixels."""
-    radiance = np.full((32, 64, 3), 1e-4)
-    radiance[5, 7], radiance[6, 9], radiance[7, 11], radiance[8, 3] = 1e6, -3281.0, np.nan, np.inf
-    rng = np.random.default_rng(8)
-    out = filled(radiance, rng.random((32, 64)))
-    assert np.isfinite(out).all()
-    assert (out >= 0).all()
-    assert out.max() <= 1e6
+# --- What the camera sees beyond and beside the ball goes into the map where the ball does not tell -------------------
+
+
+HEIGHT = 64
+WIDTH = 2 * HEIGHT
+CODES = 0.01
+"""A texel's directions against a ramp over the frame: they lie within a texel of its middle."""
+
+SCENE = """
+schema = 1
+[camera]
+width = 320
+height = 240
+fx = 160.0
+fy = 160.0
+cx = 159.5
+cy = 119.5
+transfer = "linear"
+[marker]
+size = 0.05
+[probe]
+center = [0.0, 0.0, 0.1]
+radius = 0.03
+"""
+PLANE = """
+[[proxy]]
+shape = "plane"
+size = [4.0, 4.0]
+"""
+EYE = np.array([-0.5, 0.0, 0.1])
+"""Looks along +x, level with the ball."""
+CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""``world_from_camera``."""
+
+
+def given(device, frame, text, balls):
+    """What ``fill_frame`` reads, and the kinds of proxy."""
+    scene = loads_scene(text)
+    host = HostScene(scene, device)
+    params = np.zeros(1, np.dtype(structs.FrameParams.numpy_dtype()))
+    params["camera_position"], params["world_from_camera"] = EYE, CAMERA
+    params["focal"], params["principal"] = (160.0, 160.0), (159.5, 119.5)
+    probes = np.zeros(len(balls), np.dtype(structs.Probe.numpy_dtype()))
+    probes["center"], probes["radius"], probes["reflectance"] = balls, 0.03, 0.85
+    codes, table = wp.array(frame, dtype=wp.vec3ub, device=device), decode_table("linear")
+    arguments = (
+        structs.make_picture(codes, wp.array(table, dtype=wp.vec3, device=device), None),
+        wp.array(params, dtype=structs.FrameParams, device=device),
+        wp.array(probes, dtype=structs.Probe, device=device),
+        host.ray_scene,
+    )
+    return host, arguments, trace_config(scene).proxies
+
+
+def filled_fill_frame(device, frame, text, seed, *, balls=((0.0, 0.0, 0.1),), ball=0):
+    """Level 0 of the pyramid, (h, w, 4), after the frame was put into ``seed``."""
+    _host, arguments, proxies = given(device, frame, text, balls)
+    levels = wp.array(seed.reshape(-1, 4), dtype=wp.vec4, device=device)
+    fill_frame(*arguments, levels, (HEIGHT, WIDTH), proxies=proxies, ball=ball)
+    return levels.numpy().reshape(HEIGHT, WIDTH, 4)
+
+
+def directions():
+    theta = (np.arange(HEIGHT) + 0.5) * np.pi / HEIGHT
+    phi = (2.0 * (np.arange(WIDTH) + 0.5) / WIDTH - 1.0) * np.pi
+    theta, phi = np.meshgrid(theta, phi, indexing="ij")
+    return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
+
+
+def ramp():
+    """Red grows to the right, green downward; blue is even."""
+    y, x = np.mgrid[:240, :320]
+    return np.stack([x * 255 // 320, y, np.full_like(x, 100)], -1).astype(np.uint8)
+
+
+def pixels_of(points):
+    """Pixel of each point relative to the camera, (..., 2)."""
+    p = points @ CAMERA
+    return 160.0 * p[..., :2] / p[..., 2:] + [159.5, 119.5]
+
+
+def inside(pixel, margin):
+    return ((pixel > margin) & (pixel < np.array([319.0, 239.0]) - margin)).all(axis=-1)
+
+
+def test_a_map_is_that_of_its_ball(device):
+    """Of two, the second one's map is what it would be as the first; and not the first one's."""
+    balls, seed = ((0.0, 0.0, 0.1), (0.1, 0.15, 0.06)), np.zeros((HEIGHT, WIDTH, 4), np.float32)
+    second = filled_fill_frame(device, ramp(), SCENE + PLANE, seed, balls=balls, ball=1).copy()
+    np.testing.assert_array_equal(second, filled_fill_frame(device, ramp(), SCENE + PLANE, seed, balls=balls[::-1]))
+    assert (second != filled_fill_frame(device, ramp(), SCENE + PLANE, seed, balls=balls)).any()
+
+
+def test_at_infinity_a_direction_is_where_the_camera_looks_along_it(device):
+    level = filled_fill_frame(device, ramp(), SCENE, np.zeros((HEIGHT, WIDTH, 4), np.float32))
+    d = directions()
+    pixel = pixels_of(d)
+    seen = (d[..., 0] > 0.2) & inside(pixel, 6.0)
+    past = seen & (np.arccos(d[..., 0]) > np.arcsin(1.2 * 0.03 / 0.5) + 0.05)
+    assert past.sum() > 300
+    assert level[past][:, 3] == pytest.approx(float(FRAME_TRUST.val if hasattr(FRAME_TRUST, "val") else FRAME_TRUST))
+    assert level[past][:, 0] == pytest.approx(pixel[past][:, 0] / 320, abs=CODES + 1 / 255)
+    assert level[past][:, 1] == pytest.approx(pixel[past][:, 1] / 255, abs=CODES + 1 / 255)
+    # Behind the ball, and behind the camera, it sees nothing.
+    behind = np.arccos(np.clip(d[..., 0], -1.0, 1.0)) < 0.02
+    assert (level[behind | (d[..., 0] < 0.0)][:, 3] == 0.0).all()
+
+
+def test_modelled_surfaces_are_looked_up_where_they_are(device):
+    level = filled_fill_frame(device, ramp(), SCENE + PLANE, np.zeros((HEIGHT, WIDTH, 4), np.float32))
+    d = directions()
+    down = (d[..., 2] < -0.15) & (d[..., 0] > 0.0)
+    hit = np.array([0.0, 0.0, 0.1]) - 0.1 * d / np.where(down, d[..., 2], -1.0)[..., None]
+    pixel = pixels_of(hit - EYE)
+    away = np.linalg.norm(np.cross(hit - EYE, [1.0, 0.0, 0.0]), axis=-1) / np.linalg.norm(hit - EYE, axis=-1)
+    # A texel's directions lie up to 2.8 degrees from its middle, by which their hits move along the plane.
+    far = np.linalg.norm(hit - [0.0, 0.0, 0.1], axis=-1) > 1.5 * float(OWN_SHADOW) * 0.03
+    told = down & far & inside(pixel, 6.0) & (away > 0.12)
+    assert told.sum() > 100
+    # Texels near the horizon span many pixels of the plane.
+    assert np.median(np.abs(level[told][:, 1] - pixel[told][:, 1] / 255)) < CODES
+    # Parallax: at infinity the same directions are elsewhere.
+    assert np.median(np.abs(pixels_of(d)[told][:, 1] - pixel[told][:, 1])) > 10.0
+
+
+def test_the_ball_s_own_shadow_is_not_taken_for_light(device):
+    level = filled_fill_frame(device, ramp(), SCENE + PLANE, np.zeros((HEIGHT, WIDTH, 4), np.float32))
+    d = directions()
+    to_plane = np.where(d[..., 2] < 0.0, -0.1 / np.minimum(d[..., 2], -1e-6), np.inf)
+    near = to_plane < 0.9 * float(OWN_SHADOW) * 0.03
+    assert near.sum() > 1000
+    assert (level[near][:, 3] == 0.0).all()
+    assert (level[(to_plane > 0.3) & (d[..., 2] < -0.1)][:, 3] > 0.0).sum() > 100
+
+
+def test_what_the_ball_tells_is_kept(device):
+    seed = np.zeros((HEIGHT, WIDTH, 4), np.float32)
+    seed[..., :3], seed[..., 3] = 0.9, 1.0
+    assert np.array_equal(filled_fill_frame(device, ramp(), SCENE, seed), seed)
+    seed[..., 3] = 0.5
+    level = filled_fill_frame(device, ramp(), SCENE, seed)
+    changed = level[..., 3] > 0.5
+    # Half by the ball, 0.8 of the other half by the frame, whose blue is 100.
+    expected = (0.5 * 0.9 + 0.4 * 100 / 255) / 0.9
+    whole = level[..., 3] > 0.899
+    assert changed.any()
+    assert level[whole][:, 2] == pytest.approx(expected, abs=1e-5)
+    assert np.array_equal(level[~changed], seed[~changed])

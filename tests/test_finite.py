@@ -11,7 +11,7 @@ import pytest
 from warp_ar.errors import SceneError
 from warp_ar.scene import bundled_scenes, load_scene
 from warp_ar.scene.description import PoseSpec
-from warp_ar.scene.finite import check_finite
+from warp_ar.scene.fields import check_finite
 
 
 @pytest.mark.parametrize("name", bundled_scenes())

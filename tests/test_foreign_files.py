@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import io
 import json
+import math
+import re
+import struct
 
 import cv2
 import numpy as np
@@ -11,18 +14,19 @@ import OpenImageIO
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from PIL import Image, ImageCms, TiffImagePlugin
+from PIL import ExifTags, Image, ImageCms, PngImagePlugin, TiffImagePlugin
 
+from warp_ar import calibrate
 from warp_ar.calibration.camera_calibration import BoardViews
 from warp_ar.errors import SceneError
 from warp_ar.pictures import srgb_by_profile
-from warp_ar.scene import CharucoBoard, Marker, loads_scene
+from warp_ar.scene import CharucoBoard, Marker, load_scene, loads_scene
 from warp_ar.scene.calibration_file import load_calibration
 from warp_ar.scene.exif import camera_by_exif, read_exif
 from warp_ar.scene.pixel_rays import project, undistorted
 from warp_ar.sources.frame_folder import read_frame
 from warp_ar.sources.sources import open_source
-from warp_ar.tracking.marker_pattern import make_pattern
+from warp_ar.tracking.markers import make_pattern
 
 PIXELS = 0.1
 """Error of the rational model that stands for a fisheye's, pixels."""
@@ -33,8 +37,8 @@ CODES = 2
 ADOBE = np.array([[1.39836, -0.39836, 0.0], [0.0, 1.0, 0.0], [0.0, -0.04293, 1.04293]])
 
 
-def adobe_profile():
-    """Return an ICC profile of Adobe RGB, by its tags: D50 colorants and a gamma."""
+def adobe_profile(gamma=563, kind=b"RGB "):
+    """Return an ICC profile of Adobe RGB, by its tags: D50 colorants and a gamma of 256ths; or one of grey."""
 
     def s15(value):
         return int(round(value * 65536)).to_bytes(4, "big", signed=True)
@@ -42,7 +46,7 @@ def adobe_profile():
     def xyz(*values):
         return b"XYZ \0\0\0\0" + b"".join(map(s15, values))
 
-    curve = b"curv\0\0\0\0" + (1).to_bytes(4, "big") + (563).to_bytes(2, "big") + b"\0\0"
+    curve = b"curv\0\0\0\0" + (1).to_bytes(4, "big") + gamma.to_bytes(2, "big") + b"\0\0"
     text = b"desc\0\0\0\0" + (10).to_bytes(4, "big") + b"Adobe RGB\0" + bytes(78) + b"\0\0"
     tags = {
         b"desc": text,
@@ -54,6 +58,7 @@ def adobe_profile():
         b"rTRC": curve,
         b"gTRC": curve,
         b"bTRC": curve,
+        b"kTRC": curve,
     }
     table, body, at = len(tags).to_bytes(4, "big"), b"", 128 + 4 + 12 * len(tags)
     for name, data in tags.items():
@@ -62,7 +67,7 @@ def adobe_profile():
         body += data
     head = bytearray(128)
     head[0:4] = (at + len(body)).to_bytes(4, "big")
-    head[8:12], head[12:24], head[36:40] = b"\x02\x10\0\0", b"mntrRGB XYZ ", b"acsp"
+    head[8:12], head[12:24], head[36:40] = b"\x02\x10\0\0", b"mntr" + kind + b"XYZ ", b"acsp"
     head[68:80] = s15(0.9642) + s15(1.0) + s15(0.8249)
     return bytes(head) + table + body
 
@@ -95,6 +100,39 @@ def test_a_frame_with_a_profile_is_read_in_srgb(tmp_path, suffix):
     assert np.abs(read_frame(tmp_path / f"b{suffix}")[0][16, 16].astype(int) - codes[0, 0]).max() <= CODES
 
 
+def test_a_grey_profile_is_followed(tmp_path):
+    for suffix in (".png", ".tif"):
+        path = tmp_path / f"a{suffix}"
+        Image.new("L", (8, 8), 128).save(path, icc_profile=adobe_profile(256, b"GRAY"))
+        assert np.abs(read_frame(path)[0].astype(int) - 188).max() <= CODES  # half of the light
+
+
+def test_the_mark_of_a_camera_s_adobe_rgb_is_followed(tmp_path):
+    """EXIF's interoperability R03, without a profile."""
+    exif, codes = Image.Exif(), np.full((16, 16, 3), (160, 90, 47), np.uint8)
+    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.IFD.Interop] = {1: "R03"}
+    Image.fromarray(codes).save(tmp_path / "a.jpg", exif=exif, quality=100)
+    assert np.abs(read_frame(tmp_path / "a.jpg")[0][8, 8] - as_srgb(codes[0, 0])).max() <= 2 * CODES
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.sampled_from([0.45455, 1.0, 0.55]), st.tuples(*[st.integers(1, 255)] * 3), st.booleans())
+def test_gamma_and_chromaticities_of_a_png_are_followed(tmp_path_factory, gamma, color, wide):
+    path, info = tmp_path_factory.mktemp("png") / "a.png", PngImagePlugin.PngInfo()
+    info.add(b"gAMA", struct.pack(">I", round(gamma * 1e5)))
+    if wide:  # white first, then Adobe RGB's primaries
+        xy = (0.3127, 0.329, 0.64, 0.33, 0.21, 0.71, 0.15, 0.06)
+        info.add(b"cHRM", struct.pack(">8I", *(round(value * 1e5) for value in xy)))
+    Image.new("RGB", (4, 4), color).save(path, pnginfo=info)
+    found = read_frame(path)[0][0, 0]
+    if gamma == 0.45455:
+        assert found.tolist() == list(color)
+        return
+    light = np.clip((np.array(color) / 255) ** (1 / gamma) @ (ADOBE.T if wide else np.eye(3)), 0, 1)
+    shown = 255 * np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    assert np.abs(found - shown).max() <= 1
+
+
 @settings(max_examples=20, deadline=None)
 @given(
     st.sampled_from(["uint8", "uint16", "float"]), st.sampled_from(["contig", "separate"]), st.sampled_from([1, 3, 4])
@@ -122,6 +160,9 @@ def test_hidden_files_are_no_frames(tmp_path):
         (tmp_path / f"._IMG_{number}.jpg").write_bytes(b"\0\x05\x16\x07" + bytes(80))
     with open_source(tmp_path) as source:
         assert len(list(source)) == 3
+    for name in ("desk.toml", "._desk.toml"):
+        (tmp_path / name).write_text("schema = 1\n[camera]\nfield_of_view = 60\n" if name[0] != "." else "\0")
+    assert load_scene(tmp_path).name == "desk"
 
 
 def photograph(path, size, told, film=None):
@@ -142,6 +183,18 @@ def test_resolution_of_the_sensor_holds_for_its_long_side(tmp_path):
     for size, told in (((1200, 800), (6000, 4000)), ((800, 1200), (4000, 6000)), ((1200, 800), (4000, 6000))):
         photograph(tmp_path / "a.jpg", size, told)
         assert read_exif(tmp_path / "a.jpg").focal_length() == pytest.approx(right, rel=1e-3)
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".tif", ".png", ".webp"])
+@pytest.mark.parametrize("orientation", [1, 6])
+def test_a_photograph_on_its_side_has_the_size_of_its_frames(tmp_path, suffix, orientation):
+    path = tmp_path / f"a{suffix}"
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    Image.new("RGB", (1200, 800)).save(path, exif=exif)
+    height, width = read_frame(path)[0].shape[:2]
+    assert (read_exif(path).width, read_exif(path).height) == (width, height)
+    assert (width, height) == ((1200, 800) if orientation == 1 else (800, 1200))
 
 
 def test_a_size_that_was_rewritten_is_seen(tmp_path, capsys):
@@ -184,7 +237,7 @@ def test_the_fisheye_of_a_case(tmp_path):
         ({"camera_model": "omni", "xi": 1.2}, "xi: not understood"),
         ({"distortion_parameters": [-0.3, 0.1, 0, 0]}, "distortion_parameters: not understood"),
         ({"distortion_model": "equidistant", "D": [0.1, 0, 0, 0, 0]}, "4 finite values of a fisheye"),
-        ({"fisheye_model": 1, "D": [2.0, 0, 0, 0], "image_width": 4000}, "farther than|pixels only"),
+        ({"fisheye_model": 1, "D": [2.0, 0, 0, 0], "image_width": 4000}, "reaches 90 degrees from its axis"),
     ],
 )
 def test_other_models_are_refused_by_name(tmp_path, more, said):
@@ -192,9 +245,90 @@ def test_other_models_are_refused_by_name(tmp_path, more, said):
         load_calibration(calibration(tmp_path / "c.json", **more))
 
 
-def test_distortion_coeffs_are_read(tmp_path):
-    found = load_calibration(calibration(tmp_path / "c.json", distortion_coeffs=[-0.3, 0.1, 0, 0, 0]))
-    assert found.distortion == (-0.3, 0.1, 0.0, 0.0, 0.0)
+@settings(max_examples=25, deadline=None)
+@given(st.floats(82.0, 120.0), st.sampled_from([(640, 480), (3840, 2160), (2704, 1520)]), st.floats(-0.03, 0.03))
+def test_the_crop_that_a_wide_fisheye_is_told_can_be_followed(tmp_path_factory, reach, size, term):
+    (width, height), angle = size, math.radians(reach)
+    focal = math.hypot(*size) / 2 / (angle + term * angle**3)
+    path = tmp_path_factory.mktemp("c") / "c.json"
+
+    def wide(width, height):
+        matrix = [[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]]
+        said = {"image_width": width, "image_height": height, "camera_matrix": matrix, "fisheye_model": 1}
+        return calibration(path, **said, distortion_coefficients=[term, 0, 0, 0])
+
+    with pytest.raises(SceneError, match=r"degrees(?: and more)? from its axis; expected 80 at most") as told:
+        load_calibration(wide(width, height))
+    found = re.search(r"reaches (\d+) degrees( and more)?.* to (\d+)x(\d+) around", str(told.value))
+    assert found[2] or abs(int(found[1]) - reach) <= 1.0
+    width, height = int(found[3]), int(found[4])
+    camera = load_calibration(wide(width, height))
+    assert (camera.width, camera.height) == (width, height)
+
+
+KALIBR = "cam0:\n  camera_model: {}\n  distortion_coeffs: [-0.3, 0.1, 0.001, 0.0]\n  distortion_model: radtan\n"
+KALIBR += "  intrinsics: [400, 401, 320, 240]\n  resolution: [640, 480]\n"
+NERF = {"w": 640, "h": 480, "fl_x": 400, "fl_y": 401, "cx": 320.5, "cy": 240.5, "frames": []}
+REALSENSE = {"width": 640, "height": 480, "ppx": 320, "ppy": 240, "fx": 400, "fy": 401, "model": "Brown Conrady"}
+REALSENSE["coeffs"] = [-0.3, 0.1, 0, 0, 0]
+SIZED = {"image_width": 640, "image_height": 480, "camera_matrix": [[400, 0, 320], [0, 401, 240], [0, 0, 1]]}
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "distortion"),
+    [
+        ("a.json", json.dumps(SIZED | {"distortion_coeffs": [-0.3, 0.1, 0, 0, 0]}), (-0.3, 0.1, 0, 0, 0)),
+        ("a.json", json.dumps(SIZED | {"k1": -0.3, "p2": 0.01, "k3": 0.2}), (-0.3, 0, 0, 0.01, 0.2, 0, 0, 0)),
+        ("a.json", json.dumps(SIZED | {"distortion_model": "none"}), (0, 0, 0, 0, 0)),
+        ("transforms.json", json.dumps(NERF | {"k1": -0.3, "k2": 0.1}), (-0.3, 0.1, 0, 0, 0, 0, 0, 0)),
+        ("realsense.json", json.dumps(REALSENSE), (-0.3, 0.1, 0, 0, 0)),
+        ("camchain.yaml", KALIBR.format("pinhole"), (-0.3, 0.1, 0.001, 0)),
+        ("cameras.txt", "# list\n1 PINHOLE 640 480 400 401 320.5 240.5\n", (0, 0, 0, 0, 0)),
+        ("cameras.txt", "3 OPENCV 640 480 400 401 320.5 240.5 -0.3 0.1 1e-3 0\n", (-0.3, 0.1, 0.001, 0, 0, 0, 0, 0)),
+    ],
+)
+def test_calibrations_of_other_programs(tmp_path, name, text, distortion):
+    (tmp_path / name).write_text(text)
+    found = load_calibration(tmp_path / name)
+    assert (found.width, found.height, found.fx, found.fy, found.cx, found.cy) == (640, 480, 400, 401, 320, 240)
+    assert found.distortion == pytest.approx(distortion)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("camchain.yaml", KALIBR.format("omni"), "camera model 'omni'"),
+        ("realsense.json", json.dumps(REALSENSE | {"model": "inverse_brown_conrady"}), "'inverse_brown_conrady'"),
+        ("a.json", json.dumps(SIZED | {"lens_coefficients": [0.1, 0, 0, 0]}), "lens_coefficients: not understood"),
+        ("camchain.yaml", KALIBR.format("pinhole") + KALIBR.format("pinhole").replace("cam0", "cam1"), "2 cameras"),
+        ("cameras.txt", "1 FOV 640 480 400 401 320 240 0.9\n", "camera model 'FOV'"),
+        ("cameras.txt", "1 PINHOLE 6 4 4 4 3 2\n2 PINHOLE 6 4 4 4 3 2\n", "2 cameras"),
+    ],
+)
+def test_calibrations_of_other_programs_that_are_not_followed(tmp_path, name, text, said):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(SceneError, match=said):
+        load_calibration(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("a.json", json.dumps(SIZED | {"is_fisheye": True, "D": [-0.1, 0.01, 0.02, -0.01]})),
+        ("transforms.json", json.dumps(NERF | {"is_fisheye": True, "k1": -0.1, "k2": 0.01, "k3": 0.02, "k4": -0.01})),
+        ("cameras.txt", "1 OPENCV_FISHEYE 640 480 400 401 320.5 240.5 -0.1 0.01 0.02 -0.01\n"),
+        (
+            "a.yaml",
+            KALIBR.format("pinhole")
+            .replace("radtan", "equidistant")
+            .replace("-0.3, 0.1, 0.001, 0.0", "-0.1, 0.01, 0.02, -0.01"),
+        ),
+    ],
+)
+def test_fisheyes_of_other_programs(tmp_path, name, text):
+    (tmp_path / name).write_text(text)
+    seen = project(load_calibration(tmp_path / name), np.array([[0.5, 0.3, 1.0]]))[0]
+    assert seen == pytest.approx([496.2, 240 + 105.7 * 401 / 400], abs=0.08)
 
 
 def board_picture(columns, rows, legacy):
@@ -224,6 +358,36 @@ def test_boards_of_the_old_layout_are_found(columns, rows):
     text = 'schema = 1\n[camera]\nfield_of_view = 60.0\n[source]\nsynthetic = "card"\n[marker]\nboard = "{}"\n'
     board = CharucoBoard(columns, rows, 0.04, 0.03, legacy=True)
     assert loads_scene(text.format(board)).marker.board == board
+
+
+def test_a_fisheye_is_calibrated(tmp_path):
+    """Pictures of a lens of 140 degrees across its corners: focal length, and where the rim's pixels look."""
+    width, height, focal, terms = 640, 480, 340.0, np.array([-0.03, 0.01, -0.004, 0.0])
+    matrix = np.array([[focal, 0, 322.0], [0, focal, 238.0], [0, 0, 1.0]])
+    grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1).astype(np.float64)
+    looks = cv2.fisheye.undistortPoints(grid.reshape(-1, 1, 2), matrix, terms).reshape(-1, 2)
+    rays = np.column_stack([looks, np.ones(len(looks))])
+    rng = np.random.default_rng(3)
+    for number in range(16):
+        turn = cv2.Rodrigues(rng.uniform(-0.7, 0.7, 3) * (1, 1, 0.3))[0]
+        around = 2 * np.pi * number / 16
+        away = rng.uniform(5.0, 8.0)
+        place = np.array([1.1 * away * np.cos(around), 0.8 * away * np.sin(around), away]) * rng.choice([0.4, 1.0])
+        place[2] = max(place[2], 4.0)
+        # Where rays meet the board's plane, in squares from its middle.
+        u, v, w = (rays @ np.linalg.inv(np.column_stack([turn[:, :2], place])).T).T
+        shown = np.where(w > 0, [u / w, v / w], -1e3)
+        at = (80 * shown + np.array([[40 + 320], [40 + 240]]) - 0.5).reshape(2, height, width).astype(np.float32)
+        picture = cv2.remap(board_picture(8, 6, False), *at, cv2.INTER_LINEAR, borderValue=128)
+        cv2.imwrite(str(tmp_path / f"{number:02d}.png"), picture)
+    out = tmp_path / "c.yml"
+    assert calibrate.main(["camera", str(tmp_path), "--fisheye", "--output", str(out)]) == 0
+    found = load_calibration(out)
+    assert "fisheye_model" in out.read_text()
+    assert found.fx == pytest.approx(focal, rel=2e-3)
+    rim = np.array([(5.0, 240.0), (320.0, 470.0), (630.0, 100.0), (40.0, 40.0)])
+    flat = cv2.fisheye.undistortPoints(rim[:, None], matrix, terms)[:, 0]
+    assert np.abs(project(found, np.column_stack([flat, np.ones(4)])) - rim).max() < 1.0
 
 
 def test_the_print_of_an_old_board_is_as_opencv_draws_it():

@@ -17,13 +17,15 @@ import pytest
 
 from tests.test_sinks import VIDEOS, flat, levels, no_thread_left  # noqa: F401  (a fixture)
 from warp_ar.errors import SinkError
-from warp_ar.output.folder_sink import FolderSink
 from warp_ar.output.layer_file import LayerFrame, LayerSink
 from warp_ar.output.sinks import (
     EnvironmentSink,
+    FolderSink,
     open_sink,
     read_environment,
 )
+
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture
@@ -44,7 +46,7 @@ def disk(tmp_path: pathlib.Path) -> Iterator[pathlib.Path]:
 
 
 # What is on the disk beside: every fragment, and the end of the file, is cut off somewhere.
-@pytest.mark.parametrize("taken", [0, 130, 200, 270, 330, 390])
+@pytest.mark.parametrize("taken", [0, 130, 330])
 @pytest.mark.parametrize("name", [*VIDEOS, "frames", "light"])
 def test_full_disk_leaves_whole_files_and_true_counts(disk: pathlib.Path, name: str, taken: int) -> None:
     (disk / "other").write_bytes(bytes(1000 * taken))
@@ -71,47 +73,6 @@ def test_full_disk_leaves_whole_files_and_true_counts(disk: pathlib.Path, name: 
     assert threading.active_count() <= before
 
 
-@pytest.mark.parametrize("name", VIDEOS)
-def test_an_end_that_does_not_fit_leaves_the_fragments(disk: pathlib.Path, name: str) -> None:
-    # 60 frames take 110 to 124 kB: the last fragments fit or not, and so does what makes an ordinary file of them.
-    outcomes = set()
-    for free in range(96, 136, 4):
-        (disk / name).unlink(missing_ok=True)
-        (disk / "other").write_bytes(bytes((400 - free) * 1024))
-        rng, told = np.random.default_rng(0), ""
-        try:
-            with open_sink(disk / name, fps=24) as sink:
-                for _ in range(60):
-                    sink.write(rng.integers(0, 256, (48, 64, 3), dtype=np.uint8))
-        except SinkError as error:
-            told = str(error)
-        assert len(levels(disk / name)) == sink.written
-        assert (sink.written == 60) == (told == "") or "finished" in told
-        outcomes.add(sink.written)
-    assert 60 in outcomes
-    assert len(outcomes) > 1
-
-
-@pytest.mark.parametrize("name", VIDEOS)
-def test_full_disk_at_the_start_leaves_what_stood_there(disk: pathlib.Path, name: str) -> None:
-    with open_sink(disk / name, fps=24) as sink:
-        for level in range(20):
-            sink.write(flat(level))
-    before = (disk / name).read_bytes()
-    free = shutil.disk_usage(disk).free
-    (disk / "other").write_bytes(bytes(max(free - 8192, 0)))
-    rng = np.random.default_rng(0)
-
-    def fill() -> None:
-        with open_sink(disk / name, fps=24) as sink:
-            for _ in range(60):
-                sink.write(rng.integers(0, 256, (480, 640, 3), dtype=np.uint8))
-
-    with pytest.raises(SinkError, match="No space left"):
-        fill()
-    assert (disk / name).read_bytes() == before
-
-
 @contextlib.contextmanager
 def file_limit(size: int) -> Iterator[None]:
     """Let no file of this process grow beyond so many bytes: a quota where no disk can be mounted.
@@ -129,7 +90,7 @@ def file_limit(size: int) -> Iterator[None]:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no limit of a file's size")
-@pytest.mark.parametrize("limit", [0, 2_000, 30_000, 70_000, 150_000])
+@pytest.mark.parametrize("limit", [0, 30_000, 150_000])
 @pytest.mark.parametrize("name", VIDEOS)
 def test_a_limit_of_files_leaves_whole_videos_and_true_counts(tmp_path: pathlib.Path, name: str, limit: int) -> None:
     rng = np.random.default_rng(0)
@@ -162,7 +123,7 @@ FOLDERS = {
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no limit of a file's size")
-@pytest.mark.parametrize("limit", [0, 700, 2_000, 2_500, 30_000])
+@pytest.mark.parametrize("limit", [0, 2_000, 30_000])
 @pytest.mark.parametrize("name", FOLDERS)
 def test_a_limit_of_files_leaves_whole_frames_and_true_counts(tmp_path: pathlib.Path, name: str, limit: int) -> None:
     """Three flat frames fit or not; the fourth, of noise, does not."""
@@ -204,3 +165,44 @@ def test_a_limit_at_the_start_leaves_what_stood_there(tmp_path: pathlib.Path, na
         fill()
     assert (tmp_path / name).read_bytes() == before
     assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+@pytest.mark.parametrize("name", VIDEOS)
+def test_an_end_that_does_not_fit_leaves_the_fragments(disk: pathlib.Path, name: str) -> None:
+    # 60 frames take 110 to 124 kB: the last fragments fit or not, and so does what makes an ordinary file of them.
+    outcomes = set()
+    for free in range(96, 136, 4):
+        (disk / name).unlink(missing_ok=True)
+        (disk / "other").write_bytes(bytes((400 - free) * 1024))
+        rng, told = np.random.default_rng(0), ""
+        try:
+            with open_sink(disk / name, fps=24) as sink:
+                for _ in range(60):
+                    sink.write(rng.integers(0, 256, (48, 64, 3), dtype=np.uint8))
+        except SinkError as error:
+            told = str(error)
+        assert len(levels(disk / name)) == sink.written
+        assert (sink.written == 60) == (told == "") or "finished" in told
+        outcomes.add(sink.written)
+    assert 60 in outcomes
+    assert len(outcomes) > 1
+
+
+@pytest.mark.parametrize("name", VIDEOS)
+def test_full_disk_at_the_start_leaves_what_stood_there(disk: pathlib.Path, name: str) -> None:
+    with open_sink(disk / name, fps=24) as sink:
+        for level in range(20):
+            sink.write(flat(level))
+    before = (disk / name).read_bytes()
+    free = shutil.disk_usage(disk).free
+    (disk / "other").write_bytes(bytes(max(free - 8192, 0)))
+    rng = np.random.default_rng(0)
+
+    def fill() -> None:
+        with open_sink(disk / name, fps=24) as sink:
+            for _ in range(60):
+                sink.write(rng.integers(0, 256, (480, 640, 3), dtype=np.uint8))
+
+    with pytest.raises(SinkError, match="No space left"):
+        fill()
+    assert (disk / name).read_bytes() == before

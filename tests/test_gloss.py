@@ -15,7 +15,6 @@ from tests.mirror_ball_rig import CHALK, DESK, FOCAL, RAYS, H, W, grey_frame
 from tests.reference import color as reference_color
 from tests.reference import gloss as reference
 from tests.reference.visibility import Body
-from warp_ar.engine.graph import make_plan
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SceneError
 from warp_ar.kernels import color
@@ -36,7 +35,8 @@ from warp_ar.kernels.structs import (
     make_picture,
 )
 from warp_ar.scene import ProxyMaterial, dumps_scene, loads_scene
-from warp_ar.stages.request import Request
+
+pytestmark = pytest.mark.slow
 
 EYE = np.array([0.02, -0.45, 0.3])
 CENTER, RADIUS = np.array([0.0, 0.06, 0.07]), 0.05
@@ -132,7 +132,7 @@ def test_a_mirror_shows_a_ball_where_geometry_says(device):
     assert edge.any()
 
 
-@pytest.mark.parametrize("roughness", [0.3, 0.5, 0.8])
+@pytest.mark.parametrize("roughness", [0.3, 0.8])
 def test_a_rough_receiver_is_the_integral_over_its_lobe(device, roughness):
     """GGX as printed, in float64, over the cone that the ball fills."""
     got = run((roughness, F0), samples=4096)
@@ -141,13 +141,6 @@ def test_a_rough_receiver_is_the_integral_over_its_lobe(device, roughness):
         expected = reference.rough(EYE, directions()[row, column], CENTER, RADIUS, DIFFERENCE, F0, roughness**2)
         np.testing.assert_allclose(got[row, column], expected, rtol=RAYS_ERROR, atol=0.01 * peak)
     assert peak > 1e-4
-
-
-def test_few_rays_and_their_neighbours_are_near_many(device):
-    few, many = run((0.4, F0), samples=4, smooth=True), run((0.4, F0), samples=1024)
-    # Sixteen rays around each pixel's own four: a quarter of the noise is left.
-    np.testing.assert_allclose(few[8:-8, 8:-8], many[8:-8, 8:-8], atol=0.15 * np.abs(many).max())
-    assert np.abs(few - many).mean() < 0.02 * np.abs(many).max()
 
 
 def test_what_is_mirrored_is_not_shadowed(device):
@@ -180,8 +173,14 @@ def test_a_lamp_has_a_highlight(device):
     assert shaded[peak, 0] < 0.5 * expected[peak, 0]
 
 
-@pytest.mark.parametrize("seen", ["from above", "aslant"])
-@pytest.mark.parametrize(("roughness", "radius"), [(0.4, 0.005), (0.4, 0.06), (0.2, 0.02), (0.2, 0.06), (0.1, 0.005)])
+@pytest.mark.parametrize(
+    ("roughness", "radius", "seen"),
+    [
+        (0.4, 0.005, "from above"),
+        (0.2, 0.06, "aslant"),
+        (0.1, 0.005, "aslant"),
+    ],
+)
 def test_a_sphere_has_a_wider_highlight(device, roughness, radius, seen):
     """That of all its directions, summed up; a point's would be up to five times as bright."""
     above = seen == "from above"
@@ -219,15 +218,6 @@ def test_grazing_view(device, height, roughness):
     assert (np.abs(plain) <= np.abs(DIFFERENCE).max() + 1e-4).all()
 
 
-def test_next_to_no_roughness_is_a_mirror(device):
-    """Below and just above the width from which lobes are sampled."""
-    mirror, narrow = run((0.0, F0)), run((0.033, F0), samples=256)
-    inside = (np.abs(mirror).max(-1) > 0) & (np.abs(narrow).max(-1) > 0)
-    close = np.isclose(mirror, narrow, atol=0.1 * np.abs(mirror).max()).all(-1)
-    assert close[inside].mean() > 0.9
-    np.testing.assert_array_equal(run((1e-3, F0)), mirror)
-
-
 @pytest.mark.parametrize("roughness", [0.0, 0.3])
 def test_from_below_and_behind_nothing_is_mirrored(device, roughness):
     """A plane faces its own +z; what is under it is not mirrored above it either."""
@@ -248,18 +238,6 @@ def test_a_matt_receiver_and_a_ball_before_it_do_not_change(device):
     np.testing.assert_array_equal(run((0.3, F0), balls=[covered]), 0.0)
 
 
-def test_a_lamp_in_the_surface(device):
-    on = {**LAMP, "position": (0.02, 0.0, 0.0)}
-    assert np.isfinite(run((0.0, F0), lights=[on])).all()
-    assert np.isfinite(run((0.5, F0), lights=[{**on, "intensity": (1e6, 1e6, 1e6)}])).all()
-
-
-def test_bands_are_the_whole(device):
-    whole = run((0.3, F0), lights=[LAMP])
-    np.testing.assert_array_equal(run((0.3, F0), lights=[LAMP], rows=(10, 20))[10:20], whole[10:20])
-    np.testing.assert_array_equal(run((0.3, F0), lights=[LAMP]), whole)
-
-
 # --- scenes and the stage
 
 PLANE = f"""schema = 1
@@ -271,7 +249,7 @@ size = [1.0, 1.0]
 """
 
 
-def test_scene_files(tmp_path):
+def test_scene(tmp_path):
     scene = loads_scene(PLANE + "[proxy.material]\nroughness = 0.2\nreflectance = 0.05\n")
     assert scene.proxies[0].material == ProxyMaterial(0.2, (0.05, 0.05, 0.05))
     assert loads_scene(dumps_scene(scene)) == scene
@@ -300,16 +278,6 @@ def polished(**changes):
     scene = make_scene(**changes)
     plane = dataclasses.replace(scene.proxies[0], material=ProxyMaterial(0.2, (0.3, 0.3, 0.3)))
     return dataclasses.replace(scene, proxies=(plane, *scene.proxies[1:]))
-
-
-def test_it_runs_only_where_a_proxy_has_a_material():
-    quality = make_quality()
-    matt, glossy = (make_plan(Request(scene, quality, SIZE)) for scene in (make_scene(), polished()))
-    assert "gloss" not in [stage.name for stage, _ in matt.stages]
-    assert "no proxy has a material" in dict(matt.left_out)["gloss"]
-    assert "gloss" in [stage.name for stage, _ in glossy.stages]
-    left = make_plan(Request(polished(), quality.with_methods(mirror_ball="none"), SIZE))
-    assert "quality" in dict(left.left_out)["gloss"]
 
 
 def test_the_picture_has_it(device):

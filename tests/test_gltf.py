@@ -13,7 +13,6 @@ from tests.gltf_files import SQUARE, SQUARE_FACES, SQUARE_UVS, Gltf
 from warp_ar.errors import SceneError
 from warp_ar.scene import MetallicRoughnessMaterial, Object, Play
 from warp_ar.scene.mesh_files import load_mesh
-from warp_ar.scene.mesh_materials import dump_materials, parse_materials
 from warp_ar.scene.object_materials import materials_of
 
 SINGLE = 1e-6  # float32 positions near 1
@@ -70,7 +69,6 @@ def test_every_factor_and_texture_arrives(tmp_path: pathlib.Path) -> None:
     np.testing.assert_allclose(material.roughness_span, (green.min() / 255, green.max() / 255))
     np.testing.assert_allclose(material.metallic_span, (blue.min() / 255, blue.max() / 255))
     assert mesh.notes == ()
-    assert parse_materials(dump_materials(mesh.materials)) == mesh.materials
 
 
 def test_samplers_and_transforms(tmp_path: pathlib.Path) -> None:
@@ -156,26 +154,16 @@ def test_nodes_and_skins(tmp_path: pathlib.Path) -> None:
 
 
 @pytest.mark.parametrize("play", [None, Play(0)])
-@pytest.mark.parametrize(
-    ("skinned", "morphed", "said"),
-    [
-        (True, True, "skins and morph targets"),
-        (True, False, "skins"),
-        (False, True, "morph targets"),
-        (False, False, ""),
-    ],
-)
-def test_skins_and_morph_targets_that_move_are_named_once(
-    tmp_path: pathlib.Path, caplog: pytest.LogCaptureFixture, play: Play | None, skinned: bool, morphed: bool, said: str
+def test_skins_and_morph_targets_that_move_are_no_loss(
+    tmp_path: pathlib.Path, caplog: pytest.LogCaptureFixture, play: Play | None
 ) -> None:
-    """In one sentence, however many nodes have them; what moves beside them does not take their mesh along."""
+    """That nothing plays them is said once, however many nodes have them; what is played lacks nothing."""
     made = Gltf()
     ones, joints = np.tile(np.float32([1, 0, 0, 0]), (4, 1)), np.zeros((4, 4), np.uint8)
     for _ in range(2):
-        skin = {"JOINTS_0": made.array(joints), "WEIGHTS_0": made.array(ones)} if skinned else {}
-        primitive = made.square(**skin)
+        primitive = made.square(JOINTS_0=made.array(joints), WEIGHTS_0=made.array(ones))
         primitive["targets"] = [{"POSITION": made.array(SQUARE)}]
-        made.node(primitive, **({"skin": 0} if skinned else {}))
+        made.node(primitive, skin=0)
     made.tree["nodes"].append({"translation": [0, 0, 7]})
     made.tree["skins"] = [{"joints": [2]}]
     times = made.array(np.float32([0.0, 1.0]), min=[0.0], max=[1.0])
@@ -183,17 +171,14 @@ def test_skins_and_morph_targets_that_move_are_named_once(
         {"input": times, "output": made.array(values)} for values in (np.zeros((2, 3), "f4"), np.zeros(2, "f4"))
     ]
     channels = [{"sampler": 0, "target": {"node": 2, "path": "translation"}}]
-    channels += [{"sampler": 1, "target": {"node": k, "path": "weights"}} for k in range(2 * morphed)]
+    channels += [{"sampler": 1, "target": {"node": k, "path": "weights"}} for k in range(2)]
     made.tree["animations"] = [{"samplers": samplers, "channels": channels}]
     path = made.save(tmp_path / "a.glb")
     with caplog.at_level(logging.WARNING):
         for _ in range(3):
             materials_of(Object("mesh", file=path, play=play))
-    expected = ["animations (an object's key play names one)"] if play is None else []
-    expected += [f"movement of {said} (they stand as at the start)"] if said else []
-    assert [record.getMessage() for record in caplog.records] == (
-        [f"{path}: not shown: {', '.join(expected)}"] if expected else []
-    )
+    expected = [f"{path}: not shown: animations (an object's key play names one)"] if play is None else []
+    assert [record.getMessage() for record in caplog.records] == expected
 
 
 def test_what_is_not_shown_is_said_once(tmp_path: pathlib.Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -247,31 +232,24 @@ def deep(tree: dict[str, Any]) -> None:
     ("change", "message"),
     [
         (lambda t: t["nodes"].append({"children": [1]}) or t.update(scenes=[{"nodes": [1]}]), "reached twice"),
-        (deep, "node 0 is reached twice"),
         (lambda t: t["nodes"][0].update(children=[0]), "below each other in a circle"),
-        (lambda t: t["nodes"][0].update(mesh=7), "meshes hold 7; there are 1"),
-        (lambda t: t["nodes"][0].update(children=[-1]), "children hold -1"),
-        (lambda t: t["nodes"][0].update(scale=[1, float("nan"), 1]), "node 0"),
+        (lambda t: t["nodes"][0].update(children=[-1]), "child of node 0 is -1"),
         (lambda t: t["nodes"][0].update(rotation=[0, 0, 0, 0]), "rotation without length"),
-        (lambda t: t["nodes"][0].update(matrix=[1] * 15), "matrix .* 16 numbers are right"),
+        (lambda t: t["nodes"][0].update(matrix=[1] * 15), "matrix .* 16 numbers is right"),
         (lambda t: t["nodes"][0].update(translation=[1e300, 0, 0]), "node 0 has a transform that is not finite"),
-        (lambda t: t.update(scene=3, scenes=[{}]), "the scene's number hold 3"),
+        (lambda t: t.update(scene=3, scenes=[{}]), "the scene is 3; there are 1"),
         (lambda t: t["meshes"][0]["primitives"][0].update(material=9), "names material 9; there are 1"),
-        (lambda t: t["meshes"][0]["primitives"][0].update(indices=44), "indices is accessor 44"),
-        (lambda t: t["meshes"][0]["primitives"][0]["attributes"].update(POSITION="x"), "POSITION is accessor x"),
         (lambda t: t["meshes"][0]["primitives"][0]["attributes"].update(POSITION=1), "of 2 numbers each; 3 are right"),
-        (lambda t: t["accessors"][0].update(componentType=1), "type VEC3 of 1"),
         (lambda t: t["accessors"][0].update(count=10**6), "needs .* bytes; its view has"),
-        (lambda t: t["accessors"][0].update(byteOffset=-4), "byteOffset '-4'"),
-        (lambda t: t["accessors"][0].update(bufferView=99), "buffer view 99"),
-        (lambda t: t["bufferViews"][1].update(byteLength=10**9), "which no buffer holds"),
-        (lambda t: t["bufferViews"][1].update(byteStride=1), "which no buffer holds"),
-        (lambda t: t["accessors"][0].update(sparse={"count": 10**9, "indices": {}, "values": {}}), "is sparse"),
+        (lambda t: t["bufferViews"][1].update(byteLength=10**9), "of a buffer of 172"),
+        (lambda t: t["bufferViews"][1].pop("buffer"), "buffer view 1 lies in buffer None; there are 1"),
+        (lambda t: t["bufferViews"][1].update(byteStride=1), "elements of 12 bytes, one every 1"),
+        (
+            lambda t: t["accessors"][0].update(sparse={"count": 10**9, "indices": {}, "values": {}}),
+            "the sparse part of accessor 0",
+        ),
         (lambda t: t["materials"][0].update(alphaMode="SHINE"), "alphaMode 'SHINE'"),
         (lambda t: t["materials"][0].update(emissiveFactor=[1, 2]), "emissiveFactor .* 3 numbers"),
-        (lambda t: t["materials"][0].update(normalTexture={"index": 5}), "names texture 5"),
-        (lambda t: t["textures"][0].update(sampler=3), "names sampler 3"),
-        (lambda t: t["textures"][0].update(source=3), "names image 3"),
         (lambda t: t.update(images=[{"uri": "https://a.example/x.png"}]), "nothing is fetched"),
         (lambda t: t.update(extensionsRequired=["KHR_draco_mesh_compression"]), "compressed with KHR_draco"),
         (lambda t: t.update(extensionsUsed=7), "is no list"),

@@ -9,10 +9,12 @@ from scipy.stats import binom
 
 from tests.printed_card import PrintedCard, linear_of, poses, smooth_curve
 from warp_ar import calibrate
-from warp_ar.calibration.grey_response import measure_grey_response
+from warp_ar.calibration.response import measure_grey_response
 from warp_ar.errors import UsageError
 from warp_ar.scene import Camera, load_scene
 from warp_ar.tracking.card_layout import SHEET
+
+pytestmark = pytest.mark.slow
 
 CAMERA = Camera(640, 480, 620.0, 620.0, 319.5, 239.5)
 SETUPS = 6

@@ -22,6 +22,8 @@ from warp_ar.scene import Camera, Pose, Probe, Proxy, load_scene
 from warp_ar.sources.sources import open_source
 from warp_ar.tracking.card_layout import ball_center
 
+pytestmark = pytest.mark.slow
+
 CAMERA = Camera(640, 480, 600.0, 600.0, 321.0, 238.0, (-0.08, 0.02, 0.0, 0.0, 0.0))
 PROBE = Probe(ball_center(0.03), 0.03)
 TABLE = Proxy("plane", at=(0.0, 0.0, 0.0), size=(1.6, 1.2))

@@ -21,11 +21,14 @@ from warp_ar.errors import SceneError, SourceError, UsageError, printable
 from warp_ar.files import bracket_depth, indentation_depth, limits, read_bytes, tag_depth, write_whole
 from warp_ar.pictures import picture_size
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="pipes, devices and limits as on Linux")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(sys.platform != "linux", reason="pipes, devices and limits as on Linux"),
+]
 
 LEAST_INPUTS = 600
 """Beside what hypothesis thinks up."""
-KILLS = 4
+KILLS = 2
 """For each sink and signal; ``python -m tests.hostile.kill 50`` kills more often."""
 
 

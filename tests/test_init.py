@@ -19,6 +19,8 @@ from warp_ar.signature import is_signed
 from warp_ar.tracking import card_layout
 from warp_ar.tracking.tracking import Tracker
 
+pytestmark = pytest.mark.slow
+
 PRINT_MM = 0.15
 """Of the rendered PDF: pixels of a quarter of a millimetre, found by their corners to half of one."""
 

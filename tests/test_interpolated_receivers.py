@@ -17,6 +17,8 @@ from warp_ar.kernels.environment.environment_samples import EnvironmentSample
 from warp_ar.kernels.environment.interpolated_irradiance import OtherBalls
 from warp_ar.kernels.receiver.receiver import PRIOR_WEIGHT
 
+pytestmark = pytest.mark.slow
+
 PLACES = ((-0.15, 0.02, 0.05, 1.0), (0.2, -0.05, 0.05, 1.0), (0.1, 0.15, 0.05, 0.6))
 WHERE = np.array([[weights(PLACES[:2], point) for point in row] for row in POINTS])
 """What two balls count at the desk's points, (H, W, 2)."""

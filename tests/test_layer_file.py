@@ -15,8 +15,17 @@ from tests.layer_rig import POSES, SIZE, make_frame, make_scene, run
 from tests.reference import color as reference_color
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SinkError, UsageError
-from warp_ar.output.layer_file import DEPTH_STEP, PICTURES, LayerFrame, LayerSink, compose_layers, write_layers
-from warp_ar.output.side_files import SideFiles, layer_frame, parse_layers
+from warp_ar.output.layer_file import (
+    DEPTH_STEP,
+    PICTURES,
+    LayerFrame,
+    LayerSink,
+    SideFiles,
+    compose_layers,
+    layer_frame,
+    parse_layers,
+    write_layers,
+)
 from warp_ar.scene import Exposure
 from warp_ar.stages.request import LAYERS, PICTURE_LAYERS
 

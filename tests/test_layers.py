@@ -67,7 +67,7 @@ def test_a_stage_has_a_file_of_its_name() -> None:
 
 
 LACKING = {
-    "kernels/*/{}.py": {"captured"},
+    "kernels/*/{}.py": {"captured", "coverage"},
     "tests/reference/{}.py": {"captured", "environment_samples", "motion", "separate"},
     "tests/test_{}.py": set(),
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 
 import numpy as np
@@ -15,6 +16,8 @@ from warp_ar.accuracy.path_tracer import PathTracer
 from warp_ar.errors import UsageError
 from warp_ar.light.captured import CapturedEmitter, Light, latlong_directions
 from warp_ar.scene import Camera, Pose, Probe, Proxy, Scene
+
+pytestmark = pytest.mark.slow
 
 SCENE = Scene(
     Camera(160, 120, 160.0, 160.0, 79.5, 59.5),
@@ -51,13 +54,19 @@ def photograph(light: Light, scene: Scene = SCENE, pose: Pose = POSE) -> npt.NDA
     return np.minimum(radiance, 0.9)
 
 
+@functools.cache
+def under_lamp(distance: float | None) -> npt.NDArray[np.float32]:
+    """The desk under ``lamp_light``."""
+    return photograph(lamp_light(distance))
+
+
 def distances(light: Light) -> list[float | None]:
     return [emitter.distance for emitter in light.emitters]
 
 
-@pytest.mark.parametrize("distance", [0.35, 0.5, 1.0])
+@pytest.mark.parametrize("distance", [0.35, 1.0])
 def test_a_lamp_is_found_where_it_stands(distance: float, device: str) -> None:
-    frame = photograph(lamp_light(distance))
+    frame = under_lamp(distance)
     (found,) = distances(place_emitters(lamp_light(None), SCENE, frame, POSE, device=device))
     assert found is not None
     assert abs(math.log(found / distance)) < DISTANCE_TOLERANCE
@@ -66,26 +75,22 @@ def test_a_lamp_is_found_where_it_stands(distance: float, device: str) -> None:
 def test_light_from_afar_stays_there(device: str) -> None:
     """Where nothing falls off, nothing is near, whatever grain the desk has."""
     grain = np.exp(GRAIN * np.random.default_rng(3).standard_normal((120, 160, 1))).astype(np.float32)
-    for frame in (photograph(lamp_light(None)), np.minimum(photograph(lamp_light(None)) * grain, 0.9)):
+    for frame in (under_lamp(None), np.minimum(under_lamp(None) * grain, 0.9)):
         assert distances(place_emitters(lamp_light(None), SCENE, frame, POSE, device=device)) == [None]
 
 
-@pytest.mark.parametrize("axis", [0, 1])
-@pytest.mark.parametrize("darkest", [0.5, 0.7])
-def test_paint_that_is_darker_to_one_side_is_no_lamp(axis: int, darkest: float, device: str) -> None:
+def test_paint_that_is_darker_to_one_side_is_no_lamp(device: str) -> None:
     """Hard case: under light from afar, a desk that falls off as under a near lamp."""
-    far = lamp_light(None)
-    paint = np.linspace(1.0, darkest, 120 if axis == 0 else 160, dtype=np.float32)
-    paint = paint[:, None, None] if axis == 0 else paint[None, :, None]
-    assert distances(place_emitters(far, SCENE, photograph(far) * paint, POSE, device=device)) == [None]
+    paint = np.linspace(1.0, 0.5, 120, dtype=np.float32)[:, None, None]
+    assert distances(place_emitters(lamp_light(None), SCENE, under_lamp(None) * paint, POSE, device=device)) == [None]
 
 
 def test_grain_does_not_hide_a_lamp(device: str) -> None:
     grain = np.exp(GRAIN * np.random.default_rng(4).standard_normal((120, 160, 1))).astype(np.float32)
-    frame = np.minimum(photograph(lamp_light(0.5)) * grain, 0.9)
+    frame = np.minimum(under_lamp(0.35) * grain, 0.9)
     (found,) = distances(place_emitters(lamp_light(None), SCENE, frame, POSE, device=device))
     assert found is not None
-    assert abs(math.log(found / 0.5)) < 2.0 * DISTANCE_TOLERANCE
+    assert abs(math.log(found / 0.35)) < 2.0 * DISTANCE_TOLERANCE
 
 
 def test_emitters_are_found_in_an_image_of_light(device: str) -> None:

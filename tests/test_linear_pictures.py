@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import pathlib
+import subprocess
+import sys
 
 import cv2
 import hypothesis
@@ -17,9 +20,9 @@ from warp_ar.errors import SceneError
 from warp_ar.exr_file import read_linear_picture
 from warp_ar.light.captured import Light
 from warp_ar.light.latlong_axes import AXES, from_axes, to_axes
-from warp_ar.output.environment_file import read_environment, write_environment
+from warp_ar.output.environment_file import encode_hdr, read_environment, write_environment
 from warp_ar.scene import loads_scene
-from warp_ar.scene.emissive_picture import load_emission
+from warp_ar.scene.textures import load_emission
 from warp_ar.signals import P3_D65, REC_709, REC_2020, xyz_from_rgb
 from warp_ar.sources.frame_folder import read_frame
 
@@ -148,3 +151,121 @@ def test_a_scene_says_the_axes_of_its_light(tmp_path: pathlib.Path) -> None:
     assert loads_scene(text.format("opengl"), tmp_path / "s.toml").captured.axes == "opengl"
     with pytest.raises(SceneError, match='one of "z-up", "blender", "y-up", "opengl"'):
         loads_scene(text.format("sideways"), tmp_path / "s.toml")
+
+
+def test_pictures_whose_colours_are_not_rgb_are_refused(tmp_path: pathlib.Path) -> None:
+    flat = np.full((2, 4), 0.5, np.float32)
+    kind = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(kind, {name: flat.copy() for name in ("Y", "RY", "BY")}).write(str(tmp_path / "a.exr"))
+    with pytest.raises(SceneError, match="has channels BY, RY, Y"):
+        read_linear_picture(tmp_path / "a.exr", SceneError, "a")
+    (tmp_path / "a.hdr").write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_xyze\n\n-Y 1 +X 8\n" + bytes(32))
+    with pytest.raises(SceneError, match="holds CIE XYZ"):
+        read_linear_picture(tmp_path / "a.hdr", SceneError, "a")
+
+
+def radiance(path: pathlib.Path, picture: np.ndarray, line: str, head: str = "") -> pathlib.Path:
+    """A Radiance picture whose pixels lie in the order of an array, by any line of its size."""
+    pixels = encode_hdr(picture, "").split(b"\n\n-Y", 1)[1].split(b"\n", 1)[1]
+    path.write_bytes(f"#?RADIANCE\n{head}FORMAT=32-bit_rle_rgbe\n\n{line}\n".encode() + pixels)
+    return path
+
+
+@pytest.mark.parametrize(("rows", "columns", "major"), list(itertools.product("-+", "-+", "YX")))
+def test_radiance_files_lie_in_any_order(tmp_path: pathlib.Path, rows: str, columns: str, major: str) -> None:
+    right = read_linear_picture(radiance(tmp_path / "a.hdr", gradient(4), "-Y 4 +X 8"), SceneError, "a").color
+    stored = gradient(4)[:: 1 if rows == "-" else -1, :: 1 if columns == "+" else -1]
+    sizes = f"{rows}Y 4", f"{columns}X 8"
+    stored, line = (stored, sizes) if major == "Y" else (stored.swapaxes(0, 1), sizes[::-1])
+    path = radiance(tmp_path / "b.hdr", stored, " ".join(line))
+    np.testing.assert_array_equal(read_linear_picture(path, SceneError, "b").color, right)
+
+
+@hypothesis.settings(max_examples=25, deadline=None)
+@hypothesis.given(
+    st.lists(st.floats(0.01, 100.0), max_size=3), st.lists(st.tuples(*[st.floats(0.1, 10.0)] * 3), max_size=2)
+)
+def test_what_a_radiance_file_was_multiplied_by_is_divided_out(
+    tmp_path_factory: pytest.TempPathFactory, exposures: list[float], corrections: list[tuple]
+) -> None:
+    path = tmp_path_factory.mktemp("h") / "a.hdr"
+    shown = read_linear_picture(radiance(path, gradient(4), "-Y 4 +X 8"), SceneError, "a").color
+    head = "".join(f"EXPOSURE={value!r}\n" for value in exposures)
+    head += "".join("COLORCORR= {!r} {!r} {!r}\n".format(*value) for value in corrections)
+    found = read_linear_picture(radiance(path, gradient(4), "-Y 4 +X 8", head), SceneError, "a").color
+    factor = np.prod([(value,) * 3 for value in exposures] + corrections, axis=0)
+    np.testing.assert_allclose(found, shown / factor, rtol=FLOAT32)
+
+
+@pytest.mark.parametrize(
+    ("head", "said"),
+    [
+        ("EXPOSURE=0\n", "factors above 0"),
+        ("EXPOSURE=bright\n", "EXPOSURE=bright: expected a number"),
+        ("COLORCORR=1 2\n", "COLORCORR=1 2: expected 3 numbers"),
+        ("GAMMA=2.2\n", "of GAMMA 2.2"),
+        ("PRIMARIES=0.6 0.3\n", "expected 8 numbers"),
+    ],
+)
+def test_headers_of_radiance_files_that_are_refused(tmp_path: pathlib.Path, head: str, said: str) -> None:
+    with pytest.raises(SceneError, match=said):
+        read_linear_picture(radiance(tmp_path / "a.hdr", gradient(4), "-Y 4 +X 8", head), SceneError, "a")
+
+
+def test_headers_of_radiance_files_of_other_programs(
+    tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    right = read_linear_picture(radiance(tmp_path / "a.hdr", gradient(4), "-Y 4 +X 8"), SceneError, "a").color
+    photoshop = "# Made with Adobe Photoshop\nGAMMA=1\nPRIMARIES=0 0 0 0 0 0 0 0\n"
+    render = "rpict -vf front.vf room.oct\n\tpfilt -1\nVIEW= -vtv -vh 45\nPIXASPECT=1.1\n"
+    for head, said in ((photoshop, ""), (render, "VIEW and PIXASPECT of its header are not followed")):
+        path = radiance(tmp_path / "b.hdr", gradient(4), "-Y 4 +X 8", head)
+        np.testing.assert_array_equal(read_linear_picture(path, SceneError, f"b {said}").color, right)
+        assert said in capsys.readouterr().err
+
+
+def test_the_part_of_an_openexr_with_a_picture_is_taken(
+    tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    header = {"type": OpenEXR.scanlineimage}
+    parts = [OpenEXR.Part(dict(header), {"Z": gradient()[..., 0].copy()}, "depth")]
+    parts += [OpenEXR.Part(dict(header), {"RGB": gradient()}, "beauty")]
+    OpenEXR.File(parts).write(str(tmp_path / "a.exr"))
+    np.testing.assert_array_equal(read_linear_picture(tmp_path / "a.exr", SceneError, "a").color, gradient())
+    assert "has the parts depth, beauty; beauty is taken" in capsys.readouterr().err
+
+
+OIIO_FILES = """
+import sys, numpy as np, OpenImageIO as oiio
+kind, path, picture = sys.argv[1], sys.argv[2], np.load(sys.argv[3])
+height, width, _ = picture.shape
+spec = oiio.ImageSpec(width, height, 3, "float")
+spec.tile_width = spec.tile_height = 4 if kind == "tiled" else 0
+spec.deep = kind == "deep"
+out = oiio.ImageOutput.create(path)
+assert out.open(path, spec)
+if kind == "deep":
+    data = oiio.DeepData()
+    data.init(width * height, 3, [oiio.TypeDesc("float")] * 3, ("R", "G", "B"))
+    for pixel, values in enumerate(picture.reshape(-1, 3).tolist()):
+        data.set_samples(pixel, 1)
+        for channel, value in enumerate(values):
+            data.set_deep_value(pixel, channel, 0, value)
+    assert out.write_deep_image(data)
+elif kind == "tiled":
+    assert out.write_tiles(0, width, 0, height, 0, 1, picture)
+assert out.close()
+"""
+"""Run in a process of its own: where OpenImageIO is loaded, it reports what it leaks when Python ends."""
+
+
+@pytest.mark.parametrize("kind", ["tiled", "deep"])
+def test_tiles_are_read_and_deep_pixels_refused(tmp_path: pathlib.Path, kind: str) -> None:
+    path = tmp_path / "a.exr"
+    np.save(tmp_path / "a.npy", gradient())
+    subprocess.run([sys.executable, "-c", OIIO_FILES, kind, str(path), str(tmp_path / "a.npy")], check=True)
+    if kind == "tiled":
+        np.testing.assert_array_equal(read_linear_picture(path, SceneError, "a").color, gradient())
+        return
+    with pytest.raises(SceneError, match="a is a deep OpenEXR; save it flat"):
+        read_linear_picture(path, SceneError, "a")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import cv2
 import numpy as np
 import pytest
@@ -12,7 +10,7 @@ from tests.reference import marker_edge_fit as reference
 from tests.test_tracking import CAMERA, look, make_camera, render
 from warp_ar.scene import Camera, GridBoard, Marker, Pose
 from warp_ar.tracking.edge_fit import EdgeFitter
-from warp_ar.tracking.marker_pattern import make_pattern
+from warp_ar.tracking.markers import make_pattern
 
 PIXELS = 2e-4
 """Between two fits of one picture: samples are interpolated in float32. Measured at most 3e-5."""
@@ -84,39 +82,6 @@ def test_fit_is_its_twins(case):
                 information, expected.information, atol=RELATIVE * np.abs(expected.information).max()
             )
     assert fitted >= 8
-
-
-def test_part_of_a_picture_is_read_alone():
-    """Edges beside the part that was shown are not measured, whatever an earlier picture left there."""
-    marker, truth = Marker(), look(25, 5, 0.4)
-    pattern, image = make_pattern(marker.dictionary, marker.id, marker.size, None), render((Marker(), look(25, 5, 0.4)))
-    fitter = EdgeFitter(pattern, CAMERA)
-    fitter.show(image, whole(CAMERA))
-    first = fitter.fit([truth], REACHES)[0].copy()
-    rows, columns = slice(150, 480), slice(300, 640)
-    gray = fitter.show(image, (rows, columns)).copy()
-    camera = dataclasses.replace(
-        CAMERA, width=gray.shape[1], height=gray.shape[0], cx=CAMERA.cx - columns.start, cy=CAMERA.cy - rows.start
-    )
-    expected, part = reference.fit_edges(gray, pattern, camera, truth, REACHES), fitter.fit([truth], REACHES)[0]
-    assert expected is not None
-    assert part["fitted"]
-    assert part["support"] < 0.8 * first["support"]
-    assert part["support"] == pytest.approx(expected.support, rel=RELATIVE)
-
-
-def test_correlation_alone():
-    """With no reaches the pose stays, and the print is compared with the picture."""
-    marker, truth = Marker(), look(30, 10)
-    pattern = make_pattern(marker.dictionary, marker.id, marker.size, None)
-    fitter, image = EdgeFitter(pattern, CAMERA), render((marker, truth))
-    for pose in (truth, look(30, 100), look(30, 10, 0.9)):
-        gray = fitter.show(image, whole(CAMERA))
-        linear = cv2.LUT(gray, reference.decode_table(CAMERA.transfer).mean(1)).astype(np.float32)
-        fit = fitter.fit([pose], ())[0]
-        np.testing.assert_array_equal(fit["rotation"], pose.rotation)
-        assert not fit["fitted"]
-        assert fit["pattern"] == pytest.approx(reference.correlate(linear, pattern, CAMERA, pose), abs=RELATIVE)
 
 
 @pytest.mark.parametrize("pose", [look(30, 10, -0.5), Pose(look(30).rotation, np.array([0.0, 0.0, 0.01])), look(200)])

@@ -14,6 +14,8 @@ from bench.environments import made_up_environment
 from bench.random_tables import make_setup
 from bench.table_world import FINE, Block, Bulb, World, latlong_directions
 
+pytestmark = pytest.mark.slow
+
 SEEDS = (3, 4, 5, 8, 9, 10)
 """Cards that are true, grey and absent, wrong responses, clutter and lamps."""
 LEVEL = 0.95

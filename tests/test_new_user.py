@@ -14,6 +14,8 @@ from warp_ar import __main__, calibrate, doctor, live
 from warp_ar.calibration.camera_calibration import MOST_FOCAL
 from warp_ar.scene import Camera, Pose, load_scene
 
+pytestmark = pytest.mark.slow
+
 CAMERA = Camera(640, 480, 600.0, 600.0, 321.0, 238.0)
 
 

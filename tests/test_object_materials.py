@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 import trimesh
 import warp as wp
+from PIL import Image
 
 from tests.gltf_files import SQUARE_UVS, Gltf
 from tests.reference import prefilter as reference
+from tests.test_foreign_files import adobe_profile, as_srgb
 from warp_ar.errors import SceneError
 from warp_ar.kernels.materials import make_surface
 from warp_ar.kernels.rays.shapes import FAR
@@ -28,7 +30,6 @@ from warp_ar.scene import (
     dumps_scene,
     object_from_trimesh,
 )
-from warp_ar.scene.kinds import trace_config
 from warp_ar.scene.mesh_files import load_mesh, mesh_from_trimesh
 from warp_ar.scene.object_materials import materials_of, reflects_diffusely, reflects_glossily
 from warp_ar.scene.ray_scene import HostScene
@@ -249,14 +250,6 @@ def test_a_sheet_seen_from_behind(device, tmp_path, double):
     assert (front["t"] < FAR).all()
 
 
-def test_a_closed_mesh_costs_no_questions(tmp_path):
-    """Nobody sees its back: rays ask no triangle for its sides."""
-    path = tmp_path / "box.glb"
-    trimesh.creation.box().export(path)
-    assert not materials_of(Object("mesh", file=path)).holed
-    assert not trace_config(Scene(CAMERA, objects=(Object("mesh", file=path),))).detail
-
-
 def test_objects_share_a_mesh_but_not_materials(device, tmp_path):
     """Two objects of one file with two materials, one of them with another of the scene's."""
     made = Gltf()
@@ -297,12 +290,54 @@ def test_material_libraries(tmp_path):
         load_mesh(path)
 
 
-def test_a_library_that_is_missing_is_named(tmp_path):
-    path = tmp_path / "a.obj"
-    path.write_text("mtllib parts/paint.mtl\nusemtl red\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+@pytest.mark.parametrize(
+    ("options", "placed", "wrap", "notes"),
+    [
+        ("", (1, 0, 0, 0, 1, 0), "repeat", ()),
+        ("-s 2 3 1 -o 0.25 0.5 0", (2, 0, 0.25, 0, 3, 0.5), "repeat", ()),
+        ("-blendu on -s 2 -O 0.25 -clamp on", (2, 0, 0.25, 0, 1, 0), "clamp", ()),
+        ("-texres 512 -mm 0 1 -t 0 0 0 -cc off", (1, 0, 0, 0, 1, 0), "repeat", ()),
+        ("-mm 0.1 2 -t 1 1 1", (1, 0, 0, 0, 1, 0), "repeat", ("ranges of maps (-mm)", "turbulence of maps (-t)")),
+        ("-shine 3", (1, 0, 0, 0, 1, 0), "repeat", ("the option -shine of maps",)),
+    ],
+)
+@pytest.mark.parametrize("first", [True, False])
+def test_options_of_maps_are_followed_or_named(tmp_path, options, placed, wrap, notes, first):
+    Image.fromarray(picture(channels=3)).save(tmp_path / "a map 2.png")
+    words = f"{options} a map 2.png" if first or "-shine" in options else f"a map 2.png {options}"
+    (tmp_path / "a.obj").write_text(
+        "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl a\nf 1/1 2/2 3/3\n"
+    )
+    (tmp_path / "a.mtl").write_text(f"newmtl a\nmap_Kd {words}\nmap_Pr -imfchan b {words}\nnorm -bm 0.5 {words}\n")
+    mesh = load_mesh(tmp_path / "a.obj")
+    (material,) = mesh.materials
+    for use in (material.base, material.metallic_roughness, material.normal):
+        assert (use.transform, use.wrap) == (placed, (wrap, wrap))
+    np.testing.assert_array_equal(mesh.images[material.metallic_roughness.image][..., 1], picture(channels=3)[..., 2])
+    assert (material.normal_scale, mesh.notes) == (0.5, notes)
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".ply"])
+def test_profiles_of_colour_maps_are_followed(tmp_path, suffix):
+    """Those of maps of numbers are not."""
+    codes = np.full((4, 4, 3), (160, 90, 47), np.uint8)
+    Image.fromarray(codes).save(tmp_path / "a.png", icc_profile=adobe_profile())
+    path = tmp_path / f"a{suffix}"
+    if suffix == ".obj":
+        path.write_text("mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nusemtl a\nf 1/1 2/1 3/1\n")
+        (tmp_path / "a.mtl").write_text("newmtl a\nmap_Kd a.png\nnorm a.png\n")
+    else:
+        head = (
+            "ply\nformat ascii 1.0\ncomment TextureFile a.png\nelement vertex 3\nproperty float x\nproperty float y\n"
+        )
+        head += "property float z\nproperty float s\nproperty float t\nelement face 1\n"
+        head += "property list uchar int vertex_indices\nend_header\n"
+        path.write_text(head + "0 0 0 0 0\n1 0 0 0 0\n0 1 0 0 0\n3 0 1 2\n")
     mesh = load_mesh(path)
-    assert mesh.materials == ()
-    assert mesh.notes == ("the material library paint.mtl, which is not there",)
+    (material,) = mesh.materials
+    assert np.abs(mesh.images[material.base.image][0, 0, :3] - as_srgb(codes[0, 0])).max() <= 2
+    if material.normal is not None:
+        np.testing.assert_array_equal(mesh.images[material.normal.image][..., :3], codes)
 
 
 def test_numbers_that_are_not_finite_are_named_and_nothing_else_is_said(tmp_path):

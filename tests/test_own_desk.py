@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import imageio.v3
 import numpy as np
+import pytest
 
 from tests.random_desk import RandomDesk
 from warp_ar import calibrate, doctor, init, live
 from warp_ar.light.captured import latlong_directions, texel_solid_angles
 from warp_ar.output.sinks import read_environment
 from warp_ar.scene import load_scene
+
+pytestmark = pytest.mark.slow
 
 FOCAL = 0.005
 """Share of the focal length: what a user is promised."""

@@ -2,13 +2,29 @@
 
 from __future__ import annotations
 
+import ast
+import json
+import os
 import pathlib
+import stat
 
+import numpy as np
 import pytest
 
+from bench.common import KeptLines
+from warp_ar import calibrate
+from warp_ar.calibration.camera_calibration import CameraReport, write_camera
+from warp_ar.calibration.response import write_response
+from warp_ar.command_line import Terminated
 from warp_ar.errors import SinkError, UsageError
-from warp_ar.output.own_files import OwnFiles
-from warp_ar.signature import COMMENT
+from warp_ar.files import create_new, name_aside, write_whole
+from warp_ar.kernels.color import decode_table
+from warp_ar.output.places import OwnFiles
+from warp_ar.output.sinks import open_sink, write_environment
+from warp_ar.output.video_sink import VideoSink, WholeFragments
+from warp_ar.scene import Camera, load_calibration
+from warp_ar.signature import COMMENT, PROGRAM, is_signed, sign_png
+from warp_ar.tracking.card_layout import SHEET
 
 
 def test_all_names_are_looked_at_before_the_folder_is_made(tmp_path: pathlib.Path, capsys) -> None:
@@ -42,3 +58,240 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path: pathlib.Path) -> None:
     (tmp_path / "a.md").mkdir()
     with pytest.raises(SinkError, match="is a folder"):
         OwnFiles(tmp_path, ["a.md"], overwrite=True)
+
+
+# --- Files set aside: random names, created new, no link followed, and one place that does it -------------------------
+
+
+ROOT = pathlib.Path(__file__).parents[1] / "warp_ar"
+RENAMERS = {"os.replace", "os.rename", "os.renames", "shutil.move", "os.link", "os.symlink"}
+OPENERS = {"files.py", "farm/manifest.py", "farm/pools.py"}
+"""Files that may create files by descriptor; the farm's are a lock and a log inside its own folder."""
+PRIVATE = ("farm/plan.py",)
+"""Files that rename inside a folder of the program's own, where nobody else writes."""
+FRAME = np.zeros((32, 32, 3), np.uint8)
+
+
+def test_a_link_under_the_earlier_name_of_files_set_aside_is_not_followed(tmp_path: pathlib.Path) -> None:
+    victim, mine = tmp_path / "victim.txt", tmp_path / ".keep.json.part"
+    victim.write_text("mine")
+    mine.write_text("mine too")
+    for name in ("rep.json", "clip.mp4"):
+        (tmp_path / f".{name}.part").symlink_to(victim)
+    write_whole(tmp_path / "rep.json", b"{}")
+    write_whole(tmp_path / "keep.json", b"{}")
+    with VideoSink(tmp_path / "clip.mp4", fps=30.0) as sink:
+        sink.write(FRAME)
+    assert victim.read_text() == "mine"
+    assert mine.read_text() == "mine too"
+
+
+def test_names_are_random_and_files_are_new(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert len({name_aside(tmp_path / "a.json") for _ in range(20)}) == 20
+    monkeypatch.setattr("warp_ar.files.secrets.token_hex", lambda count: "0" * 2 * count)
+    (tmp_path / f".b.json.{'0' * 16}.part").symlink_to(tmp_path / "victim")
+    with pytest.raises(FileExistsError):
+        create_new(name_aside(tmp_path / "b.json"))
+    with pytest.raises(FileExistsError):
+        write_whole(tmp_path / "b.json", b"{}")
+    assert not (tmp_path / "victim").exists()
+
+
+def test_a_signal_right_after_a_file_is_created_leaves_nothing(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    create = os.open
+
+    def end(*given: object, **more: object) -> int:
+        os.close(create(*given, **more))  # type: ignore[arg-type]
+        raise Terminated
+
+    monkeypatch.setattr("warp_ar.files.os.open", end)
+    with pytest.raises(Terminated):
+        write_whole(tmp_path / "run.json", b"{}")
+    with pytest.raises(Terminated):
+        WholeFragments(tmp_path / "clip.mp4", boxes=True)
+    monkeypatch.undo()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_nothing_is_left_beside_and_the_mode_stays(tmp_path: pathlib.Path) -> None:
+    path = tmp_path / "scene.toml"
+    path.write_text("old")
+    path.chmod(0o600)
+    (tmp_path / "linked.toml").hardlink_to(path)
+    write_whole(path, b"new", keep_links=True)
+    assert (tmp_path / "linked.toml").read_text() == "new"
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    (tmp_path / "linked.toml").unlink()
+    write_whole(path, b"newer")
+    assert (path.read_text(), stat.S_IMODE(path.stat().st_mode)) == ("newer", 0o600)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["scene.toml"]
+
+
+def test_a_second_run_on_one_video_is_found_out_by_the_first(tmp_path: pathlib.Path) -> None:
+    path = tmp_path / "clip.mp4"
+    first = VideoSink(path, fps=2.0)
+    for _ in range(8):
+        first.write(FRAME)
+    while not path.exists():
+        pass
+    second = VideoSink(path, fps=2.0, overwrite=True)
+    for _ in range(8):
+        second.write(FRAME)
+    errors = []
+    for sink in (first, second):
+        try:
+            sink.close()
+        except SinkError as error:
+            errors.append(str(error))
+    assert len(errors) == 1
+    assert "another file took its name" in errors[0]
+    import av
+
+    with av.open(str(path)) as container:
+        assert sum(1 for _ in container.decode(video=0)) == 8
+
+
+def test_a_folder_that_is_removed_while_a_video_is_written_is_said(tmp_path: pathlib.Path) -> None:
+    folder = tmp_path / "out"
+    sink = VideoSink(folder / "clip.mp4", fps=2.0)
+    for _ in range(8):
+        sink.write(FRAME)
+    while not (folder / "clip.mp4").exists():
+        pass
+    (folder / "clip.mp4").unlink()
+    folder.rmdir()
+    with pytest.raises(SinkError, match="removed while it was written"):
+        sink.close()
+
+
+def test_one_place_sets_files_aside_and_renames() -> None:
+    found = []
+    for path in sorted(ROOT.rglob("*.py")):
+        place = path.relative_to(ROOT).as_posix()
+        if place in ("files.py", *PRIVATE) or place.startswith("kernels/"):
+            continue
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Attribute) and node.attr == "O_CREAT" and place not in OPENERS:
+                found.append(f"{place}:{node.lineno}: O_CREAT")
+            if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)):
+                continue
+            text = ast.unparse(node.func)
+            one = len(node.args) == 1 and not node.keywords  # Path.replace takes one, str.replace two arguments
+            if (
+                text in RENAMERS
+                or node.func.attr in ("rename", "mkstemp", "mktemp")
+                or (node.func.attr == "replace" and one and not text.startswith("dataclasses."))
+            ):
+                found.append(f"{place}:{node.lineno}: {text}")
+    assert found == []
+
+
+# --- Lines of a long run that are kept, so that it goes on where it was ended -----------------------------------------
+
+
+def test_a_run_that_was_ended_goes_on(tmp_path, capsys):
+    path = tmp_path / "lines.jsonl"
+    first = KeptLines(path)
+    first.add({"scene": "desk", "mode": "whole", "samples": 16, "z_rms": 1.0})
+    with path.open("a") as file:
+        file.write('{"scene": "desk", "mode": "kno')  # ended while it wrote
+    later = KeptLines(path)
+    assert later.has(scene="desk", mode="whole", samples=16)
+    assert not later.has(scene="desk", mode="whole", samples=64)
+    assert not later.has(scene="desk", mode="known")
+    later.add({"scene": "desk", "mode": "known", "samples": 16})
+    assert [json.loads(line)["mode"] for line in path.read_text().splitlines()] == ["whole", "known"]
+    assert len(capsys.readouterr().out.splitlines()) == 2
+
+
+def test_without_a_file_lines_are_printed_alone(capsys):
+    lines = KeptLines(None)
+    lines.add({"scene": "desk"})
+    assert lines.has(scene="desk")
+    assert json.loads(capsys.readouterr().out) == {"scene": "desk"}
+
+
+# --- Files that this program writes are known as its own; others are not, whatever they hold --------------------------
+
+
+REPORT = CameraReport(Camera(64, 48, 60.0, 61.0, 31.5, 23.5), 0.1, (0.1,), 0.1, 1.0, (), SHEET, (5.0, 40.0))
+CURVE = np.repeat(np.linspace(0.0, 1.0, 256)[:, None] ** 2, 3, axis=1)
+
+
+def write(path: pathlib.Path) -> None:
+    """Write a file of the kind that its name tells, as the program does."""
+    if path.suffix in (".mp4", ".mov", ".mkv"):
+        with open_sink(path, fps=24) as sink:
+            for _ in range(20):
+                sink.write(np.zeros((16, 16, 3), np.uint8))
+    elif path.suffix == ".exr":
+        write_environment(path, np.zeros((4, 8, 3), np.float32))
+    elif path.suffix == ".png":
+        assert calibrate.main(["card", "--output", str(path), "--dpi", "100"]) == 0
+    elif path.suffix == ".txt":
+        write_response(CURVE, path)
+    elif path.name == "run.json":
+        path.write_text(json.dumps({"program": PROGRAM, "frames": []}, indent=1))
+    else:
+        write_camera(REPORT, path)
+
+
+@pytest.mark.parametrize(
+    "name", ["a.mp4", "a.mov", "a.mkv", "a.exr", "a.png", "a.txt", "run.json", "a.yml", "a.json", "a.xml"]
+)
+def test_what_is_written_here_is_known(tmp_path: pathlib.Path, name: str) -> None:
+    path = tmp_path / name
+    write(path)
+    assert is_signed(path)
+    path.write_bytes(path.read_bytes().replace(PROGRAM.encode(), b"another"))
+    assert not is_signed(path)
+
+
+@pytest.mark.parametrize("suffix", ["yml", "json", "xml"])
+def test_a_signed_calibration_is_read(tmp_path: pathlib.Path, suffix: str) -> None:
+    write_camera(REPORT, tmp_path / f"a.{suffix}")
+    assert load_calibration(tmp_path / f"a.{suffix}").matrix() == pytest.approx(REPORT.camera.matrix())
+
+
+def test_a_signed_response_is_read(tmp_path: pathlib.Path) -> None:
+    write_response(CURVE, tmp_path / "a.txt")
+    assert np.allclose(decode_table(tmp_path / "a.txt"), CURVE, atol=1e-7)
+
+
+def test_others_are_not(tmp_path: pathlib.Path) -> None:
+    for number, data in enumerate((b"", b"warp_ar", b"{}", b'{"frames": [], "program": "warp_ar"}', b"\x89PNG")):
+        (tmp_path / str(number)).write_bytes(data)
+        assert not is_signed(tmp_path / str(number))
+    assert not is_signed(tmp_path)
+    assert not is_signed(tmp_path / "nothing")
+
+
+def test_a_signed_png_is_the_same_picture() -> None:
+    import cv2
+
+    image = np.random.default_rng(0).integers(0, 256, (9, 7, 3), np.uint8)
+    ok, data = cv2.imencode(".png", image)
+    assert ok
+    assert np.array_equal(cv2.imdecode(np.frombuffer(sign_png(data.tobytes()), np.uint8), cv2.IMREAD_COLOR), image)
+
+
+def test_a_card_is_replaced_with_a_word_and_a_foreign_picture_only_if_asked(
+    tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "card.png"
+    card = ["card", "--output", str(path), "--dpi", "100"]
+    assert calibrate.main(card) == 0
+    assert capsys.readouterr().err == ""
+    assert calibrate.main(card) == 0
+    assert "this program wrote it before" in capsys.readouterr().err
+    path.write_bytes(b"mine")
+    assert calibrate.main(card) == 2
+    assert path.read_bytes() == b"mine"
+    assert calibrate.main([*card, "--overwrite"]) == 0
+    assert is_signed(path)
+    picture = path.read_bytes()
+    assert calibrate.main(["response", str(path), "--exposures", "1", "--output", str(path)]) == 2
+    assert "name another" in capsys.readouterr().err
+    assert path.read_bytes() == picture

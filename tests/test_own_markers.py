@@ -27,7 +27,7 @@ from warp_ar.scene import (
 from warp_ar.scene.geometry import rotation_matrix
 from warp_ar.scene.ray_scene import HostScene
 from warp_ar.stages.quality import PRESETS
-from warp_ar.tracking.own_markers import OwnMarkers, own_markers
+from warp_ar.tracking.tracking import OwnMarkers, own_markers
 
 WORLD, CARD = Marker(id=0, size=0.08), Marker(id=7, size=0.05)
 BOARD = Marker("DICT_4X4_100", board=GridBoard(2, 2, 0.03, 0.01))

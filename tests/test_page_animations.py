@@ -63,12 +63,6 @@ def test_the_page_is_told_what_a_file_can_play(item: Object) -> None:
     assert {key: record[key] for key in shown} == shown
 
 
-def test_what_is_chosen_begins_at_once(item: Object) -> None:
-    chosen = set_play(item, "animation", 0, 3.5)
-    assert [place_at(chosen, seconds) for seconds in (3.5, 4.0, 5.0)] == pytest.approx([0.0, 0.5, 1.5], abs=ROUNDING)
-    assert set_play(chosen, "animation", -1, 4.0).play is None
-
-
 @pytest.mark.parametrize(("key", "value"), [("paused", 1), ("speed", 3.0), ("speed", 0.2), ("loop", 0)])
 @pytest.mark.parametrize("now", [4.0, 6.3, 100.7])
 def test_no_change_moves_the_pose(item: Object, key: str, value: float, now: float) -> None:
@@ -85,13 +79,6 @@ def test_pause_holds_and_play_goes_on(item: Object) -> None:
     assert place_at(faster, 50.0) == pytest.approx(0.75, abs=ROUNDING)
     on = set_play(faster, "paused", 0, 60.0)
     assert place_at(on, 60.25) == pytest.approx(1.25, abs=ROUNDING)
-
-
-def test_what_has_ended_is_played_anew(item: Object) -> None:
-    once = set_play(set_play(item, "animation", 0, 0.0), "loop", 0, 0.5)
-    assert place_at(once, 7.0) == pytest.approx(DURATION, abs=ROUNDING)
-    again = set_play(set_play(once, "paused", 1, 7.0), "paused", 0, 8.0)
-    assert place_at(again, 8.5) == pytest.approx(0.5, abs=ROUNDING)
 
 
 def test_edits_are_undone_and_kept_in_the_file(item: Object) -> None:

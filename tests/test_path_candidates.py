@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 import warp as wp
 
-from tests.test_path_sampling import ERRORS, check_mean, lamp_sky, near_emitters, sunny
+from tests.test_path_sampling import ERRORS, lamp_sky, near_emitters, sunny
 from warp_ar.kernels.materials import Surface
-from warp_ar.kernels.reference.path_following import CANDIDATES, PathState, draw_toward_sky, reflected_from
+from warp_ar.kernels.reference.path_following import PathState, draw_toward_sky, reflected_from
 from warp_ar.kernels.reference.path_sampling import PathKey, balance, make_sky, surface_density
 from warp_ar.kernels.reference.path_vertices import LocalScene
 from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, Hit
+
+pytestmark = pytest.mark.slow
 
 COUNT = 1 << 16
 
@@ -85,28 +87,3 @@ def test_candidates_have_the_mean_of_one_draw(
     assert abs(first.mean() - later.mean()) <= ERRORS * noise + 1e-5 * later.mean()
     assert later.mean() > 10.0 * noise
     assert first.std() < 0.8 * later.std()
-
-
-def test_an_even_sky_is_drawn_as_the_surface_reflects_it(device: str) -> None:
-    """White paint under a white sky sends 1: by one draw with a deviation of its own, by candidates with less."""
-    scene = LocalScene()
-    scene.sky = make_sky(np.ones((16, 32, 3), np.float32), device)
-    for depth in (0, 1):
-        plain, balanced = draws(scene, False, (0.0, 0.0, 1.0), depth, device)
-        check_mean(plain, 1.0)
-        # The rest is for directions that the surface draws, of a density of cos / pi beside 1 / (4 pi) each.
-        times = int(CANDIDATES) if depth == 0 else 1
-        cosine = (np.arange(1000) + 0.5) / 1000.0
-        share = times / (times + 4.0 * cosine)
-        check_mean(balanced, float((2.0 * cosine * share).mean()))
-
-
-def test_nothing_is_drawn_where_nothing_is_reflected(device: str) -> None:
-    """A surface that turns away from the only light, and a black sky: no direction, and nothing that is not finite."""
-    radiance = np.zeros((64, 128, 3), np.float32)
-    for sky in (radiance, radiance + np.where(np.arange(64)[:, None, None] < 20, 5.0, 0.0).astype(np.float32)):
-        scene = LocalScene()
-        scene.sky = make_sky(sky, device)
-        plain, balanced = draws(scene, False, (0.0, 0.0, -1.0), 0, device)
-        assert not plain.any()
-        assert not balanced.any()

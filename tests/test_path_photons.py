@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +16,9 @@ from warp_ar.kernels.receiver.receiver import DEFAULT_REFLECTANCE, PRIOR_WEIGHT
 from warp_ar.kernels.reference.path_photons import UNIT
 from warp_ar.light.captured import CapturedEmitter
 from warp_ar.light.captured import Light as CapturedLight
-from warp_ar.scene import Camera, LambertMaterial, Light, MetallicRoughnessMaterial, Object, PhongMaterial, Proxy, Scene
+from warp_ar.scene import Camera, Light, MetallicRoughnessMaterial, Object, PhongMaterial, Proxy, Scene
+
+pytestmark = pytest.mark.slow
 
 # Dim, so that what virtual lights bring is more than its noise.
 SKY = 0.04 * latlong_sky()
@@ -73,10 +74,6 @@ def tracer_of(
         return tracer
 
 
-def picture_of(scene: Scene, device: str, samples: int, seed: int, monkeypatch: pytest.MonkeyPatch) -> TracedPicture:
-    return tracer_of(scene, device, samples, seed, monkeypatch).picture()
-
-
 def change_of(tracer: PathTracer) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Change of a white surface in every pixel and its standard error: without what the frame's reflectance adds."""
     shape = tracer._moments.change.shape
@@ -127,36 +124,6 @@ def test_both_ways_have_the_same_mean(name: str, device: str, monkeypatch: pytes
     spread = np.hypot(pictures[0].error, pictures[1].error).astype(np.float64)
     total = float((pictures[0].radiance - pictures[1].radiance).astype(np.float64).sum())
     assert abs(total) <= ERRORS * math.sqrt((spread**2).sum())
-
-
-EMITTER_CASES = {
-    "emitter": lit(),
-    "emitter and light": lit(POINT),
-    "emitter and disk": lit(dataclasses.replace(POINT, radius=0.01)),
-    "emitter, polished": polish(lit(), 0.3, 0.4),
-}
-
-
-@pytest.mark.parametrize("name", EMITTER_CASES)
-def test_near_emitters_have_the_same_mean_both_ways(name: str, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Alone, beside a light that is followed as well, and beside one with a disk, which is not.
-
-    By the same seeds, and before samples go where the noise is: what shadows have of noise is the same in both.
-    """
-    scene, sky = EMITTER_CASES[name], lamp_above()
-    off, brought = [], []
-    for seed in range(40):
-        pair = [tracer_of(scene, device, 16, seed, monkeypatch, sky=sky, follows=follows) for follows in (True, False)]
-        assert pair[0]._follows_emitters
-        assert pair[0]._follows_lights == (name == "emitter and light")
-        changes = [change_of(tracer)[0] for tracer in pair]
-        off.append(changes[0] - changes[1])
-        brought.append(changes[0] - np.array(pair[0]._moments.change.numpy(), np.float64))
-    for values in (np.stack(off)[:, rows] for rows in (slice(0, 16), slice(16, 32), slice(None))):
-        sums = values.sum(axis=(1, 2, 3))
-        noise = sums.std(ddof=1) / math.sqrt(len(sums))
-        assert abs(sums.mean()) <= ERRORS * noise, (name, sums.mean(), noise)
-    assert np.stack(brought).sum(axis=(1, 2, 3)).mean() > 2.0 * ERRORS * noise, (name, noise)
 
 
 def test_an_emitter_sends_what_a_light_at_its_place_sends(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -246,6 +213,39 @@ def test_a_wall_sends_light_on(device: str, monkeypatch: pytest.MonkeyPatch) -> 
     assert brought[clear].sum(axis=0) == pytest.approx(integral, rel=0.02)
 
 
+def picture_of(scene: Scene, device: str, samples: int, seed: int, monkeypatch: pytest.MonkeyPatch) -> TracedPicture:
+    return tracer_of(scene, device, samples, seed, monkeypatch).picture()
+
+
+EMITTER_CASES = {
+    "emitter and light": lit(POINT),
+    "emitter and disk": lit(dataclasses.replace(POINT, radius=0.01)),
+    "emitter, polished": polish(lit(), 0.3, 0.4),
+}
+
+
+@pytest.mark.parametrize("name", EMITTER_CASES)
+def test_near_emitters_have_the_same_mean_both_ways(name: str, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beside a light that is followed as well, beside one with a disk, which is not, and on a polished desk.
+
+    By the same seeds, and before samples go where the noise is: what shadows have of noise is the same in both.
+    """
+    scene, sky = EMITTER_CASES[name], lamp_above()
+    off, brought = [], []
+    for seed in range(24):
+        pair = [tracer_of(scene, device, 16, seed, monkeypatch, sky=sky, follows=follows) for follows in (True, False)]
+        assert pair[0]._follows_emitters
+        assert pair[0]._follows_lights == (name == "emitter and light")
+        changes = [change_of(tracer)[0] for tracer in pair]
+        off.append(changes[0] - changes[1])
+        brought.append(changes[0] - np.array(pair[0]._moments.change.numpy(), np.float64))
+    for values in (np.stack(off)[:, rows] for rows in (slice(0, 16), slice(16, 32), slice(None))):
+        sums = values.sum(axis=(1, 2, 3))
+        noise = sums.std(ddof=1) / math.sqrt(len(sums))
+        assert abs(sums.mean()) <= ERRORS * noise, (name, sums.mean(), noise)
+    assert np.stack(brought).sum(axis=(1, 2, 3)).mean() > 2.0 * ERRORS * noise, (name, noise)
+
+
 def test_its_standard_error_is_honest(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Spread over seeds, and what each says of itself, of pixels whose noise is mostly this."""
     monkeypatch.setattr(path_tracer, "PATHS_OF_LIGHTS", 0.05)
@@ -254,48 +254,3 @@ def test_its_standard_error_is_honest(device: str, monkeypatch: pytest.MonkeyPat
     claimed = (np.stack([p.error for p in pictures]).astype(np.float64) ** 2).mean(axis=0)
     common = (claimed > 1e-8) & (claimed < np.quantile(claimed, 0.9))
     assert found[common].sum() / claimed[common].sum() == pytest.approx(1.0, abs=0.2)
-
-
-def test_the_same_seed_gives_the_same_bits(device: str) -> None:
-    """However many samples are added at a time, and whichever thread adds to a pixel first."""
-    images = []
-    for counts in ((40,), (3, 13, 5, 19), (40,)):
-        tracer = PathTracer(CASES["point"], SKY, FRAME, ABOVE, device=device, seed=3)
-        for count in counts:
-            tracer.sample(count)
-        images.append(tracer.picture())
-    for image in images[1:]:
-        np.testing.assert_array_equal(images[0].radiance, image.radiance)
-        np.testing.assert_array_equal(images[0].error, image.error)
-
-
-def test_passes_in_parts_are_the_same(device: str) -> None:
-    whole = PathTracer(CASES["spot"], SKY, FRAME, ABOVE, device=device, seed=3)
-    parted = PathTracer(CASES["spot"], SKY, FRAME, ABOVE, device=device, seed=3)
-    while parted.samples < 3:
-        parted.sample_for(0.0)
-    whole.sample(parted.samples)
-    np.testing.assert_array_equal(whole.picture().radiance, parted.picture().radiance)
-    assert whole.rays() == parted.rays()
-
-
-@pytest.mark.parametrize(
-    ("lights", "follows"),
-    [
-        ((), False),
-        ((POINT,), True),
-        ((POINT, dataclasses.replace(SPOT, radius=0.01)), False),
-        ((Light("directional", 0.5, direction=(0.0, 0.0, -1.0)), POINT), False),
-    ],
-    ids=["none", "point", "disk", "directional"],
-)
-def test_which_lights_are_followed(lights: tuple[Light, ...], follows: bool) -> None:
-    """Those of a place and no size, where something polished throws their light onto what a frame shows."""
-    more: Any = {"device": "cpu", "light_samples": 5}
-    tracer = PathTracer(lit(*lights), SKY, FRAME, ABOVE, **more)
-    assert tracer._follows_lights == follows
-    assert not PathTracer(lit(*lights), SKY, None, ABOVE, **more)._follows_lights
-    matt = Object("sphere", radius=0.04, at=(0.08, 0.0, 0.04), material=LambertMaterial((0.7, 0.2, 0.3)))
-    for objects in ((), (matt,)):
-        scene = dataclasses.replace(lit(*lights), objects=objects)
-        assert not PathTracer(scene, SKY, FRAME, ABOVE, **more)._follows_lights

@@ -5,12 +5,11 @@ from __future__ import annotations
 import struct
 
 import av
-import cv2
 import numpy as np
 import pytest
 
 from tests.photo_files import write_photo
-from tests.test_sources import error_of, patch_centers, patches, turn, write_video
+from tests.test_sources import error_of, patch_centers, patches
 from warp_ar import calibrate, capture
 from warp_ar.calibration.camera_calibration import calibrate_camera
 from warp_ar.errors import UsageError
@@ -43,19 +42,6 @@ def test_ten_bits_are_read(tmp_path):
         frames = list(source)
     assert len(frames) == 3
     assert np.abs(patch_centers(frames[-1].image) - patch_centers(patches())).max() <= HEVC_LEVELS
-
-
-def test_a_phone_held_upright_with_a_variable_rate(tmp_path):
-    """Turned by its display matrix, times as they were: a phone's film of the card in short."""
-    picture = np.zeros((64, 96, 3), np.uint8)
-    picture[:16, :32] = 250
-    path = write_video(tmp_path / "clip.mov", [picture] * 5, fps=30, stamps=[0, 1, 3, 4, 9])
-    turn(path, (0, 1, -1, 0))
-    with open_source(path) as source:
-        assert source.size == (64, 96)
-        frames = list(source)
-    assert [round(30 * frame.time) for frame in frames] == [0, 1, 3, 4, 9]
-    assert frames[0].image[:32, -16:].mean() > 240
 
 
 @pytest.mark.parametrize("transfer", [18, 16], ids=["HLG", "PQ"])
@@ -123,15 +109,3 @@ def test_heic_that_is_called_jpeg_is_told_by_its_bytes(tmp_path):
 def test_raw_is_refused_with_what_to_do(tmp_path):
     (tmp_path / "IMG_1.CR3").write_bytes(b"\0\0\0\x18ftypcrx " + bytes(100))
     assert "a raw photograph, which is not read: save it as JPEG" in error_of(tmp_path / "IMG_1.CR3")
-
-
-def test_a_webcams_motion_jpeg(tmp_path):
-    """Full range, and without a header of its own: pictures one after another."""
-    path = tmp_path / "webcam.mjpeg"
-    packed = cv2.imencode(".jpg", patches()[..., ::-1], (cv2.IMWRITE_JPEG_QUALITY, 95))[1].tobytes()
-    path.write_bytes(3 * packed)
-    with open_source(path) as source:
-        frames = list(source)
-    assert len(frames) == 3
-    # Black, white and grey tell the range.
-    assert np.abs(patch_centers(frames[0].image)[6:9] - patch_centers(patches())[6:9]).max() <= HEVC_LEVELS

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.photo_files import encode_srgb
 from tests.photo_room import exposed, photograph, sphere
 from warp_ar.ball.ball_finder import silhouette
 from warp_ar.errors import UsageError
@@ -95,7 +96,8 @@ def test_a_response_is_estimated_where_srgb_does_not_hold():
     bracket = (15, 30, 60, 125, 250, 500)
     agreed = agree_exposures(patches(bracket, s_curve), "srgb", [1 / d for d in bracket], None)
     assert agreed.curve is not None
-    assert "response is not srgb" in agreed.notes[0]
+    (note,) = agreed.notes
+    assert "response is not srgb" in note
     grid = np.linspace(0, 1, 20001)
     truth = np.interp(np.arange(40, 230) / 255, s_curve(grid), grid)
     scale = np.median(truth / agreed.curve[40:230, 1])
@@ -104,6 +106,43 @@ def test_a_response_is_estimated_where_srgb_does_not_hold():
     before = np.abs(np.log(np.median(truth / by_srgb) * by_srgb / truth))
     # Eight numbers describe the curve; 12 % at its worst place is a third of what sRGB errs.
     assert error.max() < min(0.12, 0.5 * before.max())
+
+
+@pytest.mark.parametrize("wrong", [0, 1, 3])
+def test_one_wrong_time_is_named_and_the_pixels_believed(wrong):
+    claim = [t * (2.5 if k == wrong else 1.0) for k, t in enumerate(TRUE)]
+    agreed = agree_exposures(patches(BRACKET), "srgb", claim, None, labels="abcd")
+    assert agreed.ratios == pytest.approx([t / TRUE[0] for t in TRUE], rel=0.1)
+    assert agreed.curve is None
+    assert agreed.notes[0].startswith(f"{'abcd'[wrong]}: EXIF gives it 2.")
+
+
+def test_a_response_of_no_camera_is_doubted_with_both_readings():
+    """Times as of other photographs: a curve explains them, but none that a camera has."""
+    lying = [t**1.6 for t in TRUE]
+    agreed = agree_exposures(patches(BRACKET), "srgb", lying, None)
+    assert agreed.curve is not None
+    assert "no known camera has this response: gamma 3." in agreed.notes[1]
+    assert "--exposures pixels is right (EXIF says 828, pixels say 6" in agreed.notes[1]
+
+
+def test_what_is_wrong_with_one_picture_spoils_no_other():
+    """Between the anchor and the others stands one that shows something else."""
+    images = [exposed(d).astype(np.uint8) for d in (30, 60, 120, 240)]
+    images[1] = np.ascontiguousarray(images[1][::-1])
+    found = align(images, [circle()] * 4)
+    assert [bool(why) for why in found.strangers] == [False, True, False, False]
+    assert np.abs(np.array(found.circles[3]) - circle()).max() < TENTH
+
+
+def test_a_picture_of_another_light_is_told_from_another_exposure():
+    """A lamp to one side: darks to the left, brights to the right, all of the same room."""
+    side = np.linspace(0.6, 1.6, photograph()[0].shape[1])[:, None]
+    light = np.clip(30.0 / 60 * photograph()[0].astype(float), 0, 1)
+    plain, turned = (encode_srgb(light * share).astype(np.uint8) for share in (0.4, 0.7 * side**4))
+    found = align([plain, turned, exposed(120).astype(np.uint8)], [circle()] * 3)
+    assert found.strangers[0] == found.strangers[2] == ""
+    assert "its light is another" in found.strangers[1]
 
 
 def test_without_any_claim_the_pixels_decide():

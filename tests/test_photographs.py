@@ -13,6 +13,8 @@ from warp_ar.photographs.photographs import Photograph, exposures_by_exif, expos
 from warp_ar.scene import loads_scene
 from warp_ar.scene.exif import PhotoInfo, read_exif
 
+pytestmark = pytest.mark.slow
+
 GREY = np.full((600, 800, 3), 90, np.uint8)
 
 

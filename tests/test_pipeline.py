@@ -16,9 +16,8 @@ import numpy.typing as npt
 import pytest
 import warp as wp
 
-from warp_ar.engine.environment_history import resample_light
 from warp_ar.engine.pipeline import Pipeline, Result
-from warp_ar.errors import SceneError, UsageError
+from warp_ar.errors import SceneError, UpdateError, UsageError
 from warp_ar.scene import (
     Camera,
     Exposure,
@@ -32,10 +31,11 @@ from warp_ar.scene import (
     Proxy,
     Scene,
 )
-from warp_ar.scene.ray_scene import HostScene
 from warp_ar.sources.sources import Synthetic
 from warp_ar.stages.quality import PRESETS
 from warp_ar.tracking.tracking import Tracker, TrackState
+
+pytestmark = pytest.mark.slow
 
 SIZE = (320, 240)
 # Codes by which a picture may lag where its light moved too little for readers to run again; when that is, differs.
@@ -104,23 +104,6 @@ def test_frames_sent_ahead_are_the_same(frames: Frames, device: str) -> None:
     ):
         expected = [result.image for result in run(first, many)]
         ahead = [second.submit(image, time_seconds=index / 30) for index, image in enumerate(many)]
-        for result, image in zip(ahead, expected, strict=True):
-            np.testing.assert_array_equal(result.image, image)
-
-
-def test_frames_written_where_they_are_sent_from_are_the_same(frames: Frames, device: str) -> None:
-    """Each in memory of its own while it is under way."""
-    many = frames * 3
-    with (
-        Pipeline(make_scene(), device=device, quality="low") as first,
-        Pipeline(make_scene(), device=device, quality="low") as second,
-    ):
-        expected, ahead = [result.image for result in run(first, many)], []
-        for index, image in enumerate(many):
-            frame = second.new_frame()
-            assert (frame.shape, frame.dtype) == (image.shape, np.uint8)
-            frame[...] = image
-            ahead.append(second.submit(frame, time_seconds=index / 30))
         for result, image in zip(ahead, expected, strict=True):
             np.testing.assert_array_equal(result.image, image)
 
@@ -197,18 +180,6 @@ def test_steps_of_submitted_frames_are_timed(frames: Frames, device: str) -> Non
             assert all(milliseconds > 0.0 for milliseconds in result.steps.values())
 
 
-def test_pictures_are_kept_however_many(device: str) -> None:
-    """More than there are buffers for, by views of them alone; buffers come back when nobody has a view."""
-    generator = np.random.default_rng(8)
-    images = [generator.integers(0, 255, (240, 320, 3), np.uint8) for _ in range(12)]
-    plain = make_scene(objects=(), lights=(), probes=())
-    with Pipeline(plain, device=device, quality="low") as pipeline:
-        for _ in range(3):
-            rows = [pipeline.submit(image).image[100:] for image in images]
-            expected = [pipeline(image).image[100:] for image in images]
-            np.testing.assert_array_equal(rows, expected)
-
-
 def test_calls_updates_and_hand_overs_wait_for_what_was_submitted(frames: Frames, device: str) -> None:
     scene = make_scene()
     with contextlib.ExitStack() as stack:
@@ -221,35 +192,11 @@ def test_calls_updates_and_hand_overs_wait_for_what_was_submitted(frames: Frames
         np.testing.assert_array_equal(submitted.image, first.image)
         for pipeline in (plain, ahead):
             pipeline.submit(frames[2], time_seconds=2 / 30)
-            assert pipeline.update(edited(scene))
+            pipeline.update(edited(scene))
             pipeline.submit(frames[3], time_seconds=3 / 30)
         heir.continue_from(ahead)
         expected_heir.continue_from(plain)
         np.testing.assert_array_equal(heir(frames[0]).image, expected_heir(frames[0]).image)
-
-
-def test_an_error_while_rendering_is_raised_with_its_result(frames: Frames) -> None:
-    with Pipeline(make_scene(), device="cpu", quality="low") as pipeline:
-
-        def fail(receive: Callable[[], None]) -> None:
-            raise RuntimeError("broken stage")
-
-        pipeline._scheduler.run = fail  # type: ignore[assignment]
-        result = pipeline.submit(frames[0])
-        with pytest.raises(RuntimeError, match="broken stage"):
-            _ = result.image
-
-
-def test_a_known_pose_spares_tracking(frames: Frames, device: str) -> None:
-    with (
-        Pipeline(make_scene(), device=device, quality="low") as tracked,
-        Pipeline(make_scene(), device=device, quality="low") as told,
-    ):
-        expected = tracked(frames[0])
-        result = told(frames[0], pose=expected.pose)
-        np.testing.assert_array_equal(result.image, expected.image)
-        assert result.state is None
-        assert "track" not in result.stages
 
 
 def test_profiling_changes_times_only(frames: Frames, device: str) -> None:
@@ -286,16 +233,6 @@ def test_bands_give_the_same_bits(frames: Frames, bands: int) -> None:
             np.testing.assert_array_equal(one.environment, other.environment)
 
 
-def test_a_still_picture_runs_only_what_time_moves(frames: Frames) -> None:
-    scene = make_scene(lights=(), exposure=Exposure(1.0))
-    with Pipeline(scene, device="cpu", quality="low") as pipeline:
-        for index in range(60):  # the light settles, the tracker too
-            result = pipeline(frames[0], time_seconds=index / 30)
-        skipped = {name for name, timing in result.stages.items() if timing.skipped}
-    assert {"irradiance", "prefilter", "visibility", "shade", "composite"} <= skipped, "nothing had changed"
-    assert "accumulate" not in skipped, "accumulation follows the clock"
-
-
 def test_lost_marker_passes_the_frame_and_keeps_the_light(frames: Frames) -> None:
     outputs = ("image", "environment", "pose")
     grey = np.full_like(frames[0], 90)
@@ -328,22 +265,6 @@ def test_only_what_the_scene_calls_for_is_planned() -> None:
     assert {"relight", "summed_area", "expose"}.isdisjoint(stages(lights=(), exposure=off))
     assert {"shade", "visibility", "irradiance", "prefilter"}.isdisjoint(stages(objects=(), exposure=off))
     assert surroundings.isdisjoint(stages(probes=())), "without a ball there is no environment light to capture"
-
-
-@pytest.mark.parametrize(
-    ("image", "expected"),
-    [
-        (np.zeros((240, 320, 4), np.uint8), r"frame is uint8 \(240, 320, 4\); expected uint8 RGB \(240, 320, 3\)"),
-        (np.zeros((240, 320, 3), np.float32), r"frame is float32"),
-        (np.zeros((120, 160, 3), np.uint8), r"frame is uint8 \(120, 160, 3\)"),
-        ("frame.png", r"frame is str"),
-    ],
-)
-def test_wrong_frames_are_refused_and_the_next_one_works(image: object, expected: str, frames: Frames) -> None:
-    with Pipeline(make_scene(), device="cpu", quality="low") as pipeline:
-        with pytest.raises(UsageError, match=expected):
-            pipeline(image)
-        assert pipeline(frames[0]).pose is not None
 
 
 def test_a_closed_pipeline_says_so(frames: Frames) -> None:
@@ -484,14 +405,6 @@ def test_impossible_exposures_are_refused(frames: Frames) -> None:
         run(pipeline, frames[:1])
 
 
-def test_wrong_warp_frame_is_refused() -> None:
-    with (
-        Pipeline(make_scene(), device="cpu", quality="low") as pipeline,
-        pytest.raises(UsageError, match="of vec3ub on cpu"),
-    ):
-        pipeline(wp.zeros((240, 320), dtype=wp.vec3, device="cpu"))
-
-
 def test_captured_graph_equals_eager(frames: Frames, device: str) -> None:
     """On CUDA the scheduler replays graphs; the same stages launched one by one must give the same bits."""
     with (
@@ -528,25 +441,27 @@ def test_update_equals_a_new_pipeline(frames: Frames, device: str) -> None:
     ):
         before, expected = run(live, frames[:2]), run(new, frames[:2])
         assert (before[1].image != expected[1].image).any()
-        assert live.update(edited(scene))
+        live.update(edited(scene))
         np.testing.assert_array_equal(live(frames[2], time_seconds=0.1).image, new(frames[2], time_seconds=0.1).image)
 
 
 @pytest.mark.parametrize(
-    "changes",
+    ("changes", "told"),
     [
-        {"lights": ()},
-        {"objects": ()},
-        {"probes": ()},
-        {"exposure": Exposure(1.0)},
-        {"lights": (Light("directional", 1.0, direction=(0.0, 0.0, -1.0)),)},
-        {"marker": Marker(size=0.05)},
+        ({"lights": ()}, "the number of lights differs"),
+        ({"objects": ()}, "the number of objects differs"),
+        ({"probes": ()}, "probes differs"),
+        ({"exposure": Exposure(1.0)}, "other work of .*expose"),
+        ({"lights": (Light("directional", 1.0, direction=(0.0, 0.0, -1.0)),)}, r"lights\[0\].kind differs"),
+        ({"marker": Marker(size=0.05)}, "marker differs"),
+        ({"camera": dataclasses.replace(make_scene().camera, fx=123.0)}, "camera differs"),
     ],
 )
-def test_update_refuses_what_needs_other_kernels_or_arrays(changes: dict[str, object], frames: Frames) -> None:
+def test_update_says_why_it_cannot(changes: dict[str, object], told: str, frames: Frames) -> None:
     with Pipeline(make_scene(), device="cpu", quality="low") as pipeline:
         before = pipeline(frames[0], time_seconds=0.0).image
-        assert not pipeline.update(make_scene(**changes))
+        with pytest.raises(UpdateError, match=told):
+            pipeline.update(make_scene(**changes))
         np.testing.assert_array_equal(pipeline(frames[0], time_seconds=0.0).image, before)
 
 
@@ -591,14 +506,6 @@ def test_handing_over_between_equals_shows_nothing(recover: str, frames: Frames,
         assert 0.0 < other.arrays["expose_scale"].numpy()[0] < 1.0
 
 
-def test_warmed_up_equals_fresh(frames: Frames, device: str) -> None:
-    with contextlib.ExitStack() as stack:
-        warm, fresh = (stack.enter_context(Pipeline(make_scene(), device=device, quality="medium")) for _ in range(2))
-        warm.warm_up()
-        for one, other in zip(run(warm, frames), run(fresh, frames), strict=True):
-            np.testing.assert_array_equal(one.image, other.image)
-
-
 def test_light_is_kept_at_another_size(frames: Frames, device: str) -> None:
     with contextlib.ExitStack() as stack:
         small, large = (
@@ -617,18 +524,6 @@ def test_light_is_kept_at_another_size(frames: Frames, device: str) -> None:
             )
 
 
-def test_resampled_light_is_constant_where_it_was() -> None:
-    radiance = np.full((16, 32, 3), 2.5, np.float32)
-    confidence = np.random.default_rng(0).random((16, 32)).astype(np.float32)
-    confidence[:4] = 0.0
-    radiance[:4] = 0.0
-    for shape in ((8, 16), (32, 64), (5, 10)):
-        light, known, clipped = resample_light(radiance, confidence, np.ones_like(radiance), shape)
-        assert light.shape == (*shape, 3)
-        np.testing.assert_allclose(light[known > 1e-3], 2.5, rtol=1e-5)
-        np.testing.assert_allclose(clipped[known > 1e-3], 1.0, rtol=1e-5)
-
-
 def test_a_new_material_shows_where_nothing_else_moves(frames: Frames, device: str) -> None:
     scene = make_scene(lights=(), exposure=Exposure(1.0))
     sphere, torus = scene.objects
@@ -636,25 +531,53 @@ def test_a_new_material_shows_where_nothing_else_moves(frames: Frames, device: s
     with Pipeline(scene, device=device, quality="low") as pipeline:
         for index in range(60):  # the light settles, the tracker too
             before = pipeline(frames[0], time_seconds=index / 30).image
-        assert pipeline.update(dataclasses.replace(scene, objects=(painted, torus)))
+        pipeline.update(dataclasses.replace(scene, objects=(painted, torus)))
         assert (pipeline(frames[0], time_seconds=2.0).image != before).any()
 
 
-def test_what_virtual_light_reaches_by_no_way_is_passed_over_to_the_bit(device, frames, monkeypatch):
-    """Looking at every pixel that bounced light might reach gives the picture of looking where it does."""
-    quality = PRESETS["medium"].with_methods(relight="bounce")
-    spot = Light(
-        "spot", at=(0.0, 0.05, 0.2), target=(0.0, 0.05, 0.0), inner_angle=10.0, outer_angle=12.0, intensity=0.2
-    )
-    scene = make_scene(lights=(spot,))
-    pictures, looked = [], []
-    outline = HostScene.light_outline
-    for whole in (False, True):
-        if whole:
-            monkeypatch.setattr(HostScene, "light_outline", lambda self, bounced=False: outline(self, bounced=True))
-        with Pipeline(scene, device=device, quality=quality) as pipeline:
-            pictures.append([pipeline(frame).image.copy() for frame in frames[:2]])
-            params = pipeline.inputs.block.host("params")
-            looked.append((params["direct_rect"].tolist(), params["light_rect"].tolist()))
-    assert looked[0][0] != looked[0][1] == looked[1][0] == looked[1][1]
-    np.testing.assert_array_equal(pictures[0], pictures[1])
+def test_an_error_while_rendering_is_raised_with_its_result(frames: Frames) -> None:
+    with Pipeline(make_scene(), device="cpu", quality="low") as pipeline:
+
+        def fail(receive: Callable[[], None]) -> None:
+            raise RuntimeError("broken stage")
+
+        pipeline._scheduler.run = fail  # type: ignore[assignment]
+        result = pipeline.submit(frames[0])
+        with pytest.raises(RuntimeError, match="broken stage"):
+            _ = result.image
+
+
+def test_a_still_picture_runs_only_what_time_moves(frames: Frames) -> None:
+    scene = make_scene(lights=(), exposure=Exposure(1.0))
+    with Pipeline(scene, device="cpu", quality="low") as pipeline:
+        skipped = []
+        for index in range(60):  # the light settles, the tracker too
+            result = pipeline(frames[0], time_seconds=index / 30)
+            skipped.append({name for name, timing in result.stages.items() if timing.skipped})
+    still = [{"irradiance", "prefilter", "visibility", "shade", "composite"} <= one for one in skipped[50:]]
+    assert sum(still) >= len(still) - 1, "nothing had changed, but where an estimate came"
+    assert "accumulate" not in skipped[-1], "accumulation follows the clock"
+
+
+@pytest.mark.parametrize(
+    ("image", "expected"),
+    [
+        (np.zeros((240, 320, 4), np.uint8), r"frame is uint8 \(240, 320, 4\); expected uint8 RGB \(240, 320, 3\)"),
+        (np.zeros((240, 320, 3), np.float32), r"frame is float32"),
+        (np.zeros((120, 160, 3), np.uint8), r"frame is uint8 \(120, 160, 3\)"),
+        ("frame.png", r"frame is str"),
+    ],
+)
+def test_wrong_frames_are_refused_and_the_next_one_works(image: object, expected: str, frames: Frames) -> None:
+    with Pipeline(make_scene(), device="cpu", quality="low") as pipeline:
+        with pytest.raises(UsageError, match=expected):
+            pipeline(image)
+        assert pipeline(frames[0]).pose is not None
+
+
+def test_warmed_up_equals_fresh(frames: Frames, device: str) -> None:
+    with contextlib.ExitStack() as stack:
+        warm, fresh = (stack.enter_context(Pipeline(make_scene(), device=device, quality="medium")) for _ in range(2))
+        warm.warm_up()
+        for one, other in zip(run(warm, frames), run(fresh, frames), strict=True):
+            np.testing.assert_array_equal(one.image, other.image)

@@ -9,8 +9,10 @@ import hypothesis
 import numpy as np
 import pytest
 from hypothesis import strategies as st
+from PIL import Image
 
 from warp_ar.scene.geometry import Mesh, rotation_matrix
+from warp_ar.scene.materials import MeshMaterial
 from warp_ar.scene.mesh_files import load_mesh
 from warp_ar.scene.polygon_files import clip_ears
 
@@ -143,6 +145,103 @@ def test_what_a_ply_declares_and_is_not_shown_is_named(tmp_path: pathlib.Path) -
     rows = [(*p, 5) for p in SQUARE]
     (tmp_path / "a.ply").write_bytes(ply("ascii", rows, [((0, 1, 2), ())], "property float gloss\n", ""))
     assert load_mesh(tmp_path / "a.ply").notes == ("the property gloss of each vertex",)
+    strips = b"element tristrips 0\nproperty list uchar int vertex_indices\nend_header"
+    (tmp_path / "a.ply").write_bytes(ply("ascii", SQUARE, [((0, 1, 2), ())], "", "").replace(b"end_header", strips))
+    assert load_mesh(tmp_path / "a.ply").notes == ("strips of triangles beside faces",)
+
+
+@hypothesis.settings(max_examples=25, deadline=None)
+@hypothesis.given(st.lists(st.lists(st.integers(3, 9), min_size=1, max_size=3), min_size=1, max_size=3), st.booleans())
+def test_strips_of_a_ply_are_wound_alike(
+    tmp_path_factory: pytest.TempPathFactory, rows: list[list[int]], backwards: bool
+) -> None:
+    """Strips in rows, several of them in a row, -1 between them; each is a ribbon of its own that faces +z."""
+    points, lines = [], []
+    for row in rows:
+        strips = []
+        for count in row:
+            start, level = len(points), 2 * len(strips) + 10 * len(lines)
+            corners = [(k // 2, level + k % 2, 0) for k in range(count)]
+            points += corners
+            strips.append([start + k for k in range(count)])
+        lines.append([index for strip in strips for index in (*strip, -1)][: -1 if backwards else None])
+    side = 1 if backwards else -1
+    points = [(side * x, y, z) for x, y, z in points]
+    path = tmp_path_factory.mktemp("s") / "a.ply"
+    data = ply("ascii", points, [(line, ()) for line in lines], "", "").replace(b"element face", b"element tristrips")
+    none = b"element face 0\nproperty list uchar int vertex_indices\nproperty uchar red\n"
+    none += b"property uchar green\nproperty uchar blue\nelement tristrips"
+    path.write_bytes(data.replace(b"element tristrips", none))
+    found = normals(load_mesh(path))
+    assert len(found) == sum(count - 2 for row in rows for count in row)
+    np.testing.assert_allclose(found[:, 2], -side / 2)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".off"])
+@pytest.mark.parametrize("of_faces", [False, True])
+@pytest.mark.parametrize(
+    ("alphas", "shown"),
+    [((255, 255), "opaque"), ((255, 51), "blend"), ((0, 0), "opaque"), ((0, 255), "blend"), ((1, 1), "opaque")],
+)
+def test_alpha_of_colours_is_shown(
+    tmp_path: pathlib.Path, suffix: str, of_faces: bool, alphas: tuple, shown: str
+) -> None:
+    faces = [(0, 1, 2), (0, 2, 3)]
+    own = [(255, 128, 0, alphas[k // 2]) for k in range(4)]
+    path = tmp_path / f"a{suffix}"
+    if suffix == ".ply":
+        declared = "".join(f"property uchar {name}\n" for name in ("red", "green", "blue", "alpha"))
+        vertices = [(*p, *(() if of_faces else own[k])) for k, p in enumerate(SQUARE)]
+        polygons = [(index, own[2 * k] if of_faces else ()) for k, index in enumerate(faces)]
+        path.write_bytes(ply("ascii", vertices, polygons, "" if of_faces else declared, declared if of_faces else ""))
+    else:
+        rows = [(*p, *(() if of_faces else own[k])) for k, p in enumerate(SQUARE)]
+        rows += [(3, *index, *(own[2 * k] if of_faces else ())) for k, index in enumerate(faces)]
+        head = "OFF" if of_faces else "COFF"
+        path.write_text("\n".join([head, "4 2 0", *(" ".join(map(str, row)) for row in rows)]))
+    mesh = load_mesh(path)
+    assert [material.alpha for material in mesh.materials or (MeshMaterial(),)] == [shown]
+    told = {1.0} if shown == "opaque" else {alpha / 255 for alpha in alphas}
+    np.testing.assert_allclose(sorted(set(mesh.colors[:, 3])), sorted(told), atol=1e-6)
+    assert mesh.notes == (("alpha of colours, which is 0 everywhere",) if alphas == (0, 0) else ())
+
+
+@pytest.mark.parametrize(
+    "names", ["Red Green Blue", "r g b", "color_r color_g color_b", "ambient_red ambient_green ambient_blue"]
+)
+def test_colours_of_a_ply_under_other_names(tmp_path: pathlib.Path, names: str) -> None:
+    declared = "".join(f"property uchar {name}\n" for name in names.split())
+    (tmp_path / "a.ply").write_bytes(ply("ascii", [(*p, 255, 0, 0) for p in SQUARE], [((0, 1, 2), ())], declared, ""))
+    np.testing.assert_allclose(load_mesh(tmp_path / "a.ply").colors[:, :3], [(1, 0, 0)] * 4)
+
+
+def test_each_face_of_a_ply_has_the_texture_of_its_number(tmp_path: pathlib.Path) -> None:
+    for name, color in (("a", (255, 0, 0)), ("b", (0, 255, 0))):
+        Image.new("RGB", (2, 2), color).save(tmp_path / f"{name}.png")
+    said = "property list uchar float texcoord\nproperty int texnumber\n"
+    faces = [((0, 1, 2), (6, 0, 0, 1, 0, 1, 1, 1)), ((0, 2, 3), (6, 0, 0, 1, 1, 0, 1, 0))]
+    data = ply("ascii", SQUARE, faces, "", said)
+    named = data.replace(b"element vertex", b"comment TextureFile a.png\ncomment TextureFile b.png\nelement vertex")
+    (tmp_path / "a.ply").write_bytes(named)
+    mesh = load_mesh(tmp_path / "a.ply")
+    shown = {}
+    for face, number in zip(mesh.faces, mesh.triangle_materials, strict=True):
+        corners = frozenset(map(tuple, mesh.vertices[face, :2].astype(int).tolist()))
+        shown[corners] = mesh.images[mesh.materials[number].base.image][0, 0, :3].tolist()
+    assert shown == {
+        frozenset({(0, 0), (1, 0), (1, 1)}): [0, 255, 0],
+        frozenset({(0, 0), (1, 1), (0, 1)}): [255, 0, 0],
+    }
+
+
+def test_what_an_stl_and_an_obj_declare_and_is_not_shown_is_named(tmp_path: pathlib.Path) -> None:
+    triangle = struct.pack("<12f", 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0)
+    for head, more in ((b"solid", 0x8000), (b"COLOR=\xff\0\0\xff", 0)):
+        (tmp_path / "a.stl").write_bytes(head.ljust(80) + struct.pack("<I", 1) + triangle + struct.pack("<H", more))
+        mesh = load_mesh(tmp_path / "a.stl")
+        assert (len(mesh.faces), mesh.notes) == (1, ("colours of triangles",))
+    (tmp_path / "a.obj").write_text(f"{TRIANGLE}l 1 2\nf 1 2 3\n")
+    assert load_mesh(tmp_path / "a.obj").notes == ("points and lines",)
 
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\n"

@@ -29,7 +29,7 @@ FREE = {"numprocesses": None, "dist": "no", "usepdb": False, "capture": "fd", "c
 )
 def test_folders_alone_are_spread(monkeypatch, pytestconfig, arguments, options, expected):
     monkeypatch.chdir(pytestconfig.rootpath)
-    monkeypatch.setattr(conftest, "_cores", lambda: 3)
+    monkeypatch.setattr(conftest, "usable_cores", lambda: 3)
     monkeypatch.setattr(conftest, "_devices", lambda: ["cpu"])
     assert asked(monkeypatch, arguments, options) == expected
 
@@ -45,7 +45,7 @@ def test_folders_alone_are_spread(monkeypatch, pytestconfig, arguments, options,
 )
 def test_neither_one_core_nor_a_gpu_is_shared(monkeypatch, pytestconfig, cores, devices, expected):
     monkeypatch.chdir(pytestconfig.rootpath)
-    monkeypatch.setattr(conftest, "_cores", lambda: cores)
+    monkeypatch.setattr(conftest, "usable_cores", lambda: cores)
     monkeypatch.setattr(conftest, "_devices", lambda: devices)
     assert asked(monkeypatch, [HERE], {}) == expected
 

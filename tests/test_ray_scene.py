@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import gc
 import math
-import weakref
 
 import cv2
 import numpy as np
@@ -20,9 +18,8 @@ from warp_ar.scene import Pose
 from warp_ar.scene.geometry import rotation_matrix
 from warp_ar.scene.kinds import trace_config
 from warp_ar.scene.object_materials import reflects_diffusely, reflects_glossily
-from warp_ar.scene.ray_mesh import make_ray_mesh
 from warp_ar.scene.ray_scene import HostScene
-from warp_ar.scene.screen_extents import EMPTY, Outline, screen_rects
+from warp_ar.scene.screen_extents import EMPTY, screen_rects
 from warp_ar.scene.texture_pack import linear_texture
 
 CAMERA = scenes.Camera(width=64, height=48, fx=60.0, fy=62.0, cx=30.5, cy=24.0)
@@ -133,35 +130,6 @@ def test_mesh_is_moved_to_its_middle_and_back(device, tmp_path):
     assert host.ray_scene.vertex_normals.shape == (3,)
 
 
-def test_scenes_share_the_mesh_of_a_file(device, tmp_path):
-    """Two scenes hold one tree of a file's mesh; a file that changed is another, and nobody's is kept."""
-    path = tmp_path / "one.obj"
-    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    scene = scenes.Scene(CAMERA, objects=(scenes.Object("mesh", file=path),))
-    target = wp.get_device(device)
-    first, second = HostScene(scene, target), HostScene(scene, target)
-    shared = records(first, "objects")["mesh"][0]
-    assert records(second, "objects")["mesh"][0] == shared
-    path.write_text("v 0 0 0\nv 2 0 0\nv 0 2 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\n")
-    third = HostScene(scene, target)
-    assert records(third, "objects")["mesh"][0] != shared
-    kept = weakref.ref(next(iter(first._meshes.values()))[1])
-    del first
-    assert kept() is not None
-    del second
-    gc.collect()
-    assert kept() is None
-
-
-def test_ray_mesh_keeps_the_true_corners(device):
-    """The margin is in the boxes only: the corners that rays are tested against are exact."""
-    from tests.test_visibility import icosphere
-
-    mesh = icosphere(1)
-    made = make_ray_mesh(mesh, wp.get_device(device))
-    np.testing.assert_allclose(made.mesh.points.numpy(), mesh.vertices[mesh.faces].reshape(-1, 3), atol=1e-7)
-
-
 def test_motion(device):
     """A turning, swaying object is written where the scene puts it; standing ones change nothing."""
     moving = dataclasses.replace(
@@ -185,18 +153,6 @@ def test_motion(device):
     np.testing.assert_allclose(lights["direction"][0], np.array([-0.5, 0, -1]) / math.sqrt(1.25), atol=RECORD_TOLERANCE)
     np.testing.assert_allclose(lights["intensity"][0], [2, 1, 0.5])
     np.testing.assert_allclose(lights["outer_angle"], math.radians(20))
-
-
-def test_standing_scene_changes_nothing(device):
-    """Without animation nothing is written twice, at any time."""
-    lamp = scenes.Light("point", 1.0, at=(0.0, 0.0, 1.0))
-    host = HostScene(scenes.Scene(CAMERA, objects=OBJECTS, lights=(lamp,)), wp.get_device(device))
-    objects = np.zeros(3, np.dtype(structs.Shape.numpy_dtype()))
-    lights = np.zeros(1, np.dtype(structs.Light.numpy_dtype()))
-    assert host.write_objects(objects, 0.5)
-    assert host.write_lights(lights, 0.5)
-    assert not host.write_objects(objects, 1.5)
-    assert not host.write_lights(lights, 1.5)
 
 
 # --- Materials --------------------------------------------------------------------------------------------------------
@@ -263,6 +219,7 @@ def test_which_light_a_material_reflects():
 # --- Rectangles -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("camera", [CAMERA, BENT], ids=["pinhole", "bent"])
 def test_object_rect_holds_every_ray_that_meets_an_object(device, camera):
     """Cameras all around, near, inside, beside and looking away: nothing is cut off, and little is wasted."""
@@ -289,6 +246,7 @@ def test_object_rect_holds_every_ray_that_meets_an_object(device, camera):
     assert np.median(wasted) < 3.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("camera", [CAMERA, BENT], ids=["pinhole", "bent"])
 def test_ball_rect_holds_every_pixel_of_every_ball(device, camera):
     """Cameras around, near, inside and looking away; one ball, two far apart, and none."""
@@ -395,6 +353,7 @@ SENDING = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(LAMPS))
 @pytest.mark.parametrize("proxies", list(SENDING))
 def test_light_rect_holds_every_pixel_that_gets_bounced_light(device, name, proxies):
@@ -438,18 +397,6 @@ def test_light_rect_holds_every_pixel_that_gets_bounced_light(device, name, prox
     assert (reached > 0) == (len(sources) > 0 and name != "inside the box")
 
 
-def test_outlines_of_a_crowd_grow_with_it():
-    """Ten times the boxes have at most ten times the polygons, whatever sends light to whatever."""
-    lamp = scenes.Light("spot", 1.0, at=(0.0, 0.0, 0.8), target=(0.0, 0.0, 0.0), inner_angle=20.0, outer_angle=40.0)
-    counts = {}
-    for count in (10, 100):
-        scene = scenes.Scene(CAMERA, lights=(lamp,), proxies=(PROXIES[0], *crowd(count)))
-        host = HostScene(scene, wp.get_device("cpu"))
-        counts[count] = len(host.light_outline(bounced=True).polygons)
-    assert counts[10] > 60
-    assert counts[100] <= 10 * counts[10]
-
-
 def test_a_light_that_nothing_sends_on_has_the_same_rectangle(device):
     """Above a desk alone, and on the top of a box, which no face rises above."""
     pose = look((0.2, -0.8, 0.6), (0.1, 0.1, 0.0))
@@ -464,20 +411,3 @@ def test_a_light_that_nothing_sends_on_has_the_same_rectangle(device):
     rect = screen_rect(host.light_outline(bounced=True), pose, CAMERA)
     assert rect != screen_rect(host.light_outline(), pose, CAMERA)
     assert (rect[1] - rect[0]) * (rect[3] - rect[2]) < 0.5 * CAMERA.width * CAMERA.height
-
-
-def test_screen_rect_of_a_known_square():
-    """A square facing the camera: the pixels whose centres it covers, and one more on every side."""
-    pose = Pose(np.eye(3), np.zeros(3))
-    square = np.array([[-0.1, -0.1, 1.0], [0.1, -0.1, 1.0], [0.1, 0.1, 1.0], [-0.1, 0.1, 1.0]])
-    # Columns 30.5 -+ 6: centres 25 to 36. Rows 24 -+ 6.2: centres 18 to 30.
-    shown, behind, beside = (
-        Outline([square]),
-        Outline([square - np.array([0, 0, 2])]),
-        Outline([square + np.array([5, 0, 0])]),
-    )
-    assert screen_rects([shown], pose, CAMERA) == [(17, 32, 24, 38)]
-    assert screen_rects([behind, Outline([])], pose, CAMERA) == [EMPTY, EMPTY]
-    assert screen_rects([Outline([]), beside, shown], pose, CAMERA) == [EMPTY, EMPTY, (17, 32, 24, 38)]
-    assert screen_rects([behind, shown, beside], pose, CAMERA) == [EMPTY, (17, 32, 24, 38), EMPTY]
-    assert screen_rects([], pose, CAMERA) == []

@@ -1,6 +1,5 @@
 """Cells of the desk: the share of the environment that reaches them, and how pixels look cells up."""
 
-import dataclasses
 import math
 
 import numpy as np
@@ -10,11 +9,8 @@ import warp as wp
 
 from tests.environment_shadow_rig import draw, lamp_at, list_texels, sky, with_sun
 from tests.error_model import check_error
-from tests.hard_cases.generators import frames
-from tests.hard_cases.rig import SIZE, Rig, assert_same_bits
 from tests.kernel_rig import records, shape, tables
 from tests.receiver_cells_rig import (
-    ABOVE,
     FOCAL,
     GREY,
     OUTLINE,
@@ -37,18 +33,11 @@ from warp_ar.kernels.environment import environment_samples
 from warp_ar.kernels.environment.environment_samples import EnvironmentSample
 from warp_ar.kernels.receiver.receiver import ReceiverCells
 from warp_ar.kernels.receiver.receiver_cells import Patch
-from warp_ar.kernels.structs import (
-    BOX,
-    DIRECTIONAL,
-    LAMBERT,
-    MIRROR,
-    PHONG,
-    PLANE,
-    Light,
-)
+from warp_ar.kernels.structs import BOX, DIRECTIONAL, LAMBERT, MIRROR, PHONG, PLANE
 from warp_ar.scene import Camera, Proxy, Scene
-from warp_ar.scene.kinds import proxies_face
 from warp_ar.scene.ray_scene import HostScene
+
+pytestmark = pytest.mark.slow
 
 # --- Share: closed forms ----------------------------------------------------------------------------------------------
 
@@ -90,20 +79,9 @@ def test_a_hidden_lamp_leaves_what_grey_paper_sends(device):
     assert not inside.all()
 
 
-def test_beside_a_long_box(device):
-    """A wall of height h at distance d hides (1 - d / sqrt(d^2 + h^2)) / 2 of an even sky; its paper sends half."""
-    h = 0.1
-    share, surface = View((DESK, box((0.2, -5, 0), (0.4, 5, h)))).share(list_texels(sky(1.0, (64, 128)))[2])
-    d = 0.2 - POINTS[middles(4)][..., 0]
-    expected = 1 - (1 - GREY) * 0.5 * (1 - d / np.hypot(d, h))
-    seen = (surface == 0) & (d > 0.01)
-    assert seen.sum() > 100
-    np.testing.assert_allclose(share[..., 0][seen], expected[seen], atol=OUTLINE)
-
-
 @pytest.mark.parametrize("code", [20, 128, 230])
 def test_a_box_sends_what_the_camera_sees_of_it(device, code):
-    """The wall of ``test_beside_a_long_box`` in the frame, as bright there as the code says in each channel."""
+    """A wall of height h at distance d hides (1 - d / sqrt(d^2 + h^2)) / 2 of an even sky; the frame has its light."""
     h, frame = 0.1, np.empty((*SIZE_OF_FRAME, 3), np.uint8)
     frame[:] = code, code // 2, 0
     shapes, samples = (DESK, box((0.2, -5, 0), (0.4, 5, h))), list_texels(sky(1.0, (64, 128)))[2]
@@ -155,16 +133,6 @@ def test_the_end_of_a_long_box_is_not_passed_by(device):
     expected = brute_force(samples, View().size, boxes=[((-0.5, 0.02, 0.0), (0.1, 0.06, 0.1))])
     at = surface == 0
     np.testing.assert_allclose(share[at], expected[at], atol=2e-3)
-
-
-def test_inside_a_box(device):
-    """A camera and a desk in a box of grey paper: half of the light; the box's own faces are seen from behind."""
-    surroundings = box((-3, -3, -1), (3, 3, 2))
-    share, surface = View((DESK, surroundings)).share(draw(sky())[2])
-    assert (surface == 0).all()
-    np.testing.assert_allclose(share, GREY, rtol=SUM_ERROR)
-    _, surface = View((surroundings,)).share(draw(sky())[2])
-    assert (surface == -1).all()
 
 
 def test_only_where_light_may_fall(device):
@@ -233,77 +201,6 @@ def test_share_matches_twin(device):
     assert expected[on_desk].min() < 0.7
 
 
-@pytest.mark.parametrize("partials", [2, 16])
-def test_threads_that_share_a_cell_find_the_same(device, partials):
-    """First where a light shines, then where bounced light arrives as well; 100 samples are no multiple of 16."""
-    samples = draw(with_sun(9, 40, 300.0))[2]
-    environment_samples.place_emitters(lamp_at((0.2, 0.1, 0.4)), samples)
-    shapes = DESK, box((0.1, -0.1, 0), (0.22, 0.14, 0.08))
-    view = View(shapes, [ball((-0.1, 0.03, 0.05), 0.04)], ambient_visibility=True)
-    away = {"kind": DIRECTIONAL, "direction": (0.0, 0.0, 1.0), "intensity": (1.0,) * 3}
-    lit, dark = view.lights, records(Light, away)
-    bounced = np.zeros((*view.cells(4), 3))
-    bounced[4:8, 3:9] = 0.1
-    results = []
-    for count in (1, partials):
-        out = wp.full(view.cells(4), wp.vec3(7.0, 7.0, 7.0), dtype=wp.vec3), wp.full(view.cells(4), 7, dtype=wp.int32)
-        more = {"count": 100, "out": out, "partials": count}
-        view.lights = lit
-        first = [found.copy() for found in view.share(samples, **more)]
-        view.lights = dark
-        none = view.share(samples, **more)[1]
-        assert (none == -1).all()
-        again = view.share(samples, **more, bounced=True, cells=cells_of(view, 4, bounced=bounced))
-        results.append((*first, *again))
-    one, many = results
-    for which in (1, 3):
-        np.testing.assert_array_equal(many[which], one[which])
-        on_desk = one[which] >= 0
-        assert on_desk.any()
-        np.testing.assert_allclose(many[which - 1][on_desk], one[which - 1][on_desk], atol=SUM_ERROR)
-    assert one[0][one[1] >= 0].min() < 0.7
-    assert 0 < (one[3] >= 0).sum() < (one[1] >= 0).sum()
-
-
-@pytest.mark.parametrize("partials", [2, 16])
-def test_cells_that_are_found_already_stay_as_they_are(device, partials):
-    """The second pass adds to the first: it neither estimates its cells again nor reads sums of an earlier frame."""
-    view = View((DESK, box((0.1, -0.1, 0), (0.22, 0.14, 0.08))), ambient_visibility=True)
-    samples = draw(sky())[2]
-    kept = np.full(view.cells(4), -1, np.int32)
-    kept[2:4, 2:9] = 0
-    out = wp.full(view.cells(4), wp.vec3(7.0, 7.0, 7.0), dtype=wp.vec3), wp.array(kept, dtype=wp.int32)
-    bounced = np.zeros((*view.cells(4), 3))
-    bounced[3:8, 3:9] = 0.1
-    cells = cells_of(view, 4, bounced=bounced)
-    share, surface = view.share(samples, out=out, bounced=True, cells=cells, partials=partials)
-    assert (share[kept == 0] == 7.0).all()
-    added = (surface >= 0) & (kept < 0)
-    assert added.sum() > 10
-    assert (share[added] <= 1.0).all()
-    assert (share[surface < 0] == 7.0).all()
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_share_agrees_with_random_directions(device, seed):
-    """An even environment: the mean over 4,096 directions by the cosine, of what each meets, within five standard
-    errors."""
-    rng = np.random.default_rng(seed)
-    corners, (center, radius) = ((0.05, -0.1, 0), (0.2, 0.15, 0.2)), ((-0.1, 0.03, 0.05), 0.05)
-    share, surface = View((DESK, box(*corners)), [ball(center, radius)]).share(list_texels(sky(1.0, (64, 128)))[2])
-    for index in rng.permutation(np.argwhere(surface == 0))[:12]:
-        at = POINTS[middles(4)][tuple(index)]
-        u, phi = rng.random(4096), 2 * np.pi * rng.random(4096)
-        directions = np.stack([np.sqrt(u) * np.cos(phi), np.sqrt(u) * np.sin(phi), np.sqrt(1 - u)], -1)
-        ball_t, box_t = (
-            reference.meet_ball(at, directions, center, radius)[0],
-            reference.meet_box(at, directions, *corners)[0],
-        )
-        met = np.where(np.isinf(ball_t) & np.isinf(box_t), 1.0, np.where(ball_t < box_t, 0.85, GREY))
-        error = met.std() / math.sqrt(len(met))
-        assert abs(share[tuple(index)][0] - met.mean()) < 5 * error + OUTLINE
-
-
 def test_a_mesh_hides_as_the_box_that_it_is(device, tmp_path):
     trimesh.creation.box(bounds=[(0.1, -0.1, 0.0), (0.2, 0.1, 0.08)]).export(tmp_path / "box.ply")
     camera = Camera(64, 48, FOCAL, FOCAL, 31.5, 23.5)
@@ -343,18 +240,6 @@ def look_up(values, surface, stride, key, size):
 
 
 FRAMES = [(48, 64, 4), (47, 61, 4), (45, 66, 8), (30, 40, 3), (9, 7, 1), (1, 1, 4), (2, 3, 16), (1, 17, 5)]
-
-
-@pytest.mark.parametrize("frame", FRAMES)
-def test_a_constant_stays_constant_under_any_mask(device, frame):
-    *size, stride = frame
-    shape_of = tuple(-(-n // stride) for n in size)
-    surface = np.random.default_rng(5).integers(-1, 2, shape_of).astype(np.int32)
-    found = look_up(np.where((surface == 1)[..., None], np.ones(3), np.nan), surface, stride, 1, size)
-    known = found[..., 3] > 0
-    assert (found[known] == 1.0).all()
-    assert (found[~known] == 0.0).all()
-    assert known.any() == (surface == 1).any()
 
 
 @pytest.mark.parametrize("frame", FRAMES)
@@ -400,29 +285,6 @@ def test_reflectance_of_a_shaded_desk(device, share):
     kd = reference_relight.reflectance(radiance, share * np.pi)
     _, n_dot_l, e = reference_relight.point_light(POINTS, np.array([0, 0, 0.5]), 0.3)
     np.testing.assert_allclose(got, kd / np.pi * n_dot_l * e, rtol=2 * FLOAT_ERROR)
-
-
-def test_bounced_light_is_added(device):
-    """Kd / pi times the irradiance, where no light shines and where one does."""
-    away = {"kind": DIRECTIONAL, "direction": (0.0, 0.0, 1.0), "intensity": (1.0,) * 3}
-    kd = reference_relight.reflectance(np.asarray(tables()[0].numpy()[128], float), np.pi)
-    for lights in ([away], [ABOVE]):
-        view = View(lights=lights, bounced=True)
-        cells = cells_of(view, 4, bounced=(0.1, 0.2, 0.3))
-        extra = view.light(cells).astype(float) - view.light(bounced=False)
-        np.testing.assert_allclose(extra, np.broadcast_to(kd / np.pi * (0.1, 0.2, 0.3), extra.shape), rtol=1e-4)
-
-
-def test_where_nothing_is_hidden_and_nothing_bounces_nothing_changes(device):
-    """To the bit on CPU; CUDA may join other products and sums where more is compiled in."""
-    frame = np.random.default_rng(6).integers(60, 200, (*SIZE_OF_FRAME, 3)).astype(np.uint8)
-    view = View(frame=frame, ambient_visibility=True, bounced=True)
-    got = view.light(cells_of(view, 4, share=1.0, bounced=0.0))
-    plain = view.light(ambient_visibility=False, bounced=False)
-    unknown = np.full(view.cells(4), -1, np.int32)
-    lost = view.light(cells_of(view, 4, share=0.1, share_surface=unknown, bounced=1.0, bounced_surface=unknown))
-    for one in (got, lost):
-        np.testing.assert_allclose(one, plain, rtol=0 if device == "cpu" else 1e-6)
 
 
 def full(view, samples=None, strides=(4, 4, 4), rows=None):
@@ -527,117 +389,9 @@ def test_an_object_in_the_dark_sends_nothing(device):
     assert view.send().numpy()["area"][4:8, 6:10].max() == 0
 
 
-@pytest.mark.parametrize("size", [(1, 1), (2, 3), (5, 7), (47, 61), (49, 65)])
-def test_any_size(device, size):
-    item = box((-0.1, 0.0, 0), (0.1, 0.2, 0.1))
-    balls = [ball((0.15, 0, 0.03), 0.03)]
-    view = View((DESK, item), balls, size=size, ambient_visibility=True, bounced=True, **tilted())
-    light, share, share_surface, bounced, surface = full(view, strides=(4, 8, 16))
-    assert np.isfinite(light).all()
-    assert ((share[share_surface >= 0] >= 0) & (share[share_surface >= 0] <= 1)).all()
-    assert np.isfinite(bounced[surface >= 0]).all()
-    assert (surface >= 0).any()
-
-
-def test_bands_and_runs_give_the_same_bits(device):
-    item = box((-0.1, 0.0, 0), (0.1, 0.2, 0.1))
-    view = View((DESK, item), [ball((0.15, 0, 0.03), 0.03)], ambient_visibility=True, bounced=True, **tilted())
-    once, again, bands = full(view), full(view), full(view, rows=[(0, 5), (5, 5), (5, 6), (6, 12)])
-    for one, other, third in zip(once, again, bands, strict=True):
-        assert one.tobytes() == other.tobytes() == third.tobytes()
-    assert (once[3][once[4] >= 0] > 0).any()
-
-
 # --- Garbage ----------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, -5.0, 1e38])
-@pytest.mark.parametrize("where", ["radiance", "irradiance"])
-def test_garbage_in_the_environment(device, bad, where):
-    """Shares stay within 0..1, light finite and not negative."""
-    samples = draw(sky())[2]
-    irradiance = np.full((8, 16, 3), np.pi, np.float32)
-    if where == "irradiance":
-        irradiance[3:] = bad
-    else:
-        values = samples.numpy()
-        values["radiance"][7] = bad
-        samples = wp.array(values, dtype=EnvironmentSample)
-    item = box((-0.1, 0.0, 0), (0.1, 0.2, 0.1))
-    probes = [ball((0.15, 0, 0.03), 0.03)]
-    view = View((DESK, item), probes, irradiance=irradiance, ambient_visibility=True, bounced=True, **tilted())
-    light, share, known, bounced, surface = full(view, samples)
-    assert ((share[known >= 0] >= 0) & (share[known >= 0] <= 1)).all()
-    assert ((bounced[surface >= 0] >= 0) & np.isfinite(bounced[surface >= 0])).all()
-    assert ((light >= 0) & np.isfinite(light)).all()
-
-
-def test_a_pixel_changes_only_what_its_patch_lights(device):
-    """A black pixel in the middle of a patch: that patch, and no share."""
-    image = np.full((*SIZE_OF_FRAME, 3), 180, np.uint8)
-    bad = image.copy()
-    bad[22, 30] = 0
-    clean, spoilt = (View((DESK, WALL), frame=one, **tilted()).send(4).numpy() for one in (image, bad))
-    changed = (clean["flux"] != spoilt["flux"]).any(-1)
-    assert np.argwhere(changed).tolist() == [[5, 7]]
 
 
 # --- In the pipeline --------------------------------------------------------------------------------------------------
 
 METHODS = ("bounce", "brute_force")
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_eager_equals_replayed(device, method):
-    pictures = frames(SIZE[1], SIZE[0])
-    with Rig(device, "relight", method) as replayed, Rig(device, "relight", method) as eager:
-        eager.pipeline._scheduler.run = eager.pipeline._scheduler._run_eager
-        for name in ("noise", "noise", "white", "ramp", "noise"):
-            np.testing.assert_array_equal(replayed.frame(pictures[name]), eager.frame(pictures[name]), err_msg=name)
-        assert_same_bits(replayed.written("relight"), eager.written("relight"))
-        assert (eager.get("relight_ambient_surface") >= 0).any()
-        assert eager.get("relight_bounced").max() > 0
-
-
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("rect", [(12, 20, 10, 30), (0, 36, 0, 48), (0, 5, 0, 48), (31, 36, 40, 48), (0, 0, 0, 0)])
-def test_nothing_of_an_earlier_frame_is_read(device, method, rect):
-    """Cells and patches outside the rows that a frame's light reaches may hold anything."""
-    with Rig(device, "relight", method) as rig:
-        rig.frame(frames(SIZE[1], SIZE[0])["noise"])
-        rig.set_params(light_rect=rect, direct_rect=rect)
-        rig.pipeline.inputs.rects["light"] = rect
-        found = []
-        for old in (-1, 0):
-            for name, surface in (("ambient_visibility", "ambient_surface"), ("bounced", "bounced_surface")):
-                rig.poke(f"relight_{name}", 7.0)
-                rig.arrays[f"relight_{surface}"].fill_(old)
-            for name in ("patches", "listed"):
-                values = np.zeros(rig.arrays[f"relight_{name}"].shape, np.dtype(Patch.numpy_dtype()))
-                if old == 0:
-                    values["area"], values["flux"], values["position"] = 1.0, 1e3, (0, 0, 0.2)
-                    values["normal"] = (0, 0, -1)
-                rig.arrays[f"relight_{name}"].assign(values)
-            rig.arrays["relight_count"].fill_((old + 1) * rig.arrays["relight_patches"].shape[1])
-            rig.poke("added_light", 0.0)
-            for step in rig.stage("relight")[1]:
-                step.launch(step.extent() if step.extent else None)
-            found.append(rig.get("added_light"))
-        np.testing.assert_array_equal(found[0], found[1])
-
-
-def test_which_proxies_face():
-    camera = Camera(64, 48, FOCAL, FOCAL, 31.5, 23.5)
-    plane, item = Proxy("plane", size=(1.0, 1.0)), Proxy("box", size=(0.1, 0.1, 0.1))
-    over = dataclasses.replace(plane, at=(0.0, 0.0, 0.5))
-    ceiling, wall = (dataclasses.replace(over, rotate=(turn, 0.0, 0.0)) for turn in (180.0, 90.0))
-    for proxies, expected in (
-        ((plane,), False),
-        ((item,), False),
-        ((plane, over), False),
-        ((plane, ceiling), True),
-        ((plane, wall), True),
-        ((plane, item), True),
-        ((item, item), True),
-    ):
-        assert proxies_face(Scene(camera, proxies=proxies)) == expected

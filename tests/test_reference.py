@@ -12,10 +12,10 @@ import pytest
 from warp_ar.errors import SceneError
 from warp_ar.scene import loads_scene
 from warp_ar.scene.description import SCHEMA
-from warp_ar.scene.keys import IN_MEMORY
-from warp_ar.scene.reference import INTRINSICS, SECTIONS, Key, as_markdown, keys
+from warp_ar.scene.reference import SECTIONS, Key, as_markdown, keys
 
 KEYS = list(keys())
+INTRINSICS = "width = 640\nheight = 480\nfx = 640.0\nfy = 640.0\ncx = 319.5\ncy = 239.5"
 
 
 @pytest.fixture
@@ -103,7 +103,7 @@ def test_reader_knows_no_other_keys(folder):
         for kind in section.kinds
         for field in dataclasses.fields(kind)
     }
-    assert fields - {(key.section, key.name) for key in KEYS} == set(IN_MEMORY)
+    assert fields - {(key.section, key.name) for key in KEYS} == {("object", "mesh")}
 
 
 @pytest.mark.parametrize("key", [key for key in KEYS if key.section], ids=lambda key: f"{key.section}.{key.name}")

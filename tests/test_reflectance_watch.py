@@ -5,13 +5,12 @@ from __future__ import annotations
 import dataclasses
 import functools
 
-import cv2
 import numpy as np
 import pytest
 
 from warp_ar import PRESETS, Pipeline
 from warp_ar.ball import reflectance_watch
-from warp_ar.ball.ball_reflectance import BLUR, Reflected, _blurred, difference_of_halves, measure_reflectance
+from warp_ar.ball.ball_reflectance import Reflected, difference_of_halves, measure_reflectance
 from warp_ar.ball.reflectance_watch import ENOUGH, FIRST, MOST, ReflectanceWatch
 from warp_ar.calibration.saturation import ball_discs
 from warp_ar.checks.check_pictures import take_look
@@ -20,11 +19,12 @@ from warp_ar.live_clip import reflectances_told
 from warp_ar.scene import Pose, load_scene
 from warp_ar.sources.sources import open_source
 
+pytestmark = pytest.mark.slow
+
 TOLD = 0.08
 """Relative error of one frame: the desk's texture is mirrored smaller than it is seen."""
 ROUNDED = 0.02
 """Relative error of codes."""
-ORDER = 5e-7
 """Relative: four roundings of float32. OpenCV adds in another order at the end of a row."""
 NOWHERE = Pose(np.eye(3), np.zeros(3))
 BLACK = np.zeros((4, 4, 3), np.uint8)
@@ -185,37 +185,3 @@ def test_a_run_says_which_reflectances_were_taken():
     assert "0.50, 0.50, 0.50" in line
     assert reflectances_told((first, second), dict) == []
     assert reflectances_told((first, second), None) == []
-
-
-@pytest.mark.parametrize("corner", [(1.2, 1.2), (60.3, 1.5), (61.4, 41.6), (30.0, 20.7)])
-def test_what_is_blurred_around_places_is_as_in_the_whole_picture(corner):
-    random = np.random.default_rng(3)
-    picture, table = random.integers(0, 256, (44, 64, 3), np.uint8), decode_table("srgb")
-    places = np.array(corner) + random.uniform(-1.0, 1.0, (50, 2))
-    x, y = places.astype(np.float32).T
-    whole = cv2.GaussianBlur(np.stack([table[picture[..., k], k] for k in range(3)], -1), (0, 0), BLUR)
-    expected = cv2.remap(whole, x[:, None], y[:, None], cv2.INTER_LINEAR)[:, 0]
-    np.testing.assert_allclose(_blurred(picture, table, places), expected, rtol=ORDER)
-
-
-@pytest.mark.parametrize(("part", "value"), [("size", 80.0), ("size", 10.0), ("radius", 1e-9), ("center", None)])
-def test_a_ball_whose_box_touches_the_picture_where_no_pixel_shows_it_tells_nothing(part, value):
-    """A marker in millimetres, one of ten metres, a ball of a nanometre, and one just beyond the picture's corner."""
-    scene, (image, pose) = load_scene("desk"), view()
-    table = decode_table(scene.camera.transfer).astype(np.float32)
-    ball = scene.probes[0]
-    if part == "size":
-        # All that is measured by the marker is as many times as far away.
-        pose = Pose(pose.rotation, pose.translation * (value / scene.marker.size))
-    elif part == "radius":
-        ball = dataclasses.replace(ball, radius=value)
-    else:
-        # Its outline passes the corner by, the square around its outline does not.
-        away, radius = 0.5, 0.03
-        reach = scene.camera.fx * radius / away
-        pixel = np.array([-0.8 * reach, -0.8 * reach]) - (scene.camera.cx, scene.camera.cy)
-        at = away * np.array([pixel[0] / scene.camera.fx, pixel[1] / scene.camera.fy, 1.0])
-        center = tuple((at - pose.translation) @ pose.rotation)
-        ball = dataclasses.replace(ball, center=center, radius=radius)
-    scene = dataclasses.replace(scene, probes=(ball,))
-    assert measure_reflectance(scene, scene.camera, ball, (image, pose), table) is None

@@ -14,9 +14,14 @@ from warp_ar import environment
 from warp_ar.light.captured import Light
 from warp_ar.light.latlong_axes import from_axes
 from warp_ar.output.environment_file import read_environment
+from warp_ar.scene.calibration_file import load_calibration
+from warp_ar.scene.exif import camera_by_exif
 from warp_ar.scene.geometry import Mesh
-from warp_ar.scene.gltf import decode_rgba
 from warp_ar.scene.mesh_files import load_mesh
+from warp_ar.scene.pixel_rays import project
+from warp_ar.scene.textures import decode_rgba
+from warp_ar.sources.frame_folder import read_frame
+from warp_ar.sources.sources import open_source
 
 
 @pytest.fixture
@@ -117,3 +122,44 @@ def test_texture_grey_trns(cases: pathlib.Path) -> None:
     expected = np.asarray(Image.open(path).convert("RGBA"))
     np.testing.assert_array_equal(decode_rgba(path.read_bytes(), "a.png"), expected)
     assert (expected[..., 3] == 0).any()
+
+
+def test_hidden_files_are_no_frames(cases: pathlib.Path) -> None:
+    with open_source(cases / "appledouble" / "frames") as source:
+        assert len(list(source)) == 3
+
+
+def test_profile_of_a_camera(cases: pathlib.Path) -> None:
+    image = read_frame(cases / "icc_profiles" / "adobe.jpg")[0].astype(int)
+    for column, right in ((10, (180, 90, 40)), (32, (60, 80, 170))):
+        assert np.abs(image[8, column] - right).max() <= 3  # of JPEG
+
+
+@pytest.mark.parametrize(("name", "right"), [("u16_planar.tif", (200, 120, 60)), ("f32_grey.tif", (200, 200, 200))])
+def test_tiffs_in_planes_and_of_floats(cases: pathlib.Path, name: str, right: tuple[int, ...]) -> None:
+    plate = read_frame(cases / "tiff_planar_and_float" / name)[1]
+    most = 65535.0 if plate.picture.dtype == np.uint16 else 1.0
+    np.testing.assert_allclose(plate.picture[0, 0] / most, np.array(right) / 255, atol=1e-4)
+
+
+def test_focal_length_of_tags_that_contradict_each_other(cases: pathlib.Path) -> None:
+    assert camera_by_exif(cases / "exif_focal_length" / "resized_tags_rewritten.jpg").fx == pytest.approx(
+        2553, rel=0.01
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "right"), [("opencv_fisheye_model.yml", (496.2, 345.7)), ("unknown_distortion_key.json", (501.9, 349.1))]
+)
+def test_calibrations_of_a_case(cases: pathlib.Path, name: str, right: tuple[float, float]) -> None:
+    camera = load_calibration(cases / "calibration_fisheye" / name)
+    assert project(camera, np.array([[0.5, 0.3, 1.0]]))[0] == pytest.approx(right, abs=0.07)
+
+
+def test_videos_as_their_containers_present_them(cases: pathlib.Path) -> None:
+    with open_source(cases / "video_mirror_matrix" / "hflip.mp4") as source:
+        first = next(iter(source)).image
+    assert first[10, -10].tolist() == pytest.approx([254, 0, 0], abs=4)
+    with open_source(cases / "video_times_and_pixel_shape" / "vfr.mp4") as source:
+        times = [round(1000 * frame.time) for frame in source]
+    assert times == [0, 33, 66, 100, 600, 633, 666, 700, 1200, 1233, 1266, 1300]

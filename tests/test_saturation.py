@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_ar.calibration.saturation import FULL, SaturationLevels, ball_codes, ball_discs, luma_top
+from warp_ar.calibration.saturation import FULL, SaturationLevels, ball_codes
 from warp_ar.kernels.color import camera_table, decode_table, is_saturated, saturation_codes
-from warp_ar.scene import Camera, Probe
-from warp_ar.scene.pose import Pose
 from warp_ar.sources.deep_frame import Plate, codes8
 
 DISC = (160.0, 120.0, 90.0)
@@ -56,16 +54,6 @@ def test_a_plateau_between_two_codes_of_8_bits_is_told_by_deep_frames(step):
     assert (below < decode_table("srgb")[round(step * STEP10)]).all()
 
 
-@pytest.mark.parametrize("top", [255, 247, 238])
-def test_codes_of_8_bits_are_read_alike_from_a_plate(top):
-    plain, deep = SaturationLevels(), SaturationLevels()
-    for seed in range(3):
-        image = ball_picture(top, seed=seed)
-        seen = deep.observe(np.zeros_like(image), [DISC], plate=Plate(image.astype(np.uint16) * 257))
-        assert seen == plain.observe(image, [DISC]) or top == 255
-    np.testing.assert_array_equal(deep.levels, plain.levels)
-
-
 @pytest.mark.parametrize("top", [238, 235, 247])
 def test_a_plateau_below_full_is_where_channels_saturate(top):
     levels = SaturationLevels()
@@ -106,14 +94,6 @@ def test_pictures_without_a_ball_tell_nothing():
     assert not levels.observe(ball_picture(238), [])
     assert not levels.observe(ball_picture(238), [(-500.0, 120.0, 90.0)])
     assert ball_codes(ball_picture(238), [(-500.0, 120.0, 90.0)]).shape == (0, 3)
-
-
-def test_discs_are_where_the_camera_sees_balls():
-    camera = Camera(width=320, height=240, fx=300.0, fy=300.0, cx=159.5, cy=119.5)
-    pose = Pose(np.eye(3), np.array([0.0, 0.0, 0.5]))
-    balls = (Probe(center=(0.1, -0.05, 0.0), radius=0.03), Probe(center=(0.0, 0.0, -1.0), radius=0.03))
-    ((x, y, radius),) = ball_discs(balls, camera, pose)
-    assert (x, y, radius) == pytest.approx((219.5, 89.5, 18.0))
 
 
 @wp.kernel
@@ -195,13 +175,3 @@ def test_what_was_taken_for_the_end_and_moves_with_the_gain_is_taken_back():
         told.append(seen.levels[0])
     assert told[0] < FULL
     assert told[-1] == FULL
-
-
-@pytest.mark.parametrize("level", [210, 238, 245])
-@pytest.mark.parametrize("spread", [0.0, 1.0])
-def test_a_top_is_where_its_crowd_is(level, spread):
-    """Also where it is narrower than the window in which it is looked for."""
-    rng = np.random.default_rng(4)
-    crowd = np.rint(level + spread * rng.normal(size=(400, 1))) + np.zeros(3)
-    others = rng.uniform(20.0, 200.0, size=(2000, 3))
-    assert luma_top(np.concatenate([crowd, others]).astype(np.uint8)) == level

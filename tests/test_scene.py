@@ -7,18 +7,23 @@ import json
 import math
 import pathlib
 import tomllib
+import typing
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from warp_ar import keys
 from warp_ar import scene as sc
-from warp_ar.errors import SceneError, WarpArError
+from warp_ar.errors import SceneError, UsageError, WarpArError
 from warp_ar.scene import Camera, Scene, bundled_scenes, dumps_scene, load_calibration, load_scene, loads_scene
 from warp_ar.scene.geometry import rotation_matrix
+from warp_ar.scene.reference import keys as all_keys
+from warp_ar.scene.scene_files import SceneFiles, files_of
 
 CAMERA = """
 schema = 1
@@ -392,138 +397,70 @@ ERRORS = [
     ("schema = ", r"not valid TOML"),
     ("schema = 1\n[probe]\nradius = 0,035 # metres\n", r"not valid TOML: .*line 3.*; 0,035 is written 0\.035$"),
     ("[[" * 5000, r"levels of nesting"),
-    ("schema = " + "1" * 5000, r"not valid TOML"),
     ("", r"schema is missing: expected schema = 1"),
     (CAMERA.replace("schema = 1", "schema = 2"), r"schema = 2: this program reads schema 1"),
-    (CAMERA.replace("schema = 1", "schema = true"), r"schema = true: this program reads schema 1"),
     ("schema = 1", r"\[camera\] is missing"),
     ("schema = 1\ncamera = 3", r"camera = 3: expected a table with width"),
-    ("schema = 1\nname = 3\n", r"name = 3|camera"),
     # Unknown keys and sections.
     (BASE + "[lite]\nx = 1", r'lite: unknown key; did you mean "light"\?'),
-    (BASE + "[[objects]]\nx = 1", r'objects: unknown key; did you mean "object"\?'),
     (BASE + "[zzz]\nx = 1", r"zzz: unknown key; known: schema, name, camera"),
-    (CAMERA + "widht = 3", r'camera\.widht: unknown key; did you mean "width"\?'),
     (BASE + SPHERE.replace("radius", "radious"), r'object\[0\]\.radious: unknown key; did you mean "radius"\?'),
     (BASE + SPHERE + '"a\\nb" = 1', r'object\[0\]\."a\\nb": unknown key'),
     (BASE + SPHERE + 'material = { model = "lambert", basecolor = [1, 1, 1] }', r'did you mean "base_color"\?'),
-    (BASE + SPHERE + "animate = { trun = [0, 0, 1] }", r'object\[0\]\.animate\.trun: .*did you mean "turn"\?'),
     (BASE + "[light]\nkind = 'point'", r"light: there may be several: write \[\[light\]\]"),
     # The camera.
     ("schema = 1\n[camera]\ntransfer = 'srgb'", r"camera\.width is missing: give width, height, .*or calibration"),
     (CAMERA.replace("width = 640", "width = 640.5"), r"camera\.width = 640\.5: expected a whole number from 1"),
-    (CAMERA.replace("width = 640", "width = true"), r"camera\.width = true: expected a whole number"),
-    (CAMERA.replace("fx = 600.0", "fx = 0"), r"camera\.fx = 0: expected a number above 0 \(pixels\)"),
     (CAMERA.replace("fx = 600.0", ""), r"camera\.fx is missing: expected a number above 0 \(pixels\)"),
     (CAMERA.replace("fx = 600.0", "fx = nan"), r"camera\.fx = NaN"),
     (CAMERA.replace("cx = 319.5", "cx = inf"), r"camera\.cx = Infinity: expected a number, finite"),
-    (CAMERA.replace("fx = 600.0", "fx = true"), r"camera\.fx = true: expected a number"),
-    (CAMERA.replace("cx = 319.5", "cx = '3'"), r'camera\.cx = "3": expected a number'),
-    (
-        CAMERA.replace("cx = 319.5", "cx = 0x" + "f" * 400),
-        r"camera\.cx = .*\.\.\. \(482 characters\): expected a number",
-    ),
     (CAMERA.replace("cx = 319.5", "cx = 0x" + "f" * 8000), r"camera\.cx = a number of thousands of digits: "),
     (CAMERA + "distortion = [0, 0, 0]", r"camera\.distortion = \[0, 0, 0\]: expected a list of 4 or 5 or 8 numbers"),
-    (CAMERA + "distortion = [0, 0, 0, nan]", r"camera\.distortion = \[0, 0, 0, NaN\]"),
     (CAMERA + "transfer = 'sRGBB'", r'camera\.transfer = "sRGBB": expected "srgb", "linear".*no such file: .*sRGBB'),
     (CAMERA + "transfer = 'gamma:x'", r'camera\.transfer = "gamma:x": expected a gamma from 0\.1 to 10'),
-    (CAMERA + "transfer = 'gamma:0'", r"expected a gamma from 0\.1 to 10"),
     (CAMERA + "calibration = 'notes.txt'", r"camera\.width = 640: not used beside calibration"),
-    ("schema = 1\n[camera]\ncalibration = 'none.yml'", r"camera\.calibration = .*no such file: .*none\.yml"),
     # The source.
     (BASE + "[source]\nfps = 3", r"source\.path is missing: expected exactly one of path, camera and synthetic"),
-    (BASE + "[source]\npath = 'frames'\ncamera = 0", r"source\.camera = 0: path is given too"),
-    (BASE + "[source]\npath = '" + "x" * 5000 + "'", r"source\.path = .*cannot be one"),
     (BASE + '[source]\npath = "a\\u0000b"', r"source\.path = .*cannot be one"),
-    (BASE + "[source]\ncamera = -1", r"source\.camera = -1: expected a whole number from 0"),
-    (BASE + "[source]\ncamera = 0\nfps = 0", r"source\.fps = 0: expected a number from 0\.001 to"),
-    (BASE + "[source]\nsynthetic = ''", r'source\.synthetic = "": expected the name'),
     # The marker.
     (CAMERA + SPHERE, r"\[marker\] is missing: \[object\] has its place in the marker's frame"),
     (CAMERA + "[marker]\nid = 0", r"marker\.size is missing: expected a number above 0 \(metres\)"),
     (BASE + "dictionary = 'DICT_4X4_5O'", r'marker\.dictionary = "DICT_4X4_5O": unknown; did you mean "DICT_4X4_50"\?'),
     (BASE + "id = 50", r"marker\.id = 50: expected a whole number from 0 to 49"),
-    (BASE + "dictionary = 'DICT_APRILTAG_16h5'\nid = 30", r"marker\.id = 30: expected a whole number from 0 to 29"),
-    (BASE + "white = 1.5", r"marker\.white = 1\.5: expected a number from 0\.01 to 1"),
     (BASE + "board = 'grid 4x3 0.04 0.01'", r"marker\.size = 0\.08: not used beside board"),
     (CAMERA + "[marker]\nboard = 'chess 4x3 1 1'", r'marker\.board = "chess 4x3 1 1": expected "charuco COLUMNSxROWS'),
-    (CAMERA + "[marker]\nboard = 'grid 4 3 1 1'", r"marker\.board = .*expected"),
     (CAMERA + "[marker]\nboard = 'grid 4x3 a b'", r"lengths must be above 0 and finite"),
-    (CAMERA + "[marker]\nboard = 'grid 0x3 1 1'", r"at least 1x1"),
-    (CAMERA + "[marker]\nboard = 'charuco 1x3 1 0.5'", r"at least 2x2"),
     (CAMERA + "[marker]\nboard = 'charuco 5x7 0.03 0.04'", r"a marker must be smaller than its square"),
     (CAMERA + "[marker]\nboard = 'grid 8x8 0.03 0.04'", r"needs 64 markers; DICT_4X4_50 has 50"),
     # The probe.
-    (BASE + "[probe]\nradius = 1", r"probe\.center is missing: expected a list of 3 numbers"),
     (BASE + "[probe]\ncenter = [0, 0]\nradius = 1", r"probe\.center = \[0, 0\]: expected a list of 3 numbers"),
-    (
-        BASE + "[[probe]]\ncenter = [0, 0, 0]\nradius = 0",
-        r"probe\[0\]\.radius = 0: expected a number above 0 \(metres\)",
-    ),
-    (BASE + "[probe]\ncenter = [0, 0, 0]\nradius = 1\nreflectance = 0", r"probe\.reflectance = 0: .*from 0\.01 to 1"),
     (BASE + "[probe]\ncenter = [0, 0, 0]\nradius = 1\nreflectance = [1, 1, 2]", r"probe\.reflectance = \[1, 1, 2\]"),
     # Proxies.
-    (BASE + "[[proxy]]\nat = [0, 0, 0]", r'proxy\[0\]\.shape is missing: expected one of "plane", "box", "mesh"'),
-    (BASE + "[[proxy]]\nshape = 'sphere'", r'proxy\[0\]\.shape = "sphere": expected one of "plane", "box", "mesh"'),
-    (BASE + "[[proxy]]\nshape = 'plane'\nsize = [1, 2, 3]", r"proxy\[0\]\.size = .*: expected a list of 2 numbers"),
-    (BASE + "[[proxy]]\nshape = 'box'\nsize = [1, 2, 0]", r"proxy\[0\]\.size = .*: .*each above 0 \(metres\)"),
     (BASE + "[[proxy]]\nshape = 'mesh'\nfile = 'x.ply'", r'proxy\[0\]\.file = "x\.ply": no such file: .*/x\.ply'),
     (BASE + "[[proxy]]\nshape = 'mesh'\nfile = 'notes.txt'", r"unknown mesh format; use one of \.ply, \.obj"),
-    (BASE + "[[proxy]]\nshape = 'box'\nfile = 'model.ply'", r'not used with shape = "box"; its own keys are size'),
     # Objects.
-    (BASE + SPHERE.replace("0.03", "-1"), r"object\[0\]\.radius = -1: expected a number above 0 \(metres\)"),
-    (BASE + SPHERE + "size = [1, 1, 1]", r'object\[0\]\.size = .*not used with shape = "sphere"'),
-    (BASE + SPHERE + SPHERE + "scale = 0", r"object\[1\]\.scale = 0: expected a number above 0"),
-    (BASE + SPHERE + "rotate = [0, 0, inf]", r"object\[0\]\.rotate = .*each finite \(degrees\)"),
     (
         BASE + "[[object]]\nshape = 'torus'\nmajor_radius = 1\nminor_radius = 1",
         r"minor_radius = 1: must be below major_",
     ),
-    (BASE + "[[object]]\nshape = 'mesh'", r"object\[0\]\.file is missing: expected the path of a mesh"),
-    (BASE + "[[object]]\nshape = 'mesh'\nfile = 'frames'", r"no such file: .*/frames"),
-    (BASE + SPHERE + "animate = 3", r"object\[0\]\.animate = 3: expected a table with turn, pivot, sway, period"),
     (BASE + SPHERE + "animate = { period = 3 }", r"animate\.period = 3: .*give sway too"),
-    (BASE + SPHERE + "animate = { pivot = [0, 0, 0] }", r"animate\.pivot = .*give turn too"),
-    (BASE + SPHERE + "animate = { sway = [0, 0, 1], period = 0 }", r"period = 0: expected a number, 0\.001 or more"),
     # Materials.
-    (BASE + SPHERE + "material = 3", r"object\[0\]\.material = 3: expected a table"),
     (BASE + SPHERE + "[object.material]", r"object\[0\]\.material\.model is missing: expected one of \"phong\""),
     (
         BASE + SPHERE + "[object.material]\nmodel = 'lambert'\nroughness = 1",
         r'roughness = 1: not used with model = "lam',
     ),
-    (BASE + SPHERE + "[object.material]\nmodel = 'metallic_roughness'\nroughness = 1.1", r"roughness = 1\.1: .*0 to 1"),
-    (BASE + SPHERE + "[object.material]\nmodel = 'metallic_roughness'\nmetallic = -0.1", r"metallic = -0\.1: .*0 to 1"),
-    (
-        BASE + SPHERE + "[object.material]\nmodel = 'phong'\nshininess = -1",
-        r"shininess = -1: expected a number, 0 or more",
-    ),
-    (BASE + SPHERE + "[object.material]\nmodel = 'mirror'\nbase_color = [1, 1, 2]", r"base_color = .*from 0 to 1"),
-    (
-        BASE + SPHERE + "[object.material]\nmodel = 'mirror'\nbase_color = 0.5",
-        r"base_color = 0\.5: expected a list of 3",
-    ),
     (BASE + SPHERE + "[object.material]\nmodel = 'mirror'\nbase_color = 'w.png'", r'"w\.png": no such file: .*/w\.png'),
     # Lights.
-    (light(kind="'area'"), r'light\[0\]\.kind = "area": expected one of "point", "spot", "directional"'),
     (light(kind="'point'"), r'light\[0\]\.target = .*not used with kind = "point"'),
     (light(intensity=""), r"light\[0\]\.intensity is missing: expected a number, 0 or more"),
-    (light(intensity="-1"), r"light\[0\]\.intensity = -1: expected a number, 0 or more"),
-    (light(color="[1, 1, -1]"), r"light\[0\]\.color = .*0 or more"),
     (light(target=""), r"light\[0\]\.target is missing: a spot light needs a target"),
     (light(direction="[0, 0, 1]"), r"light\[0\]\.direction = .*target is given too"),
     (light(target="", direction="[0, 0, 0]"), r"light\[0\]\.direction = .*has no length"),
     (light(target="[0, 0, 1]"), r"light\[0\]\.target = .*is where the light itself is"),
     (light(inner_angle="31"), r"light\[0\]\.inner_angle = 31: must not be above outer_angle \(30\)"),
-    (light(outer_angle="91"), r"light\[0\]\.outer_angle = 91: expected a number from 0 to 90 \(degrees\)"),
-    (light(outer_angle=""), r"light\[0\]\.outer_angle is missing: expected a number from 0 to 90"),
     (light(attenuation="[0, 0, 0]"), r"light\[0\]\.attenuation = .*is zero everywhere"),
-    (light(attenuation="[0, 0, -1]"), r"light\[0\]\.attenuation = .*0 or more"),
-    (light(radius="-1"), r"light\[0\]\.radius = -1: expected a number, 0 or more \(metres\)"),
-    (BASE + "[[light]]\nkind = 'directional'\nintensity = 1", r"light\[0\]\.direction is missing"),
     # Exposure.
-    (BASE + "[exposure]\nscale = -1", r"exposure\.scale = -1: expected a number, 0 or more"),
     (BASE + "[exposure]\nscale = 'of'", r'exposure\.scale = "of": expected a number, 0 or more, or "auto"'),
 ]
 
@@ -545,6 +482,13 @@ def test_scenes_that_are_no_files(folder: pathlib.Path) -> None:
     with pytest.raises(SceneError, match="not a text file in UTF-8") as caught:
         load_scene(latin)
     assert_helpful(caught.value, latin)
+
+
+@pytest.mark.parametrize("section", ["object", "light", "proxy"])
+def test_too_many_entries_are_refused_by_a_limit_that_says_what_it_is(section: str) -> None:
+    entry = {"object": SPHERE, "light": SPOT, "proxy": "[[proxy]]\nshape = 'plane'\nsize = [1, 1]\n"}[section]
+    with pytest.raises(SceneError, match=rf"2,001 \[\[{section}\]\] tables; at most 2,000 .*MAX_SCENE_ENTRIES"):
+        loads_scene(BASE + entry * 2001)
 
 
 @pytest.mark.parametrize("text", [light(inner_angle="90", outer_angle="90"), light(inner_angle="0", outer_angle="0")])
@@ -584,6 +528,7 @@ def toml(value: Any) -> str:
     return repr(value)
 
 
+@pytest.mark.slow
 @settings(max_examples=300, deadline=None, suppress_health_check=list(HealthCheck))
 @given(
     section=st.sampled_from(SECTIONS),
@@ -599,3 +544,157 @@ def test_garbage_is_refused_politely(folder: pathlib.Path, section: str, entries
         assert_helpful(error, path)
     else:
         assert loads_scene(dumps_scene(scene)) == scene
+
+
+# --- Scenes from outside name no file but those that came with them, whatever key names it ----------------------------
+
+
+HEAD = "schema = 1\n[camera]\nfield_of_view = 60\n"
+MARKER_SCENE_FILES = "[marker]\nsize = 0.1\n"
+OBJECT = MARKER_SCENE_FILES + '[[object]]\nshape = "sphere"\nradius = 0.1\nmaterial = {{ model = '
+CASES = {
+    ("Camera", "transfer"): 'transfer = "{}"',
+    ("SourceSpec", "path"): '[source]\npath = "{}"',
+    ("Proxy", "file"): MARKER_SCENE_FILES + '[[proxy]]\nshape = "mesh"\nfile = "{}"',
+    ("Object", "file"): MARKER_SCENE_FILES + '[[object]]\nshape = "mesh"\nfile = "{}"',
+    ("PhongMaterial", "diffuse"): OBJECT + '"phong", diffuse = "{}" }}',
+    ("PhongMaterial", "specular"): OBJECT + '"phong", specular = "{}" }}',
+    ("MetallicRoughnessMaterial", "base_color"): OBJECT + '"metallic_roughness", base_color = "{}" }}',
+    ("LambertMaterial", "base_color"): OBJECT + '"lambert", base_color = "{}" }}',
+    ("MirrorMaterial", "base_color"): OBJECT + '"mirror", base_color = "{}" }}',
+    ("EmissiveMaterial", "image"): OBJECT + '"emissive", image = "{}" }}',
+    ("CapturedLight", "file"): '[marker]\nsize = 0.1\n[light]\nfile = "{}"',
+    ("PoseSpec", "file"): '[pose]\nfile = "{}"',
+}
+"""A scene file that names one path, by the class and field that keep it."""
+OTHER = {
+    "calibration": 'schema = 1\n[camera]\ncalibration = "{}"',
+    "exif": 'schema = 1\n[camera]\ncalibration = "exif"\n[source]\npath = "{}"',
+    "image of an area light": HEAD
+    + MARKER_SCENE_FILES
+    + '[[light]]\nkind = "rect"\nat = [0, 0, 1]\nsize = [1, 1]\nintensity = 1\nimage = "{}"',
+}
+"""Keys whose path the scene does not keep in a field of its own."""
+
+
+def path_fields(kind: type, seen: set[type] | None = None) -> set[tuple[str, str]]:
+    """Fields of a dataclass, and of those that it holds, whose type has a path in it."""
+    seen = set() if seen is None else seen
+    if kind in seen or not dataclasses.is_dataclass(kind):
+        return set()
+    seen.add(kind)
+    found = set()
+    for name, hint in typing.get_type_hints(kind).items():
+        pending = [hint]
+        while pending:
+            item = pending.pop()
+            pending += typing.get_args(item)
+            if item is pathlib.Path:
+                found.add((kind.__name__, name))
+            elif isinstance(item, type):
+                found |= path_fields(item, seen)
+    return found
+
+
+def test_every_field_that_holds_a_path_has_its_case() -> None:
+    assert path_fields(Scene) - {("Scene", "path")} == set(CASES)
+
+
+@pytest.mark.parametrize("text", [*(HEAD + case for case in CASES.values()), *OTHER.values()])
+@pytest.mark.parametrize("name", ["id_rsa", "..", ".", "{folder}/id_rsa", "sub/../id_rsa", "link", "no_such"])
+def test_a_scene_from_outside_reaches_no_file_but_its_own(tmp_path: pathlib.Path, text: str, name: str) -> None:
+    (tmp_path / "id_rsa").write_text("secret")
+    own = tmp_path / "own"
+    own.mkdir()
+    (own / "link").symlink_to(tmp_path / "id_rsa")
+    (own / "mesh.ply").write_bytes(trimesh.creation.box((1, 1, 1)).export(file_type="ply"))
+    files = SceneFiles.of(own, [own / "mesh.ply"])
+    with pytest.raises(SceneError) as raised:
+        loads_scene(text.format(name.format(folder=tmp_path)), "dropped.toml", files)
+    message = str(raised.value).replace(name.format(folder=tmp_path), "")
+    assert "came with the scene" in message
+    assert str(tmp_path) not in message
+
+
+def test_its_own_files_and_cameras_are_taken(tmp_path: pathlib.Path) -> None:
+    mesh = tmp_path / "mesh.ply"
+    mesh.write_bytes(trimesh.creation.box((1, 1, 1)).export(file_type="ply"))
+    text = HEAD + "[source]\ncamera = 2\n" + CASES["Object", "file"].format("mesh.ply")
+    scene = loads_scene(text, "dropped.toml", SceneFiles.of(tmp_path, [mesh], cameras=[2]))
+    assert list(files_of(dataclasses.replace(scene, path=None))) == [mesh]
+    with pytest.raises(SceneError, match="opens no capture device"):
+        loads_scene(text, "dropped.toml", SceneFiles.of(tmp_path, [mesh]))
+
+
+def test_a_users_own_scene_names_any_file(tmp_path: pathlib.Path) -> None:
+    (tmp_path / "deep").mkdir()
+    (tmp_path / "mesh.ply").write_bytes(trimesh.creation.box((1, 1, 1)).export(file_type="ply"))
+    (tmp_path / "deep" / "scene.toml").write_text(HEAD + CASES["Object", "file"].format("../mesh.ply"))
+    assert load_scene(tmp_path / "deep").objects[0].file == tmp_path / "mesh.ply"
+
+
+# Values that scene constructors take are checked where they are given, with class, field, value and what is right.
+
+
+@pytest.mark.parametrize(
+    ("make", "values", "message"),
+    [
+        (sc.Object, {"shape": "cube"}, "Object: shape = 'cube': unknown; .*"),
+        (sc.Object, {"shape": "sphere", "radius": 0}, "Object: radius = 0: expected a number above 0"),
+        (sc.Object, {"shape": "mesh"}, "a mesh needs its file"),
+        (sc.Object, {"shape": "torus", "major_radius": 0.1, "minor_radius": 0.2}, "less than major_radius, 0.1"),
+        (sc.Object, {"shape": "sphere", "radius": 1, "at": (0, 0)}, r"at = \(0, 0\): expected 3 numbers"),
+        (sc.Probe, {"center": (0, 0, 0), "radius": 1, "reflectance": (2, 1, 1)}, "each from 0.01 to 1"),
+        (sc.LambertMaterial, {"base_color": (255, 0, 0)}, r"base_color = \(255, 0, 0\): .*each from 0 to 1"),
+        (sc.Light, {"kind": "sun", "intensity": 1}, "kind = 'sun': unknown"),
+        (sc.Light, {"kind": "spot", "intensity": 1}, "a spot light needs a target or a direction"),
+        (sc.Light, {"kind": "point", "intensity": True}, "intensity = True: expected a number"),
+        (sc.Light, {"kind": "directional", "intensity": 1, "direction": (0, 0, 0)}, "the way the light travels"),
+        (sc.CapturedLight, {"file": pathlib.Path("a.exr"), "axes": "up"}, "axes = 'up': unknown"),
+        (sc.Object, {"shape": "box"}, "expected 3 lengths above 0"),
+        (sc.AreaLight, {"kind": "rect", "intensity": 1, "at": (0, 0, 1)}, "expected 2 lengths above 0"),
+        (sc.Marker, {"size": -0.08}, "size = -0.08: expected a number above 0"),
+        (
+            sc.Camera,
+            {"width": 0, "height": 9, "fx": 9, "fy": 9, "cx": 4, "cy": 4},
+            "width = 0: expected a number from 1",
+        ),
+        (sc.Camera, {"width": 9, "height": 9, "fx": -9, "fy": 9, "cx": 4, "cy": 4}, "fx = -9: expected a number above"),
+    ],
+)
+def test_what_cannot_be_is_named(make: Any, values: dict[str, Any], message: str) -> None:
+    with pytest.raises(SceneError, match=message):
+        make(**values)
+
+
+@pytest.mark.parametrize("rotation", [2 * np.eye(3), np.diag([1, 1, -1]), np.zeros((3, 3)), np.ones((3, 3))])
+def test_a_pose_has_a_rotation(rotation: np.ndarray) -> None:
+    with pytest.raises(UsageError, match="expected a rotation matrix"):
+        sc.Pose(rotation, np.zeros(3))
+
+
+def test_numbers_of_numpy_are_numbers() -> None:
+    item = sc.Object("sphere", radius=np.float32(0.1), at=np.array([0.0, 1.0, 2.0], np.float32))
+    assert item.radius == np.float32(0.1)
+
+
+# --- ``python -m warp_ar.keys`` ---------------------------------------------------------------------------------------
+
+
+def test_all_keys_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert keys.main([]) == 0
+    text = capsys.readouterr().out
+    assert all(f"  {key.name} = " in text for key in all_keys())
+
+
+def test_one_section(capsys: pytest.CaptureFixture[str]) -> None:
+    assert keys.main(["[marker]"]) == 0
+    text = capsys.readouterr().out
+    assert text.startswith("[marker]\n")
+    assert "  size = " in text
+    assert "[camera]" not in text
+
+
+def test_a_section_that_is_none_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    assert keys.main(["camra"]) == 2
+    assert "camera" in capsys.readouterr().err

@@ -15,6 +15,8 @@ from tests.test_scene import BASE, SPHERE, SPOT, folder  # noqa: F401  (a fixtur
 from warp_ar import scene as sc
 from warp_ar.scene import Camera, Scene, dumps_scene, loads_scene
 
+pytestmark = pytest.mark.slow
+
 FINITE = st.floats(-1e18, 1e18)
 POSITIVE = st.floats(1e-18, 1e18)
 UNIT = st.floats(0.0, 1.0)

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import gc
-import itertools
 import os
 import subprocess
 import sys
 import threading
 import types
-import weakref
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
@@ -20,7 +17,7 @@ import warp as wp
 
 from warp_ar.engine import graph
 from warp_ar.engine.graph import Plan, make_plan
-from warp_ar.engine.scheduler import Scheduler, _in_launch_order, _segments
+from warp_ar.engine.scheduler import Scheduler, _in_launch_order
 from warp_ar.kernels.launch import copy, launch, launch_rows
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Stage, Wiring
 from warp_ar.stages.features import Features
@@ -145,33 +142,6 @@ def test_switching_sets_of_stages_gives_the_same_answer(monkeypatch: pytest.Monk
     scheduler.close()
 
 
-def test_alone_it_stays_on_the_callers_thread(monkeypatch: pytest.MonkeyPatch) -> None:
-    """And counts by the clock that it is given: one that grows by a second whenever it is read."""
-    arrays = inputs("cpu")
-    scheduler = Scheduler(plan_of(monkeypatch, chain("a", "b"), ("b",)), arrays, wp.get_device("cpu"), bands=3)
-    threads = []
-    launch = scheduler._launch
-    monkeypatch.setattr(
-        scheduler,
-        "_launch",
-        lambda step, rows: (threads.append(threading.get_ident()), launch(step, rows)),
-    )
-    clock = scheduler.clock
-    ticks = itertools.count()
-    with scheduler.alone(lambda: float(next(ticks))):
-        timings = scheduler.run()
-    assert [timing.milliseconds for timing in timings.values()] == [1e3, 1e3]
-    assert threads == [threading.get_ident()] * 2, "each pass whole"
-    np.testing.assert_array_equal(arrays["b"].numpy(), 2)
-    assert scheduler.clock is clock
-    arrays["frame"].fill_(5)
-    arrays.touch("frame")
-    scheduler.run()
-    assert len(threads) == 2, "native threads again"
-    np.testing.assert_array_equal(arrays["b"].numpy(), 7)
-    scheduler.close()
-
-
 @pytest.mark.parametrize("bands", [1, 2, 3, 16])
 def test_bands_cover_every_row_once(monkeypatch: pytest.MonkeyPatch, bands: int) -> None:
     arrays = inputs("cpu")
@@ -280,6 +250,7 @@ def test_rows_that_are_not_due_are_left_alone(monkeypatch: pytest.MonkeyPatch) -
         scheduler.close()
 
 
+@pytest.mark.slow
 def test_progress_counts_what_is_compiled(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """First 0 of all, in the end all; a second scheduler of the kind finds everything and says nothing."""
     script = """
@@ -299,37 +270,6 @@ for _ in range(2):
     assert run.stdout.splitlines() == ["True True {-1}", "True False set()"]
 
 
-def test_two_owners_of_one_resource_are_an_error() -> None:
-    arrays = Arrays()
-    arrays.add("x", None)
-    with pytest.raises(ValueError, match="'x' is already there"):
-        arrays.add("x", None)
-
-
-def test_a_frame_calls_launchers_under_a_debugger(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A breakpoint in one is hit, and the frame is the same."""
-    called: list[str] = []
-    plan = plan_of(monkeypatch, chain("a", "b"), ("b",))
-    arrays = inputs("cpu")
-    scheduler = Scheduler(plan, arrays, wp.get_device("cpu"), bands=2)
-    scheduler.run()
-    arrays.touch("frame")
-
-    def trace(frame: types.FrameType, event: str, argument: object) -> None:
-        if frame.f_code.co_name == "launch_rows":
-            called.append(event)
-
-    before = sys.gettrace()
-    sys.settrace(trace)
-    try:
-        scheduler.run()
-    finally:
-        sys.settrace(before)
-    assert called == ["call", "call"]
-    np.testing.assert_array_equal(arrays["b"].numpy(), np.full(SIZE, 2))
-    scheduler.close()
-
-
 def test_stages_without_a_common_input_run_side_by_side(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each waits for the other; one thread after another would never end."""
     meeting = threading.Barrier(2, timeout=10.0)
@@ -346,34 +286,6 @@ def test_stages_without_a_common_input_run_side_by_side(monkeypatch: pytest.Monk
     scheduler._threads = 2  # on any machine
     assert run_count(scheduler.run()) == 2
     scheduler.close()
-
-
-def test_threads_of_a_scheduler_that_nobody_closed_keep_what_they_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is collected, its threads are told to end, and until they have, their tables stay.
-
-    A thread that wakes up when its tables are gone writes into memory of others: ``malloc(): smallbin``.
-    """
-    scheduler = Scheduler(plan_of(monkeypatch, chain("a", "b"), ("b",)), inputs("cpu"), wp.get_device("cpu"), bands=2)
-    scheduler._threads = 3
-    scheduler.run()
-    crew = scheduler._crew
-    assert crew is not None
-    tables = (crew._state, crew._stages, crew._passes, crew._calls, crew._readers, crew._system)
-    kept, collected, threads = [weakref.ref(table) for table in tables], weakref.ref(crew), crew._threads.copy()
-    told = crew._end.detach()  # as if no thread had woken up yet
-    assert told is not None
-    stop, counted = told[1], told[2][2]
-    del scheduler, crew, tables, told
-    gc.collect()
-    assert collected() is None, "threads do not keep the scheduler"
-    assert [table() is not None for table in kept] == [True] * 6
-    assert all(thread.is_alive() for thread in threads)
-    stop(kept[0](), kept[-1](), counted)
-    for thread in threads:
-        thread.join(10.0)
-        assert not thread.is_alive()
-    gc.collect()
-    assert [table() for table in kept] == [None] * 6
 
 
 def test_passes_take_part_when_they_are_due(monkeypatch: pytest.MonkeyPatch, device: str) -> None:
@@ -474,23 +386,32 @@ def test_a_pass_waits_for_what_it_reads(monkeypatch: pytest.MonkeyPatch) -> None
     assert (found["d0"], found["d1"], found["d2"]) == (set(), {"c0", "d0"}, {"a0", "d1"})
 
 
-def test_what_is_done_beforehand_leaves_the_graph_whole() -> None:
-    """The same graph serves frames with it and without; a step of the host between launches cuts it."""
-    first, second = (types.SimpleNamespace(name=name) for name in ("first", "second"))
-    launch_first, before, weigh, ask, rest = (
-        Pass(lambda rows: None),
-        Pass(lambda rows: None, on_host=True, beforehand=True),
-        Pass(lambda rows: None),
-        Pass(lambda rows: None, on_host=True),
-        Pass(lambda rows: None),
-    )
-    with_it, without = (
-        _segments([(first, [launch_first]), (second, [*taken, weigh, rest])]) for taken in ([before], [])
-    )
-    assert [(segment.on_host, segment.part) for segment in with_it] == [
-        (True, [(second, [before])]),
-        (False, [(first, [launch_first]), (second, [weigh, rest])]),
-    ]
-    assert [segment.key for segment in with_it[1:]] == [segment.key for segment in without]
-    cut = _segments([(first, [launch_first]), (second, [weigh, ask, rest])])
-    assert [segment.on_host for segment in cut] == [False, True, False]
+def test_two_owners_of_one_resource_are_an_error() -> None:
+    arrays = Arrays()
+    arrays.add("x", None)
+    with pytest.raises(ValueError, match="'x' is already there"):
+        arrays.add("x", None)
+
+
+def test_a_frame_calls_launchers_under_a_debugger(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A breakpoint in one is hit, and the frame is the same."""
+    called: list[str] = []
+    plan = plan_of(monkeypatch, chain("a", "b"), ("b",))
+    arrays = inputs("cpu")
+    scheduler = Scheduler(plan, arrays, wp.get_device("cpu"), bands=2)
+    scheduler.run()
+    arrays.touch("frame")
+
+    def trace(frame: types.FrameType, event: str, argument: object) -> None:
+        if frame.f_code.co_name == "launch_rows":
+            called.append(event)
+
+    before = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        scheduler.run()
+    finally:
+        sys.settrace(before)
+    assert called == ["call", "call"]
+    np.testing.assert_array_equal(arrays["b"].numpy(), np.full(SIZE, 2))
+    scheduler.close()

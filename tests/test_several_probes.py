@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 from tests.reference import latlong
-from tests.rendered_lamp import Array, Desk, mirrored_irradiance
+from tests.rendered_lamp import Array, Desk
 from tests.two_balls import ALBEDO, BALLS, PLACES, TwoBalls, hits, make_scene, material, pose, rms, shares, shown_of
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.scene import LambertMaterial, dumps_scene, loads_scene
 from warp_ar.stages.quality import PRESETS
+
+pytestmark = pytest.mark.slow
 
 DESK = Desk()
 WORLD = TwoBalls(DESK)
@@ -22,9 +24,6 @@ QUALITY = PRESETS["low"].with_methods(recover="clipped")
 SHADING = 1e-4
 # The same normals turn what a mirror shows by twice as much, across a lamp's edge that is one texel of 0.05 wide.
 MIRRORING = 1e-3
-# A code of sRGB is known to half a step: of linear x, 2.4 / 255 / 2 / (c + 0.055) of it, c the code over 255. The room
-# has the darkest that balls show, c = 0.19.
-HALF_CODE = 2.4 / 510.0 / (0.19 + 0.055)
 TRUST_TIME = 0.4
 
 
@@ -61,9 +60,7 @@ def test_objects_have_the_light_of_the_balls_maps_by_their_weights(device: str, 
 def test_interpolated_light_is_nearer_to_the_truth_than_either_balls(device: str, mirror: bool) -> None:
     """On objects between the balls, whose error is what interpolation cannot do: it is compared, not bounded.
 
-    Matt ones are off what the balls can tell by no more than what none tells, and half a code. A mirror shows the lamp
-    at each ball's place, as brightly as the ball has weight: what it sends in the mean is right, not where; and a lamp
-    is a pixel or two of the picture of a ball, so that nothing is foreseen of it.
+    A mirror shows the lamp at each ball's place, as brightly as the ball has weight: right in the mean, not where.
     """
     errors, true = np.zeros((3, len(PLACES))), [WORLD.truth(index, mirror) for index in range(len(PLACES))]
     for case, probes in enumerate((BALLS[:1], BALLS[1:], BALLS)):
@@ -75,9 +72,6 @@ def test_interpolated_light_is_nearer_to_the_truth_than_either_balls(device: str
             if mirror:
                 found, expected = found.mean(0), expected.mean(0)
             errors[case, index] = rms(found - expected) / rms(expected)
-            if not mirror:
-                foreseen, untold = (one[whole] for one in WORLD.foreseen(probes, index))
-                assert rms(found - foreseen) < rms(untold) + HALF_CODE * rms(foreseen)
     print(np.round(errors, 3))
     between = errors[:, 1:4]
     assert between[2].mean() < between[:2].mean(1).min()
@@ -101,42 +95,6 @@ def test_a_ball_that_leaves_the_picture_goes_out_smoothly(device: str) -> None:
                 expected = by_maps(pipeline, 1, False, (1.0, trust), away)
                 np.testing.assert_allclose(found[whole], expected[whole], rtol=SHADING)
     assert trust < 1e-4
-
-
-def test_light_that_clips_is_put_back_where_each_ball_sees_it(device: str) -> None:
-    """A lamp between the balls, 25 times as bright as the camera shows: what the one tells, the other tells mirrored.
-
-    By the card alone, which knows no place of the lamp: its light was found in the first ball's map. The picture is
-    symmetric but for the card's print, which is a hundredth of what a ball mirrors.
-    """
-    balls = tuple((ball.center, ball.radius, ball.reflectance[0]) for ball in BALLS)
-    desk = Desk(lamp_at=(0.0, -0.15, 0.4), lamp_radius=0.025, lamp=27.5, card=0.08, balls=balls)
-    world = TwoBalls(desk, detail=2)
-    ends = 0, len(PLACES) - 1
-    captured, recovered = (
-        [light for index, light in enumerate(world.lit(BALLS, quality, device, frames=1)) if index in ends]
-        for quality in (QUALITY, QUALITY.with_methods(recover="white_card"))
-    )
-    means = np.array([[np.nanmean(light, axis=0) for light in found] for found in (captured, recovered)])
-    expected = [world.foreseen(BALLS, index)[0] for index in ends]
-    whole = [np.isfinite(light[:, 0]) for light in captured]
-    foreseen = np.array([light[inside].mean(0) for light, inside in zip(expected, whole, strict=True)])
-    print(means / foreseen)
-    np.testing.assert_allclose(means[:, 1], means[:, 0], rtol=0.01)
-    # Off by a quarter of what clipping took, or less.
-    assert (np.abs(means[1] - foreseen) < 0.25 * np.abs(means[0] - foreseen)).all()
-
-
-def test_what_frames_leave_out_changes_no_bit(device: str) -> None:
-    """Frames in which no object is to be seen: light is gathered meanwhile."""
-    scene = make_scene(BALLS, material(False))
-    views = (0.0, 3.0, 0.0, -0.5, 3.0, 0.0)
-    frames = {right: WORLD.photograph(right) for right in set(views)}
-    lit = []
-    for culling in (True, False):
-        with Pipeline(scene, device=device, quality=QUALITY, culling=culling) as pipeline:
-            lit.append([pipeline(frames[x], pose=pose(x), time_seconds=0.1 * k).image for k, x in enumerate(views)])
-    np.testing.assert_array_equal(lit[0], lit[1])
 
 
 def test_the_environments_are_those_of_the_balls(device: str) -> None:
@@ -173,34 +131,3 @@ def test_scene_files_say_several_balls() -> None:
     header = dumps_scene(dataclasses.replace(scene, probes=()))
     assert len(loads_scene(header + single).probes) == 1
     assert len(loads_scene(header + 3 * single.replace("[probe]", "[[probe]]")).probes) == 3
-
-
-def test_the_true_desk_has_the_light_that_balls_mirror_onto_it() -> None:
-    """Against rays from the lamp by way of a ball, counted in squares of the desk."""
-    ball = ((-0.2, 0.0, 0.04), 0.04, 0.85)
-    desk = Desk(lamp_at=(-0.1, -0.15, 0.34), lamp_radius=0.02, lamp=27.5, balls=(ball,))
-    lamp, center, radius = np.array(desk.lamp_at), np.array(ball[0]), ball[1]
-    away = float(np.linalg.norm(lamp - center))
-    widest = math.sqrt(1.0 - (radius / away) ** 2)
-    rng, count, half = np.random.default_rng(0), 600_000, 0.01
-    cosine, turn = 1.0 - (1.0 - widest) * rng.random(count), 2.0 * np.pi * rng.random(count)
-    z = (center - lamp) / away
-    x = np.cross(z, [1.0, 0.0, 0.0])
-    x /= np.linalg.norm(x)
-    sine = np.sqrt(1.0 - cosine**2)
-    rays = np.column_stack([sine * np.cos(turn), sine * np.sin(turn), cosine]) @ np.stack([x, np.cross(z, x), z])
-    along = rays @ (lamp - center)
-    points = lamp + (-along - np.sqrt(along**2 - away**2 + radius**2))[:, None] * rays
-    normals = (points - center) / radius
-    gone = rays - 2.0 * (rays * normals).sum(1, keepdims=True) * normals
-    down = gone[:, 2] < 0.0
-    points, gone = points[down], gone[down]
-    landed = points - (points[:, 2] / gone[:, 2])[:, None] * gone
-    flux = ball[2] * desk.lamp * np.pi * desk.lamp_radius**2 * 2.0 * np.pi * (1.0 - widest) / count
-    side = (np.arange(24) + 0.5) / 12.0 * half - half
-    square = np.stack(np.meshgrid(side, side, [0.0]), -1).reshape(-1, 3)
-    for at in ((-0.1, -0.05), (-0.3, 0.0), (-0.2, -0.08), (-0.15, 0.02)):
-        inside = (np.abs(landed[:, :2] - at) < half).all(axis=1).sum()
-        assert inside > 500
-        expected = mirrored_irradiance(desk, square + np.array([*at, 0.0])).mean() * (2.0 * half) ** 2 / flux
-        assert abs(inside - expected) < 5.0 * math.sqrt(expected)

@@ -17,7 +17,6 @@ from warp_ar.kernels.rays.shadow import (
     make_shadow,
     make_visible_share,
     sample_light,
-    tile_turn,
 )
 from warp_ar.kernels.structs import BOX, DIRECTIONAL, POINT, SPHERE, SPOT, Light, RayScene, Shape
 
@@ -137,12 +136,6 @@ def test_at_the_light_itself(device, kind, radius):
     np.testing.assert_allclose(np.linalg.norm(result["wi"], axis=-1), 1.0, atol=1e-5)
 
 
-def test_point_light_without_direction_at_itself(device):
-    """A point light has no direction of its own; +z is documented."""
-    result, _ = samples(light(direction=(0, 0, 0)), [(0, 0, 0)], device)
-    np.testing.assert_array_equal(result["wi"], [(0, 0, 1)])
-
-
 def lit(scene, record, points, device, *, error=1e-6):
     points = np.asarray(points, np.float32)
     result = wp.zeros(len(points), dtype=wp.int32, device=device)
@@ -239,17 +232,3 @@ def test_points_and_enclosing_lights_are_seen_or_not(device):
 def test_light_at_the_horizon_is_half_set(device):
     got = shares([(0, 0, 0)], 0.1, position=(1.0, 0.0, 0.0))
     assert got[0] == pytest.approx(0.5, abs=SUNFLOWER)
-
-
-def test_tile_holds_every_turn(device):
-    out = wp.zeros((8, 8), wp.float32)
-    wp.launch(turn_kernel, dim=(8, 8), outputs=[out])
-    for row, column in ((0, 0), (4, 0), (2, 3)):
-        tile = out.numpy()[row : row + 4, column : column + 4]
-        assert sorted((tile * 16).ravel().astype(int)) == list(range(16))
-
-
-@wp.kernel(enable_backward=False)
-def turn_kernel(out: wp.array2d[wp.float32]):
-    i, j = wp.tid()
-    out[i, j] = tile_turn(i, j)

@@ -27,12 +27,13 @@ from tests.viewer_rig import PATIENCE, Site, run, served
 from warp_ar import live
 from warp_ar.errors import UsageError
 from warp_ar.light.captured import latlong_directions, texel_solid_angles
-from warp_ar.output.environment_axes import AXES, FACES, to_cube
-from warp_ar.output.environment_harmonics import basis
+from warp_ar.output.environment_axes import AXES, FACES, basis, to_cube
 from warp_ar.scene import Pose
-from warp_ar.viewer import routes
+from warp_ar.viewer import server
 from warp_ar.viewer.light_record import LightState, describe, encode_picture, key_light
-from warp_ar.viewer.routes import MOST_LISTENERS, check_origin
+from warp_ar.viewer.server import MOST_LISTENERS, check_origin
+
+pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).resolve().parents[1]
 # A lamp of 4 degrees within a map of 64 rows: half a texel is 1.4 degrees.
@@ -252,11 +253,11 @@ async def test_the_token_is_asked_for() -> None:
 
 @run
 async def test_who_has_asked_counts_as_a_viewer_for_a_while(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(routes, "WATCH_SECONDS", 0.3)
+    monkeypatch.setattr(server, "WATCH_SECONDS", 0.3)
     async with served() as site:
         await known_light(site)
         await known_light(site)
-        controls = site.server.backend.host._controls
+        controls = (await site.server.started())._controls
         assert controls.watchers == 1
         while controls.watchers:
             await asyncio.sleep(0.05)

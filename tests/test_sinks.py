@@ -20,13 +20,10 @@ import pytest
 
 from warp_ar.command_line import Terminated, ended_by_signals
 from warp_ar.errors import SinkError, UsageError
-from warp_ar.output.folder_sink import FolderSink
 from warp_ar.output.sink import FRAMES_WAITING, ThreadedSink
 from warp_ar.output.sinks import (
     EnvironmentSink,
-    NullSink,
-    Sink,
-    TeeSink,
+    FolderSink,
     open_sink,
     read_environment,
     write_environment,
@@ -190,15 +187,6 @@ def test_png_that_cannot_be_written_is_told_once(tmp_path: pathlib.Path) -> None
     assert not list(tmp_path.glob(".*"))
 
 
-def test_last_png_that_cannot_be_written_is_told_by_close(tmp_path: pathlib.Path) -> None:
-    (tmp_path / "0000.png").mkdir()
-    sink = open_sink(tmp_path, fps=24)
-    sink.write(flat(1))
-    with pytest.raises(SinkError, match=r"0000\.png"):
-        sink.close()
-    sink.close()
-
-
 # ---------------------------------------------------------------------------------------------------------------- video
 
 
@@ -296,11 +284,6 @@ def test_odd_sizes_are_padded_and_say_so(tmp_path: pathlib.Path, size: tuple[int
     assert abs(int(decoded[height // 2, even[0] - 1, 1]) - 60) <= RAMP_LEVELS + 10 * (width > 1)
 
 
-def test_even_size_has_no_note(tmp_path: pathlib.Path) -> None:
-    with open_sink(tmp_path / "clip.mp4", fps=24, size=(64, 48)) as sink:
-        assert "padded" not in sink.description
-
-
 @pytest.mark.parametrize("name", VIDEOS)
 def test_file_is_a_video_while_it_grows(tmp_path: pathlib.Path, name: str) -> None:
     rng = np.random.default_rng(0)
@@ -320,36 +303,6 @@ def test_file_is_a_video_while_it_grows(tmp_path: pathlib.Path, name: str) -> No
     assert counts[0] >= 60 - 40
     assert counts[1] >= 90 - 40
     assert len(levels(tmp_path / name)) == 96
-
-
-def test_killed_process_leaves_a_video(tmp_path: pathlib.Path) -> None:
-    script = (
-        "import os, sys, numpy as np\n"
-        "from warp_ar.output.sinks import open_sink\n"
-        "sink = open_sink(sys.argv[1], fps=24)\n"
-        "for index in range(120):\n"
-        "    sink.write(np.full((48, 64, 3), index, np.uint8))\n"
-        "os.kill(os.getpid(), 9)\n"
-    )
-    path = tmp_path / "clip.mp4"
-    root = pathlib.Path(__file__).resolve().parents[1]
-    done = subprocess.run([sys.executable, "-c", script, str(path)], cwd=root, check=False, capture_output=True)
-    assert done.returncode == -9, done.stderr
-    frames = levels(path)
-    assert len(frames) >= 120 - 40
-    assert frames == pytest.approx(list(range(len(frames))), abs=VIDEO_LEVELS)
-
-
-def test_interrupted_block_finishes_the_file(tmp_path: pathlib.Path) -> None:
-    def interrupted() -> None:
-        with open_sink(tmp_path / "clip.mp4", fps=24) as sink:
-            for index in range(7):
-                sink.write(flat(index))
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        interrupted()
-    assert len(levels(tmp_path / "clip.mp4")) == 7
 
 
 def test_no_frame_leaves_no_file_and_no_loss(tmp_path: pathlib.Path) -> None:
@@ -420,40 +373,7 @@ def test_encoder_failure_is_told_at_the_next_write(tmp_path: pathlib.Path, monke
     sink.close()
 
 
-# -------------------------------------------------------------------------------------------------------------- several
-
-
-def test_tee_writes_and_closes_all(tmp_path: pathlib.Path) -> None:
-    class Failing(NullSink):
-        def close(self) -> None:
-            raise SinkError("cannot be finished")
-
-    null = NullSink()
-    sinks: list[Sink] = [open_sink(tmp_path / "frames", fps=24), Failing(), null, open_sink(tmp_path / "a.mkv", fps=24)]
-    tee = TeeSink(*sinks)
-    for level in range(3):
-        tee.write(flat(level))
-    with pytest.raises(SinkError, match="cannot be finished"):
-        tee.close()
-    assert null.count == 3
-    assert levels(tmp_path / "frames") == [0, 1, 2]
-    assert len(levels(tmp_path / "a.mkv")) == 3
-
-
 # -------------------------------------------------------------------------------------------------------------- signals
-
-
-@pytest.mark.parametrize("name", ["clip.mp4", "frames"])
-def test_no_thread_is_started_while_frames_flow(tmp_path: pathlib.Path, name: str, monkeypatch) -> None:
-    """A signal that interrupts the start of an executor's thread leaves one that works and that nobody waits for."""
-    with open_sink(tmp_path / name, fps=24) as sink:
-        own = {thread for thread in threading.enumerate() if thread.name.startswith("warp-ar-sink")}
-        assert len(own) == sink._executor._max_workers == len(sink._executor._threads)
-        with monkeypatch.context() as patched:
-            patched.setattr(ThreadPoolExecutor, "_adjust_thread_count", lambda pool: None)
-            for level in range(30):
-                sink.write(flat(8 * level))
-    assert levels(tmp_path / name) == pytest.approx([8 * level for level in range(30)], abs=VIDEO_LEVELS)
 
 
 @pytest.mark.parametrize("name", [*VIDEOS, "frames", "light"])
@@ -494,3 +414,42 @@ def test_a_signal_on_the_way_into_close_loses_nothing(tmp_path: pathlib.Path, na
         else:
             assert levels(place) == pytest.approx([20 * level for level in range(10)], abs=VIDEO_LEVELS)
         assert not list(place.parent.rglob(".*"))
+
+
+def test_last_png_that_cannot_be_written_is_told_by_close(tmp_path: pathlib.Path) -> None:
+    (tmp_path / "0000.png").mkdir()
+    sink = open_sink(tmp_path, fps=24)
+    sink.write(flat(1))
+    with pytest.raises(SinkError, match=r"0000\.png"):
+        sink.close()
+    sink.close()
+
+
+def test_killed_process_leaves_a_video(tmp_path: pathlib.Path) -> None:
+    script = (
+        "import os, sys, numpy as np\n"
+        "from warp_ar.output.sinks import open_sink\n"
+        "sink = open_sink(sys.argv[1], fps=24)\n"
+        "for index in range(120):\n"
+        "    sink.write(np.full((48, 64, 3), index, np.uint8))\n"
+        "os.kill(os.getpid(), 9)\n"
+    )
+    path = tmp_path / "clip.mp4"
+    root = pathlib.Path(__file__).resolve().parents[1]
+    done = subprocess.run([sys.executable, "-c", script, str(path)], cwd=root, check=False, capture_output=True)
+    assert done.returncode == -9, done.stderr
+    frames = levels(path)
+    assert len(frames) >= 120 - 40
+    assert frames == pytest.approx(list(range(len(frames))), abs=VIDEO_LEVELS)
+
+
+def test_interrupted_block_finishes_the_file(tmp_path: pathlib.Path) -> None:
+    def interrupted() -> None:
+        with open_sink(tmp_path / "clip.mp4", fps=24) as sink:
+            for index in range(7):
+                sink.write(flat(index))
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert len(levels(tmp_path / "clip.mp4")) == 7

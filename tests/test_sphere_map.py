@@ -215,24 +215,6 @@ def test_a_pixel_reaches_only_what_looks_at_it(device):
     assert reached > 0
 
 
-@pytest.mark.parametrize("content", ["black", "white", "noise", "one pixel"])
-@pytest.mark.parametrize("level", [0, 3, 6])
-def test_finite_for_any_frame(device, content, level):
-    one = np.zeros((H, W, 3), np.uint8)
-    one[H // 2, W // 2] = 255
-    frames = {"black": np.zeros_like(one), "white": np.full_like(one, 255), "noise": noise(2), "one pixel": one}
-    texture, found, _, _ = run(frames[content], level=level)
-    for values in (texture, found):
-        assert np.isfinite(values).all()
-        assert (values >= 0.0).all()
-
-
-def test_bands_give_the_same_bits(device):
-    whole, banded = (run(noise(3), rows=rows) for rows in ((None,), ((0, 4), (4, 12), (12, 16))))
-    for one, other in zip(whole, banded, strict=True):
-        np.testing.assert_array_equal(one, other)
-
-
 @pytest.mark.parametrize("height", [32, 64, 128, 256])
 def test_lobes_widen_level_by_level(height):
     """The mirror is the texture itself, the widest lobe the level of 2x2, each one between twice as wide."""

@@ -41,11 +41,6 @@ def test_what_hides_what(device):
     assert set(np.unique(ids)) == {-1, 1, 4}
 
 
-def test_only_what_is_asked_for_runs(device):
-    with Pipeline(make_scene(), device=device, quality="low", outputs=("depth",)) as pipeline:
-        assert [kind.name for kind, _ in pipeline.plan.stages] == ["visibility", "surfaces"]
-
-
 @pytest.mark.parametrize("part", ["objects", "proxies", "probes"])
 def test_a_scene_without_some_of_it(device, part):
     scene = make_scene(**{part: ()})

@@ -10,7 +10,7 @@ import warp as wp
 from tests.reference import textures as reference
 from warp_ar.kernels.structs import RayScene, Texture
 from warp_ar.kernels.textures import SurfacePoint, sample_texture
-from warp_ar.scene.mesh_materials import IDENTITY, TextureUse
+from warp_ar.scene.materials import IDENTITY, TextureUse
 from warp_ar.scene.texture_pack import DECODE, TexturePack, encode_texture, mip_levels
 
 # Coordinates of 3 are rounded to 2e-7, seven texels wide; weights are products of two such.

@@ -18,6 +18,8 @@ from tests.test_pipeline import SIZE, make_scene
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.sources.sources import Synthetic
 
+pytestmark = pytest.mark.slow
+
 WIDTH, HEIGHT = SIZE
 FRAME_BYTES = WIDTH * HEIGHT * 3
 OUTPUTS = ("image", "environment")

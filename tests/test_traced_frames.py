@@ -19,11 +19,25 @@ from warp_ar.kernels.color import decode_table
 from warp_ar.live import main
 from warp_ar.scene import Exposure, dumps_scene
 from warp_ar.session import Session
+from warp_ar.sources.synthetic import Synthetic
+
+pytestmark = pytest.mark.slow
 
 
-def test_frames_are_those_of_the_path_tracer() -> None:
+@pytest.fixture
+def clip(tmp_path: Path) -> Path:
+    """Two small frames: paths are followed for each pixel."""
+    folder = tmp_path / "clip"
+    folder.mkdir()
+    with Synthetic("card", size=(160, 120), length=2) as source:
+        for frame in source:
+            cv2.imwrite(str(folder / f"{frame.index}.png"), frame.image[..., ::-1])
+    return folder
+
+
+def test_frames_are_those_of_the_path_tracer(clip: Path) -> None:
     """In the light, pose and time of each frame, not of the one after it."""
-    with Session(page_scene(), device="cpu", quality="low") as session:
+    with Session(page_scene(), source=clip, device="cpu", quality="low") as session:
         session.ahead = False
         traced = TracedFrames(session.pipeline, 1)  # type: ignore[arg-type]
         first = None
@@ -80,12 +94,12 @@ def test_a_darker_exposure_scales_what_is_encoded() -> None:
     np.testing.assert_allclose(table[pictures[1].image], 0.25, atol=0.004)  # half a code there
 
 
-def test_the_command_writes_them(tmp_path: Path) -> None:
+def test_the_command_writes_them(tmp_path: Path, clip: Path) -> None:
     path = tmp_path / "scene.toml"
-    path.write_text(dumps_scene(page_scene()))
-    options = ["--device", "cpu", "--quality", "low", "--frames", "1", "--headless"]
+    path.write_text(dumps_scene(page_scene(probes=())))
+    options = ["--source", str(clip), "--device", "cpu", "--quality", "low", "--frames", "1", "--headless"]
     assert main([str(path), *options, "--output", str(tmp_path / "lit")]) == 0
-    assert main([str(path), *options, "--output", str(tmp_path / "traced"), "--samples", "2"]) == 0
+    assert main([str(path), *options, "--output", str(tmp_path / "traced"), "--samples", "1"]) == 0
     lit, traced = (cv2.imread(str(tmp_path / name / "0000.png")) for name in ("lit", "traced"))
     assert lit.shape == traced.shape
     assert (lit != traced).any()

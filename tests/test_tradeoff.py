@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+import base64
+import html.parser
 import json
+import re
 
 import pytest
+from PIL import Image
 
-from tests.accuracy_rig import setting
-from warp_ar import tradeoff
-from warp_ar.accuracy import case_report
+from bench import paper_figures
+from tests.accuracy_rig import case, frames, report, setting  # noqa: F401  (fixtures)
+from warp_ar import paper, tradeoff
+from warp_ar.accuracy import measure, tradeoff_page
 from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, EXIT_USAGE
 from warp_ar.signature import is_signed
+
+pytestmark = pytest.mark.slow
 
 pytest.importorskip("flip_evaluator")
 pytest.importorskip("matplotlib")
 
 
 def test_command_writes_all_three(tmp_path, monkeypatch, capsys, device):
-    monkeypatch.setattr(case_report, "RUNS", ("low",))
+    monkeypatch.setattr(tradeoff, "RUNS", ("low",))
     arguments = ["darken", "--stage", "expose", "--frames", "2", "--shrink", "4", "--device", device]
     assert tradeoff.main([*arguments, "--out", str(tmp_path / "out")]) == EXIT_DONE
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
@@ -30,10 +37,7 @@ def test_command_writes_all_three(tmp_path, monkeypatch, capsys, device):
     assert [json.loads(line)["method"] for line in lines[: len(methods)]] == methods
     shown = capsys.readouterr().out
     assert "expose" in shown
-    told = [line for line in shown.splitlines() if "% " in line and " left" in line]
-    assert told[-2].split()[-1] == "darken", "shown while the page is written too"
-    assert told[-1].endswith("page: darken: expose")
-    assert told[-1].split()[0] == "100%", "units that were announced are all reported"
+    assert "darken: presets" in shown
     assert all(is_signed(path) for path in (tmp_path / "out").iterdir())
 
 
@@ -42,11 +46,11 @@ def no_measurement(*_):
 
 
 def test_nothing_of_somebody_elses_is_overwritten(tmp_path, monkeypatch, capsys, device):
-    monkeypatch.setattr(case_report, "RUNS", ("paper", "low"))
+    monkeypatch.setattr(tradeoff, "RUNS", ("paper", "low"))
     arguments = ["darken", "--presets", "--frames", "1", "--shrink", "8", "--device", device, "--out", str(tmp_path)]
     (tmp_path / "presets.json").write_text("mine")
     with monkeypatch.context() as before:
-        before.setattr(tradeoff, "measure", no_measurement)
+        before.setattr(tradeoff, "measure_case", no_measurement)
         assert tradeoff.main(arguments) == EXIT_FAILED
     assert "presets.json is there, and this program did not write it" in capsys.readouterr().err
     assert (tmp_path / "presets.json").read_text() == "mine"
@@ -62,9 +66,9 @@ def test_presets_alone(tmp_path, device):
     assert {path.name for path in tmp_path.iterdir()} == {"presets.json", "tradeoff.jsonl"}
     listed = json.loads((tmp_path / "presets.json").read_text())
     assert listed["made"]["against"] == "truth"
-    assert set(listed["errors"]) == {"darken"}
-    assert set(listed["errors"]["darken"]) == {"paper", "low"}
-    assert all(0.0 < error < 1.0 for error in listed["errors"]["darken"].values())
+    assert set(listed["presets"]) == {"darken"}
+    assert set(listed["presets"]["darken"]) == {"paper", "low"}
+    assert all(0.0 < whole["error"] < 1.0 and whole["ms"] > 0.0 for whole in listed["presets"]["darken"].values())
 
 
 @pytest.mark.parametrize(
@@ -73,8 +77,8 @@ def test_presets_alone(tmp_path, device):
         (["desk", "--presets", "--stage", "irradiance"], "--presets --stage irradiance: expected one of both"),
         (["desk", "--only", "low"], "--only low: expected --presets beside it"),
         (["desk", "--presets", "--only", "low,best"], "--only best: expected presets of paper, low, medium"),
-        (["desk", "--frames", "0"], "--frames 0: expected 1 or more"),
-        (["desk", "--shrink", "0"], "--shrink 0: expected 1 or more"),
+        (["desk", "--frames", "0"], "--frames: 0: expected 1 or more"),
+        (["desk", "--shrink", "0"], "--shrink: 0: expected 1 or more"),
         (["desk", "--stage", "colour", "--frames", "1"], "--stage colour: expected one of environment_height"),
         (["--truth", "TMP"], "expected folders with scene_"),
         (["darken", "--stage", "irradiance", "--frames", "1"], "nothing to turn"),
@@ -83,6 +87,124 @@ def test_presets_alone(tmp_path, device):
 def test_bad_usage_is_one_line(arguments, message, tmp_path, capsys):
     arguments = [str(tmp_path) if argument == "TMP" else argument for argument in arguments]
     assert tradeoff.main(arguments) == EXIT_USAGE
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+
+
+# --- The page: one file that needs nothing else -----------------------------------------------------------------------
+
+
+pytest.importorskip("flip_evaluator")
+pytest.importorskip("matplotlib")
+
+
+class Checker(html.parser.HTMLParser):
+    """Every tag that opens closes, in order."""
+
+    VOID = ("meta", "img")
+
+    def __init__(self):
+        super().__init__()
+        self.open: list[str] = []
+        self.images: list[str] = []
+
+    def handle_starttag(self, tag, attrs):
+        if tag == "img":
+            self.images.append(dict(attrs)["src"])
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        pass
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def test_the_page_is_whole_and_needs_nothing_else(report):
+    page = tradeoff_page.render([report], {"device": "this <one>", "warp": "1"})
+    checker = Checker()
+    checker.feed(page)
+    assert checker.open == []
+    assert "&lt;made&gt; &amp; so on" in page
+    assert "this &lt;one&gt;" in page
+    assert not re.search(r"""(src|href)=["'](?!data:|#)""", page)
+    assert "<script" not in page
+    assert len(checker.images) > 5
+    for source in checker.images:
+        code = re.fullmatch(r"data:image/webp;base64,(.+)", source).group(1)
+        assert base64.b64decode(code)[:4] == b"RIFF"
+
+
+def whole(label, flip, over):
+    return measure.Whole(label, 10.0 * over, flip, {"irradiance": "sh2"}, {}, over)
+
+
+@pytest.mark.parametrize(
+    ("over", "flip", "expected"),
+    [
+        (0.9, 0.2, "Chosen for the paper's time: 33% less error in 0.90x the time."),
+        (1.2, 0.4, "33% more error in 1.20x"),
+    ],
+)
+def test_words_say_what_was_measured(over, flip, expected):
+    """What was chosen for the paper's time is said to take what it took."""
+    words = tradeoff_page.whole_words(
+        [whole("paper", 0.3, 1.0), whole("high", 0.1, 9.5), whole(measure.SAME_TIME, flip, over)]
+    )
+    assert expected in words
+    assert "High: 67% less error in 9.50x the time." in words
+
+
+# --- The command that makes the paper's figures -----------------------------------------------------------------------
+
+
+pytest.importorskip("flip_evaluator")
+pytest.importorskip("matplotlib")
+
+
+def test_a_figure_is_a_picture_numbers_and_a_plot(tmp_path, monkeypatch, capsys, device):
+    monkeypatch.setattr(paper_figures, "OURS", ("low",))
+    out = tmp_path / "paper"
+    arguments = ["7", "--frames", "2", "--shrink", "4", "--device", device, "--out", str(out)]
+    assert paper.main(arguments) == EXIT_DONE
+    assert {path.name for path in out.iterdir()} == {"figure7.webp", "figure7.svg", "figures.md"}
+    text = (out / "figures.md").read_text()
+    assert text.startswith("<!-- warp_ar -->\n\n## Figure 7: ")
+    assert "](paper/figure7.webp)" in text
+    assert "| quality | ms per frame | FLIP to the truth | error kept |" in text
+    assert "Figure 7" in capsys.readouterr().out
+    assert "--mark:" in (out / "figure7.svg").read_text()
+    assert all(is_signed(path) for path in out.iterdir())
+    picture = Image.open(out / "figure7.webp").convert("RGB")
+    monkeypatch.setattr(paper, "write_figure", None)  # nothing is made where it may not be written
+    picture.save(out / "figure7.webp", quality=50)
+    kept = (out / "figure7.webp").read_bytes()
+    assert paper.main(arguments) == EXIT_FAILED
+    assert "figure7.webp is there, and this program did not write it" in capsys.readouterr().err
+    assert (out / "figure7.webp").read_bytes() == kept
+
+
+def test_readings_are_a_table(monkeypatch, capsys, device):
+    monkeypatch.setattr(paper, "READING_SCENES", ("darken",))
+    monkeypatch.setattr(paper_figures, "READING_SCENES", ("darken",))
+    assert paper.main(["readings", "--frames", "2", "--shrink", "4", "--device", device]) == EXIT_DONE
+    printed = capsys.readouterr().out
+    assert "Readings of the open text" in printed
+    assert "clamp" in printed
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["2"], "figure 2: expected 1, 3, 4"),
+        (["1", "--frames", "0"], "--frames: 0: expected 1 or more"),
+        (["1", "--shrink", "0"], "--shrink: 0: expected 1 or more"),
+    ],
+)
+def test_paper_bad_usage_is_one_line(arguments, message, capsys):
+    assert paper.main(arguments) == EXIT_USAGE
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1

@@ -11,16 +11,7 @@ import pytest
 import warp as wp
 
 from warp_ar.engine import transfer
-from warp_ar.engine.transfer import COPY_BYTES, COPY_THREADS, KEPT, Transfers, split_rows
-
-
-@pytest.mark.parametrize(("height", "width", "parts"), [(480, 640, 1), (1080, 1920, 2), (2160, 3840, COPY_THREADS)])
-def test_parts_are_a_whole_frame(height: int, width: int, parts: int) -> None:
-    """Threads copy every row once, and none of them less than pays."""
-    rows = split_rows(height, width)
-    assert len(rows) == parts
-    np.testing.assert_array_equal(np.concatenate([np.arange(height)[part] for part in rows]), np.arange(height))
-    assert parts == 1 or min(3 * width * (part.stop - part.start) for part in rows) >= COPY_BYTES
+from warp_ar.engine.transfer import KEPT, Transfers
 
 
 @pytest.mark.parametrize("given", [False, True])

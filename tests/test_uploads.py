@@ -25,7 +25,9 @@ from warp_ar.scene.scene_files import files_of
 from warp_ar.stages.quality import PRESETS
 from warp_ar.viewer import edits, uploads
 from warp_ar.viewer.edits import Wanted
-from warp_ar.viewer.uploads import DroppedFiles, pack_scene
+from warp_ar.viewer.uploads import DroppedFiles, pack_scene, unpack_scene
+
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture
@@ -87,6 +89,18 @@ def test_captured_light_stands_for_the_balls(files, wanted, tmp_path):
     # What was dropped is saved beside the scene, by its name alone.
     saved = dumps_scene(dataclasses.replace(edits.beside(after.scene, tmp_path), path=None))
     assert str(tmp_path) not in saved
+
+
+def test_a_saved_scene_with_dropped_meshes_is_taken_again(files, wanted, tmp_path):
+    """By the session that saved it; two meshes of one name stay two."""
+    for size in (0.05, 0.08):
+        make, _, _ = files.take("my box.glb", trimesh.creation.box((size,) * 3).export(file_type="glb"), wanted)
+        wanted = make(wanted)
+    saved = dumps_scene(dataclasses.replace(edits.beside(wanted.scene, tmp_path), path=None))
+    make, _, _ = files.take("scene.toml", saved.encode(), wanted)
+    again = make(wanted).scene.objects
+    assert [item.file for item in again] == [item.file for item in wanted.scene.objects]
+    assert len({item.file for item in again if item.file is not None}) == 2
 
 
 def test_a_radiance_picture_is_light_seen_from_inside(files, wanted):
@@ -223,7 +237,7 @@ def test_limits_are_said(files, wanted, monkeypatch):
     with pytest.raises(UsageError, match="12 triangles; at most 11"):
         files.take("box.ply", box(0.1, 0.1, 0.1), wanted)
     monkeypatch.setattr(uploads, "MOST_BYTES", 50)
-    with pytest.raises(UsageError, match="bytes; at most 50"):
+    with pytest.raises(UsageError, match="MB; at most"):
         files.take("box.ply", box(0.1, 0.1, 0.1), wanted)
     monkeypatch.undo()
     monkeypatch.setattr(uploads, "MOST_FILES", 1)
@@ -352,13 +366,23 @@ def packed(**members):
     return made.getvalue()
 
 
+def test_hidden_files_of_a_zip_are_left_out(tmp_path):
+    scene, hidden = "schema = 1\n[camera]\nfield_of_view = 60\n", b"\0\5\x16\7"
+    made = io.BytesIO()
+    with zipfile.ZipFile(made, "w") as file:
+        for name in ("scene.toml", "__MACOSX/._scene.toml", ".DS_Store", "00/._a.ply"):
+            file.writestr(name, scene if name == "scene.toml" else hidden)
+    path = unpack_scene("desk.zip", made.getvalue(), tmp_path, 1 << 20)
+    assert list(tmp_path.iterdir()) == [path]
+
+
 @pytest.mark.parametrize(
     ("members", "said"),
     [
         ({"other.toml": "schema = 1"}, "holds no scene.toml"),
         ({"scene.toml": "schema = 1", "..__evil.ply": "x"}, "nothing that a scene names"),
         ({"scene.toml": "schema = 1", "run.sh": "x"}, "run.sh is nothing"),
-        ({"scene.toml": "schema = 1", "big.bin": bytes(1 << 27)}, "unpacks to 134,217,738 bytes"),
+        ({"scene.toml": "schema = 1", "big.bin": bytes(1 << 27)}, "unpacks to 128 MB; at most 64 MB"),
         ({"scene.toml": 'schema = 1\n[camera]\nfield_of_view = 60\ntransfer = "id_rsa"'}, "no file of this name"),
         ({"scene.toml": 'schema = 1\n[camera]\nfield_of_view = 60\n[source]\npath = ".."'}, "no file of this name"),
         ({"scene.toml": "schema = 9"}, "desk.zip"),
@@ -418,7 +442,7 @@ def test_all_files_together_have_a_limit(files, wanted, tmp_path, monkeypatch):
     monkeypatch.setattr(uploads, "MOST_KEPT_BYTES", 2 * len(data))
     for _ in range(2):
         files.take("box.ply", data, wanted)
-    with pytest.raises(UsageError, match="bytes would be kept"):
+    with pytest.raises(UsageError, match="MB would be kept"):
         files.take("box.ply", data, wanted)
     bomb = packed(**{"scene.toml": SCENE_OF_ONE.partition("[[object]]")[0], "big.bin": bytes(1 << 20)})
     monkeypatch.setattr(uploads, "MOST_KEPT_BYTES", 2 * len(data) + len(bomb))

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from tests.browser_rig import SMALL, Tab, axe_core, serious_findings
+from tests.browser_rig import SMALL, Tab, axe_core, findings
 from tests.page_rig import (  # noqa: F401  (fixtures)
     artefacts,
     browser,
@@ -21,7 +21,7 @@ from tests.page_rig import (  # noqa: F401  (fixtures)
 )
 
 pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install '.[test]'")
-pytestmark = needs_browser
+pytestmark = [pytest.mark.slow, needs_browser]
 
 
 def test_by_keyboard_alone(open_tab: Callable[..., Tab]) -> None:
@@ -43,25 +43,66 @@ def test_by_keyboard_alone(open_tab: Callable[..., Tab]) -> None:
     tab.until("warpAr.state.playing === false")
 
 
-@pytest.mark.parametrize("size", [(1280, 800), (390, 844)], ids=["desktop", "phone"])
-def test_nothing_serious_hinders_anybody(open_tab: Callable[..., Tab], size: Any, artefacts: Path) -> None:
-    phone = size[0] < 800
+PRESSED = """import('/static/geometry.js').then(({ project }) => {
+  const [x, y] = project(warpAr.camera, warpAr.pose, [0.15, 0.055, 0.03]);
+  const { left, top, width } = document.getElementById("handles").getBoundingClientRect();
+  const scale = width / warpAr.camera.width;
+  return [left + x * scale, top + y * scale];
+})"""
+"""Place of the teapot on the screen."""
+
+
+def pinch_the_teapot(tab: Tab) -> None:
+    """Two fingers that part and turn make it larger and turn it; it stays where it is."""
+    tab.hold()
+    x, y = tab.page.evaluate(PRESSED)
+    before = tab.page.evaluate("warpAr.scene.objects[0]")
+    touch = tab.page.context.new_cdp_session(tab.page)
+
+    def fingers(kind: str, *places: tuple[float, float]) -> None:
+        points = [{"x": px, "y": py, "id": number} for number, (px, py) in enumerate(places)]
+        touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+    fingers("touchStart", (x, y))
+    tab.until("warpAr.handles.dragged === 'object 0'")
+    fingers("touchStart", (x, y), (x + 40, y))
+    for step in range(1, 6):
+        fingers("touchMove", (x, y), (x + 40 + 8 * step, y + 6 * step))
+    fingers("touchEnd")
+    tab.until(f"warpAr.scene.objects[0].scale > 1.2 * {before['scale']}")
+    assert tab.page.evaluate("warpAr.scene.objects[0].rotate[2]") < before["rotate"][2] - 5.0
+    assert tab.page.evaluate("warpAr.scene.objects[0].at") == before["at"]
+    tab.page.click("#play")
+    tab.until("warpAr.state.playing")
+
+
+TOPS = """() => [...document.querySelectorAll(".toolbar > *")].filter((e) => e.offsetParent)
+  .map((e) => { const box = e.getBoundingClientRect(); return box.top + box.height / 2; })"""
+
+
+@pytest.mark.parametrize("size", [(1280, 800), (390, 844), (844, 390)], ids=["desktop", "phone", "phone on its side"])
+def test_nothing_hinders_anybody(open_tab: Callable[..., Tab], size: Any, artefacts: Path) -> None:
+    phone = min(size) < 800
     shape = {"viewport": {"width": size[0], "height": size[1]}, "has_touch": phone, "is_mobile": phone}
+    tab = open_tab(**shape)
+    page = tab.page
+    if size == (390, 844):
+        pinch_the_teapot(tab)
+    page.evaluate(axe_core())
     for scheme in ("dark", "light"):
-        tab = open_tab(color_scheme=scheme, **shape)
-        page = tab.page
-        page.evaluate(axe_core())
+        page.emulate_media(color_scheme=scheme)
         assert page.evaluate("document.documentElement.scrollWidth") <= size[0], "wider than the screen"
+        middles = page.evaluate(TOPS)
+        assert max(middles) - min(middles) < 12, "the toolbar wraps"
         for name in ("scene", "quality", "light", "setup"):
             press = page.tap if phone else page.click
             press(f"#tab-{name}")
             assert page.locator(f"#panel-{name}").is_visible()
             page.wait_for_timeout(300)
             page.screenshot(path=artefacts / f"{size[0]}_{name}_{scheme}.png")
-            assert serious_findings(page) == [], (name, scheme)
+            assert findings(page) == [], (name, scheme)
             if phone:
                 assert page.evaluate(SMALL) == [], (name, scheme)
-        page.context.close()
 
 
 def reach(page: Any, selector: str, most: int = 80) -> None:
@@ -105,7 +146,8 @@ def ask_for_another_marker(tab: Tab, artefacts: Path) -> None:
     reach(page, "#use-marker")
     page.keyboard.press("Enter")
     tab.until("warpAr.scene.marker.id === 7 && !document.getElementById('guide').hidden", "what is missing")
-    tab.until("document.getElementById('guide').textContent.includes('the picture shows DICT_4X4_50 0')", "the words")
+    words = "the picture shows marker 0 of the family 4X4_50"
+    tab.until(f"document.getElementById('guide').textContent.includes('{words}')", "the words")
     page.screenshot(path=artefacts / "missing.png")
     page.keyboard.press("Control+z")
     tab.until("document.getElementById('track-state').classList.contains('tracked')", "the marker again")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -14,13 +15,17 @@ import pytest
 from tests.test_budget import even_costs
 from tests.viewer_rig import PATIENCE, SIZE, Running, page_scene
 from warp_ar.accuracy.controller import AIM
-from warp_ar.accuracy.cost_table import SETTINGS
+from warp_ar.accuracy.cost_table import SETTINGS, load_presets
 from warp_ar.accuracy.costs import Costs
 from warp_ar.engine.pipeline import Pipeline
-from warp_ar.scene import Scene
+from warp_ar.scene import Scene, load_scene
 from warp_ar.viewer import budget as budget_setting
 from warp_ar.viewer.budget import BudgetSetting
 
+pytestmark = pytest.mark.slow
+
+ROUNDED = 0.00051
+"""Of an error that is written with three digits."""
 # What the cost table may hold; the test's own, for that in the package may be made anew.
 ERRORS = {
     setting.name: {method: 0.1 / (1 + place) for place, method in enumerate(setting.methods)} for setting in SETTINGS
@@ -49,7 +54,8 @@ def test_what_the_budget_offers_is_what_it_chooses(known_errors: None, tmp_path:
     with Pipeline(scene, device="cpu", quality="low") as pipeline, ThreadPoolExecutor(1) as helper:
         frame = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
         setting.look(pipeline, frame, None, helper)
-        off = {"type": "budget", "measuring": None, "remaining": None, "known": False}
+        off = {"type": "budget", "measuring": None, "remaining": None, "known": False, "errors": told[-1]["errors"]}
+        assert set(off["errors"]) >= {"paper", "low", "medium", "high"}
         assert told[-1] == off, "nothing is measured while it is off"
         setting.switch(50.0)
         assert setting.choose(10.0, 0.0) is None, "nothing is known yet"
@@ -70,7 +76,6 @@ def test_what_the_budget_offers_is_what_it_chooses(known_errors: None, tmp_path:
         assert times == sorted(times)
         assert errors == sorted(errors, reverse=True)
         assert "brute_force" in record["settings"]["irradiance"]
-        assert "reference" not in record["presets"], "brute force is not measured"
         for budget in (0.1, 18.0, 25.0, 500.0):
             setting.switch(budget)
             quality = setting.choose(None, 0.0)
@@ -88,6 +93,33 @@ def test_what_the_budget_offers_is_what_it_chooses(known_errors: None, tmp_path:
         again = BudgetSetting(told.append, tmp_path)
         again.look(pipeline, frame, None, helper)
         assert told[-1]["known"]
+
+
+def test_the_page_states_the_errors_of_the_documentation() -> None:
+    text = (Path(__file__).parents[1] / "docs" / "accuracy.md").read_text()
+    head, _, *rows = text.split("<!-- made: ladder -->\n")[1].split("\n<!--")[0].splitlines()
+    assert len(rows) >= 8
+    for row in rows:
+        scene = re.findall(r"`(\w+)`", row)[0]
+        errors = map(float, re.findall(r"([\d.]+) \(", row))
+        told = dict(zip(re.findall(r"`(\w+)`", head), errors, strict=True))
+        assert load_presets(scene) == pytest.approx(told, abs=ROUNDED)
+
+
+def test_what_presets_cost_is_told_by_the_table_until_they_have_run(tmp_path: Path) -> None:
+    setting = BudgetSetting(lambda message: None, tmp_path)
+    table = load_presets("desk", "ms")
+    with Pipeline(load_scene("desk"), device="cpu", quality="low") as pipeline, ThreadPoolExecutor(1) as helper:
+        setting.look(pipeline, np.zeros((480, 640, 3), np.uint8), None, helper)
+    assert setting.costs() == {name: {"ms": ms, "frames": 0} for name, ms in table.items()}, "nothing has run"
+    for _ in range(5):
+        setting.note("medium", 3.0 * table["medium"])
+    told = setting.costs()
+    assert {name: cost["frames"] for name, cost in told.items()} == {**dict.fromkeys(table, 0), "medium": 5}
+    for name, ms in table.items():
+        assert told[name]["ms"] == pytest.approx(3.0 * ms, abs=0.01)
+    setting.note("high", 7.0)
+    assert setting.costs()["high"] == {"ms": 7.0, "frames": 1}
 
 
 def test_the_budget_changes_the_picture(known_errors: None, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,10 +17,12 @@ from tests.viewer_rig import Running, page_scene, rendered_cards
 from warp_ar.errors import UsageError
 from warp_ar.scene import Camera, Pose, load_calibration
 from warp_ar.tracking.card_layout import SHEET
-from warp_ar.viewer.camera import CalibrationSession
-from warp_ar.viewer.frames import Lit
+from warp_ar.viewer.host import Lit
 from warp_ar.viewer.protocol import Picture
 from warp_ar.viewer.server import encode_jpeg
+from warp_ar.viewer.setup import CalibrationSession
+
+pytestmark = pytest.mark.slow
 
 # A dozen views of the board in noisy pictures of 480x360, measured 0.3 %.
 CALIBRATED_ERROR = 0.01

@@ -24,7 +24,7 @@ from tests.page_rig import (  # noqa: F401  (fixtures)
 )
 
 pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install '.[test]'")
-pytestmark = needs_browser
+pytestmark = [pytest.mark.slow, needs_browser]
 
 
 def test_the_browsers_camera_is_lit(open_tab: Callable[..., Tab], artefacts: Path) -> None:

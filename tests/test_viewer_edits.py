@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import math
 from typing import Any
 
 import pytest
@@ -47,6 +48,29 @@ def test_edits_are_checked_as_the_file_is() -> None:
     ]:
         with pytest.raises(SceneError):
             edits.set_value(scene, part, index, key, value)
+
+
+def test_what_is_new_stands_apart_and_on_the_desk() -> None:
+    scene = load_scene("desk")
+    for kind in ("sphere", "box", "torus", "torus"):
+        scene = edits.add_part(scene, "object", kind)
+    scene = edits.duplicate_part(scene, "object", 0)
+    assert scene.objects[-1].file == scene.objects[0].file
+    for index, item in enumerate(scene.objects):
+        for other in scene.objects[:index]:
+            apart = math.dist(item.at[:2], other.at[:2])
+            assert apart > 0.9 * (item.radius + other.radius + 0.02), (item, other)
+    lights = edits.duplicate_part(edits.add_part(scene, "light", "point"), "light", 1).lights
+    assert len({light.at for light in lights}) == len(lights)
+    for index, (item, rotate, lowest) in enumerate(
+        [(scene.objects[1], (0.0, 0.0, 0.0), -0.03), (scene.objects[2], (0.0, 90.0, 45.0), -0.025)], 1
+    ):
+        lifted = edits.set_value(scene, "object", index, "at", (*item.at[:2], 0.4))
+        turned = edits.set_value(lifted, "object", index, "rotate", rotate)
+        assert edits.snap_object(turned, index).objects[index].at == (*item.at[:2], pytest.approx(-lowest))
+    assert edits.snap_object(scene, 0).objects[0].at[2] == pytest.approx(0.0, abs=0.002), "the teapot's foot"
+    with pytest.raises(UsageError, match="object 9"):
+        edits.snap_object(scene, 9)
 
 
 @pytest.mark.parametrize(
@@ -133,6 +157,18 @@ def test_the_printed_card_is_used_with_the_sizes_that_were_typed() -> None:
     for radius, ruler, said in [(31.0, 0.1, "31000 mm; expected 5 to"), (0.03, 97.0, "97000 mm; expected 50 to 150")]:
         with pytest.raises(UsageError, match=said):
             edits.use_card(scene, radius, ruler)
+
+
+def test_a_material_comes_back_with_its_model() -> None:
+    """Gold made chalk, and metal again, is gold again; of another object nothing is kept."""
+    wanted = Wanted(page_scene(), PRESETS["low"])
+    for key, value in (("model", "metallic_roughness"), ("metallic", 1.0), ("roughness", 0.3)):
+        wanted = wanted.with_value("object", 0, key, value)
+    gold = wanted.scene.objects[0].material
+    wanted = wanted.with_value("object", 0, "model", "lambert").with_value("object", 1, "model", "lambert")
+    wanted = wanted.with_value("object", 0, "model", "metallic_roughness")
+    assert wanted.scene.objects[0].material == gold
+    assert wanted.without_part("object", 0).materials == ()
 
 
 def test_edits_are_undone_and_done_again() -> None:

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from tests.viewer_rig import GOOD, jpeg, mutated, picture_message
-from warp_ar.errors import WarpArError
 from warp_ar.viewer import protocol
 from warp_ar.viewer.protocol import Bucket, ProtocolError, parse_picture, parse_text
 
@@ -34,34 +33,20 @@ def test_what_the_page_says_is_understood(message: dict[str, Any]) -> None:
     ("text", "reason"),
     [
         ("", "no JSON"),
-        ("{", "no JSON"),
         ("[" * 4000, "no JSON"),
         ("[]", "no known type"),
-        ('{"type": ["ack"]}', "no known type"),
         ('{"type": "exec", "code": 1}', "no known type"),
         ('{"type": "ack"}', "ack takes id"),
         ('{"type": "ack", "id": 1, "more": 1}', "ack takes id"),
-        ('{"type": "ack", "id": true}', "ack: id"),
         ('{"type": "ack", "id": -1}', "ack: id"),
         ('{"type": "ack", "id": 1e3}', "ack: id"),
         ('{"type": "ping", "sent": NaN}', "NaN is no number"),
-        ('{"type": "ping", "sent": 1e999}', "ping: sent"),
-        ('{"type": "budget", "ms": 0}', "budget: ms"),
         ('{"type": "set", "part": "camera", "index": 0, "key": "fx", "value": 1}', "set: part"),
-        ('{"type": "set", "part": "light", "index": 64, "key": "at", "value": [0, 0, 0]}', "set: index"),
         ('{"type": "set", "part": "light", "index": 0, "key": "at", "value": [1, 2, 3, 4]}', "set: value"),
-        ('{"type": "set", "part": "light", "index": 0, "key": "at", "value": [1, 2, "x"]}', "set: value"),
-        ('{"type": "set", "part": "light", "index": 0, "key": "at", "value": {"a": 1}}', "set: value"),
         ('{"type": "add", "part": "object", "kind": "mesh"}', "add: kind"),
-        ('{"type": "add", "part": "object", "kind": "spot"}', "add: kind"),
-        ('{"type": "add", "part": "proxy", "kind": "mesh"}', "add: kind"),
-        ('{"type": "outline", "kind": "door", "points": [[0, 0], [1, 0], [1, 1], [0, 1]]}', "outline: kind"),
-        ('{"type": "outline", "kind": "wall", "points": [[0, 0], [1, 0], [1, 1]]}', "outline: points"),
         ('{"type": "outline", "kind": "wall", "points": [[0, 0], [1, 0], [1, 1], [0, "x"]]}', "outline: points"),
         ('{"type": "card", "radius": "large", "ruler": 0.1}', "card: radius"),
-        ('{"type": "setup", "step": "all"}', "setup: step"),
         ('{"type": "camera", "width": 100000, "height": 480}', "camera: width"),
-        ('{"type": "quality", "name": "' + "x" * 65 + '"}', "quality: name"),
         ('{"type": "quality", "name": "' + "x" * 5000 + '"}', "4096 at most"),
     ],
 )
@@ -71,11 +56,10 @@ def test_what_no_page_says_is_refused_with_a_reason(text: str, reason: str) -> N
 
 
 def test_pictures_are_measured_before_they_are_decoded() -> None:
-    assert protocol.jpeg_size(jpeg()) == (64, 48)
     progressive = cv2.imencode(".jpg", np.zeros((48, 64, 3), np.uint8), (cv2.IMWRITE_JPEG_PROGRESSIVE, 1))[1].tobytes()
-    assert protocol.jpeg_size(progressive) == (64, 48)
-    picture = parse_picture(picture_message(jpeg(), 7.5, 3), (64, 48))
-    assert (picture.taken, picture.id, picture.jpeg) == (7.5, 3, jpeg())
+    for data in (jpeg(), progressive):
+        picture = parse_picture(picture_message(data, 7.5, 3), (64, 48))
+        assert (picture.taken, picture.id, picture.jpeg) == (7.5, 3, data)
     bomb = bytearray(jpeg())
     start = bomb.index(b"\xff\xc0")
     bomb[start + 5 : start + 9] = b"\xff\xff\xff\xff"  # 65535 x 65535: 12 GB
@@ -111,7 +95,3 @@ def test_ten_thousand_random_messages_are_understood_or_refused() -> None:
             else:
                 parse_picture(message, (64, 48))
     assert 1000 < understood < 9000  # else the fuzz tries only one of the two
-
-
-def test_errors_are_one_of_ours() -> None:
-    assert issubclass(ProtocolError, WarpArError)

@@ -20,9 +20,9 @@ import pytest
 from tests.viewer_rig import Page, is_refused, jpeg, mutated, picture_message, run, served
 from warp_ar.light.captured import Light as CapturedMap
 from warp_ar.viewer import uploads
-from warp_ar.viewer.backend import MOST_VIEWERS
-from warp_ar.viewer.protocol import Bucket
-from warp_ar.viewer.uploads import MOST_BYTES
+from warp_ar.viewer.protocol import MOST_BYTES
+
+pytestmark = pytest.mark.slow
 
 
 def encode_exr() -> bytes:
@@ -92,7 +92,7 @@ async def test_downloads() -> None:
                 assert response.status == 200
                 assert name in response.headers["Content-Disposition"]
                 assert (await response.read()).startswith(start)
-        async with site.session.get(f"{site.url}/download/recording.mp4") as response:
+        async with site.session.get(f"{site.url}/download/camera.yml") as response:
             assert response.status == 409
 
 
@@ -158,6 +158,12 @@ async def test_token() -> None:
             async with site.session.get(aiohttp.client.URL(site.url + path, encoded=True)) as response:
                 assert response.status == 403, path
                 assert "token" in await response.text()
+        async with site.session.get(f"{site.url}/", headers={"Accept": "text/html"}) as response:
+            assert response.status == 403
+            assert response.content_type == "text/html"
+            assert "token" in await response.text()
+        async with site.session.get(f"{site.url}/address.svg?token=5ec2e7") as response:
+            assert (await response.read()).startswith(b"<?xml")
         async with site.session.get(f"{site.url}/?token=5ec2e7") as response:
             assert response.status == 200
             assert response.headers["Referrer-Policy"] == "no-referrer"
@@ -210,25 +216,6 @@ async def test_too_many_messages_close_their_sender() -> None:
 
 
 @run
-async def test_an_address_that_comes_too_often_waits_and_keeps_no_other_out() -> None:
-    async with served() as site:
-        backend = site.server.backend
-        backend._arrivals["often"] = Bucket(rate=0.0, burst=0.0)
-        waiting = [asyncio.create_task(backend.may_come("often")) for _ in range(MOST_VIEWERS - 1)]
-        await asyncio.sleep(0.1)
-        assert not any(task.done() for task in waiting)
-        assert await backend.may_come("seldom")
-        waiting.append(asyncio.create_task(backend.may_come("often")))
-        await asyncio.sleep(0.1)
-        assert not await backend.may_come("often"), "waiting connections pile up"
-        for task in waiting:
-            task.cancel()
-        await asyncio.gather(*waiting, return_exceptions=True)
-        async with site.page() as page:
-            await page.until("frame")
-
-
-@run
 async def test_bad_edits_are_answered_and_not_punished() -> None:
     async with served() as site, site.page() as page:
         await page.say(type="set", part="light", index=0, key="intensity", value=-1)
@@ -271,7 +258,7 @@ async def test_a_thousand_messages_from_hostile_pages_change_nothing_for_the_goo
     rng = random.Random(1)
     messages = [mutated(rng) for _ in range(1000)]
     # What is understood is done; these take seconds each.
-    messages = [m for m in messages if isinstance(m, bytes) or not any(f'"{w}"' in m for w in ("record", "scene"))]
+    messages = [m for m in messages if isinstance(m, bytes) or '"scene"' not in m]
     assert 200 < sum(map(is_refused, messages)) < 900
     async with served() as site, site.page() as good:
         await good.until("frame")

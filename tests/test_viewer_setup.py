@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.browser_rig import CHROMIUM, SMALL, CanvasCamera, Tab, axe_core, chromium, serious_findings, served
+from tests.browser_rig import CHROMIUM, SMALL, CanvasCamera, Tab, axe_core, chromium, findings, served
 from tests.random_desk import RandomDesk
 from warp_ar.calibration.card import write_card
 from warp_ar.init import make_desk
@@ -23,7 +23,10 @@ from warp_ar.srgb import decode_srgb
 from warp_ar.tracking.card_layout import SHEET
 
 pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install '.[test]'")
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs a browser: apt-get install chromium")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="needs a browser: apt-get install chromium"),
+]
 
 SEED = 31
 VIEWS = 14
@@ -115,7 +118,7 @@ class Hands:
         """Nothing serious hinders anybody in this step, and a finger hits what it wants."""
         self.page.screenshot(path=self._folder / f"{self._name}_{self._count}_{step}.png")
         self._count += 1
-        found = serious_findings(self.page)
+        found = findings(self.page)
         if self._phone:
             # The picture stays on top, and axe takes what is half scrolled beneath it for a small target; all targets
             # are measured below, against more than axe asks for.

@@ -24,9 +24,8 @@ from warp_ar.calibration.card import card_size, draw_card
 from warp_ar.scene import Camera, Marker, Scene, SourceSpec
 from warp_ar.scene.pixel_rays import pixel_rays
 from warp_ar.viewer.address import Address
-from warp_ar.viewer.frames import Lit
 from warp_ar.viewer.gate import HEADER_SECONDS
-from warp_ar.viewer.host import Host
+from warp_ar.viewer.host import Host, Lit
 from warp_ar.viewer.protocol import ProtocolError, parse_text
 from warp_ar.viewer.server import Server, encode_jpeg
 
@@ -41,6 +40,7 @@ def page_scene(**changes: Any) -> Scene:
 GOOD = [
     {"type": "ack", "id": 3},
     {"type": "ping", "sent": 12.5},
+    {"type": "pick", "x": 12.5, "y": -3, "reach": 8},
     {"type": "set", "part": "light", "index": 0, "key": "at", "value": [0.1, 0.2, 0.3]},
     {"type": "set", "part": "exposure", "index": 0, "key": "scale", "value": "auto"},
     {"type": "add", "part": "object", "kind": "sphere"},
@@ -56,6 +56,8 @@ GOOD = [
     {"type": "animate", "index": 0, "key": "speed", "value": 2.0},
     {"type": "scene", "name": "torus"},
     {"type": "reset"},
+    {"type": "duplicate", "part": "light", "index": 0},
+    {"type": "snap", "index": 0},
     {"type": "undo"},
     {"type": "redo"},
     {"type": "add", "part": "proxy", "kind": "plane"},
@@ -65,7 +67,6 @@ GOOD = [
     {"type": "camera", "width": 640, "height": 480},
     {"type": "no_camera"},
     {"type": "calibrate", "step": "start"},
-    {"type": "record", "on": True},
 ]
 
 

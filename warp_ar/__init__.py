@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from warp_ar.engine.graph import Plan, make_plan
     from warp_ar.engine.pipeline import Pipeline, Result
+    from warp_ar.engine.switcher import PipelineSwitcher
     from warp_ar.errors import SceneError, SinkError, SourceError, UsageError, WarpArError
     from warp_ar.light.captured import Light
     from warp_ar.output.sinks import open_sink, read_environment, write_environment
@@ -30,6 +31,7 @@ _HOMES = {
     "errors": ("SceneError", "SinkError", "SourceError", "UsageError", "WarpArError"),
     "engine.graph": ("Plan", "make_plan"),
     "engine.pipeline": ("Pipeline", "Result"),
+    "engine.switcher": ("PipelineSwitcher",),
     "stages.quality": ("PRESETS", "Quality"),
     "stages.request": ("LAYERS",),
     "scene": ("Pose", "Scene", "bundled_scenes", "dumps_scene", "load_scene"),
@@ -49,6 +51,7 @@ __all__ = [
     "Frame",
     "Light",
     "Pipeline",
+    "PipelineSwitcher",
     "Plan",
     "Pose",
     "Quality",
@@ -74,6 +77,19 @@ __all__ = [
 ]
 
 
+class _Help:
+    """Docstring of a dataclass together with those of its fields, put together when somebody asks for it."""
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+
+    def __get__(self, instance: object, owner: type[Any]) -> str:
+        from warp_ar.scene.reference import field_docs
+
+        fields = (f"    {name}: {text}" for name, text in field_docs(owner).items() if not name.startswith("_"))
+        return "\n".join([self.text, "", "Attributes:", *fields])
+
+
 def __getattr__(name: str) -> Any:
     """Import what is asked for only when it is: a scene can be read without loading OpenCV's or Warp's libraries.
 
@@ -82,7 +98,11 @@ def __getattr__(name: str) -> Any:
     """
     if name not in _HOME_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_HOME_OF[name]}"), name)
+    found = getattr(importlib.import_module(f"{__name__}.{_HOME_OF[name]}"), name)
+    own = vars(found).get("__doc__") if isinstance(found, type) and hasattr(found, "__dataclass_fields__") else None
+    if isinstance(own, str):
+        found.__doc__ = _Help(own)
+    return found
 
 
 def __dir__() -> list[str]:

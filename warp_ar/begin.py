@@ -1,4 +1,4 @@
-"""How ``python -m warp_ar.COMMAND`` begins: signals are handled before anything is imported that takes its time.
+"""Start of ``python -m warp_ar.COMMAND``: signals are handled before anything is imported that takes its time.
 
 A command's file begins with its guard, which comes here. What Python has loaded as ``__main__`` goes no further; the
 file is imported under its own name. This module imports nothing but what Python itself has loaded, or loads at once.

@@ -1,4 +1,4 @@
-"""Where what can be made again is kept between runs."""
+"""Folder of files that can be made again, kept between runs."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def cache_folder() -> Path:
-    """Where this user's programs keep what they can make again."""
+    """Return the folder in which this user's programs keep files that they can make again."""
     if os.environ.get("XDG_CACHE_HOME"):
         return Path(os.environ["XDG_CACHE_HOME"]) / "warp_ar"
     if sys.platform == "win32":

@@ -32,18 +32,15 @@ from warp_ar.ball.ball import posed_frames
 from warp_ar.ball.ball_measure import measure_ball
 from warp_ar.calibration.camera_calibration import calibrate_camera, write_camera
 from warp_ar.calibration.card import PAPERS, write_card
-from warp_ar.calibration.grey_response import MOST_DEVIATION, measure_grey_response
-from warp_ar.calibration.response import measure_response, write_response
+from warp_ar.calibration.response import MOST_DEVIATION, measure_grey_response, measure_response, write_response
 from warp_ar.checks.check_ball import DULL, inside_contrast
-from warp_ar.checks.checkup import source_of
 from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, run_command
 from warp_ar.errors import UsageError, say
 from warp_ar.output.places import check_places, check_replaceable
 from warp_ar.scene import CharucoBoard, Marker, bundled_scenes, load_scene, loads_scene
-from warp_ar.scene.amend import amend_scene
-from warp_ar.scene.keys import INTRINSICS
-from warp_ar.scene.starter import guesses
-from warp_ar.sources.sources import open_source
+from warp_ar.scene.description import INTRINSICS
+from warp_ar.scene.starter import amend_scene, guesses
+from warp_ar.sources.sources import open_source, source_of
 from warp_ar.tracking.card_layout import SHEET
 
 Image = NDArray[np.uint8]
@@ -91,46 +88,57 @@ def make_parser() -> argparse.ArgumentParser:
     def add(name: str, text: str, output: str | None) -> Any:
         command = commands.add_parser(name, help=text, description=text)
         if output is not None:
-            command.add_argument("--output", type=Path, default=Path(output), metavar="FILE", help=f"default: {output}")
-            text = "replace a file that this program did not write; one that it wrote is replaced anyway"
-            command.add_argument("--overwrite", action="store_true", help=text)
+            command.add_argument(
+                "--output", type=Path, default=Path(output), metavar="FILE", help=f"file to write (default: {output})"
+            )
+            command.add_common("--overwrite")
         return command.add_argument
 
-    board = f'a board, as in a scene: "{SHEET.board}" or "grid 4x3 0.04 0.01", lengths in metres'
-    option = add(
-        "card", "write the card, or a marker or board of your own, as a page that prints at true size", "card.pdf"
+    board = f'a board, as in a scene: "{SHEET.board}", "grid 4x3 0.04 0.01" (metres)'
+    option = add("card", "write the card, or a marker or board of your own, to print at true size", "card.pdf")
+    option("--dictionary", metavar="NAME", help=f"OpenCV's dictionary of your marker (default: {Marker.dictionary})")
+    option("--id", type=int, metavar="N", help="number of your marker, instead of the card (default: 0)")
+    option(
+        "--size",
+        type=float,
+        metavar="X",
+        help="side of its black square in metres, instead of the card (default: 0.08)",
     )
-    option("--dictionary", metavar="NAME", help=f"OpenCV's dictionary of a marker of your own ({Marker.dictionary})")
-    option("--id", type=int, metavar="N", help="which marker (0), instead of the card")
-    option("--size", type=float, metavar="X", help="side of its black square in metres (0.08), instead of the card")
     option("--board", metavar="TEXT", help=board)
-    option("--paper", default="a4", metavar="|".join(PAPERS), help="default: a4")
+    option("--paper", default="a4", metavar="|".join(PAPERS), help="size of the page (default: a4)")
     option("--dpi", type=float, default=600.0, help="dots per inch (default: 600)")
     option = add("camera", "calibrate the camera from pictures of a ChArUco board", "camera.yml")
-    option("pictures", nargs="+", metavar="PATH|INDEX", help="folders, pictures, videos, or a capture device")
-    option("--dictionary", metavar="NAME", help="OpenCV's dictionary (default: that of the board in the pictures)")
-    option("--board", metavar="TEXT", help=board + " (default: the one in the pictures)")
-    text = "write the calibration beside this scene, as camera.yml, and into its [camera]; its comments stay"
+    option("pictures", nargs="+", metavar="PATH|INDEX", help="folders, pictures, videos or a capture device")
+    option("--dictionary", metavar="NAME", help="OpenCV's dictionary (default: the pictures' board's)")
+    option("--board", metavar="TEXT", help=board + " (default: the pictures' board)")
+    text = "write camera.yml beside this scene and into its [camera]"
     option("--write", type=Path, metavar="SCENE", help=text)
     option("--frames", type=int, metavar="N", help="stop after N frames of each video or device")
+    option("--fisheye", action="store_true", help="for fisheye lenses: action cameras, phones' widest")
     option = add("ball", "measure where a scene's mirror ball stands", None)
     option(
         "scene",
         metavar="SCENE",
-        help="a scene file or bundled scene: its camera, marker, and a rough [probe] with the radius",
+        help="a scene with camera, marker and a rough [probe] with radius",
     )
     option("--source", metavar="PATH|INDEX", help="frames, if not the scene's own")
     option("--frames", type=int, default=60, metavar="N", help="frames to look at (default: 60)")
-    option("--keep-radius", action="store_true", help="believe the scene's radius instead of measuring it")
-    option("--write", action="store_true", help="write center and radius into the scene file; its comments stay")
-    text = "measure the response curve, from the printed card's greys or from pictures of one still scene"
+    option("--keep-radius", action="store_true", help="keep the scene's radius")
+    option("--write", action="store_true", help="write center and radius into the scene file")
+    text = "measure the response curve by the card's greys or a still scene"
     option = add("response", text, "response.txt")
-    text = "pictures of the card under several exposures or lights; with --exposures any still scene, in their order"
+    text = "the card under several exposures or lights; with --exposures any still scene"
     option("pictures", nargs="+", metavar="PATH|INDEX", help=text)
-    text = "seconds, such as 1/200 1/50 0.08 (default: by the card's greys)"
+    text = "seconds of the pictures in turn, such as 1/200 1/50 0.08"
     option("--exposures", nargs="+", type=_fraction, metavar="S", help=text)
-    option("--frames", type=int, default=24, metavar="N", help="of each video or device, by the card's greys (24)")
-    text = "write the curve beside this scene, as response.txt, and into its [camera]; its comments stay"
+    option(
+        "--frames",
+        type=int,
+        default=24,
+        metavar="N",
+        help="frames of each video or device, without --exposures (default: 24)",
+    )
+    text = "write response.txt beside this scene and into its [camera]"
     option("--write", type=Path, metavar="SCENE", help=text)
     return parser
 
@@ -138,9 +146,9 @@ def make_parser() -> argparse.ArgumentParser:
 def _run_camera(options: argparse.Namespace, target: Path | None) -> int:
     marker, pictures = _marker(options), _pictures(options.pictures, options.frames)
     if marker is not None and options.dictionary is None and isinstance(marker.board, CharucoBoard):
-        report = calibrate_camera(pictures, board=marker.board)
+        report = calibrate_camera(pictures, board=marker.board, fisheye=options.fisheye)
     else:
-        report = calibrate_camera(pictures, marker)
+        report = calibrate_camera(pictures, marker, fisheye=options.fisheye)
     c, interval = report.camera, 2 * report.focal_deviation
     for warning in report.warnings:
         say(warning)

@@ -8,6 +8,7 @@ if __name__ == "__main__":
     begin("warp_ar.capture")
 
 import argparse
+import dataclasses
 import math
 from collections.abc import Sequence
 from fractions import Fraction
@@ -17,30 +18,23 @@ import cv2
 import numpy as np
 
 from warp_ar.ball.ball_finder import BallOutline
+from warp_ar.calibration.response import write_response
 from warp_ar.checks.check_objects import check_objects, written_poses
 from warp_ar.command_line import EXIT_DONE, Parser, run_command
-from warp_ar.errors import SinkError, UsageError, reason, say
-from warp_ar.files import write_whole
+from warp_ar.errors import SinkError, UsageError, say
+from warp_ar.files import store
+from warp_ar.light.latlong_axes import AXES
 from warp_ar.output.places import check_places, check_replaceable
 from warp_ar.output.sink import make_folder
 from warp_ar.photo_capture import PIXELS, Capture, capture_light
-from warp_ar.photographs.support import Support, plane_from_contact, plane_from_rectangle
-from warp_ar.scene import (
-    Camera,
-    CapturedLight,
-    LambertMaterial,
-    MetallicRoughnessMaterial,
-    Object,
-    PoseSpec,
-    Proxy,
-    Scene,
-    SourceSpec,
-    dumps_scene,
-)
+from warp_ar.photographs.support import Support, plane_from_contact, plane_from_rectangle, scene_on
+from warp_ar.scene import Camera, CapturedLight, Scene, dumps_scene
 from warp_ar.signature import sign_png
 
 SUFFIXES = {"--output": ".exr", "--outline": ".png", "--scene": ".toml"}
-"""What the names of written files end in."""
+"""Endings of the names of written files."""
+OUTLINE, PREVIEW, RESPONSE = ".outline.png", ".preview.png", ".response.txt"
+"""Endings of files beside the light."""
 LARGEST_BALL = 1.0
 """Metres of the radius: beyond that another unit was meant."""
 
@@ -63,53 +57,42 @@ def make_parser() -> argparse.ArgumentParser:
     """The command's options."""
     parser = Parser(
         prog="python -m warp_ar.capture",
-        description="Photographs of a mirror ball, one or a bracket, become an environment in an OpenEXR file, which a "
-        "scene's [light] file and live --light read.",
+        description="Make an environment from photographs of a mirror ball, for [light] file and live --light.",
     )
     add = parser.add_argument
-    add("photos", nargs="+", type=Path, metavar="PHOTO", help="photographs of the ball, from one place")
-    add("--output", type=Path, default=Path("light.exr"), metavar="FILE", help="default: light.exr")
-    add("--overwrite", action="store_true", help="also replace files that this program did not write")
+    add("photos", nargs="+", type=Path, metavar="PHOTO", help="photographs of the ball from one place")
+    add("--output", type=Path, default=Path("light.exr"), metavar="FILE", help="file to write (default: light.exr)")
+    parser.add_common("--overwrite")
+    text = "rough circle around the ball, pixels, if it is not found"
+    add("--ball", type=float, nargs=3, metavar=("X", "Y", "RADIUS"), help=text)
+    text = "picture of the found outline (default: beside the light)"
+    add("--outline", type=Path, metavar="FILE.png", help=text)
+    add("--circle", type=float, nargs=3, metavar=("X", "Y", "RADIUS"), help="exact outline of the ball, pixels")
+    text = "seconds of each photograph instead of EXIF's; pixels: by the pictures"
+    add("--exposures", type=_exposure, nargs="+", metavar="S", help=text)
     add(
-        "--ball", type=float, nargs=3, metavar=("X", "Y", "RADIUS"),
-        help="a rough circle around the ball in pixels, where it is not found",
-    )  # fmt: skip
-    add(
-        "--outline", type=Path, metavar="FILE.png", help="also write the shown photograph with the ball's outline on it"
-    )
-    add(
-        "--exposures", type=_exposure, nargs="+", metavar="S",
-        help="seconds of each photograph, not what EXIF says; pixels: what the pictures themselves tell",
-    )  # fmt: skip
-    add("--shown", type=Path, metavar="PHOTO", help="whose camera values the light is in (default: the best exposed)")
-    add(
-        "--transfer",
-        default="srgb",
-        metavar="NAME",
-        help='response that is tried first: "srgb", "gamma:2.2" (default: srgb)',
-    )
-    add("--focal-35mm", type=float, metavar="MM", help="focal length for a full frame, if EXIF does not tell")
-    add(
-        "--as-clipped", action="store_true",
-        help="leave what clips in a single photograph at the level of clipping; else it is raised by what nearly every "
-        "place lacks",
-    )  # fmt: skip
-    add("--reflectance", type=float, default=0.85, metavar="R", help="of the ball (default: 0.85)")
-    add("--device", default="auto", metavar="auto|cpu|cuda:0", help="where the kernels run (default: auto)")
-    support = parser.add_argument_group("the plane under the ball, from the shown photograph")
-    support.add_argument(
-        "--rectangle", type=float, nargs=8, metavar="N",
-        help="columns and rows of the four corners of a rectangle on it, in order round it, such as a sheet of paper",
-    )  # fmt: skip
-    support.add_argument("--rectangle-size", type=float, nargs=2, metavar=("W", "H"), help="its sides in metres")
-    support.add_argument("--contact", type=float, nargs=2, metavar=("X", "Y"), help="pixel where the ball touches it")
-    support.add_argument("--ball-radius", type=float, metavar="M", help="of the ball, metres; else lengths are radii")
-    support.add_argument(
-        "--scene",
+        "--shown",
         type=Path,
-        metavar="FILE.toml",
-        help="also write a scene of photograph, camera, plane and light",
+        metavar="PHOTO",
+        help="photograph whose camera values the light has (default: the best exposed)",
     )
+    text = 'response tried first, such as "gamma:2.2" (default: srgb)'
+    add("--transfer", default="srgb", metavar="NAME", help=text)
+    parser.add_common("--focal-35mm")
+    add("--as-clipped", action="store_true", help="do not raise what clips in a single photograph")
+    text = "the ball's reflectance (default: measured by the plane, else 0.85)"
+    add("--reflectance", type=float, metavar="R", help=text)
+    add("--height", type=int, metavar="N", help="rows of the light (default: by the ball's pixels)")
+    add("--axes", choices=AXES, default="z-up", help="axes of the light (default: z-up)")
+    parser.add_common("--device")
+    support = parser.add_argument_group("the plane under the ball, from the shown photograph")
+    add = support.add_argument
+    text = "a rectangle's corners in order round it: column and row of each"
+    add("--rectangle", type=float, nargs=8, metavar="N", help=text)
+    parser.add_common("--rectangle-size", add=add)
+    add("--contact", type=float, nargs=2, metavar=("X", "Y"), help="pixel where the ball touches the plane")
+    add("--ball-radius", type=float, metavar="M", help="the ball's radius in metres; else lengths are radii")
+    add("--scene", type=Path, metavar="FILE.toml", help="also write a scene of it")
     return parser
 
 
@@ -127,6 +110,8 @@ def _check(options: argparse.Namespace) -> None:
         raise UsageError("--rectangle and --contact both tell the plane; give one of the two")
     if options.scene is not None and options.rectangle is None and options.contact is None:
         raise UsageError("--scene needs the plane: give --rectangle and --rectangle-size, or --contact")
+    if options.ball is not None and options.circle is not None:
+        raise UsageError("--ball is a rough circle and --circle an exact one; give one of the two")
     if options.shown is not None and options.shown not in options.photos:
         raise UsageError(f"--shown {options.shown}: expected one of the photographs")
     if options.exposures == [PIXELS]:
@@ -137,11 +122,13 @@ def _check(options: argparse.Namespace) -> None:
         number = _count(len(options.photos), "photograph")
         raise UsageError(f"{_count(len(options.exposures), 'exposure')} for {number}; expected one for each")
     _check_numbers(options)
+    options.outline = options.outline or options.output.with_suffix(OUTLINE)
     writes = {"--output": options.output, "--outline": options.outline, "--scene": options.scene}
     writes = {name: path for name, path in writes.items() if path is not None}
     for name, path in writes.items():
         if path.suffix.lower() != SUFFIXES[name]:
             raise UsageError(f"{name} {path}: expected a name that ends in {SUFFIXES[name]}")
+    writes |= {f"*{end}": options.output.with_suffix(end) for end in (PREVIEW, RESPONSE)}
     check_places({"the photographs": list(options.photos)}, writes)
     for path in writes.values():
         if words := check_replaceable(path, overwrite=options.overwrite):
@@ -151,8 +138,10 @@ def _check(options: argparse.Namespace) -> None:
 
 
 def _check_numbers(options: argparse.Namespace) -> None:
-    if not 0.01 <= options.reflectance <= 1.0:
+    if options.reflectance is not None and not 0.01 <= options.reflectance <= 1.0:
         raise UsageError(f"--reflectance {options.reflectance:g}: expected a share from 0.01 to 1")
+    if options.height is not None and not 16 <= options.height <= 4096:
+        raise UsageError(f"--height {options.height}: expected 16 to 4096 rows")
     if options.focal_35mm is not None and not 1.0 <= options.focal_35mm <= 10_000.0:
         raise UsageError(f"--focal-35mm {options.focal_35mm:g}: expected millimetres from 1 to 10000, such as 26")
     radius = options.ball_radius
@@ -168,28 +157,9 @@ def _check_numbers(options: argparse.Namespace) -> None:
 def make_scene(found: Capture, light: Path, ball_radius: float | None) -> Scene:
     """A scene that shows the photograph with a ball on either side of the mirror ball, lit by what was captured."""
     assert found.support is not None
-    unit = ball_radius or 1.0
-    pose = found.support.pose
-    # Where the mirror ball stands in the world, and from there to the right.
-    x, y, _ = (float(v) for v in pose.inverse().apply(unit * np.array(found.outline.sphere)))
-    beside = Object(
-        "sphere",
-        radius=unit,
-        at=(x + 3.0 * unit, y, unit),
-        material=MetallicRoughnessMaterial((0.95, 0.95, 0.95), 1.0, 0.05),
-    )
-    chalk = Object("sphere", radius=unit, at=(x - 3.0 * unit, y, unit), material=LambertMaterial((0.8, 0.8, 0.8)))
-    a, b, c = (float(v) for v in pose.translation)
-    return Scene(
-        camera=found.camera,
-        name=light.stem,
-        source=SourceSpec(path=found.shown.resolve()),
-        proxies=(Proxy("plane", at=(x, y, 0.0), size=(40.0 * unit, 40.0 * unit)),),
-        objects=(beside, chalk),
-        captured=CapturedLight(light.resolve()),
-        pose=PoseSpec(((tuple(map(float, pose.rotation.reshape(-1))), (a, b, c)),)),
-        has_marker=False,
-    )
+    unit = ball_radius or found.support.radius_of(found.outline.sphere)
+    x, y, _ = map(float, found.support.pose.inverse().apply(unit * np.array(found.outline.sphere)))
+    return scene_on(found.support, found.camera, found.shown, CapturedLight(light.resolve()), (x, y), unit)
 
 
 def draw_outline(found: Capture) -> bytes:
@@ -202,11 +172,11 @@ def draw_outline(found: Capture) -> bytes:
     return sign_png(bytes(cv2.imencode(".png", picture)[1]))
 
 
-def _write(path: Path, data: bytes) -> None:
-    try:
-        write_whole(path, data)
-    except OSError as error:
-        raise SinkError(f"{path} cannot be written: {reason(error)}") from error
+def draw_preview(found: Capture) -> bytes:
+    """A PNG of the light, tone-mapped by Reinhard's operator, in the axes of this program."""
+    shown = cv2.createTonemapReinhard(gamma=2.2).process(np.ascontiguousarray(found.light.radiance[..., ::-1]))
+    codes = np.round(255.0 * np.clip(np.nan_to_num(shown), 0.0, 1.0)).astype(np.uint8)
+    return sign_png(bytes(cv2.imencode(".png", codes)[1]))
 
 
 def _count(number: int, what: str) -> str:
@@ -221,6 +191,7 @@ def capture(options: argparse.Namespace) -> int:
     found = capture_light(
         options.photos,
         ball=options.ball,
+        circle=options.circle,
         exposures=options.exposures,
         shown=None if options.shown is None else options.photos.index(options.shown),
         transfer=options.transfer,
@@ -228,11 +199,12 @@ def capture(options: argparse.Namespace) -> int:
         support=(lambda outline, camera: _support_of(options, outline, camera)) if wanted else None,
         reflectance=options.reflectance,
         device=options.device,
+        height=options.height,
         raises=not options.as_clipped,
     )
     for note in found.notes:
         say(note)
-    found.light.save(options.output)
+    found.light.save(options.output, options.axes)
     emitters = _count(len(found.light.emitters), "emitter")
     print(f"{options.output}: light in camera values of {found.shown.name}, {emitters}")
     for emitter in found.light.emitters:
@@ -242,12 +214,18 @@ def capture(options: argparse.Namespace) -> int:
             f"  toward ({x:+.2f}, {y:+.2f}, {z:+.2f}): power {sum(emitter.low) / 3:.3g} {most}, "
             f"{emitter.solid_angle:.3f} sr"
         )
-    if options.outline is not None:
-        _write(options.outline, draw_outline(found))
-        print(f"{options.outline}: {found.shown.name} with the ball's outline in red")
+    preview, response = (options.output.with_suffix(end) for end in (PREVIEW, RESPONSE))
+    store(options.outline, draw_outline(found))
+    print(f"{options.outline}: {found.shown.name} with the ball's outline in red")
+    store(preview, draw_preview(found))
+    print(f"{preview}: the light, tone-mapped")
+    if found.response is not None:
+        write_response(found.response, response)
+        print(f"{response}: the camera's response, for [camera] transfer")
+        found = dataclasses.replace(found, camera=dataclasses.replace(found.camera, transfer=response.resolve()))
     if options.scene is not None:
         scene = make_scene(found, options.output, options.ball_radius)
-        _write(options.scene, dumps_scene(scene, options.scene.parent).encode())
+        store(options.scene, dumps_scene(scene, options.scene.parent).encode())
         for finding in check_objects(scene, scene.camera, written_poses(scene)):
             say(f"{options.scene}: {finding.text}; to do: {finding.remedy}")
         print(f"{options.scene}: python -m warp_ar.live {options.scene} --output out/")

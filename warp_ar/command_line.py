@@ -1,4 +1,4 @@
-"""What all commands share: exit codes, errors in one line that a terminal cannot mistake, and how signals end them."""
+"""Common part of all commands: exit codes, errors in one line that a terminal cannot mistake, signals."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import argparse
 import contextlib
 import difflib
 import errno
-import gc
 import io
 import os
 import re
@@ -16,12 +15,12 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from types import FrameType
-from typing import Any, NoReturn
+from typing import Any, Final, NoReturn
 
 from warp_ar.begin import EXIT_INTERRUPTED, EXIT_TERMINATED, end_at_once, handling
 from warp_ar.errors import SinkError, UsageError, WarpArError, reason, say
 from warp_ar.output.sink import close_open_sinks
+from warp_ar.scene.description import LATLONG_AXES
 
 EXIT_DONE = 0
 EXIT_FAILED = 1
@@ -33,8 +32,88 @@ _LARGEST = 2**31 - 1
 """Largest whole number of an argument: they count frames, samples, pixels, ports."""
 
 
+def count(text: str) -> int:
+    """Return a number of frames, samples or the like that an argument names.
+
+    Raises:
+        ArgumentTypeError: It is below 1.
+    """
+    if (value := int(text)) < 1:
+        raise argparse.ArgumentTypeError(f"{text}: expected 1 or more")
+    return value
+
+
+_COMMON: Final[dict[str, dict[str, Any]]] = {
+    "scene": {
+        "nargs": "?",
+        "default": "desk",
+        "metavar": "SCENE",
+        "help": "scene file, its folder, or a bundled scene's name (default: desk)",
+    },
+    "--source": {
+        "metavar": "PATH|INDEX",
+        "help": "folder, picture, video, capture device or stream (rtsp://, http://)",
+    },
+    "--calibration": {"metavar": "FILE|exif", "help": "OpenCV's calibration file; exif: by the first picture"},
+    "--light": {
+        "metavar": "FILE|card",
+        "help": "captured .exr or .hdr instead of the ball's light; card: live --output only",
+    },
+    "--light-axes": {
+        "choices": LATLONG_AXES,
+        "help": "axes of the light read (default: its file's, else y-up of .exr, blender of .hdr)",
+    },
+    "--device": {
+        "default": "auto",
+        "metavar": "auto|cpu|cuda:0",
+        "help": "where the kernels run (default: auto)",
+    },
+    "--frames": {"type": count, "metavar": "N", "help": "stop after N frames"},
+    "--shrink": {
+        "type": count,
+        "default": 1,
+        "metavar": "N",
+        "help": "divide width and height of frames (default: 1)",
+    },
+    "--overwrite": {"action": "store_true", "help": "also replace files that this program did not write"},
+    "--rectangle-size": {"type": float, "nargs": 2, "metavar": ("W", "H"), "help": "the rectangle's sides in metres"},
+    "--focal-35mm": {"type": float, "metavar": "MM", "help": "full-frame focal length, if EXIF does not tell"},
+}
+"""Options that mean the same wherever they are."""
+
+
 class Parser(argparse.ArgumentParser):
-    """Argument parser whose errors are one line, as all errors here are."""
+    """Argument parser whose errors are one line, as all errors here are.
+
+    Options that are declared by ``add_rare`` are left out of ``--help``; ``--help-all`` lists them.
+    """
+
+    def add_rare(self, *flags: str, group: argparse._ActionsContainer, **options: Any) -> None:
+        """Declare an option that few runs need; arguments as those of ``add_argument``."""
+        if not any(action.dest == "help_all" for action in self._actions):
+            self.add_argument("--help-all", action=_HelpAll, nargs=0, help="list all options and stop")
+        group.add_argument(*flags, **options).rare = True  # type: ignore[attr-defined]
+
+    def add_common(self, *names: str, add: Callable[..., Any] | None = None) -> None:
+        """Declare options, or the scene, that several commands have; ``add`` puts them into a group."""
+        for name in names:
+            (add or self.add_argument)(name, **_COMMON[name])
+
+    def format_help(self) -> str:
+        """Return the help, without the rare options."""
+        rare = [action for action in self._actions if getattr(action, "rare", False)]
+        words = [action.help for action in rare]
+        for action in rare:
+            action.help = argparse.SUPPRESS
+        try:
+            return super().format_help()
+        finally:
+            for action, text in zip(rare, words, strict=True):
+                action.help = text
+
+    def format_all(self) -> str:
+        """Return the help with all options."""
+        return super().format_help()
 
     def error(self, message: str) -> NoReturn:
         """Tell what is wrong with an argument.
@@ -67,6 +146,13 @@ class Parser(argparse.ArgumentParser):
                 digits = len(str(abs(value)))
                 raise UsageError(f"{name}: a number of {digits} digits; expected {_LARGEST:,} at most")
         return found, rest
+
+
+class _HelpAll(argparse.Action):
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
+        assert isinstance(parser, Parser)
+        print(parser.format_all(), end="")
+        parser.exit()
 
 
 def _options(parser: argparse.ArgumentParser) -> list[str]:
@@ -112,10 +198,12 @@ def run_command(command: Callable[[], int], failures: type[WarpArError] | tuple[
         return EXIT_TERMINATED
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
-    except MemoryError as error:
-        say(f"there is not enough memory: {reason(error)}")
-        return EXIT_FAILED
-    except OSError as error:
+    except Exception as error:
+        if _is_out_of_memory(error):
+            say(f"there is not enough memory: {reason(error)}")
+            return EXIT_FAILED
+        if not isinstance(error, OSError):
+            raise
         if _folder_is_gone():
             say("the current folder is gone; run this in another one")
             return EXIT_USAGE
@@ -126,6 +214,19 @@ def run_command(command: Callable[[], int], failures: type[WarpArError] | tuple[
             return EXIT_PIPE
         say(f"what this command prints cannot be written: {reason(error)}")
         return EXIT_FAILED
+
+
+_NO_MEMORY: Final = re.compile("(?i)failed to (allocate|map)|(insufficient|cannot allocate) memory|start new thread")
+"""Words of what has no error of its own for it: Warp, OpenCV, the loader of libraries, Python's threads."""
+
+
+def _is_out_of_memory(error: BaseException | None) -> bool:
+    """Return whether an error, or what caused it, is that memory cannot be had."""
+    while error is not None:
+        if isinstance(error, MemoryError) or _NO_MEMORY.search(str(error)):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
 
 
 def _folder_is_gone() -> bool:
@@ -143,40 +244,10 @@ def _drop_output() -> None:
         os.dup2(nowhere.fileno(), sys.stdout.fileno())
 
 
-@contextlib.contextmanager
-def loading() -> Iterator[Callable[[], None]]:
-    """Leave Python's garbage collector off until the function that is yielded is called, at the latest until the end.
-
-    Next to nothing of what is imported and built once is garbage; looking through it again and again takes a sixth of
-    the time to the first picture. From then on it is not looked through either.
-    """
-    was_on = gc.isenabled()
-    gc.disable()
-
-    def loaded() -> None:
-        gc.freeze()
-        if was_on:
-            gc.enable()
-
-    try:
-        yield loaded
-    finally:
-        gc.unfreeze()
-        if was_on:
-            gc.enable()
-
-
-_TAKES_A_LOCK = frozenset(
-    getattr(threading.Condition, name).__code__
-    for name in ("__enter__", "__exit__", "_is_owned", "_release_save", "_acquire_restore")
-)
-"""Functions of Python's own, of futures, events and queues, in which an exception leaves a lock taken that nobody gives
-back: who waits for it afterwards waits for ever."""
-_WAITS = threading.Condition.wait.__code__
-_WAITING = "gotit"
-"""The variable that is set in ``Condition.wait`` once it puts the lock back whatever comes."""
-_SOON = 0.001
-"""Seconds after which a signal that came in one of them is sent again."""
+_GRACE: Final = 20.0
+"""Seconds after SIGTERM or SIGHUP at which a process ends that has not unwound by itself."""
+_SOON: Final = 0.001
+"""Seconds after which a signal that was dropped is sent again."""
 
 
 @contextlib.contextmanager
@@ -184,27 +255,20 @@ def ended_by_signals() -> Iterator[None]:
     """Have SIGTERM and SIGHUP unwind the stack as Ctrl-C does, so that files are closed and folders removed.
 
     Once: who is ending already is not interrupted by the next of them. A signal that arrives where Python drops what is
-    raised, in a finaliser or as native code calls back, or where Python is taking a lock, is sent again, Ctrl-C too.
+    raised, in a finaliser or as native code calls back, is sent again, Ctrl-C too. One that comes as Python takes a
+    lock may leave it taken, and whoever waits for it never ends: after ``_GRACE`` the process ends all the same.
     """
     ending, hook = False, sys.unraisablehook
-    numbers: list[int] = []
+    last = signal.SIGTERM
+    unwound = _thread.allocate_lock()
 
-    def end(number: int, frame: FrameType | None) -> None:
-        nonlocal ending
-        if ending:
-            return
-        if _takes_a_lock(frame):
-            _send_soon(number)
-            return
-        ending = True
-        numbers.append(number)
-        raise Terminated
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        if _takes_a_lock(frame):
-            _send_soon(number)
-            return
-        raise KeyboardInterrupt
+    def end(number: int, _: object) -> None:
+        nonlocal ending, last
+        if not ending:
+            ending, last = True, signal.Signals(number)
+            # Not by the class `Thread`: that takes locks, and this runs wherever a signal has come.
+            _thread.start_new_thread(_give_up, (unwound, number))
+            raise Terminated
 
     def send_again(dropped: Any) -> None:
         nonlocal ending
@@ -212,10 +276,12 @@ def ended_by_signals() -> Iterator[None]:
             hook(dropped)
             return
         ending = False
-        _send_soon(numbers[-1] if isinstance(dropped.exc_value, Terminated) else signal.SIGINT)
+        number = last if isinstance(dropped.exc_value, Terminated) else signal.SIGINT
+        _thread.start_new_thread(_send, (number,))
 
-    ctrl_c = ("SIGINT",) if signal.getsignal(signal.SIGINT) in (signal.default_int_handler, end_at_once) else ()
-    with handling(end, "SIGTERM", "SIGHUP"), handling(interrupt, *ctrl_c):
+    ctrl_c = ("SIGINT",) if signal.getsignal(signal.SIGINT) is end_at_once else ()
+    unwound.acquire()
+    with handling(end, "SIGTERM", "SIGHUP"), handling(signal.default_int_handler, *ctrl_c):
         sys.unraisablehook = send_again
         try:
             yield
@@ -226,30 +292,19 @@ def ended_by_signals() -> Iterator[None]:
             raise
         finally:
             sys.unraisablehook = hook
+            unwound.release()
         ending = True
 
 
-def _takes_a_lock(frame: FrameType | None) -> bool:
-    """Whether what a signal interrupts is in the midst of taking a lock, or of giving it back."""
-    while frame is not None:
-        code = frame.f_code
-        if code in _TAKES_A_LOCK:
-            return True
-        if code is _WAITS and _WAITING in code.co_varnames and _WAITING not in frame.f_locals:
-            return True
-        frame = frame.f_back
-    return False
+def _give_up(unwound: Any, number: int) -> None:
+    if not unwound.acquire(timeout=_GRACE):
+        end_at_once(number, None)
 
 
-def _send_soon(number: int) -> None:
+def _send(number: int) -> None:
     """Send a signal to the main thread once it has gone on."""
-
-    def send() -> None:
-        time.sleep(_SOON)
-        if hasattr(signal, "pthread_kill"):
-            signal.pthread_kill(threading.main_thread().ident or 0, number)
-        else:
-            signal.raise_signal(number)
-
-    # Not by the class `Thread`: that takes locks, and this runs wherever a signal has come.
-    _thread.start_new_thread(send, ())
+    time.sleep(_SOON)
+    if hasattr(signal, "pthread_kill"):
+        signal.pthread_kill(threading.main_thread().ident or 0, number)
+    else:
+        signal.raise_signal(number)

@@ -69,7 +69,7 @@ def compiling() -> contextlib.AbstractContextManager[Any]:
 
 
 class _Captures:
-    """Who captures, and who waits for events: CUDA allows one or the other."""
+    """Turns of those who capture and those who wait for events: CUDA allows one or the other."""
 
     def __init__(self) -> None:
         self.changed = threading.Condition()

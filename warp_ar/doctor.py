@@ -20,15 +20,16 @@ from rich.console import Console
 
 from warp_ar.begin import importing
 from warp_ar.checks.check_pictures import Look
-from warp_ar.checks.checkup import FRAMES, check_and_look, source_of
+from warp_ar.checks.checkup import FRAMES, check_and_look
 from warp_ar.checks.finding import Finding, worst_first
-from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, run_command
+from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, count, run_command
 from warp_ar.errors import UsageError, printable, say
 from warp_ar.scene import Pose, Scene, bundled_scenes, load_scene
-from warp_ar.scene.amend import amend_scene
+from warp_ar.scene.starter import amend_scene
+from warp_ar.sources.sources import source_of
 
 DEVICES = Path("/dev")
-"""Where the system lists capture devices."""
+"""Folder in which the system lists capture devices."""
 FEW_SIDES = 5
 """Directions from which a table must be seen to tell whether it mirrors."""
 APART = 4.0
@@ -41,7 +42,7 @@ STEP = 0.5
 
 @dataclasses.dataclass(frozen=True)
 class TablePolish:
-    """How the scene's table mirrors, by its frames."""
+    """Polish of the scene's table, by its frames."""
 
     values: dict[str, float]
     """Of ``[proxy.material]``, rounded."""
@@ -56,21 +57,20 @@ def make_parser() -> argparse.ArgumentParser:
     parser = Parser(
         prog="python -m warp_ar.doctor",
         description="Say what is wrong with a set-up: units, camera, card, mirror ball, light, and this machine. "
-        "Ends with 0 where nothing is found, with 1 where something is.",
+        "Ends with 1 where something is.",
     )
-    text = "a scene file, a folder with one, or a bundled scene's name"
+    text = "scene file, its folder, or a bundled scene's name"
     parser.add_argument("scene", metavar="SCENE", help=text)
-    parser.add_argument("--source", metavar="PATH|INDEX", help="frames, if not the scene's own")
-    parser.add_argument(
-        "--frames", type=int, default=FRAMES, metavar="N", help=f"frames to look at (default: {FRAMES})"
-    )
-    text = "write [proxy.material] into the scene file where the frames tell that the table mirrors; its comments stay"
+    parser.add_common("--source")
+    text = f"frames to look at (default: {FRAMES})"
+    parser.add_argument("--frames", type=count, default=FRAMES, metavar="N", help=text)
+    text = "write [proxy.material] into the scene file if the table mirrors"
     parser.add_argument("--write", action="store_true", help=text)
     return parser
 
 
 def check_machine() -> tuple[list[str], list[Finding]]:
-    """What this machine has, one line each, and what it lacks."""
+    """Return this machine's parts, one line each, and its faults."""
     # Here, for it loads Warp.
     with importing():
         import av
@@ -102,7 +102,7 @@ def check_machine() -> tuple[list[str], list[Finding]]:
 
 
 def check_access(scene: Scene, source: str | int | Path | None) -> list[Finding]:
-    """Whether the capture device that the frames come from is there and may be opened; on Linux, which lists them."""
+    """Check that the capture device of the frames is there and may be opened; on Linux, which lists them."""
     index = source_of(scene, source)
     if isinstance(index, str) and index.isdecimal():
         index = int(index)
@@ -121,7 +121,7 @@ def check_access(scene: Scene, source: str | int | Path | None) -> list[Finding]
 
 
 def look_for_polish(scene: Scene, look: Look, tell: Callable[[str], object] | None = None) -> TablePolish | None:
-    """How a table mirrors its surroundings, and what to write of it.
+    """Measure how a table mirrors its surroundings; return the words and the keys to write.
 
     Args:
         scene: With a card, a mirror ball and a plane.
@@ -200,8 +200,6 @@ def _write_polish(scene: Scene, polish: TablePolish | None, misled: bool) -> Non
 
 
 def _run(options: argparse.Namespace) -> int:
-    if options.frames < 1:
-        raise UsageError(f"--frames {options.frames}: expected a number of frames, 1 or more")
     scene = load_scene(options.scene)
     bundled = scene.path in bundled_scenes().values()
     if options.write and bundled:

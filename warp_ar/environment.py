@@ -19,11 +19,12 @@ import numpy.typing as npt
 
 from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, run_command
 from warp_ar.errors import SinkError, UsageError, say
-from warp_ar.output.color_spaces import COLOR_SPACES, grey_card_scale
 from warp_ar.output.environment_axes import AXES, LAYOUTS
 from warp_ar.output.environment_file import (
+    COLOR_SPACES,
     ENVIRONMENT_SUFFIXES,
     EnvironmentInfo,
+    grey_card_scale,
     read_environment,
     read_environment_info,
     write_environment,
@@ -40,21 +41,21 @@ def make_parser() -> argparse.ArgumentParser:
         description="Write an environment in the axes and format of another program.",
     )
     add = parser.add_argument
-    add("environment", type=Path, metavar="FILE", help="a latlong .exr or .hdr, as live --save-environment writes")
-    add("--light-axes", choices=AXES, help="axes of FILE (default: as it says, else y-up of .exr and blender of .hdr)")
+    add("environment", type=Path, metavar="FILE", help="a latlong .exr or .hdr")
+    parser.add_common("--light-axes")
     add("--output", type=Path, required=True, metavar="FILE", help="an .exr, .hdr, or .json of spherical harmonics")
-    text = "z-up (this program's own), blender (three.js too), y-up (OpenEXR, USD), opengl (default: y-up)"
+    text = "z-up: this program's; blender: also three.js; y-up: OpenEXR, USD (default: y-up)"
     add("--axes", choices=AXES, default="y-up", help=text)
-    add("--layout", choices=LAYOUTS, default="latlong", help="latlong, or the six faces of a cube (default: latlong)")
-    add("--size", type=int, metavar="TEXELS", help="edge of a cube's faces (default: half the rows of the environment)")
-    add("--taken", type=_time, metavar="TIME", help="when it was captured, such as 2026-05-01T12:00:00+02:00")
-    text = "where: longitude and latitude in degrees, altitude in metres"
+    add("--layout", choices=LAYOUTS, default="latlong", help="latlong, or a cube's six faces (default: latlong)")
+    add("--size", type=int, metavar="TEXELS", help="edge of a cube's faces (default: half the rows)")
+    add("--taken", type=_time, metavar="TIME", help="time of capture, such as 2026-05-01T12:00:00+02:00")
+    text = "longitude, latitude in degrees, altitude in metres"
     add("--place", type=float, nargs=3, metavar=("EAST", "NORTH", "ALTITUDE"), help=text)
-    add("--white-luminance", type=float, metavar="CD", help="cd/m^2 of the value 1 (default: as the file says)")
-    text = "rec709 (this program's own), or acescg, to .exr (default: rec709)"
+    add("--white-luminance", type=float, metavar="CD", help="cd/m^2 of the value 1 (default: the file's)")
+    text = "acescg: to .exr only (default: rec709)"
     add("--color-space", choices=tuple(COLOR_SPACES), default="rec709", help=text)
-    add("--grey-card", action="store_true", help="scale the light: a grey card lying on the marker has 0.18")
-    add("--overwrite", action="store_true", help="replace a file that this program did not write")
+    add("--grey-card", action="store_true", help="scale the light: a grey card on the marker has 0.18")
+    parser.add_common("--overwrite")
     return parser
 
 

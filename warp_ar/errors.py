@@ -27,8 +27,12 @@ class UsageError(WarpArError, ValueError):
     """An option or argument, on the command line or in a call, has a value that cannot be used."""
 
 
+class UpdateError(UsageError):
+    """A scene differs from that of a running pipeline in more than numbers: names the part."""
+
+
 def reason(error: BaseException) -> str:
-    """What went wrong, on one line, without the path that the message around it names already."""
+    """Return the reason of an error on one line, without the path that the message around it names already."""
     text = getattr(error, "strerror", None) or str(error) or type(error).__name__
     return " ".join(str(text).split())
 
@@ -38,7 +42,7 @@ _UNPRINTABLE = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2
 
 
 def printable(text: object) -> str:
-    r"""A text on one line that a terminal shows as it is: control characters become ``\x1b`` and the like."""
+    r"""Return a text on one line that a terminal shows as it is: control characters become ``\x1b`` and the like."""
     return _UNPRINTABLE.sub(lambda match: match[0].encode("unicode_escape").decode(), str(text))
 
 

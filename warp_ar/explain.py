@@ -31,15 +31,12 @@ from warp_ar.stages.request import Request
 def make_parser() -> argparse.ArgumentParser:
     """The command's options."""
     parser = Parser(
-        prog="python -m warp_ar.explain", description="Which stages a scene calls for, and why the others are left out."
+        prog="python -m warp_ar.explain", description="Say which stages a scene calls for, and why others are left out."
     )
-    parser.add_argument(
-        "scene", nargs="?", default="desk", metavar="SCENE", help="a scene file, or a bundled scene's name"
-    )
-    parser.add_argument(
-        "--quality", default=DEFAULT_PRESET, metavar="NAME", help=f"{', '.join(PRESETS)} (default: {DEFAULT_PRESET})"
-    )
-    parser.add_argument("--numerics", action="store_true", help="print every stage's precision and worst error instead")
+    parser.add_common("scene")
+    text = f"{', '.join(PRESETS)} (default: {DEFAULT_PRESET})"
+    parser.add_argument("--quality", default=DEFAULT_PRESET, metavar="NAME", help=text)
+    parser.add_argument("--numerics", action="store_true", help="print each stage's precision and worst error")
     return parser
 
 

@@ -19,16 +19,14 @@ from typing import Any
 from warp_ar.begin import importing
 from warp_ar.command_line import EXIT_DONE, Parser, run_command
 from warp_ar.errors import SinkError, SourceError, UsageError, say
+from warp_ar.output.camera_files import TRACK_SUFFIX, distort_map, undistort_map, write_stmap, write_track
 from warp_ar.output.environment_file import write_environment
 from warp_ar.output.gltf_file import GLTF_SUFFIX, write_glb
-from warp_ar.output.places import check_places, check_replaceable
+from warp_ar.output.places import check_places, check_replaceable, reads_of
 from warp_ar.output.shot import Shot, texture_files
 from warp_ar.output.sink import make_folder
-from warp_ar.output.stmap import distort_map, undistort_map, write_stmap
-from warp_ar.output.track_file import TRACK_SUFFIX, write_track
 from warp_ar.output.usd_file import USD_SUFFIXES, load_usd, write_usd
 from warp_ar.scene import Scene, load_scene
-from warp_ar.scene.scene_files import files_of
 from warp_ar.signature import is_signed
 
 SUFFIXES = (*USD_SUFFIXES, GLTF_SUFFIX, TRACK_SUFFIX)
@@ -38,20 +36,16 @@ def make_parser() -> argparse.ArgumentParser:
     """The command's options."""
     parser = Parser(
         prog="python -m warp_ar.export",
-        description="Write a scene and the way of its camera for other programs: USD, glTF, or OpenTrackIO (.jsonl).",
+        description="Write a scene and its camera's path as USD, glTF, or OpenTrackIO (.jsonl).",
     )
     add = parser.add_argument
-    add("scene", metavar="SCENE", help="a scene file, a folder with one, or a bundled scene's name")
+    add("scene", metavar="SCENE", help="scene file, its folder, or a bundled scene's name")
     add("--output", type=Path, required=True, metavar="FILE", help=f"ends in {', '.join(SUFFIXES)}")
-    add("--source", metavar="PATH", help="frames from this folder or video, not the scene's own")
-    add("--calibration", metavar="FILE|exif", help="as in warp_ar.live")
-    add("--frames", type=int, metavar="N", help="stop after N frames")
-    text = "camera, surfaces and virtual lights only: frames are tracked, not lit"
+    parser.add_common("--source", "--calibration", "--frames", "--device", "--overwrite")
+    text = "write camera, surfaces and virtual lights only"
     add("--no-environment", action="store_true", help=text)
-    text = "write FILE_undistort.exr and FILE_distort.exr, STMaps of the lens, too"
+    text = "also write the lens's STMaps, FILE_undistort.exr and FILE_distort.exr"
     add("--stmaps", action="store_true", help=text)
-    add("--device", default="auto", metavar="auto|cpu|cuda:0", help="where the kernels run (default: auto)")
-    add("--overwrite", action="store_true", help="replace files that this program did not write")
     return parser
 
 
@@ -72,8 +66,6 @@ def export(options: argparse.Namespace) -> int:
     output: Path = options.output
     if output.suffix.lower() not in SUFFIXES:
         raise UsageError(f"--output {output} ends in {output.suffix!r}; use {', '.join(SUFFIXES)}")
-    if options.frames is not None and options.frames < 1:
-        raise UsageError(f"--frames {options.frames}: expected a number of frames, 1 or more")
     if output.suffix.lower() in USD_SUFFIXES:
         load_usd()
     scene = load_scene(options.scene)
@@ -85,7 +77,7 @@ def export(options: argparse.Namespace) -> int:
         del beside["undistort"], beside["distort"]
     textures = texture_files(scene, output) if output.suffix.lower() in USD_SUFFIXES else {}
     writes = {"--output": output, **{f"--output's {name}": path for name, path in {**beside, **textures}.items()}}
-    check_places(_read_by(scene, options), writes)
+    check_places(reads_of(scene, options), writes)
     for path in writes.values():
         if words := check_replaceable(path, overwrite=options.overwrite):
             say(words)
@@ -113,7 +105,7 @@ def export(options: argparse.Namespace) -> int:
 
 
 def environment_names(scene: Scene) -> tuple[str, ...]:
-    """What the environments' files are named by: of the first mirror ball, and of each other one in turn."""
+    """Return the endings of environments' files: of the first mirror ball, and of each other one in turn."""
     return ("environment", *(f"environment_{ball}" for ball in range(1, len(scene.probes))))
 
 
@@ -124,14 +116,6 @@ def _clear_stale(output: Path, balls: int) -> None:
         if number.isdecimal() and int(number) >= balls and is_signed(path):
             path.unlink(missing_ok=True)
             say(f"{path}: of an earlier export, of a mirror ball that this one does not have; removed")
-
-
-def _read_by(scene: Scene, options: argparse.Namespace) -> dict[str, list[Path]]:
-    """Files and folders that the run reads, by what they are."""
-    named = {"--source": options.source, "--calibration": options.calibration}
-    reads = {name: [Path(value)] for name, value in named.items() if value is not None}
-    reads["the scene"] = [] if scene.path is None else [scene.path]
-    return {**reads, "what the scene names,": [path for path in files_of(scene) if path != scene.path]}
 
 
 def _read_shot(options: argparse.Namespace, scene: Any) -> tuple[Shot, tuple[Any, ...]]:

@@ -22,13 +22,16 @@ import numpy.typing as npt
 import OpenEXR
 
 from warp_ar.errors import WarpArError, reason, say
-from warp_ar.files import is_file, limits, read_bytes, too_much
+from warp_ar.files import check_size, is_file, read_bytes, store
 from warp_ar.signals import REC_709, are_primaries, converted
+from warp_ar.signature import PROGRAM
 
 _LINES = (1, 1, 1, 16, 32, 16, 32, 32, 32, 256)
 """Rows of a chunk, by the number of the compression: none, RLE, ZIPS, ZIP, PIZ, PXR24, B44, B44A, DWAA, DWAB."""
 LARGEST = 65504.0
 """Largest half float: what an infinite value is read as."""
+_HDR_HEAD = 1 << 16
+"""Bytes within which a Radiance picture has its size; its header tells all programs that it went through."""
 _MAGIC = b"\x76\x2f\x31\x01"
 _SEVERAL_PARTS = 0x10
 """Bit of the second byte of the version's four."""
@@ -59,9 +62,14 @@ class LinearPicture:
 def read_linear_picture(path: pathlib.Path, error: type[WarpArError], label: str) -> LinearPicture:
     """Read a picture of linear light: Radiance's HDR by its ending, else OpenEXR.
 
-    The one reader of frames, light, environments and emission. An OpenEXR's first part is read: channels R, G and B, or
-    Y for grey, within its display window, black where it holds nothing. Chromaticities are followed, with the white
-    adapted. NaN becomes 0 and infinity the largest half float, alike for all readers, and a line on stderr says so.
+    The one reader of frames, light, environments and emission.
+
+    Follows:
+        OpenEXR: first part with R G B or Y, half or float, display window (black without data), chromaticities,
+        envmap; HDR: PRIMARIES, EXPOSURE, COLORCORR, rows and columns in any order.
+
+    Names:
+        axes taken; parts not taken; EXPOSURE, COLORCORR; VIEW, PIXASPECT; values not finite (NaN: 0, infinity: 65,504).
 
     Args:
         path: The file.
@@ -69,7 +77,7 @@ def read_linear_picture(path: pathlib.Path, error: type[WarpArError], label: str
         label: Name of the picture in messages.
 
     Raises:
-        WarpArError: As ``error``: it is another kind of file, damaged, too large, or has other channels.
+        WarpArError: As ``error``: damaged; other channels; deep pixels; HDR of CIE XYZ or a GAMMA.
     """
     picture = _read_hdr(path, error, label) if path.suffix.lower() == ".hdr" else _read_exr(path, error, label)
     wrong = sum(values.size - int(np.isfinite(values).sum()) for values in (picture.color, *picture.others.values()))
@@ -82,27 +90,39 @@ def read_linear_picture(path: pathlib.Path, error: type[WarpArError], label: str
 
 
 def read_exr_header(path: pathlib.Path, error: type[WarpArError], label: str) -> dict[str, Any]:
-    """Read the attributes of an OpenEXR's first part; arguments as `read_linear_picture`.
+    """Read the attributes of an OpenEXR's picture; arguments as `read_linear_picture`.
 
     Raises:
         WarpArError: As ``error``: there is no such file, it is too large or cannot be read.
     """
+    return _picture_part(path, error, label, header_only=True)[0]
+
+
+def _picture_part(
+    path: pathlib.Path, error: type[WarpArError], label: str, **how: bool
+) -> tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]:
+    """Attributes and channels of an OpenEXR's first part that has R, G and B, or Y; of the first where none has."""
     if not is_file(path):
         raise error(f"there is no file {label}")
     try:
-        with OpenEXR.File(str(path), header_only=True) as file:
-            header = dict(file.header())
-        for name in ("dataWindow", "displayWindow"):
-            width, height = _size_of(header[name])
-            if not (width > 0 and height > 0):
-                raise error(f"{label} cannot be read as OpenEXR: its {name} is {width}x{height}")
-            if width * height > limits().picture_pixels:
-                raise error(too_much(f"{label} is {width}x{height}: it", width * height, "pixels", "picture_pixels"))
-    except (RuntimeError, OSError, ValueError, KeyError) as problem:
+        with OpenEXR.File(str(path), **how) as file:
+            headers = [dict(part.header) for part in file.parts]
+            for window in (header[name] for header in headers for name in ("dataWindow", "displayWindow")):
+                check_size(*_size_of(window), error, label)
+            names = [{channel.name for channel in header["channels"]} for header in headers]
+            number = next((k for k, own in enumerate(names) if {"R", "G", "B"} <= own or "Y" in own), 0)
+            channels = {name: np.asarray(one.pixels) for name, one in file.parts[number].channels.items()}
+    except (RuntimeError, OSError, ValueError, LookupError) as problem:
         if isinstance(problem, WarpArError):
             raise
         raise error(f"{label} cannot be read as OpenEXR: {exr_problem(path, problem)}") from problem
-    return header
+    if len(headers) > 1:
+        shown = [str(header.get("name")) for header in headers]
+        every = path.with_stem("*")  # said once of a folder of frames
+        say_once(f"{every} has the parts {', '.join(shown)}; {shown[number]} is taken")
+    if headers[number].get("type") in (OpenEXR.deepscanline, OpenEXR.deeptile):
+        raise error(f"{label} is a deep OpenEXR; save it flat, with one value of each channel for a pixel")
+    return headers[number], channels
 
 
 @functools.cache
@@ -112,14 +132,10 @@ def say_once(text: str) -> None:
 
 
 def _read_exr(path: pathlib.Path, error: type[WarpArError], label: str) -> LinearPicture:
-    header = read_exr_header(path, error, label)
-    try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            channels = {name: np.asarray(channel.pixels) for name, channel in file.channels().items()}
-    except (RuntimeError, OSError, ValueError, KeyError) as problem:
-        raise error(f"{label} cannot be read as OpenEXR: {exr_problem(path, problem)}") from problem
+    _picture_part(path, error, label, header_only=True)  # looks at sizes before pixels are read
+    header, channels = _picture_part(path, error, label, separate_channels=True)
     names = "RGB" if {"R", "G", "B"} <= channels.keys() else "YYY"
-    if names[0] not in channels:
+    if names[0] not in channels or (names == "YYY" and {"RY", "BY"} & channels.keys()):
         raise error(f"{label} has channels {', '.join(channels)}; R, G and B, or Y, are needed")
     shape = channels[names[0]].shape
     if any(channels[name].shape != shape for name in names):
@@ -138,18 +154,46 @@ def _read_exr(path: pathlib.Path, error: type[WarpArError], label: str) -> Linea
 
 def _read_hdr(path: pathlib.Path, error: type[WarpArError], label: str) -> LinearPicture:
     data = read_bytes(path, "picture_bytes", error, label)
-    size = re.search(rb"\n-Y (\d{1,9}) \+X (\d{1,9})\n", data[:4096])
-    if not data.startswith(b"#?") or size is None:
-        raise error(f"{label}: no Radiance picture with rows from the top (-Y ... +X ...)")
-    height, width = int(size[1]), int(size[2])
-    if width * height > limits().picture_pixels:
-        raise error(too_much(f"{label} is {width}x{height}: it", width * height, "pixels", "picture_pixels"))
-    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    size = re.search(rb"\n([-+])([XY]) (\d{1,9}) ([-+])([XY]) (\d{1,9})\n", data[:_HDR_HEAD])
+    if not data.startswith(b"#?") or size is None or size[2] == size[5]:
+        raise error(f"{label}: no Radiance picture with a line of its size, such as -Y 512 +X 1024")
+    head = data[: size.start() + 1].decode("latin-1")
+    if "_xyze" in head:
+        raise error(f"{label}: the Radiance picture holds CIE XYZ; save it as RGB (FORMAT=32-bit_rle_rgbe)")
+    lines, length = int(size[3]), int(size[6])
+    check_size(length, lines, error, label)
+    # OpenCV reads no other order of pixels than this one.
+    plain = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y %d +X %d\n" % (lines, length)
+    picture = cv2.imdecode(np.frombuffer(plain + data[size.end() :], np.uint8), cv2.IMREAD_UNCHANGED)
     if picture is None or picture.ndim != 3 or picture.dtype != np.float32:
         raise error(f"{label}: the Radiance picture is damaged")
-    said = re.search(rb"\nPRIMARIES\s*=\s*([-+.\deE \t]+)\n", data[: size.start() + 1])
-    chromaticities = tuple(map(float, said[1].split())) if said else None
-    return LinearPicture(_in_rec_709(picture[..., 2::-1], chromaticities, error, label), {}, {})
+    signs = {size[2]: size[1], size[5]: size[4]}
+    picture = picture.swapaxes(0, 1) if size[2] == b"X" else picture
+    picture = picture[:: 1 if signs[b"Y"] == b"-" else -1, :: 1 if signs[b"X"] == b"+" else -1, ::-1]
+
+    def numbers(key: str, count: int) -> npt.NDArray[np.float64]:
+        """Return the numbers of all lines of a key, (lines, count)."""
+        said = re.findall(rf"(?m)^{key}[ \t]*=(.*)$", head)
+        try:
+            return np.array([line.split() for line in said], np.float64).reshape(len(said), count)
+        except ValueError:
+            right = "a number" if count == 1 else f"{count} numbers"
+            raise error(f"{label}: {key}={said[0].strip()[:40]}: expected {right}") from None
+
+    factor = numbers("EXPOSURE", 1).prod(0) * numbers("COLORCORR", 3).prod(0)
+    if not ((factor > 0.0) & np.isfinite(factor)).all():
+        raise error(f"{label}: its EXPOSURE and COLORCORR multiply to {factor.tolist()}; expected factors above 0")
+    if (numbers("GAMMA", 1) != 1.0).any():
+        raise error(f"{label}: its values are of GAMMA {numbers('GAMMA', 1)[0, 0]:g}; save it as linear light")
+    if (factor != 1.0).any():
+        shown = ", ".join(f"{value:g}" for value in dict.fromkeys(factor.tolist()))
+        say_once(f"{label}: its values were multiplied by {shown} (EXPOSURE, COLORCORR); that is divided out")
+    if (numbers("PIXASPECT", 1).prod() != 1.0) or re.search("(?m)^VIEW[ \t]*=", head):
+        say_once(f"{label}: VIEW and PIXASPECT of its header are not followed; it is taken as it lies")
+    said = numbers("PRIMARIES", 8)
+    primaries = tuple(said[-1]) if said.any() else None  # Photoshop writes zeros
+    light = picture / factor.astype(np.float32) if (factor != 1.0).any() else picture
+    return LinearPicture(_in_rec_709(light, primaries, error, label), {}, {})
 
 
 def _in_rec_709(
@@ -185,6 +229,21 @@ def _in_window(picture: npt.NDArray[np.float32], data: Any, display: Any) -> npt
     if y0 < y1 and x0 < x1:
         out[y0:y1, x0:x1] = picture[y0 - top : y1 - top, x0 - left : x1 - left]
     return out
+
+
+def exr_header(**attributes: Any) -> dict[str, Any]:
+    """Return the header of a signed picture of rows, packed without loss, with further attributes."""
+    kind = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    return {**kind, "software": PROGRAM, **attributes}
+
+
+def store_exr(path: pathlib.Path, image: OpenEXR.File) -> None:
+    """Write a picture as `write_exr`, under its name when it is whole.
+
+    Raises:
+        SinkError: It cannot be written.
+    """
+    store(path, functools.partial(write_exr, image=image))
 
 
 def write_exr(path: pathlib.Path, image: OpenEXR.File) -> None:
@@ -227,7 +286,7 @@ def check_whole_exr(path: pathlib.Path) -> None:
 
 
 def _end_of_chunks(data: bytes) -> int:
-    """Where the last chunk ends, by the tables that point to chunks."""
+    """Return the end of the last chunk, by the tables that point to chunks."""
     if data[:4] != _MAGIC:
         raise ValueError
     several = bool(data[5] & _SEVERAL_PARTS)

@@ -21,7 +21,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from warp_ar.errors import UsageError, WarpArError, reason
+from warp_ar.errors import SinkError, UsageError, WarpArError, reason
 
 _CHUNK = 1 << 20
 
@@ -37,7 +37,7 @@ _MANY_DOTS: Final = re.compile(rf"(?m)(?:^|[\[{{,])[ \t]*{_PART}(?:[ \t]*\.[ \t]
 
 @dataclasses.dataclass(frozen=True)
 class Limits:
-    """How large files may be; each field has the environment variable ``WARP_AR_MAX_`` and its name in capitals."""
+    """Largest sizes of files; each field has the environment variable ``WARP_AR_MAX_`` and its name in capitals."""
 
     picture_pixels: int = 1 << 26
     """Pixels of a frame, a texture, a video's frame or an environment, by the file's header."""
@@ -49,6 +49,8 @@ class Limits:
     """Bytes of a mesh's file, and of each buffer that it names."""
     mesh_elements: int = 20_000_000
     """Vertices, or faces, of a mesh, by the file's header where it has one."""
+    scene_entries: int = 2000
+    """Tables of one section of a scene: objects, proxies, lights or mirror balls."""
     run_bytes: int = 1 << 30
     """Bytes of what a run of the farm keeps of itself, each file."""
     nesting: int = 64
@@ -79,13 +81,25 @@ def limits() -> Limits:
 
 
 def too_much(label: str, amount: int, what: str, name: str) -> str:
-    """What to say of a file that is beyond the limit ``name``."""
+    """Words for a file that is beyond the limit ``name``."""
     most = getattr(limits(), name)
     return f"{label} has {amount:,} {what}; at most {most:,} are read (set {variable_of(name)} for more)"
 
 
+def check_size(width: int, height: int, error: type[WarpArError], label: str) -> None:
+    """Check the size in pixels that the header of a picture promises.
+
+    Raises:
+        WarpArError: As ``error``: it is empty, or too large to be read.
+    """
+    if width < 1 or height < 1:
+        raise error(f"{label} cannot be read: its header promises {width}x{height} pixels")
+    if width * height > limits().picture_pixels:
+        raise error(too_much(f"{label} is {width}x{height}: it", width * height, "pixels", "picture_pixels"))
+
+
 def kind_of(path: str | os.PathLike[str]) -> str:
-    """What a path leads to.
+    """Return the kind of thing that a path leads to.
 
     Returns:
         "file", "folder", "nothing", or words for what is none of them: "a named pipe", "a device", "a socket".
@@ -106,20 +120,17 @@ def kind_of(path: str | os.PathLike[str]) -> str:
     return "a named pipe" if stat.S_ISFIFO(mode) else "a socket" if stat.S_ISSOCK(mode) else "a device"
 
 
-def is_file(path: str | os.PathLike[str]) -> bool:
-    """Whether a path leads to a regular file; a path that cannot be one does not."""
+def is_file(path: str | os.PathLike[str], kind: str = "file") -> bool:
+    """Tell whether a path leads to a regular file; a path that cannot be one does not."""
     try:
-        return kind_of(path) == "file"
+        return kind_of(path) == kind
     except OSError:
         return False
 
 
 def is_folder(path: str | os.PathLike[str]) -> bool:
-    """Whether a path leads to a folder; a path that cannot be one does not."""
-    try:
-        return kind_of(path) == "folder"
-    except OSError:
-        return False
+    """Tell whether a path leads to a folder; a path that cannot be one does not."""
+    return is_file(path, "folder")
 
 
 def read_bytes(path: str | os.PathLike[str], limit: str, error: type[WarpArError], label: str | None = None) -> bytes:
@@ -294,6 +305,20 @@ def write_whole(
         raise
 
 
+def store(
+    path: pathlib.Path, write: bytes | Callable[[pathlib.Path], object], *, suffix: str = "", label: str | None = None
+) -> None:
+    """Write a file as `write_whole` does, and name it where that fails.
+
+    Raises:
+        SinkError: It cannot be written; nothing has changed.
+    """
+    try:
+        write_whole(path, write, suffix=suffix)
+    except (OSError, RuntimeError) as error:  # RuntimeError: OpenEXR's
+        raise SinkError(f"{label or path} cannot be written: {reason(error)}") from error
+
+
 def name_aside(path: pathlib.Path, suffix: str = "") -> pathlib.Path:
     """Return the path, hidden and of a random name, for a file that is to take another one's name when it is whole.
 
@@ -330,12 +355,8 @@ def take_name(part: pathlib.Path, path: pathlib.Path) -> None:
 
 
 def is_same_file(a: pathlib.Path, b: pathlib.Path) -> bool:
-    """Whether two paths lead to one file or folder, by whatever links; neither needs to exist."""
+    """Tell whether two paths lead to one file or folder, by whatever links; neither needs to exist."""
     try:
-        return os.path.samefile(a, b)
-    except (OSError, ValueError):
-        pass
-    try:
-        return os.path.realpath(a) == os.path.realpath(b)
+        return os.path.realpath(a) == os.path.realpath(b) or (os.path.exists(a) and os.path.samefile(a, b))
     except (OSError, ValueError):
         return False

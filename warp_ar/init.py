@@ -38,13 +38,13 @@ def make_parser() -> argparse.ArgumentParser:
     """The command's options."""
     parser = Parser(
         prog="python -m warp_ar.init",
-        description="Make a folder to start your own desk from: a scene file, a teapot, and the card to print.",
+        description="Make a folder to start from: a scene file, a teapot, the card to print.",
     )
-    parser.add_argument("folder", type=Path, metavar="FOLDER", help="the folder to make; it must not be there yet")
-    text = "frames: a capture device's index, a video, a folder (default: 0)"
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="the new folder")
+    text = "a capture device's index, a video or a folder (default: 0)"
     parser.add_argument("--source", default="0", metavar="PATH|INDEX", help=text)
     parser.add_argument(
-        "--radius", type=float, metavar="X", help=f"the mirror ball's radius in metres (default: {DEFAULT_RADIUS})"
+        "--radius", type=float, metavar="X", help=f"the ball's radius in metres (default: {DEFAULT_RADIUS})"
     )
     return parser
 

@@ -8,6 +8,7 @@ if __name__ == "__main__":
     begin("warp_ar.live")
 
 import argparse
+import functools
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -18,151 +19,68 @@ from warp_ar.live_page import DEFAULT_PORT, serve_page
 from warp_ar.output.encoders import CODINGS, describe_encoders
 from warp_ar.output.sinks import FOLDER_CODINGS
 from warp_ar.scene import bundled_scenes
-from warp_ar.scene.description import LATLONG_AXES
 from warp_ar.stages.quality import AUTO, DEFAULT_BUDGET_MS, DEFAULT_PRESET, PRESETS
 from warp_ar.stages.request import LAYERS
 
 
-def make_parser() -> argparse.ArgumentParser:
-    """The command's options."""
+def make_parser() -> Parser:
+    """Return the parser of the command's options."""
     parser = Parser(
         prog="python -m warp_ar.live",
-        description="Camera frames of a desk with a marker and a mirror ball in, consistently lit frames out. "
-        "Without --output or --headless they go to a page in the browser.",
+        usage="%(prog)s [SCENE] [OPTIONS]",
+        description="Light camera frames of a desk with a marker and a mirror ball. Without --output or --headless "
+        "they go to a page in the browser.",
     )
-    add = parser.add_argument
-    add(
-        "scene",
-        nargs="?",
-        default="desk",
-        metavar="SCENE",
-        help="a scene file, a folder with one, or a bundled scene's name (default: desk)",
-    )
+    files, page = parser.add_argument_group("files"), parser.add_argument_group("the page")
+    add, rare = parser.add_argument, functools.partial(parser.add_rare, group=parser)
+    parser.add_common("scene", "--source", "--calibration", "--light", "--device", "--frames")
     add("--list", action="store_true", help="list the bundled scenes and stop")
-    add(
-        "--source",
-        metavar="PATH|INDEX",
-        help="frames from this folder, picture, video file, capture device or stream (rtsp://..., http://...), "
-        "not the scene's own",
-    )
-    add(
-        "--calibration",
-        metavar="FILE|exif",
-        help="OpenCV camera calibration, YAML or JSON, instead of the scene's numbers; exif: the first picture's",
-    )
-    add("--light", metavar="FILE", help="captured light (.exr, .hdr) instead of what a mirror ball in the frames shows")
-    text = "axes of --light (default: as the file says, else y-up of .exr and blender of .hdr)"
-    add("--light-axes", choices=LATLONG_AXES, help=text)
-    add("--device", default="auto", metavar="auto|cpu|cuda:0", help="where the kernels run (default: auto)")
-    add(
-        "--quality",
-        default=DEFAULT_PRESET,
-        metavar="NAME",
-        help=f"{', '.join(PRESETS)}, or {AUTO}: what errs least within a budget (default: {DEFAULT_PRESET})",
-    )
-    add(
-        "--budget-ms",
-        type=float,
-        metavar="X",
-        help=f"milliseconds per frame for --quality {AUTO} (default: {DEFAULT_BUDGET_MS:g})",
-    )
-    add("--frames", type=int, metavar="N", help="stop after N frames")
-    add("--loop", action="store_true", help="start the clip again when it ends; on the page it always does")
-    add(
-        "--refine-ball",
-        action="store_true",
-        help="with --output or --headless: first find the mirror ball by the desk that it mirrors, in some seconds",
-    )
-    text = (
-        "with --output or --headless: frames by path tracing with N samples a pixel, in the light that --quality finds"
-    )
-    add("--samples", type=int, metavar="N", help=text)
-    text = (
-        "with --samples: stop at this relative standard error of what virtual objects and lights change, such as 0.05"
-    )
-    add("--error", type=float, metavar="E", help=text)
-    _add_file_options(parser.add_argument_group("files"))
-    _add_page_options(parser.add_argument_group("the page"))
-    return parser
-
-
-def _add_file_options(group: argparse._ArgumentGroup) -> None:
-    """What is written instead of the page."""
-    add = group.add_argument
-    add(
-        "--output",
-        type=Path,
-        metavar="FILE.mp4|DIR",
-        help="write frames instead of serving the page: a folder gets NNNN.png, a file H.264",
-    )
-    add(
-        "--coding",
-        choices=tuple(dict.fromkeys((*CODINGS, *FOLDER_CODINGS))),
-        default="8bit",
-        help="with --output: a video of 10bit, pq or hlg; a folder of 16bit (PNG) or exr (default: 8bit)",
-    )
-    add("--encoder", metavar="NAME|list", help="with --output FILE: FFmpeg's encoder; list: show those of this machine")
-    add(
-        "--encoder-option",
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        help="an option of the encoder by FFmpeg's name, such as crf=23; may be given again",
-    )
-    add(
-        "--virtual-camera",
-        nargs="?",
-        const="",
-        metavar="DEVICE",
-        help="show frames as a camera that other programs open, such as /dev/video4 (default: the first there is)",
-    )
-    add(
-        "--headless",
-        action="store_true",
-        help="no page, no progress bar, no table; writes only what other options name",
-    )
-    add(
-        "--overwrite",
-        action="store_true",
-        help="replace files that this program did not write; those that it wrote are replaced anyway",
-    )
-    add("--save-environment", type=Path, metavar="DIR", help="write the captured light of every frame as NNNN.exr")
-    add("--save-layers", type=Path, metavar="DIR", help="write the layers of every frame as NNNN.exr of several parts")
-    add(
-        "--layers",
-        metavar="NAMES|all",
-        help=f"with --save-layers: which, separated by commas (default: all): {', '.join(LAYERS)}",
-    )
-    add("--layer-pictures", action="store_true", help="with --save-layers: those that PNG can hold, as PNG besides")
+    text = f"{', '.join(PRESETS)}, or {AUTO}: least error within a budget (default: {DEFAULT_PRESET})"
+    add("--quality", default=DEFAULT_PRESET, metavar="NAME", help=text)
+    parser.add_common("--light-axes", add=rare)
+    text = f"milliseconds per frame for --quality {AUTO} (default: {DEFAULT_BUDGET_MS:g})"
+    rare("--budget-ms", type=float, metavar="X", help=text)
+    rare("--loop", action="store_true", help="start the clip again at its end; the page always does")
+    text = "with files: first find the ball by what it mirrors"
+    rare("--refine-ball", action="store_true", help=text)
+    text = "with files: path-trace with N samples a pixel, in the light of --quality"
+    rare("--samples", type=int, metavar="N", help=text)
+    text = "with --samples: relative standard error to stop at, such as 0.05"
+    rare("--error", type=float, metavar="E", help=text)
+    add, rare = files.add_argument, functools.partial(parser.add_rare, group=files)
+    add("--output", type=Path, metavar="FILE.mp4|DIR", help="write frames: H.264, or a folder of PNG")
+    text = "no page, no progress; write only what options name"
+    add("--headless", action="store_true", help=text)
+    parser.add_common("--overwrite", add=add)
     add("--report", type=Path, metavar="FILE.json", help="write poses and timings of every frame")
-
-
-def _add_page_options(group: argparse._ArgumentGroup) -> None:
-    """Where the page is served, and to whom."""
-    add = group.add_argument
-    add("--port", type=int, metavar="N", help=f"port to serve at (default: {DEFAULT_PORT}, or the next free one)")
-    add(
-        "--host",
-        default="127.0.0.1",
-        metavar="ADDRESS",
-        help="address to serve at (default: 127.0.0.1); one that others reach, such as 0.0.0.0, asks for a token",
-    )
-    add("--token", metavar="SECRET", help="ask for this token (default: a new one where other machines reach the page)")
-    add(
-        "--tls",
-        nargs="?",
-        const=True,
-        metavar="FILE.pem",
-        help="serve over TLS, without which browsers keep their camera from other machines; makes its own certificate",
-    )
+    add("--verbose", action="store_true", help="print a table of all stages at the end")
+    text = "of --output: 10bit, pq, hlg for video; 16bit, exr for folders (default: 8bit)"
+    rare("--coding", choices=tuple(dict.fromkeys((*CODINGS, *FOLDER_CODINGS))), default="8bit", help=text)
+    text = "FFmpeg's encoder of the video; list: show this machine's"
+    rare("--encoder", metavar="NAME|list", help=text)
+    text = "an option of the encoder, such as crf=23; repeatable"
+    rare("--encoder-option", action="append", default=[], metavar="KEY=VALUE", help=text)
+    text = "show frames as a camera, such as /dev/video4 (default: the first)"
+    rare("--virtual-camera", nargs="?", const="", metavar="DEVICE", help=text)
+    text = "write each frame's captured light as NNNN.exr"
+    rare("--save-environment", type=Path, metavar="DIR", help=text)
+    text = "write each frame's layers as NNNN.exr of several parts"
+    rare("--save-layers", type=Path, metavar="DIR", help=text)
+    text = f"with --save-layers, separated by commas: {', '.join(LAYERS)} (default: all)"
+    rare("--layers", metavar="NAMES|all", help=text)
+    rare("--layer-pictures", action="store_true", help="with --save-layers: also PNG where it can hold them")
+    add, rare = page.add_argument, functools.partial(parser.add_rare, group=page)
+    text = "address to serve at; one that others reach, such as 0.0.0.0, needs a token"
+    add("--host", default="127.0.0.1", metavar="ADDRESS", help=text)
+    text = "serve over TLS, as cameras elsewhere need; without FILE makes a certificate"
+    add("--tls", nargs="?", const=True, metavar="FILE.pem", help=text)
     add("--no-browser", action="store_true", help="only print the page's address")
-    add(
-        "--allow-origin",
-        action="append",
-        default=[],
-        metavar="ORIGIN",
-        help="let pages of this site, such as http://localhost:5173, ask for the light; may be given again",
-    )
+    rare("--port", type=int, metavar="N", help=f"port (default: {DEFAULT_PORT}, or the next free one)")
+    text = "ask for this token (default: a new one if others reach the page)"
+    rare("--token", metavar="SECRET", help=text)
+    text = "let this site, such as http://localhost:5173, ask for the light; repeatable"
+    rare("--allow-origin", action="append", default=[], metavar="ORIGIN", help=text)
+    return parser
 
 
 def run(options: argparse.Namespace) -> int:
@@ -180,8 +98,6 @@ def run(options: argparse.Namespace) -> int:
         return EXIT_DONE
     if options.output is None and (options.coding != "8bit" or options.encoder or options.encoder_option):
         raise UsageError("--coding, --encoder and --encoder-option need --output, the file or folder to write")
-    if options.frames is not None and options.frames < 1:
-        raise UsageError(f"--frames {options.frames}: expected a number of frames, 1 or more")
     if options.budget_ms is not None and not 0.0 < options.budget_ms < float("inf"):
         raise UsageError(f"--budget-ms {options.budget_ms:g}: expected milliseconds above 0")
     if options.budget_ms is not None and options.quality != AUTO:

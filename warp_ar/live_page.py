@@ -1,14 +1,14 @@
-"""``python -m warp_ar.live`` as a page: its scene, its address, and serving it until somebody ends it."""
+"""Page of ``python -m warp_ar.live``: its scene, its address, and serving it until somebody ends it."""
 
 from __future__ import annotations
 
 import argparse
 import asyncio
-import contextlib
 import functools
 import gc
 import os
 import secrets
+import shutil
 import signal
 import sys
 import tempfile
@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from warp_ar.begin import EXIT_INTERRUPTED, EXIT_TERMINATED, importing
-from warp_ar.command_line import EXIT_DONE, EXIT_USAGE, Terminated, loading
+from warp_ar.command_line import EXIT_DONE, EXIT_USAGE, Terminated
 from warp_ar.errors import UsageError, WarpArError, printable, say
 from warp_ar.live_start import say_quick_check, start_device
 from warp_ar.scene import Scene, load_scene
@@ -28,16 +28,16 @@ if TYPE_CHECKING:
 
 DEFAULT_PORT = 8720
 PORT_TRIES = 20
+CHECKING_S = 10.0
+"""Seconds that a page which ends by itself waits for the check of its scene."""
 
 
 def _page_scene(options: argparse.Namespace) -> Scene:
-    """The scene of a page.
+    """Return the scene of a page.
 
     Raises:
         UsageError: An option is for files only, or has an impossible value.
     """
-    from warp_ar.session import calibrated, with_light
-
     for name in ("save_environment", "save_layers", "report", "samples", "error"):
         if getattr(options, name) is not None:
             raise UsageError(f"--{name.replace('_', '-')} needs --headless or --output: the page saves on its own")
@@ -47,16 +47,17 @@ def _page_scene(options: argparse.Namespace) -> Scene:
         raise UsageError(f"--port {options.port}: expected a port, 0 to 65535; 0 takes a free one")
     if options.token is not None and not (options.token.isascii() and options.token.isalnum()):
         raise UsageError("--token: expected letters and digits, for it stands in an address")
-    scene = load_scene(options.scene)
-    if options.calibration is not None:
-        scene = calibrated(scene, options.calibration, options.source)
-    return scene if options.light is None else with_light(scene, options.light, options.light_axes)
+    if options.calibration is None and options.light is None:
+        return load_scene(options.scene)
+    from warp_ar.session import chosen_scene  # loads Warp, for which the page does not wait elsewhere
+
+    return chosen_scene(options.scene, options.source, options.calibration, options.light, options.light_axes)
 
 
 def _page_address(options: argparse.Namespace) -> Address:
-    """Where the page is served, and with which token and certificate."""
+    """Return the address of the page, with its token and certificate."""
     from warp_ar.viewer.address import EVERYWHERE, LOOPBACK, Address, load_context, make_context, own_address
-    from warp_ar.viewer.routes import check_origin
+    from warp_ar.viewer.server import check_origin
 
     known = options.token is not None or options.host in LOOPBACK
     tls = None
@@ -70,15 +71,14 @@ def _page_address(options: argparse.Namespace) -> Address:
 
 
 def _make_page_host(options: argparse.Namespace, scene: Scene, **callbacks: Any) -> Any:
-    """The host of a page that is served already, on its own thread: it loads Warp and all that uses it."""
-    with loading():
-        from warp_ar.device import bound_arenas
+    """Return the host of a page that is served already, on its own thread: it loads Warp and all that uses it."""
+    from warp_ar.device import bound_arenas
 
-        start_device(options.device)
-        from warp_ar.viewer.host import Host
+    start_device(options.device)
+    from warp_ar.viewer.host import Host
 
-        bound_arenas()
-    # What is imported stays: looking through it for garbage would hold up a frame for a tenth of a second.
+    bound_arenas()
+    # Imports stay: looking through them for garbage would hold up a frame for a tenth of a second.
     gc.collect()
     gc.freeze()
     host = Host(
@@ -110,25 +110,32 @@ def serve_page(options: argparse.Namespace) -> int:
     """Serve the page until Ctrl-C, or until ``--frames`` have been lit."""
     # Here, for what only writes files should not wait for a web server to load.
     with importing():
+        import segno
+
         from warp_ar.viewer.address import LOOPBACK
         from warp_ar.viewer.server import Server
 
     scene = _page_scene(options)
     address = _page_address(options)
     # Beside the page, which does not wait for it.
-    threading.Thread(target=say_quick_check, args=(options, scene), daemon=True).start()
+    checking = threading.Thread(target=say_quick_check, args=(options, scene), daemon=True)
+    checking.start()
 
     def ready(address: Address) -> None:
         print(f"warp_ar: {printable(scene.name)} is at {address.url} (Ctrl-C ends it)", flush=True)
         if (outside := address.outside_url) is not None:
             print(f"warp_ar: from other machines, {outside}", flush=True)
+            if sys.stdout.isatty():  # for a phone's camera
+                segno.make_qr(outside).terminal(compact=True)
         if not options.no_browser and options.host in LOOPBACK and _has_display():
             webbrowser.open(address.url)
 
     # A shell that starts this in the background has it ignore the signal; here it is the only way to end.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     server = Server(functools.partial(_make_page_host, options, scene), address)
-    code = EXIT_DONE
+    code, before = EXIT_DONE, tempfile.tempdir
+    # All temporary folders of this run, Warp's own for each thread that compiles among them.
+    tempfile.tempdir = folder = tempfile.mkdtemp(prefix="warp_ar_page_")
     try:
         asyncio.run(server.serve(ready, tries=PORT_TRIES if options.port is None else 1))
     except KeyboardInterrupt as error:
@@ -139,14 +146,15 @@ def serve_page(options: argparse.Namespace) -> int:
         say(error)
         code = EXIT_USAGE
     finally:
+        tempfile.tempdir = before
+        shutil.rmtree(folder, ignore_errors=True)
         gc.unfreeze()  # whoever called goes on with a collector that sees all
-    if not server.ended or code in (EXIT_INTERRUPTED, EXIT_TERMINATED):
-        # A frame of the reference, or a kernel that is compiled, takes many seconds and cannot be stopped, and Python
-        # would wait for its thread, or end it within native code, which aborts. All files are closed by now,
-        # and temporary folders gone, but for those in which Warp keeps parsed headers for each thread that compiles.
-        for folder in [one for one in gc.get_objects() if type(one) is tempfile.TemporaryDirectory]:
-            with contextlib.suppress(OSError):
-                folder.cleanup()
+    interrupted = code in (EXIT_INTERRUPTED, EXIT_TERMINATED)
+    checking.join(0.0 if interrupted else CHECKING_S)
+    if not server.ended or interrupted or checking.is_alive():
+        # A frame of the reference, a kernel that is compiled, or the check of the scene takes seconds and cannot be
+        # stopped, and Python would wait for its thread, or end it within native code, which aborts. All files are
+        # closed by now, and temporary folders gone.
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)
@@ -154,5 +162,5 @@ def serve_page(options: argparse.Namespace) -> int:
 
 
 def _has_display() -> bool:
-    """Whether a browser can open a window here."""
+    """Return True if a browser can open a window here."""
     return sys.platform in ("win32", "darwin") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

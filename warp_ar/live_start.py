@@ -1,4 +1,4 @@
-"""What pictures on a page and frames in files begin with: a quick check of the set-up, and the device."""
+"""Start of a page and of a run to files: a quick check of the set-up, and the device."""
 
 from __future__ import annotations
 
@@ -7,35 +7,34 @@ from typing import Final
 
 from warp_ar.errors import WarpArError, say
 from warp_ar.scene import Scene, bundled_scenes
-from warp_ar.scene.scene_files import files_of
 
 ALWAYS: Final = ("camera.guessed", "object.outside")
 """Findings that are said beside the worst."""
 
 
-def say_quick_check(options: argparse.Namespace, scene: Scene) -> bool:
+def say_quick_check(options: argparse.Namespace, scene: Scene) -> tuple[bool, str]:
     """Say in one line each what is guessed, what lies outside the picture, and the worst of what else is wrong.
 
     Frames of a capture device are left to the run itself: a device is not opened twice.
 
     Returns:
-        Whether a mirror ball was seen where the scene has one.
+        True if a mirror ball was seen where the scene has one, and the worst finding in words.
     """
-    from warp_ar.checks.quick_check import quick_check
+    from warp_ar.checks.checkup import quick_check
 
     try:
-        checked = quick_check(scene, options.source, files_of(scene))
+        findings, ball_seen = quick_check(scene, options.source)
     except WarpArError:
-        return False  # the run meets it too, and says it
+        return False, ""  # the run meets it too, and says it
     # What the run itself cannot start with, it says itself.
     told = ("source.", "camera.aspect")
-    found = [finding for finding in checked.findings if not finding.name.startswith(told)]
+    found = [finding for finding in findings if not finding.name.startswith(told)]
     worst = [finding for finding in found if finding.name not in ALWAYS][:1]
     for finding in [*worst, *(finding for finding in found if finding.name in ALWAYS)]:
         more = f"; all there is to say: python -m warp_ar.doctor {options.scene}" if finding in worst else ""
         own = None if scene.path in bundled_scenes().values() else options.scene
         say(f"{finding.text}; to do: {finding.remedy_for(own)}{more}")
-    return checked.ball_seen
+    return ball_seen, next((finding.text for finding in [*worst, *found]), "")
 
 
 def start_device(name: str) -> None:

@@ -20,15 +20,14 @@ from typing import Any
 import numpy.typing as npt
 from PIL import Image
 from rich.console import Console
-from rich.table import Table
+from rich.progress import track
 
 from warp_ar.accuracy.charts import require_plots, stand_alone
-from warp_ar.accuracy.progress import WorkProgress
-from warp_ar.accuracy.report import MIN_COLUMNS
-from warp_ar.command_line import EXIT_DONE, Parser, run_command
+from warp_ar.accuracy.report import MIN_COLUMNS, print_table
+from warp_ar.command_line import EXIT_DONE, Parser, count, run_command
 from warp_ar.device import resolve_device
 from warp_ar.errors import SceneError, SinkError, SourceError, UsageError
-from warp_ar.output.own_files import OwnFiles
+from warp_ar.output.places import OwnFiles
 from warp_ar.signature import COMMENT, software_exif
 
 try:
@@ -46,15 +45,13 @@ PAGE = "figures.md"
 
 def make_parser() -> argparse.ArgumentParser:
     """The command's options."""
-    parser = Parser(prog="python -m warp_ar.paper", description="The paper's figures, made again beside ours.")
+    parser = Parser(prog="python -m warp_ar.paper", description="Make the paper's figures again, beside ours.")
     add = parser.add_argument
     names = ", ".join(map(str, FIGURES))
     add("figures", nargs="*", metavar="FIGURE", help=f"{names} or {READINGS} (default: all)")
-    add("--frames", type=int, default=12, metavar="N", help="frames per run, the last is shown (default: 12)")
-    add("--shrink", type=int, default=1, metavar="N", help="frames at an Nth of their width and height (default: 1)")
-    add("--device", default="auto", metavar="auto|cpu|cuda:0", help="where the kernels run (default: auto)")
-    add("--out", type=Path, metavar="DIR", help="write figureN.webp, figureN.svg and figures.md here")
-    add("--overwrite", action="store_true", help="also replace files that this program did not write")
+    add("--frames", type=count, default=12, metavar="N", help="frames per run, the last is shown (default: 12)")
+    parser.add_common("--shrink", "--device", "--overwrite")
+    add("--out", type=Path, metavar="DIR", help="folder of figureN.webp, figureN.svg and figures.md")
     return parser
 
 
@@ -75,22 +72,6 @@ def as_markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A table in Markdown."""
     lines = [head, ["---", *["--:"] * (len(head) - 1)], *rows]
     return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
-
-
-def print_table(console: Console, title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """A table in the terminal."""
-    table = Table(title=title)
-    for index, column in enumerate(head):
-        table.add_column(column, justify="left" if index == 0 else "right")
-    for row in rows:
-        table.add_row(*row)
-    console.print(table)
-
-
-def open_out(options: argparse.Namespace, figures: Sequence[str]) -> OwnFiles:
-    """The folder that is written to, looked at before anything is made."""
-    made = [f"figure{name}{ending}" for name in figures if name != READINGS for ending in ENDINGS]
-    return OwnFiles(options.out, [*made, PAGE], overwrite=options.overwrite)
 
 
 def encode_webp(picture: npt.NDArray[Any]) -> bytes:
@@ -114,9 +95,9 @@ def write_figure(figure: PaperFigure, out: OwnFiles, folder: str) -> str:
     return "\n\n".join(parts)
 
 
-def reading_rows(context: Context, progress: WorkProgress) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+def reading_rows(context: Context) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     """The table of readings."""
-    found = compare_readings(context, advance=lambda text: progress.advance(text, 0.3))
+    found = compare_readings(context)
     head = ("section", "open", "reading", *(f"`{scene}`" for scene in READING_SCENES))
     rows = [
         (
@@ -137,30 +118,24 @@ def make_all(options: argparse.Namespace) -> int:
         UsageError: An option makes no sense, or a library is missing.
     """
     names = asked_figures(options.figures)
-    if options.frames < 1:
-        raise UsageError(f"--frames {options.frames}: expected 1 or more")
-    if options.shrink < 1:
-        raise UsageError(f"--shrink {options.shrink}: expected 1 or more")
     require_plots()
     context = Context(str(resolve_device(options.device)), options.frames, options.shrink)
     console = Console()
     console.width = max(console.width, MIN_COLUMNS)
-    out = None if options.out is None else open_out(options, names)
+    made = [f"figure{name}{ending}" for name in names if name != READINGS for ending in ENDINGS]
+    out = None if options.out is None else OwnFiles(options.out, [*made, PAGE], overwrite=options.overwrite)
     sections = []
-    units = sum(5.0 if name == READINGS else 1.0 for name in names)
-    with WorkProgress(console, units) as progress:
-        for name in names:
-            if name == READINGS:
-                head, rows = reading_rows(context, progress)
-                title = "Readings of the open text"
-                print_table(console, f"{title}: FLIP of the preset paper to the truth", head, rows)
-                sections.append(f"## {title}\n\n{as_markdown(head, rows)}")
-                continue
-            figure = FIGURES[int(name)](context)
-            progress.advance(f"figure {name}", 1.0)
-            print_table(console, f"Figure {name}: {figure.title}", figure.head, figure.rows)
-            if out is not None:
-                sections.append(write_figure(figure, out, options.out.name))
+    for name in track(names, "figures", console=console):
+        if name == READINGS:
+            head, rows = reading_rows(context)
+            title = "Readings of the open text"
+            print_table(console, f"{title}: FLIP of the preset paper to the truth", head, rows)
+            sections.append(f"## {title}\n\n{as_markdown(head, rows)}")
+            continue
+        figure = FIGURES[int(name)](context)
+        print_table(console, f"Figure {name}: {figure.title}", figure.head, figure.rows)
+        if out is not None:
+            sections.append(write_figure(figure, out, options.out.name))
     if out is not None:
         out.write(PAGE, "\n\n".join([COMMENT, *sections]) + "\n")
         console.print(f"written to {options.out}", highlight=False)

@@ -13,17 +13,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from warp_ar.ball.ball_finder import BallOutline, far_camera, find_ball, sphere_of_circle
+from warp_ar.ball.ball_finder import BallOutline, exact_outline, far_camera, find_ball, sphere_of_circle
 from warp_ar.calibration.response import write_response
 from warp_ar.checks.check_ball import DULL, disc_contrast
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import UsageError
+from warp_ar.kernels.color import decode_table
 from warp_ar.kernels.recovery.recover_cells import cell_shape
-from warp_ar.light.captured import Light, find_emitters, texel_solid_angles
-from warp_ar.light.least_missing import least_missing
-from warp_ar.photographs.bracket import MOVED, Aligned, Circle, agree_exposures, align, thin_exposures
+from warp_ar.light.captured import Light, find_emitters, irradiance_above, texel_solid_angles
+from warp_ar.light.priors import least_missing
+from warp_ar.photographs.bracket import Aligned, Circle, agree_exposures, align, thin_exposures
 from warp_ar.photographs.photographs import Photograph, exposures_by_exif, exposures_by_name, read_photograph
 from warp_ar.photographs.support import Support
+from warp_ar.photographs.table_seen import WHITEST, Table
 from warp_ar.scene import Camera, Pose, Probe, Scene
 from warp_ar.scene.exif import FULL_FRAME_DIAGONAL
 from warp_ar.scene.pose_file import pose_of_position
@@ -32,17 +34,24 @@ from warp_ar.stages.quality import PRESETS
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 Image = NDArray[np.uint8]
+RGB = tuple[float, float, float]
 
 PIXELS: Final = "pixels"
 """In the place of exposures: what the pictures themselves tell."""
-HEIGHT = 128
-"""Rows of the environment."""
+HEIGHTS = 128, 2048
+"""Rows of the environment, at least and at most, where they follow the ball."""
 WINDOW = 1.25
 """Half side, in radii, of the part of a photograph that is unwrapped."""
 NEAR = 0.08
 """Share of the radius by which the ball lies elsewhere in another photograph of a bracket, at most."""
+SHIFTED = 0.05
+"""Share of the radius from which on a photograph's shift is doubted."""
 BRACKET_ERROR = 0.05
 """Relative error of merged radiance: what a response that was estimated or assumed leaves."""
+GUESS = 0.85
+"""Reflectance of a ball that nothing tells: a silvered ornament's."""
+LEAST_CLIPPED = 0.05
+"""Share of the irradiance that must clip for light that is lacking to be looked for there."""
 SEEN = 0.25
 """Mean confidence from which a part of the map was seen."""
 LEAST_SAID = 0.005
@@ -66,21 +75,24 @@ class Capture:
     support: Support | None
     """The plane that the ball stands on, where it was asked for."""
     notes: tuple[str, ...]
-    """What a user should know, a line each."""
+    """Notes for the user, a line each."""
+    response: Array | None = None
+    """Linear value of each code, (256, 3), where it was estimated from the bracket."""
 
 
 def capture_light(
     paths: Sequence[str | Path],
     *,
     ball: Sequence[float] | None = None,
+    circle: Sequence[float] | None = None,
     exposures: Sequence[float] | Literal["pixels"] | None = None,
     shown: int | None = None,
     transfer: str = "srgb",
     focal_35mm: float | None = None,
     support: Callable[[BallOutline, Camera], Support] | None = None,
-    reflectance: float = 0.85,
+    reflectance: float | None = None,
     device: str = "auto",
-    height: int = HEIGHT,
+    height: int | None = None,
     raises: bool = True,
 ) -> Capture:
     """Capture the light that a mirror ball shows in one photograph or a bracket of them.
@@ -89,15 +101,16 @@ def capture_light(
         paths: Photographs of the ball, from one place, at one or more exposures.
         ball: Column, row and radius in pixels of a rough circle around the ball in the shown photograph; None: look
             for it.
+        circle: The same of a circle that is exact, in the place of a rough one.
         exposures: Seconds of each photograph, instead of what EXIF or names say; ``pixels``: by the pictures alone,
             under ``transfer``.
         shown: Which photograph's camera values the light is in; None: the one whose ball is best exposed.
         transfer: Response that is tried first.
         focal_35mm: Focal length for a full frame in millimetres, of the picture as it is; None: by EXIF.
         support: Finds the plane that the ball stands on, whose axes the light then has; None: a level camera's.
-        reflectance: Of the ball.
+        reflectance: Of the ball; None: by what it mirrors of the support's plane, else ``GUESS``.
         device: ``auto``, ``cpu`` or ``cuda:N``.
-        height: Rows of the map.
+        height: Rows of the map; None: as many as the ball's pixels tell.
         raises: Whether what clips in a single photograph is raised by what nearly every place lacks
             (``light/least_missing.py``).
 
@@ -114,7 +127,10 @@ def capture_light(
         raise UsageError(f"shown = {shown}: expected the number of a photograph, 0 to {len(photos) - 1}")
     reference = photos[shown] if shown is not None else photos[_best_exposed(photos)]
     camera, notes = _camera_of(reference, transfer, focal_35mm)
-    outline, taken_from = _find_outline(photos, reference, camera, ball)
+    if circle is None:
+        outline, taken_from = _find_outline(photos, reference, camera, ball)
+    else:
+        outline, taken_from = exact_outline(reference.image, camera, circle), None
     bracket = _merge_plan(photos, reference, outline, transfer, exposures)
     notes += [*bracket.notes, _describe_outline(outline)]
     if taken_from is not None:
@@ -124,8 +140,8 @@ def capture_light(
         )
     if outline.is_doubtful:
         notes.append(
-            "this outline is doubtful: look at it (--outline FILE draws it), and give a rough circle (--ball) if it is "
-            "wrong"
+            "this outline is doubtful: look at its picture; if it is wrong, give a rough circle (--ball) or an exact "
+            "one (--circle)"
         )
     if disc_contrast(reference.image, (*outline.center, outline.radius)) < DULL:
         notes.append("where the ball is found, the picture is flat: is a ball there, uncovered and polished?")
@@ -134,9 +150,42 @@ def capture_light(
     if found is not None:
         turn = found.pose.rotation
         notes.append(f"the support's normal is known within {found.tilt_deviation:.1f} degrees")
-    light, more = _unwrap(bracket, reference, camera, outline, turn, reflectance, device, height, raises)
+    table = None
+    if found is not None:
+        codes = decode_table(transfer) if bracket.curve is None else bracket.curve.astype(np.float32)
+        table = Table.under(outline, reference.image, camera, found, codes)
+    mirrored, note = _ball_reflectance(table, reflectance)
+    notes.append(note)
+    maps = _unwrap(bracket, reference, camera, outline, turn, mirrored, device, height or _rows_of(outline.radius))
+    light, more = _make_light(maps, bracket, table, raises)
     light = dataclasses.replace(light, exposure=reference.info.exposure)
-    return Capture(light, outline, reference.path, camera, reference.image, found, (*notes, *more))
+    notes += [*maps.notes, *more]
+    return Capture(light, outline, reference.path, camera, reference.image, found, tuple(notes), bracket.curve)
+
+
+def _rows_of(radius: float) -> int:
+    """Return the rows of a map as fine as a ball of so many pixels: at its middle one of them mirrors 2 / radius."""
+    rows = 1 << math.floor(math.log2(0.5 * math.pi * radius))
+    return min(max(rows, HEIGHTS[0]), HEIGHTS[1])
+
+
+def _ball_reflectance(table: Table | None, given: float | None) -> tuple[RGB, str]:
+    """Return what the ball reflects, and what is to be said of it."""
+    told = None if table is None else table.reflectance_of_ball()
+    if told is None and given is None:
+        how = "give --reflectance" + ", --contact or --rectangle" * (table is None)
+        return (GUESS,) * 3, f"the ball is taken to reflect {GUESS:g} of its light; all light is off by as much: {how}"
+    looks = ""
+    if told is not None:
+        middle = float(np.mean(told.reflectance))
+        low, high = (middle * math.exp(sign * 2.0 * told.deviation) for sign in (-1.0, 1.0))
+        seen = f"{middle:.2f} ({low:.2f} to {min(high, 1.0):.2f}) of its light, by the table that it mirrors"
+        if given is None:
+            red, green, blue = (min(value, 1.0) for value in told.reflectance)
+            return (red, green, blue), f"the ball reflects {seen}"
+        looks = "" if low <= given <= high else f"; it looks like {seen}"
+    assert given is not None
+    return (given,) * 3, f"the ball reflects {given:g}, as was given{looks}"
 
 
 def _best_exposed(photos: Sequence[Photograph]) -> int:
@@ -199,7 +248,7 @@ def _find_outline(
 
 
 def _same_place(circle: Circle, of: Image, other: Image) -> Circle:
-    """Where a ball is in a picture of another size: cut differently around it, at about the same share."""
+    """Return the place of a ball in a picture of another size: cut differently around it, at about the same share."""
     sy, sx = other.shape[0] / of.shape[0], other.shape[1] / of.shape[1]
     return (circle[0] + 0.5) * sx - 0.5, (circle[1] + 0.5) * sy - 0.5, circle[2] * math.sqrt(sx * sy)
 
@@ -230,29 +279,32 @@ def _merge_plan(
     transfer: str,
     given: Sequence[float] | Literal["pixels"] | None,
 ) -> _Bracket:
-    """Which photographs to merge, where the ball is in them, and their exposures."""
+    """Return the photographs to merge, the place of the ball in them, and their exposures."""
     circle = (*outline.center, outline.radius)
     if len(photos) == 1:
-        return _Bracket((reference,), (circle,), (1.0,), None, ())
+        note = f"one photograph tells no response: {transfer} is taken; by a phone's, darks may be 3 times darker"
+        return _Bracket((reference,), (circle,), (1.0,), None, (note,))
     claims: dict[str, Sequence[float] | None] = {"given": None, "exif": None, "names": None}
     if not isinstance(given, str):
         claims = {"given": given, "exif": exposures_by_exif(photos), "names": exposures_by_name(photos)}
+    told = [photo.info.exposure is not None for photo in photos]
+    untold = [photo for photo, tells in zip(photos, told, strict=True) if any(told) and not tells]
     # Brightness tells the order even where claims contradict each other.
     order = sorted(range(len(photos)), key=lambda k: -float(photos[k].image[::8, ::8].mean()))
     chosen = [photos[k] for k in order]
     known = next((claim for claim in claims.values() if claim is not None), None)
     times = None if known is None else [known[k] for k in order]
-    aligned = _align_all(chosen, chosen.index(reference), circle, times)
-    moved = [k for k, c in enumerate(aligned.correlation) if math.isfinite(c) and c < MOVED]
-    notes = [
-        f"{chosen[k].name} is left out: it shows something else ({aligned.correlation[k]:.0%} alike)" for k in moved
-    ]
-    notes += _shift_notes(chosen, aligned, circle)
-    stay = [k for k in range(len(chosen)) if k not in moved]
+    rough = [_same_place(circle, reference.image, photo.image) for photo in chosen]
+    aligned = align([photo.image for photo in chosen], rough, times, chosen.index(reference))
+    notes = [f"{photo.name} is left out: {why}" for photo, why in zip(chosen, aligned.strangers, strict=True) if why]
+    notes += [f"{photo.name} tells no exposure, so none is taken from EXIF" for photo in untold]
+    notes += _shift_notes(chosen, aligned, rough, outline.radius)
+    stay = [k for k, why in enumerate(aligned.strangers) if not why]
     picked = {name: None if claim is None else [claim[order[k]] for k in stay] for name, claim in claims.items()}
     agreed = agree_exposures(
-        [aligned.patches[k] for k in stay], transfer, picked["exif"], picked["names"], picked["given"]
-    )
+        [aligned.patches[k] for k in stay], transfer, picked["exif"], picked["names"], picked["given"],
+        [chosen[k].name for k in stay],
+    )  # fmt: skip
     first = [chosen[k] for k in stay].index(reference)
     kept, more = thin_exposures(agreed.ratios, first, [chosen[k].name for k in stay])
     return _Bracket(
@@ -264,29 +316,29 @@ def _merge_plan(
     )
 
 
-def _align_all(photos: Sequence[Photograph], reference: int, circle: Circle, times: Sequence[float] | None) -> Aligned:
-    """Align outward from the reference, to both sides."""
-    shown = photos[reference].image
-
-    def one_way(part: slice) -> Aligned:
-        own = [photo.image for photo in photos[part]]
-        return align(own, [_same_place(circle, shown, image) for image in own], times and times[part])
-
-    down, up = one_way(slice(reference, None)), one_way(slice(reference, None, -1))
-    return Aligned(
-        up.circles[:0:-1] + down.circles, up.patches[:0:-1] + down.patches, up.correlation[:0:-1] + down.correlation
-    )
-
-
-def _shift_notes(photos: Sequence[Photograph], aligned: Aligned, circle: Circle) -> list[str]:
-    shape = next(photo.image.shape for photo, found in zip(photos, aligned.circles, strict=True) if found == circle)
+def _shift_notes(photos: Sequence[Photograph], aligned: Aligned, rough: Sequence[Circle], radius: float) -> list[str]:
     shifts = [
-        math.hypot(found[0] - circle[0], found[1] - circle[1])
-        for photo, found in zip(photos, aligned.circles, strict=True)
-        if photo.image.shape == shape
+        0.0 if why else math.hypot(found[0] - start[0], found[1] - start[1])
+        for found, start, why in zip(aligned.circles, rough, aligned.strangers, strict=True)
     ]
-    most = max(shifts, default=0.0)
-    return [f"photographs lie up to {most:.1f} pixels apart at the ball; they were aligned"] if most > 0.5 else []
+    most = max(shifts)
+    name = photos[shifts.index(most)].name
+    doubt = f": the camera was moved, which shifts near things; leave {name} out" if most > SHIFTED * radius else ""
+    return [f"{name} lies {most:.1f} pixels apart at the ball; it was aligned{doubt}"] if most > 0.5 else []
+
+
+@dataclasses.dataclass(frozen=True)
+class _Maps:
+    """Merged map of all photographs."""
+
+    radiance: Map
+    """(height, 2 height, 3), in camera values."""
+    confidence: Map
+    """(height, 2 height)."""
+    clipped: Map
+    """Share that clips in every exposure, of the radiance's shape."""
+    notes: tuple[str, ...]
+    """Notes for the user."""
 
 
 def _unwrap(
@@ -295,11 +347,10 @@ def _unwrap(
     camera: Camera,
     outline: BallOutline,
     turn: Array,
-    reflectance: float,
+    reflectance: RGB,
     device: str,
     height: int,
-    raises: bool,
-) -> tuple[Light, list[str]]:
+) -> _Maps:
     """The merged map of all photographs, by the pipeline that lights frames."""
     index = bracket.photos.index(reference)
     own = bracket.circles[index]
@@ -315,7 +366,7 @@ def _unwrap(
             window = dataclasses.replace(window, transfer=response)
         scene = Scene(
             camera=window,
-            probes=(Probe((0.0, 0.0, 0.0), 1.0, (reflectance,) * 3),),
+            probes=(Probe((0.0, 0.0, 0.0), 1.0, reflectance),),
             has_marker=False,
             name=reference.name,
         )
@@ -339,25 +390,48 @@ def _unwrap(
         assert radiance is not None
         confidence = np.array(pipeline.arrays["environment_confidence"].numpy())
         clipped = np.array(pipeline.arrays["environment_clipped"].numpy())
-        left_out = pipeline.bracket.notes
-    captured = np.array(radiance)
-    if raises and len(times) == 1:
-        radiance = _raised(captured, confidence, clipped)
-    area = texel_solid_angles(height)
-    whole = float((radiance * area[..., None]).sum())
-    share = float((radiance * clipped * area[..., None]).sum() / max(whole, 1e-12))
-    notes = list(left_out)
+        return _Maps(np.array(radiance), confidence, clipped, tuple(pipeline.bracket.notes))
+
+
+def _make_light(maps: _Maps, bracket: _Bracket, table: Table | None, raises: bool) -> tuple[Light, list[str]]:
+    """Return the light of a map, with what clips raised as far as that is known, and what is to be said of it."""
+    single, radiance, clipped = len(bracket.photos) == 1, maps.radiance, maps.clipped
+    if raises and single:
+        radiance = _raised(radiance, maps.confidence, clipped)
+    area = texel_solid_angles(len(radiance))[..., None]
+    whole = float((radiance * area).sum())
+    share = float((radiance * clipped * area).sum() / max(whole, 1e-12))
+    notes = []
     if share > 0.0:
-        what = "the shortest exposure" if len(times) > 1 else "the photograph"
+        what = "the photograph" if single else "the shortest exposure"
         notes.append(f"{what} still clips: {share:.1%} of the light is a lower bound")
-    more = whole / max(float((captured * area[..., None]).sum()), 1e-12) - 1.0
+    more = whole / max(float((maps.radiance * area).sum()), 1e-12) - 1.0
     if more > LEAST_SAID:
         notes.append(
             f"what clips was raised, which makes {more:.0%} more light: nearly every place has as much; a shorter "
             "photograph beside this one measures it (--as-clipped leaves it out)"
         )
-    emitters = find_emitters(radiance, clipped, BRACKET_ERROR, captured)
-    return Light(radiance, confidence, emitters, 1.0, None, share), notes
+    if table is not None:
+        radiance, said = _bounded(radiance, clipped, table, raises)
+        notes += said
+    emitters = find_emitters(radiance, clipped, BRACKET_ERROR, maps.radiance)
+    return Light(radiance, maps.confidence, emitters, 1.0, None, share), notes
+
+
+def _bounded(radiance: Map, clipped: Map, table: Table, raises: bool) -> tuple[Map, list[str]]:
+    """Return a map that is bright enough for the table to be no whiter than ``WHITEST``, and what is to be said."""
+    whole, bounds = irradiance_above(radiance), irradiance_above(radiance * clipped).mean()
+    lacking = table.reflectance_under(whole) / WHITEST
+    if lacking <= 1.0:
+        return radiance, []
+    note = f"the table would reflect {WHITEST * lacking:.2f} of this light, and none reflects more than {WHITEST}"
+    if not raises:
+        return radiance, [f"{note}: the light is too low"]
+    if bounds < LEAST_CLIPPED * whole.mean():
+        return lacking * radiance, [f"{note}: all light was raised {lacking:.2f} times; what does --reflectance say?"]
+    grow = float((lacking - 1.0) * whole.mean() / bounds)
+    raised = np.asarray(radiance * (1.0 + grow * clipped), np.float32)
+    return raised, [f"{note}: what clips was raised {1.0 + grow:.2f} times"]
 
 
 def _raised(radiance: Map, confidence: Map, clipped: Map) -> Map:

@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import os
 import struct
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 import PIL.Image
-from PIL import ImageCms
+from PIL import BmpImagePlugin, ExifTags, GifImagePlugin, ImageCms, PpmImagePlugin, WebPImagePlugin
 
 from warp_ar.errors import WarpArError, reason
-from warp_ar.files import limits, read_bytes, too_much
+from warp_ar.files import check_size, read_bytes
+from warp_ar.signals import ADOBE_RGB, REC_709, Chromaticities, are_primaries, converted
+from warp_ar.srgb import encode_srgb
 
 FORMATS = "PNG, JPEG, BMP, TIFF, WebP, GIF or PNM"
-"""What is read: the formats whose headers are known here."""
+"""Formats that are read: those whose headers are known here."""
 
 RAW = frozenset({".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"})
 """Raw photographs, by their names' endings."""
@@ -28,6 +31,11 @@ HEIF = frozenset({".heic", ".heif", ".hif", ".avif"})
 _BRANDS = (b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1", b"avif")
 
 Size = tuple[int, int]
+
+_HEAD = 1 << 16
+"""Bytes within which a photograph has its EXIF."""
+_SAME_GAMMA = 0.02
+"""Share by which a gamma may differ from sRGB's 1/2.2 and is taken for it."""
 
 # OpenCV 5.0 leaves TIFFs of more than 8 bits undecoded, or their channels in the other order, where it is to give RGB.
 _TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
@@ -55,12 +63,10 @@ def picture_size(data: bytes) -> Size | None:
 
     Of a TIFF the larger of the picture and its tiles, which is what its reader makes room for.
     """
-    for start, read in _READERS:
+    for start, read in _READERS.items():
         if data.startswith(start):
-            try:
+            with contextlib.suppress(struct.error, IndexError, ValueError, OSError, SyntaxError, EOFError):
                 return read(data)
-            except (struct.error, IndexError, ValueError):
-                return None
     return None
 
 
@@ -75,6 +81,10 @@ def read_picture(
 def decode_picture(data: bytes, flags: int, error: type[WarpArError], label: str) -> npt.NDArray[Any]:
     """Decode a picture.
 
+    Follows:
+        8 and 16 bits; TIFF: floats, planes; EXIF: orientation, Adobe RGB; ICC profiles: RGB, grey (16 bits: to one code
+        of 8); PNG: gamma, chromaticities.
+
     Args:
         data: The whole file.
         flags: OpenCV's for ``imdecode``.
@@ -85,7 +95,7 @@ def decode_picture(data: bytes, flags: int, error: type[WarpArError], label: str
         OpenCV's array: (height, width) or (height, width, channels).
 
     Raises:
-        WarpArError: As ``error``: it is empty, cut off, damaged, of another format or too large.
+        WarpArError: As ``error``: damaged.
     """
     check_picture(data, error, label)
     asked = flags
@@ -111,41 +121,69 @@ def _in_color(picture: npt.NDArray[Any], data: bytes, flags: int) -> npt.NDArray
     """Return a picture that is asked for in RGB in sRGB, by the ICC profile of its file."""
     if not flags & cv2.IMREAD_COLOR_RGB or flags < 0 or picture.ndim != 3 or picture.dtype.kind != "u":
         return picture
-    return srgb_by_profile(picture, icc_profile(data))
+    return in_srgb(picture, data)
 
 
-def icc_profile(data: bytes) -> bytes:
-    """Return the ICC profile that a picture file carries; empty if none."""
+def in_srgb(picture: npt.NDArray[Any], data: bytes) -> npt.NDArray[Any]:
+    """Return a picture in sRGB, by what its file says of its codes.
+
+    That is an ICC profile; else EXIF's mark of Adobe RGB, R03, which cameras write without a profile; else a PNG's
+    gamma and chromaticities. Without any it is sRGB already.
+
+    Args:
+        picture: RGB, (height, width, 3), uint8 or uint16.
+        data: The file.
+    """
     try:
         with PIL.Image.open(io.BytesIO(data)) as header:
-            return header.info.get("icc_profile") or b""
+            said = header.info
+            adobe = b"R03\0" in data[:_HEAD] and header.getexif().get_ifd(ExifTags.IFD.Interop).get(1) == "R03"
     except (OSError, ValueError, SyntaxError, PIL.Image.DecompressionBombError, struct.error):
-        return b""
+        return picture
+    if profile := said.get("icc_profile"):
+        return srgb_by_profile(picture, profile)
+    if adobe:
+        return _srgb_of(picture, 563 / 256, ADOBE_RGB)
+    gamma, primaries = said.get("gamma"), tuple(said.get("chromaticity", ()))
+    if gamma is None or "srgb" in said or abs(gamma * 2.2 - 1.0) < _SAME_GAMMA:
+        return picture
+    primaries = (*primaries[2:], *primaries[:2])  # a PNG names white first
+    known = len(primaries) == 8 and are_primaries(primaries)
+    return _srgb_of(picture, 1.0 / gamma if gamma > 0.0 else 1.0, primaries if known else REC_709)
+
+
+def _srgb_of(picture: npt.NDArray[Any], gamma: float, primaries: Chromaticities) -> npt.NDArray[Any]:
+    """Return codes of sRGB of those whose power ``gamma`` is light of other primaries."""
+    most = float(np.iinfo(picture.dtype).max)
+    light = (np.arange(most + 1) / most) ** gamma
+    shown = encode_srgb(np.clip(converted(light.astype(np.float32)[picture], primaries, REC_709), 0.0, 1.0))
+    return np.asarray(np.round(most * shown), dtype=picture.dtype)
 
 
 def srgb_by_profile(picture: npt.NDArray[Any], profile: bytes) -> npt.NDArray[Any]:
     """Return the codes of sRGB of a picture whose codes an ICC profile explains.
 
-    Profiles of sRGB itself, of other spaces than RGB (OpenCV has converted those), and damaged ones change nothing.
+    Profiles of sRGB itself, of other spaces than RGB and grey (OpenCV has converted those), and damaged ones change
+    nothing.
     Codes of 16 bits are converted by their upper 8, to within one code of 8 bits.
 
     Args:
         picture: RGB, (height, width, 3), uint8 or uint16.
-        profile: The file's; empty: none.
+        profile: The file's.
     """
-    if not profile or picture.shape[2] != 3:
-        return picture
     try:
         source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
         name = ImageCms.getProfileDescription(source)
-        if source.profile.xcolor_space.strip() != "RGB" or "sRGB" in name:
+        kind = {"RGB": "RGB", "GRAY": "L"}.get(source.profile.xcolor_space.strip())
+        if kind is None or "sRGB" in name:
             return picture
-        way = ImageCms.buildTransform(source, ImageCms.createProfile("sRGB"), "RGB", "RGB")
+        way = ImageCms.buildTransform(source, ImageCms.createProfile("sRGB"), kind, "RGB")
     except (ImageCms.PyCMSError, OSError, ValueError):
         return picture
     deep = picture.dtype == np.uint16
     codes = (picture >> 8).astype(np.uint8) if deep else picture
-    image = ImageCms.applyTransform(PIL.Image.fromarray(np.ascontiguousarray(codes)), way)
+    shown = codes if kind == "RGB" else codes[..., 0]
+    image = ImageCms.applyTransform(PIL.Image.fromarray(np.ascontiguousarray(shown)), way)
     converted = np.array(image, np.uint8)
     if not deep:
         return converted
@@ -200,11 +238,7 @@ def check_picture(data: bytes, error: type[WarpArError], label: str) -> None:
         raise error(f"{label} is {words}")
     if size is None:
         raise error(f"{label} cannot be decoded: damaged, cut off, or no image; use {FORMATS}")
-    width, height = size
-    if width < 1 or height < 1:
-        raise error(f"{label} cannot be decoded: its header promises {width}x{height} pixels")
-    if width * height > limits().picture_pixels:
-        raise error(too_much(f"{label} is {width}x{height}: it", width * height, "pixels", "picture_pixels"))
+    check_size(*size, error, label)
 
 
 def _png(data: bytes) -> Size:
@@ -241,14 +275,6 @@ def _jpeg(data: bytes) -> Size | None:
     return None
 
 
-def _bmp(data: bytes) -> Size:
-    if struct.unpack_from("<I", data, 14)[0] == 12:
-        width, height = struct.unpack_from("<HH", data, 18)
-    else:
-        width, height = struct.unpack_from("<ii", data, 18)
-    return abs(width), abs(height)
-
-
 def _tiff_tags(data: bytes) -> dict[int, int]:
     """Return the first value of those tags of a TIFF's first picture that are whole numbers."""
     order = "<" if data[:2] == b"II" else ">"
@@ -276,47 +302,22 @@ def _tiff(data: bytes) -> Size | None:
     return max(tags[256], tags.get(322, 0)), max(tags[257], tags.get(323, 0))
 
 
-def _webp(data: bytes) -> Size | None:
-    if data[8:12] != b"WEBP":
-        return None
-    kind = data[12:16]
-    if kind == b"VP8X":
-        return (
-            1 + int.from_bytes(data[24:27], "little"),
-            1 + int.from_bytes(data[27:30], "little"),
-        )
-    if kind == b"VP8L":
-        bits = struct.unpack_from("<I", data, 21)[0]
-        return 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF)
-    width, height = struct.unpack_from("<HH", data, 26)
-    return width & 0x3FFF, height & 0x3FFF
+def _by_pillow(data: bytes) -> Size:
+    """Return the size by Pillow's reader of the format, itself: ``Image.open`` has a limit of its own."""
+    kind = next(kind for start, kind in _PILLOW.items() if data.startswith(start))
+    with kind(io.BytesIO(data)) as header:
+        return int(header.width), int(header.height)
 
 
-def _gif(data: bytes) -> Size:
-    width, height = struct.unpack_from("<HH", data, 6)
-    return width, height
-
-
-def _pnm(data: bytes) -> Size | None:
-    words: list[bytes] = []
-    for line in data[2:4096].split(b"\n"):
-        words += line.split(b"#")[0].split()
-        if len(words) >= 2:
-            break
-    if len(words) < 2 or not all(word.isdigit() and len(word) < 10 for word in words[:2]):
-        return None
-    return int(words[0]), int(words[1])
-
-
-_READERS = (
-    (b"\x89PNG\r\n\x1a\n", _png),
-    (b"\xff\xd8", _jpeg),
-    (b"BM", _bmp),
-    (b"II*\0", _tiff),
-    (b"MM\0*", _tiff),
-    (b"II+\0", _tiff),
-    (b"MM\0+", _tiff),
-    (b"RIFF", _webp),
-    (b"GIF8", _gif),
-    *((f"P{digit}".encode(), _pnm) for digit in range(1, 7)),
-)
+_PILLOW: dict[bytes, Any] = {
+    b"BM": BmpImagePlugin.BmpImageFile,
+    b"RIFF": WebPImagePlugin.WebPImageFile,
+    b"GIF8": GifImagePlugin.GifImageFile,
+    **dict.fromkeys((b"P1", b"P2", b"P3", b"P4", b"P5", b"P6"), PpmImagePlugin.PpmImageFile),
+}
+_READERS: dict[bytes, Callable[[bytes], Size | None]] = {
+    b"\x89PNG\r\n\x1a\n": _png,
+    b"\xff\xd8": _jpeg,
+    **dict.fromkeys(_TIFF_STARTS, _tiff),
+    **dict.fromkeys(_PILLOW, _by_pillow),
+}

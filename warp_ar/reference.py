@@ -12,7 +12,6 @@ if __name__ == "__main__":
     begin("warp_ar.reference")
 
 import argparse
-import dataclasses
 import functools
 import re
 from collections.abc import Callable, Sequence
@@ -27,19 +26,16 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from warp_ar.accuracy.known_frame import KnownFrame, light_up_to
 from warp_ar.accuracy.path_tracer import DEFAULT_SAMPLES, PathTracer, TracedPicture
-from warp_ar.command_line import EXIT_DONE, Parser, run_command
+from warp_ar.command_line import EXIT_DONE, Parser, count, run_command
 from warp_ar.errors import SinkError, SourceError, UsageError, reason, say
 from warp_ar.exr_file import write_exr
 from warp_ar.files import write_whole
 from warp_ar.light.captured import Light
-from warp_ar.output.places import check_places, check_replaceable
+from warp_ar.output.places import check_places, check_replaceable, reads_of
 from warp_ar.output.sink import make_folder
-from warp_ar.scene import Scene, load_scene
-from warp_ar.scene.description import LATLONG_AXES
-from warp_ar.scene.scene_files import files_of
-from warp_ar.session import calibrated, with_light
+from warp_ar.scene import Scene
+from warp_ar.session import chosen_scene
 from warp_ar.signature import PROGRAM, sign_png
-from warp_ar.stages.quality import PRESETS
 
 SUFFIXES = (".png", ".exr")
 STEP = 8
@@ -52,33 +48,26 @@ def make_parser() -> argparse.ArgumentParser:
     """The command's options."""
     parser = Parser(
         prog="python -m warp_ar.reference",
-        description="One frame of a scene by path tracing, in the light that the pipeline finds, with standard errors.",
+        description="Path-trace one frame in the light that the pipeline finds, with standard errors.",
     )
     add = parser.add_argument
-    add("scene", nargs="?", default="desk", metavar="SCENE", help="a scene file, or a bundled scene's name")
-    add("--frame", type=int, default=0, metavar="N", help="which frame, from 0; those before it bring the light")
-    text = "paths per pixel in the mean, at most (default: %(default)s)"
-    add("--samples", type=int, default=DEFAULT_SAMPLES, metavar="N", help=text)
-    text = "stop at this relative standard error of what virtual objects and lights change, such as 0.01"
+    parser.add_common("scene", "--source", "--light", "--light-axes", "--calibration", "--device", "--overwrite")
+    add("--frame", type=int, default=0, metavar="N", help="which frame, from 0; earlier ones bring the light")
+    text = f"mean paths per pixel, at most (default: {DEFAULT_SAMPLES})"
+    add("--samples", type=count, default=DEFAULT_SAMPLES, metavar="N", help=text)
+    text = "relative standard error to stop at, such as 0.01"
     add("--error", type=float, metavar="E", help=text)
-    add("--output", type=Path, metavar="FILE", help=".png: the picture; .exr: linear radiance and its standard error")
-    text = "write the pipeline's picture, the reference and their difference side by side"
+    add("--output", type=Path, metavar="FILE", help="picture (.png), or radiance and standard error (.exr)")
+    text = "write the pipeline's picture, the reference and their difference"
     add("--compare", type=Path, metavar="FILE.png", help=text)
-    text = f"of the pipeline that finds the light: {', '.join(PRESETS)} (default: high)"
+    text = "preset that finds the light (default: high)"
     add("--quality", default="high", metavar="NAME", help=text)
-    add("--source", metavar="PATH|INDEX", help="frames from here, not the scene's own")
-    add("--light", metavar="FILE", help="captured light (OpenEXR, HDR) instead of what a mirror ball shows")
-    text = "axes of --light (default: as the file says, else y-up of .exr and blender of .hdr)"
-    add("--light-axes", choices=LATLONG_AXES, help=text)
-    text = "look in the frame for how far the emitters of --light or of the scene's light file stand"
+    text = "find in the frame how far the light file's emitters stand"
     add("--places", action="store_true", help=text)
-    text = "write the light, with the distances that --places found: live --light reads them"
+    text = "write the light, with distances of --places, for live --light"
     add("--save-light", type=Path, metavar="FILE.exr", help=text)
-    add("--calibration", metavar="FILE|exif", help="camera calibration instead of the scene's numbers")
-    add("--size", metavar="WxH", help="of the picture; frames are averaged down to it (default: the frames')")
-    add("--device", default="auto", metavar="auto|cpu|cuda:0", help="where the kernels run (default: auto)")
-    add("--seed", type=int, default=0, metavar="N", help="of the random numbers (default: 0)")
-    add("--overwrite", action="store_true", help="replace files that this program did not write")
+    add("--size", metavar="WxH", help="size of the picture (default: the frames')")
+    add("--seed", type=int, default=0, metavar="N", help="seed of the random numbers (default: 0)")
     return parser
 
 
@@ -90,16 +79,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def trace(options: argparse.Namespace) -> int:
     """Find the light, follow paths, write what is asked for."""
     size = _check(options)
-    scene = load_scene(options.scene)
-    if options.calibration is not None:
-        scene = calibrated(scene, options.calibration, options.source)
-    if options.light is not None:
-        scene = with_light(scene, options.light, options.light_axes)
+    scene = chosen_scene(options.scene, options.source, options.calibration, options.light, options.light_axes)
     if options.save_light is not None:
         _check_axes(scene)
     writes = {f"--{name}": getattr(options, name.replace("-", "_")) for name in ("output", "compare", "save-light")}
     writes = {name: path for name, path in writes.items() if path is not None}
-    check_places({"the scene": _read_by(scene, options)}, writes)
+    check_places(reads_of(scene, options), writes)
     replaced = [check_replaceable(path, overwrite=options.overwrite) for path in writes.values()]
     for path in writes.values():
         make_folder(path.parent)
@@ -135,7 +120,7 @@ def _check_axes(scene: Scene) -> None:
 
 
 def places_found(light: Light) -> str:
-    """Which emitters of a light have a distance, in one line."""
+    """Name the emitters of a light that have a distance, in one line."""
     found = [
         f"{emitter.distance:.2f} m toward {', '.join(f'{value:.2f}' for value in emitter.direction)}"
         for emitter in light.emitters
@@ -154,28 +139,19 @@ def _write_all(options: argparse.Namespace, known: KnownFrame, picture: TracedPi
 
 def _check(options: argparse.Namespace) -> tuple[int, int] | None:
     """The size that is asked for; complain about options that cannot be."""
-    if options.samples < 1:
-        raise UsageError(f"--samples {options.samples}: expected 1 or more")
     if options.error is not None and not options.error > 0.0:
         raise UsageError(f"--error {options.error:g}: expected a number above 0, such as 0.01")
-    if options.output is not None and options.output.suffix.lower() not in SUFFIXES:
-        raise UsageError(f"--output {options.output} ends in {options.output.suffix!r}; use {', '.join(SUFFIXES)}")
-    if options.save_light is not None and options.save_light.suffix.lower() != ".exr":
-        raise UsageError(f"--save-light {options.save_light} ends in {options.save_light.suffix!r}; use .exr")
-    if options.compare is not None and options.compare.suffix.lower() != ".png":
-        raise UsageError(f"--compare {options.compare} ends in {options.compare.suffix!r}; use .png")
+    for name, suffixes in (("output", SUFFIXES), ("save_light", (".exr",)), ("compare", (".png",))):
+        path = getattr(options, name)
+        if path is not None and path.suffix.lower() not in suffixes:
+            flag = name.replace("_", "-")
+            raise UsageError(f"--{flag} {path} ends in {path.suffix!r}; use {', '.join(suffixes)}")
     if options.size is None:
         return None
     match = re.fullmatch(r"([1-9][0-9]{0,4})x([1-9][0-9]{0,4})", options.size)
     if match is None:
         raise UsageError(f"--size {options.size}: expected width x height, such as 320x240")
     return int(match[1]), int(match[2])
-
-
-def _read_by(scene: Scene, options: argparse.Namespace) -> list[Path]:
-    """Files and folders that the run reads."""
-    named = [options.source, options.light, options.calibration]
-    return [*files_of(dataclasses.replace(scene)), *(Path(name) for name in named if name is not None)]
 
 
 def render(
@@ -197,7 +173,7 @@ def render(
 
 
 def summary(known: KnownFrame, picture: TracedPicture, device: str) -> str:
-    """What was done, in one line."""
+    """Summarise the run in one line."""
     height, width = picture.image.shape[:2]
     difference = _lit_at(known, picture) - picture.image
     rms = float(np.sqrt((difference**2).mean()))

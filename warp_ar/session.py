@@ -3,53 +3,43 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
 from warp_ar.accuracy.budget import AutoPipeline
-from warp_ar.ball.ball import BallFit, refine_balls
+from warp_ar.ball.ball import BallFit, posed_frames, refine_balls
+from warp_ar.cache_folder import cache_folder
 from warp_ar.closing import Closing
 from warp_ar.engine.modules import Progress
-from warp_ar.engine.pipeline import Pipeline, Result, resolve_quality
-from warp_ar.engine.switcher import PipelineSwitcher, Target
+from warp_ar.engine.pipeline import Pipeline, Result
 from warp_ar.errors import UsageError, WarpArError
 from warp_ar.light.captured import Light
-from warp_ar.scene import CapturedLight, Scene, SourceSpec, load_calibration, load_scene
+from warp_ar.light.card_light import light_by_card
+from warp_ar.output.sinks import write_environment
+from warp_ar.scene import CapturedLight, Scene, load_calibration, load_scene
 from warp_ar.scene.exif import camera_by_exif
 from warp_ar.sources.deep_frame import check_linear
 from warp_ar.sources.exposures import plan_bracket
-from warp_ar.sources.sources import Frame, Source, open_source
+from warp_ar.sources.sources import Frame, Source, open_scene_source
 from warp_ar.stages.quality import AUTO, DEFAULT_BUDGET_MS, DEFAULT_PRESET, Quality
+from warp_ar.tracking.markers import tell_upright
+from warp_ar.tracking.tracking import given_pose, tell_missing_poses
 
-
-def _where(spec: SourceSpec) -> str | int | Path:
-    """What ``open_source`` calls the source that a scene names; a scene names exactly one."""
-    if spec.path is not None:
-        return spec.path
-    return spec.camera if spec.camera is not None else f"synthetic:{spec.synthetic}"
-
-
-def _open_source(scene: Scene, chosen: str | int | Path | None, loop: bool) -> Source:
-    """Open the source that is chosen, or else the scene's own, with what the scene says of it.
-
-    Raises:
-        SourceError: It cannot be opened.
-        UsageError: There is none.
-    """
-    if chosen is not None:
-        return open_source(chosen, fps=None, loop=loop, exposures=())
-    if (spec := scene.source) is None:
-        raise UsageError(f"scene {scene.name!r} names no source; give one with --source")
-    return open_source(_where(spec), fps=spec.fps, loop=loop, exposures=spec.exposures or ())
+BY_CARD = "card"
+"""Word for light that the card and other surfaces tell of."""
+CARD_FRAMES = 24
+"""Frames in which the marker is looked for."""
 
 
 def calibrated(scene: Scene, calibration: str | Path, source: str | int | Path | None = None) -> Scene:
-    """The scene with its camera by a calibration file or, for ``exif``, by the EXIF of the source's first picture.
+    """Return the scene with its camera by a calibration file, or for ``exif`` by the source's first picture.
 
     Raises:
         SceneError: The calibration or the EXIF cannot be used.
@@ -81,14 +71,39 @@ def with_light(scene: Scene, light: str | Path, axes: str | None = None) -> Scen
     return dataclasses.replace(scene, captured=dataclasses.replace(spec, file=Path(light).resolve(), axes=axes))
 
 
-def _chosen_scene(
+def lit_by_card(scene: Scene, source: Source) -> tuple[Scene, str]:
+    """Return the scene lit by what its card and other surfaces show of the light, and a line that says how surely.
+
+    Args:
+        scene: The scene.
+        source: Its frames; those of a device are gone afterwards.
+
+    Raises:
+        UsageError: The first frames do not show the marker well.
+    """
+    scene = dataclasses.replace(scene, camera=scene.camera.scaled_to(*source.size))
+    views = posed_frames(source, scene.marker, scene.camera, CARD_FRAMES) if scene.has_marker else []
+    if not views:
+        raise UsageError(f"light {BY_CARD!r}: the first {CARD_FRAMES} frames do not show the marker well")
+    found = light_by_card(views[0][0], scene, views[0][1])
+    data = found.radiance.tobytes()
+    path = cache_folder() / "card_light" / f"{hashlib.sha256(data).hexdigest()[:16]}.exr"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_environment(path, cv2.resize(found.radiance, (64, 32), interpolation=cv2.INTER_NEAREST))
+    value, half = (float(part.mean()) for part in found.irradiance(np.array([[0.0, 0.0, 1.0]])))
+    x, y, z = found.main_direction
+    told = f"from above {value:.2f} +- {half:.2f} camera values, mainly from ({x:.2f}, {y:.2f}, {z:.2f})"
+    return with_light(scene, path), f"light by the card, of second order: irradiance {told}"
+
+
+def chosen_scene(
     scene: Scene | str | Path,
     source: str | int | Path | None,
     calibration: str | Path | None,
     light: str | Path | None,
     light_axes: str | None,
 ) -> Scene:
-    """The scene with the camera and the light that are given instead of its own."""
+    """Return the scene with the camera and the light that are given instead of its own."""
     scene = scene if isinstance(scene, Scene) else load_scene(scene)
     if calibration is not None:
         scene = calibrated(scene, calibration, source)
@@ -102,13 +117,13 @@ class Session(Closing):
     """
 
     ahead = True
-    """Whether frames may be begun before the one ahead of them is handed out, where that is possible."""
+    """True if frames may be begun before the one ahead of them is handed out, where that is possible."""
     decode_ms = 0.0
     """Milliseconds that the source took for its last frame."""
     ball_fits: tuple[BallFit | None, ...] = ()
-    """Where ``refine_ball`` found the mirror balls; None for one that it did not find."""
-    bracket_notes: tuple[str, ...] = ()
-    """What of the source's exposures is not merged, and why, one line each."""
+    """Fits of the mirror balls by ``refine_ball``; None for one that it did not find."""
+    notes: tuple[str, ...] = ()
+    """Exposures that are not merged, frames without a pose, upright of a marker: a line each."""
 
     def __init__(
         self,
@@ -133,13 +148,15 @@ class Session(Closing):
                 the URL of a camera's stream.
             calibration: OpenCV calibration file instead of the scene's camera numbers, or ``exif``: by the EXIF of the
                 first picture.
-            light: Captured light instead of what a mirror ball shows: a latlong OpenEXR or Radiance HDR.
+            light: Captured light instead of what a mirror ball shows: a latlong OpenEXR or Radiance HDR. Or ``card``:
+                what the card and other surfaces of the first frame tell of it, to second order (``notes`` has the
+                interval).
             light_axes: Axes of that file, ``z-up``, ``blender``, ``y-up`` or ``opengl``; None: as it says, else y-up of
                 an OpenEXR and blender of an HDR.
             device: ``auto``, ``cpu`` or ``cuda:N``.
             quality: A preset's name, a value of one's own, or ``auto``: the least error within a budget.
             budget_ms: Milliseconds per frame for ``auto``; None means 33.
-            outputs: What results shall hold: ``image``, ``environment``, ``pose``, layers of ``warp_ar.LAYERS``.
+            outputs: Parts of the results: ``image``, ``environment``, ``pose``, layers of ``warp_ar.LAYERS``.
             loop: Start a clip again when it ends.
             refine_ball: Look for the mirror balls first, in the source's first frames, which takes some seconds; what
                 was found is in ``ball_fits``.
@@ -149,51 +166,51 @@ class Session(Closing):
             SourceError: The source cannot be opened.
             UsageError: Any other argument cannot be used.
         """
-        self.scene = _chosen_scene(scene, source, calibration, light, light_axes)
+        scene = chosen_scene(scene, source, calibration, None if light == BY_CARD else light, light_axes)
         if budget_ms is not None and quality != AUTO:
             raise UsageError(f"a budget of {budget_ms:g} ms needs the quality {AUTO!r}, not {quality!r}")
-        shown = self.scene.source.shown if source is None and self.scene.source is not None else None
-        self.source: Source = _open_source(self.scene, source, loop)
+        shown = scene.source.shown if source is None and scene.source is not None else None
+        self.source: Source = open_scene_source(scene, source, loop=loop)
         self.pipeline: Pipeline | AutoPipeline
-        self._switcher: PipelineSwitcher | None = None
         try:
             if refine_ball:
-                self.scene, self.ball_fits = refine_balls(self.scene, self.source)
+                scene, self.ball_fits = refine_balls(scene, self.source)
+            by_card = ""
+            if light == BY_CARD:
+                scene, by_card = lit_by_card(scene, self.source)
             size, exposures = self.source.size, self.source.exposures
-            self.bracket_notes = plan_bracket(exposures, shown).notes
+            told = tell_missing_poses(scene.pose, self.source), tell_upright(scene)
+            self.notes = (*plan_bracket(exposures, shown).notes, *filter(None, (*told, by_card)))
             given: dict[str, Any] = {"size": size, "outputs": outputs, "exposures": exposures, "shown": shown}
             if quality == AUTO:
                 budget = DEFAULT_BUDGET_MS if budget_ms is None else budget_ms
                 # A budget is kept by frames that do not wait, of recordings too.
                 given["estimates"] = "real_time" if self.source.live else "delayed"
-                self.pipeline = AutoPipeline(self.scene, budget_ms=budget, device=device, **given)
+                self.pipeline = AutoPipeline(scene, budget_ms=budget, device=device, **given)
             else:
-                self.pipeline = self._open(Target(self.scene, resolve_quality(quality), **given), device)
+                self.pipeline = self._open(scene, quality=quality, device=device, **given)
                 if self.pipeline.device.is_cuda:
                     self.source.memory = self._new_frame
         except BaseException:
             self.source.close()
             raise
 
-    def _open(self, target: Target, device: str) -> Pipeline:
-        """A pipeline that can be changed; the one before is kept: results that were handed out may still be read."""
-        self._target = target
+    def _open(self, scene: Scene, **given: Any) -> Pipeline:
+        """Open the pipeline of a fixed quality."""
         source = self.source
-        linear = source.deep != "" and not target.exposures
+        linear = source.deep != "" and not given["exposures"]
         if source.deep == "light":
-            check_linear(str(target.scene.camera.transfer))
+            check_linear(str(scene.camera.transfer))
         source.keeps_depth = linear
-        self._switcher = PipelineSwitcher(
-            device=device,
-            keep=1,
-            profile=False,
-            estimates="real_time" if source.live else "synchronous",
-            linear=linear,
-        )
-        return self._switcher.open(target)
+        return Pipeline(scene, estimates="real_time" if source.live else "synchronous", linear=linear, **given)
+
+    @property
+    def scene(self) -> Scene:
+        """Scene that frames are lit by."""
+        return self.pipeline.scene
 
     def _new_frame(self) -> npt.NDArray[np.uint8]:
-        """Where the source writes a frame, so that it need not be copied to be sent."""
+        """Return memory in which the source writes a frame, so that it need not be copied to be sent."""
         assert isinstance(self.pipeline, Pipeline)
         return self.pipeline.new_frame()
 
@@ -202,38 +219,22 @@ class Session(Closing):
         try:
             self.source.close()
         finally:
-            if self._switcher is None:
-                self.pipeline.close()
-            else:
-                self._switcher.close()
+            self.pipeline.close()
 
     def change(self, *, scene: Scene | None = None, quality: str | Quality | None = None) -> None:
-        """Light the frames to come with another scene or quality; source, light and clock go on.
-
-        What differs in numbers alone, such as where an object is, takes effect at once. For all else a pipeline is
-        built, here and now; ``warp_ar.engine.switcher.PipelineSwitcher`` builds it beside the frames.
+        """Light the frames to come with another scene or quality, as ``Pipeline.change`` does; the source goes on.
 
         Args:
-            scene: What to show; None leaves it.
+            scene: The next scene; None leaves it.
             quality: A preset's name or a value; None leaves it.
 
         Raises:
-            UsageError: The session keeps to a budget, ``scene`` is no scene, or the quality is none or cannot run
-                here. What is refused changes nothing: frames go on as they were.
-            SceneError: The scene's camera does not fit the source, or a file that it names cannot be used.
+            UsageError: The session keeps to a budget, or as ``Pipeline.change``.
+            SceneError: As ``Pipeline.change``.
         """
-        if self._switcher is None:
+        if not isinstance(self.pipeline, Pipeline):
             raise UsageError(f"a session of quality {AUTO!r} chooses for itself; open another one")
-        if scene is not None and not isinstance(scene, Scene):
-            raise UsageError(f"scene is {type(scene).__name__}; expected a Scene, such as load_scene returns")
-        target = dataclasses.replace(
-            self._target,
-            scene=self._target.scene if scene is None else scene,
-            quality=self._target.quality if quality is None else resolve_quality(quality),
-        )
-        pipeline = self._switcher.follow(target, wait=True)
-        assert pipeline is not None
-        self._target, self.scene, self.pipeline = target, target.scene, pipeline
+        self.pipeline.change(scene, quality=quality)
 
     def warm_up(self, progress: Progress | None = None) -> None:
         """Compile and load what the frames need; left out, the first frame does it.
@@ -244,7 +245,7 @@ class Session(Closing):
         self.pipeline.warm_up(progress)
 
     def _frames(self) -> Iterator[Frame]:
-        """The source's frames; notes what they are waited for."""
+        """Yield the source's frames, and note the time that each was waited for."""
         frames = iter(self.source)
         while True:
             start = time.perf_counter()
@@ -254,13 +255,18 @@ class Session(Closing):
                 return
             yield frame
 
+    def _known_of(self, frame: Frame) -> dict[str, Any]:
+        """Return what a pipeline is told of a frame besides its picture."""
+        pose = given_pose(self.pipeline.scene.pose, frame)
+        return {"time_seconds": frame.time, "exposure_time": frame.exposure_time, "pose": pose}
+
     def __iter__(self) -> Iterator[tuple[Frame, Result]]:
         pipeline, live = self.pipeline, self.source.live
         kept = pipeline.device.is_cpu or set(pipeline.plan.request.outputs) <= {"image", "pose"}
         called = live and pipeline.device.is_cpu  # which is to have no copy of the frame
         if not self.ahead or called or not kept or not isinstance(pipeline, Pipeline):
             for frame in self._frames():
-                yield frame, self.pipeline(frame.deepest, time_seconds=frame.time, exposure_time=frame.exposure_time)
+                yield frame, self.pipeline(frame.deepest, **self._known_of(frame))
             return
         # One frame ahead of what is handed out: the next is decoded and its marker found while this one is rendered,
         # and reading a picture does not hold up the next frame. The first is handed out at once: somebody waits for it.
@@ -269,8 +275,7 @@ class Session(Closing):
         ahead = 0
         try:
             for frame in self._frames():
-                result = self.pipeline.submit(frame.deepest, time_seconds=frame.time, exposure_time=frame.exposure_time)
-                ready.append((frame, result))
+                ready.append((frame, self.pipeline.submit(frame.deepest, **self._known_of(frame))))
                 if len(ready) > ahead:
                     yield ready.pop(0)
                 ahead = 0 if live else 1

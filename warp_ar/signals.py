@@ -1,4 +1,4 @@
-"""What the numbers of a video's signal mean as light: transfer functions of HDR, and primaries.
+"""Light of the numbers of a video's signal: transfer functions of HDR, and primaries.
 
 All functions here are closed forms in float64. Light is relative to reference white, which is 1: the signal level of
 diffuse white that HDR programmes are graded by. Of HLG it is 75 % of the signal, taken back to the light of the scene
@@ -22,6 +22,7 @@ Chromaticities = tuple[float, float, float, float, float, float, float, float]
 REC_709: Final[Chromaticities] = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 """x and y of red, green, blue and white."""
 REC_2020: Final[Chromaticities] = (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.3290)
+ADOBE_RGB: Final[Chromaticities] = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, 0.3127, 0.3290)
 P3_D65: Final[Chromaticities] = (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.3127, 0.3290)
 
 PQ_PEAK: Final = 10000.0
@@ -69,18 +70,6 @@ def hlg_of_light(light: npt.ArrayLike) -> Array:
     e = np.clip(np.asarray(light, np.float64) * HLG_WHITE, 0.0, 1.0)
     above = _A * np.log(np.maximum(12.0 * e - _B, 1e-12)) + _C
     return np.where(e <= 1.0 / 12.0, np.sqrt(3.0 * e), above)
-
-
-def light_of_srgb(signal: npt.ArrayLike) -> Array:
-    """Linear value of an sRGB signal (IEC 61966-2-1)."""
-    s = np.maximum(np.asarray(signal, np.float64), 0.0)
-    return np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
-
-
-def srgb_of_light(light: npt.ArrayLike) -> Array:
-    """SRGB signal from 0 to 1 of a linear value; below and above are cut."""
-    x = np.clip(np.asarray(light, np.float64), 0.0, 1.0)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1.0 / 2.4) - 0.055)
 
 
 def xyz_from_rgb(chromaticities: Chromaticities) -> Array:

@@ -27,7 +27,7 @@ import warp as wp
 
 from warp_ar.kernels.color import brightness
 from warp_ar.kernels.latlong import texel_solid_angle
-from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.launch import row_launcher
 from warp_ar.kernels.safe_math import is_finite, light_confidence, smooth_ramp, usable_confidence
 from warp_ar.kernels.structs import EnvironmentView, FrameParams
 
@@ -36,7 +36,7 @@ wp.set_module_options({"enable_backward": False})
 FOLLOW_TIME = wp.constant(wp.float32(0.15))
 """Time constant of accumulation in seconds: after half a second 4 % of a small change are left."""
 HASTE = wp.constant(wp.float32(6.0))
-"""How much faster a significant change is followed."""
+"""Factor by which a significant change is followed faster."""
 FORGET_TIME = wp.constant(wp.float32(20.0))
 """Time constant in seconds with which the confidence of what is not seen fades."""
 SECTOR_SIZE = 8
@@ -55,7 +55,7 @@ ALL_CLIPPED = wp.constant(wp.float32(0.9))
 
 @wp.func
 def known_beyond_clipping(x: wp.vec3, m: wp.vec3, clipped: wp.vec3) -> wp.vec3:
-    """How far a texel's channels clip below what is known of them, 0 to 1."""
+    """Return the degree to which each channel clips below its known radiance, 0 to 1."""
     beyond = wp.vec3(0.0, 0.0, 0.0)
     for channel in range(3):
         excess = m[channel] - x[channel]
@@ -176,49 +176,22 @@ def change_shape(height: int, width: int) -> tuple[int, int]:
     return max(1, height // SECTOR_SIZE), max(1, width // SECTOR_SIZE)
 
 
-def measure_change(
-    view: EnvironmentView, environment: EnvironmentView, change_out: wp.array, *, rows: Rows | None = None
-) -> None:
-    """Signed relative change of each sector between the accumulated light and a frame's.
+measure_change = row_launcher(measure_change_kernel)
+"""Signed relative change of each sector between the accumulated light and a frame's.
 
-    Args:
-        view: (h, w) this frame's light.
-        environment: (h, w) accumulated light.
-        change_out: ``wp.vec2`` of ``change_shape(h, w)``: the change in -1..1, and what stood there before.
-        rows: Band of sector rows, None for all.
-    """
-    launch_rows(
-        measure_change_kernel,
-        change_out.shape,
-        [view, environment],
-        [change_out],
-        rows=rows,
-        device=change_out.device,
-    )
+Args:
+    view: (h, w) this frame's light.
+    environment: (h, w) accumulated light.
+    change_out: ``wp.vec2`` of ``change_shape(h, w)``: the change in -1..1, and what stood there before.
+"""
 
 
-def accumulate_environment(
-    view: EnvironmentView,
-    change: wp.array,
-    params: wp.array,
-    environment_out: EnvironmentView,
-    *,
-    rows: Rows | None = None,
-) -> None:
-    """Draw the accumulated light toward a frame's; outputs are read and written in place and start at zero.
+accumulate_environment = row_launcher(accumulate_environment_kernel, like=lambda *given: given[-1].radiance)
+"""Draw the accumulated light toward a frame's; outputs are read and written in place and start at zero.
 
-    Args:
-        view: (h, w) this frame's light.
-        change: From ``measure_change``.
-        params: ``FrameParams`` (1): ``time_step`` and ``environment_reset``.
-        environment_out: (h, w) accumulated light.
-        rows: Band of rows, None for all.
-    """
-    launch_rows(
-        accumulate_environment_kernel,
-        environment_out.radiance.shape,
-        [view, change, params],
-        [environment_out],
-        rows=rows,
-        device=environment_out.radiance.device,
-    )
+Args:
+    view: (h, w) this frame's light.
+    change: From ``measure_change``.
+    params: ``FrameParams`` (1): ``time_step`` and ``environment_reset``.
+    environment_out: (h, w) accumulated light.
+"""

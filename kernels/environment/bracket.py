@@ -107,14 +107,7 @@ def spread_clipping(stack_out: ExposureStack, *, reach: float = REACH, rows: Row
         rows: Band of rows, None for all.
     """
     count, height, width = stack_out.clipped.shape
-    launch_rows(
-        spread_clipping_kernel,
-        (height, width, count),
-        [reach],
-        [stack_out],
-        rows=rows,
-        device=stack_out.clipped.device,
-    )
+    launch_rows(spread_clipping_kernel, (height, width, count), [reach], [stack_out], rows=rows)
 
 
 @wp.kernel(enable_backward=False)
@@ -192,11 +185,4 @@ def merge_exposures(
         reach: Radians.
         rows: Band of rows, None for all.
     """
-    launch_rows(
-        merge_exposures_kernel,
-        view_out.radiance.shape,
-        [exposures, stack, reach],
-        [view_out],
-        rows=rows,
-        device=view_out.radiance.device,
-    )
+    launch_rows(merge_exposures_kernel, view_out.radiance.shape, [exposures, stack, reach], [view_out], rows=rows)

@@ -1,4 +1,4 @@
-"""Whether the environment has changed since its readers last saw it."""
+"""Change of the environment since its readers last saw it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import warp as wp
 
-from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.launch import row_launcher
 
 wp.set_module_options({"enable_backward": False})
 
@@ -23,8 +23,6 @@ def measure_difference_kernel(
     row_start: wp.int32,
     environment: wp.array2d[wp.vec3],
     published: wp.array2d[wp.vec3],
-    floor: wp.float32,
-    share: wp.float32,
     # Out:
     difference_out: wp.array[wp.float32],
 ):
@@ -35,37 +33,19 @@ def measure_difference_kernel(
         new = environment[i, j]
         old = published[i, j]
         for channel in range(3):
-            largest = wp.max(largest, wp.abs(new[channel] - old[channel]) / (floor + share * wp.abs(old[channel])))
+            tolerated = wp.static(CHANGE_FLOOR) + wp.static(CHANGE_SHARE) * wp.abs(old[channel])
+            largest = wp.max(largest, wp.abs(new[channel] - old[channel]) / tolerated)
     difference_out[i] = largest
 
 
-def measure_difference(
-    environment: wp.array,
-    published: wp.array,
-    difference_out: wp.array,
-    *,
-    floor: float = CHANGE_FLOOR,
-    share: float = CHANGE_SHARE,
-    rows: Rows | None = None,
-) -> None:
-    """Largest change of each row against a map that readers have seen, in units of what is tolerated.
+measure_difference = row_launcher(measure_difference_kernel)
+"""Largest change of each row against a map that readers have seen, in units of what is tolerated.
 
-    Args:
-        environment: ``wp.vec3`` (h, w).
-        published: ``wp.vec3`` (h, w).
-        difference_out: ``wp.float32`` (h): largest |difference| / (floor + share * published); above 1 it has changed.
-        floor: Tolerated change of a black texel.
-        share: Tolerated relative change.
-        rows: Band of rows, None for all.
-    """
-    launch_rows(
-        measure_difference_kernel,
-        (environment.shape[0],),
-        [environment, published, floor, share],
-        [difference_out],
-        rows=rows,
-        device=environment.device,
-    )
+Args:
+    environment: ``wp.vec3`` (h, w).
+    published: ``wp.vec3`` (h, w).
+    difference_out: ``wp.float32`` (h): largest |difference| over what is tolerated; above 1 it has changed.
+"""
 
 
 @wp.kernel(enable_backward=False)

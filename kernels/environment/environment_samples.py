@@ -138,7 +138,7 @@ def sobol_second(index: wp.uint32) -> wp.float32:
 
 @wp.func
 def direction_weight(cos_theta: wp.float32) -> wp.float32:
-    """How much directions at an angle to +z matter."""
+    """Return the weight of directions at an angle to +z."""
     return SIDE_WEIGHT + wp.max(cos_theta, 0.0)
 
 
@@ -353,15 +353,12 @@ def place_emitters(
         turn: As for ``draw_samples``.
         rows: Range of samples; None means all.
     """
-    device = samples_out.device
     given = [emitters, wp.vec2i(*turn)]
-    launch_rows(place_emitters_kernel, samples_out.shape, given, [samples_out], rows=rows, device=device)
+    launch_rows(place_emitters_kernel, samples_out.shape, given, [samples_out], rows=rows)
 
 
 def sum_environment(
-    environment: wp.array2d[wp.vec3],
-    cumulative_out: wp.array2d[wp.float32],
-    rows_out: wp.array[wp.vec2],
+    environment: wp.array2d[wp.vec3], cumulative_out: wp.array2d[wp.float32], rows_out: wp.array[wp.vec2]
 ) -> None:
     """Cumulative sums that ``draw_samples`` inverts.
 
@@ -370,9 +367,9 @@ def sum_environment(
         cumulative_out: (h, w) brightness summed along each row.
         rows_out: (h,) weighted brightness and weight, summed over rows.
     """
-    device, height = environment.device, environment.shape[0]
-    launch(sum_along_rows_kernel, height, [environment], [cumulative_out], device=device)
-    launch(sum_rows_kernel, height, [cumulative_out], [rows_out], device=device)
+    height = environment.shape[0]
+    launch(sum_along_rows_kernel, height, [environment], [cumulative_out])
+    launch(sum_rows_kernel, height, [cumulative_out], [rows_out])
 
 
 def draw_samples(
@@ -406,7 +403,6 @@ def draw_samples(
         [environment, cumulative, rows_sums, origin, wp.vec2i(*turn)],
         [directions_out, flux_out, samples_out],
         rows=rows,
-        device=environment.device,
     )
 
 
@@ -437,5 +433,4 @@ def list_texels(
         [environment, origin, wp.vec2i(*turn)],
         [directions_out, flux_out, samples_out],
         rows=rows,
-        device=environment.device,
     )

@@ -19,7 +19,7 @@ from typing import Any
 import warp as wp
 
 from warp_ar.kernels.latlong import PI, beside_in_row
-from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.launch import Rows, launch_rows, row_launcher
 from warp_ar.kernels.safe_math import smooth_ramp, usable_confidence
 
 wp.set_module_options({"enable_backward": False})
@@ -199,22 +199,18 @@ def fill_level_shapes(height: int, width: int) -> tuple[tuple[int, int], ...]:
 
 
 def fill_level_offsets(height: int, width: int) -> tuple[int, ...]:
-    """Where each level starts in the packed array, and as last number the array's length."""
+    """Return the index of each level's first texel in the packed array, then the array's length."""
     return (0, *itertools.accumulate(rows * columns for rows, columns in fill_level_shapes(height, width)))
 
 
-def seed_fill(radiance: wp.array, confidence: wp.array, levels_out: wp.array, *, rows: Rows | None = None) -> None:
-    """Write level 0 of the fill pyramid.
+seed_fill = row_launcher(seed_fill_kernel, like=lambda radiance, *_: radiance)
+"""Write level 0 of the fill pyramid.
 
-    Args:
-        radiance: Light that is known in part, ``wp.vec3`` (h, w).
-        confidence: ``wp.float32`` (h, w) in 0..1.
-        levels_out: ``wp.vec4`` (``fill_level_offsets(h, w)[-1]``): radiance and trust.
-        rows: Band of rows, None for all.
-    """
-    launch_rows(
-        seed_fill_kernel, radiance.shape, [radiance, confidence], [levels_out], rows=rows, device=radiance.device
-    )
+Args:
+    radiance: Light that is known in part, ``wp.vec3`` (h, w).
+    confidence: ``wp.float32`` (h, w) in 0..1.
+    levels_out: ``wp.vec4`` (``fill_level_offsets(h, w)[-1]``): radiance and trust.
+"""
 
 
 def push_pull(levels_out: wp.array, height: int, width: int, *, most: float = math.inf) -> None:
@@ -227,12 +223,11 @@ def push_pull(levels_out: wp.array, height: int, width: int, *, most: float = ma
         most: Radiance that a texel counts for at most: no share of an emitter is spread over what is unseen beside it.
     """
     shapes, offsets = fill_level_shapes(height, width), fill_level_offsets(height, width)
-    device = levels_out.device
     levels: list[tuple[Any, ...]] = [(offset, *shape) for offset, shape in zip(offsets, shapes, strict=False)]
     for fine, coarse in itertools.pairwise(levels):
-        launch_rows(pull_level_kernel, coarse[1:], [*fine, *coarse, most], [levels_out], rows=None, device=device)
+        launch_rows(pull_level_kernel, coarse[1:], [*fine, *coarse, most], [levels_out], rows=None)
     for coarse, fine in itertools.pairwise(reversed(levels[1:])):
-        launch_rows(push_level_kernel, fine[1:], [*fine, *coarse], [levels_out], rows=None, device=device)
+        launch_rows(push_level_kernel, fine[1:], [*fine, *coarse], [levels_out], rows=None)
 
 
 def finish_fill(levels: wp.array, environment_out: wp.array, *, rows: Rows | None = None) -> None:
@@ -246,11 +241,4 @@ def finish_fill(levels: wp.array, environment_out: wp.array, *, rows: Rows | Non
     height, width = environment_out.shape
     shapes, offsets = fill_level_shapes(height, width), fill_level_offsets(height, width)
     coarse = (offsets[1], *shapes[1]) if len(shapes) > 1 else (0, 0, 0)
-    launch_rows(
-        finish_fill_kernel,
-        environment_out.shape,
-        [levels, *coarse],
-        [environment_out],
-        rows=rows,
-        device=environment_out.device,
-    )
+    launch_rows(finish_fill_kernel, environment_out.shape, [levels, *coarse], [environment_out], rows=rows)

@@ -1,4 +1,4 @@
-"""What the camera itself sees of the directions that no ball shows.
+"""Directions that no ball shows, looked up in the camera's own picture.
 
 Behind the ball, and near its rim, where a pixel is many degrees, the map of the environment is filled from neighbours.
 A good part of it stands in the picture, beyond and beside the ball. A direction d from the ball's centre is looked up
@@ -33,7 +33,7 @@ SIDE = wp.constant(3)
 FRAME_TRUST = wp.constant(wp.float32(0.8))
 """Of what the picture shows, beside 1 of what a ball shows."""
 BALL_MARGIN = wp.constant(wp.float32(1.08))
-"""How much larger a ball is taken to be where it hides what is behind it: its outline's blur."""
+"""Factor on a ball's radius where it hides what is behind it: its outline is blurred."""
 OWN_SHADOW = wp.constant(wp.float32(6.0))
 """Radii around a ball within which it shades surfaces: as far reaches its shadow of light 10 degrees above them."""
 CLOSE = wp.constant(wp.float32(1.0e-3))
@@ -44,7 +44,7 @@ ENOUGH = wp.constant(wp.float32(0.999))
 
 @wp.func
 def passes_balls(probes: wp.array[Probe], origin: wp.vec3, direction: wp.vec3, reach: wp.float32) -> wp.bool:
-    """Whether a ray of unit direction meets no ball up to a distance."""
+    """Return whether a ray of unit direction meets no ball up to a distance."""
     for k in range(probes.shape[0]):
         to_center = probes[k].center - origin
         along = wp.dot(to_center, direction)
@@ -57,7 +57,7 @@ def passes_balls(probes: wp.array[Probe], origin: wp.vec3, direction: wp.vec3, r
 
 @wp.func
 def shaded_by_ball(probes: wp.array[Probe], point: wp.vec3) -> wp.bool:
-    """Whether a point of a surface lies in what a ball may shade."""
+    """Return whether a ball may shade a point of a surface."""
     for k in range(probes.shape[0]):  # noqa: SIM110 - kernels have no any()
         if wp.length(point - probes[k].center) < OWN_SHADOW * probes[k].radius:
             return True
@@ -188,5 +188,4 @@ def fill_frame(
         [picture, params, probes, scene, wp.vec2i(*shape), ball],
         [levels_out],
         rows=rows,
-        device=levels_out.device,
     )

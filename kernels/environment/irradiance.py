@@ -441,27 +441,19 @@ def project_irradiance_sh(
         row_sums_out: (H, 5) scratch.
         irradiance_sh_out: (9,).
     """
-    launch_tiles(
-        sum_columns_kernel,
-        row_sums_out.shape,
-        [environment, tables.columns],
-        [row_sums_out],
-        block_dim=BLOCK,
-        device=environment.device,
-    )
+    launch_tiles(sum_columns_kernel, row_sums_out.shape, [environment, tables.columns], [row_sums_out], block_dim=BLOCK)
     launch_tiles(
         sum_rows_kernel,
         irradiance_sh_out.shape,
         [row_sums_out, tables.rows, tables.fourier],
         [irradiance_sh_out],
         block_dim=BLOCK,
-        device=environment.device,
     )
 
 
 def window_sh(irradiance_sh_out: wp.array[wp.vec3]) -> None:
     """Window nine coefficients, (9,), in place, as little as keeps irradiance from being negative anywhere."""
-    launch(window_sh_kernel, dim=1, outputs=[irradiance_sh_out], device=irradiance_sh_out.device)
+    launch(window_sh_kernel, dim=1, outputs=[irradiance_sh_out])
 
 
 def gather_clusters(
@@ -480,14 +472,11 @@ def gather_clusters(
         rows: Band of block rows; None means all.
     """
     inputs = [environment, *blocks]
-    launch_rows(gather_clusters_kernel, blocks, inputs, [clusters_out], rows=rows, device=environment.device)
+    launch_rows(gather_clusters_kernel, blocks, inputs, [clusters_out], rows=rows)
 
 
 def sum_clusters(
-    clusters: wp.array[Cluster],
-    irradiance_map_out: wp.array2d[wp.vec3],
-    *,
-    rows: Rows | None = None,
+    clusters: wp.array[Cluster], irradiance_map_out: wp.array2d[wp.vec3], *, rows: Rows | None = None
 ) -> None:
     """Map of irradiance from distant lights.
 
@@ -502,6 +491,5 @@ def sum_clusters(
         [clusters],
         [irradiance_map_out],
         block_dim=BLOCK,
-        device=clusters.device,
         rows=rows if rows is not None else (0, irradiance_map_out.shape[0]),
     )

@@ -73,6 +73,5 @@ def find_key_light(environment: wp.array, sums_out: wp.array, key_lights_out: wp
         sums_out: Scratch, ``wp.vec4`` (h).
         key_lights_out: ``KeyLight`` (1). Without any light it looks toward +z with directionality 0.
     """
-    device = environment.device
-    launch(sum_rows_kernel, environment.shape[0], [environment], [sums_out], device=device)
-    launch(find_key_light_kernel, 1, [sums_out], [key_lights_out], device=device)
+    launch(sum_rows_kernel, environment.shape[0], [environment], [sums_out])
+    launch(find_key_light_kernel, 1, [sums_out], [key_lights_out])

@@ -18,6 +18,7 @@ References:
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Literal
 
 import numpy as np
@@ -174,6 +175,7 @@ def lobe_kernel(cos_theta: np.ndarray, alpha: float, lobe: Lobe) -> np.ndarray:
 # K_k the lobe's zonal coefficients (K_0 = 1) and S_k the power per coefficient of natural scenes. A single level with
 # the lobe's second moment would do for Phong; GGX has tails so long that its moment grows without bound as alpha falls,
 # and a single box cannot have peak and tails.
+@functools.lru_cache(maxsize=4)
 def mip_weights(height: int, lobe: Lobe) -> np.ndarray:
     """Weights w_lm of box mips m (columns) that make the lobe of level l (rows), as derived above; row 0 is the mirror.
 

@@ -25,10 +25,10 @@ import math
 
 import warp as wp
 
-from warp_ar.kernels.environment.lobes import Lobe, LobeSamples, last_lobe, locate_texel
+from warp_ar.kernels.environment.lobes import Lobe, last_lobe, locate_texel
 from warp_ar.kernels.environment.pyramid import last_mip, sample_mips, sample_packed, sample_packed_smooth
 from warp_ar.kernels.latlong import texel_solid_angle
-from warp_ar.kernels.launch import Rows, launch_rows, launch_tiles, tile_kernel
+from warp_ar.kernels.launch import Rows, launch_rows, launch_tiles, row_launcher, tile_kernel
 from warp_ar.kernels.safe_math import safe_radiance
 
 wp.set_module_options({"enable_backward": False})
@@ -249,46 +249,26 @@ def scale_levels_kernel(
         levels_out[index] = value
 
 
-def mix_mips(
-    pyramid: wp.array[wp.vec3],
-    weights: wp.array2d[wp.float32],
-    height: int,
-    levels_out: wp.array[wp.vec3],
-    *,
-    rows: Rows | None = None,
-) -> None:
-    """Fill all levels with weighted sums of a pyramid's levels, each read through quadratic B-splines.
+mix_mips = row_launcher(mix_mips_kernel)
+"""Fill all levels with weighted sums of a pyramid's levels, each read through quadratic B-splines.
 
-    Args:
-        pyramid: Pyramid of the (height, 2 height) environment, see ``pyramid.build_pyramid``.
-        weights: (levels, mips) of ``mip_weights``.
-        height: Rows of the environment.
-        levels_out: (lobe_texels(height),).
-        rows: Band of packed texels; None means all.
-    """
-    inputs = [pyramid, weights, height]
-    launch_rows(mix_mips_kernel, levels_out.shape, inputs, [levels_out], rows=rows, device=pyramid.device)
+Args:
+    pyramid: Pyramid of the (height, 2 height) environment, see ``pyramid.build_pyramid``.
+    weights: (levels, mips) of ``mip_weights``.
+    height: Rows of the environment.
+    levels_out: (lobe_texels(height),).
+"""
 
 
-def sample_lobes(
-    pyramid: wp.array[wp.vec3],
-    samples: LobeSamples,
-    height: int,
-    levels_out: wp.array[wp.vec3],
-    *,
-    rows: Rows | None = None,
-) -> None:
-    """Fill all levels by filtered importance sampling.
+sample_lobes = row_launcher(sample_lobes_kernel)
+"""Fill all levels by filtered importance sampling.
 
-    Args:
-        pyramid: Isotropic pyramid of the (height, 2 height) environment.
-        samples: For the same height.
-        height: Rows of the environment.
-        levels_out: (lobe_texels(height),).
-        rows: Band of packed texels; None means all.
-    """
-    inputs = [pyramid, samples.directions, samples.weights, height]
-    launch_rows(sample_lobes_kernel, levels_out.shape, inputs, [levels_out], rows=rows, device=pyramid.device)
+Args:
+    pyramid: Isotropic pyramid of the (height, 2 height) environment.
+    samples: For the same height.
+    height: Rows of the environment.
+    levels_out: (lobe_texels(height),).
+"""
 
 
 def integrate_lobes(
@@ -303,7 +283,7 @@ def integrate_lobes(
         rows: Band of packed texels; None means all.
     """
     inputs = [environment, int(lobe == "phong")]
-    launch_rows(integrate_lobes_kernel, levels_out.shape, inputs, [levels_out], rows=rows, device=environment.device)
+    launch_rows(integrate_lobes_kernel, levels_out.shape, inputs, [levels_out], rows=rows)
 
 
 def measure_energy(
@@ -317,35 +297,15 @@ def measure_energy(
         row_energy_out: (lobe_rows(height),) scratch.
         energy_out: (lobe_count(height),).
     """
-    launch_tiles(
-        sum_level_rows_kernel,
-        row_energy_out.shape,
-        [levels, height],
-        [row_energy_out],
-        block_dim=BLOCK,
-        device=levels.device,
-    )
-    launch_tiles(
-        sum_levels_kernel,
-        energy_out.shape,
-        [row_energy_out, height],
-        [energy_out],
-        block_dim=BLOCK,
-        device=levels.device,
-    )
+    launch_tiles(sum_level_rows_kernel, row_energy_out.shape, [levels, height], [row_energy_out], block_dim=BLOCK)
+    launch_tiles(sum_levels_kernel, energy_out.shape, [row_energy_out, height], [energy_out], block_dim=BLOCK)
 
 
-def scale_levels(
-    energy: wp.array[wp.vec3], height: int, levels_out: wp.array[wp.vec3], *, rows: Rows | None = None
-) -> None:
-    """Scale every level, in place, to the energy of level 0.
+scale_levels = row_launcher(scale_levels_kernel)
+"""Scale every level, in place, to the energy of level 0.
 
-    Args:
-        energy: As ``measure_energy`` writes.
-        height: Rows of the environment.
-        levels_out: (lobe_texels(height),).
-        rows: Band of packed texels; None means all.
-    """
-    launch_rows(
-        scale_levels_kernel, levels_out.shape, [energy, height], [levels_out], rows=rows, device=levels_out.device
-    )
+Args:
+    energy: As ``measure_energy`` writes.
+    height: Rows of the environment.
+    levels_out: (lobe_texels(height),).
+"""

@@ -1,4 +1,4 @@
-"""How much each of several mirror balls says of the light at a point between them.
+"""Weights of several mirror balls in the light at a point between them.
 
 Gradient bands [Johansen09, section 6.3]. From the place c of ball i toward that of another, j, the point x stands at
 
@@ -138,7 +138,7 @@ def measure_seen(corners: wp.array, size: tuple[int, int], seen_out: wp.array, *
         rim_start: Pixels from the silhouette from which on a ball is read.
     """
     inputs = [corners, size[1], size[0], rim_start]
-    launch(measure_seen_kernel, seen_out.shape, inputs, [seen_out], device=seen_out.device)
+    launch(measure_seen_kernel, seen_out.shape, inputs, [seen_out])
 
 
 def update_places(seen: wp.array, probes: wp.array, params: wp.array, places_out: wp.array) -> None:
@@ -150,4 +150,4 @@ def update_places(seen: wp.array, probes: wp.array, params: wp.array, places_out
         params: ``FrameParams`` (1): ``time_step`` and ``environment_reset``.
         places_out: (P,) ``wp.vec4``: where each ball was last seen, metres, and its trust; the greatest is 1.
     """
-    launch(update_places_kernel, 1, [seen, probes, params], [places_out], device=places_out.device)
+    launch(update_places_kernel, 1, [seen, probes, params], [places_out])

@@ -29,7 +29,7 @@ import math
 import warp as wp
 
 from warp_ar.kernels.latlong import wrap_texel
-from warp_ar.kernels.launch import Rows, launch, launch_rows
+from warp_ar.kernels.launch import launch, row_launcher
 from warp_ar.kernels.safe_math import safe_radiance
 
 wp.set_module_options({"enable_backward": False})
@@ -343,15 +343,13 @@ def reduce_latlong_kernel(
     reduced_out[i, j] = total * (scale / (total_weight * wp.float32(source_width)))
 
 
-def copy_safe(environment: wp.array2d[wp.vec3], levels_out: wp.array[wp.vec3], *, rows: Rows | None = None) -> None:
-    """Write level 0 of a packed array: the environment with bad texels made safe.
+copy_safe = row_launcher(copy_safe_kernel, like=lambda environment, _: environment)
+"""Write level 0 of a packed array: the environment with bad texels made safe.
 
-    Args:
-        environment: (H, W) radiance.
-        levels_out: At least H W texels.
-        rows: Band of rows; None means all.
-    """
-    launch_rows(copy_safe_kernel, environment.shape, [environment], [levels_out], rows=rows, device=environment.device)
+Args:
+    environment: (H, W) radiance.
+    levels_out: At least H W texels.
+"""
 
 
 def build_pyramid(environment: wp.array2d[wp.vec3], levels_out: wp.array[wp.vec3]) -> None:
@@ -365,7 +363,7 @@ def build_pyramid(environment: wp.array2d[wp.vec3], levels_out: wp.array[wp.vec3
     for level in range(1, level_count(*environment.shape)):
         source, shape = level_size(*environment.shape, level - 1), level_size(*environment.shape, level)
         inputs = [level_offset(*environment.shape, level - 1), *source, *shape]
-        launch(reduce_level_kernel, shape, inputs, [levels_out], device=environment.device)
+        launch(reduce_level_kernel, shape, inputs, [levels_out])
 
 
 def reduce_latlong(radiance: wp.array2d[wp.vec3], reduced_out: wp.array2d[wp.vec3], *, scale: float = 1.0) -> None:
@@ -376,10 +374,4 @@ def reduce_latlong(radiance: wp.array2d[wp.vec3], reduced_out: wp.array2d[wp.vec
         reduced_out: (h, w), h <= H and w <= W.
         scale: Factor on the result.
     """
-    launch(
-        reduce_latlong_kernel,
-        dim=reduced_out.shape,
-        inputs=[radiance, scale],
-        outputs=[reduced_out],
-        device=radiance.device,
-    )
+    launch(reduce_latlong_kernel, dim=reduced_out.shape, inputs=[radiance, scale], outputs=[reduced_out])

@@ -9,7 +9,7 @@ axis:
     m = 2 sqrt(d_x^2 + d_y^2 + (d_z + 1)^2),   (s, t) = (d_x, d_y) / m + 1/2:
 
 the point whose normal halves the angle between d and the viewer. Nothing is divided by the ball's reflectance, for "the
-acquired environment map can be used as is". ``unwrap``'s ``area`` and ``bilinear`` are exact where this is not.
+acquired environment map can be used as is". ``unwrap``'s ``area`` is exact where this is not.
 
 References:
     [DH04] DiVerdi, Hoellerer, "Combining Dynamic Physical and Virtual Illumination in Augmented Reality", 2004.
@@ -249,7 +249,7 @@ def copy_ball(
         rows: Band of texel rows; None means all.
     """
     inputs = [params, probes, frame, decode_table, linear, SIZE]
-    launch_rows(copy_ball_kernel, (SIZE, SIZE), inputs, [sphere_map_out], rows=rows, device=frame.device)
+    launch_rows(copy_ball_kernel, (SIZE, SIZE), inputs, [sphere_map_out], rows=rows)
 
 
 def halve_levels(sphere_map: wp.array) -> None:
@@ -261,7 +261,7 @@ def halve_levels(sphere_map: wp.array) -> None:
     for level in range(1, level_count()):
         size = level_size(level)
         inputs = [level_offset(level - 1), level_offset(level), size]
-        launch(halve_level_kernel, (size, size), inputs, [sphere_map], device=sphere_map.device)
+        launch(halve_level_kernel, (size, size), inputs, [sphere_map])
 
 
 def look_up_level(
@@ -289,7 +289,7 @@ def look_up_level(
     """
     level = min(level, level_count() - 1)
     inputs = [params, sphere_map, level_offset(level), level_size(level), *shape, scale, first]
-    launch_rows(look_up_level_kernel, shape, inputs, [latlong_out], rows=rows, device=sphere_map.device)
+    launch_rows(look_up_level_kernel, shape, inputs, [latlong_out], rows=rows)
 
 
 def trust_ball(
@@ -316,4 +316,4 @@ def trust_ball(
         rows: Band of rows; None means all.
     """
     inputs, outputs = [params, probes, frame, linear, linear_clip], [confidence_out, clipped_out]
-    launch_rows(trust_ball_kernel, confidence_out.shape, inputs, outputs, rows=rows, device=frame.device)
+    launch_rows(trust_ball_kernel, confidence_out.shape, inputs, outputs, rows=rows)

@@ -39,8 +39,6 @@ from warp_ar.kernels.structs import BOX, MESH, PLANE, EnvironmentView, FramePara
 
 wp.set_module_options({"enable_backward": False})
 
-METHODS = ("bilinear", "area")
-
 RIM_START = 2.5
 """Pixels from the silhouette at which confidence starts. Along a diagonal a bilinear sample reaches 1.4 pixels and the
 pixel it finds there spreads over another 0.7; the rest is for the tracked outline, which errs by about half a pixel."""
@@ -106,7 +104,7 @@ def any_perpendicular(axis: wp.vec3) -> wp.vec3:
 
 @dataclasses.dataclass(frozen=True)
 class ProjectConfig:
-    """What can hide a ball."""
+    """Kinds of shape that can hide a ball."""
 
     occluders: tuple[int, ...] = ()
     """Kinds of proxy in the scene: any of PLANE, BOX, MESH."""
@@ -158,7 +156,7 @@ def make_hidden_by_proxies(kinds: tuple[int, ...]) -> wp.Function:
 
 @wp.func
 def is_folded(camera: FrameParams, rays: wp.array2d[wp.vec2], point: wp.vec3, at: wp.vec3) -> wp.bool:
-    """Whether the pixel that a point is projected to looks elsewhere, as a polynomial lens beyond its field of view.
+    """Return whether the pixel of a point looks elsewhere, as under a polynomial lens beyond its field of view.
 
     Args:
         camera: Of the frame.
@@ -179,7 +177,7 @@ def is_folded(camera: FrameParams, rays: wp.array2d[wp.vec2], point: wp.vec3, at
 def hidden_by_balls(
     probes: wp.array[Probe], own: wp.int32, origin: wp.vec3, point: wp.vec3, t_max: wp.float32, pad: wp.float32
 ) -> wp.bool:
-    """Whether a ball other than ``own`` comes within ``pad``, in metres, of the ray to a point up to ``t_max``.
+    """Return whether a ball other than ``own`` comes within ``pad``, in metres, of the ray to a point up to ``t_max``.
 
     ``point`` is relative to the ray's origin.
     """
@@ -294,7 +292,6 @@ def project_corners(
         [params, probes, rays, scene, rim_start],
         [corners_out],
         rows=rows,
-        device=corners_out.device,
     )
 
 
@@ -306,7 +303,7 @@ def mix(a: wp.vec3, b: wp.vec3, t: wp.float32) -> wp.vec3:
 
 @wp.struct
 class Texel:
-    """Where a frame shows a texel of the environment: its corners, as ``project_corners`` writes them."""
+    """Corners of a texel of the environment in the frame, as ``project_corners`` writes them."""
 
     c00: wp.vec3
     c01: wp.vec3
@@ -339,7 +336,7 @@ def footprint_samples(a0: wp.vec3, a1: wp.vec3, b0: wp.vec3, b1: wp.vec3) -> wp.
 
 
 @functools.cache
-def make_average_footprint(method: str, linear: bool) -> wp.Function:
+def make_average_footprint(linear: bool) -> wp.Function:
     """``average_footprint(frame, table, texel, rim) -> Footprint``.
 
     ``rim``: pixels from the silhouette at which confidence starts, and over which it rises.
@@ -350,21 +347,13 @@ def make_average_footprint(method: str, linear: bool) -> wp.Function:
     clips = is_at_clipping if linear else is_saturated
 
     @wp.func(module="unique")
-    def average_footprint(
-        frame: wp.array2d[pixel],
-        table: wp.array[wp.vec3],
-        texel: Texel,
-        rim: wp.vec2,
-    ) -> Footprint:
+    def average_footprint(frame: wp.array2d[pixel], table: wp.array[wp.vec3], texel: Texel, rim: wp.vec2) -> Footprint:
         out = Footprint()
         last_row = wp.float32(frame.shape[0] - 1)
         last_column = wp.float32(frame.shape[1] - 1)
         saturation = find_levels(table)
-        count_y = 1
-        count_x = 1
-        if wp.static(method == "area"):
-            count_y = footprint_samples(texel.c00, texel.c10, texel.c01, texel.c11)
-            count_x = footprint_samples(texel.c00, texel.c01, texel.c10, texel.c11)
+        count_y = footprint_samples(texel.c00, texel.c10, texel.c01, texel.c11)
+        count_x = footprint_samples(texel.c00, texel.c01, texel.c10, texel.c11)
         line = wp.int32(-1)
         area = wp.float32(0.0)
         left = wp.vec3(0.0, 0.0, 0.0)
@@ -409,16 +398,10 @@ def make_average_footprint(method: str, linear: bool) -> wp.Function:
 
 
 @functools.cache
-def make_gather_probe_kernel(method: str, linear: bool = False) -> wp.Kernel:
-    """Kernel of one method, of frames of 8-bit codes or ``linear`` ones.
-
-    Raises:
-        ValueError: There is no such method.
-    """
-    if method not in METHODS:
-        raise ValueError(f"unwrap: no method {method!r}; expected {', '.join(METHODS)}")
+def make_gather_probe_kernel(linear: bool = False) -> wp.Kernel:
+    """Kernel for frames of 8-bit codes or ``linear`` ones."""
     pixel = wp.vec3 if linear else wp.vec3ub
-    average_footprint = make_average_footprint(method, linear)
+    average_footprint = make_average_footprint(linear)
 
     @wp.kernel(module="unique", enable_backward=False)
     def gather_probe_kernel(
@@ -481,7 +464,6 @@ def gather_probe(
     corners: wp.array,
     view_out: EnvironmentView,
     *,
-    method: str = "area",
     rim_start: float = RIM_START,
     rim_width: float = RIM_WIDTH,
     own: int = ALL_ALIKE,
@@ -496,22 +478,16 @@ def gather_probe(
         probes: ``Probe`` (P); reflectances must be positive.
         corners: From ``project_corners``, (h + 1, w + 1, P).
         view_out: (h, w); of every texel its footprint's mean, and the share of it that is at clipping.
-        method: ``bilinear``: one sample at the texel's centre; ``area``: one per pixel of the footprint,
-            up to 8 x 8.
         rim_start: Pixels from the silhouette that are not used.
         rim_width: Pixels over which confidence then rises.
         own: The ball whose light is asked for: others then tell only of what it does not see. ``ALL_ALIKE``: all balls
             make one map, in which the one that sees more sharply has the say.
         rows: Band of texel rows, None for all.
-
-    Raises:
-        ValueError: There is no such method.
     """
     launch_rows(
-        make_gather_probe_kernel(method, frame.dtype is wp.vec3),
+        make_gather_probe_kernel(frame.dtype is wp.vec3),
         view_out.radiance.shape,
         [frame, decode_table, probes, corners, wp.vec2(rim_start, rim_width), own],
         [view_out],
         rows=rows,
-        device=view_out.radiance.device,
     )

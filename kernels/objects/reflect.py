@@ -1,4 +1,4 @@
-"""What a ray that leaves a surface sees: the receiver in the picture, virtual objects, the environment.
+"""Light along a ray that leaves a surface: of the receiver in the picture, virtual objects, the environment.
 
 The receiver is known twice: as part of the environment, seen from the mirror ball, and as the camera's picture, which
 the proxies place in space. Near an object the two differ by parallax, so a ray that meets a proxy looks the point up in
@@ -59,7 +59,7 @@ class DistantLightConfig:
     textures: bool
     """True if any material has a texture or emits, or any object's triangles have materials of their own."""
     diffuse: DiffuseForm
-    """Where the environment's irradiance comes from: nine coefficients, a latlong map, or nowhere."""
+    """Source of the environment's irradiance: nine coefficients, a latlong map, or nowhere."""
     specular: bool
     """True if the prefiltered environment is read."""
     probes: bool
@@ -73,17 +73,16 @@ class DistantLightConfig:
     gathered: bool = True
     """True if rays that happen to meet what emits bring its light; else ``area_lights`` are looked for themselves."""
 
-    def general(self, form: DiffuseForm, *, by_call: bool = False) -> DistantLightConfig:
+    def general(self, form: DiffuseForm) -> DistantLightConfig:
         """For any scene with as many mirror balls, textures or not: forms that it does not call for may be empty.
 
         Args:
             form: Where irradiance comes from in scenes that call for it.
-            by_call: As in ``TraceConfig.general``.
         """
         models = tuple(sorted(map(int, (LAMBERT, PHONG, MIRROR, METALLIC_ROUGHNESS))))
         known = self.probes or self.captured
         diffuse: DiffuseForm = form if known else "none"
-        trace = self.trace.general(by_call=by_call)
+        trace = self.trace.general()
         return dataclasses.replace(self, trace=trace, models=models, diffuse=diffuse, specular=known)
 
 
@@ -128,7 +127,7 @@ def look_up_layer(layer: wp.array2d[wp.vec3], x: wp.float32, y: wp.float32) -> w
 
 @wp.func
 def knows_irradiance(distant: DistantLight) -> wp.bool:
-    """Whether this scene calls for the environment's irradiance: a kernel of several scenes has it compiled in."""
+    """Return whether this scene calls for irradiance: a kernel of several scenes has it compiled in."""
     return distant.irradiance_map.shape[0] > 0 or distant.irradiance_sh.shape[0] > 0
 
 
@@ -218,12 +217,7 @@ def make_distant_irradiance(config: DistantLightConfig) -> wp.Function:
         if wp.static(config.diffuse != "none"):
             if knows_irradiance(distant):
                 irradiance = irradiance_at(
-                    distant.irradiance_sh,
-                    distant.irradiance_map,
-                    distant.emitters,
-                    distant.others,
-                    point,
-                    normal,
+                    distant.irradiance_sh, distant.irradiance_map, distant.emitters, distant.others, point, normal
                 )
         return irradiance
 
@@ -231,15 +225,23 @@ def make_distant_irradiance(config: DistantLightConfig) -> wp.Function:
 
 
 @functools.cache
-def make_radiance_along(config: DistantLightConfig) -> wp.Function:
-    """``radiance_along(distant, point, direction, level) -> vec3``: a level of the environment, as a point sees it."""
+def make_radiance_along(config: DistantLightConfig, captured: bool = False) -> wp.Function:
+    """``radiance_along(distant, point, direction, level) -> vec3``: a level of the environment, as a point sees it.
+
+    If ``captured``, the environment itself, whatever the level, with emitters where the balls saw them.
+    """
+    placed = config.emitters and not captured
 
     @wp.func(module="unique")
     def radiance_along(distant: DistantLight, point: wp.vec3, direction: wp.vec3, level: wp.float32) -> wp.vec3:
+        radiance = wp.vec3(0.0)
         toward = direction
-        if wp.static(config.emitters):
+        if wp.static(placed):
             toward = correct_parallax(distant.emitters, point, direction)
-        radiance = sample_levels(distant.levels, toward, level, distant.level_height)
+        if wp.static(captured):
+            radiance = sample_latlong(distant.environment, toward)
+        else:
+            radiance = sample_levels(distant.levels, toward, level, distant.level_height)
         if wp.static(config.several):
             balls = distant.others
             total = probe_weight(balls.places, 0, point)
@@ -248,33 +250,17 @@ def make_radiance_along(config: DistantLightConfig) -> wp.Function:
                 if weight > 0.0:
                     total += weight
                     toward = direction
-                    if wp.static(config.emitters):
+                    if wp.static(placed):
                         toward = correct_parallax(balls.emitters[ball - 1], point, direction)
-                    other = sample_levels(balls.levels[ball - 1], toward, level, distant.level_height)
+                    other = wp.vec3(0.0)
+                    if wp.static(captured):
+                        other = sample_latlong(balls.environment[ball - 1], toward)
+                    else:
+                        other = sample_levels(balls.levels[ball - 1], toward, level, distant.level_height)
                     radiance += (weight / total) * (other - radiance)
         return radiance
 
     return radiance_along
-
-
-@functools.cache
-def make_captured_along(config: DistantLightConfig) -> wp.Function:
-    """``captured_along(distant, point, direction) -> vec3``: the environment, unfiltered, as it was captured."""
-
-    @wp.func(module="unique")
-    def captured_along(distant: DistantLight, point: wp.vec3, direction: wp.vec3) -> wp.vec3:
-        radiance = sample_latlong(distant.environment, direction)
-        if wp.static(config.several):
-            balls = distant.others
-            total = probe_weight(balls.places, 0, point)
-            for ball in range(1, balls.places.shape[0]):
-                weight = probe_weight(balls.places, ball, point)
-                if weight > 0.0:
-                    total += weight
-                    radiance += (weight / total) * (sample_latlong(balls.environment[ball - 1], direction) - radiance)
-        return radiance
-
-    return captured_along
 
 
 @functools.cache

@@ -58,7 +58,7 @@ from warp_ar.kernels.rays.visibility import (
     make_primary,
     make_sample_direction,
 )
-from warp_ar.kernels.structs import FrameParams, Hit, Light, RayScene
+from warp_ar.kernels.structs import FrameParams, Hit, Light, RayScene, filled
 
 wp.set_module_options({"enable_backward": False})
 
@@ -72,7 +72,7 @@ MIN_FACING = wp.constant(wp.float32(1.0e-3))
 ALONE = wp.constant(-1)
 """Number of the one sample of a pixel without an edge."""
 SAMPLED, LISTED, LEFT = "sampled", "listed", "left"
-"""What becomes of edges in a kernel of ``make_shade_kernel``."""
+"""Treatments of edges in a kernel of ``make_shade_kernel``."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,9 +92,9 @@ class ShadeConfig:
     area_samples: int = 0
     """Samples of what emits, per point; ``area_lights.POINT_SAMPLES``: as lights at points; 0: nothing emits."""
 
-    def general(self, form: DiffuseForm, *, soft: bool, by_call: bool = False) -> ShadeConfig:
-        """For any scene with as many mirror balls; ``form`` and ``by_call`` as in ``DistantLightConfig.general``."""
-        distant = self.distant.general(form, by_call=by_call)
+    def general(self, form: DiffuseForm, *, soft: bool) -> ShadeConfig:
+        """For any scene with as many mirror balls; ``form`` as in ``DistantLightConfig.general``."""
+        distant = self.distant.general(form)
         return dataclasses.replace(self, distant=distant, lights=ALL_LIGHTS, soft=soft)
 
     def __post_init__(self) -> None:
@@ -120,13 +120,7 @@ def make_object_light(
         lights: (n,) Light; None without virtual lights.
         near: (H, W) each, as ``near_field.filter_near_field`` writes; None where objects show the environment alone.
     """
-    light = ObjectLight()
-    light.distant = distant
-    if lights is not None:
-        light.lights = lights
-    if near is not None:
-        light.near = near
-    return light
+    return filled(ObjectLight(), distant=distant, lights=lights, near=near)
 
 
 @wp.struct
@@ -164,13 +158,7 @@ def make_lit_by_areas(config: ShadeConfig) -> wp.Function:
 
     @wp.func(module="unique")
     def lit_by_areas(
-        scene: RayScene,
-        hit: Hit,
-        surface: Surface,
-        normal: wp.vec3,
-        geometric: wp.vec3,
-        wo: wp.vec3,
-        turn: wp.float32,
+        scene: RayScene, hit: Hit, surface: Surface, normal: wp.vec3, geometric: wp.vec3, wo: wp.vec3, turn: wp.float32
     ) -> wp.vec3:
         total = wp.vec3(0.0)
         count = area_count(scene)
@@ -302,13 +290,7 @@ def make_shade_hit(config: ShadeConfig) -> wp.Function:
 
 @wp.func
 def differs(
-    i: wp.int32,
-    j: wp.int32,
-    found: wp.int32,
-    reach: wp.float32,
-    rect: wp.vec4i,
-    visible: VisibleObjects,
-    hit: Hit,
+    i: wp.int32, j: wp.int32, found: wp.int32, reach: wp.float32, rect: wp.vec4i, visible: VisibleObjects, hit: Hit
 ) -> wp.bool:
     """Return whether a neighbour sees another surface than this pixel."""
     other = wp.int32(-1)
@@ -365,8 +347,7 @@ def make_shade_sample(config: ShadeConfig) -> wp.Function:
         sample: wp.int32,
         centre: Hit,
     ) -> wp.vec4:
-        i = pixel[0]
-        j = pixel[1]
+        i, j = pixel[0], pixel[1]
         alone = sample == ALONE
         direction = centre_direction(params, rays[i, j], 0)
         hit = centre
@@ -429,8 +410,7 @@ def make_shade_kernel(config: ShadeConfig, edges: str = SAMPLED) -> wp.Kernel:
         samples = wp.int32(0)
         rect = params[0].object_rect
         own = own_pixel(i, j, row_start, rect, virtual_out.shape[0], virtual_out.shape[1])
-        i = own[0]
-        j = own[1]
+        i, j = own[0], own[1]
         if i < 0:
             return
         if inside_rect(i, j, rect):

@@ -18,7 +18,7 @@ from warp_ar.kernels.color import below_saturation, decode, encode, saturation_c
 from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.pixels import pixel_run
 from warp_ar.kernels.rays.visibility import inside_rect
-from warp_ar.kernels.structs import FrameParams
+from warp_ar.kernels.structs import FrameParams, filled
 
 wp.set_module_options({"enable_backward": False})
 
@@ -117,12 +117,7 @@ def make_layers(
         shadow_ratio: (H, W) vec3, factor on the frame's radiance.
         mirror_ball: (H, W) vec3, change of the frame's radiance in the mirror balls.
     """
-    layers = Layers()
-    given = {"objects": virtual, "added": added_light, "ratio": shadow_ratio, "mirror_ball": mirror_ball}
-    for name, array in given.items():
-        if array is not None:
-            setattr(layers, name, array)
-    return layers
+    return filled(Layers(), objects=virtual, added=added_light, ratio=shadow_ratio, mirror_ball=mirror_ball)
 
 
 def composite(

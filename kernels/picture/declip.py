@@ -1,4 +1,4 @@
-"""How bright clipped pixels really were: the frame's linear radiance with an estimate wherever a channel clips.
+"""Radiance of clipped pixels: the frame's linear radiance with an estimate wherever a channel clips.
 
 A camera's clipped channel says only "at least 1". Three objects say more, each where it can:
 
@@ -46,7 +46,7 @@ import warp as wp
 
 from warp_ar.kernels.color import decode
 from warp_ar.kernels.latlong import sample_latlong
-from warp_ar.kernels.launch import Rows, launch, launch_rows
+from warp_ar.kernels.launch import Rows, launch, launch_rows, row_launcher
 from warp_ar.kernels.rays.shapes import FAR, intersect_sphere
 from warp_ar.kernels.rays.trace import TraceConfig, make_trace
 from warp_ar.kernels.structs import FrameParams, Picture, Probe, RayScene
@@ -82,17 +82,16 @@ class DeclipConfig:
 
 @wp.func
 def clipping(code: wp.vec3ub) -> wp.vec3:
-    """How far each channel counts as clipped, 0..1: 1 from ``CLIPPED`` up."""
-    return wp.vec3(
-        wp.clamp((wp.float32(code[0]) - KNEE) / (CLIPPED - KNEE), 0.0, 1.0),
-        wp.clamp((wp.float32(code[1]) - KNEE) / (CLIPPED - KNEE), 0.0, 1.0),
-        wp.clamp((wp.float32(code[2]) - KNEE) / (CLIPPED - KNEE), 0.0, 1.0),
-    )
+    """Degree to which each channel counts as clipped, 0..1: 1 from ``CLIPPED`` up."""
+    clipped = wp.vec3()
+    for channel in range(3):
+        clipped[channel] = wp.clamp((wp.float32(code[channel]) - KNEE) / (CLIPPED - KNEE), 0.0, 1.0)
+    return clipped
 
 
 @wp.func
 def hue_weight(radiance: wp.vec3) -> wp.float32:
-    """How much an unclipped pixel says about its clipped neighbours."""
+    """Weight of an unclipped pixel for its clipped neighbours."""
     w = wp.clamp((wp.max(radiance) - DARKEST) / (1.0 - DARKEST), 0.0, 1.0)
     return w * w
 
@@ -150,47 +149,24 @@ def pull_frame_kernel(
     active: wp.array2d[wp.int32],
     frame: wp.array2d[wp.vec3ub],
     decode_table: wp.array[wp.vec3],
-    columns: wp.int32,
-    # Out:
-    levels_out: wp.array[wp.vec4],
-):
-    """First level: hues of pixels that clip in no channel."""
-    i, j = wp.tid()
-    i += row_start
-    if active[i >> (_TILE_LEVEL - 1), j >> (_TILE_LEVEL - 1)] == 0:
-        levels_out[i * columns + j] = wp.vec4()
-        return
-    total = wp.vec4()
-    for r in range(2 * i, wp.min(2 * i + 2, frame.shape[0])):
-        for c in range(2 * j, wp.min(2 * j + 2, frame.shape[1])):
-            code = frame[r, c]
-            if wp.max(clipping(code)) == 0.0:
-                total += weighted_hue(decode(decode_table, code))
-    levels_out[i * columns + j] = total
-
-
-@wp.kernel(enable_backward=False)
-def pull_completed_kernel(
-    # In:
-    row_start: wp.int32,
-    active: wp.array2d[wp.int32],
-    frame: wp.array2d[wp.vec3ub],
     completed: wp.array2d[wp.vec3],
     columns: wp.int32,
     # Out:
     levels_out: wp.array[wp.vec4],
 ):
-    """First level again: hues of pixels that do not clip in all channels."""
+    """First level: hues of pixels that clip in no channel; of a ``completed`` frame, that do not clip in all."""
     i, j = wp.tid()
     i += row_start
-    if active[i >> (_TILE_LEVEL - 1), j >> (_TILE_LEVEL - 1)] == 0:
-        levels_out[i * columns + j] = wp.vec4()
-        return
     total = wp.vec4()
-    for r in range(2 * i, wp.min(2 * i + 2, frame.shape[0])):
-        for c in range(2 * j, wp.min(2 * j + 2, frame.shape[1])):
-            if wp.min(clipping(frame[r, c])) == 0.0:
-                total += weighted_hue(completed[r, c])
+    if active[i >> (_TILE_LEVEL - 1), j >> (_TILE_LEVEL - 1)] != 0:
+        for r in range(2 * i, wp.min(2 * i + 2, frame.shape[0])):
+            for c in range(2 * j, wp.min(2 * j + 2, frame.shape[1])):
+                clipped = clipping(frame[r, c])
+                if completed.shape[0] > 0:
+                    if wp.min(clipped) == 0.0:
+                        total += weighted_hue(completed[r, c])
+                elif wp.max(clipped) == 0.0:
+                    total += weighted_hue(decode(decode_table, frame[r, c]))
     levels_out[i * columns + j] = total
 
 
@@ -240,7 +216,6 @@ def sample_coarser(
 @wp.kernel(enable_backward=False)
 def push_level_kernel(
     # In:
-    row_start: wp.int32,
     active: wp.array2d[wp.int32],
     to_tile: wp.int32,
     coarse_offset: wp.int32,
@@ -253,7 +228,6 @@ def push_level_kernel(
 ):
     """From sums to values: hue, and levels climbed; the last level (no coarser rows) is completed by grey."""
     i, j = wp.tid()
-    i += row_start
     if to_tile >= 0 and active[i >> to_tile, j >> to_tile] == 0:
         return
     at = offset + i * columns + j
@@ -302,11 +276,9 @@ def complete_kernel(
     clipped = clipping(code)
     if wp.max(clipped) > 0.0 and wp.min(clipped) == 0.0:
         hue = hue_of(sample_coarser(levels, 0, rows, columns, i, j))
-        kept = wp.vec3(
-            wp.where(clipped[0] > 0.0, 0.0, 1.0),
-            wp.where(clipped[1] > 0.0, 0.0, 1.0),
-            wp.where(clipped[2] > 0.0, 0.0, 1.0),
-        )
+        kept = wp.vec3()
+        for channel in range(3):
+            kept[channel] = wp.where(clipped[channel] > 0.0, 0.0, 1.0)
         k = wp.dot(kept, radiance) / wp.dot(kept, hue)
         for channel in range(3):
             guess = wp.clamp(k * hue[channel], radiance[channel], BRIGHTEST)
@@ -423,9 +395,8 @@ def tile_shape(height: int, width: int) -> tuple[int, int]:
     return -(-height // side), -(-width // side)
 
 
-def mark_tiles(frame: wp.array, marked_out: wp.array, *, rows: Rows | None = None) -> None:
-    """Mark the tiles, ``tile_shape(H, W)`` int32, of a frame, (H, W) vec3ub, in which some channel clips."""
-    launch_rows(mark_tiles_kernel, marked_out.shape, [frame], [marked_out], rows=rows, device=frame.device)
+mark_tiles = row_launcher(mark_tiles_kernel)
+"""Mark the tiles, ``tile_shape(H, W)`` int32, of a frame, (H, W) vec3ub, in which some channel clips."""
 
 
 def widen_tiles(marked: wp.array, active_out: wp.array) -> None:
@@ -434,7 +405,13 @@ def widen_tiles(marked: wp.array, active_out: wp.array) -> None:
 
 
 def pull_frame(
-    active: wp.array, frame: wp.array, decode_table: wp.array, levels_out: wp.array, *, rows: Rows | None = None
+    active: wp.array,
+    frame: wp.array,
+    decode_table: wp.array,
+    completed: wp.array | None,
+    levels_out: wp.array,
+    *,
+    rows: Rows | None = None,
 ) -> None:
     """Write the first level: weighted hues of the pixels that do not clip.
 
@@ -442,23 +419,13 @@ def pull_frame(
         active: Tiles of ``widen_tiles``; the others give and get nothing.
         frame: (H, W) vec3ub, RGB.
         decode_table: (256,) vec3 of ``color.decode_table``.
+        completed: (H, W) vec3 of ``complete``, whose pixels that do not clip in all channels count; None: the frame's.
         levels_out: (``level_texels(H, W)``,) vec4: sums of weighted hue, and of weights.
         rows: Band of rows of the first level; None means all.
     """
     shape = level_shapes(*frame.shape)[0]
-    launch_rows(
-        pull_frame_kernel, shape, [active, frame, decode_table, shape[1]], [levels_out], rows=rows, device=frame.device
-    )
-
-
-def pull_completed(
-    active: wp.array, frame: wp.array, completed: wp.array, levels_out: wp.array, *, rows: Rows | None = None
-) -> None:
-    """Write the first level from ``complete``: weighted hues of the pixels that do not clip in all channels."""
-    shape = level_shapes(*frame.shape)[0]
-    launch_rows(
-        pull_completed_kernel, shape, [active, frame, completed, shape[1]], [levels_out], rows=rows, device=frame.device
-    )
+    given = [active, frame, decode_table, completed, shape[1]]
+    launch_rows(pull_frame_kernel, shape, given, [levels_out], rows=rows, device=frame.device)
 
 
 def fill_levels(active: wp.array, shape: tuple[int, int], levels_out: wp.array) -> None:
@@ -473,24 +440,13 @@ def fill_levels(active: wp.array, shape: tuple[int, int], levels_out: wp.array) 
     offsets = [sum(map(math.prod, shapes[:level])) for level in range(len(shapes))]
     device = levels_out.device
     for level in range(1, len(shapes)):
-        inputs = [
-            active,
-            TILE_LEVEL - 1 - level,
-            offsets[level - 1],
-            *shapes[level - 1],
-            offsets[level],
-            shapes[level][1],
-        ]
-        launch(pull_level_kernel, shapes[level], inputs, [levels_out], device=device)
+        finer = offsets[level - 1], *shapes[level - 1]
+        given = [active, TILE_LEVEL - 1 - level, *finer, offsets[level], shapes[level][1]]
+        launch(pull_level_kernel, shapes[level], given, [levels_out], device=device)
     coarser = (0, 0, 0)
     for level in reversed(range(len(shapes))):
-        launch(
-            push_level_kernel,
-            shapes[level],
-            [0, active, TILE_LEVEL - 1 - level, *coarser, offsets[level], shapes[level][1]],
-            [levels_out],
-            device=device,
-        )
+        given = [active, TILE_LEVEL - 1 - level, *coarser, offsets[level], shapes[level][1]]
+        launch(push_level_kernel, shapes[level], given, [levels_out], device=device)
         coarser = (offsets[level], *shapes[level])
 
 
@@ -514,14 +470,8 @@ def complete(
         rows: Band of rows; None means all.
     """
     shape = level_shapes(*frame.shape)[0]
-    launch_rows(
-        complete_kernel,
-        frame.shape,
-        [active, frame, decode_table, levels, *shape],
-        [declipped_out],
-        rows=rows,
-        device=frame.device,
-    )
+    given = [active, frame, decode_table, levels, *shape]
+    launch_rows(complete_kernel, frame.shape, given, [declipped_out], rows=rows, device=frame.device)
 
 
 def complete_core(
@@ -541,7 +491,7 @@ def complete_core(
     Args:
         config: Whether the ball's light is used, and which kinds of proxy there are.
         picture: The frame's codes, (H, W), and where its pixels look.
-        levels: Filled levels of ``pull_completed`` and ``fill_levels``.
+        levels: Filled levels of ``pull_frame`` of what was completed, and ``fill_levels``.
         params: (1,) FrameParams; the camera's pose.
         scene: Proxies.
         probes: Balls; ``environment`` is the light at the first.
@@ -549,13 +499,6 @@ def complete_core(
         declipped_out: (H, W) vec3; other pixels stay.
         rows: Band of rows; None means all.
     """
-    frame = picture.frame
-    shape = level_shapes(*frame.shape)[0]
-    launch_rows(
-        make_complete_core_kernel(config),
-        frame.shape,
-        [picture, levels, *shape, params, scene, probes, environment],
-        [declipped_out],
-        rows=rows,
-        device=frame.device,
-    )
+    kernel, size = make_complete_core_kernel(config), picture.frame.shape
+    given = [picture, levels, *level_shapes(*size)[0], params, scene, probes, environment]
+    launch_rows(kernel, size, given, [declipped_out], rows=rows, device=picture.frame.device)

@@ -68,19 +68,19 @@ from warp_ar.kernels.launch import Rows, launch, launch_rows
 from warp_ar.kernels.picture.composite import Layers, compose, is_changed, read_layers
 from warp_ar.kernels.picture.summed_area import fine_mean
 from warp_ar.kernels.pixels import pixel_run
-from warp_ar.kernels.structs import FrameParams, Picture
+from warp_ar.kernels.structs import FrameParams, Picture, filled
 
 wp.set_module_options({"enable_backward": False})
 
 METHODS = ("plain", "paper", "box", "declipped")
 """Cheapest first."""
 BOXES = ("paper", "paper_mean", "box")
-"""What looks at a box around clipped pixels: methods, and a reading of the paper that docs/paper.md compares."""
+"""Methods that look at a box around clipped pixels, and a reading of the paper that docs/paper.md compares."""
 
 MAX_BOX = 1.0 / 8.0
 """Side of the largest box in frame heights."""
 MAX_GAIN = wp.constant(wp.float32(2.0))
-"""How far above clipping a clipped pixel is guessed at most: one stop."""
+"""Largest guess of a clipped pixel over clipping: one stop."""
 LEAST_SCALE = wp.constant(wp.float32(1.0e-3))
 """Scale below which the paper's factor falls to 0 too: without light there is no picture."""
 KNEE = wp.constant(wp.float32(250.0))
@@ -103,7 +103,7 @@ _AUTO_STRIDE = wp.constant(AUTO_STRIDE)
 
 @wp.struct
 class ClippedEvidence:
-    """What tells the radiance of pixels that clip; what a method does not read may be empty."""
+    """Evidence of the radiance of pixels that clip; what a method does not read may be empty."""
 
     summed_area: wp.array2d[wp.uint32]  # (H, W) the frame's summed-area table, for methods that look at boxes
     cut_table: wp.array2d[wp.uint32]  # that of what 8 bits cut off; empty for frames of 8 bits
@@ -341,7 +341,7 @@ def make_clipped_evidence(
     cut_table: wp.array | None = None,
     levels: wp.array | None = None,
 ) -> ClippedEvidence:
-    """What is known of the clipped pixels of a frame; None for what the method does not read.
+    """Return the evidence of the clipped pixels of a frame; None for what the method does not read.
 
     Args:
         height: Rows of the frame.
@@ -350,13 +350,8 @@ def make_clipped_evidence(
         cut_table: (H, W) uint32, the table of what 8 bits cut off; None for frames of 8 bits.
         levels: (2,) vec3, radiance from which channels of a linear frame clip; None for frames of 8 bits.
     """
-    evidence = ClippedEvidence()
-    evidence.max_box = largest_box(height)
     arrays = {"summed_area": summed_area, "declipped": declipped, "cut_table": cut_table, "levels": levels}
-    for name, array in arrays.items():
-        if array is not None:
-            setattr(evidence, name, array)
-    return evidence
+    return filled(ClippedEvidence(), max_box=largest_box(height), **arrays)
 
 
 def make_exposure(encode_table: wp.array, scale: wp.array, codes: wp.array) -> Exposure:
@@ -367,9 +362,7 @@ def make_exposure(encode_table: wp.array, scale: wp.array, codes: wp.array) -> E
         scale: (1,) float32, not negative.
         codes: (256,) vec3ub, as ``expose_codes`` writes for this scale.
     """
-    exposure = Exposure()
-    exposure.encode_table, exposure.scale, exposure.codes = encode_table, scale, codes
-    return exposure
+    return filled(Exposure(), encode_table=encode_table, scale=scale, codes=codes)
 
 
 def read_scale(params: wp.array, scale_out: wp.array) -> None:
@@ -378,12 +371,7 @@ def read_scale(params: wp.array, scale_out: wp.array) -> None:
 
 
 def count_levels(
-    params: wp.array,
-    picture: Picture,
-    layers: Layers,
-    levels_out: wp.array,
-    *,
-    rows: Rows | None = None,
+    params: wp.array, picture: Picture, layers: Layers, levels_out: wp.array, *, rows: Rows | None = None
 ) -> None:
     """Count how bright the receiver is under virtual light, for ``auto``.
 
@@ -394,14 +382,8 @@ def count_levels(
         levels_out: (ceil(H / AUTO_STRIDE), LEVELS) int32, one row per sampled row of the frame.
         rows: Band of rows of ``levels_out``; None means all.
     """
-    launch_rows(
-        count_levels_kernel,
-        (levels_out.shape[0],),
-        [params, picture, layers],
-        [levels_out],
-        rows=rows,
-        device=levels_out.device,
-    )
+    shape, device = levels_out.shape[:1], levels_out.device
+    launch_rows(count_levels_kernel, shape, [params, picture, layers], [levels_out], rows=rows, device=device)
 
 
 def adapt_scale(params: wp.array, levels: wp.array, scale_out: wp.array) -> None:

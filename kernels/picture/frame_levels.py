@@ -39,7 +39,7 @@ LEAST_COSINE = wp.constant(wp.float32(0.02))
 
 @wp.struct
 class ReceiverLayers:
-    """What virtual objects and lights change in the picture of the receiver; empty where nothing does."""
+    """Changes of the picture of the receiver by virtual objects and lights; empty where nothing changes."""
 
     shadow_ratio: wp.array2d[wp.vec3]  # factor on the frame
     added: wp.array2d[wp.vec3]  # radiance of virtual light
@@ -48,7 +48,7 @@ class ReceiverLayers:
 
 @wp.struct
 class Footprint:
-    """How a ray changes over what it stands for, along two axes."""
+    """Change of a ray over the part of a pixel that it stands for, along two axes."""
 
     origin_x: wp.vec3  # metres
     origin_y: wp.vec3
@@ -110,40 +110,18 @@ def shrink_frame_kernel(
     # Out:
     levels_out: wp.array[wp.vec3],
 ):
-    """A texel of level 2, and the four of level 1 that it is the mean of."""
+    """A texel of level 1."""
     i, j = wp.tid()
     i += row_start
     height = picture.rays.shape[0]
     width = picture.rays.shape[1]
-    second = start_of(height, width, 2)
     total = wp.vec3(0.0)
     pixels = float(0.0)
-    # Most blocks are whole: loops of a fixed length take half the time.
-    if 4 * i + 4 <= height and 4 * j + 4 <= width:
-        for part in range(4):
-            row = 2 * i + part / 2
-            column = 2 * j + part % 2
-            own = wp.vec3(0.0)
-            for pixel in range(4):
-                own += composed_radiance(params[0], picture, layers, 2 * row + pixel / 2, 2 * column + pixel % 2)
-            levels_out[row * rows_of(width, 1) + column] = own / 4.0
-            total += own
-        pixels = 16.0
-    else:
-        for part in range(4):
-            row = 2 * i + part / 2
-            column = 2 * j + part % 2
-            own = wp.vec3(0.0)
-            count = float(0.0)
-            for y in range(2 * row, wp.min(2 * row + 2, height)):
-                for x in range(2 * column, wp.min(2 * column + 2, width)):
-                    own += composed_radiance(params[0], picture, layers, y, x)
-                    count += 1.0
-            if count > 0.0:
-                levels_out[row * rows_of(width, 1) + column] = own / count
-            total += own
-            pixels += count
-    levels_out[second + i * rows_of(width, 2) + j] = total / pixels
+    for y in range(2 * i, wp.min(2 * i + 2, height)):
+        for x in range(2 * j, wp.min(2 * j + 2, width)):
+            total += composed_radiance(params[0], picture, layers, y, x)
+            pixels += 1.0
+    levels_out[i * rows_of(width, 1) + j] = total / pixels
 
 
 @wp.func
@@ -180,21 +158,21 @@ def shrink_level_kernel(
 def shrink_frame(
     params: wp.array, picture: Picture, layers: ReceiverLayers, levels_out: wp.array, *, rows: Rows | None = None
 ) -> None:
-    """Write levels 1 and 2 of a picture.
+    """Write level 1 of a picture.
 
     Args:
         params: (1,) FrameParams: light_rect, beyond which no virtual light is added.
         picture: (H, W) the camera's.
         layers: (H, W) what is virtual on the receiver.
         levels_out: (level_texels(H, W),) vec3, linear radiance in camera values.
-        rows: Band of rows of level 2; None means all.
+        rows: Band of rows of the level; None means all.
     """
-    size = level_size(*picture.rays.shape, 2)
+    size = level_size(*picture.rays.shape, 1)
     launch_rows(shrink_frame_kernel, size, [params, picture, layers], [levels_out], rows=rows, device=levels_out.device)
 
 
 def shrink_level(height: int, width: int, level: int, levels_out: wp.array, *, rows: Rows | None = None) -> None:
-    """Write one of the levels 3 to ``LAST_LEVEL`` from the one below.
+    """Write one of the levels 2 to ``LAST_LEVEL`` from the one below.
 
     Args:
         height: Rows of the frame.
@@ -256,7 +234,7 @@ def look_up_level(
 
 @wp.func
 def covered_on(origin: wp.vec3, turn: wp.vec3, t: wp.float32, direction: wp.vec3, normal: wp.vec3) -> wp.vec3:
-    """What a ray covers of a surface that it meets at t, along one axis, as derived above."""
+    """Return the part of a surface that a ray covers at t, along one axis, as derived above."""
     moved = origin + t * turn
     cosine = wp.dot(direction, normal)
     cosine = wp.where(cosine < 0.0, wp.min(cosine, -LEAST_COSINE), wp.max(cosine, LEAST_COSINE))
@@ -269,10 +247,7 @@ def shown_as(params: FrameParams, from_camera: wp.vec3, change: wp.vec3) -> wp.v
     p = wp.transpose(params.world_from_camera) * from_camera
     d = wp.transpose(params.world_from_camera) * change
     z = wp.max(p[2], 1.0e-6)
-    return wp.vec2(
-        params.focal[0] * (d[0] - d[2] * p[0] / z) / z,
-        params.focal[1] * (d[1] - d[2] * p[1] / z) / z,
-    )
+    return wp.vec2(params.focal[0] * (d[0] - d[2] * p[0] / z) / z, params.focal[1] * (d[1] - d[2] * p[1] / z) / z)
 
 
 # A A' + B B' is a symmetric matrix of two rows, whose eigenvalues are the squares of the ellipse's half axes:

@@ -64,7 +64,7 @@ mat99d = wp.types.matrix((UNKNOWNS, UNKNOWNS), wp.float64)
 
 @wp.struct
 class Print:
-    """What is printed, in the world's frame, metres: m points on edges, c cells."""
+    """Printed pattern in the world's frame, metres: m points on edges, c cells."""
 
     points: wp.array[wp.vec3d]
     tangents: wp.array[wp.vec3d]
@@ -86,7 +86,7 @@ class Lens:
 
 @wp.struct
 class Asked:
-    """What one call is asked; the host writes it."""
+    """Input of one call; the host writes it."""
 
     poses: wp.int32
     reaches: wp.int32

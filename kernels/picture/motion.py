@@ -1,4 +1,4 @@
-"""How far the surface that a pixel shows has moved in the picture since the frame before, in pixels.
+"""Motion of the surface that a pixel shows since the frame before, in pixels of the picture.
 
     motion = where the camera shows the point now - where the camera before showed where the point was before
 
@@ -12,7 +12,7 @@ from __future__ import annotations
 import warp as wp
 
 from warp_ar.kernels.camera import project
-from warp_ar.kernels.launch import Rows, launch, launch_rows
+from warp_ar.kernels.launch import launch, row_launcher
 from warp_ar.kernels.rays.shapes import to_local_point
 from warp_ar.kernels.structs import FrameParams, RayScene, Shape
 
@@ -21,7 +21,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def point_before(point: wp.vec3, now: Shape, before: Shape) -> wp.vec3:
-    """Where a point of a rigid body was, given where the body is and was."""
+    """Return the earlier place of a point of a rigid body, given where the body is and was."""
     if now.position == before.position and now.rotation == before.rotation and now.scale == before.scale:
         return point
     return before.rotation * (before.scale * to_local_point(now, point)) + before.position
@@ -75,37 +75,18 @@ def remember_kernel(
         objects_out[k] = scene.objects[k]
 
 
-def find_motion(
-    params: wp.array,
-    params_before: wp.array,
-    scene: RayScene,
-    objects_before: wp.array,
-    index: wp.array,
-    position: wp.array,
-    motion_out: wp.array,
-    *,
-    rows: Rows | None = None,
-) -> None:
-    """Write the motion of every pixel; 0 where nothing is modelled, and in the first frame.
+find_motion = row_launcher(find_motion_kernel)
+"""Write the motion of every pixel; 0 where nothing is modelled, and in the first frame.
 
-    Args:
-        params: (1,) FrameParams, the camera.
-        params_before: (1,) FrameParams of the frame before, as ``remember`` writes it; zeros before the first.
-        scene: Its objects are where they are now.
-        objects_before: (n,) Shape of the frame before.
-        index: (H, W) int32, as ``trace_surfaces`` writes.
-        position: (H, W) vec3, world, metres.
-        motion_out: (H, W) vec2, pixels.
-        rows: Band of rows; None means all.
-    """
-    launch_rows(
-        find_motion_kernel,
-        index.shape,
-        [params, params_before, scene, objects_before, index, position],
-        [motion_out],
-        rows=rows,
-        device=index.device,
-    )
+Args:
+    params: (1,) FrameParams, the camera.
+    params_before: (1,) FrameParams of the frame before, as ``remember`` writes it; zeros before the first.
+    scene: Its objects are where they are now.
+    objects_before: (n,) Shape of the frame before.
+    index: (H, W) int32, as ``trace_surfaces`` writes.
+    position: (H, W) vec3, world, metres.
+    motion_out: (H, W) vec2, pixels.
+"""
 
 
 def remember(params: wp.array, scene: RayScene, params_out: wp.array, objects_out: wp.array) -> None:

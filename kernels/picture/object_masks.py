@@ -1,10 +1,10 @@
-"""Which virtual objects a ray through each pixel's centre meets, whatever hides them: silhouettes for data sets."""
+"""Virtual objects that a ray through each pixel's centre meets, whatever hides them: silhouettes for data sets."""
 
 from __future__ import annotations
 
 import warp as wp
 
-from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.launch import row_launcher
 from warp_ar.kernels.rays.shapes import (
     FAR,
     intersect_box,
@@ -53,23 +53,12 @@ def trace_object_masks_kernel(
     masks_out[i, j] = mask
 
 
-def trace_object_masks(
-    params: wp.array[FrameParams],
-    rays: wp.array2d[wp.vec2],
-    scene: RayScene,
-    masks_out: wp.array2d[wp.uint64],
-    *,
-    rows: Rows | None = None,
-) -> None:
-    """Note which objects lie behind each pixel's centre.
+trace_object_masks = row_launcher(trace_object_masks_kernel)
+"""Note which objects lie behind each pixel's centre.
 
-    Args:
-        params: Frame values: camera and object_rect, outside of which no object is.
-        rays: (H, W) undistorted x / z and y / z of each pixel centre.
-        scene: At most 64 objects: a pixel has a bit for each.
-        masks_out: (H, W) bit k: the ray meets object k, in front of whatever else.
-        rows: Band of rows; None means all.
-    """
-    launch_rows(
-        trace_object_masks_kernel, rays.shape, [params, rays, scene], [masks_out], rows=rows, device=rays.device
-    )
+Args:
+    params: Frame values: camera and object_rect, outside of which no object is.
+    rays: (H, W) undistorted x / z and y / z of each pixel centre.
+    scene: At most 64 objects: a pixel has a bit for each.
+    masks_out: (H, W) bit k: the ray meets object k, in front of whatever else.
+"""

@@ -15,7 +15,7 @@ import functools
 import warp as wp
 
 from warp_ar.kernels.color import decode, is_clipped
-from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.launch import row_launcher
 from warp_ar.kernels.picture.composite import Layers, read_layers
 from warp_ar.kernels.picture.expose import ClippedEvidence, make_find_gain
 from warp_ar.kernels.structs import FrameParams, Picture
@@ -76,34 +76,15 @@ def make_separate_layers_kernel(method: str) -> wp.Kernel:
     return separate_layers_kernel
 
 
-def separate_layers(
-    method: str,
-    params: wp.array,
-    picture: Picture,
-    layers: Layers,
-    clipped: ClippedEvidence,
-    scale: wp.array | None,
-    out: SeparateLayers,
-    *,
-    rows: Rows | None = None,
-) -> None:
-    """Write every layer that has an array in ``out``.
+separate_layers = row_launcher(make_separate_layers_kernel, like=lambda params, picture, *_: picture.frame)
+"""Write every layer that has an array in ``out``.
 
-    Args:
-        method: How ``expose`` estimates clipped pixels: ``plain`` where it does not run.
-        params: (1,) FrameParams; its rectangles bound the layers.
-        picture: (H, W) the camera's; its rays are not read.
-        layers: From ``composite.make_layers``.
-        clipped: From ``expose.make_clipped_evidence``.
-        scale: (1,) float32, the exposure scale; None means 1.
-        out: (H, W) arrays of the layers that are asked for.
-        rows: Band of rows; None means all.
-    """
-    launch_rows(
-        make_separate_layers_kernel(method),
-        picture.frame.shape,
-        [params, picture, layers, clipped, scale],
-        [out],
-        rows=rows,
-        device=picture.frame.device,
-    )
+Args:
+    method: How ``expose`` estimates clipped pixels: ``plain`` where it does not run.
+    params: (1,) FrameParams; its rectangles bound the layers.
+    picture: (H, W) the camera's; its rays are not read.
+    layers: From ``composite.make_layers``.
+    clipped: From ``expose.make_clipped_evidence``.
+    scale: (1,) float32, the exposure scale; None means 1.
+    out: (H, W) arrays of the layers that are asked for.
+"""

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.launch import Rows, launch_rows, row_launcher
 from warp_ar.kernels.pixels import cut_luma
 
 wp.set_module_options({"enable_backward": False})
@@ -109,20 +109,15 @@ def write_cut_kernel(
     cut_out[row, column] = wp.vec3ub(code, code, code)
 
 
-def write_cut(
-    frame: wp.array, decode_table: wp.array, linear: wp.array, cut_out: wp.array, *, rows: Rows | None = None
-) -> None:
-    """Write what 8 bits cut off a frame's intensity as a frame of its own, to be summed like one.
+write_cut = row_launcher(write_cut_kernel)
+"""Write what 8 bits cut off a frame's intensity as a frame of its own, to be summed like one.
 
-    Args:
-        frame: (H, W) vec3ub, RGB codes.
-        decode_table: (256,) vec3, linear value of each code.
-        linear: (H, W) vec3, linear radiance.
-        cut_out: (H, W) vec3ub, greys: ``NOT_CUT`` and ``CUT_STEPS`` for each code that is cut off.
-        rows: Band of rows; None means all.
-    """
-    inputs = [frame, decode_table, linear]
-    launch_rows(write_cut_kernel, frame.shape, inputs, [cut_out], rows=rows, device=frame.device)
+Args:
+    frame: (H, W) vec3ub, RGB codes.
+    decode_table: (256,) vec3, linear value of each code.
+    linear: (H, W) vec3, linear radiance.
+    cut_out: (H, W) vec3ub, greys: ``NOT_CUT`` and ``CUT_STEPS`` for each code that is cut off.
+"""
 
 
 @wp.kernel(enable_backward=False)
@@ -172,10 +167,10 @@ def column_groups(width: int) -> int:
     return -(-width // int(COLUMNS))
 
 
-def sum_columns(table_out: wp.array, *, groups: Rows | None = None) -> None:
-    """Sum the columns of ``sum_rows``, in place; ``groups`` is a band of ``column_groups``, None means all."""
+def sum_columns(table_out: wp.array, *, rows: Rows | None = None) -> None:
+    """Sum the columns of ``sum_rows``, in place; ``rows`` is a band of ``column_groups``, None means all."""
     shape = (column_groups(table_out.shape[1]),)
-    launch_rows(sum_columns_kernel, shape, [], [table_out], rows=groups, device=table_out.device)
+    launch_rows(sum_columns_kernel, shape, [], [table_out], rows=rows, device=table_out.device)
 
 
 def sum_area(frame: wp.array, table_out: wp.array) -> None:

@@ -66,7 +66,7 @@ CANDIDATES = 4
 MANY_SAMPLES = 128
 """Number of samples from which on each is a place of its own."""
 LEAST_FACING = wp.constant(wp.float32(0.05))
-"""What a place counts that a surface does not face: its lobe may still look there."""
+"""Weight of a place that a surface does not face: its lobe may still look there."""
 # Solid angles between which a triangle is sampled by its angle. Directions lose 1e-7 / angle^2 to float32: 1e-3 here,
 # where all of a triangle is seen nearly alike anyway. Above, it is nearly a half space.
 LEAST_SOLID_ANGLE = wp.constant(wp.float32(1.0e-2))
@@ -396,7 +396,7 @@ def lobe_solid_angle(surface: Surface) -> wp.float32:
 
 @wp.func
 def looks_by_lobe(shape: Shape, point: wp.vec3, lobe: wp.float32) -> wp.bool:
-    """Whether rays into a lobe of a solid angle find what an object sends there, not samples on the object."""
+    """Return whether rays into a lobe of a solid angle find what an object sends there, not samples on the object."""
     away = shape.position - point
     square = wp.dot(away, away)
     radius = area_radius(shape)
@@ -420,7 +420,7 @@ def draw_lobe(surface: Surface, normal: wp.vec3, wo: wp.vec3, u: wp.vec2) -> wp.
 
 @wp.func
 def lobe_weight(surface: Surface, normal: wp.vec3, wo: wp.vec3, wi: wp.vec3) -> wp.vec3:
-    """What the lobe reflects from a direction of ``draw_lobe``, over the density with which that is drawn."""
+    """Return the lobe's reflection from a direction of ``draw_lobe``, over the density with which that is drawn."""
     if surface.model == METALLIC_ROUGHNESS:
         half = wp.normalize(wi + wo)
         alpha = surface.roughness * surface.roughness

@@ -26,7 +26,7 @@ MOST_LAYERS = wp.constant(64)
 def is_there(
     scene: RayScene, shape: Shape, contact: Contact, origin: wp.vec3, direction: wp.vec3, sided: wp.bool
 ) -> wp.bool:
-    """Whether a triangle holds up a ray in the shape's coordinates; ``sided``: not from behind, if it is seen so.
+    """Return whether a triangle holds up a ray in the shape's coordinates; if ``sided``, not from behind.
 
     Blended triangles hold up as large a share of rays as their alpha says, by a threshold for each cell of space that
     is about a pixel wide: it stays with the surface when the camera moves [WM17].

@@ -145,4 +145,4 @@ def find_closest_face(mesh_id: wp.uint64, origin: wp.vec3, direction: wp.vec3, t
 
 @wp.func_native(_WALK.format(stack=STACK, found="", meet="return true;", missed="false"))
 def meets_any_face(mesh_id: wp.uint64, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
-    """Whether a ray meets a triangle before ``t_max``."""
+    """Return whether a ray meets a triangle before ``t_max``."""

@@ -123,7 +123,7 @@ def make_shadow(config: TraceConfig) -> wp.Function:
 
 @wp.func
 def has_penumbra(light: Light, sample: LightSample) -> wp.bool:
-    """Whether a light is seen in part from around the point of a sample."""
+    """Return whether a light is seen in part from around the point of a sample."""
     return light.radius > 0.0 and light.kind != DIRECTIONAL and sample.distance > light.radius
 
 

@@ -1,4 +1,4 @@
-"""Where a ray meets one shape: a sphere, a box, a plane or a mesh, in the shape's own coordinates.
+"""Intersection of a ray with one shape: a sphere, a box, a plane or a mesh, in the shape's own coordinates.
 
 Spheres, boxes and planes are intersected analytically, meshes through a BVH in local space: Warp's own on CUDA
 (``kernels/rays/mesh_walk.py``), one of eight children per node on CPU (``kernels/rays/wide_bvh.py``). Ray parameters
@@ -33,7 +33,7 @@ FAR = wp.constant(wp.float32(3.0e38))
 
 @wp.struct
 class Contact:
-    """Where a ray meets one shape."""
+    """Intersection of a ray with one shape."""
 
     t: wp.float32  # FAR: not at all
     face: wp.int32  # of a mesh
@@ -188,7 +188,7 @@ def intersect_mesh(shape: Shape, origin: wp.vec3, direction: wp.vec3, t_max: wp.
 
 @wp.func
 def meets_mesh(shape: Shape, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
-    """Whether any face of a mesh lies before t_max."""
+    """Return whether any face of a mesh lies before t_max."""
     start = enter_mesh(shape.extent, origin, direction)
     if start >= t_max:
         return False

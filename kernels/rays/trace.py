@@ -1,8 +1,7 @@
 """Rays through the scene: the closest hit and any hit among objects and proxies.
 
 Functions that walk the scene come from ``make_trace``, specialised to the kinds of shape that are there: a scene of
-spheres holds no mesh code. Kernels on CPU that all scenes share call one walk through all kinds by its address
-(``kernels/rays/called_walks.py``). ``kernels/rays/shapes.py`` has the shapes one by one; here rays also leave surfaces
+spheres holds no mesh code. ``kernels/rays/shapes.py`` has the shapes one by one; here rays also leave surfaces
 (``offset_origin``) and meet mirror balls (``meets_probe``).
 
 References:
@@ -17,7 +16,6 @@ from typing import NamedTuple
 
 import warp as wp
 
-from warp_ar.kernels.rays import called_walks
 from warp_ar.kernels.rays.mesh_detail import bumped, intersect_solid
 from warp_ar.kernels.rays.shapes import (
     FAR,
@@ -46,13 +44,11 @@ wp.set_module_options({"enable_backward": False})
 
 ALL_KINDS = tuple(sorted(map(int, (SPHERE, BOX, PLANE, MESH))))
 """Of shapes."""
-BY_CALL = (-1,)
-"""In place of kinds: any, by a walk that is called (``kernels/rays/called_walks.py``). Only scenes on CPU have one."""
 
 
 @wp.func
 def meets_probe(probes: wp.array[Probe], origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
-    """Whether a mirror ball lies in the way."""
+    """Return whether a mirror ball lies in the way."""
     for index in range(probes.shape[0]):
         probe = probes[index]
         if intersect_sphere(probe.radius, origin - probe.center, direction, t_max) < t_max:
@@ -80,34 +76,28 @@ class Trace(NamedTuple):
     closest_proxy: wp.Function
     """Closest proxy: ``Hit``."""
     occluded_by_objects: wp.Function
-    """Whether any virtual object lies in the way: ``bool``."""
+    """True if any virtual object lies in the way: ``bool``."""
     occluded_by_proxies: wp.Function
-    """Whether any proxy lies in the way: ``bool``."""
+    """True if any proxy lies in the way: ``bool``."""
     occluded: wp.Function
     """Either of the two."""
 
 
 @dataclasses.dataclass(frozen=True)
 class TraceConfig:
-    """Which kinds of shape exist; the others are not compiled in. Kinds are sorted and unique, or ``BY_CALL``."""
+    """Kinds of shape that exist; the others are not compiled in. Kinds are sorted and unique."""
 
     objects: tuple[int, ...]
     """Kinds among the virtual objects."""
     proxies: tuple[int, ...]
     """Kinds among the proxies."""
     detail: bool = False
-    """Whether any object's triangles let rays pass or have normal maps."""
+    """True if any object's triangles let rays pass or have normal maps."""
     stretched: bool = False
-    """Whether any object may be stretched."""
+    """True if any object may be stretched."""
 
-    def general(self, *, by_call: bool = False) -> TraceConfig:
-        """For any scene with such triangles or without: each shape's kind is asked for as it is met.
-
-        Args:
-            by_call: Whether walks are called, those of any triangles then; for kernels that run on CPU.
-        """
-        if by_call:
-            return TraceConfig(BY_CALL, BY_CALL)
+    def general(self) -> TraceConfig:
+        """For any scene with such triangles: each shape's kind is asked for as it is met."""
         return TraceConfig(ALL_KINDS, ALL_KINDS, self.detail, self.stretched)
 
 
@@ -240,7 +230,7 @@ def _make_closest(kinds: tuple[int, ...], detail: bool, stretched: bool) -> wp.F
 
 @functools.cache
 def _make_meets(kinds: tuple[int, ...], detail: bool, stretched: bool) -> wp.Function:
-    """Whether a ray meets a shape of one of the given kinds."""
+    """Return whether a ray meets a shape of one of the given kinds."""
     local_point, local_vector, _ = _ways(stretched)
 
     @wp.func(name=f"meets_{_label(kinds, detail, stretched)}", module="unique")
@@ -269,7 +259,7 @@ def _make_meets(kinds: tuple[int, ...], detail: bool, stretched: bool) -> wp.Fun
 
 @functools.cache
 def _make_any(kinds: tuple[int, ...], detail: bool, stretched: bool) -> wp.Function:
-    """Whether a ray meets any of the shapes of the given kinds."""
+    """Return whether a ray meets any of the shapes of the given kinds."""
     meets = _make_meets(kinds, detail, stretched)
 
     @wp.func(name=f"any_hit_{_label(kinds, detail, stretched)}", module="unique")
@@ -287,7 +277,7 @@ def _make_any(kinds: tuple[int, ...], detail: bool, stretched: bool) -> wp.Funct
 
 @functools.cache
 def _make_any_of_both(kinds: tuple[int, ...], detail: bool, stretched: bool) -> wp.Function:
-    """Whether a ray meets any object or proxy, both of the given kinds: one loop, for the walks in it are long code."""
+    """Return whether a ray meets any object or proxy of the given kinds: one loop, for its walks are long code."""
     meets = _make_meets(kinds, detail, stretched)
 
     @wp.func(module="unique")
@@ -311,9 +301,7 @@ def make_trace(config: TraceConfig) -> Trace:
     """Functions that trace rays through a scene with the kinds of shape in ``config``; equal configs share them."""
     closest_object, any_object = _through_objects(config)
     closest_proxy, any_proxy = _through_proxies(config.proxies)
-    if config.objects == config.proxies == BY_CALL:
-        occluded = called_walks.call_any_of_both
-    elif config.objects == config.proxies:
+    if config.objects == config.proxies:
         occluded = _make_any_of_both(config.objects, config.detail, config.stretched)
     else:
 
@@ -328,8 +316,6 @@ def make_trace(config: TraceConfig) -> Trace:
 
 def _through_objects(config: TraceConfig) -> tuple[wp.Function, wp.Function]:
     """Closest and any hit among objects."""
-    if config.objects == BY_CALL:
-        return called_walks.call_closest_object, called_walks.call_any_object
     closest, any_hit = make_walks(config.objects, config.detail, config.stretched)
 
     @wp.func(module="unique")
@@ -345,8 +331,6 @@ def _through_objects(config: TraceConfig) -> tuple[wp.Function, wp.Function]:
 
 def _through_proxies(kinds: tuple[int, ...]) -> tuple[wp.Function, wp.Function]:
     """Closest and any hit among proxies."""
-    if kinds == BY_CALL:
-        return called_walks.call_closest_proxy, called_walks.call_any_proxy
     closest, any_hit = make_walks(kinds, False, False)
 
     @wp.func(module="unique")

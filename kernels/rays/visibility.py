@@ -11,7 +11,7 @@ import math
 
 import warp as wp
 
-from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.launch import row_launcher
 from warp_ar.kernels.pixel_order import own_pixel
 from warp_ar.kernels.rays.shapes import FAR, ROUNDING
 from warp_ar.kernels.rays.trace import TraceConfig, make_trace, meets_probe
@@ -30,7 +30,7 @@ class VisibleObjects:
 
 @wp.func
 def inside_rect(row: wp.int32, column: wp.int32, rect: wp.vec4i) -> wp.bool:
-    """Whether a pixel lies in a rectangle (row_start, row_stop, column_start, column_stop)."""
+    """Return whether a pixel lies in a rectangle (row_start, row_stop, column_start, column_stop)."""
     return row >= rect[0] and row < rect[1] and column >= rect[2] and column < rect[3]
 
 
@@ -88,7 +88,7 @@ def check_edge_samples(count: int) -> None:
 
 @wp.func
 def look_within_pixel(params: wp.array[FrameParams], ray: wp.vec2, sample: wp.int32, side: wp.int32) -> wp.vec3:
-    """Where one of a pixel's ``side**2`` samples looks in the world, not unit; a single one through its centre."""
+    """Return the direction, not unit, of one of a pixel's ``side**2`` samples; a single one is at its centre."""
     inner = wp.vec3(ray[0], ray[1], 1.0)
     if side > 1:
         step = 1.0 / wp.float32(side)
@@ -154,31 +154,13 @@ def make_trace_pixels_kernel(config: TraceConfig) -> wp.Kernel:
     return trace_pixels_kernel
 
 
-def trace_pixels(
-    config: TraceConfig,
-    params: wp.array[FrameParams],
-    rays: wp.array2d[wp.vec2],
-    scene: RayScene,
-    visible_out: VisibleObjects,
-    *,
-    rows: Rows | None = None,
-) -> None:
-    """Trace a ray through the centre of every pixel of ``params.object_rect``.
+trace_pixels = row_launcher(make_trace_pixels_kernel, like=lambda params, rays, *_: rays, rectangle_first=True)
+"""Trace a ray through the centre of every pixel of ``params.object_rect``.
 
-    Args:
-        config: Kinds of shape in ``scene``.
-        params: Frame values: camera and object_rect.
-        rays: (H, W) undistorted x / z and y / z of each pixel centre.
-        scene: What rays meet.
-        visible_out: (H, W) the objects and hits.
-        rows: Band of rows; None means all.
-    """
-    launch_rows(
-        make_trace_pixels_kernel(config),
-        rays.shape,
-        [params, rays, scene],
-        [visible_out],
-        rows=rows,
-        device=rays.device,
-        rectangle_first=True,
-    )
+Args:
+    config: Kinds of shape in ``scene``.
+    params: Frame values: camera and object_rect.
+    rays: (H, W) undistorted x / z and y / z of each pixel centre.
+    scene: What rays meet.
+    visible_out: (H, W) the objects and hits.
+"""

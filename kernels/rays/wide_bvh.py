@@ -225,7 +225,7 @@ def walk_closest(tree: wp.uint64, origin: wp.vec3, direction: wp.vec3, t_max: wp
 
 @wp.func_native(_WALK.format(missed="false", distances="", stack=STACK, descend=_DESCEND, meet=_MEET_ANY, go_on=_GO_ON))
 def walk_any(tree: wp.uint64, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
-    """Whether a ray meets a triangle before ``t_max``."""
+    """Return whether a ray meets a triangle before ``t_max``."""
 
 
 # ---- building --------------------------------------------------------------------------------------------------------
@@ -246,7 +246,7 @@ def find_bin(middle: wp.float32, low: wp.float32, bins_per_length: wp.float32) -
 
 @wp.struct
 class Building:
-    """What a tree is built from, and environment to work."""
+    """Input of the construction of a tree, and its working memory."""
 
     corners: wp.array2d[wp.vec3]  # (triangles, 3)
     lower: wp.array[wp.vec3]  # boxes, with their margins

@@ -9,54 +9,353 @@ real and in the picture already) and with them. Both are sums over the same samp
 (``environment_samples``), so a point that no object shades has a ratio of exactly 1, one that sees nothing but a black
 object 0, and an error of the samples cancels to first order.
 
-How that is done stands in its parts: cells and sets of samples (``environment_shadow_cells``), what their rays may meet
-(``environment_shadow_rays``), what objects send back (``environment_shadow_bounce``), and the mean of neighbours
-(``environment_shadow_filter``). The estimate is one kernel here, for a CPU and for sets of any size, or a wavefront of
-kernels (``environment_shadow_wavefront``) with the same result.
+Cells. One pixel of every ``stride x stride`` is estimated. The cells of a tile of ``side x side`` use one set of
+samples each, and every set in turn; ``environment_shadow_filter`` then averages over one tile's worth of cells, so that
+each set counts the same [KH01]. All of it is a function of the frame alone: nothing flickers and nothing lags.
+
+Culling. A sample matters only if its direction meets the bounding sphere of an object; a dot product tells. Only those
+rays are traced, and cells that have none are done.
+
+The physical. A ray that meets a proxy or a mirror ball, with objects or without them, finds its light: the camera's
+picture of it where that shows it (``traced``), else what the ball saw in its direction; of a ball what it reflects.
+
+What objects send back is found by ``environment_shadow_bounce``. The estimate is one kernel here, for a CPU and for
+sets of any size, or a wavefront of kernels (``environment_shadow_wavefront``) with the same result.
 
 References:
     [Deb98] Debevec 1998, Rendering Synthetic Objects into Real Scenes.
+    [KH01] Keller, Heidrich 2001, Interleaved Sampling.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import functools
+from typing import Literal
 
 import warp as wp
 
 from warp_ar.kernels.cells import cell_pixel
-from warp_ar.kernels.environment.environment_samples import SampleSets
-from warp_ar.kernels.launch import Rows, launch_rows
-from warp_ar.kernels.objects.reflect import DistantLight
-from warp_ar.kernels.rays.shapes import surface_key
+from warp_ar.kernels.environment.environment_samples import SampleSets, ball_of_sample, sample_toward
+from warp_ar.kernels.environment.probe_weights import probe_share
+from warp_ar.kernels.latlong import sample_latlong
+from warp_ar.kernels.launch import row_launcher
+from warp_ar.kernels.materials import reflect
+from warp_ar.kernels.objects.reflect import DistantLight, DistantLightConfig, look_up, make_find_in_frame
+from warp_ar.kernels.rays.shapes import FAR, intersect_sphere, surface_key
 from warp_ar.kernels.rays.trace import make_trace, offset_origin
-from warp_ar.kernels.rays.visibility import make_visible_proxy
+from warp_ar.kernels.rays.visibility import inside_rect, make_visible_proxy
 from warp_ar.kernels.receiver.environment_shadow_bounce import (
     Before,
-    Meeting,
     ReflectedLight,
-    caustic_alpha,
+    bounding_radius,
     make_look_before,
+    make_look_wide,
     make_reflect_back,
+    meet_object,
 )
-from warp_ar.kernels.receiver.environment_shadow_cells import (
-    CHUNK,
-    SHADED_TILE,
-    WARP_LANES,
-    EnvironmentShadowConfig,
-    ShadowCells,
-    bounced_of,
-    can_matter,
-    cell_column,
-    first_of_set,
-    ratio_of,
-)
-from warp_ar.kernels.receiver.environment_shadow_rays import make_aim, make_find_sender, make_masks, may_be_one_sided
-from warp_ar.kernels.receiver.environment_shadow_wavefront import Wavefront, shade_wavefront
 from warp_ar.kernels.sampling import pcg3d_hash
-from warp_ar.kernels.structs import FrameParams, Hit, Picture, RayScene
+from warp_ar.kernels.structs import BOX, PLANE, FrameParams, Hit, Picture, RayScene, Shape
 
 wp.set_module_options({"enable_backward": False})
+
+SHADED_TILE = wp.constant(4)
+"""Cells along a tile that notes whether something in it is shaded."""
+CHUNK = wp.constant(64)
+"""Samples that are culled together: the bits of a mask."""
+MIN_IRRADIANCE = wp.constant(wp.float32(1.0e-6))
+"""Irradiance, in camera values, below which a surface is dark and a shadow on it means nothing."""
+MAX_RATIO = wp.constant(wp.float32(4.0))
+"""Largest factor: what objects bounce onto a dark place is bounded, as the picture of it is mostly noise."""
+MAX_RETURN = wp.constant(wp.float32(0.99))
+"""Largest share of its light that the receiver gets back from objects, estimated: what goes to and fro stays finite."""
+
+
+@dataclasses.dataclass(frozen=True)
+class EnvironmentShadowConfig:
+    """Compile-time configuration of the kernels."""
+
+    distant: DistantLightConfig
+    """Kinds of shape and forms of light."""
+    count: int
+    """Samples per set: up to 64, or a multiple of it."""
+    side: int
+    """Cells along a tile; there are side^2 sets."""
+    bounce: Literal["estimated", "traced"]
+    """Method by which light from objects onto the receiver is found."""
+    secondary: float = 1.0
+    """Share of a set, its first samples, whose rays ask what an object that they meet sends; others stop there."""
+    emitters: bool = False
+    """True if some samples are emitters at a known distance."""
+    partials: int = 1
+    """Partial sums per cell of the wavefront, a thread each: a divisor of count."""
+
+    def __post_init__(self) -> None:
+        if self.count > CHUNK and self.count % CHUNK:
+            raise ValueError(f"count is {self.count}; expected up to {CHUNK} or a multiple of it")
+        if not 1 <= self.secondary_count <= self.count:
+            raise ValueError(f"secondary is {self.secondary}; expected a share of {self.count} samples")
+        if self.count % self.partials:
+            raise ValueError(f"partials is {self.partials}; expected a divisor of {self.count}")
+
+    @property
+    def secondary_count(self) -> int:
+        """Samples of a set that send secondary rays."""
+        return round(self.count * self.secondary)
+
+
+@wp.struct
+class ShadowCells:
+    """Estimates of all cells and what the filter makes of them; shaded and changed may be empty."""
+
+    stride: wp.int32  # pixels from one estimate to the next
+    ratio: wp.array2d[wp.vec4]  # RGB share of the environment that is not hidden, and depth; 1 where no surface is
+    bounced: wp.array2d[wp.vec3]  # what objects send there, relative to the environment
+    surface: wp.array2d[wp.int32]  # number of the surface that the cell shows; -1: none, and ratio holds nothing
+    shaded: wp.array2d[wp.int32]  # per tile: number of the last frame in which something in it was shaded
+    filtered: wp.array2d[wp.vec3]  # factor on the frame; written only where a surface is seen
+    changed: wp.array2d[wp.int32]  # per tile: number of the last frame in which some factor in it was not 1
+
+
+@wp.func
+def ratio_of(without: wp.vec3, hidden: wp.vec3, depth: wp.float32) -> wp.vec4:
+    """Share of the environment that is left, and the depth beside it."""
+    ratio = wp.vec4(1.0, 1.0, 1.0, depth)
+    for channel in range(3):
+        if without[channel] > MIN_IRRADIANCE:
+            ratio[channel] = wp.clamp(1.0 - hidden[channel] / without[channel], 0.0, 1.0)
+    return ratio
+
+
+@wp.func
+def bounced_of(without: wp.vec3, hidden: wp.vec3, sent: wp.vec3, returned: wp.vec3) -> wp.vec3:
+    """Return the light of objects over the environment's; ``returned`` is the part that the receiver must light."""
+    ratio = wp.vec3(0.0)
+    for channel in range(3):
+        if without[channel] > MIN_IRRADIANCE:
+            left = wp.clamp(1.0 - hidden[channel] / without[channel], 0.0, 1.0)
+            back = wp.min(returned[channel] / without[channel], MAX_RETURN)
+            total = (left + sent[channel] / without[channel]) / (1.0 - back)
+            ratio[channel] = wp.min(total - left, MAX_RATIO)
+    return ratio
+
+
+@wp.func
+def first_of_set(i: wp.int32, j: wp.int32, side: wp.int32, count: wp.int32) -> wp.int32:
+    """First sample of a cell's set; ``count`` are all sets together."""
+    return count / (side * side) * ((i % side) * side + j % side)
+
+
+@wp.func
+def can_matter(row: wp.int32, column: wp.int32, margin: wp.int32, rect: wp.vec4i) -> wp.bool:
+    """Return whether the filter may read a cell estimated at this pixel: it reads ``margin`` beyond the rectangle."""
+    wide = wp.vec4i(rect[0] - margin, rect[1] + margin, rect[2] - margin, rect[3] + margin)
+    return rect[0] < rect[1] and inside_rect(row, column, wide)
+
+
+def shaded_shape(rows: int, columns: int) -> tuple[int, int]:
+    """Shape of the arrays that note tiles, for so many cells."""
+    return -(-rows // int(SHADED_TILE)), -(-columns // int(SHADED_TILE))
+
+
+@wp.func
+def may_be_one_sided(objects: wp.array[Shape]) -> wp.bool:
+    """Return whether the closest hit may pass what hides the environment: triangles that are seen from one side only.
+
+    They throw shadows from both sides, and ``occluded_by_objects`` knows no other.
+    """
+    found = wp.bool(False)
+    for index in range(objects.shape[0]):
+        found = found or objects[index].holed != 0
+    return found
+
+
+@wp.func
+def cone_threshold(to_center: wp.vec3, radius: wp.float32) -> wp.float32:
+    """Unit directions w with w . to_center above this meet the sphere; from inside, all do."""
+    squared = wp.dot(to_center, to_center) - radius * radius
+    if squared <= 0.0:
+        return -FAR
+    return wp.sqrt(squared)
+
+
+@functools.cache
+def make_mask_cone(count: int, emitters: bool) -> wp.Function:
+    """``mask_cone(sets, first, point, to_center, radius) -> uint64``: samples that point at a sphere."""
+
+    @wp.func(module="unique")
+    def mask_cone(
+        sets: SampleSets, first: wp.int32, point: wp.vec3, to_center: wp.vec3, radius: wp.float32
+    ) -> wp.uint64:
+        directions = sets.directions
+        threshold = cone_threshold(to_center, radius)
+        mask = wp.uint64(0)
+        bit = wp.uint64(1)
+        # Its end is no constant: a loop that is unrolled loads all of its samples at once, into as many registers.
+        for k in range(first, first + count):
+            direction = directions[k]
+            if wp.static(emitters):
+                direction = sample_toward(sets.samples[k], point).direction
+            if wp.dot(direction, to_center) >= threshold:
+                mask = mask | bit
+            bit = bit << wp.uint64(1)
+        return mask
+
+    return mask_cone
+
+
+@wp.struct
+class Physical:
+    """Samples that may meet a proxy or a mirror ball, a bit each."""
+
+    proxies: wp.uint64
+    balls: wp.uint64
+
+
+@functools.cache
+def make_masks(config: EnvironmentShadowConfig, count: int) -> tuple[wp.Function, wp.Function]:
+    """Functions that tell which of ``count`` samples from ``first`` on may meet something, a bit each.
+
+    ``mask_objects(scene, sets, first, point) -> uint64``, and ``mask_physical(scene, distant, sets, first, point, own)
+    -> Physical``, ``own`` being the proxy that the point is on.
+    """
+    mask_cone = make_mask_cone(count, config.emitters)
+
+    @wp.func(module="unique")
+    def mask_objects(scene: RayScene, sets: SampleSets, first: wp.int32, point: wp.vec3) -> wp.uint64:
+        mask = wp.uint64(0)
+        for index in range(scene.objects.shape[0]):
+            shape = scene.objects[index]
+            mask = mask | mask_cone(sets, first, point, shape.position - point, bounding_radius(shape))
+        return mask
+
+    @wp.func(module="unique")
+    def mask_physical(
+        scene: RayScene, distant: DistantLight, sets: SampleSets, first: wp.int32, point: wp.vec3, own: wp.int32
+    ) -> Physical:
+        mask = Physical()
+        everywhere = wp.uint64(0) - wp.uint64(1)
+        for index in range(scene.proxies.shape[0]):
+            shape = scene.proxies[index]
+            if shape.kind == PLANE:
+                if index != own:
+                    mask.proxies = everywhere
+            elif shape.kind != BOX or index != own:
+                cone = mask_cone(sets, first, point, shape.position - point, bounding_radius(shape))
+                mask.proxies = mask.proxies | cone
+        if wp.static(config.distant.probes):
+            for index in range(distant.probes.shape[0]):
+                probe = distant.probes[index]
+                mask.balls = mask.balls | mask_cone(sets, first, point, probe.center - point, probe.radius)
+        return mask
+
+    return mask_objects, mask_physical
+
+
+@wp.struct
+class SampleRay:
+    """From a point of the receiver toward a sample of the environment."""
+
+    origin: wp.vec3  # set where the ray is traced
+    direction: wp.vec3
+    distance: wp.float32  # of the sample, metres
+    grown: wp.float32  # the sample's measure as the point sees it, over that from the ball, and what the ball counts
+    cosine: wp.float32  # at the receiver; the point sees the sample if it is above 0
+
+
+@functools.cache
+def make_aim(emitters: bool, several: bool = False) -> wp.Function:
+    """``aim(sets, places, index, hit) -> SampleRay``: less its origin; ``places`` of the balls, if ``several``."""
+
+    @wp.func(module="unique")
+    def aim(sets: SampleSets, places: wp.array[wp.vec4], index: wp.int32, hit: Hit) -> SampleRay:
+        ray = SampleRay()
+        ray.direction = sets.directions[index]
+        ray.distance = FAR
+        ray.grown = 1.0
+        if wp.static(emitters):
+            toward = sample_toward(sets.samples[index], hit.point)
+            ray.direction = toward.direction
+            ray.distance = toward.distance
+            ray.grown = toward.measure / sets.samples[index].measure
+        if wp.static(several):
+            ray.grown *= probe_share(places, ball_of_sample(index, places.shape[0]), hit.point)
+        ray.cosine = wp.min(wp.dot(hit.normal, ray.direction), wp.dot(hit.geometric_normal, ray.direction))
+        return ray
+
+    return aim
+
+
+@wp.struct
+class Sender:
+    """Sender of light along a sample's direction where no virtual object stands."""
+
+    radiance: wp.vec3
+    distance: wp.float32
+
+
+@functools.cache
+def make_find_sender(config: EnvironmentShadowConfig) -> wp.Function:
+    """``find_sender(params, picture, scene, distant, sets, index, ray, by_proxy, by_ball) -> Sender``.
+
+    The sample itself, or the physical before it: a proxy if ``by_proxy``, a mirror ball if
+    ``by_ball``; those that the ray cannot meet need not be asked.
+    """
+    closest_proxy = make_trace(config.distant.trace).closest_proxy
+    traced = config.bounce == "traced"
+    find_in_frame = make_find_in_frame(config.distant.trace, config.distant.probes) if traced else None
+    look_wide = make_look_wide(config.distant)
+
+    @wp.func(module="unique")
+    def find_sender(
+        params: wp.array[FrameParams],
+        picture: Picture,
+        scene: RayScene,
+        distant: DistantLight,
+        sets: SampleSets,
+        index: wp.int32,
+        ray: SampleRay,
+        by_proxy: wp.bool,
+        by_ball: wp.bool,
+    ) -> Sender:
+        sender = Sender()
+        sender.radiance = sets.samples[index].radiance
+        sender.distance = ray.distance
+        if by_proxy:
+            proxy = closest_proxy(scene, ray.origin, ray.direction, ray.distance)
+            if proxy.shape >= 0:
+                sender.distance = proxy.t
+                at = wp.vec2(-1.0, -1.0)
+                if wp.static(traced):
+                    at = find_in_frame(params[0], picture, scene, distant.probes, proxy)
+                if at[0] >= 0.0:
+                    sender.radiance = look_up(picture, at[0], at[1])
+                else:
+                    # Where the ball saw it; an emitter right beside it is not its light.
+                    toward = proxy.point - sets.samples[index].origin
+                    from_ball = wp.vec3(0.0)
+                    if wp.static(config.distant.several):
+                        ball = ball_of_sample(index, distant.others.places.shape[0])
+                        if ball == 0:
+                            from_ball = sample_latlong(distant.environment, toward)
+                        else:
+                            from_ball = sample_latlong(distant.others.environment[ball - 1], toward)
+                    else:
+                        from_ball = sample_latlong(distant.environment, toward)
+                    sender.radiance = wp.min(from_ball, wp.vec3(1.0, 1.0, 1.0))
+        if wp.static(config.distant.probes):
+            if by_ball:
+                for ball in range(distant.probes.shape[0]):
+                    probe = distant.probes[ball]
+                    t = intersect_sphere(probe.radius, ray.origin - probe.center, ray.direction, sender.distance)
+                    if t < sender.distance:
+                        sender.distance = t
+                        normal = (ray.origin + t * ray.direction - probe.center) / probe.radius
+                        wi = reflect(-ray.direction, normal)
+                        sender.radiance = wp.cw_mul(probe.reflectance, look_wide(distant, probe.center, wi))
+        return sender
+
+    return find_sender
 
 
 @functools.cache
@@ -83,7 +382,6 @@ def make_environment_shadow_kernel(config: EnvironmentShadowConfig) -> wp.Kernel
         scene: RayScene,
         distant: DistantLight,
         sets: SampleSets,
-        lanes: wp.int32,
         # Out:
         cells_out: ShadowCells,
     ):
@@ -91,7 +389,6 @@ def make_environment_shadow_kernel(config: EnvironmentShadowConfig) -> wp.Kernel
         i += row_start
         rays = picture.rays
         stride = cells_out.stride
-        j = cell_column(j, cells_out.surface.shape[1], side, lanes)
         row = cell_pixel(i, stride, rays.shape[0])
         column = cell_pixel(j, stride, rays.shape[1])
         cells_out.surface[i, j] = -1
@@ -159,11 +456,8 @@ def make_environment_shadow_kernel(config: EnvironmentShadowConfig) -> wp.Kernel
                             if hides:
                                 hidden += weight * radiance
                             if other.shape >= 0:
-                                meeting = Meeting()
-                                meeting.hit = other
-                                meeting.direction = ray.direction
-                                meeting.alpha = caustic_alpha(scene.objects[other.shape], point)
-                                meeting.stands_for = weight * wp.static(config.count / secondary_count)
+                                stands_for = weight * wp.static(config.count / secondary_count)
+                                meeting = meet_object(scene, other, point, ray.direction, stands_for)
                                 seed = wp.vec3ui()
                                 if wp.static(traced):
                                     seed = pcg3d_hash(wp.uint32(at + k), wp.uint32(row), wp.uint32(column))
@@ -182,41 +476,15 @@ def make_environment_shadow_kernel(config: EnvironmentShadowConfig) -> wp.Kernel
     return environment_shadow_kernel
 
 
-def shade_environment(
-    config: EnvironmentShadowConfig,
-    params: wp.array[FrameParams],
-    picture: Picture,
-    scene: RayScene,
-    distant: DistantLight,
-    sets: SampleSets,
-    cells_out: ShadowCells,
-    *,
-    wave: Wavefront | None = None,
-    rows: Rows | None = None,
-) -> None:
-    """Estimate the ratio for one pixel of every ``stride x stride``, each with one set of samples.
+shade_environment = row_launcher(make_environment_shadow_kernel, like=lambda *given: given[-1].surface)
+"""Estimate the ratio for one pixel of every ``stride x stride``, each with one set of samples.
 
-    Args:
-        config: What the scene calls for.
-        params: (1,) FrameParams: camera and shadow_rect.
-        picture: (H, W) the camera's frame, which is needed if bounces are traced, and its rays.
-        scene: Objects and proxies.
-        distant: The environment; what ``config.distant`` leaves out may be empty.
-        sets: config.side^2 sets of config.count samples or more.
-        cells_out: (ceil(H / stride), ceil(W / stride)) cells: ratio, bounced, surface and shaded are written.
-        wave: Scratch of ``make_wavefront``, for a CUDA device: as a wavefront of kernels; ``rows`` must be None.
-        rows: Band of rows of the cells; None means all.
-    """
-    if wave is not None:
-        shade_wavefront(config, (params, picture, scene, distant, sets), cells_out, wave)
-        return
-    device = picture.rays.device
-    lanes = 1 if device.is_cpu else WARP_LANES
-    launch_rows(
-        make_environment_shadow_kernel(config),
-        cells_out.surface.shape,
-        [params, picture, scene, distant, sets, lanes],
-        [cells_out],
-        rows=rows,
-        device=device,
-    )
+Args:
+    config: What the scene calls for.
+    params: (1,) FrameParams: camera and shadow_rect.
+    picture: (H, W) the camera's frame, which is needed if bounces are traced, and its rays.
+    scene: Objects and proxies.
+    distant: The environment; what ``config.distant`` leaves out may be empty.
+    sets: config.side^2 sets of config.count samples or more.
+    cells_out: (ceil(H / stride), ceil(W / stride)) cells: ratio, bounced, surface and shaded are written.
+"""

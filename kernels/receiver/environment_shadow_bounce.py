@@ -1,4 +1,4 @@
-"""What virtual objects send to the receiver along a ray that met them: an estimate without a ray, or one by rays.
+"""Light that virtual objects send to the receiver along a ray that met them: an estimate without a ray, or one by rays.
 
 What a ray meets is not black. Either a ray finds out (``traced``): an object reflects one of its two lobes,
 picked by their reflectance. Its rough lobe gives albedo E(n) / pi, times what a ray into it meets: nothing, 1; an
@@ -15,6 +15,9 @@ the cell and shaded as it is, so the ratio r is that of
 
 with all the light that goes to and fro between an object and the ground: white objects in a white environment (u + d =
 h) leave it as it is, black ones give 1 - h, and where nothing but the ground is seen (u = 0, h = 1) all is dark.
+
+Of either way no receiver is brighter than a white one, E / pi: light that was captured too low would else make it glow
+beside the object that shades it.
 """
 
 from __future__ import annotations
@@ -33,7 +36,6 @@ from warp_ar.kernels.objects.reflect import (
     knows_irradiance,
     knows_levels,
     look_up,
-    make_captured_along,
     make_distant_irradiance,
     make_find_in_frame,
     make_radiance_along,
@@ -79,12 +81,42 @@ def caustic_alpha(shape: Shape, point: wp.vec3) -> wp.float32:
 
 
 @wp.struct
-class Sent:
-    """Light that an object reflects along a ray."""
+class Meeting:
+    """Place at which a ray from the receiver met an object, and the weight of light from there."""
 
-    distant: wp.vec3  # radiance that it has from the environment
-    receiver: wp.vec3  # radiance that it would have from a receiver without shadows
-    emitted: wp.vec3  # radiance of its own
+    hit: Hit
+    direction: wp.vec3
+    alpha: wp.float32  # least width of the object's lobe
+    stands_for: wp.float32  # weight of its radiance, which is that of several samples where one ray stands for them
+
+
+@wp.func
+def meet_object(scene: RayScene, other: Hit, point: wp.vec3, direction: wp.vec3, stands_for: wp.float32) -> Meeting:
+    """Return the meeting of a ray from a point of the receiver with an object."""
+    meeting = Meeting()
+    meeting.hit = other
+    meeting.direction = direction
+    meeting.alpha = caustic_alpha(scene.objects[other.shape], point)
+    meeting.stands_for = stands_for
+    return meeting
+
+
+@wp.struct
+class ReflectedLight:
+    """Light that objects send to a point of the receiver, times its weight."""
+
+    sent: wp.vec3  # of the environment
+    returned: wp.vec3  # of what the receiver sent them
+
+
+@wp.struct
+class Before:
+    """Surroundings in front of a cell's surface, for estimates without a ray."""
+
+    up: wp.vec3  # the surface's normal, on the side that light comes from
+    from_receiver: wp.vec3  # irradiance that a surface above it has from below
+    most: wp.vec3  # largest radiance of the receiver: of a white one
+    brightest: wp.float32  # largest radiance that an object is believed to have
 
 
 @functools.cache
@@ -112,100 +144,102 @@ def make_look_wide(config: DistantLightConfig) -> wp.Function:
 
 
 @functools.cache
-def make_estimated(config: DistantLightConfig) -> wp.Function:
-    """``estimated(scene, environment, hit, direction, alpha, up, from_receiver) -> Sent``.
+def make_reflect_estimated(config: DistantLightConfig) -> wp.Function:
+    """``reflect_back`` without a further ray: both lobes of the distant environment.
 
-    What an object sends back along a ray that met it at ``hit``, without a further ray: both lobes of the distant
-    environment, the glossy one ``alpha`` wide or more. What lies below ``up`` is the receiver; ``from_receiver`` is the
-    irradiance that a surface above it has from there.
+    The glossy one is no narrower than ``meeting.alpha``. Below ``before.up`` lies the receiver; nothing is believed to
+    be brighter than ``before.brightest``.
     """
     surface_at = make_surface(config.models, config.textures)
     reflected_radiance = make_reflected_radiance(config)
     distant_irradiance = make_distant_irradiance(config)
 
     @wp.func(module="unique")
-    def estimated(
+    def reflect_back(
+        params: FrameParams,
+        picture: Picture,
         scene: RayScene,
         distant: DistantLight,
-        hit: Hit,
-        direction: wp.vec3,
-        alpha: wp.float32,
-        up: wp.vec3,
-        from_receiver: wp.vec3,
-    ) -> Sent:
-        wo = -direction
+        meeting: Meeting,
+        before: Before,
+        seed: wp.vec3ui,
+        so_far: ReflectedLight,
+    ) -> ReflectedLight:
+        out = so_far
+        hit = meeting.hit
+        wo = -meeting.direction
         normal = hit.normal
         if wp.dot(hit.geometric_normal, wo) < 0.0:
             normal = -normal
         cosine = wp.max(wp.dot(normal, wo), 0.0)
         surface = surface_at(scene, distant.dfg, hit, cosine, RAY_SPREAD)
-        sent = Sent()
         if wp.static(config.textures and config.gathered):
-            sent.emitted = surface.emission
+            out.sent += meeting.stands_for * surface.emission
+        of_environment = wp.vec3(0.0)
+        of_receiver = wp.vec3(0.0)  # that it would have from a receiver without shadows
         if wp.static(config.diffuse != "none"):
             irradiance = distant_irradiance(distant, hit.point, normal)
             if wp.static(config.textures):
                 irradiance *= surface.occlusion
             # A surface sees (1 - n.up) / 2 of what an even receiver sends to one that faces it.
-            received = wp.min(0.5 * (1.0 - wp.dot(normal, up)) * from_receiver, irradiance)
-            sent.receiver = wp.cw_mul(surface.diffuse, received) / wp.pi
-            sent.distant = wp.cw_mul(surface.diffuse, irradiance - received) / wp.pi
+            seen = 0.5 * (1.0 - wp.dot(normal, before.up))
+            received = wp.min(seen * before.from_receiver, irradiance)
+            of_receiver = wp.cw_mul(surface.diffuse, wp.min(received, seen * wp.pi * before.most)) / wp.pi
+            of_environment = wp.cw_mul(surface.diffuse, irradiance - received) / wp.pi
         if wp.static(config.specular):
             if knows_levels(distant):
                 wi = lobe_axis(surface, reflect(wo, normal), normal)
-                floor = level_from_alpha(alpha, distant.level_height)
+                floor = level_from_alpha(meeting.alpha, distant.level_height)
                 reflected = reflected_radiance(
                     distant, surface.model, surface.roughness, surface.shininess, hit.point, wi, floor
                 )
-                radiance = wp.cw_mul(surface.reflectance, reflected)
-                share = wp.clamp(0.5 - 0.5 * wp.dot(wi, up) / CAUSTIC_ALPHA, 0.0, 1.0)
-                sent.receiver += share * radiance
-                sent.distant += (1.0 - share) * radiance
-        return sent
+                share = wp.clamp(0.5 - 0.5 * wp.dot(wi, before.up) / CAUSTIC_ALPHA, 0.0, 1.0)
+                of_it = wp.min(share * wp.max(reflected, before.from_receiver / wp.pi), reflected)
+                of_receiver += wp.cw_mul(surface.reflectance, wp.min(of_it, share * before.most))
+                of_environment += wp.cw_mul(surface.reflectance, reflected - of_it)
+        brightness = wp.max(of_environment + of_receiver)
+        weight = meeting.stands_for * wp.min(before.brightest / wp.max(brightness, 1.0e-20), 1.0)
+        out.sent += weight * of_environment
+        out.returned += weight * of_receiver
+        return out
 
-    return estimated
+    return reflect_back
 
 
 @functools.cache
-def make_bounced(config: DistantLightConfig) -> wp.Function:
-    """``bounced(params, picture, scene, environment, hit, direction, alpha, seed) -> vec3``.
-
-    Radiance that an object sends back along a ray that met it at ``hit``: one lobe, the glossy one ``alpha`` wide or
-    more, one ray; a Monte-Carlo estimate.
-    """
+def make_reflect_traced(config: DistantLightConfig) -> wp.Function:
+    """``reflect_back`` by one ray into one lobe, the glossy one no narrower than ``alpha``: a Monte-Carlo estimate."""
     trace = make_trace(config.trace)
-    closest_object, closest_proxy, occluded_by_objects = (
-        trace.closest_object,
-        trace.closest_proxy,
-        trace.occluded_by_objects,
-    )
+    closest_object, closest_proxy = trace.closest_object, trace.closest_proxy
+    occluded_by_objects = trace.occluded_by_objects
     surface_at = make_surface(config.models, config.textures)
     find_in_frame = make_find_in_frame(config.trace, config.probes)
     shade_unoccluded = make_shade_unoccluded(config)
     reflected_radiance = make_reflected_radiance(config)
-    distant_irradiance, captured_along = make_distant_irradiance(config), make_captured_along(config)
+    distant_irradiance, captured_along = make_distant_irradiance(config), make_radiance_along(config, captured=True)
 
     @wp.func(module="unique")
-    def bounced(
+    def reflect_back(
         params: FrameParams,
         picture: Picture,
         scene: RayScene,
         distant: DistantLight,
-        hit: Hit,
-        direction: wp.vec3,
-        alpha: wp.float32,
+        meeting: Meeting,
+        before: Before,
         seed: wp.vec3ui,
-    ) -> wp.vec3:
-        wo = -direction
+        so_far: ReflectedLight,
+    ) -> ReflectedLight:
+        out = so_far
+        hit = meeting.hit
+        wo = -meeting.direction
         normal = hit.normal
         geometric = hit.geometric_normal
         if wp.dot(geometric, wo) < 0.0:
             normal = -normal
             geometric = -geometric
         surface = surface_at(scene, distant.dfg, hit, wp.max(wp.dot(normal, wo), 0.0), RAY_SPREAD)
-        emitted = wp.vec3(0.0)
         if wp.static(config.textures and config.gathered):
-            emitted = surface.emission
+            out.sent += meeting.stands_for * surface.emission
         rough = surface.diffuse[0] + surface.diffuse[1] + surface.diffuse[2]
         glossy = surface.reflectance[0] + surface.reflectance[1] + surface.reflectance[2]
         if wp.static(config.diffuse == "none") or not knows_irradiance(distant):
@@ -213,7 +247,7 @@ def make_bounced(config: DistantLightConfig) -> wp.Function:
         if wp.static(not config.specular) or not knows_levels(distant):
             glossy = float(0.0)
         if rough + glossy <= 0.0:
-            return emitted
+            return out
         rough_share = rough / (rough + glossy)
         u = wp.vec2(uniform_from_bits(seed[0]), uniform_from_bits(seed[1]))
         is_rough = uniform_from_bits(seed[2]) < rough_share
@@ -223,7 +257,7 @@ def make_bounced(config: DistantLightConfig) -> wp.Function:
             weight = surface.diffuse / rough_share
             wi = frame_from_normal(normal) * sample_cosine_hemisphere(u)
         if wp.dot(wi, geometric) <= 0.0:
-            return emitted
+            return out
 
         received = wp.vec3(0.0)
         origin = offset_origin(hit.point, geometric, wi, hit.error)
@@ -240,40 +274,30 @@ def make_bounced(config: DistantLightConfig) -> wp.Function:
             start = offset_origin(proxy.point, up, leaving, proxy.error)
             if not is_rough:
                 at = find_in_frame(params, picture, scene, distant.probes, proxy)
-                if at[0] >= 0.0:  # noqa: SIM108  (a conditional expression computes both)
+                if at[0] >= 0.0:
                     received = look_up(picture, at[0], at[1])
                 else:
-                    received = captured_along(distant, proxy.point, wi)
+                    received = captured_along(distant, proxy.point, wi, 0.0)
+            received = wp.min(received, distant_irradiance(distant, proxy.point, up) / wp.pi)
             if occluded_by_objects(scene, start, leaving, FAR):
                 received = wp.cw_mul(received, FURTHER * (surface.diffuse + surface.reflectance))
         elif other.shape >= 0:
             received = shade_unoccluded(scene, distant, other, wi, RAY_SPREAD)
         elif not is_rough:
             if wp.static(config.specular):
-                floor = level_from_alpha(alpha, distant.level_height)
+                floor = level_from_alpha(meeting.alpha, distant.level_height)
                 received = reflected_radiance(
                     distant, surface.model, surface.roughness, surface.shininess, hit.point, wi, floor
                 )
-        if wp.static(config.textures):
-            return wp.cw_mul(weight, received) + emitted
-        return wp.cw_mul(weight, received)
+        out.sent += meeting.stands_for * wp.cw_mul(weight, received)
+        return out
 
-    return bounced
-
-
-@wp.struct
-class Before:
-    """Surroundings in front of a cell's surface, for ``estimated``."""
-
-    up: wp.vec3  # the surface's normal, on the side that light comes from
-    from_receiver: wp.vec3  # irradiance that a surface above it has from below
-    brightest: wp.float32  # largest radiance that an object is believed to have
+    return reflect_back
 
 
 @functools.cache
 def make_look_before(config: DistantLightConfig) -> wp.Function:
     """``look_before(environment, point, normal, direction) -> Before``: of a surface that ``direction`` leaves."""
-    look_wide = make_look_wide(config)
     distant_irradiance = make_distant_irradiance(dataclasses.replace(config, emitters=False))
 
     @wp.func(module="unique")
@@ -282,72 +306,18 @@ def make_look_before(config: DistantLightConfig) -> wp.Function:
         before.up = normal
         if wp.dot(normal, direction) < 0.0:
             before.up = -normal
-        before.brightest = MAX_BRIGHTNESS * wp.max(look_wide(distant, point, before.up))
-        if wp.static(config.diffuse != "none"):
-            if knows_irradiance(distant):
-                before.from_receiver = distant_irradiance(distant, point, -before.up)
-                upward = distant_irradiance(distant, point, before.up)
-                before.brightest = MAX_BRIGHTNESS * wp.max(upward) / wp.pi
+        before.from_receiver = distant_irradiance(distant, point, -before.up)
+        before.most = distant_irradiance(distant, point, before.up) / wp.pi
+        before.brightest = MAX_BRIGHTNESS * wp.max(before.most)
         return before
 
     return look_before
 
 
-@wp.struct
-class Meeting:
-    """Where a ray from the receiver met an object, and how much light from there counts."""
-
-    hit: Hit
-    direction: wp.vec3
-    alpha: wp.float32  # least width of the object's lobe
-    stands_for: wp.float32  # weight of its radiance, which is that of several samples where one ray stands for them
-
-
-@wp.struct
-class ReflectedLight:
-    """Light that objects send to a point of the receiver, times its weight."""
-
-    sent: wp.vec3  # of the environment
-    returned: wp.vec3  # of what the receiver sent them
-
-
-@functools.cache
 def make_reflect_back(config: DistantLightConfig, traced: bool) -> wp.Function:
     """``reflect_back(params, picture, scene, distant, meeting, before, seed, so_far) -> ReflectedLight``.
 
     Adds what an object sends back to what others do: found by another ray if ``traced``, else estimated from what lies
-    ``before`` the receiver, of which nothing is believed to be brighter than ``before.brightest``.
+    ``before`` the receiver.
     """
-    bounced = make_bounced(config) if traced else None
-    estimated = None if traced else make_estimated(config)
-
-    @wp.func(module="unique")
-    def reflect_back(
-        params: FrameParams,
-        picture: Picture,
-        scene: RayScene,
-        distant: DistantLight,
-        meeting: Meeting,
-        before: Before,
-        seed: wp.vec3ui,
-        so_far: ReflectedLight,
-    ) -> ReflectedLight:
-        out = so_far
-        weight = meeting.stands_for
-        if wp.static(traced):
-            out.sent += weight * bounced(
-                params, picture, scene, distant, meeting.hit, meeting.direction, meeting.alpha, seed
-            )
-        else:
-            light = estimated(
-                scene, distant, meeting.hit, meeting.direction, meeting.alpha, before.up, before.from_receiver
-            )
-            if wp.static(config.textures):
-                out.sent += weight * light.emitted
-            brightness = wp.max(light.distant + light.receiver)
-            weight *= wp.min(before.brightest / wp.max(brightness, 1.0e-20), 1.0)
-            out.sent += weight * light.distant
-            out.returned += weight * light.receiver
-        return out
-
-    return reflect_back
+    return make_reflect_traced(config) if traced else make_reflect_estimated(config)

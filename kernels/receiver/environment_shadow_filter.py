@@ -16,18 +16,13 @@ import functools
 
 import warp as wp
 
-from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch, launch_rows
+from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows, row_launcher
 from warp_ar.kernels.objects.reflect import DistantLightConfig
 from warp_ar.kernels.pixel_order import own_pixel
+from warp_ar.kernels.pixels import pixel_run
 from warp_ar.kernels.rays.shapes import FACES, MESH_KEY, surface_key
 from warp_ar.kernels.rays.visibility import inside_rect, make_visible_proxy
-from warp_ar.kernels.receiver.environment_shadow_cells import (
-    SHADED_TILE,
-    WARP_LANES,
-    EnvironmentShadowConfig,
-    ShadowCells,
-    any_shaded,
-)
+from warp_ar.kernels.receiver.environment_shadow import SHADED_TILE, EnvironmentShadowConfig, ShadowCells
 from warp_ar.kernels.structs import FrameParams, Probe, RayScene
 
 wp.set_module_options({"enable_backward": False})
@@ -38,12 +33,18 @@ NOISE = wp.constant(wp.float32(1.0))
 """The same, in standard errors of the narrow mean."""
 NEGLIGIBLE = wp.constant(wp.float32(1.0 / 512.0))
 """Change of the environment that no 8-bit picture shows: a quarter of a code at most, taken for none."""
-LEAST_APART = 10
-"""Pixels along a cell from which those between surfaces have a kernel of their own on CUDA."""
-CPU_RUN = 32
-"""Pixels of a row that one thread of a CPU does: it looks once whether any of them can be shaded."""
 DEPTH_STEP = wp.constant(wp.float32(0.03))
 """Relative change of depth from which neighbours on a mesh belong to different parts of it."""
+
+
+@wp.func
+def any_shaded(shaded: wp.array2d[wp.int32], frame_index: wp.int32, rows: wp.vec2i, columns: wp.vec2i) -> wp.bool:
+    """Return whether a tile of cells from the first to the last row and column is noted in this frame."""
+    for a in range(wp.max(rows[0], 0) / SHADED_TILE, wp.min(rows[1] / SHADED_TILE + 1, shaded.shape[0])):
+        for b in range(wp.max(columns[0], 0) / SHADED_TILE, wp.min(columns[1] / SHADED_TILE + 1, shaded.shape[1])):
+            if shaded[a, b] == frame_index:
+                return True
+    return False
 
 
 @wp.func
@@ -58,9 +59,9 @@ def window_weight(offset: wp.int32, reach: wp.int32) -> wp.float32:
 
 
 @functools.cache
-def make_filter_ratio_kernel(side: int) -> wp.Kernel:
-    """Kernel of ``filter_ratio`` for tiles of so many cells along."""
-    wide, narrow = side // 2, side // 4
+def make_filter_ratio_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
+    """Kernel of ``filter_ratio``."""
+    wide, narrow = config.side // 2, config.side // 4
     width = 2 * wide + 1
 
     # The loops stay loops: written out, with weights that are known, they take compilers seconds and gain nothing.
@@ -183,9 +184,7 @@ def make_spread_ratio_kernel(config: DistantLightConfig) -> wp.Kernel:
     """Kernel of ``spread_ratio``, specialised to ``config``."""
     visible_proxy = make_visible_proxy(config.trace, config.probes)
 
-    @wp.kernel(
-        module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS
-    )
+    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def spread_ratio_kernel(
         # In:
         row_start: wp.int32,
@@ -237,99 +236,14 @@ def make_spread_ratio_kernel(config: DistantLightConfig) -> wp.Kernel:
     return spread_ratio_kernel
 
 
-@wp.kernel(enable_backward=False)
-def spread_even_kernel(
-    # In:
-    row_start: wp.int32,
-    params: wp.array[FrameParams],
-    cells: ShadowCells,
-    # Out:
-    shadow_ratio_out: wp.array2d[wp.vec3],
-):
-    """A pixel, unless cells of several surfaces surround it."""
-    i, j = wp.tid()
-    rect = params[0].shadow_rect
-    pixel = own_pixel(i, j, row_start, rect, shadow_ratio_out.shape[0], shadow_ratio_out.shape[1])
-    i = pixel[0]
-    j = pixel[1]
-    stride = cells.stride
-    value = wp.vec3(1.0, 1.0, 1.0)
-    if inside_rect(i, j, rect):
-        y = wp.float32(i - stride / 2) / wp.float32(stride)
-        x = wp.float32(j - stride / 2) / wp.float32(stride)
-        found = between_surfaces(cells.surface, wp.int32(wp.floor(y)), wp.int32(wp.floor(x)))
-        if found[1] != 0:
-            return
-        if found[0] >= 0:
-            value = ratio_between(cells, found[0], y, x)
-    shadow_ratio_out[i, j] = value
+filter_ratio = row_launcher(make_filter_ratio_kernel, like=lambda params, cells: cells.surface)
+"""Average the estimates over tiles, along surfaces only; exactly 1 where nothing is shaded, or next to nothing.
 
-
-@functools.cache
-def make_spread_mixed_kernel(config: DistantLightConfig) -> wp.Kernel:
-    """Kernel for the pixels that ``spread_even_kernel`` leaves, specialised to ``config``."""
-    visible_proxy = make_visible_proxy(config.trace, config.probes)
-
-    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
-    def spread_mixed_kernel(
-        # In:
-        params: wp.array[FrameParams],
-        rays: wp.array2d[wp.vec2],
-        scene: RayScene,
-        probes: wp.array[Probe],
-        cells: ShadowCells,
-        across: wp.int32,
-        # Out:
-        shadow_ratio_out: wp.array2d[wp.vec3],
-    ):
-        """The pixels between four cells, if those are on several surfaces: a warp's threads take them in turn."""
-        index = wp.tid()
-        lane = index % WARP_LANES
-        row = (index / WARP_LANES) / across - 1
-        column = (index / WARP_LANES) % across - 1
-        stride = cells.stride
-        if between_surfaces(cells.surface, row, column)[1] == 0:
-            return
-        rect = params[0].shadow_rect
-        pixel = lane
-        while pixel < stride * stride:
-            i = row * stride + stride / 2 + pixel / stride
-            j = column * stride + stride / 2 + pixel % stride
-            pixel += WARP_LANES
-            inside = i >= 0 and j >= 0 and i < shadow_ratio_out.shape[0] and j < shadow_ratio_out.shape[1]
-            if inside and inside_rect(i, j, rect):
-                value = wp.vec3(1.0, 1.0, 1.0)
-                hit = visible_proxy(params[0], rays[i, j], scene, probes)
-                if hit.shape >= 0:
-                    key = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
-                    if key >= 0:
-                        y = wp.float32(i - stride / 2) / wp.float32(stride)
-                        x = wp.float32(j - stride / 2) / wp.float32(stride)
-                        value = ratio_between(cells, key, y, x)
-                shadow_ratio_out[i, j] = value
-
-    return spread_mixed_kernel
-
-
-def filter_ratio(
-    config: EnvironmentShadowConfig,
-    params: wp.array[FrameParams],
-    cells_out: ShadowCells,
-    *,
-    rows: Rows | None = None,
-) -> None:
-    """Average the estimates over tiles, along surfaces only; exactly 1 where nothing is shaded, or next to nothing.
-
-    Args:
-        config: As that of ``shade_environment``.
-        params: (1,) FrameParams: frame_index.
-        cells_out: From ``shade_environment``; filtered and changed are written. Without shaded, every cell is averaged.
-        rows: Band of rows of the cells; None means all.
-    """
-    surface = cells_out.surface
-    launch_rows(
-        make_filter_ratio_kernel(config.side), surface.shape, [params], [cells_out], rows=rows, device=surface.device
-    )
+Args:
+    config: As that of ``shade_environment``.
+    params: (1,) FrameParams: frame_index.
+    cells_out: From ``shade_environment``; filtered and changed are written. Without shaded, every cell is averaged.
+"""
 
 
 def spread_ratio(
@@ -353,19 +267,11 @@ def spread_ratio(
         probes: Mirror balls; needed if ``config.distant.probes``.
         cells: From ``filter_ratio``. Without changed, every pixel is looked at.
         shadow_ratio_out: (H, W) factor on the frame; 1 outside the rectangle and where no proxy is seen.
-        rows: Band of rows; None means all. On CUDA, where cells are large, all are done in any case.
+        rows: Band of rows; None means all.
     """
     height, width = shadow_ratio_out.shape
     device = rays.device
-    if spreads_apart(int(cells.stride), device):
-        whole = {"rows": None, "device": device, "rectangle_first": True}
-        launch_rows(spread_even_kernel, (height, width), [params, cells], [shadow_ratio_out], **whole)
-        down, across = (_last_cell(size, int(cells.stride)) + 2 for size in (height, width))
-        given = [params, rays, scene, probes, cells, across]
-        threads = down * across * WARP_LANES
-        launch(make_spread_mixed_kernel(config.distant), threads, given, [shadow_ratio_out], device=device)
-        return
-    run = CPU_RUN if device.is_cpu else 1
+    run = pixel_run(device)
     launch_rows(
         make_spread_ratio_kernel(config.distant),
         (height, -(-width // run)),
@@ -375,16 +281,3 @@ def spread_ratio(
         device=device,
         rectangle_first=run == 1,
     )
-
-
-def spreads_apart(stride: int, device: wp.DeviceLike) -> bool:
-    """Whether pixels between surfaces are left to a kernel of their own.
-
-    On CUDA, where a warp would wait for their rays, and all other pixels would have fewer registers for them.
-    """
-    return not wp.get_device(device).is_cpu and stride >= LEAST_APART
-
-
-def _last_cell(size: int, stride: int) -> int:
-    """The last cell that is estimated at or before the last of so many rows; -1: all are before the first."""
-    return (size - 1 - stride // 2) // stride

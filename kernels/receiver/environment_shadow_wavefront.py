@@ -18,15 +18,7 @@ from warp_ar.kernels.objects.reflect import DistantLight
 from warp_ar.kernels.rays.shapes import FAR, intersect_sphere, surface_key
 from warp_ar.kernels.rays.trace import make_trace, offset_origin
 from warp_ar.kernels.rays.visibility import make_visible_proxy
-from warp_ar.kernels.receiver.environment_shadow_bounce import (
-    Before,
-    Meeting,
-    ReflectedLight,
-    caustic_alpha,
-    make_look_before,
-    make_reflect_back,
-)
-from warp_ar.kernels.receiver.environment_shadow_cells import (
+from warp_ar.kernels.receiver.environment_shadow import (
     CHUNK,
     SHADED_TILE,
     EnvironmentShadowConfig,
@@ -34,11 +26,18 @@ from warp_ar.kernels.receiver.environment_shadow_cells import (
     bounced_of,
     can_matter,
     first_of_set,
+    make_aim,
+    make_find_sender,
+    make_masks,
     ratio_of,
-    tiled_cell,
-    tiled_shape,
 )
-from warp_ar.kernels.receiver.environment_shadow_rays import make_aim, make_find_sender, make_masks
+from warp_ar.kernels.receiver.environment_shadow_bounce import (
+    Before,
+    ReflectedLight,
+    make_look_before,
+    make_reflect_back,
+    meet_object,
+)
 from warp_ar.kernels.sampling import pcg3d_hash
 from warp_ar.kernels.structs import FrameParams, Picture, RayScene
 
@@ -48,13 +47,17 @@ WORD = 32
 """Samples of a partial sum: the bits of a word."""
 MAX_QUEUE = 1 << 24
 """Secondary rays that may be queued: beyond it the queue takes too much memory, 16 bytes each and more."""
+WARP_LANES = 32
+"""Threads that go the same way or wait for each other."""
+TILE_ROWS, TILE_COLUMNS = 4, 8
+"""Cells of a warp, which takes a square of the frame."""
 QUEUE_THREADS = 1 << 17
 """Threads that trace the queue, each what is left of it when the others have theirs."""
 
 
 @wp.struct
 class Wavefront:
-    """What the kernels hand on; every cell has several partial sums, each over as many samples as a word has bits."""
+    """Arrays that kernels hand on; a cell has several partial sums, each over as many samples as a word has bits."""
 
     occluded: wp.array3d[wp.uint32]  # (partials, rows, columns): samples that an object hides, a bit each
     queue_starts: wp.array3d[wp.int32]  # (partials, rows, columns): place in the queue of the first secondary ray
@@ -62,6 +65,28 @@ class Wavefront:
     queue_length: wp.array[wp.int32]  # (1,)
     sums: wp.array3d[wp.vec3]  # (2 * partials, rows, columns): light without the objects, and what they hide
     reflected: wp.array2d[wp.vec3]  # (2, queue): what objects send of the environment, and of the receiver
+
+
+@wp.func
+def tiled_cell(i: wp.int32, thread: wp.int32, side: wp.int32, columns: wp.int32) -> wp.vec2i:
+    """Row and column of the cell of a thread, of those that ``tiled_shape`` asks for; ``columns`` is its second.
+
+    A warp takes cells of one set, so that their rays go the same way, from a square of the frame, so that they meet the
+    same or nothing: TILE_ROWS x TILE_COLUMNS of them, ``side`` apart. The warps that follow take the other sets there.
+    """
+    number = i * columns + thread
+    lane = number % WARP_LANES
+    one_of = number / WARP_LANES % (side * side)
+    tile = number / (WARP_LANES * side * side)
+    across = columns / (TILE_COLUMNS * side)
+    row = (tile / across * TILE_ROWS + lane / TILE_COLUMNS) * side + one_of / side
+    return wp.vec2i(row, (tile % across * TILE_COLUMNS + lane % TILE_COLUMNS) * side + one_of % side)
+
+
+def tiled_shape(rows: int, columns: int, side: int) -> tuple[int, int]:
+    """Rows and columns of threads with which ``tiled_cell`` reaches all cells, and some beyond."""
+    down, across = side * int(TILE_ROWS), side * int(TILE_COLUMNS)
+    return -(-rows // down) * down, -(-columns // across) * across
 
 
 @functools.cache
@@ -93,8 +118,7 @@ def make_find_occluded_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
         stride = cells_out.stride
         columns = cells_out.surface.shape[1]
         cell = tiled_cell(i, thread, side, tiled)
-        i = cell[0]
-        j = cell[1]
+        i, j = cell[0], cell[1]
         if i >= cells_out.surface.shape[0] or j >= columns:
             return
         row = cell_pixel(i, stride, rays.shape[0])
@@ -153,7 +177,7 @@ def make_find_occluded_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
 
 @wp.func
 def any_occluded(occluded: wp.array3d[wp.uint32], i: wp.int32, j: wp.int32) -> wp.bool:
-    """Whether an object hides any sample from a cell."""
+    """Return whether an object hides any sample from a cell."""
     found = wp.uint32(0)
     for partial in range(occluded.shape[0]):
         found = found | occluded[partial, i, j]
@@ -184,8 +208,7 @@ def make_sum_light_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
     ):
         partial, i, thread = wp.tid()
         cell = tiled_cell(i, thread, side, tiled)
-        i = cell[0]
-        j = cell[1]
+        i, j = cell[0], cell[1]
         if i >= cells.surface.shape[0] or j >= cells.surface.shape[1]:
             return
         if not any_occluded(wave_out.occluded, i, j):
@@ -264,11 +287,8 @@ def make_trace_secondary_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
             other = closest_object(scene, ray.origin, ray.direction, FAR)
             if other.shape >= 0:
                 weight = ray.cosine * ray.grown * sets.samples[index].measure
-                meeting = Meeting()
-                meeting.hit = other
-                meeting.direction = ray.direction
-                meeting.alpha = caustic_alpha(scene.objects[other.shape], hit.point)
-                meeting.stands_for = weight * wp.static(config.count / secondary_count)
+                stands_for = weight * wp.static(config.count / secondary_count)
+                meeting = meet_object(scene, other, hit.point, ray.direction, stands_for)
                 seed = wp.vec3ui()
                 before = Before()
                 if wp.static(traced):
@@ -326,14 +346,8 @@ def make_reduce_partials_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
     return reduce_partials_kernel
 
 
-def takes_wavefront(config: EnvironmentShadowConfig, rows: int, columns: int) -> bool:
-    """Whether cells can be estimated pass after pass: one set of samples each, and not too many secondary rays."""
-    queue = rows * columns * config.secondary_count
-    return config.count <= CHUNK and config.count // config.partials <= WORD and queue <= MAX_QUEUE
-
-
 def make_wavefront(config: EnvironmentShadowConfig, rows: int, columns: int, device: wp.DeviceLike) -> Wavefront | None:
-    """Scratch of ``shade_wavefront``; None where ``takes_wavefront`` says no.
+    """Scratch of ``shade_wavefront``; None where a cell has more than one set of samples, or too many secondary rays.
 
     Args:
         config: As for ``shade_wavefront``; the samples of a partial sum are the bits of a word: 32 at most.
@@ -341,9 +355,9 @@ def make_wavefront(config: EnvironmentShadowConfig, rows: int, columns: int, dev
         columns: Cells in a row.
         device: Where.
     """
-    if not takes_wavefront(config, rows, columns):
-        return None
     queue = rows * columns * config.secondary_count
+    if config.count > CHUNK or config.count // config.partials > WORD or queue > MAX_QUEUE:
+        return None
     cells = config.partials, rows, columns
     wave = Wavefront()
     wave.occluded, wave.queue_starts = (wp.empty(cells, dtype=kind, device=device) for kind in (wp.uint32, wp.int32))
@@ -354,7 +368,7 @@ def make_wavefront(config: EnvironmentShadowConfig, rows: int, columns: int, dev
 
 
 Given = tuple[wp.array[FrameParams], Picture, RayScene, DistantLight, SampleSets]
-"""What the kernels read, as ``shade_environment`` has it: params, picture, scene, distant, sets."""
+"""Inputs of the kernels, as ``shade_environment`` has them: params, picture, scene, distant, sets."""
 
 
 def _threads(config: EnvironmentShadowConfig, wave: Wavefront) -> tuple[tuple[int, int, int], int]:
@@ -390,7 +404,11 @@ def reduce_partials(config: EnvironmentShadowConfig, given: Given, cells_out: Sh
     launch(kernel, size, [given[0], wave], [cells_out], device=wave.occluded.device)
 
 
+PASSES = (find_occluded, sum_light, trace_secondary, reduce_partials)
+"""In their order; the first and the third do not read what the second writes."""
+
+
 def shade_wavefront(config: EnvironmentShadowConfig, given: Given, cells_out: ShadowCells, wave: Wavefront) -> None:
     """Estimate all cells, pass after pass, with the scratch of ``make_wavefront``."""
-    for one in (find_occluded, sum_light, trace_secondary, reduce_partials):
+    for one in PASSES:
         one(config, given, cells_out, wave)

@@ -1,4 +1,4 @@
-"""What polished receivers show of what is virtual: objects, highlights of virtual lights, what of both they hide.
+"""Virtual content in polished receivers: objects, highlights of virtual lights, what of both they hide.
 
 The camera's picture of a polished table holds the real surroundings, mirrored. Were the virtual objects there, they
 would be mirrored too, and hide what the table mirrors behind them. With f the receiver's specular reflection, GGX of
@@ -38,7 +38,7 @@ import warp as wp
 
 from warp_ar.kernels.emitters import correct_parallax
 from warp_ar.kernels.environment.lobes import level_from_alpha, sample_levels
-from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
+from warp_ar.kernels.launch import MOST_REGISTERS, row_launcher
 from warp_ar.kernels.materials import MIN_ALPHA, ggx_lobe, reflect, schlick
 from warp_ar.kernels.objects.reflect import DistantLight, look_up, look_up_layer, make_find_in_frame
 from warp_ar.kernels.objects.shade import NearPoint, ShadeConfig, make_shade_hit
@@ -129,7 +129,7 @@ def may_mirror(scene: RayScene, point: wp.vec3, direction: wp.vec3, reach: wp.fl
 
 @wp.struct
 class Sight:
-    """What the camera sees of the scene, and what lights it."""
+    """Scene as the camera sees it, and its light."""
 
     scene: RayScene
     distant: DistantLight
@@ -277,30 +277,6 @@ def make_highlights(config: GlossConfig) -> wp.Function:
 
 
 @wp.struct
-class FacetRay:
-    """What a facet of a rough receiver reflects toward the camera."""
-
-    wi: wp.vec3
-    masking: wp.float32  # share of it that other facets let pass; 0: none, it leads onto another facet
-    cos_d: wp.float32  # between the facet's normal and the ray
-
-
-@wp.func
-def draw_facet(u: wp.vec2, normal: wp.vec3, wo: wp.vec3, alpha: wp.float32) -> FacetRay:
-    """One of the facets that the camera sees, by a point of the unit square."""
-    out = FacetRay()
-    basis = frame_from_normal(normal)
-    local = wp.transpose(basis) * wo
-    facet = sample_ggx_visible(u, local, alpha)
-    away = reflect(local, facet)
-    if away[2] > 0.0:
-        out.masking = ggx_masking_shadowing(away, local, alpha) / ggx_masking(local, alpha)
-        out.cos_d = wp.max(wp.dot(local, facet), 0.0)
-        out.wi = wp.normalize(basis * away)
-    return out
-
-
-@wp.struct
 class GlossPoint:
     """A point of a receiver that mirrors."""
 
@@ -346,9 +322,24 @@ class GlossRay:
 
     hit: Hit  # that it leaves
     wi: wp.vec3
-    masking: wp.float32  # share of it that other facets let pass; 0: there is no such ray
+    masking: wp.float32  # share of it that other facets let pass; 0: there is no such ray, or it leads onto a facet
     cos_d: wp.float32  # between the facet's normal and the ray
     width: wp.float32  # alpha that it stands for
+
+
+@wp.func
+def draw_facet(ray: GlossRay, u: wp.vec2, wo: wp.vec3, alpha: wp.float32) -> GlossRay:
+    """Aim a ray by one of the facets that the camera sees, of a point of the unit square."""
+    out = ray
+    basis = frame_from_normal(ray.hit.normal)
+    local = wp.transpose(basis) * wo
+    facet = sample_ggx_visible(u, local, alpha)
+    away = reflect(local, facet)
+    if away[2] > 0.0:
+        out.masking = ggx_masking_shadowing(away, local, alpha) / ggx_masking(local, alpha)
+        out.cos_d = wp.max(wp.dot(local, facet), 0.0)
+        out.wi = wp.normalize(basis * away)
+    return out
 
 
 @functools.cache
@@ -381,10 +372,7 @@ def make_draw_ray(config: GlossConfig) -> wp.Function:
             out.width = at.alpha
         elif at.alpha > MIRROR_ALPHA:
             u = hammersley(sample, count) + shift
-            drawn = draw_facet(wp.vec2(u[0] - wp.floor(u[0]), u[1] - wp.floor(u[1])), at.hit.normal, at.wo, at.alpha)
-            out.wi = drawn.wi
-            out.masking = drawn.masking  # 0: onto another facet
-            out.cos_d = drawn.cos_d
+            out = draw_facet(out, wp.vec2(u[0] - wp.floor(u[0]), u[1] - wp.floor(u[1])), at.wo, at.alpha)
             out.width = at.alpha / wp.sqrt(wp.float32(count))
         else:
             origin = params[0].camera_position
@@ -409,9 +397,7 @@ def make_gloss_kernel(config: GlossConfig) -> wp.Kernel:
     see_receiver, draw_ray, follow = make_see_receiver(config), make_draw_ray(config), make_follow(config)
     highlights = make_highlights(config) if config.lights else None
 
-    @wp.kernel(
-        module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS
-    )
+    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def gloss_kernel(
         # In:
         row_start: wp.int32,
@@ -505,61 +491,26 @@ def smooth_gloss_kernel(
     reflected_out[i, j] = result
 
 
-def gloss(
-    config: GlossConfig,
-    params: wp.array,
-    sight: Sight,
-    lights: wp.array | None,
-    surfaces: wp.array,
-    change_out: wp.array,
-    surface_out: wp.array,
-    *,
-    rows: Rows | None = None,
-) -> None:
-    """Write what virtual objects and lights change in what the receiver mirrors, pixel by pixel.
+gloss = row_launcher(make_gloss_kernel, outputs=2)
+"""Write what virtual objects and lights change in what the receiver mirrors, pixel by pixel.
 
-    Args:
-        config: What the scene calls for; what it leaves out may be None.
-        params: (1,) FrameParams: camera, shadow_rect and ball_rect, beyond which nothing changes.
-        sight: The scene, its light and its picture.
-        lights: (n,) Light.
-        surfaces: (n,) Gloss, one for each proxy.
-        change_out: (H, W) vec3, change of linear radiance in camera values.
-        surface_out: (H, W) int32, the rough proxy that a pixel shows, or -1.
-        rows: Band of rows; None means all.
-    """
-    launch_rows(
-        make_gloss_kernel(config),
-        change_out.shape,
-        [params, sight, lights, surfaces],
-        [change_out, surface_out],
-        rows=rows,
-        device=change_out.device,
-    )
+Args:
+    config: What the scene calls for; what it leaves out may be None.
+    params: (1,) FrameParams: camera, shadow_rect and ball_rect, beyond which nothing changes.
+    sight: The scene, its light and its picture.
+    lights: (n,) Light.
+    surfaces: (n,) Gloss, one for each proxy.
+    change_out: (H, W) vec3, change of linear radiance in camera values.
+    surface_out: (H, W) int32, the rough proxy that a pixel shows, or -1.
+"""
 
 
-def smooth_gloss(
-    change: wp.array,
-    surface: wp.array,
-    mirror_ball: wp.array | None,
-    reflected_out: wp.array,
-    *,
-    rows: Rows | None = None,
-) -> None:
-    """Write what receivers and mirror balls change, the noise of rough receivers averaged over neighbours.
+smooth_gloss = row_launcher(smooth_gloss_kernel)
+"""Write what receivers and mirror balls change, the noise of rough receivers averaged over neighbours.
 
-    Args:
-        change: (H, W) vec3 of ``gloss``.
-        surface: (H, W) int32 of ``gloss``.
-        mirror_ball: (H, W) vec3 of ``mirror_ball``, which is added; None where there is none.
-        reflected_out: (H, W) vec3.
-        rows: Band of rows; None means all.
-    """
-    launch_rows(
-        smooth_gloss_kernel,
-        change.shape,
-        [change, surface, mirror_ball],
-        [reflected_out],
-        rows=rows,
-        device=change.device,
-    )
+Args:
+    change: (H, W) vec3 of ``gloss``.
+    surface: (H, W) int32 of ``gloss``.
+    mirror_ball: (H, W) vec3 of ``mirror_ball``, which is added; None where there is none.
+    reflected_out: (H, W) vec3.
+"""

@@ -1,4 +1,4 @@
-"""What mirror balls show of what is virtual: objects, light on the receiver, shadows.
+"""Virtual content in mirror balls: objects, light on the receiver, shadows.
 
 The camera's picture of a ball holds the real environment. Were the virtual objects there, the ball would mirror them
 too. A pixel's ray is reflected at the ball, of reflectance rho, and followed to what it meets first:
@@ -16,13 +16,10 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import math
-from collections.abc import Sequence
 
 import warp as wp
 
-from warp_ar.kernels.cooperative import of_lane
-from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
+from warp_ar.kernels.launch import MOST_REGISTERS, row_launcher
 from warp_ar.kernels.materials import reflect
 from warp_ar.kernels.objects.reflect import DistantLight, look_up_layer, make_find_in_frame
 from warp_ar.kernels.objects.shade import NearPoint, ShadeConfig, make_shade_hit
@@ -34,14 +31,12 @@ from warp_ar.kernels.rays.trace import TraceConfig, make_trace, offset_origin
 from warp_ar.kernels.rays.visibility import inside_rect, look_within_pixel
 from warp_ar.kernels.receiver.receiver import Receiver, RelightConfig
 from warp_ar.kernels.receiver.relight import make_direct_lighting
-from warp_ar.kernels.structs import FrameParams, Light, Picture, Probe, RayScene
+from warp_ar.kernels.structs import FrameParams, Light, Probe, RayScene
 
 wp.set_module_options({"enable_backward": False})
 
 MIN_REFLECTANCE = wp.constant(wp.float32(0.05))
 """Of a ball that is a mirror at all: what a pixel shows is divided by it."""
-SHARED = (4, 16)
-"""Numbers of samples of a pixel that a CUDA device takes side by side, a lane each."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,7 +48,7 @@ class MirrorBallConfig:
     shade: ShadeConfig | None = None
     """Shading of virtual objects; None: there are none."""
     relight: RelightConfig | None = None
-    """How the receiver responds to virtual light; None: there is no virtual light, or no proxy for it."""
+    """Response of the receiver to virtual light; None: there is no virtual light, or no proxy for it."""
     ratio: bool = False
     """True if virtual objects shade the receiver under the environment."""
 
@@ -112,24 +107,9 @@ def make_reflect_at_ball(config: MirrorBallConfig) -> wp.Function:
     return reflect_at_ball
 
 
-@wp.struct
-class Change:
-    """What a sample adds to a pixel's radiance: by an object or by shadow, and by virtual light."""
-
-    first: wp.vec3
-    second: wp.vec3
-    shows: wp.vec2  # row and column of the frame at which the shadow is to be looked up; below zero: nowhere
-
-
-@wp.func
-def shadow_change(shadow_ratio: wp.array2d[wp.vec3], at: wp.vec2, shown: wp.vec3) -> wp.vec3:
-    """What shadows of the environment change where a ball shows what the frame shows at a row and column."""
-    return wp.cw_mul(shown, look_up_layer(shadow_ratio, at[0], at[1]) - wp.vec3(1.0, 1.0, 1.0))
-
-
 @functools.cache
 def make_mirrored_change(config: MirrorBallConfig) -> wp.Function:
-    """``mirrored_change``: of a sample of the pixel, which looks in ``direction``; if ``later``, without shadow."""
+    """``mirrored_change``: of the radiance of a pixel, by its sample that looks in ``direction``."""
     trace = make_trace(config.trace)
     closest_object, closest_proxy = trace.closest_object, trace.closest_proxy
     reflect_at_ball = make_reflect_at_ball(config)
@@ -148,12 +128,9 @@ def make_mirrored_change(config: MirrorBallConfig) -> wp.Function:
         pixel: wp.vec2i,
         direction: wp.vec3,
         shown: wp.vec3,
-        later: wp.bool,
-    ) -> Change:
-        i = pixel[0]
-        j = pixel[1]
-        change = Change()
-        change.shows = wp.vec2(-1.0, -1.0)
+    ) -> wp.vec3:
+        i, j = pixel[0], pixel[1]
+        change = wp.vec3(0.0, 0.0, 0.0)
         seen = reflect_at_ball(scene, receiver.probes, params[0].camera_position, direction)
         if seen.ball < 0:
             return change
@@ -173,20 +150,18 @@ def make_mirrored_change(config: MirrorBallConfig) -> wp.Function:
                 # A pixel's rays leave the ball turned by twice the angle between the normals where they meet it.
                 spread = seen.width / wp.max(item.t, 1.0e-6) + 2.0 * seen.width / probe.radius
                 radiance = shade_hit(scene, lights, distant, item, wi, NearPoint(), tile_turn(i, j), spread)
-                change.first = wp.cw_mul(rho, radiance) - shown
-                return change
+                return wp.cw_mul(rho, radiance) - shown
         if surface.shape < 0 or wp.dot(surface.geometric_normal, wi) >= 0.0:
             return change
         if wp.static(config.ratio):
-            if later or shadow_ratio.shape[0] > 0:
+            if shadow_ratio.shape[0] > 0:
                 at = find_in_frame(params[0], receiver.picture, scene, receiver.probes, surface)
                 if at[0] >= 0.0:
-                    change.shows = wp.vec2(at[0], at[1])
-                    if not later:
-                        change.first = shadow_change(shadow_ratio, change.shows, shown)
+                    ratio = look_up_layer(shadow_ratio, at[0], at[1])
+                    change = wp.cw_mul(shown, ratio - wp.vec3(1.0, 1.0, 1.0))
         if wp.static(config.relight is not None):
             lit = direct_lighting(scene, lights, receiver, surface, i, j, rho, tile_turn(i, j))
-            change.second = wp.cw_mul(rho, lit.added)
+            change += wp.cw_mul(rho, lit.added)
         return change
 
     return mirrored_change
@@ -197,9 +172,7 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
     """Kernel specialised to ``config``; equal configs share one kernel."""
     mirrored_change = make_mirrored_change(config)
 
-    @wp.kernel(
-        module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS
-    )
+    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def mirror_ball_kernel(
         # In:
         row_start: wp.int32,
@@ -210,19 +183,12 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
         receiver: Receiver,
         shadow_ratio: wp.array2d[wp.vec3],
         side: wp.int32,
-        share: wp.int32,
         # Out:
         mirrored_out: wp.array2d[wp.vec3],
-        shows_out: wp.array2d[wp.vec2],
     ):
-        """A pixel; or one of its samples, which ``share`` lanes take, one each.
-
-        With ``shows_out`` of a pixel's one sample, shadows are left to ``shade_mirrored_kernel``.
-        """
-        i, j, part = wp.tid()
+        i, j = wp.tid()
         pixel = own_pixel(i, j, row_start, params[0].ball_rect, mirrored_out.shape[0], mirrored_out.shape[1])
-        i = pixel[0]
-        j = pixel[1]
+        i, j = pixel[0], pixel[1]
         if i < 0:
             return
         if not inside_rect(i, j, params[0].ball_rect):
@@ -231,122 +197,26 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
         ray = receiver.picture.rays[i, j]
         shown = shown_radiance(receiver.picture, i, j)
         change = wp.vec3(0.0, 0.0, 0.0)
-        later = shows_out.shape[0] > 0
-        one = Change()
-        for sample in range(part, side * side, share):
+        for sample in range(side * side):
             direction = look_within_pixel(params, ray, sample, side)
-            one = mirrored_change(
-                params, scene, lights, distant, receiver, shadow_ratio, pixel, direction, shown, later
-            )
-            change += one.first
-            change += one.second
-        if share > 1:
-            change = wp.vec3(0.0, 0.0, 0.0)
-            for lane in range(share):  # in the order in which one thread adds them
-                change += of_lane(one.first, lane, share)
-                change += of_lane(one.second, lane, share)
-        if part == 0:
-            mirrored_out[i, j] = change / wp.float32(side * side)
-            if later:
-                shows_out[i, j] = one.shows
+            change += mirrored_change(params, scene, lights, distant, receiver, shadow_ratio, pixel, direction, shown)
+        mirrored_out[i, j] = change / wp.float32(side * side)
 
     return mirror_ball_kernel
 
 
-@wp.kernel(enable_backward=False)
-def shade_mirrored_kernel(
-    # In:
-    row_start: wp.int32,
-    params: wp.array[FrameParams],
-    picture: Picture,
-    shadow_ratio: wp.array2d[wp.vec3],
-    shows: wp.array2d[wp.vec2],
-    # Out:
-    mirrored_out: wp.array2d[wp.vec3],
-):
-    """Shadows of the environment in a pixel of a ball of which the rest is known."""
-    i, j = wp.tid()
-    pixel = own_pixel(i, j, row_start, params[0].ball_rect, mirrored_out.shape[0], mirrored_out.shape[1])
-    i = pixel[0]
-    j = pixel[1]
-    if i < 0:
-        return
-    if inside_rect(i, j, params[0].ball_rect):
-        at = shows[i, j]
-        if at[0] >= 0.0:
-            mirrored_out[i, j] = mirrored_out[i, j] + shadow_change(shadow_ratio, at, shown_radiance(picture, i, j))
+mirror_ball = row_launcher(make_mirror_ball_kernel, rectangle_first=True)
+"""Write what virtual objects change in the picture of mirror balls; zero outside ``params[0].ball_rect``.
 
-
-def shade_mirrored(
-    params: wp.array, picture: Picture, shadow_ratio: wp.array, shows: wp.array, mirrored_out: wp.array
-) -> None:
-    """Add shadows of the environment to what ``mirror_ball`` wrote without them.
-
-    Args:
-        params: As that of ``mirror_ball``, and so are all arguments that are not named here.
-        picture: That of its receiver.
-        shadow_ratio: Likewise.
-        shows: (H, W) vec2 as ``mirror_ball`` writes.
-        mirrored_out: Likewise.
-    """
-    given = [params, picture, shadow_ratio, shows]
-    whole = {"rows": None, "device": mirrored_out.device, "rectangle_first": True, "alone": True}
-    launch_rows(shade_mirrored_kernel, mirrored_out.shape, given, [mirrored_out], **whole)
-
-
-def launch_shape(size: Sequence[int], samples: int, device: wp.DeviceLike) -> tuple[int, int, int]:
-    """Threads of a picture of (H, W) pixels: on CUDA some numbers of samples have a lane each."""
-    height, width = size
-    return height, width, samples if samples in SHARED and not wp.get_device(device).is_cpu else 1
-
-
-def mirror_ball(
-    config: MirrorBallConfig,
-    params: wp.array,
-    scene: RayScene,
-    lights: wp.array | None,
-    distant: DistantLight,
-    receiver: Receiver,
-    shadow_ratio: wp.array | None,
-    mirrored_out: wp.array,
-    *,
-    samples: int = 1,
-    shows_out: wp.array | None = None,
-    cleared: bool = False,
-    rows: Rows | None = None,
-) -> None:
-    """Write what virtual objects change in the picture of mirror balls; zero outside ``params[0].ball_rect``.
-
-    Args:
-        config: What the scene calls for; what it leaves out may be None.
-        params: (1,) FrameParams: camera and ball_rect.
-        scene: Objects and proxies.
-        lights: (n,) Light.
-        distant: The environment, as ``shade`` reads it; empty if ``config.shade`` is None.
-        receiver: From ``make_receiver``; picture and probes are always needed.
-        shadow_ratio: (H, W) vec3 of ``environment_shadow``; needed if ``config.ratio``.
-        mirrored_out: (H, W) vec3, change of linear radiance in camera values.
-        shows_out: (H, W) vec2, if there is one ray per pixel: the shadows are left to ``shade_mirrored``, and it says
-            where. ``shadow_ratio`` is not read.
-        cleared: Whether ``mirrored_out`` is zero, so that on CUDA it need not be written outside.
-        samples: Rays per pixel, spread as ``shade``'s along edges: a square number. A number, not a kernel of its own.
-        rows: Band of rows; None means all.
-
-    Raises:
-        ValueError: ``samples`` is no square number.
-    """
-    side = math.isqrt(max(samples, 0))
-    if samples < 1 or side**2 != samples:
-        raise ValueError(f"samples is {samples}; expected a square number such as 1 or 4")
-    rays = receiver.picture.rays
-    shape = launch_shape(rays.shape, samples, rays.device)
-    launch_rows(
-        make_mirror_ball_kernel(config),
-        shape,
-        [params, scene, lights, distant, receiver, shadow_ratio, side, shape[2]],
-        [mirrored_out, shows_out],
-        rows=rows,
-        device=rays.device,
-        rectangle_first=True,
-        alone=cleared,
-    )
+Args:
+    config: What the scene calls for; what it leaves out may be None.
+    params: (1,) FrameParams: camera and ball_rect.
+    scene: Objects and proxies.
+    lights: (n,) Light.
+    distant: The environment, as ``shade`` reads it; empty if ``config.shade`` is None.
+    receiver: From ``make_receiver``; picture and probes are always needed.
+    shadow_ratio: (H, W) vec3 of ``environment_shadow``; needed if ``config.ratio``.
+    side: Rays per pixel are its square, spread as ``shade``'s along edges. A number, not a kernel of its own.
+    mirrored_out: (H, W) vec3, change of linear radiance in camera values.
+    alone: Whether ``mirrored_out`` is zero, so that on CUDA it need not be written outside.
+"""

@@ -41,7 +41,7 @@ from warp_ar.kernels.pixels import cut_luma, shown_radiance
 from warp_ar.kernels.rays.shapes import surface_key
 from warp_ar.kernels.rays.trace import TraceConfig
 from warp_ar.kernels.rays.visibility import check_edge_samples
-from warp_ar.kernels.structs import Emitter, Hit, KeyLight, Picture, Probe, RayScene
+from warp_ar.kernels.structs import Emitter, Hit, KeyLight, Picture, Probe, RayScene, filled
 
 wp.set_module_options({"enable_backward": False})
 
@@ -51,7 +51,7 @@ METHODS = ("flat", "paper", "reflectance")
 
 @dataclasses.dataclass(frozen=True)
 class Reading:
-    """How equation (1) takes what the paper's text leaves open; the defaults are the letter of the text."""
+    """Choices of equation (1) that the paper's text leaves open; the defaults are the letter of the text."""
 
     values: Literal["video", "linear"] = "video"
     """Of the multiplicative factor: codes over 255 as the shader samples them, or linear luminance."""
@@ -103,9 +103,9 @@ class RelightConfig:
     area_samples: int = 0
     """Samples of what emits, per point; ``area_lights.POINT_SAMPLES``: as lights at points; 0: nothing emits."""
 
-    def general(self, *, soft: bool, by_call: bool = False) -> RelightConfig:
-        """For any scene in which as much is known of the receiver; ``by_call`` as in ``TraceConfig.general``."""
-        return dataclasses.replace(self, trace=self.trace.general(by_call=by_call), soft=soft)
+    def general(self, *, soft: bool) -> RelightConfig:
+        """For any scene in which as much is known of the receiver."""
+        return dataclasses.replace(self, trace=self.trace.general(), soft=soft)
 
     def __post_init__(self) -> None:
         known = dict.fromkeys((*METHODS, *READINGS))
@@ -159,7 +159,7 @@ def reflectance_of(radiance: wp.float32, irradiance: wp.float32) -> wp.float32:
 
 @wp.struct
 class ReceiverCells:
-    """What ``receiver_cells.py`` found for cells of the frame, each with the surface that it lies on."""
+    """Results of ``receiver_cells.py`` for cells of the frame, each with the surface that it lies on."""
 
     ambient_visibility: wp.array2d[wp.vec3]  # share of the environment that reaches a cell
     ambient_surface: wp.array2d[wp.int32]  # ``surface_key`` of the cell, -1 for none
@@ -312,11 +312,5 @@ def make_receiver(
         others: The balls after the first; needed if ``config.several``.
         cells: From ``receiver_cells``; needed if ``config.ambient_visibility`` or ``config.bounced``.
     """
-    receiver = Receiver()
-    receiver.picture = picture
-    form = f"irradiance_{config.irradiance}"
-    optional = {"probes": probes, "key_lights": key_lights, form: irradiance}
-    for name, value in {**optional, "emitters": emitters, "others": others, "cells": cells}.items():
-        if value is not None:
-            setattr(receiver, name, value)
-    return receiver
+    given = {"probes": probes, "key_lights": key_lights, f"irradiance_{config.irradiance}": irradiance}
+    return filled(Receiver(), picture=picture, emitters=emitters, others=others, cells=cells, **given)

@@ -1,4 +1,4 @@
-"""What ``relight`` needs to know of the receiver beyond its own pixel, estimated for cells of the frame.
+"""Light that reaches the receiver beyond one pixel, estimated for cells of the frame for ``relight``.
 
 **Ambient visibility.** Reflectance is what the camera sees over what the environment sends (``receiver``, equation 3).
 The environment's filtered irradiance knows nothing of what stands in the way: in the shadow of the ball or of a box it
@@ -38,7 +38,7 @@ from warp_ar.kernels.cells import cell_pixel
 from warp_ar.kernels.environment.environment_samples import EnvironmentSample, Incidence, ball_of_sample, sample_toward
 from warp_ar.kernels.environment.interpolated_irradiance import make_irradiance_at
 from warp_ar.kernels.environment.probe_weights import probe_share
-from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch, launch_rows
+from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch, launch_rows, row_launcher
 from warp_ar.kernels.materials import material_at
 from warp_ar.kernels.objects.reflect import look_up, make_find_in_frame
 from warp_ar.kernels.rays.shadow import make_shadow, sample_light, tile_turn
@@ -68,7 +68,7 @@ MAX_PARTIALS = 16
 KINDS = wp.constant(2)
 """Values of a partial sum: the environment, and what is lost of it."""
 PENDING = wp.constant(-2)
-"""What ``surface_out`` holds less the cell's surface while partials of its share are not yet added."""
+"""Value of ``surface_out`` less the cell's surface while partials of its share are not yet added."""
 
 
 @wp.struct
@@ -81,36 +81,16 @@ class Patch:
     area: wp.float32  # square metres
 
 
-@dataclasses.dataclass(frozen=True)
-class CellConfig:
-    """Compile-time configuration of the kernels."""
-
-    relight: RelightConfig
-    """Of the direct light: kinds of shape, and form of the environment's irradiance."""
-
-    @property
-    def trace(self) -> TraceConfig:
-        """Kinds of shape."""
-        return self.relight.trace
-
-
-@wp.func
-def visible_share_of(lost: wp.float32, whole: wp.float32) -> wp.float32:
-    """Part of ``whole`` that is left without ``lost``; within 0..1 for whatever comes in, 1 where nothing is known."""
-    if not whole > MIN_IRRADIANCE:  # NaN as well
-        return 1.0
-    share = 1.0 - lost / whole
-    if not share < 1.0:
-        return 1.0
-    return wp.max(share, 0.0)
-
-
 @wp.func
 def visible_shares_of(lost: wp.vec3, whole: wp.vec3) -> wp.vec3:
-    """``visible_share_of`` for each channel."""
-    return wp.vec3(
-        visible_share_of(lost[0], whole[0]), visible_share_of(lost[1], whole[1]), visible_share_of(lost[2], whole[2])
-    )
+    """Part of ``whole`` that is left without ``lost``; within 0..1 for whatever comes in, 1 where nothing is known."""
+    shares = wp.vec3(1.0, 1.0, 1.0)
+    for channel in range(3):
+        if whole[channel] > MIN_IRRADIANCE:  # NaN is not
+            share = 1.0 - lost[channel] / whole[channel]
+            if share < 1.0:
+                shares[channel] = wp.max(share, 0.0)
+    return shares
 
 
 @wp.func
@@ -129,12 +109,12 @@ def in_lit_cells(cell_row: wp.int32, cell_col: wp.int32, stride: wp.int32, rect:
 
 
 @functools.cache
-def make_mean_facing(config: CellConfig) -> wp.Function:
+def make_mean_facing(config: RelightConfig) -> wp.Function:
     """``mean_facing(receiver, point, normal) -> vec3``: mean radiance, by the cosine, of what lies before a surface.
 
     Of the environment, emitters where the balls saw them.
     """
-    irradiance_at = make_irradiance_at(config.relight.irradiance, False, config.relight.several)
+    irradiance_at = make_irradiance_at(config.irradiance, False, config.several)
 
     @wp.func(module="unique")
     def mean_facing(receiver: Receiver, point: wp.vec3, normal: wp.vec3) -> wp.vec3:
@@ -175,10 +155,10 @@ class Hider:
 
 
 @functools.cache
-def make_find_hider(config: CellConfig) -> wp.Function:
+def make_find_hider(config: RelightConfig) -> wp.Function:
     """``find_hider(params, scene, receiver, hit, toward, solids) -> Hider``; ``solids`` of ``bound_solids``."""
     mean_facing = make_mean_facing(config)
-    find_in_frame = make_find_in_frame(config.trace, config.relight.probes)
+    find_in_frame = make_find_in_frame(config.trace, config.probes)
     closest_proxy = make_trace(config.trace).closest_proxy
     only_planes = set(config.trace.proxies) <= {PLANE}
 
@@ -230,9 +210,9 @@ def is_shone_on(lights: wp.array[Light], hit: Hit) -> wp.bool:
 
 
 @functools.cache
-def make_ambient_visibility_kernel(config: CellConfig) -> wp.Kernel:
+def make_ambient_visibility_kernel(config: RelightConfig) -> wp.Kernel:
     """Kernel of ``estimate_ambient_visibility``."""
-    visible_proxy = make_visible_proxy(config.trace, config.relight.probes)
+    visible_proxy = make_visible_proxy(config.trace, config.probes)
     find_hider = make_find_hider(config)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
@@ -291,7 +271,7 @@ def make_ambient_visibility_kernel(config: CellConfig) -> wp.Kernel:
             toward = sample_toward(sample, hit.point)
             cosine = wp.dot(hit.normal, toward.direction)
             if cosine > 0.0:
-                if wp.static(config.relight.several):
+                if wp.static(config.several):
                     places = receiver.others.places
                     toward.measure *= probe_share(places, ball_of_sample(k, places.shape[0]), hit.point)
                 flux = cosine * toward.measure * sample.radiance
@@ -373,10 +353,10 @@ def make_sent_by_object(trace: TraceConfig) -> wp.Function:
 
 
 @functools.cache
-def make_send_light_kernel(config: CellConfig) -> wp.Kernel:
+def make_send_light_kernel(config: RelightConfig) -> wp.Kernel:
     """Kernel of ``send_light``."""
-    visible_proxy = make_visible_proxy(config.trace, config.relight.probes)
-    direct_lighting = make_direct_lighting(dataclasses.replace(config.relight, bounced=False))
+    visible_proxy = make_visible_proxy(config.trace, config.probes)
+    direct_lighting = make_direct_lighting(dataclasses.replace(config, bounced=False))
     has_objects = bool(config.trace.objects)
     closest_object = make_trace(config.trace).closest_object
     sent_by_object = make_sent_by_object(config.trace)
@@ -455,9 +435,9 @@ def list_patches_kernel(
 
 
 @functools.cache
-def make_gather_light_kernel(config: CellConfig) -> wp.Kernel:
+def make_gather_light_kernel(config: RelightConfig) -> wp.Kernel:
     """Kernel of ``gather_light``."""
-    visible_proxy = make_visible_proxy(config.trace, config.relight.probes)
+    visible_proxy = make_visible_proxy(config.trace, config.probes)
     mean_facing = make_mean_facing(config)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
@@ -509,7 +489,7 @@ def make_gather_light_kernel(config: CellConfig) -> wp.Kernel:
 
 
 def estimate_ambient_visibility(
-    config: CellConfig,
+    config: RelightConfig,
     params: wp.array[FrameParams],
     scene: RayScene,
     lights: wp.array[Light],
@@ -557,91 +537,41 @@ def partial_sums_shape(partials: int, rows: int, columns: int) -> tuple[int, int
     return partials * int(KINDS), rows, columns
 
 
-def send_light(
-    config: CellConfig,
-    params: wp.array[FrameParams],
-    scene: RayScene,
-    lights: wp.array[Light],
-    receiver: Receiver,
-    stride: int,
-    patches_out: wp.array2d[Patch],
-    *,
-    rows: Rows | None = None,
-) -> None:
-    """Find what every patch of the receiver sends on of the virtual light that falls on it.
+send_light = row_launcher(make_send_light_kernel)
+"""Find what every patch of the receiver sends on of the virtual light that falls on it.
 
-    Args:
-        config: As for ``estimate_ambient_visibility``.
-        params: (1,) FrameParams: camera and light_rect.
-        scene: Objects and proxies.
-        lights: (n,) Light.
-        receiver: From ``make_receiver``, with the cells of ``estimate_ambient_visibility`` where the config has them.
-        stride: Pixels along a patch.
-        patches_out: (ceil(H / stride), ceil(W / stride)) patches; those that send nothing have no area.
-        rows: Band of rows of patches; None means all.
-    """
-    launch_rows(
-        make_send_light_kernel(config),
-        patches_out.shape,
-        [params, scene, lights, receiver, stride],
-        [patches_out],
-        rows=rows,
-        device=patches_out.device,
-    )
+Args:
+    config: As for ``estimate_ambient_visibility``.
+    params: (1,) FrameParams: camera and light_rect.
+    scene: Objects and proxies.
+    lights: (n,) Light.
+    receiver: From ``make_receiver``, with the cells of ``estimate_ambient_visibility`` where the config has them.
+    stride: Pixels along a patch.
+    patches_out: (ceil(H / stride), ceil(W / stride)) patches; those that send nothing have no area.
+"""
 
 
-def list_patches(
-    patches: wp.array2d[Patch],
-    listed_out: wp.array2d[Patch],
-    count_out: wp.array[wp.int32],
-    *,
-    rows: Rows | None = None,
-) -> None:
-    """Move the patches that send light to the front of their rows.
+list_patches = row_launcher(list_patches_kernel, outputs=2, like=lambda patches, listed, count: count)
+"""Move the patches that send light to the front of their rows.
 
-    Args:
-        patches: (r, c) of ``send_light``.
-        listed_out: (r, c) patches.
-        count_out: (r,) how many of a row send light.
-        rows: Band of rows; None means all.
-    """
-    launch_rows(
-        list_patches_kernel, count_out.shape, [patches], [listed_out, count_out], rows=rows, device=patches.device
-    )
+Args:
+    patches: (r, c) of ``send_light``.
+    listed_out: (r, c) patches.
+    count_out: (r,) how many of a row send light.
+"""
 
 
-def gather_light(
-    config: CellConfig,
-    params: wp.array[FrameParams],
-    scene: RayScene,
-    receiver: Receiver,
-    patches: wp.array2d[Patch],
-    count: wp.array[wp.int32],
-    patch_stride: int,
-    cells_out: ReceiverCells,
-    *,
-    rows: Rows | None = None,
-) -> None:
-    """Sum what patches send to the cells of the receiver.
+gather_light = row_launcher(make_gather_light_kernel, like=lambda *given: given[-1].bounced)
+"""Sum what patches send to the cells of the receiver.
 
-    Args:
-        config: As for ``estimate_ambient_visibility``.
-        params: (1,) FrameParams: camera and light_rect.
-        scene: Proxies.
-        receiver: From ``make_receiver``: picture, balls and the environment's irradiance.
-        patches: (r, c) of ``list_patches``; only rows that light_rect reaches are read.
-        count: (r,) how many of a row send light.
-        patch_stride: Pixels along a patch.
-        cells_out: Cells whose bounced light and its surface are written; bounced light is 0 where it is less than
-            ``NEGLIGIBLE`` of the environment's.
-        rows: Band of rows of cells; None means all.
-    """
-    bounced = cells_out.bounced
-    launch_rows(
-        make_gather_light_kernel(config),
-        bounced.shape,
-        [params, scene, receiver, patches, count, patch_stride],
-        [cells_out],
-        rows=rows,
-        device=bounced.device,
-    )
+Args:
+    config: As for ``estimate_ambient_visibility``.
+    params: (1,) FrameParams: camera and light_rect.
+    scene: Proxies.
+    receiver: From ``make_receiver``: picture, balls and the environment's irradiance.
+    patches: (r, c) of ``list_patches``; only rows that light_rect reaches are read.
+    count: (r,) how many of a row send light.
+    patch_stride: Pixels along a patch.
+    cells_out: Cells whose bounced light and its surface are written; bounced light is 0 where it is less than
+        ``NEGLIGIBLE`` of the environment's.
+"""

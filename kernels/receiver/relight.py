@@ -27,7 +27,7 @@ import warp as wp
 
 from warp_ar.kernels.cells import any_cell_above_zero
 from warp_ar.kernels.edges import EdgeList, EdgeLists, holds_all, list_edge, listed_edges, sample_listed_edges
-from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
+from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows, row_launcher
 from warp_ar.kernels.pixel_order import own_pixel
 from warp_ar.kernels.rays.area_lights import make_area_count, make_area_sample
 from warp_ar.kernels.rays.shadow import (
@@ -200,8 +200,7 @@ def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
     ):
         i, j = wp.tid()
         pixel = own_pixel(i, j, row_start, params[0].light_rect, added_out.shape[0], added_out.shape[1])
-        i = pixel[0]
-        j = pixel[1]
+        i, j = pixel[0], pixel[1]
         if i < 0:
             return
         black = wp.vec3(0.0, 0.0, 0.0)
@@ -298,9 +297,7 @@ def make_smooth_edges_kernel(config: RelightConfig, *, left: bool = False) -> wp
     """Kernel that samples edges in place; if ``left``, only where the list did not hold all."""
     sample_lighting = make_sample_lighting(config)
 
-    @wp.kernel(
-        module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS
-    )
+    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def smooth_edges_kernel(
         # In:
         row_start: wp.int32,
@@ -319,10 +316,7 @@ def make_smooth_edges_kernel(config: RelightConfig, *, left: bool = False) -> wp
                 return
         rect = params[0].light_rect
         pixel = own_pixel(i, j, row_start, rect, added_out.shape[0], added_out.shape[1])
-        i = pixel[0]
-        j = pixel[1]
-        if i < 0:
-            return
+        i, j = pixel[0], pixel[1]
         if not inside_rect(i, j, rect):
             return
         if not is_edge(visibility, rect, i, j):
@@ -350,10 +344,7 @@ def list_edges_kernel(
     i, j = wp.tid()
     rect = params[0].light_rect
     pixel = own_pixel(i, j, row_start, rect, visibility.shape[0], visibility.shape[1])
-    i = pixel[0]
-    j = pixel[1]
-    if i < 0:
-        return
+    i, j = pixel[0], pixel[1]
     if inside_rect(i, j, rect):
         if is_edge(visibility, rect, i, j):
             list_edge(i, j, list_out)
@@ -387,45 +378,22 @@ def make_sample_edges_kernel(config: RelightConfig) -> wp.Kernel:
     return sample_lighting_edges_kernel
 
 
-def relight(
-    config: RelightConfig,
-    params: wp.array[FrameParams],
-    scene: RayScene,
-    lights: wp.array[Light],
-    receiver: Receiver,
-    added_out: wp.array2d[wp.vec3],
-    visibility_out: wp.array2d[wp.int32] | None = None,
-    *,
-    cleared: bool = False,
-    rows: Rows | None = None,
-) -> None:
-    """Write the radiance that virtual lights add to the receiver; zero outside ``params[0].light_rect``.
+relight = row_launcher(make_relight_kernel, outputs=2, rectangle_first=True)
+"""Write the radiance that virtual lights add to the receiver; zero outside ``params[0].light_rect``.
 
-    One sample per pixel: where ``config.edge_samples`` is more than 1, ``smooth_edges`` comes next.
+One sample per pixel: where ``config.edge_samples`` is more than 1, ``smooth_edges`` comes next.
 
-    Args:
-        config: Method and kinds of shape.
-        params: (1,) FrameParams: camera, light_rect and, if ``config.bounced``, direct_rect.
-        scene: Objects and proxies.
-        lights: (n,) Light.
-        receiver: Of ``make_receiver``.
-        added_out: (H, W) linear radiance in camera values.
-        visibility_out: (H, W) which surface a pixel sees and which lights do not; needed if ``config.edge_samples`` is
-            more than 1. Only what lies in ``light_rect`` is written.
-        cleared: Whether ``added_out`` is zero, so that on CUDA it need not be written outside.
-        rows: Band of rows; None means all.
-    """
-    rays = receiver.picture.rays
-    launch_rows(
-        make_relight_kernel(config),
-        rays.shape,
-        [params, scene, lights, receiver],
-        [added_out, visibility_out],
-        rows=rows,
-        device=rays.device,
-        rectangle_first=True,
-        alone=cleared,
-    )
+Args:
+    config: Method and kinds of shape.
+    params: (1,) FrameParams: camera, light_rect and, if ``config.bounced``, direct_rect.
+    scene: Objects and proxies.
+    lights: (n,) Light.
+    receiver: Of ``make_receiver``.
+    added_out: (H, W) linear radiance in camera values.
+    visibility_out: (H, W) which surface a pixel sees and which lights do not; None if ``config.edge_samples`` is 1.
+        Only what lies in ``light_rect`` is written.
+    alone: Whether ``added_out`` is zero, so that on CUDA it need not be written outside.
+"""
 
 
 def smooth_edges(
@@ -464,6 +432,5 @@ def smooth_edges(
     launch_rows(list_edges_kernel, shape, [params, visibility], [edge_lists.listed], **whole)
     kernel = make_smooth_edges_kernel(config, left=True)
     launch_rows(kernel, shape, [*inputs, visibility, edge_lists.listed], [added_out], **whole)
-    sample_listed_edges(
-        make_sample_edges_kernel(config), inputs, edge_lists, config.edge_samples, added_out, weighted=True
-    )
+    kernel = make_sample_edges_kernel(config)
+    sample_listed_edges(kernel, inputs, edge_lists, config.edge_samples, added_out, weighted=True)

@@ -3,6 +3,11 @@
 One ray per pixel, through its centre: nothing here is filtered, for a mean of two depths is the depth of neither. The
 depth is along the camera's axis, as depth cameras and OpenEXR's ``Z`` have it. What hides what is as in the picture:
 an object is hidden by proxies alone, and a proxy shows its front.
+
+Several surfaces may share a pixel: how much of it each covers is what Cryptomatte keeps of a picture. Within a
+surface a pixel shows that alone. Where one of the eight neighbours shows another, the pixel's samples are traced, the
+same as those by which ``shade`` smooths edges, and counted by surface. The ``RANKS`` that cover most are kept, in
+falling order; what nothing modelled covers is in no rank.
 """
 
 from __future__ import annotations
@@ -11,13 +16,22 @@ import functools
 
 import warp as wp
 
-from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.launch import row_launcher
 from warp_ar.kernels.rays.shapes import FAR, intersect_sphere
 from warp_ar.kernels.rays.trace import TraceConfig, make_trace
-from warp_ar.kernels.rays.visibility import VisibleObjects, inside_rect
-from warp_ar.kernels.structs import FrameParams, Probe, RayScene
+from warp_ar.kernels.rays.visibility import (
+    VisibleObjects,
+    check_edge_samples,
+    inside_rect,
+    make_primary,
+    make_sample_direction,
+)
+from warp_ar.kernels.structs import FrameParams, Probe, RayScene, filled, vec8
 
 wp.set_module_options({"enable_backward": False})
+
+RANKS = 4
+"""Surfaces that a pixel keeps."""
 
 
 @wp.struct
@@ -122,39 +136,124 @@ def make_trace_surfaces_kernel(config: TraceConfig) -> wp.Kernel:
 
 def make_surfaces(index: wp.array, depth: wp.array, normal: wp.array, position: wp.array) -> Surfaces:
     """The arrays of ``trace_surfaces`` together."""
-    surfaces = Surfaces()
-    surfaces.index, surfaces.depth, surfaces.normal, surfaces.position = index, depth, normal, position
-    return surfaces
+    return filled(Surfaces(), index=index, depth=depth, normal=normal, position=position)
 
 
-def trace_surfaces(
-    config: TraceConfig,
-    params: wp.array,
-    rays: wp.array,
-    scene: RayScene,
-    balls: wp.array,
-    visible: VisibleObjects,
-    out: Surfaces,
-    *,
-    rows: Rows | None = None,
-) -> None:
-    """Write the surface that every pixel's centre shows.
+trace_surfaces = row_launcher(make_trace_surfaces_kernel, like=lambda params, rays, *_: rays)
+"""Write the surface that every pixel's centre shows.
 
-    Args:
-        config: Kinds of shape in ``scene``.
-        params: (1,) FrameParams: camera and ``object_rect``.
-        rays: (H, W) undistorted x / z and y / z of each pixel centre.
-        scene: What rays meet.
-        balls: (n,) Probe, the mirror balls.
-        visible: (H, W) as ``trace_pixels`` writes; its arrays are empty in a scene without objects.
-        out: (H, W) arrays, all four.
-        rows: Band of rows; None means all.
-    """
-    launch_rows(
-        make_trace_surfaces_kernel(config),
-        rays.shape,
-        [params, rays, scene, balls, visible],
-        [out],
-        rows=rows,
-        device=rays.device,
-    )
+Args:
+    config: Kinds of shape in ``scene``.
+    params: (1,) FrameParams: camera and ``object_rect``.
+    rays: (H, W) undistorted x / z and y / z of each pixel centre.
+    scene: What rays meet.
+    balls: (n,) Probe, the mirror balls.
+    visible: (H, W) as ``trace_pixels`` writes; its arrays are empty in a scene without objects.
+    out: (H, W) arrays, all four.
+"""
+
+
+@wp.func
+def add_to_rank(ranks: vec8, found: wp.int32, share: wp.float32) -> vec8:
+    """Count a share of the pixel for a surface: in its rank, else in the first that is free, else in none."""
+    out = ranks
+    taken = bool(found < 0)
+    for k in range(wp.static(RANKS)):
+        if not taken and (out[2 * k] == wp.float32(found) or out[2 * k] < 0.0):
+            out[2 * k] = wp.float32(found)
+            out[2 * k + 1] = out[2 * k + 1] + share
+            taken = True
+    return out
+
+
+@wp.func
+def sort_ranks(ranks: vec8) -> vec8:
+    """In falling order; few, so the plainest way to sort them. Equal ones keep the order of their samples."""
+    out = ranks
+    for _ in range(wp.static(RANKS - 1)):
+        for k in range(wp.static(RANKS - 1)):
+            if out[2 * k + 3] > out[2 * k + 1]:
+                which = out[2 * k]
+                much = out[2 * k + 1]
+                out[2 * k] = out[2 * k + 2]
+                out[2 * k + 1] = out[2 * k + 3]
+                out[2 * k + 2] = which
+                out[2 * k + 3] = much
+    return out
+
+
+@functools.cache
+def make_shown(config: TraceConfig) -> wp.Function:
+    """``shown(scene, balls, origin, direction) -> int32``: number of the surface that a ray meets first, or -1."""
+    closest_visible = make_primary(config)
+    physical_surface = make_physical_surface(config)
+
+    @wp.func(module="unique")
+    def shown(scene: RayScene, balls: wp.array[Probe], origin: wp.vec3, direction: wp.vec3) -> wp.int32:
+        hit = closest_visible(scene, origin, direction)
+        found = hit.shape
+        if found < 0:
+            surface = physical_surface(scene, balls, origin, direction)
+            found = surface.index
+        return found
+
+    return shown
+
+
+@functools.cache
+def make_count_coverage_kernel(config: TraceConfig, edge_samples: int) -> wp.Kernel:
+    """Kernel of ``count_coverage``, specialised to the kinds of shape that exist and to the samples of a pixel."""
+    check_edge_samples(edge_samples)
+    shown, sample_direction = make_shown(config), make_sample_direction(edge_samples)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def count_coverage_kernel(
+        # In:
+        row_start: wp.int32,
+        params: wp.array[FrameParams],
+        rays: wp.array2d[wp.vec2],
+        scene: RayScene,
+        balls: wp.array[Probe],
+        index: wp.array2d[wp.int32],
+        # Out:
+        coverage_out: wp.array2d[vec8],
+    ):
+        i, j = wp.tid()
+        i += row_start
+        own = index[i, j]
+        edge = bool(False)
+        if wp.static(edge_samples > 1):
+            for a in range(wp.max(i - 1, 0), wp.min(i + 2, index.shape[0])):
+                for b in range(wp.max(j - 1, 0), wp.min(j + 2, index.shape[1])):
+                    edge = edge or index[a, b] != own
+        ranks = vec8()
+        for k in range(wp.static(RANKS)):
+            ranks[2 * k] = -1.0
+        if not edge:
+            if own >= 0:
+                ranks[0] = wp.float32(own)
+                ranks[1] = 1.0
+        else:
+            for sample in range(wp.static(edge_samples)):
+                found = shown(scene, balls, params[0].camera_position, sample_direction(params, rays[i, j], sample))
+                ranks = add_to_rank(ranks, found, wp.static(1.0 / edge_samples))
+            ranks = sort_ranks(ranks)
+        coverage_out[i, j] = ranks
+
+    return count_coverage_kernel
+
+
+count_coverage = row_launcher(make_count_coverage_kernel, configs=2)
+"""Write what share of every pixel which surface covers.
+
+Args:
+    config: Kinds of shape in ``scene``.
+    edge_samples: Samples of a pixel at an edge, a square number; 1 leaves edges hard.
+    params: (1,) FrameParams, the camera.
+    rays: (H, W) undistorted x / z and y / z of each pixel centre.
+    scene: What rays meet.
+    balls: (n,) Probe, the mirror balls.
+    index: (H, W) int32, as ``trace_surfaces`` writes.
+    coverage_out: (H, W) of index and share in turn, ``RANKS`` times, in falling order; index -1 with share 0
+        where there are fewer.
+"""

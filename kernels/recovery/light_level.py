@@ -1,4 +1,4 @@
-"""How bright recovered light is now, against the frame that it was recovered from: by the card, in every frame.
+"""Level of recovered light, now over that of the frame it was recovered from: by the card, in every frame.
 
 An estimate of what clips takes effect some frames after the one it is of, and the next comes later still; a lamp that
 is dimmed changes in between, and goes on clipping in the ball. With E what the card receives, e that part of it which
@@ -50,7 +50,7 @@ def sum_upward_kernel(
     # Out:
     upward_out: wp.array[wp.vec3],
 ):
-    """What each row of the upper half gives a surface that faces upward."""
+    """Sum the irradiance that each row of the upper half gives a surface facing upward."""
     i = wp.tid()
     height = radiance.shape[0]
     width = radiance.shape[1]
@@ -77,20 +77,20 @@ def add_rows_kernel(
 
 
 def sum_upward(radiance: wp.array, rows: wp.array, upward_out: wp.array) -> None:
-    """What a map gives a surface that faces upward.
+    """Sum the irradiance that a map gives a surface facing upward.
 
     Args:
         radiance: Latlong, ``wp.vec3`` (h, w).
         rows: Scratch, ``wp.vec3`` (h / 2).
         upward_out: Irradiance, float32 (3).
     """
-    launch(sum_upward_kernel, rows.shape, [radiance], [rows], device=radiance.device)
-    launch(add_rows_kernel, 3, [rows], [upward_out], device=radiance.device)
+    launch(sum_upward_kernel, rows.shape, [radiance], [rows])
+    launch(add_rows_kernel, 3, [rows], [upward_out])
 
 
 @wp.func
 def change_of(now: Observation, then: Observation, c: wp.int32) -> wp.float32:
-    """What a point shows over what it showed, in a channel; negative where either does not tell."""
+    """Return the ratio of a point's radiance now and then, in a channel; negative where either is unknown."""
     seen = wp.min(now.visible, then.visible) > 0.8 and wp.max(now.clipped[c], then.clipped[c]) < 0.01
     if seen and now.radiance[c] > DARK and then.radiance[c] > DARK:
         return now.radiance[c] / then.radiance[c]
@@ -147,7 +147,7 @@ def follow_level(
         share: Of the card's light then that the map does not show, by channel, float32 (3).
         level_out: Radiance of recovered light over that of the estimate, by channel, float32 (3).
     """
-    launch(follow_level_kernel, (3, now.shape[0]), [now, then, *upward, share], [level_out], device=now.device)
+    launch(follow_level_kernel, (3, now.shape[0]), [now, then, *upward, share], [level_out])
 
 
 @wp.kernel(enable_backward=False)
@@ -182,10 +182,4 @@ def apply_level(
         recovered_out: As ``recovered``.
         emitters_out: As ``emitters``.
     """
-    launch(
-        apply_level_kernel,
-        recovered.shape,
-        [recovered, emitters, level],
-        [recovered_out, emitters_out],
-        device=recovered.device,
-    )
+    launch(apply_level_kernel, recovered.shape, [recovered, emitters, level], [recovered_out, emitters_out])

@@ -1,4 +1,4 @@
-"""What else the frame says about the environment: how bright surfaces are, and which part of it lights them.
+"""Both sides of the equations of recovery: radiance of surfaces, and the light that each receives from each cell.
 
 The ball clips where emitters and windows are. Surfaces that the scene models (the white card, planes, boxes) do not, or
 not there, and are lit by the same light. A surface point x with normal n and reflectance rho that shows the camera the
@@ -21,7 +21,7 @@ from warp_ar.kernels.camera import project
 from warp_ar.kernels.color import decode, is_saturated, saturation_codes
 from warp_ar.kernels.environment.unwrap import reflecting_normal
 from warp_ar.kernels.latlong import PI
-from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.launch import Rows, launch_rows, row_launcher
 from warp_ar.kernels.pixels import clip_levels, is_at_clipping, keep_linear
 from warp_ar.kernels.rays.shapes import FAR, ROUNDING
 from warp_ar.kernels.rays.trace import TraceConfig, make_trace, offset_origin
@@ -33,7 +33,7 @@ wp.set_module_options({"enable_backward": False})
 PATCH = wp.constant(5)
 """Points along the side of the patch over which a surface point is averaged."""
 BALL_MARGIN = wp.constant(wp.float32(1.08))
-"""How much larger a ball is taken to be where it hides surfaces from the camera: its outline's blur."""
+"""Factor on a ball's radius where it hides surfaces from the camera: its outline is blurred."""
 FAR_FROM_BALL = wp.constant(wp.float32(10.0))
 """Radii from which what a ball throws is left out: (R / 2 s)^2, less than a four-hundredth of the light itself."""
 GRAZING = wp.constant(wp.float32(1.0e-3))
@@ -54,7 +54,7 @@ class SurfacePoint:
 
 @wp.struct
 class Observation:
-    """What the frame shows of a surface point."""
+    """Radiance of a surface point in the frame."""
 
     radiance: wp.vec3  # mean over the patch, linear camera values
     deviation: wp.vec3  # standard deviation over the patch
@@ -64,7 +64,7 @@ class Observation:
 
 @wp.func
 def surface_error(scene: RayScene, point: SurfacePoint) -> wp.float32:
-    """How far off its surface a point may lie, metres; which proxy that is is not kept, so the largest bounds it."""
+    """Return a bound on the distance of a point from its surface, metres. The largest proxy bounds all."""
     size = wp.float32(0.0)
     for index in range(scene.proxies.shape[0]):
         size = wp.max(size, scene.proxies[index].scale * wp.length(scene.proxies[index].extent))
@@ -241,7 +241,6 @@ def observe_surfaces(
         [frame, decode_table, params, probes, scene, points],
         [observations_out],
         rows=rows,
-        device=observations_out.device,
     )
 
 
@@ -302,43 +301,22 @@ def make_trace_transfer_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
     return trace_transfer_kernel
 
 
-def trace_transfer(
-    points: wp.array,
-    observations: wp.array,
-    cells: wp.array,
-    probes: wp.array,
-    scene: RayScene,
-    traced_out: wp.array,
-    transfer_out: wp.array,
-    mirrored_out: wp.array,
-    *,
-    proxies: tuple[int, ...],
-    rows: Rows | None = None,
-) -> None:
-    """Irradiance that a surface point receives from each cell of the environment, per unit of the cell's radiance.
+trace_transfer = row_launcher(make_trace_transfer_kernel, outputs=3, like=lambda points, *_: points)
+"""Irradiance that a surface point receives from each cell of the environment, per unit of the cell's radiance.
 
-    Nothing of it changes from frame to frame, so each point is traced once: when the camera first sees it.
+Nothing of it changes from frame to frame, so each point is traced once: when the camera first sees it.
 
-    Args:
-        points: ``SurfacePoint`` (n).
-        observations: ``Observation`` (n): points that the camera does not see are left out.
-        cells: ``Cell`` (rows, columns): middles and solid angles.
-        probes: ``Probe`` (P), at least one; the environment is the one that the first sees.
-        scene: Its proxies hide the environment.
-        traced_out: 1 where a point has been traced, 0 before, ``wp.int32`` (n).
-        transfer_out: Straight, past balls and proxies, ``wp.float32`` (n, rows * columns).
-        mirrored_out: By way of balls, ``wp.float32`` (n, rows * columns).
-        proxies: Kinds of proxy in the scene.
-        rows: Band of points, None for all.
-    """
-    launch_rows(
-        make_trace_transfer_kernel(proxies),
-        points.shape,
-        [points, observations, cells, probes, scene],
-        [traced_out, transfer_out, mirrored_out],
-        rows=rows,
-        device=transfer_out.device,
-    )
+Args:
+    proxies: Kinds of proxy in the scene.
+    points: ``SurfacePoint`` (n).
+    observations: ``Observation`` (n): points that the camera does not see are left out.
+    cells: ``Cell`` (rows, columns): middles and solid angles.
+    probes: ``Probe`` (P), at least one; the environment is the one that the first sees.
+    scene: Its proxies hide the environment.
+    traced_out: 1 where a point has been traced, 0 before, ``wp.int32`` (n).
+    transfer_out: Straight, past balls and proxies, ``wp.float32`` (n, rows * columns).
+    mirrored_out: By way of balls, ``wp.float32`` (n, rows * columns).
+"""
 
 
 @functools.cache
@@ -388,37 +366,16 @@ def make_trace_emitters_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
     return trace_emitters_kernel
 
 
-def trace_emitters(
-    points: wp.array,
-    observations: wp.array,
-    emitters: wp.array,
-    probes: wp.array,
-    scene: RayScene,
-    transfer_out: wp.array,
-    *,
-    proxies: tuple[int, ...],
-    rows: Rows | None = None,
-    stream: wp.Stream | None = None,
-) -> None:
-    """Irradiance that a surface point receives from emitters, per unit of their radiant intensity.
+trace_emitters = row_launcher(make_trace_emitters_kernel)
+"""Irradiance that a surface point receives from emitters, per unit of their radiant intensity.
 
-    Args:
-        points: ``SurfacePoint`` (n).
-        observations: ``Observation`` (n): points that the camera does not see receive nothing.
-        emitters: ``wp.vec4`` (q): position and radius in metres.
-        probes: ``Probe`` (P).
-        scene: Its proxies hide emitters.
-        transfer_out: ``wp.float32`` (n, q), per square metre.
-        proxies: Kinds of proxy in the scene.
-        rows: Band of points, None for all.
-        stream: CUDA stream; None means the device's current one.
-    """
-    launch_rows(
-        make_trace_emitters_kernel(proxies),
-        transfer_out.shape,
-        [points, observations, emitters, probes, scene],
-        [transfer_out],
-        rows=rows,
-        device=transfer_out.device,
-        stream=stream,
-    )
+Args:
+    proxies: Kinds of proxy in the scene.
+    points: ``SurfacePoint`` (n).
+    observations: ``Observation`` (n): points that the camera does not see receive nothing.
+    emitters: ``wp.vec4`` (q): position and radius in metres.
+    probes: ``Probe`` (P).
+    scene: Its proxies hide emitters.
+    transfer_out: ``wp.float32`` (n, q), per square metre.
+    stream: CUDA stream; None means the device's current one.
+"""

@@ -12,7 +12,7 @@ import functools
 import warp as wp
 
 from warp_ar.kernels.latlong import direction_from_latlong, latlong_from_direction, texel_solid_angle
-from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.launch import Rows, launch_rows, row_launcher
 from warp_ar.kernels.rays.shapes import FAR
 from warp_ar.kernels.rays.trace import TraceConfig, make_trace
 from warp_ar.kernels.structs import Probe, RayScene
@@ -29,7 +29,7 @@ _LOST = wp.constant(wp.float32(LOST))
 BEYOND = wp.constant(wp.float32(0.25))
 """Share of what clips in a cell that lies beyond proxies from which what clips on them there is the same light."""
 MOST_LEFT = wp.constant(wp.float32(4.0))
-"""How much more light what still clips of a cell may get because less of it clips."""
+"""Largest factor on the light of what still clips in a cell, for less of it clipping."""
 
 
 @wp.struct
@@ -53,7 +53,7 @@ def cell_shape(height: int, width: int) -> tuple[int, int]:
 
 @wp.func
 def trust(confidence: wp.float32) -> wp.float32:
-    """How far a texel counts as seen, 0..1; 0 for NaN."""
+    """Return the degree to which a texel counts as seen, 0..1; 0 for NaN."""
     t = wp.clamp(confidence / FULL_TRUST, 0.0, 1.0)
     return wp.where(confidence > 0.0, t * t * (3.0 - 2.0 * t), 0.0)
 
@@ -128,12 +128,7 @@ def leave_out_edges(
     """
     shape = cell_shape(*clipped.shape)
     launch_rows(
-        make_leave_out_edges_kernel(proxies),
-        shape,
-        [clipped, probes, scene, shape[0]],
-        [missing_out],
-        rows=rows,
-        device=clipped.device,
+        make_leave_out_edges_kernel(proxies), shape, [clipped, probes, scene, shape[0]], [missing_out], rows=rows
     )
 
 
@@ -206,39 +201,19 @@ def make_condense_cells_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
     return condense_cells_kernel
 
 
-def condense_cells(
-    radiance: wp.array,
-    confidence: wp.array,
-    clipped: wp.array,
-    missing: wp.array,
-    probes: wp.array,
-    scene: RayScene,
-    cells_out: wp.array,
-    *,
-    proxies: tuple[int, ...],
-    rows: Rows | None = None,
-) -> None:
-    """Condense a map to cells. What clips and yet lacks nothing, for ``leave_out_edges`` said so, does not count.
+condense_cells = row_launcher(make_condense_cells_kernel)
+"""Condense a map to cells. What clips and yet lacks nothing, for ``leave_out_edges`` said so, does not count.
 
-    Args:
-        radiance: ``wp.vec3`` (h, w), complete.
-        confidence: How well each texel was seen, ``wp.float32`` (h, w).
-        clipped: Share at clipping per channel, ``wp.vec3`` (h, w).
-        missing: The same from ``weigh_boundaries``.
-        probes: ``Probe`` (P), at least one.
-        scene: Its proxies are known surfaces: what clips there is lit, not a light.
-        cells_out: ``Cell``, ``cell_shape(h, w)``.
-        proxies: Kinds of proxy in the scene.
-        rows: Band of cell rows, None for all.
-    """
-    launch_rows(
-        make_condense_cells_kernel(proxies),
-        cells_out.shape,
-        [radiance, confidence, clipped, missing, probes, scene],
-        [cells_out],
-        rows=rows,
-        device=cells_out.device,
-    )
+Args:
+    proxies: Kinds of proxy in the scene.
+    radiance: ``wp.vec3`` (h, w), complete.
+    confidence: How well each texel was seen, ``wp.float32`` (h, w).
+    clipped: Share at clipping per channel, ``wp.vec3`` (h, w).
+    missing: The same from ``weigh_boundaries``.
+    probes: ``Probe`` (P), at least one.
+    scene: Its proxies are known surfaces: what clips there is lit, not a light.
+    cells_out: ``Cell``, ``cell_shape(h, w)``.
+"""
 
 
 @wp.func
@@ -289,39 +264,21 @@ def add_recovered_kernel(
             recovered_out[i, j] = radiance[i, j] + wp.cw_mul(share, more)
 
 
-def add_recovered(
-    radiance: wp.array,
-    confidence: wp.array,
-    missing: wp.array,
-    cells: wp.array,
-    recovered: wp.array,
-    recovered_out: wp.array,
-    *,
-    rows: Rows | None = None,
-) -> None:
-    """Give texels back what they lost.
+add_recovered = row_launcher(add_recovered_kernel, like=lambda *given: given[-2])
+"""Give texels back what they lost.
 
-    Where more or less of a cell clips than when its radiance was recovered, the energy stays what was found: a
-    thousandth that clips can have a high radiance, and in the next frame be half of the cell; a video codec takes the
-    weakest channel of an emitter across the limit and back. Below a quarter of the share the energy falls with it.
+Where more or less of a cell clips than when its radiance was recovered, the energy stays what was found: a
+thousandth that clips can have a high radiance, and in the next frame be half of the cell; a video codec takes the
+weakest channel of an emitter across the limit and back. Below a quarter of the share the energy falls with it.
 
-    Args:
-        radiance: As captured and completed, ``wp.vec3`` (h, w).
-        confidence: How well each texel was seen, ``wp.float32`` (h, w).
-        missing: Share at clipping per channel from ``weigh_boundaries``, ``wp.vec3`` (h, w).
-        cells: ``Cell``, ``cell_shape(h, w)``, of when that was.
-        recovered: Radiance that a wholly clipped texel lacks, per cell: ``wp.vec3``, ``cell_shape(h, w)``.
-        recovered_out: ``wp.vec3`` (h, w).
-        rows: Band of rows of cells, None for all.
-    """
-    launch_rows(
-        add_recovered_kernel,
-        recovered.shape,
-        [radiance, confidence, missing, cells, recovered],
-        [recovered_out],
-        rows=rows,
-        device=recovered_out.device,
-    )
+Args:
+    radiance: As captured and completed, ``wp.vec3`` (h, w).
+    confidence: How well each texel was seen, ``wp.float32`` (h, w).
+    missing: Share at clipping per channel from ``weigh_boundaries``, ``wp.vec3`` (h, w).
+    cells: ``Cell``, ``cell_shape(h, w)``, of when that was.
+    recovered: Radiance that a wholly clipped texel lacks, per cell: ``wp.vec3``, ``cell_shape(h, w)``.
+    recovered_out: ``wp.vec3`` (h, w).
+"""
 
 
 @wp.func

@@ -26,7 +26,7 @@ import warp as wp
 
 from warp_ar.kernels.emitters import MAX_DISTANCE, correct_parallax, seen_from, solid_angle_gain
 from warp_ar.kernels.latlong import direction_from_latlong, sample_latlong, texel_solid_angle
-from warp_ar.kernels.launch import Rows, launch, launch_rows
+from warp_ar.kernels.launch import Rows, launch, launch_rows, row_launcher
 from warp_ar.kernels.recovery.recover_cells import Cell, trust
 from warp_ar.kernels.structs import Emitter
 
@@ -39,7 +39,7 @@ NEARBY = wp.constant(wp.float32(0.2))
 
 @wp.func
 def any_near(emitters: wp.array[Emitter]) -> wp.bool:
-    """Whether an emitter is known by its place."""
+    """Return whether an emitter is known by its place."""
     near = bool(False)
     for k in range(emitters.shape[0]):
         near = near or (emitters[k].distance > 0.0 and emitters[k].distance < MAX_DISTANCE)
@@ -171,60 +171,30 @@ def move_emitters_kernel(
     emitters_out[k] = seen_from(emitters[k], wp.vec3(place[0], place[1], place[2]))
 
 
-def relocate(
-    filled: wp.array,
-    environment: wp.array,
-    captured: wp.array,
-    emitters: wp.array,
-    places: wp.array,
-    environment_out: wp.array,
-    *,
-    ball: int,
-    rows: Rows | None = None,
-) -> None:
-    """Add what was recovered in the first ball's map to another's, turned, where an emitter is known by its place.
+relocate = row_launcher(relocate_kernel)
+"""Add what was recovered in the first ball's map to another's, turned, where an emitter is known by its place.
 
-    Args:
-        filled: (h, w) the other ball's light as captured and completed.
-        environment: (h, w) the first ball's, with what was recovered.
-        captured: (h, w) the first ball's without.
-        emitters: Of the first ball's map.
-        places: (P,) of ``probe_weights.update_places``.
-        environment_out: (h, w) ``wp.vec3``.
-        ball: The other one's number.
-        rows: Band of rows, None for all.
-    """
-    launch_rows(
-        relocate_kernel,
-        filled.shape,
-        [filled, environment, captured, emitters, places, ball],
-        [environment_out],
-        rows=rows,
-        device=filled.device,
-    )
+Args:
+    filled: (h, w) the other ball's light as captured and completed.
+    environment: (h, w) the first ball's, with what was recovered.
+    captured: (h, w) the first ball's without.
+    emitters: Of the first ball's map.
+    places: (P,) of ``probe_weights.update_places``.
+    environment_out: (h, w) ``wp.vec3``.
+    ball: The other one's number.
+"""
 
 
-def send_recovered(
-    share: wp.array,
-    confidence: wp.array,
-    cells: wp.array,
-    recovered: wp.array,
-    sent_out: wp.array,
-    *,
-    rows: Rows | None = None,
-) -> None:
-    """What each cell of the first ball's map sends to a unit of what clips in another's.
+send_recovered = row_launcher(send_recovered_kernel)
+"""Compute the light that each cell of the first ball's map sends to a unit of what clips in another's.
 
-    Args:
-        share: (h, w) what clips in the other map, of ``weigh_boundaries``.
-        confidence: (h, w) how well each of its texels was seen.
-        cells: ``Cell`` of the first ball's map when light was recovered in it.
-        recovered: Radiance that a wholly clipped texel of a cell lacks, as many.
-        sent_out: ``wp.vec3``, as many.
-        rows: Band of rows of cells, None for all.
-    """
-    inputs = [share, confidence, cells, recovered]
-    launch_rows(send_recovered_kernel, sent_out.shape, inputs, [sent_out], rows=rows, device=sent_out.device)
+Args:
+    share: (h, w) what clips in the other map, of ``weigh_boundaries``.
+    confidence: (h, w) how well each of its texels was seen.
+    cells: ``Cell`` of the first ball's map when light was recovered in it.
+    recovered: Radiance that a wholly clipped texel of a cell lacks, as many.
+    sent_out: ``wp.vec3``, as many.
+"""
 
 
 def share_recovered(
@@ -254,7 +224,7 @@ def share_recovered(
     device = environment.device
     emitters = wp.empty(0, dtype=Emitter, device=device) if emitters is None else emitters
     inputs = [*other, environment, captured, emitters, cells, sent]
-    launch_rows(share_recovered_kernel, environment.shape, inputs, [environment_out], rows=rows, device=device)
+    launch_rows(share_recovered_kernel, environment.shape, inputs, [environment_out], rows=rows)
 
 
 def move_emitters(emitters: wp.array, places: wp.array, emitters_out: wp.array, *, ball: int) -> None:
@@ -266,6 +236,4 @@ def move_emitters(emitters: wp.array, places: wp.array, emitters_out: wp.array, 
         emitters_out: As many.
         ball: The other one's number.
     """
-    launch(
-        move_emitters_kernel, emitters.shape[0], [emitters, places, ball], [emitters_out], device=emitters_out.device
-    )
+    launch(move_emitters_kernel, emitters.shape[0], [emitters, places, ball], [emitters_out])

@@ -9,7 +9,7 @@ from __future__ import annotations
 import warp as wp
 
 from warp_ar.kernels.latlong import PI, direction_from_latlong, sample_latlong, sample_row
-from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.launch import row_launcher
 from warp_ar.kernels.structs import FrameParams, Probe
 
 wp.set_module_options({"enable_backward": False})
@@ -108,37 +108,21 @@ def weigh_boundaries_kernel(
     missing_out[i, j] = share * around
 
 
-def weigh_boundaries(
-    clipped: wp.array,
-    params: wp.array,
-    probes: wp.array,
-    missing_out: wp.array,
-    *,
-    rows: Rows | None = None,
-) -> None:
-    """Weigh what clips by how likely it is the light itself: saturation boundaries count less.
+weigh_boundaries = row_launcher(weigh_boundaries_kernel, like=lambda clipped, *_: clipped)
+"""Weigh what clips by how likely it is the light itself: saturation boundaries count less.
 
-    A pixel at a light's boundary shows part of the light, and clips all the same if that is bright: what clips in the
-    ball's picture is larger than the light by up to a pixel. A texel counts by the mean share at clipping around it,
-    in the channel that clips most and by a Gaussian of half a pixel's standard deviation, to the power
+A pixel at a light's boundary shows part of the light, and clips all the same if that is bright: what clips in the
+ball's picture is larger than the light by up to a pixel. A texel counts by the mean share at clipping around it,
+in the channel that clips most and by a Gaussian of half a pixel's standard deviation, to the power
 
-        2 max(0, 1 - 2 w),    w the same mean by a Gaussian of three pixels.
+    2 max(0, 1 - 2 w),    w the same mean by a Gaussian of three pixels.
 
-    An emitter of a few pixels becomes as small as it is, and so do its shadows and highlights. Windows keep theirs
-    (w is a half there): they are not so much brighter than clipping that a pixel clips of which they are a small part.
+An emitter of a few pixels becomes as small as it is, and so do its shadows and highlights. Windows keep theirs
+(w is a half there): they are not so much brighter than clipping that a pixel clips of which they are a small part.
 
-    Args:
-        clipped: Share at clipping per channel, ``wp.vec3`` (h, w).
-        params: ``FrameParams`` (1): the camera.
-        probes: ``Probe`` (P), at least one: the ball.
-        missing_out: ``wp.vec3`` (h, w), 0 where nothing clips.
-        rows: Band of rows, None for all.
-    """
-    launch_rows(
-        weigh_boundaries_kernel,
-        clipped.shape,
-        [clipped, params, probes],
-        [missing_out],
-        rows=rows,
-        device=clipped.device,
-    )
+Args:
+    clipped: Share at clipping per channel, ``wp.vec3`` (h, w).
+    params: ``FrameParams`` (1): the camera.
+    probes: ``Probe`` (P), at least one: the ball.
+    missing_out: ``wp.vec3`` (h, w), 0 where nothing clips.
+"""

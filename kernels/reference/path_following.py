@@ -81,12 +81,12 @@ MOST_RANDOM = wp.constant(wp.float32(0.99999994))
 SURFACE = wp.constant(0)
 RAY = wp.constant(1)
 ENDED = wp.constant(2)
-"""What is next for a path."""
+"""Next step of a path."""
 
 
 @wp.struct
 class PathState:
-    """Where a path is: at its surface number ``depth``, or on the ray that leads to it."""
+    """State of a path: at its surface number ``depth``, or on the ray that leads to it."""
 
     throughput: wp.vec3
     origin: wp.vec3  # of the ray
@@ -168,7 +168,7 @@ def wrap(u: wp.float32) -> wp.float32:
 
 @wp.func
 def reflected_from(surface: Surface, hit: Hit, wo: wp.vec3, wi: wp.vec3) -> wp.vec3:
-    """What a surface reflects of light from ``wi``, cosine included; of a mirror its reflectance. 0 from below."""
+    """Return a surface's reflection of light from ``wi``, with the cosine; a mirror's reflectance; 0 from below."""
     reflected = wp.vec3(0.0, 0.0, 0.0)
     if wp.dot(hit.geometric_normal, wi) > 0.0:
         reflected = surface.reflectance
@@ -184,7 +184,7 @@ def reflected_from(surface: Surface, hit: Hit, wo: wp.vec3, wi: wp.vec3) -> wp.v
 # do with each other: each alone is drawn as it should be. So they are spread evenly from one random start.
 @wp.func
 def candidate_value(surface: Surface, hit: Hit, wo: wp.vec3, sky: SkyLight, times: wp.float32) -> wp.float32:
-    """What a surface would reflect of light along a candidate, by its share beside what the surface draws itself."""
+    """Return a surface's reflection of light along a candidate, by its share beside what the surface draws itself."""
     value = brightness(wp.cw_mul(reflected_from(surface, hit, wo, sky.direction), sky.radiance))
     if value > 0.0:
         value *= balance(times * sky.density, surface_density(surface, hit.normal, wo, sky.direction))
@@ -337,7 +337,7 @@ def end_without(pair: PathPair) -> PathPair:
 
 @wp.struct
 class SeenProxy:
-    """What the frame tells of a point of a proxy."""
+    """Observation of a point of a proxy in the frame."""
 
     reflectance: wp.vec3
     shows: wp.bool  # whether what the camera sees of it is what it sends everywhere
@@ -406,13 +406,13 @@ def add_direct(
 
 @wp.func
 def is_first_white(pair: PathPair) -> wp.bool:
-    """Whether a path is at the first surface of a pixel that tells how much light arrives."""
+    """Return whether a path is at the first surface of a pixel that tells how much light arrives."""
     return pair.white and pair.path.depth == 0
 
 
 @wp.func
 def bring_direct(pair: PathPair, direct: DirectLight) -> PathPair:
-    """What of it the path that is followed asks for."""
+    """Return the part of it that the followed path asks for."""
     if pair.path.without:
         return bring(pair, direct.of_sky)
     out = bring(pair, direct.changed + direct.of_lights)
@@ -423,20 +423,20 @@ def bring_direct(pair: PathPair, direct: DirectLight) -> PathPair:
 
 @wp.func
 def with_virtual_content(pair: PathPair) -> wp.bool:
-    """Whether the path that is followed meets virtual lights and what objects send."""
+    """Return whether the path that is followed meets virtual lights and what objects send."""
     return not (pair.only_light or pair.path.without)
 
 
 @wp.func
 def is_polished(kind: wp.int32, surface: Surface) -> wp.bool:
-    """Whether a surface is of a virtual object that throws light by a lobe, which paths from the camera rarely meet."""
+    """Return whether a surface throws light by a lobe that paths from the camera rarely meet."""
     matt = surface.model == wp.static(int(LAMBERT)) or surface.model == wp.static(int(MIRROR))
     return kind == OBJECT and not matt
 
 
 @wp.func
 def lights_at(scene: LocalScene, kind: wp.int32, surface: Surface, pair: PathPair) -> wp.int32:
-    """How many virtual lights the path that is followed asks for at its surface: all, or none."""
+    """Return the number of virtual lights that the followed path asks for at its surface: all, or none."""
     # What they send a white surface by way of a polished one is followed from the lights (``path_photons``).
     followed = scene.lights_followed and pair.white and not pair.lobe and pair.path.depth > 0
     if (followed and is_polished(kind, surface)) or not with_virtual_content(pair):
@@ -446,7 +446,7 @@ def lights_at(scene: LocalScene, kind: wp.int32, surface: Surface, pair: PathPai
 
 @wp.func
 def are_near_followed(scene: LocalScene, kind: wp.int32, surface: Surface, pair: PathPair) -> wp.bool:
-    """Whether light of near emitters at a surface is followed from them (``path_photons``)."""
+    """Return whether light of near emitters at a surface is followed from them (``path_photons``)."""
     asked = scene.near_followed and pair.white and not pair.lobe and pair.path.depth > 0
     return asked and is_polished(kind, surface)
 
@@ -541,7 +541,7 @@ def make_scatter(trace: TraceConfig) -> wp.Function:
 # is compiled once.
 @wp.func
 def meet(scene: LocalScene, vertex: Vertex, pair: PathPair) -> PathPair:
-    """What a ray that left a surface brings, where it leads to ``vertex``: light, and whether its path goes on."""
+    """Return the light that a ray from a surface finds at ``vertex``, and whether its path goes on."""
     out = pair
     out.next = SURFACE
     path = pair.path
@@ -569,7 +569,7 @@ def meet(scene: LocalScene, vertex: Vertex, pair: PathPair) -> PathPair:
 
 @wp.func
 def take_seen(pair: PathPair, seen: SeenProxy) -> PathPair:
-    """What the frame tells of the proxy on which a path is: it ends there if nothing virtual is asked for."""
+    """Return the frame's observation of the proxy on which a path is: it ends there if nothing virtual is asked for."""
     out = pair
     out.rays += seen.rays
     if seen.shows and not pair.path.changes_only:

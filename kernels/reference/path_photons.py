@@ -97,7 +97,7 @@ COUNTERS = 1024
 
 @wp.struct
 class LightImage:
-    """What paths from virtual lights brought to pixels, sums over all of them."""
+    """Light that paths from virtual lights brought to pixels, sums over all of them."""
 
     sums: wp.array[wp.int64]  # (H W 3) radiance times the number of paths of a pass, over the number of pixels
     squares: wp.array[wp.int64]  # (H W 3) of the same
@@ -116,7 +116,7 @@ def add_whole(sums: wp.array[wp.int64], index: wp.int32, value: wp.int64):
 
 
 def is_polished_one(objects: npt.NDArray[np.void], materials: npt.NDArray[np.void]) -> bool:
-    """Whether an object may be polished, by any of the materials.
+    """Return whether an object may be polished, by any of the materials.
 
     Args:
         objects: Records of ``structs.Shape``.
@@ -129,7 +129,7 @@ def is_polished_one(objects: npt.NDArray[np.void], materials: npt.NDArray[np.voi
 def follows_lights(
     lights: npt.NDArray[np.void], objects: npt.NDArray[np.void], materials: npt.NDArray[np.void]
 ) -> bool:
-    """Whether light of virtual lights is followed from them: of all, which have a place and no size, or of none.
+    """Return whether light of virtual lights is followed from them: of all, which have a place and no size, or of none.
 
     Args:
         lights: Records of ``structs.Light``.
@@ -211,7 +211,7 @@ def start_density(scene: LocalScene, at: wp.vec3, direction: wp.vec3) -> wp.floa
 
 @wp.struct
 class PointOfEmitter:
-    """Where a path leaves a near emitter."""
+    """Start of a path at a near emitter."""
 
     position: wp.vec3
     intensity: wp.vec3  # over the density with which the point was drawn

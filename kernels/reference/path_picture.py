@@ -19,7 +19,7 @@ from __future__ import annotations
 import warp as wp
 
 from warp_ar.kernels.color import encode
-from warp_ar.kernels.launch import launch_rows
+from warp_ar.kernels.launch import launch_rows, row_launcher
 from warp_ar.kernels.receiver.receiver import reflectance_of
 from warp_ar.kernels.reference.path_photons import UNIT, LightImage
 from warp_ar.kernels.reference.path_vertices import LocalScene
@@ -111,7 +111,7 @@ def count_samples_kernel(
     # Out:
     counts_out: wp.array[wp.int32],
 ):
-    """How many samples each pixel takes in ``count`` passes after ``begun``."""
+    """Count the samples that each pixel takes in ``count`` passes after ``begun``."""
     i, j = wp.tid()
     i += row_start
     pixel = i * shares.shape[1] + j
@@ -196,10 +196,8 @@ def list_samples(shares: wp.array2d[wp.float32], samples_out: Round, *, seed: in
     return total
 
 
-def add_samples(samples: Round, moments_out: Moments) -> None:
-    """Take the samples of a round into the moments of their pixels, (H, W)."""
-    shape, device = moments_out.samples.shape, moments_out.samples.device
-    launch_rows(add_samples_kernel, shape, [samples], [moments_out], rows=None, device=device)
+add_samples = row_launcher(add_samples_kernel, like=lambda samples, moments: moments.samples)
+"""Take the samples of a round into the moments of their pixels, (H, W)."""
 
 
 # Reflectance of a proxy's point is pi L0 / E, E its irradiance without virtual content, gathered by the same paths:
@@ -267,7 +265,7 @@ def map_reflectance_kernel(
 
 @wp.func
 def light_of_pixel(image: LightImage, place: wp.int32, followed: wp.float32) -> wp.vec2:
-    """What a pixel has of paths from lights, ``followed`` of them per pixel, and the variance of that; one channel."""
+    """Return a pixel's light of paths from lights, ``followed`` of them per pixel, and its variance; one channel."""
     total = wp.float32(image.sums[place]) / UNIT
     squares = wp.float32(image.squares[place]) / UNIT
     paths = followed * wp.float32(image.sums.shape[0] / 3)

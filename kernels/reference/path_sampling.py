@@ -1,4 +1,4 @@
-"""Where a path goes next: directions drawn by the environment's light, by a virtual light, or by what a surface is.
+"""Directions in which paths go on: drawn by the environment's light, by a virtual light, or by the surface.
 
 Each way to draw a direction has its density, per steradian, so that two ways can be combined by the balance heuristic
 [VG95]: a direction of density p that another way would have drawn with density q counts p / (p + q) of its light.
@@ -106,7 +106,7 @@ class SkyLight:
 
 @wp.struct
 class PathKey:
-    """What makes the random numbers of one path its own."""
+    """Key of the random numbers of one path."""
 
     pixel: wp.uint32
     sample: wp.uint32
@@ -157,7 +157,7 @@ def direction_in_texel(row: wp.int32, column: wp.int32, height: wp.int32, width:
 
 @wp.func
 def within_step(cumulative: wp.array[wp.float32], step: wp.int32, u: wp.float32) -> wp.float32:
-    """Where in a step of ``find_step`` a number lies, 0 to 1."""
+    """Return the place of a number within a step of ``find_step``, 0 to 1."""
     low = cumulative[step]
     return wp.clamp((u - low) / wp.max(cumulative[step + 1] - low, 1.0e-30), 0.0, 1.0)
 

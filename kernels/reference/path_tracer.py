@@ -14,7 +14,7 @@ import functools
 
 import warp as wp
 
-from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
+from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows, row_launcher
 from warp_ar.kernels.rays.trace import TraceConfig
 from warp_ar.kernels.reference.path_following import ENDED, SURFACE, PathPair, end_without, make_visit, meet
 from warp_ar.kernels.reference.path_picture import Round
@@ -39,13 +39,12 @@ wp.set_module_options({"enable_backward": False})
 
 
 WHOLE, DIFFERENCE, IRRADIANCE = 0, 1, 2
-"""What is asked of pixels: radiance of the scene; what virtual content changes in the frame; or only what makes
-reflectance known."""
+"""Task of the tracer: radiance of the scene; change of the frame by virtual content; or only reflectance."""
 
 
 @wp.func
 def sample_key(samples: Round, k: wp.int32, seed: wp.int32, first: wp.int32, done: wp.array2d[wp.int32]) -> PathKey:
-    """What makes the random numbers of sample ``k`` of a round its own."""
+    """Return the key of the random numbers of sample ``k`` of a round."""
     pixel = samples.pixels[k]
     i = pixel / done.shape[1]
     j = pixel % done.shape[1]
@@ -85,7 +84,7 @@ def begin_path(origin: wp.vec3, direction: wp.vec3, asked: wp.int32, lobe: wp.bo
 def see(
     scene: LocalScene, asked: wp.int32, vertex: Vertex, pair: PathPair, k: wp.int32, samples_out: Round
 ) -> PathPair:
-    """What the camera's ray meets: whether there is a path to follow; writes what needs none."""
+    """Trace the camera's ray; return whether there is a path to follow, and write what needs none."""
     out = pair
     out.next = ENDED
     whole = asked == wp.static(WHOLE)
@@ -128,8 +127,7 @@ def write_sample(pair: PathPair, k: wp.int32, samples_out: Round):
 
 
 # One loop for all rays of a sample, its camera's as well: so what finds a surface is in the kernel once. A warp of a
-# GPU waits for the longest of its 32 paths; threads that went on with samples of a shared counter were no faster
-#.
+# GPU waits for the longest of its 32 paths; threads that went on with samples of a shared counter were no faster.
 @functools.cache
 def make_trace_paths_kernel(trace: TraceConfig) -> wp.Kernel:
     """Kernel of ``trace_paths`` for the kinds of shape in ``trace``."""
@@ -251,14 +249,5 @@ def trace_paths(
     launch_rows(kernel, (count,), inputs, [samples_out], rows=part, device=done.device)
 
 
-def find_shown(
-    trace: TraceConfig,
-    params: wp.array[FrameParams],
-    scene: LocalScene,
-    shown_out: wp.array2d[wp.int32],
-    *,
-    rows: Rows | None = None,
-) -> None:
-    """Write which proxy alone the frame shows in every pixel, -1 for none or several surfaces; (H, W)."""
-    shape, device = shown_out.shape, shown_out.device
-    launch_rows(make_find_shown_kernel(trace), shape, [params, scene], [shown_out], rows=rows, device=device)
+find_shown = row_launcher(make_find_shown_kernel)
+"""Write which proxy alone the frame shows in every pixel, -1 for none or several surfaces; (H, W)."""

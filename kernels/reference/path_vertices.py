@@ -1,4 +1,4 @@
-"""What a path meets: the surfaces of the local scene, what they are made of, and what the frame shows of them.
+"""Surfaces that paths meet in the local scene, their materials, and the frame's picture of them.
 
 ``LocalScene`` is all that the program knows: virtual objects, proxies, mirror balls, virtual lights, and the
 environment, which is distant. ``kernels/reference/path_following.py`` goes from vertex to vertex.
@@ -35,7 +35,7 @@ NOTHING = wp.constant(0)
 OBJECT = wp.constant(1)
 PROXY = wp.constant(2)
 BALL = wp.constant(3)
-"""What a ray meets."""
+"""Kind of thing that a ray meets."""
 LEAST_WEIGHT = wp.constant(wp.float32(0.25))
 """Of the frame's four pixels around a point, what those of its surface must have for the frame to show it."""
 
@@ -72,7 +72,7 @@ class Vertex:
 
 @wp.struct
 class Seen:
-    """What the frame says of a point of a proxy."""
+    """Observation in the frame of a point of a proxy."""
 
     known: wp.bool
     radiance: wp.vec3
@@ -179,7 +179,7 @@ def make_see_in_frame(trace: TraceConfig) -> wp.Function:
 
 @wp.func
 def is_glossy(scene: LocalScene, vertex: Vertex) -> wp.bool:
-    """Whether a vertex is on a proxy that mirrors."""
+    """Return whether a vertex is on a proxy that mirrors."""
     if vertex.kind != PROXY or scene.gloss.shape[0] == 0:
         return False
     values = scene.gloss[vertex.hit.shape]
@@ -230,5 +230,5 @@ def make_look_up_material() -> wp.Function:
 
 @wp.func
 def is_turned(vertex: Vertex, direction: wp.vec3) -> wp.bool:
-    """Whether a ray meets a surface from behind."""
+    """Return whether a ray meets a surface from behind."""
     return wp.dot(vertex.hit.geometric_normal, direction) >= 0.0

@@ -47,6 +47,7 @@ def assert_light(outputs, cause):
                 assert (found >= 0).all(), f"{name}{part} is below zero {cause}"
 
 
+@pytest.mark.slow
 @pytest.mark.atlas(row=6)
 @pytest.mark.parametrize(("stage", "method"), MAP_READERS)
 def test_any_map_gives_finite_light(rig_for, stage, method):

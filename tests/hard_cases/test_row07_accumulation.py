@@ -17,6 +17,7 @@ FRAMES = generators.frames(SIZE[1], SIZE[0])
 REMEMBERED = 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.atlas(row=7, stage="pipeline")
 @pytest.mark.atlas(row=15, stage="pipeline")
 @pytest.mark.parametrize("case", long_run.CASES)

@@ -29,6 +29,7 @@ def test_from_the_first_frame_on(device, stage, method):
         assert_same_bits(found[0], other)
 
 
+@pytest.mark.slow
 @pytest.mark.atlas(row=17)
 @pytest.mark.parametrize(("stage", "method"), [case for case in STAGE_METHODS if case[0] not in REMEMBERS])
 def test_run_to_run_and_in_any_bands(rig_for, stage, method):
@@ -60,23 +61,3 @@ def test_outputs_do_not_depend_on_what_stood_in_them(rig_for, stage, method):
         seen = rig.get("hit_object") >= 0
         first, second = ({name: values[seen] for name, values in outputs.items()} for outputs in (first, second))
     assert_same_bits(first, second)
-
-
-@pytest.mark.atlas(row=17, stage="pipeline")
-def test_a_graph_replayed_is_the_stages_launched(device):
-    """Frames that change which stages run, replayed from graphs and launched one by one; on CPU both are launched."""
-    with Rig(device) as replayed, Rig(device) as eager:
-        eager.pipeline._scheduler.run = eager.pipeline._scheduler._run_eager
-        for name in ("noise", "noise", "white", "black", "noise", "ramp", "noise"):
-            np.testing.assert_array_equal(replayed.frame(FRAMES[name]), eager.frame(FRAMES[name]), err_msg=name)
-        for stage, _ in replayed.pipeline._scheduler._stages:
-            assert_same_bits(replayed.written(stage.name), eager.written(stage.name))
-
-
-@pytest.mark.atlas(row=17, stage="pipeline")
-@pytest.mark.parametrize("bands", [2, 3, 7, 16])
-def test_bands_of_threads(bands):
-    """The thread pool's bands, over the rows that matter only."""
-    with Rig("cpu", bands=bands) as rig, Rig("cpu", bands=1) as whole:
-        for name in ("noise", "top half saturated", "ramp"):
-            np.testing.assert_array_equal(rig.frame(FRAMES[name]), whole.frame(FRAMES[name]))

@@ -118,6 +118,7 @@ def test_a_constant_frame_is_a_constant_map(rig_for, method, eye, code):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.atlas(row=3, stage="unwrap")
 @pytest.mark.atlas(row=3, stage="fill")
 @pytest.mark.parametrize("method", EXACT)

@@ -170,6 +170,7 @@ def test_directions_an_ulp_beyond_unit_length(device):
     assert (lobes >= 0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.atlas(row=5)
 @pytest.mark.parametrize(
     ("stage", "method"),

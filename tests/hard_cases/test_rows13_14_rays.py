@@ -139,6 +139,7 @@ def _cube(device) -> Mesh:
     return Mesh(np.float32(box.vertices), np.int32(box.faces), np.float32(box.vertex_normals))
 
 
+@pytest.mark.slow
 @pytest.mark.atlas(row=13)
 @pytest.mark.parametrize(("stage", "method"), [*RAY_METHODS, *(("recover", method) for method in METHODS["recover"])])
 def test_broken_meshes_in_the_pipeline(device, stage, method, tmp_path):
@@ -254,7 +255,7 @@ def receive(device, scale, shift):
     lamp = scale * np.array([0.03, 0.05, 0.4]) + shift
     out = wp.zeros((len(places), 1), dtype=wp.float32, device=device)
     lamps = wp.array([[*lamp, 0.01 * scale]], dtype=wp.vec4, device=device)
-    recover.trace_emitters(points, seen(device, len(places)), lamps, probes, host.ray_scene, out, proxies=proxies)
+    recover.trace_emitters(proxies, points, seen(device, len(places)), lamps, probes, host.ray_scene, out)
     return straight, mirrored, scale**2 * out.numpy()
 
 
@@ -271,6 +272,7 @@ def test_surfaces_receive_the_same_light_at_any_scale_and_place(device, scale, s
     assert (expected[2] == 0).any(), "some faces are turned away from the lamp"
 
 
+@pytest.mark.slow
 @pytest.mark.atlas(row=14)
 @PLACES  # one after another: the same home
 @pytest.mark.parametrize(("stage", "method"), RAY_METHODS)

@@ -17,15 +17,16 @@ from warp_ar.farm.jobs import parse_jobs, read_jobs
 from warp_ar.farm.manifest import read_status, status_lines
 from warp_ar.kernels.color import decode_table
 from warp_ar.light.captured import Light, find_emitters
+from warp_ar.output.camera_files import write_track
 from warp_ar.output.shot import Shot
 from warp_ar.output.sinks import open_sink, read_environment, write_environment
-from warp_ar.output.track_file import write_track
 from warp_ar.output.usd_file import write_usd
 from warp_ar.scene import Pose, load_calibration, load_scene, loads_scene
 from warp_ar.scene.exif import read_exif
-from warp_ar.scene.mesh_files import load_mesh, load_texture
-from warp_ar.scene.pose_file import load_poses
+from warp_ar.scene.mesh_files import load_mesh
+from warp_ar.scene.pose_file import load_pose_file
 from warp_ar.scene.shapes import torus_mesh
+from warp_ar.scene.textures import load_texture
 from warp_ar.sources.sources import FrameFolder, Synthetic, open_source
 
 SCENE = """schema = 1
@@ -198,7 +199,7 @@ def _status(path: pathlib.Path) -> object:
 
 
 def _run(path: pathlib.Path) -> None:
-    """A run of two jobs, one of which has failed, and its driver's last word."""
+    """A run of two jobs, one of which has failed."""
     folder = path.parent
     (folder / "run.json").write_text(json.dumps({"version": "1", "jobs": {"clip": [{"scene": "desk"}]}}))
     lines: list[dict[str, object]] = [
@@ -206,10 +207,6 @@ def _run(path: pathlib.Path) -> None:
         {"state": "failed", "job": "desk/segment-1", "reason": "no frame"},
     ]
     (folder / "manifest.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    worker = {"device": "cpu", "job": "desk/segment-2", "frames": 3, "fps": 2.5}
-    known = {"clips": 1, "clips_surveyed": 1, "jobs_known": 3, "jobs_open": 1, "seconds_left": 9.0}
-    told = {"program": "warp_ar", "time": 0.0, "ended": False, "workers": [worker], **known}
-    (folder / "progress.json").write_text(json.dumps(told))
 
 
 def _response(path: pathlib.Path) -> None:
@@ -283,15 +280,14 @@ READERS = (
     Reader("photograph with EXIF, TIFF", "a.tiff", read_exif, _photograph),
     Reader("environment, EXR", "a.exr", read_environment, _environment),
     Reader("captured light, EXR", "light.exr", Light.load, _light),
-    Reader("poses, JSON", "poses.json", load_poses, _poses),
-    Reader("poses, COLMAP", "images.txt", load_poses, _poses),
-    Reader("poses, COLMAP's binary", "images.bin", load_poses, _binary_poses),
-    Reader("poses, OpenTrackIO", "track.jsonl", load_poses, _track),
-    Reader("poses, USD", "shot.usda", load_poses, lambda path: write_usd(path, _shot())),
+    Reader("poses, JSON", "poses.json", load_pose_file, _poses),
+    Reader("poses, COLMAP", "images.txt", load_pose_file, _poses),
+    Reader("poses, COLMAP's binary", "images.bin", load_pose_file, _binary_poses),
+    Reader("poses, OpenTrackIO", "track.jsonl", load_pose_file, _track),
+    Reader("poses, USD", "shot.usda", load_pose_file, lambda path: write_usd(path, _shot())),
     Reader("farm's jobs, TOML", "jobs.toml", lambda path: parse_jobs(read_jobs(path), str(path)), _jobs),
     Reader("farm's run, run.json", "run.json", _status, _run),
     Reader("farm's run, manifest", "manifest.jsonl", _status, _run),
-    Reader("farm's run, progress", "progress.json", _status, _run),
 )
 
 assert Synthetic.NAMES  # the scene's source is one of them

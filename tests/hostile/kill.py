@@ -2,12 +2,16 @@
 
     python -m tests.hostile.kill 50 [SINK ...]      # so often for each sink, or for those named; prints a table
 
-Each attempt is a fork of this process that writes frames; half of them stand on what an earlier run left.
+Each attempt is a process that writes frames; half of them stand on what an earlier run left. It is forked from one that
+has never started a thread: what a lock of this process's encoders is at that moment, taken or free, is not its matter.
 """
 
 from __future__ import annotations
 
+import contextlib
+import faulthandler
 import json
+import multiprocessing
 import os
 import pathlib
 import random
@@ -16,6 +20,8 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
+from multiprocessing.connection import Connection
+from typing import NoReturn
 
 import cv2
 import numpy as np
@@ -25,9 +31,8 @@ from warp_ar.command_line import Terminated, ended_by_signals
 from warp_ar.errors import WarpArError
 from warp_ar.exr_file import check_whole_exr
 from warp_ar.files import write_whole
-from warp_ar.output.environment_file import EnvironmentSink
 from warp_ar.output.layer_file import LayerFrame, LayerSink
-from warp_ar.output.sinks import open_sink, read_environment
+from warp_ar.output.sinks import EnvironmentSink, open_sink, read_environment
 from warp_ar.sources.sources import open_source
 
 SIZE = (96, 128)
@@ -38,6 +43,8 @@ TOLERANCE = 3
 """Levels that a video may be off."""
 PATIENCE = 120.0
 """Seconds within which a process ends that was told to."""
+FORKS = multiprocessing.get_context("forkserver")
+FORKS.set_forkserver_preload(["warp_ar.command_line", "warp_ar.output.layer_file", "warp_ar.sources.sources"])
 
 
 def frame(index: int, brighter: int = 0) -> np.ndarray:
@@ -135,53 +142,46 @@ SINKS: dict[str, tuple[Writer, Callable[..., int]]] = {
 }
 
 
-def ended(child: int) -> int:
-    """Exit code of a process that was told to end; one that does not end is killed.
-
-    Raises:
-        AssertionError: It did not end.
-    """
-    deadline = time.monotonic() + PATIENCE
-    while (found := os.waitpid(child, os.WNOHANG)) == (0, 0):
-        if time.monotonic() > deadline:
-            os.kill(child, signal.SIGKILL)
-            os.waitpid(child, 0)
-            raise AssertionError(f"it did not end within {PATIENCE:g} s")
-        time.sleep(0.005)
-    return os.waitstatus_to_exitcode(found[1])
+def write_until_told(name: str, place: pathlib.Path, begun: Connection) -> NoReturn:
+    """Write a whole run in a process of its own, say that it has begun, and end as a command does."""
+    # In a thread of C, so that a process that hangs says where, whoever holds Python's lock.
+    faulthandler.dump_traceback_later(PATIENCE - 10.0)
+    code = 1
+    try:
+        with ended_by_signals():
+            begun.send(True)
+            SINKS[name][0](place, FRAMES, 0)
+            code = 0
+    except Terminated:
+        code = 143
+    finally:
+        os._exit(code)
 
 
 def attempt(name: str, number: int, kind: signal.Signals, folder: pathlib.Path) -> int:
     """Kill one run; returns how many frames it left.
 
     Raises:
-        AssertionError: What it left is not whole.
+        AssertionError: It did not end, or what it left is not whole.
     """
     chance = random.Random(f"{name} {number}")
     write, check = SINKS[name]
     place = folder / name
     if number % 2:
         write(place, EARLIER, EARLIER)
-    begin, begun = os.pipe()
-    child = os.fork()
-    if child == 0:
-        code = 1
-        try:
-            with ended_by_signals():
-                os.write(begun, b"x")
-                write(place, FRAMES, 0)
-                code = 0
-        except Terminated:
-            code = 143
-        finally:
-            os._exit(code)
-    os.read(begin, 1)
-    os.close(begin)
-    os.close(begun)
+    begins, begun = FORKS.Pipe(duplex=False)
+    child = FORKS.Process(target=write_until_told, args=(name, place, begun))
+    child.start()
+    begun.close()
+    begins.recv()
     time.sleep(chance.uniform(0.0, 0.5))
-    os.kill(child, kind)
-    code = ended(child)
-    assert code in (0, -kind if kind == signal.SIGKILL else 143), code
+    with contextlib.suppress(ProcessLookupError):  # it has written all there is
+        os.kill(child.pid, kind)
+    child.join(PATIENCE)
+    if child.exitcode is None:
+        child.kill()
+        raise AssertionError(f"it did not end within {PATIENCE:g} s")
+    assert child.exitcode in (0, -kind if kind == signal.SIGKILL else 143), child.exitcode
     count = check(place, finished=bool(number % 2))
     if kind == signal.SIGTERM:
         assert not list(folder.rglob(".*")), "a file that was being written was left"

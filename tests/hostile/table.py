@@ -16,6 +16,7 @@ from tests.hostile.mutate import EXAMPLES, HELD, ROW, Worker, mutate_all
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 FILE = ROOT / "docs" / "hostile-inputs.md"
 BEGIN, END = "<!-- table -->", "<!-- /table -->"
+MADE = "sound, damaged and made-up inputs of every reader and sink"
 MOST_DEATHS = 5
 """Processes that may die of an input before the rest is given up."""
 
@@ -58,10 +59,10 @@ def mutate(examples: int = EXAMPLES) -> list[Outcome]:
 
 
 def make_table(outcomes: list[Outcome]) -> str:
-    """One line per reader and sink, and the sum."""
+    """One line for what was made, one for what was mutated, and the sum."""
     rows: dict[str, collections.Counter[str]] = collections.defaultdict(collections.Counter)
     for row, _, outcome, _ in outcomes:
-        for name in (row, "all"):
+        for name in (row if row == ROW else MADE, "all"):
             rows[name][outcome if outcome in HELD else "broke"] += 1
     rows["all"] = rows.pop("all")
     lines = ["| what takes it in | tried | accepted | refused in one line | broke |", "| --- | --: | --: | --: | --: |"]
@@ -72,9 +73,8 @@ def make_table(outcomes: list[Outcome]) -> str:
 
 def tried() -> dict[str, int]:
     """How many inputs each row of the table has."""
-    counts = collections.Counter(case.row for case in all_cases())
-    counts[ROW] = EXAMPLES * len(READERS)
-    return {**counts, "all": counts.total()}
+    made, mutated = sum(1 for _ in all_cases()), EXAMPLES * len(READERS)
+    return {MADE: made, ROW: mutated, "all": made + mutated}
 
 
 def tried_in_docs() -> dict[str, int]:

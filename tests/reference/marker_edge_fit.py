@@ -12,7 +12,7 @@ import numpy as np
 from warp_ar.kernels.color import decode_table
 from warp_ar.kernels.picture.marker_edge_fit import CORRELATED, DONE, MIN_CELLS, MIN_EDGES, MIN_REACH, NOISE_FLOOR, TAPS
 from warp_ar.scene import Camera, Pose
-from warp_ar.tracking.marker_pattern import Pattern
+from warp_ar.tracking.markers import Pattern
 
 PLACES = np.linspace(-1.0, 1.0, TAPS)
 WEIGHTS = np.full(TAPS, 2.0 / (TAPS - 1))

@@ -111,7 +111,7 @@ def corners(view, center, radius, height):
     return np.where(np.isfinite(theta)[..., None], np.concatenate([seen, margin[..., None]], -1), np.nan)
 
 
-def gather(frame, table, reflectance, corner, method, rim_start, rim_width, half_density=4.0, most=8):
+def gather(frame, table, reflectance, corner, rim_start, rim_width, half_density=4.0, most=8):
     """Radiance, confidence and clipped share of every texel of one ball."""
     height, width = corner.shape[0] - 1, corner.shape[1] - 1
     area = latlong.solid_angles(height, width)
@@ -132,11 +132,9 @@ def gather(frame, table, reflectance, corner, method, rim_start, rim_width, half
             quad = corner[i : i + 2, j : j + 2]
             if np.isnan(quad).any():
                 continue
-            count_y = count_x = 1
-            if method == "area":
-                down = np.linalg.norm(quad[1, :, :2] - quad[0, :, :2], axis=-1).max()
-                along = np.linalg.norm(quad[:, 1, :2] - quad[:, 0, :2], axis=-1).max()
-                count_y, count_x = (int(np.clip(np.ceil(s), 1, most)) for s in (down, along))
+            down = np.linalg.norm(quad[1, :, :2] - quad[0, :, :2], axis=-1).max()
+            along = np.linalg.norm(quad[:, 1, :2] - quad[:, 0, :2], axis=-1).max()
+            count_y, count_x = (int(np.clip(np.ceil(s), 1, most)) for s in (down, along))
             weights, values, shares, possible = [], [], [], 0.0
             for a in range(count_y):
                 y = (a + 0.5) / count_y

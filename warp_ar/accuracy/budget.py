@@ -16,7 +16,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import warp as wp
 
@@ -46,18 +46,6 @@ from warp_ar.stages.quality import DEFAULT_BUDGET_MS, Quality
 from warp_ar.stages.request import Estimates
 
 _KEPT_PIPELINES = 6
-
-T = TypeVar("T")
-
-
-class _OfTheLatest(Generic[T]):
-    """A property of the pipeline that lights the next frame."""
-
-    def __init__(self, get: Callable[[Pipeline], T]) -> None:
-        self._get = get
-
-    def __get__(self, auto: AutoPipeline, owner: type[AutoPipeline]) -> T:
-        return self._get(auto.pipeline)
 
 
 class AutoPipeline(Closing):
@@ -125,12 +113,11 @@ class AutoPipeline(Closing):
         """Stop the threads; arrays go when the last result that refers to them does."""
         self._switcher.close()
 
-    plan = _OfTheLatest(lambda pipeline: pipeline.plan)
-    quality = _OfTheLatest(lambda pipeline: pipeline.quality)
-    scene = _OfTheLatest(lambda pipeline: pipeline.scene)
-    size = _OfTheLatest(lambda pipeline: pipeline.size)
-    device = _OfTheLatest(lambda pipeline: pipeline.device)
-    arrays = _OfTheLatest(lambda pipeline: pipeline.arrays)
+    def __getattr__(self, name: str) -> Any:
+        """Return what the pipeline that lights the next frame has by this name: its plan, quality, arrays, device."""
+        if name == "pipeline":  # not built yet
+            raise AttributeError(name)
+        return getattr(self.pipeline, name)
 
     def __call__(
         self,

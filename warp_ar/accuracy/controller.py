@@ -57,7 +57,7 @@ class Controller:
             running: Settings that run until the load is known; None: the choice is made at once.
         """
         self._costs, self._errors, self.budget_ms = costs, errors, budget_ms
-        self._front = pareto_front(make_method_costs(costs, errors), costs.scales)
+        self._front = pareto_front(make_method_costs(costs, errors))
         self._factor: float | None = None
         self._times: list[float] = []
         self._window = WINDOW
@@ -93,11 +93,6 @@ class Controller:
     def expected_ms(self) -> float:
         """Milliseconds per frame that the present settings should take under the present load."""
         return self.factor * self._cost(self.settings)
-
-    @property
-    def least_ms(self) -> float:
-        """Milliseconds per frame that the cheapest settings should take under the present load."""
-        return self.factor * (self._costs.base + self._front[0].milliseconds)
 
     @property
     def expected_error(self) -> float:

@@ -1,8 +1,6 @@
 """The cost of every method on this device: measured on one frame, and kept in the user's cache folder.
 
-Costs depend on the device and on the scene. They are measured one setting at a time from a base, and hold together by
-what settings share: a method's milliseconds more than the base's are multiplied where another setting gives its stage
-more to do, by as much as that setting multiplies the stage's time at the base.
+Costs depend on the device and on the scene. They are measured one setting at a time from a base.
 """
 
 from __future__ import annotations
@@ -11,8 +9,6 @@ import dataclasses
 import hashlib
 import importlib.metadata
 import json
-import math
-import os
 import statistics
 import sys
 import time
@@ -22,7 +18,8 @@ from typing import Any, cast
 
 import warp as wp
 
-from warp_ar.accuracy.cost_table import BETWEEN, MethodCost, Scales, Setting, chosen, light_only, turn
+from warp_ar.accuracy.cost_table import MethodCost, Setting, chosen, light_only, turn
+from warp_ar.device import usable_cores
 from warp_ar.engine.graph import Plan
 from warp_ar.engine.pipeline import DEFAULT_FRAME_INTERVAL, TRACK, Pipeline, Result
 from warp_ar.engine.switcher import let_go
@@ -56,20 +53,12 @@ class Costs:
     """Milliseconds per frame of the preset that methods were measured from, tracking included."""
     methods: Mapping[str, Mapping[str, float]]
     """By setting and method: milliseconds per frame more than the base takes."""
-    scales: Scales = dataclasses.field(default_factory=dict)
-    """Factors by which settings that stages share multiply the excess costs of methods of those stages."""
     track: float = 0.0
     """Milliseconds of ``base`` that tracking takes."""
 
     def excess(self, settings: Mapping[str, str]) -> float:
-        """Milliseconds per frame that settings should take more than the base."""
-        shared = [
-            self.scales[setting].get(method, {}) for setting, method in settings.items() if setting in self.scales
-        ]
-        return sum(
-            self.methods[setting][method] * math.prod(scale.get(setting, 1.0) for scale in shared)
-            for setting, method in settings.items()
-        )
+        """Return the milliseconds per frame that settings should take more than the base."""
+        return sum(self.methods[setting][method] for setting, method in settings.items())
 
 
 def make_method_costs(costs: Costs, errors: Mapping[str, Mapping[str, float]]) -> list[MethodCost]:
@@ -81,41 +70,14 @@ def make_method_costs(costs: Costs, errors: Mapping[str, Mapping[str, float]]) -
     ]
 
 
-def measure_costs(
-    scene: Scene,
-    image: Any,
-    pose: Pose | None,
-    device: str,
-    size: tuple[int, int],
-    settings: Sequence[Setting],
-    clock: Callable[[], float] | None = None,
-) -> Costs:
-    """Time every method but brute force on one frame that is shown again and again.
-
-    Args:
-        scene: What is shown.
-        image: uint8 RGB (height, width, 3).
-        pose: Of the camera in that frame, if the scene needs it.
-        device: ``cpu`` or ``cuda:N``.
-        size: Width and height.
-        settings: What may be turned.
-        clock: Seconds, on CPU. None counts processor time, so that other programs matter little, and takes it by the
-            ratio in which the base's stands to the time that passes.
-    """
-    return finish_steps(measure_steps(scene, image, pose, device, size, settings, clock))
-
-
-def finish_steps(steps: Generator[float, None, Costs], advance: Callable[[float], None] = lambda share: None) -> Costs:
-    """Take all steps of ``measure_steps``; ``advance`` is told the share of the work that each was."""
-    done = 0.0
+def measure_costs(*arguments: Any, **options: Any) -> Costs:
+    """Take all steps of ``measure_steps`` at once; arguments are the same."""
+    steps = measure_steps(*arguments, **options)
     while True:
         try:
-            share = next(steps)
+            next(steps)
         except StopIteration as end:
-            advance(1.0 - done)
             return cast(Costs, end.value)
-        advance(share - done)
-        done = share
 
 
 def measure_steps(
@@ -127,91 +89,49 @@ def measure_steps(
     settings: Sequence[Setting],
     clock: Callable[[], float] | None = None,
     *,
-    frames: int = MEASURED_FRAMES,
+    all_methods: bool = False,
 ) -> Generator[float, None, Costs]:
-    """``measure_costs`` in small steps, for whoever has other objects to do; yields the share that is done."""
-    count, done = sum(len(setting.measured) for setting in settings) + 2, 2
+    """Time methods on one frame that is shown again and again, in small steps; yield the share that is done.
+
+    Args:
+        scene: Scene that is shown.
+        image: uint8 RGB (height, width, 3).
+        pose: Of the camera in that frame, if the scene needs it.
+        device: ``cpu`` or ``cuda:N``.
+        size: Width and height.
+        settings: Settings that may be turned.
+        clock: Seconds, on CPU. None counts processor time, so that other programs matter little, and takes it by the
+            ratio in which the base's stands to the time that passes.
+        all_methods: True to time brute force too.
+    """
+    methods = {setting: setting.methods if all_methods else setting.measured for setting in settings}
+    count, done = sum(map(len, methods.values())) + 2, 2
     timed = WORK if clock is None else clock
     passed = _time_stages(scene, image, pose, device, size, BASE, time.perf_counter)
     track = passed.pop(TRACK, 0.0)
     yield 1 / count
-    base = _time_stages(scene, image, pose, device, size, BASE, timed, frames=frames)
+    base = _time_stages(scene, image, pose, device, size, BASE, timed)
     base.pop(TRACK, None)
     yield done / count
     work = sum(base.values())
     pace = sum(passed.values()) / work if clock is None and work > 0.0 else 1.0
-    methods: dict[str, dict[str, float]] = {}
-    scales: dict[str, dict[str, dict[str, float]]] = {}
-    shares: dict[str, float] = {}
-    for setting in settings:
-        start = chosen(BASE, setting)
+    costs: dict[str, dict[str, float]] = {}
+    for setting, names in methods.items():
+        start, spread = chosen(BASE, setting), setting.name == NOW_AND_THEN
         times: dict[str, dict[str, float]] = {}
-        spread = setting.name == NOW_AND_THEN
-        for method in setting.measured:
-            quality = turn(BASE, {setting.name: method})
-            known = method == start and not spread
-            if known:
-                times[method] = base
-            else:
-                times[method] = _time_stages(scene, image, pose, device, size, quality, timed, spread, frames)
-            times[method].pop(TRACK, None)
+        for method in names:
+            times[method] = base
+            if method != start or spread:
+                quality = turn(BASE, {setting.name: method})
+                times[method] = _time_stages(scene, image, pose, device, size, quality, timed, spread)
+                times[method].pop(TRACK, None)
             done += 1
             yield done / count
         # Stages that run whatever the method is cost the same: what was measured of them is noise.
         common = set.intersection(*(set(own) for own in times.values())) - set(setting.stages)
         own = {method: sum(ms for name, ms in stages.items() if name not in common) for method, stages in times.items()}
-        methods[setting.name] = {method: pace * (ms - own[start]) for method, ms in own.items()}
-        # A method may bring another stage along; what is shared scales the setting's own stage.
-        most = max(own, key=lambda method: abs(own[method] - own[start]))
-        part = times[most].get(setting.name, 0.0) - times[start].get(setting.name, 0.0)
-        shares[setting.name] = min(max(part / (own[most] - own[start]), 0.0), 1.0) if own[most] != own[start] else 1.0
-        if others := _scale_others(setting, settings, times, base):
-            scales[setting.name] = others
-    for table in scales.values():
-        for scale in table.values():
-            scale.update({name: 1.0 + shares[name] * (ratio - 1.0) for name, ratio in scale.items()})
-    return fill_between(Costs(track + pace * work, methods, scales, track))
-
-
-def _scale_others(
-    setting: Setting, settings: Sequence[Setting], times: dict[str, dict[str, float]], base: dict[str, float]
-) -> dict[str, dict[str, float]]:
-    """By how much each method of a setting scales the stages of other settings; empty where it has none of them."""
-    # What recovery does on its own thread is the same for a map of any size.
-    others = [
-        other.name
-        for other in settings
-        if other.name in setting.stages and other.name not in (setting.name, NOW_AND_THEN)
-    ]
-    if not others:
-        return {}
-    return {
-        method: {name: stages[name] / base[name] for name in others if base.get(name) and stages.get(name)}
-        for method, stages in times.items()
-    }
-
-
-def fill_between(costs: Costs) -> Costs:
-    """``costs`` with methods of which others tell what they cost; a measured one stays."""
-
-    def filled(known: Mapping[str, Any], between: Mapping[str, tuple[str, str, float]], mix: Callable[..., Any]) -> Any:
-        found = {
-            method: mix(known[low], known[high], share)
-            for method, (low, high, share) in between.items()
-            if low in known and high in known
-        }
-        return {**found, **known}
-
-    def mix_scales(low: Mapping[str, float], high: Mapping[str, float], share: float) -> dict[str, float]:
-        return {name: _mix(low[name], high[name], share) for name in low if name in high}
-
-    methods = {name: filled(own, BETWEEN.get(name, {}), _mix) for name, own in costs.methods.items()}
-    scales = {name: filled(own, BETWEEN.get(name, {}), mix_scales) for name, own in costs.scales.items()}
-    return dataclasses.replace(costs, methods=methods, scales=scales)
-
-
-def _mix(low: float, high: float, share: float) -> float:
-    return low + share * (high - low)
+        costs[setting.name] = {method: pace * (ms - own[start]) for method, ms in own.items()}
+    return Costs(track + pace * work, costs, track)
 
 
 def _time_stages(
@@ -223,12 +143,11 @@ def _time_stages(
     quality: Quality,
     clock: Callable[[], float],
     spread: bool = False,
-    frames: int = MEASURED_FRAMES,
 ) -> dict[str, float]:
     """Milliseconds by stage, tracking among them where the clock is that of the time that passes."""
     times: dict[str, list[float]] = {}
     spent = 0.0
-    warm_up, count = (EVERY_FRAME, _SPREAD_FRAMES) if spread else (_WARM_UP, frames)
+    warm_up, count = (EVERY_FRAME, _SPREAD_FRAMES) if spread else (_WARM_UP, MEASURED_FRAMES)
     shown_at = light_only(quality) if spread else quality
     with open_profiled(scene, device, shown_at, size, clock) as pipeline:
         begun = 0.0
@@ -276,17 +195,15 @@ def open_profiled(
 
 def worked_ms(seconds: float, clock: Callable[[], float]) -> float:
     """Milliseconds that the process's work takes: by ``WORK`` all of it, by the time its share on every core."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return seconds * 1e3 / (1 if clock is WORK else cores)
+    return seconds * 1e3 / (1 if clock is WORK else usable_cores())
 
 
 def cost_key(plan: Plan, device: Any, settings: Sequence[Setting]) -> str:
     """Return a digest of all that costs depend on: device, versions, stages, scene, the frames' size, the methods."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     scene = plan.request.scene
     parts = [
         device.name,
-        cores if device.is_cpu else None,
+        usable_cores() if device.is_cpu else None,
         wp.__version__,
         package_version(),
         plan.request.size,
@@ -318,13 +235,7 @@ def read_costs(folder: Path, key: str, settings: Sequence[Setting]) -> Costs | N
         known = all(
             set(methods[setting.name]) <= set(setting.methods) and methods[setting.name] for setting in settings
         )
-        scales = {
-            str(setting): {
-                str(method): {str(name): float(x) for name, x in own.items()} for method, own in table.items()
-            }
-            for setting, table in kept["scales"].items()
-        }
-        return Costs(float(kept["base"]), methods, scales, float(kept["track"])) if known else None
+        return Costs(float(kept["base"]), methods, float(kept["track"])) if known else None
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None  # not there, or not ours: it is measured anew
 

@@ -19,6 +19,7 @@ from warp_ar.light.captured import CapturedEmitter, Light, texel_solid_angles
 from warp_ar.scene import Exposure, Pose, Scene
 from warp_ar.sources.sources import Frame, Source, open_source
 from warp_ar.stages.quality import Quality
+from warp_ar.tracking.tracking import given_pose
 
 _LOG = logging.getLogger(__name__)
 
@@ -149,7 +150,8 @@ def light_up_to(
         first: float | None = None
         for frame in frames:
             first = frame.time if first is None else first
-            result = pipeline(frame.image, time_seconds=frame.time, exposure_time=frame.exposure_time)
+            known = {"time_seconds": frame.time, "exposure_time": frame.exposure_time}
+            result = pipeline(frame.image, **known, pose=given_pose(scene.pose, frame))
             if frame.index < number:
                 continue
             where = f"frame {number} of {frames.description}"

@@ -1,4 +1,4 @@
-"""How far emitters of a given light stand, by what a frame's surfaces show.
+"""Distances of the emitters of a given light, by what a frame's surfaces show.
 
 Light that a file gives is light as one point sees it: it says in which direction an emitter stands, not how far. Taken
 for distant, a lamp half a metre away lights all of a desk alike, and its shadows fall in one direction. The frame knows
@@ -51,7 +51,7 @@ GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 
 
 def reflectance_scatter(tracer: PathTracer) -> float:
-    """How far the reflectance that a frame tells scatters over each proxy: the cost above.
+    """Return the scatter of the reflectance that a frame tells over each proxy: the cost above.
 
     Args:
         tracer: Of the frame, in the light that is judged.

@@ -48,6 +48,7 @@ from warp_ar.scene import Pose, Scene
 from warp_ar.scene.kinds import trace_config
 from warp_ar.scene.pixel_rays import pixel_rays
 from warp_ar.scene.ray_scene import HostScene
+from warp_ar.stages.shared.lighting import trace_variant
 
 FloatImage = npt.NDArray[np.float32]
 Image = npt.NDArray[np.uint8]
@@ -207,21 +208,23 @@ class PathTracer:
         self._seconds = 0.0
         self._followed = 0
         """Passes of paths from virtual lights that were made."""
-        self._parts: Iterator[bool] | None = None
-        self._compiled: set[Callable[..., None]] = set()
+        self._work, self._sliced, self._goal = self._all_work(), False, 0
+        """Work left; True if it is done pass by pass; samples per pixel for which it is done else."""
+        self._compiled: set[str] = set()
+        self._prepared = False
         self._passes = 0
         """Made with the shares that are there."""
-        self._prepared = frame is None
         self._linear = None if frame is None else _linear_frame(frame, self.camera)
-        self._trace = trace_config(scene)
-        if self.device.is_cpu:
-            self._trace = self._trace.general()
+        self._config = trace_variant(trace_config(scene), self.device)
         with translating(self.device), wp.ScopedDevice(self.device):
             self._host = HostScene(self.scene, self.device)
             self._local = self._make_local(_environment(light), _near_emitters(light), seconds)
             self._params = wp.array(self._camera_values(pose), dtype=structs.FrameParams, device=self.device)
             self._set_reflectances(reflectances)
             self._allocate()
+        self._part, self._most = PART, MOST_SAMPLES
+        if not self.device.is_cpu:
+            self._part = self._most = max(1, min(MOST_CUDA_SAMPLES, self.device.free_memory // SAMPLE_BYTES))
 
     def _allocate(self) -> None:
         """Moments of no samples, and what a picture of them is written to."""
@@ -297,115 +300,97 @@ class PathTracer:
         values = np.asarray(reflectances, np.float32).reshape(count, 3)
         self._local.proxy_reflectance = wp.array(values, dtype=wp.vec3, device=self.device)
 
-    def _begin_round(self, passes: int) -> int:
-        """List the samples of some passes; how many there are."""
-        with translating(self.device), wp.ScopedDevice(self.device):
-            return int(list_samples(self._shares, self._round, seed=self.seed, begun=self._passes, count=passes))
-
-    def _end_round(self, passes: int) -> None:
-        """Take the samples of some passes into the moments."""
-        with translating(self.device), wp.ScopedDevice(self.device):
-            add_samples(self._round, self._moments)
-        self._passes += passes
-
-    def _follow(self, asked: int, first: int, count: int, at_once: int) -> Iterator[None]:
-        """Trace a round of ``count`` samples, in parts as ``_in_parts`` has it.
+    def _trace(self, asked: int, first: int, count: int) -> Iterator[None]:
+        """Make so many passes, in rounds of as many as there is room for, each in parts that cores take side by side.
 
         ``first`` is the number of a pixel's first sample in the moments.
         """
 
-        def trace(part: tuple[int, int] | None) -> None:
+        def trace(part: tuple[int, int]) -> None:
             path_tracer.trace_paths(
-                self._trace, self._params, self._local, self._moments.samples, self._round,
-                count=count, asked=asked, seed=self.seed, first=first, part=part,
+                self._config, self._params, self._local, self._moments.samples, self._round,
+                count=samples, asked=asked, seed=self.seed, first=first, part=part,
             )  # fmt: skip
 
-        yield from self._in_parts(path_tracer.trace_paths, trace, count, at_once)
+        while count > 0:
+            room = self._most // (self.camera.width * self.camera.height)
+            passes = 1 if self._sliced else min(count, max(1, room))
+            with translating(self.device), wp.ScopedDevice(self.device):
+                samples = list_samples(self._shares, self._round, seed=self.seed, begun=self._passes, count=passes)
+            yield from self._in_parts("paths", trace, samples)
+            with translating(self.device), wp.ScopedDevice(self.device):
+                add_samples(self._round, self._moments)
+            self._passes += passes
+            count -= passes
+            if asked == path_tracer.DIFFERENCE and (self._follows_lights or self._follows_emitters):
+                for _ in range(passes):
+                    yield from self._follow_lights()
 
-    def _follow_lights(self, at_once: int) -> Iterator[None]:
+    def _follow_lights(self) -> Iterator[None]:
         """Follow the paths of a pass from virtual lights, in parts as ``_in_parts`` has it."""
         each = self._paths_of_each()
         of_lights = each if self._follows_lights else 0
         count = of_lights + (each if self._follows_emitters else 0)
 
-        def trace(part: tuple[int, int] | None) -> None:
+        def trace(part: tuple[int, int]) -> None:
             follow_lights(
-                self._trace, self._params, self._local, self._image_of_lights,
+                self._config, self._params, self._local, self._image_of_lights,
                 count=count, of_lights=of_lights, seed=self.seed, number=self._followed, part=part,
             )  # fmt: skip
 
-        yield from self._in_parts(follow_lights, trace, count, at_once)
+        yield from self._in_parts("lights", trace, count)
         self._followed += 1
 
     def _paths_of_each(self) -> int:
         """Paths of a pass from virtual lights, and as many from near emitters, where either are followed."""
         return math.ceil(PATHS_OF_LIGHTS * self.camera.width * self.camera.height)
 
-    def _in_parts(
-        self,
-        launcher: Callable[..., None],
-        trace: Callable[[tuple[int, int] | None], None],
-        count: int,
-        at_once: int,
-    ) -> Iterator[None]:
-        """On CPU ``at_once`` parts of ``count`` threads by all cores, then others; on CUDA all of them."""
-        if not self.device.is_cpu:
+    def _in_parts(self, kind: str, trace: Callable[[tuple[int, int]], None], count: int) -> Iterator[None]:
+        """Trace ``count`` threads in parts that cores take side by side: all of them, or as many as there are cores."""
+        parts = [(start, min(start + self._part, count)) for start in range(0, count, self._part)]
+        if len(parts) == 1 or (parts and kind not in self._compiled):
             with translating(self.device), wp.ScopedDevice(self.device):
-                trace(None)
-            yield
-            return
-        parts = [(start, min(start + PART, count)) for start in range(0, count, PART)]
-        if parts and launcher not in self._compiled:
-            with translating(self.device):
                 trace(parts.pop(0))  # compiles, before threads would each do so
-            self._compiled.add(launcher)
+            self._compiled.add(kind)
             yield
+        at_once = usable_cores() if self._sliced else max(len(parts), 1)
         with ThreadPoolExecutor(usable_cores(), "warp_ar-paths") as pool:
             for start in range(0, len(parts), at_once):
                 list(pool.map(trace, parts[start : start + at_once]))
                 yield
 
-    def _most_samples(self) -> int:
-        """Of a round."""
-        if self.device.is_cpu:
-            return MOST_SAMPLES
-        return int(min(MOST_CUDA_SAMPLES, self.device.free_memory // SAMPLE_BYTES))
-
-    def _brings_lights(self, asked: int) -> bool:
-        """Whether a pass has paths from virtual lights as well."""
-        return (self._follows_lights or self._follows_emitters) and asked == path_tracer.DIFFERENCE
-
-    def _add(self, asked: int, count: int, first: int) -> None:
-        """Make so many passes, as many of them in a round as it has room for."""
-        most = max(1, self._most_samples() // (self.camera.width * self.camera.height))
-        while count > 0:
-            passes = min(count, most)
-            samples = self._begin_round(passes)
-            for _ in self._follow(asked, first, samples, at_once=max(samples, 1)):
-                pass
-            self._end_round(passes)
-            for _ in range(passes if self._brings_lights(asked) else 0):
-                for _ in self._follow_lights(at_once=1 << 30):
-                    pass
-            count -= passes
+    def _all_work(self) -> Iterator[bool]:
+        """All work in parts; True after one that ended what adds samples to every pixel."""
+        asked = path_tracer.WHOLE
+        if self._linear is not None:
+            asked = path_tracer.DIFFERENCE
+            with translating(self.device), wp.ScopedDevice(self.device):
+                path_tracer.find_shown(self._config, self._params, self._local, self._local.shown)
+            first = 0
+            for count in (FIRST_LIGHT_SAMPLES, self.light_samples - FIRST_LIGHT_SAMPLES):
+                for _ in self._trace(path_tracer.IRRADIANCE, first, count):
+                    yield False
+                first += count
+                with translating(self.device), wp.ScopedDevice(self.device):
+                    self._map_reflectance()
+        self._prepared = True
+        yield False
+        while True:
+            self._share()
+            due = FIRST_ROUND
+            while due <= self.samples:
+                due *= 2
+            count = 1 if self._sliced else min(self._goal, due) - self.samples
+            for _ in self._trace(asked, self.light_samples, count):
+                yield False
+            self.samples += count
+            yield True
 
     def prepare(self) -> None:
         """Find the reflectance of proxies; ``sample`` does it where it was not done."""
-        if self._prepared:
-            return
-        self._prepared = True
-        with translating(self.device), wp.ScopedDevice(self.device):
-            path_tracer.find_shown(self._trace, self._params, self._local, self._local.shown)
-        done = 0
-        for count in self._light_counts():
-            self._add(path_tracer.IRRADIANCE, count, done)
-            done += count
-            with translating(self.device), wp.ScopedDevice(self.device):
-                self._map_reflectance()
-
-    def _light_counts(self) -> tuple[int, int]:
-        """Samples of the two rounds in which reflectance is found."""
-        return FIRST_LIGHT_SAMPLES, self.light_samples - FIRST_LIGHT_SAMPLES
+        self._sliced = False
+        while not self._prepared:
+            next(self._work)
 
     def _map_reflectance(self) -> None:
         """Reflectance by the light that the moments hold, which then begin anew."""
@@ -457,74 +442,33 @@ class PathTracer:
             raise UsageError(f"{count} samples: expected 1 or more")
         self.prepare()
         start = time.perf_counter()
-        asked = path_tracer.WHOLE if self._linear is None else path_tracer.DIFFERENCE
-        end = self.samples + count
-        while self.samples < end:
-            self._share()
-            ahead = FIRST_ROUND
-            while ahead <= self.samples:
-                ahead *= 2
-            step = min(end, ahead) - self.samples
-            self._add(asked, step, self.light_samples)
-            self.samples += step
+        self._goal = self.samples + count
+        while self.samples < self._goal:
+            next(self._work)
         with exclusive(self.device):
             wp.synchronize_device(self.device)
         self._seconds += time.perf_counter() - start
 
     def sample_for(self, seconds: float) -> bool:
-        """Add samples for about so long, in parts of a few rows; not to be mixed with ``sample``.
+        """Add samples for about so long, in parts of a few rows.
 
         Between two passes over the picture, and after any number of them, it is what ``sample`` gives.
 
         Returns:
             Whether a pass over the whole picture has ended.
         """
-        start, ended = time.perf_counter(), False
-        self._parts = self._parts or self._all_parts()
+        start, ended, self._sliced = time.perf_counter(), False, True
         while True:
-            ended |= next(self._parts)
+            ended |= next(self._work)
+            with exclusive(self.device):
+                wp.synchronize_device(self.device)
             spent = time.perf_counter() - start
             if spent >= seconds:
                 self._seconds += spent
                 return ended
 
-    def _all_parts(self) -> Iterator[bool]:
-        """All work in parts; True after the last one of a pass that added a sample to every pixel."""
-        if not self._prepared:
-            with translating(self.device), wp.ScopedDevice(self.device):
-                path_tracer.find_shown(self._trace, self._params, self._local, self._local.shown)
-            first = 0
-            for count in self._light_counts():
-                for _k in range(count):
-                    for _ in self._pass(path_tracer.IRRADIANCE, first):
-                        yield False
-                first += count
-                with translating(self.device), wp.ScopedDevice(self.device):
-                    self._map_reflectance()
-            self._prepared = True
-        asked = path_tracer.WHOLE if self._linear is None else path_tracer.DIFFERENCE
-        while True:
-            self._share()
-            for _ in self._pass(asked, self.light_samples):
-                yield False
-            self.samples += 1
-            yield True
-
-    def _pass(self, asked: int, first: int) -> Iterator[None]:
-        """Make one pass in parts."""
-        for _ in self._follow(asked, first, self._begin_round(1), at_once=usable_cores()):
-            with exclusive(self.device):
-                wp.synchronize_device(self.device)
-            yield
-        self._end_round(1)
-        if self._brings_lights(asked):
-            for _ in self._follow_lights(at_once=usable_cores()):
-                with exclusive(self.device):
-                    wp.synchronize_device(self.device)
-                yield
-
     def picture(self) -> TracedPicture:
-        """What the samples so far give.
+        """Return the picture of the samples so far.
 
         Raises:
             UsageError: There are none.

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import math
 import os
 import platform
 import statistics
+import subprocess
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,9 +18,9 @@ import warp as wp
 from rich.console import Console
 from rich.table import Table
 
-from warp_ar.accuracy.case_report import CaseReport
 from warp_ar.accuracy.cost_table import SETTINGS
-from warp_ar.accuracy.runs import BASE
+from warp_ar.accuracy.measure import BASE, CaseReport
+from warp_ar.device import usable_cores
 from warp_ar.signature import PROGRAM
 from warp_ar.stages.quality import PRESETS
 
@@ -27,128 +29,123 @@ MIN_COLUMNS = 110
 
 
 def make_cost_table(reports: Sequence[CaseReport], device: str) -> dict[str, Any]:
-    """Errors of every method, and the methods that another beats in every case.
+    """Return error and cost of every method, and the methods that another beats in every case.
 
-    ``errors`` is FLIP per changed pixel as a method's error counts (see above), mean over the cases in which the
-    setting matters. ``stage_errors`` is the relative RMSE of what the stage writes against its last method, mean
-    likewise. Both depend on the device only by rounding; costs do not, so they are not kept here.
+    ``errors`` is FLIP per changed pixel, mean over the cases in which the setting matters; it depends on the device
+    only by rounding. ``milliseconds`` is the mean likewise, and this device's.
     """
-    errors: dict[str, dict[str, float]] = {}
-    stage_errors: dict[str, dict[str, float]] = {}
-    dominated: dict[str, list[str]] = {}
+    tables: dict[str, dict[str, Any]] = {"errors": {}, "milliseconds": {}, "dominated": {}}
     for setting in SETTINGS:
         rows = [row for report in reports for row in report.rows if row.setting == setting.name]
-        if not rows:
+        by_method = {method: [row for row in rows if row.method == method] for method in setting.methods}
+        by_method = {method: own for method, own in by_method.items() if own}
+        if not by_method:
             continue
-        measured = {row.method for row in rows}
-        by_method = {
-            method: [row for row in rows if row.method == method] for method in setting.methods if method in measured
-        }
         means = {method: statistics.fmean(row.error for row in own) for method, own in by_method.items()}
         best = min(means.values())
-        errors[setting.name] = {method: round(mean - best, 5) for method, mean in means.items()}
-        arrays = {
-            method: [row.stage_error.relative_rmse for row in own if row.stage_error is not None]
-            for method, own in by_method.items()
+        tables["errors"][setting.name] = {method: round(mean - best, 5) for method, mean in means.items()}
+        tables["milliseconds"][setting.name] = {
+            method: round(statistics.fmean(row.milliseconds for row in own), 3) for method, own in by_method.items()
         }
-        stage_errors[setting.name] = {method: round(statistics.fmean(own), 5) for method, own in arrays.items() if own}
-        kept = {row.method for row in rows if not row.dominated}
-        dominated[setting.name] = [method for method in by_method if method not in kept]
-    return {
-        "program": PROGRAM,
-        "made": _made(reports, device) | {"base": BASE.name},
-        "errors": errors,
-        "stage_errors": stage_errors,
-        "dominated": {setting: methods for setting, methods in dominated.items() if methods},
-    }
+        beaten = [method for method, own in by_method.items() if all(row.dominated for row in own)]
+        tables["dominated"] |= {setting.name: beaten} if beaten else {}
+    made = _made(reports, device) | {"base": BASE.name}
+    return {"program": PROGRAM, "made": made, "presets": _presets(reports), **tables}
 
 
 def make_preset_list(reports: Sequence[CaseReport], device: str) -> dict[str, Any]:
-    """FLIP per changed pixel of every preset's whole picture, by case."""
+    """Return error and milliseconds of every preset's whole frames, by case."""
+    return {"program": PROGRAM, "made": _made(reports, device), "presets": _presets(reports)}
+
+
+def _presets(reports: Sequence[CaseReport]) -> dict[str, dict[str, dict[str, float]]]:
     return {
-        "program": PROGRAM,
-        "made": _made(reports, device),
-        "errors": {
-            report.case.name: {whole.label: round(whole.flip, 4) for whole in report.wholes if whole.label in PRESETS}
-            for report in reports
-            if report.wholes
-        },
+        report.case.name: {
+            whole.label: {"error": round(whole.flip, 4), "ms": round(whole.milliseconds, 3)}
+            for whole in report.wholes
+            if whole.label in PRESETS
+        }
+        for report in reports
+        if report.wholes
     }
 
 
 def _made(reports: Sequence[CaseReport], device: str) -> dict[str, Any]:
-    """Of what a list was made."""
+    """Return the circumstances in which a table was made."""
     return {
         "by": f"python -m warp_ar.tradeoff {' '.join(report.case.name for report in reports)}",
         "device": device_name(device),
         "warp": wp.__version__,
+        "commit": commit(),
         "against": "truth" if all(report.case.truth for report in reports) else "the last method where no truth is",
     }
 
 
+@functools.cache
+def commit() -> str:
+    """Return the short hash of the checkout, with a + where it has uncommitted changes; ``unknown`` outside one.
+
+    ``WARP_AR_COMMIT`` says it where the files were taken without their history.
+    """
+    if "WARP_AR_COMMIT" in os.environ:
+        return os.environ["WARP_AR_COMMIT"]
+    command = ["git", "describe", "--always", "--dirty=+"]
+    try:
+        out = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return out.stdout.strip()
+
+
 def device_name(alias: str) -> str:
-    """The device as a person would name it; for a CPU with the cores that this process may use."""
+    """Return the device as a person would name it; for a CPU with the cores that this process may use."""
     device = wp.get_device(alias)
     if not device.is_cpu:
         return str(device.name)
     model = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")
     if info.is_file():
-        names = [
-            line.partition(":")[2].strip() for line in info.read_text().splitlines() if line.startswith("model name")
-        ]
-        model = names[0] if names else model
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return f"{model}, {cores} cores"
+        lines = info.read_text().splitlines()
+        model = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), model)
+    return f"{model}, {usable_cores()} cores"
 
 
 def print_report(report: CaseReport, console: Console) -> None:
-    """The tables of one case."""
+    """Print the tables of one case."""
     against = "the truth" if report.case.truth else "the last method"
-    table = Table(title=f"{report.case.name}: every method, FLIP against {against}")
-    for column in ("setting", "method"):
-        table.add_column(column)
-    for column in ("ms", "rel. RMSE", "worst", "drift", "FLIP", "error"):
-        table.add_column(column, justify="right")
-    table.add_column("")
+    rows = []
     for _, group in itertools.groupby(report.rows, lambda row: row.setting):
         for position, row in enumerate(group):
-            error = row.stage_error
-            numbers = (
-                ("", "", "")
-                if error is None
-                else (f"{error.relative_rmse:.2%}", f"{error.worst:.2f}", f"{error.energy_drift:+.2%}")
-            )
-            table.add_row(
-                row.setting if position == 0 else "",
-                row.method,
-                f"{row.milliseconds:.3f}",
-                *numbers,
-                f"{row.flip:.4f}",
-                f"{row.error:.4f}",
-                "dominated" if row.dominated else "",
-                style="dim" if row.dominated else "",
-            )
-        table.add_section()
-    if report.rows:
-        console.print(table)
-    table = Table(title=f"{report.case.name}: as a whole")
-    table.add_column("quality")
-    for column in ("ms", "over paper's", "FLIP"):
-        table.add_column(column, justify="right")
-    for whole in report.wholes:
-        table.add_row(whole.label, f"{whole.milliseconds:.2f}", f"{whole.over_paper:.2f}", f"{whole.flip:.4f}")
+            numbers = f"{row.milliseconds:.3f}", f"{row.flip:.4f}", f"{row.error:.4f}"
+            rows.append(("" if position else row.setting, row.method, *numbers, "dominated" if row.dominated else ""))
+    if rows:
+        head = ("setting", "method", "ms more", "FLIP", "error", "")
+        print_table(console, f"{report.case.name}: every method, FLIP against {against}", head, rows, left=2)
+    wholes = [
+        (whole.label, f"{whole.milliseconds:.2f}", f"{whole.over_paper:.2f}", f"{whole.flip:.4f}")
+        for whole in report.wholes
+    ]
+    print_table(console, f"{report.case.name}: as a whole", ("quality", "ms", "over paper's", "FLIP"), wholes)
+
+
+def print_table(
+    console: Console, title: str, head: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1
+) -> None:
+    """Print a table whose first columns are words."""
+    table = Table(title=title)
+    for index, column in enumerate(head):
+        table.add_column(column, justify="left" if index < left else "right")
+    for row in rows:
+        table.add_row(*row)
     console.print(table)
 
 
 def records(report: CaseReport, device: str) -> Iterator[dict[str, Any]]:
-    """One plain record per method and per whole, ready for JSON lines."""
+    """Yield one plain record per method and per whole, ready for JSON lines."""
     signed = {"program": PROGRAM}  # first, as a file is known by its first key
     common = {"device": device_name(device), "warp": wp.__version__}
     for row in report.rows:
-        error = {} if row.stage_error is None else dataclasses.asdict(row.stage_error)
-        plain = {key: value for key, value in dataclasses.asdict(row).items() if key != "stage_error"}
-        yield {**signed, "kind": "method", **plain, **error, **common}
+        yield {**signed, "kind": "method", **dataclasses.asdict(row), **common}
     for whole in report.wholes:
         yield {
             **signed,

@@ -6,12 +6,13 @@ a sphere before the camera, three in all, so that the ellipse that a wide lens m
 
 How far it may be off is told by leaving out one sector of the rim after the other (a delete-a-group jackknife): what
 spoils a rim, a stand, a band of light, a shadow, spoils neighbouring pieces alike, so single pieces must not count as
-independent.
+independent. Where a model of both sides of the rim and plain steps differ, that is uncertainty as well.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Sequence
 
@@ -31,7 +32,7 @@ from warp_ar.ball.ball_rim import (
 )
 from warp_ar.errors import UsageError
 from warp_ar.scene import Camera
-from warp_ar.scene.pixel_rays import undistorted
+from warp_ar.scene.pixel_rays import project, undistorted
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -58,6 +59,8 @@ CERTAIN = 9.0
 """Evidence from which on no further circle is looked at, as most pictures of a ball have it and few others."""
 LEAST_EVIDENCE = 6.0
 """Evidence below which there is no ball. From here to ``CERTAIN`` a person should look: most are right."""
+UNSURE = 0.02
+"""Share of the radius by which a doubtless outline's place and radius may be off, one standard deviation."""
 DARK = 6.0
 """Codes below which a lifted picture is no logarithm any more: there is noise."""
 LARGEST_RADIUS = 700.0
@@ -97,13 +100,14 @@ class BallOutline:
     sphere: tuple[float, float, float]
     """The ball's centre in the camera's frame over its radius."""
     evidence: float = math.inf
-    """How much looks like a mirror ball, where the whole picture was searched; else infinite."""
+    """Likeness to a mirror ball, where the whole picture was searched; else infinite."""
 
     @property
     def is_doubtful(self) -> bool:
-        """Whether something else may have been taken for the ball: most such outlines are right, but not all."""
+        """Return whether something else may have been taken for the ball: most such outlines are right, but not all."""
         dim = self.support < DIM_SUPPORT or self.radius < TINY
-        return math.isfinite(self.evidence) and (self.evidence < CERTAIN or dim)
+        searched = math.isfinite(self.evidence) and (self.evidence < CERTAIN or dim)
+        return searched or max(self.deviation) > UNSURE * self.radius
 
     @property
     def radius(self) -> float:
@@ -133,7 +137,7 @@ def silhouette(camera: Camera, sphere: Array, count: int = PIECES) -> tuple[Arra
 
 
 def _is_before(spheres: Array) -> NDArray[np.bool_]:
-    """Which spheres (m, 3) are wholly before the camera."""
+    """Return which spheres (m, 3) are wholly before the camera."""
     return np.asarray((np.linalg.norm(spheres, axis=1) > 1.0) & (spheres[:, 2] > 1.0))
 
 
@@ -150,17 +154,11 @@ def silhouettes(camera: Camera, spheres: Array, count: int = PIECES) -> tuple[Ar
     spokes = np.cos(angle) * u[:, None] + np.sin(angle) * np.cross(n, u)[:, None]
     # Rays that touch the ball touch it on a circle: centre c - n / d, radius sqrt(1 - 1 / d^2).
     rim = (spheres - n / d)[:, None] + np.sqrt(1.0 - 1.0 / (d * d))[:, None] * spokes
-    zero = np.zeros(3)
-    flat = cv2.projectPoints(rim.reshape(-1, 3), zero, zero, camera.matrix(), np.array(camera.distortion))[0]
-    pixels = flat.reshape(len(spheres), count, 2)
-    tangent = np.empty_like(pixels)
-    tangent[:, 1:-1] = pixels[:, 2:] - pixels[:, :-2]
-    tangent[:, 0], tangent[:, -1] = pixels[:, 1] - pixels[:, -1], pixels[:, 0] - pixels[:, -2]
+    pixels = project(camera, rim.reshape(-1, 3)).reshape(len(spheres), count, 2)
+    # The rim turns from x to y, about the axis away from the camera: right of its way is outward.
+    tangent = np.roll(pixels, -1, 1) - np.roll(pixels, 1, 1)
     normal = np.stack([tangent[..., 1], -tangent[..., 0]], -1)
-    normal /= np.maximum(np.hypot(normal[..., 0], normal[..., 1]), 1e-9)[..., None]
-    out = pixels - pixels.mean(1, keepdims=True)
-    sign = np.sign(out[..., 0] * normal[..., 0] + out[..., 1] * normal[..., 1])
-    return pixels, normal * sign[..., None]
+    return pixels, normal / np.maximum(np.hypot(normal[..., 0], normal[..., 1]), 1e-9)[..., None]
 
 
 def sphere_of_circle(camera: Camera, x: float, y: float, radius: float) -> Array:
@@ -213,12 +211,8 @@ class _Fit:
         return (evidence or self.evidence).totals(self.shifts(moves))
 
     def spheres(self, moves: Array) -> Array:
-        """Spheres (m, 3) of moves (m, 3)."""
+        """Spheres (m, 3) of moves (m, 3), or the sphere (3,) of one."""
         return np.asarray(self.base + moves @ self.steps.T)
-
-    def sphere(self, move: Array) -> Array:
-        """The sphere of one move (3,)."""
-        return np.asarray(self.base + self.steps @ move)
 
 
 def _reduced(image: Image, camera: Camera, share: float) -> tuple[Image, Camera]:
@@ -255,7 +249,7 @@ def _search(image: Image, camera: Camera, sphere: Array, shift: float, step: flo
     moves = np.stack(np.meshgrid(grid, grid, grid), -1).reshape(-1, 3)
     chosen = _apart(moves, costs(moves), 2.5 * step)
     found = [descend(costs, moves[k], 0.5 * step, 0.2) for k in chosen]
-    return fit.sphere(min(found, key=lambda item: item[1])[0])
+    return fit.spheres(min(found, key=lambda item: item[1])[0])
 
 
 def _apart(places: Array, costs: Array, distance: float) -> list[int]:
@@ -296,37 +290,31 @@ def refine_outline(image: Image, camera: Camera, sphere: Array, largest: float =
     image, camera, corner = _window(image, camera, sphere)
     radius = _radius(camera, sphere)
     share, finest = min(1.0, COARSE_RADIUS / radius), min(1.0, largest / radius)
-    while share < finest:
-        share = min(2.0 * share, finest)
-        picture, view = _reduced(image, camera, share)
-        sphere = _search(picture, view, sphere, 2.0, 1.0)
-    picture, view = _reduced(image, camera, finest)
-    if radius <= COARSE_RADIUS:
+    for octave in range(max(math.ceil(math.log2(finest / share)), 1)):
+        picture, view = _reduced(image, camera, min(2.0 ** (octave + 1) * share, finest))
         sphere = _search(picture, view, sphere, 2.0, 1.0)
     # A wider blur moves the rim inward by as much as it is wider: what the picture cannot tell apart is uncertainty.
     tried = []
     for blur in BLURS:
         fit = _Fit(picture, view, sphere, 1.5, blur)
         move, value = descend(fit.costs, np.zeros(3), 0.4, 0.02)
-        tried.append((value + fit.evidence.least, fit.shifts(move[None])[0], fit.sphere(move), blur))
-    least = min(item[0] for item in tried)
-    likely = [item for item in tried if item[0] < least + ALIKE]
-    unsure = np.std([item[1].mean() for item in likely])
+        tried.append((value + fit.evidence.least, move, blur))
+    least = min(cost for cost, _, _ in tried)
+    likely = [(move, blur) for cost, move, blur in tried if cost < least + ALIKE]
+    unsure = np.std([move[2] for move, _ in likely])
     # Once more about what was found, so that normals and window are those of the outline itself.
-    middle = likely[(len(likely) - 1) // 2]
-    fit = _Fit(picture, view, middle[2], 1.5, middle[3])
+    move, blur = likely[(len(likely) - 1) // 2]
+    fit = _Fit(picture, view, fit.spheres(move), 1.5, blur)
     move, _ = descend(fit.costs, np.zeros(3), 0.2, 0.01)
     sector = np.arange(PIECES) * SECTORS // PIECES
-
-    def without(k: int) -> Array:
-        evidence = fit.evidence.without(sector == k)
-        return descend(lambda moves: fit.costs(moves, evidence), move, 0.1, 0.01)[0]
-
-    left = np.stack([without(k) for k in range(SECTORS)])
+    rest = [functools.partial(fit.costs, evidence=fit.evidence.without(sector == k)) for k in range(SECTORS)]
+    left = np.stack([descend(costs, move, 0.1, 0.01)[0] for costs in rest])
     spread = np.sqrt((SECTORS - 1) / SECTORS * ((left - left.mean(0)) ** 2).sum(0)) + LEAST_DEVIATION
-    spread = np.hypot(spread, [0.0, 0.0, unsure]) / finest
-    steps = _Fit(picture, view, fit.sphere(move), 1.0).evidence
-    found = _describe(camera, fit.sphere(move), spread, steps.support(np.zeros(PIECES)))
+    # Where steps are, whatever lies on either side, is a second opinion: models that differ are uncertainty too.
+    steps = _Fit(picture, view, fit.spheres(move), 1.0)
+    other, _ = descend(steps.costs, np.zeros(3), 0.4, 0.02)
+    spread = np.sqrt(spread**2 + np.array([0.0, 0.0, unsure]) ** 2 + other**2) / finest
+    found = _describe(camera, fit.spheres(move), spread, steps.evidence.support(np.zeros(PIECES)))
     return dataclasses.replace(found, center=(found.center[0] + corner[0], found.center[1] + corner[1]))
 
 
@@ -385,6 +373,33 @@ def find_ball(
     camera = camera or far_camera(width, height)
     if rough is None:
         return _find_anywhere(image, camera)
+    start = _sphere_of_given(image, camera, rough)
+    outlines = []
+    for view in (image, lifted(image)):
+        outlines.append(refine_outline(view, camera, _coarse(view, camera, start, rough_error)))
+        if outlines[-1].support >= LEAST_SUPPORT:
+            return outlines[-1]
+    raise _unseen(max(outlines, key=lambda outline: outline.support), "give a circle that is nearer to the rim")
+
+
+def exact_outline(image: Image, camera: Camera, circle: Sequence[float]) -> BallOutline:
+    """Return the outline that a circle (column, row, radius in pixels) is, as it was given.
+
+    Raises:
+        UsageError: There is no such ball before the camera.
+    """
+    sphere = _sphere_of_given(image, camera, circle)
+    steps = _Fit(image, camera, sphere, 1.0).evidence
+    return _describe(camera, sphere, np.zeros(3), steps.support(np.zeros(PIECES)))
+
+
+def _sphere_of_given(image: Image, camera: Camera, rough: Sequence[float]) -> Array:
+    """Return the sphere of a circle that was given.
+
+    Raises:
+        UsageError: The circle is none, or lies outside of the picture.
+    """
+    height, width = image.shape[:2]
     if len(rough) != 3 or not all(map(math.isfinite, rough)) or rough[2] < 4.0:
         raise UsageError(
             f"ball {', '.join(f'{v:g}' for v in rough)}: expected column, row and radius (4 or more) in pixels"
@@ -395,12 +410,7 @@ def find_ball(
     start = sphere_of_circle(camera, *rough)
     if start[2] <= 1.0:
         raise UsageError("no ball is before the camera at this circle; expected one that is nearer to the axis")
-    outlines = []
-    for view in (image, lifted(image)):
-        outlines.append(refine_outline(view, camera, _coarse(view, camera, start, rough_error)))
-        if outlines[-1].support >= LEAST_SUPPORT:
-            return outlines[-1]
-    raise _unseen(max(outlines, key=lambda outline: outline.support), "give a circle that is nearer to the rim")
+    return start
 
 
 def _find_anywhere(image: Image, camera: Camera) -> BallOutline:
@@ -413,11 +423,11 @@ def _find_anywhere(image: Image, camera: Camera) -> BallOutline:
     tries = [(lift, start) for lift in (False, True) for start in starts if start[2] > 1.0]
     pictures = small, lifted(small)
     # What is worth a search is told by what the proposed circle itself shows: a mirrored edge may be one inside it.
-    tries = sorted(tries, key=lambda item: -_evidence(pictures[item[0]], view, item[1]))[:SEARCHES]
+    tries = sorted(tries, key=lambda item: -rim_strength(pictures[item[0]], view, item[1]))[:SEARCHES]
     best, told = None, -math.inf
     for lift, start in tries:
         sphere = _coarse(pictures[lift], view, start, ROUGH_ERROR)
-        strength = _evidence(pictures[lift], view, sphere)
+        strength = rim_strength(pictures[lift], view, sphere)
         if strength > told:
             best, told = (lift, sphere), strength
         if told > CERTAIN:
@@ -455,54 +465,29 @@ def _unseen(outline: BallOutline, ask: str) -> UsageError:
     )
 
 
-def outline_strength(image: Image, camera: Camera, outline: BallOutline) -> float:
-    """How much of a mirror ball is seen at an outline; compares outlines of one picture."""
-    return _strength(image, camera, np.array(outline.sphere))
-
-
-def _strength(image: Image, camera: Camera, sphere: Array) -> float:
-    """How much of a mirror ball is seen at a sphere: steps at its rim, compression inside, more for larger balls."""
-    rim = _rim(image, camera, sphere)
-    return -math.inf if rim is None else (rim.steps + COMPRESSION * rim.compression) * rim.known * rim.size
-
-
-def _evidence(image: Image, camera: Camera, sphere: Array) -> float:
-    """The same where a whole picture is searched: what is round is often no ball, and balls are of all sizes.
+def rim_strength(image: Image, camera: Camera, sphere: Array) -> float:
+    """Return how much of a ball is seen at a sphere: steps at its rim, compression inside, more for larger ones.
 
     A plate, a lid or a mirrored horizon has as sharp a rim as a ball. Only in a ball is what is inside squeezed toward
     it, so that counts twice.
+
+    Args:
+        image: 8-bit RGB, in which the ball is looked at ``COARSE_RADIUS`` pixels large.
+        camera: It took the picture.
+        sphere: Centre over radius, (3,), in the camera's frame.
     """
-    rim = _rim(image, camera, sphere)
-    return -math.inf if rim is None else (rim.steps + 2.0 * rim.compression) * rim.known * (1.0 + 0.1 * rim.size)
-
-
-@dataclasses.dataclass(frozen=True)
-class _Rim:
-    """What is seen at a sphere's rim."""
-
-    steps: float
-    """How much better than a smooth curve a step explains the pieces of the rim, mean of at most ``MOST_COST`` each."""
-    compression: float
-    """Of gradients, by ``radial_compression``."""
-    known: float
-    """Share of the rim that is in the picture."""
-    size: float
-    """Logarithm of the radius in pixels."""
-
-
-def _rim(image: Image, camera: Camera, sphere: Array) -> _Rim | None:
-    """What a picture whose ball is ``COARSE_RADIUS`` pixels shows of a rim; None where it is not in the picture."""
     radius = _radius(camera, sphere)
     if not math.isfinite(radius):
-        return None
+        return -math.inf
     small, view = _reduced(image, camera, COARSE_RADIUS / radius)
     fit = _Fit(small, view, sphere, 1.0)
     if not fit.evidence.known.any():
-        return None
-    outline = (fit.points[None], fit.normals[None], np.array([fit.radius]))
-    compression = float(radial_compression(gradients(small), *outline)[0])
+        return -math.inf
+    compression = radial_compression(gradients(small), fit.points[None], fit.normals[None], np.array([fit.radius]))
+    # The gain of a step over a smooth curve in explaining the pieces of the rim.
     steps = MOST_COST - float(fit.costs(np.zeros((1, 3)))[0])
-    return _Rim(steps, compression, float(fit.evidence.known.mean()), math.log(max(radius, 4.0)))
+    size = 1.0 + 0.1 * math.log(max(radius, 4.0))
+    return (steps + 2.0 * float(compression[0])) * float(fit.evidence.known.mean()) * size
 
 
 _LIFT = np.round(255 * np.log1p(np.arange(256) / DARK) / np.log1p(255 / DARK)).astype(np.uint8)

@@ -14,11 +14,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from warp_ar.ball.ball import fit_ball
-from warp_ar.ball.ball_outline import outline_search
-from warp_ar.ball.ball_radius import DEVIATION, mirrored_radius
-from warp_ar.ball.ball_solve import BallSolution, ground_below, solve_ball
-from warp_ar.ball.ball_views import agreeing_outlines
+from warp_ar.ball.ball import DEVIATION, fit_ball, mirrored_radius
+from warp_ar.ball.ball_solve import BallSolution, agreeing_outlines, solve_ball, standing_ground
 from warp_ar.ball.ground_seen import ground_is_seen
 from warp_ar.errors import UsageError
 from warp_ar.scene import Camera, Pose, Probe, Proxy
@@ -39,10 +36,6 @@ DOUBT = 0.025
 """Share of the radius by which outlines may differ from what was typed before the mirrored receiver is asked."""
 STRAY = 1.0 / 3.0
 """Share of the given radius beyond which outlines are not those that were looked for, but of rings on the card."""
-LEAST_CONTRAST = 0.15
-"""Contrast across an outline below which there is none: the bundled clips have 0.32 to 0.55, a bare card 0.08."""
-SEARCH_DEVIATION = 0.0015
-"""Metres: standard deviation of a centre that only a single outline's contrast tells."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,11 +51,11 @@ class BallMeasurement:
     radius_deviation: float | None
     """Its standard deviation; None: it was assumed."""
     how: str
-    """What told, in words."""
+    """Source of the numbers, in words."""
 
     @property
     def is_usable(self) -> bool:
-        """Whether radius and centre are known well enough to be put into a scene."""
+        """Return whether radius and centre are known well enough to be put into a scene."""
         return max(2 * (self.radius_deviation or 0.0), self.deviation) <= MOST * self.radius
 
 
@@ -91,16 +84,15 @@ def measure_ball(
         UsageError: The ball is in too few frames, or they show what it should stand on instead.
     """
     few = views[:: -(-len(views) // OUTLINES)]
-    ground = ground_below(probe, proxies)
-    standing = ground is not None and probe.center[2] - probe.radius - ground < 0.3 * probe.radius
-    ground = ground if standing else None
-    if ground is not None and ground_is_seen(few, camera, probe, ground):
-        raise UsageError(_not_seen(probe))
-    how = "by {} outlines"
+    ground = standing_ground(probe, proxies)
+    is_bare = ground is not None and ground_is_seen(few, camera, probe, ground)
     tell("the ball's outlines")
-    outlines = agreeing_outlines(few, camera, probe, ground)
+    outlines = [] if is_bare else agreeing_outlines(few, camera, probe, ground)
     if not outlines:
-        return _measure_by_contrast(views, camera, probe)
+        raise UsageError(
+            f"no mirror ball is seen where [probe] center = {[round(x, 4) for x in probe.center]} has it; stand it on "
+            "the card's cross, have all of it in the picture, and check [probe]"
+        )
     solution = solve_ball(outlines, camera, probe, ground)
     if abs(solution.radius - probe.radius) > STRAY * probe.radius:
         raise UsageError(
@@ -110,7 +102,7 @@ def measure_ball(
     assumed = keep_radius or solution.radius_assumed
     radius = probe.radius if assumed else solution.radius
     deviation = ASSUMED * radius if assumed else solution.radius_deviation
-    own = max(solution.center_deviation)
+    own, how = max(solution.center_deviation), f"by {len(outlines)} outlines"
     if not assumed and ground is not None and _is_doubtful(solution, probe, len(few)):
         tell("its radius, by what it mirrors")
         mirrored = mirrored_radius(few, camera, probe, proxies, others)
@@ -121,62 +113,29 @@ def measure_ball(
             how = "by the desk in it"
     tell("its place, by what it mirrors")
     told = None if assumed else deviation
-    by_outlines = BallMeasurement(solution.center, own, radius, told, how.format(len(outlines)))
+    by_outlines = BallMeasurement(solution.center, own, radius, told, how)
     found = dataclasses.replace(probe, center=solution.center, radius=radius)
-    return _refine_center(by_outlines, few, camera, found, proxies, others, SLOPE * deviation)
-
-
-def _measure_by_contrast(views: Sequence[tuple[Image, Pose]], camera: Camera, probe: Probe) -> BallMeasurement:
-    """Where no outline is found: the place at which the contrast across one is largest."""
-    report = outline_search(views, camera, probe.center, probe.radius)
-    if report.contrast < LEAST_CONTRAST:
-        raise UsageError(_not_seen(probe))
-    return BallMeasurement(
-        report.center, SEARCH_DEVIATION, probe.radius, None, "by its rim's contrast, height as given"
-    )
-
-
-def _refine_center(
-    measured: BallMeasurement,
-    views: Sequence[tuple[Image, Pose]],
-    camera: Camera,
-    probe: Probe,
-    proxies: Sequence[Proxy],
-    others: Sequence[Probe],
-    by_radius: float,
-) -> BallMeasurement:
-    """With the centre that the mirrored receiver tells, where that is surer; ``by_radius``: what its radius adds."""
-    try:
-        better = fit_ball(views, camera, probe, proxies, others, search=SEARCH)
-    except UsageError:
-        return measured
+    better = fit_ball(few, camera, found, proxies, others, search=SEARCH)
     if better is None or not better.is_good:
-        return measured
-    spread = math.hypot(better.deviation, by_radius)
+        return by_outlines
+    spread = math.hypot(better.deviation, SLOPE * deviation)
     x, y, z = (float(value) for value in better.center)
     # Both are right within their intervals, or the mirrored receiver has been confused with another part of it.
-    apart = math.dist((x, y, z), measured.center)
-    if apart < 3 * math.hypot(spread, measured.deviation) and spread < measured.deviation:
-        return dataclasses.replace(measured, center=(x, y, z), deviation=spread, how="by the desk in it")
-    return measured
-
-
-def _not_seen(probe: Probe) -> str:
-    return (
-        f"no mirror ball is seen where [probe] center = {[round(x, 4) for x in probe.center]} has it; stand it on the "
-        "card's cross, have all of it in the picture, and check [probe]"
-    )
+    apart = math.dist((x, y, z), by_outlines.center)
+    if apart < 3 * math.hypot(spread, own) and spread < own:
+        return dataclasses.replace(by_outlines, center=(x, y, z), deviation=spread, how="by the desk in it")
+    return by_outlines
 
 
 def _is_doubtful(solution: BallSolution, probe: Probe, frames: int) -> bool:
-    """Whether outlines are worth a second opinion: some of them are missing, or the ball is not what was given."""
+    """Return whether outlines need a second opinion: some are missing, or the ball is not what was given."""
     allowed = DOUBT * probe.radius
     moved = max(abs(a - b) for a, b in zip(solution.center[:2], probe.center[:2], strict=True))
     return len(solution.outlines) < frames or abs(solution.radius - probe.radius) > allowed or moved > 2 * allowed
 
 
 def _contradicts(solution: BallSolution, mirrored: Probe) -> bool:
-    """Whether a ball that explains what is mirrored cannot be the one of the outlines, or is better known."""
+    """Return whether a ball that explains what is mirrored cannot be the one of the outlines, or is better known."""
     off = DEVIATION * mirrored.radius
     if solution.radius_deviation > 1.5 * off:
         return True

@@ -21,16 +21,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from warp_ar.kernels.color import decode_table
 from warp_ar.scene import Camera, Scene
 from warp_ar.scene.geometry import rotation_matrix
+from warp_ar.scene.pixel_rays import project
 from warp_ar.scene.pose import Pose
 from warp_ar.sources.deep_frame import Plate
-from warp_ar.tracking.drift import codes_around, still_points
+from warp_ar.tracking.drift import codes_around, still_points, under_boxes
 
 Array = NDArray[np.float64]
 
@@ -78,20 +78,10 @@ class BallCover:
             camera: Of the frames.
         """
         self.watches = (camera, scene.marker, scene.proxies, scene.probes)
-        """What frames are of: the same frames tell those that watch the same, the same."""
+        """Things that frames are of: the same frames tell those that watch the same, the same."""
         self._camera = camera
         self._table = decode_table(camera.transfer).astype(np.float64)
         self._points = np.concatenate([still_points(scene)[0][::EVERY], _points_around(scene)])
-        # A cell is the mean of four codes, of which there are so few that all are looked up.
-        means: Array = 0.25 * np.arange(4 * 255 + 1, dtype=np.float64)
-        self._of_sums = np.stack([self._radiance(means, c) for c in range(3)]).ravel()
-        self._logarithms: Array = np.zeros(0)
-        self._gain: Array | None = None
-        self._cell_row, self._cell_column = _cells_in_disc()
-        # Of four samples of each cell, the place among all of a disc's, (4, cells).
-        side = 2 * CELLS
-        first = 2 * self._cell_row * side + 2 * self._cell_column
-        self._samples = first + np.array([[0], [side], [1], [side + 1]])
         self.forget()
 
     def forget(self) -> None:
@@ -102,7 +92,7 @@ class BallCover:
         self._covered = False
 
     def rests(self, seconds: float) -> bool:
-        """Whether the last look was so short a time ago that what it found still holds.
+        """Return whether the last look was so short a time ago that what it found still holds.
 
         Args:
             seconds: When the frame was taken.
@@ -111,7 +101,7 @@ class BallCover:
 
     @property
     def is_covered(self) -> bool:
-        """Whether a ball was covered at the last look."""
+        """Return whether a ball was covered at the last look."""
         return self._covered
 
     def observe(
@@ -138,39 +128,30 @@ class BallCover:
         """
         own = [self._cells(image, disc, gain, plate) for disc in discs]
         known = self._shown is not None and len(own) == len(self._discs)
-        changes = list(map(np.subtract, own, self._discs)) if known else []
-        rests = known and not self._covered and not any(map(_has_changed, changes))
-        if rests and abs(seconds - self._looked) < LOOK_SECONDS:
-            self._follow_discs(own, changes, seconds)
-            return False
-        shown = self._logarithm(codes_around(image, self._camera, pose, self._points, plate), gain)
-        if not known:
-            self._shown, self._discs, self._covered = shown, own, False
-            self._last = self._looked = seconds
-            return False
-        was = self._covered
-        self._covered = not rests and self._is_covered(shown, changes, discs, pose)
-        if self._covered and not was:
-            self._since = seconds
-        if self._covered and abs(seconds - self._since) > PATIENCE:
-            self._shown, self._discs, self._covered = shown, own, False
+        changed = [known and _has_changed(now - before) for now, before in zip(own, self._discs, strict=False)]
+        rests = known and not self._covered and not any(changed)
+        if not rests or abs(seconds - self._looked) >= LOOK_SECONDS:
+            shown = self._logarithm(codes_around(image, self._camera, pose, self._points, plate), gain)
+            covered = known and not rests and self._is_covered(shown, changed, discs, pose)
+            if covered and not self._covered:
+                self._since = seconds
+            stays = covered and abs(seconds - self._since) > PATIENCE
+            if stays or not known:
+                self._shown, self._discs = shown, own
+            self._covered = covered and not stays
+            if not self._covered:
+                assert self._shown is not None
+                self._shown = _follow(self._shown, shown, seconds - self._looked)
+            self._looked = seconds
         if not self._covered:
-            assert self._shown is not None
-            self._shown = _follow(self._shown, shown, shown - self._shown, _rate(seconds - self._looked))
-            changes = list(map(np.subtract, own, self._discs))
-            self._follow_discs(own, changes, seconds)
-        self._last = self._looked = seconds
+            self._discs = [_follow(*disc, seconds - self._last) for disc in zip(self._discs, own, strict=True)]
+        self._last = seconds
         return self._covered
 
-    def _follow_discs(self, own: list[Array], changes: list[Array], seconds: float) -> None:
-        rate = _rate(seconds - self._last)
-        self._discs = [_follow(*disc, rate) for disc in zip(self._discs, own, changes, strict=True)]
-        self._last = seconds
-
     def _is_covered(
-        self, shown: Array, changes: list[Array], discs: Sequence[tuple[float, float, float]], pose: Pose
+        self, shown: Array, changed: list[bool], discs: Sequence[tuple[float, float, float]], pose: Pose
     ) -> bool:
-        """Whether a ball is, by what points show now and are remembered to show, and what of discs has changed."""
+        """Return whether a ball is covered, by what points show now and showed before, and which discs changed."""
         assert self._shown is not None
         change = shown - self._shown
         seen = ~np.isnan(change).any(axis=1)
@@ -182,107 +163,62 @@ class BallCover:
         is_other = np.abs(change[seen] - median).max(axis=1) > CHANGED
         if not is_other.any():
             return False
-        local = self._points[seen] @ pose.rotation.T + pose.translation
-        zero = np.zeros(3)
-        at = cv2.projectPoints(local, zero, zero, self._camera.matrix(), np.array(self._camera.distortion))[0][:, 0]
-        for (x, y, radius), of_disc in zip(discs, changes, strict=True):
+        at = project(self._camera, pose.apply(self._points[seen]))
+        for (x, y, radius), has_changed in zip(discs, changed, strict=True):
             away = np.hypot(at[:, 0] - x, at[:, 1] - y) / radius
             near = (away > BESIDE[0]) & (away < BESIDE[1])
-            if near.sum() < LEAST_NEAR or is_other[near].mean() < NEAR_SHARE:
-                continue
-            if _has_changed(of_disc):
+            if has_changed and near.sum() >= LEAST_NEAR and is_other[near].mean() >= NEAR_SHARE:
                 return True
         return False
 
     def _cells(
         self, image: NDArray[np.uint8], disc: tuple[float, float, float], gain: Array, plate: Plate | None = None
     ) -> Array:
-        """Logarithm of what a disc's cells show, four samples of each, NaN beyond the picture, (3, cells)."""
+        """Logarithm of what a disc's cells show, four samples of each, NaN beyond the picture, (cells, 3)."""
         picture: NDArray[Any] = image if plate is None else plate.picture
         x, y, radius = disc
         radius = max(radius, 1.0)
         if not (abs(x) < 1e5 and abs(y) < 1e5 and radius < 1e4):
-            return np.full((3, len(self._cell_row)), np.nan)
-        # Half a cell of blur by sampling four places in each.
-        corner = np.array([[x - radius], [y - radius]])
-        columns, rows = np.rint(corner + 2.0 * radius / CELLS * _STEPS).astype(np.int64)
-        height, width = picture.shape[:2]
-        seen = None
-        if rows[0] < 0 or columns[0] < 0 or rows[-1] >= height or columns[-1] >= width:
-            seen = _pairs((rows >= 0) & (rows < height))[self._cell_row]
-            seen &= _pairs((columns >= 0) & (columns < width))[self._cell_column]
-            rows, columns = rows.clip(0, height - 1), columns.clip(0, width - 1)
-        at = ((3 * width * rows)[:, None] + 3 * columns).take(self._samples)
-        samples = picture.reshape(-1).take(at + _CHANNEL)
-        if samples.dtype.kind == "f":
-            samples = samples.astype(np.float64)
-            sums: NDArray[Any] = (samples[:, 0] + samples[:, 1]) + (samples[:, 2] + samples[:, 3])
+            return np.full((_SAMPLES.shape[1], 3), np.nan)
+        at = np.rint(np.array([x, y]) + radius * _SAMPLES).astype(np.int64)
+        last = np.array(picture.shape[1::-1]) - 1
+        beyond = ((at < 0) | (at > last)).any((0, 2))
+        columns, rows = np.moveaxis(at.clip(0, last), 2, 0)
+        values = picture[rows, columns].astype(np.float64).mean(0)
+        if picture.dtype.kind == "f":
+            found = np.log(np.maximum(values, 0.0) / gain + DARK)
         else:
-            sums = samples.sum(axis=1, dtype=np.int64)
-        if plate is None:
-            found: Array = self._table_of_sums(gain).take(sums + _CHANNELS)
-        elif picture.dtype == np.uint16:
-            found = self._logarithm(sums.T / (4.0 * 257.0), gain).T
-        else:
-            found = np.log(np.maximum(0.25 * sums.T, 0.0) / gain + DARK).T
-        if seen is not None:
-            found[:, ~seen] = np.nan
-        return found
-
-    def _table_of_sums(self, gain: Array) -> Array:
-        """Logarithm of the radiance of all sums of four codes at a gain, channel after channel."""
-        if self._gain is None or (self._gain != gain).any():
-            self._gain = np.array(gain)
-            self._logarithms = np.log(self._of_sums.reshape(3, -1) / self._gain[:, None] + DARK).ravel()
-        return self._logarithms
-
-    def _radiance(self, codes: Array, channel: int) -> Array:
-        return np.asarray(np.interp(codes, np.arange(256), self._table[:, channel]))
+            found = self._logarithm(values if picture.dtype == np.uint8 else values / 257.0, gain)
+        found[beyond] = np.nan
+        return np.asarray(found)
 
     def _logarithm(self, codes: Array, gain: Array) -> Array:
         """Of the radiance that codes stand for at gain 1, (n, 3)."""
-        values = np.stack([self._radiance(codes[:, c], c) for c in range(3)], -1)
+        values = np.stack([np.interp(codes[:, c], np.arange(256), self._table[:, c]) for c in range(3)], -1)
         return np.asarray(np.log(values / gain + DARK))
 
 
-_STEPS = np.arange(2 * CELLS) * 0.5 + 0.25
-"""Where samples lie along a disc, in cells."""
-_CHANNEL = np.arange(3)[:, None, None]
-"""Where a channel's code lies in a pixel."""
-_CHANNELS = np.arange(3)[:, None] * (4 * 255 + 1)
-"""Where a channel's sums begin in a table of all."""
-
-
-def _cells_in_disc() -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows and columns of those cells of a square that lie in the disc."""
+def _samples_in_disc() -> Array:
+    """Four places of each cell of a square that lies in the disc, (4, cells, 2) in radii: half a cell of blur."""
     middle = 2.0 * (np.arange(CELLS) + 0.5) / CELLS - 1.0
     row, column = np.nonzero(np.hypot(middle, middle[:, None]) < 0.9)
-    return row, column
+    around = np.array([[-0.5, -0.5], [0.5, -0.5], [-0.5, 0.5], [0.5, 0.5]]) / CELLS
+    return np.stack([middle[column], middle[row]], -1) + around[:, None]
 
 
-def _pairs(inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Whether both samples of a cell are inside, along one side."""
-    return np.asarray(inside[::2] & inside[1::2])
-
-
-def _rate(seconds: float) -> float:
-    """Share by which what is remembered follows within so long."""
-    return float(1.0 - np.exp(-abs(seconds) / MEMORY))
+_SAMPLES = _samples_in_disc()
 
 
 def _has_changed(change: Array) -> bool:
-    """Whether a ball's disc shows something else, (3, cells); a cell that is not seen in both is as it was."""
-    most = np.abs(change).max(axis=0)
-    return bool(np.count_nonzero(most > CHANGED) / len(most) >= DISC_SHARE)
+    """Return whether a ball's disc shows something else, (cells, 3); a cell that is not seen in both is as it was."""
+    return bool((np.abs(change) > CHANGED).any(axis=1).mean() >= DISC_SHARE)
 
 
-def _follow(before: Array, now: Array, change: Array, rate: float) -> Array:
-    """What is remembered, drawn toward what is seen now, where that is seen; ``change`` is ``now - before``."""
-    followed = before + rate * change
-    if np.isnan(followed).any():
-        followed = np.where(np.isnan(before), now, followed)
-        followed = np.where(np.isnan(followed), before, followed)
-    return np.asarray(followed)
+def _follow(before: Array, now: Array, seconds: float) -> Array:
+    """Return what is remembered, drawn toward what is seen now, where that is seen, after so long."""
+    followed = before + (1.0 - np.exp(-abs(seconds) / MEMORY)) * (now - before)
+    followed = np.where(np.isnan(before), now, followed)
+    return np.asarray(np.where(np.isnan(followed), before, followed))
 
 
 def _points_around(scene: Scene) -> Array:
@@ -301,9 +237,5 @@ def _points_around(scene: Scene) -> Array:
             local = np.concatenate([middle + ratio * probe.radius * circle for ratio in RINGS])
             local = local[(np.abs(local) < 0.5 * np.array(plane.size)).all(axis=1)]
             points = at + np.column_stack([local, np.zeros(len(local))]) @ rotation.T
-            for box in scene.proxies:
-                if box.shape == "box" and box.marker is None:
-                    within = (points - np.array(box.at)) @ rotation_matrix(box.rotate)
-                    points = points[~(np.abs(within) < 0.5 * np.array(box.size) + 0.01).all(axis=1)]
-            found.append(points)
+            found.append(points[~under_boxes(scene, points)])
     return np.concatenate(found)

@@ -1,4 +1,4 @@
-"""How much of the light a mirror ball reflects, told by what is seen twice: directly, and mirrored in the ball.
+"""Share of light that a mirror ball reflects, told by what is seen twice: directly, and mirrored in the ball.
 
 A matt surface has one radiance wherever it is seen from. So where the ball mirrors a point of a modelled plane that the
 camera sees beside the ball as well, the ball's pixel over that point's own is the ball's reflectance:
@@ -15,15 +15,16 @@ each place: one half of the ball then says something else than the other.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, Final
+import math
+from typing import Final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from warp_ar.ball.surface_rays import dot, nearest_shape, shapes_of
 from warp_ar.scene import Camera, Pose, Probe, Proxy, Scene
-from warp_ar.scene.geometry import rotation_matrix
-from warp_ar.scene.pixel_rays import undistorted
+from warp_ar.scene.pixel_rays import project, undistorted
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -51,22 +52,24 @@ HALVES: Final = 0.15
 """Greatest difference of a logarithm between halves of the pixels: 0.11 at most on matt tables and the clips, 0.26 and
 more on three of four polished tables.
 """
+LEAST_DEVIATION: Final = 0.025
+"""Logarithm by which all of a ball is off together: its place and radius are."""
 REFLECTANCE: Final = 0.12
 """Logarithm by which a ball may reflect more or less than the scene says: another response than the camera's, or a
 radius that is 5 % off, moves what is measured by up to 0.09.
 """
-NEAR: Final = 1e-4
-"""Metres from which on a ray may meet something."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Reflected:
-    """What one picture says of a ball."""
+    """Statement of one picture about a ball."""
 
     reflectance: tuple[float, float, float]
     """RGB."""
     pixels: int
     """Pixels that say so."""
+    deviation: float = 0.0
+    """Standard deviation of the logarithm, by how far halves of the ball differ."""
 
 
 def measure_reflectance(
@@ -88,7 +91,7 @@ def measure_reflectance(
     mirrored, points = _mirrored_points(scene, camera, probe, pose)
     if len(points) < FEWEST:
         return None
-    direct = _pixels_of(camera, pose, points)
+    direct = project(camera, pose.apply(points))
     column, row = np.round(direct).astype(int).T
     own, other = image[mirrored[:, 1], mirrored[:, 0]], image[row, column]
     tells = ((own > CODES[0]) & (own < CODES[1]) & (other > CODES[0]) & (other < CODES[1])).all(axis=1)
@@ -102,10 +105,11 @@ def measure_reflectance(
     correlation = float(np.corrcoef(*both)[0, 1]) if min(np.ptp(part) for part in both) > 0.0 else 0.0
     if 1.4826 * float(np.median(off)) > SCATTER or correlation < ALIKE:
         return None
-    if difference_of_halves(ratio, mirrored[tells]) > HALVES:
+    halves = difference_of_halves(ratio, mirrored[tells])
+    if halves > HALVES:
         return None
     red, green, blue = (float(value) for value in np.exp(np.median(ratio, axis=0)))
-    return Reflected((red, green, blue), int(tells.sum()))
+    return Reflected((red, green, blue), int(tells.sum()), math.hypot(halves / 2.0, LEAST_DEVIATION))
 
 
 def _blurred(image: Image, table: NDArray[np.float32], places: Array) -> Array:
@@ -125,7 +129,7 @@ def _blurred(image: Image, table: NDArray[np.float32], places: Array) -> Array:
 
 
 def difference_of_halves(ratio: Array, pixels: NDArray[np.int64]) -> float:
-    """How far one half of the ball says something else than the other, in the channel in which it does most.
+    """Return how far one half of the ball says something else than the other, in the channel in which it does most.
 
     Args:
         ratio: Logarithms, (n, 3).
@@ -148,7 +152,7 @@ def _mirrored_points(scene: Scene, camera: Camera, probe: Probe, pose: Pose) -> 
     depth = float((pose.rotation @ center + pose.translation)[2])
     if depth <= radius:
         return nothing
-    middle = _pixels_of(camera, pose, center[None])[0]
+    middle = project(camera, pose.apply(center[None]))[0]
     reach = camera.fx * radius / (depth - radius)
     low = np.maximum(np.floor(middle - reach), 0).astype(int)
     high = np.minimum(np.ceil(middle + reach) + 1, (camera.width, camera.height)).astype(int)
@@ -161,7 +165,7 @@ def _mirrored_points(scene: Scene, camera: Camera, probe: Probe, pose: Pose) -> 
     within = along**2 - float((eye - center) @ (eye - center)) + radius**2
     hit = eye + (-along - np.sqrt(np.maximum(within, 0.0)))[:, None] * rays
     normal = (hit - center) / radius
-    facing = -_dot(normal, rays)
+    facing = -dot(normal, rays)
     met = (within > 0.0) & (facing > FACING)
     pixels, hit = pixels[met], hit[met]
     outward = rays[met] + 2.0 * facing[met, None] * normal[met]
@@ -172,13 +176,12 @@ def _mirrored_points(scene: Scene, camera: Camera, probe: Probe, pose: Pose) -> 
 
 
 def are_seen(scene: Scene, camera: Camera, probe: Probe, pose: Pose, points: Array) -> NDArray[np.bool_]:
-    """Whether the camera sees points of planes beside the ball, (n,)."""
+    """Return whether the camera sees points of planes beside the ball, (n,)."""
     eye = -pose.rotation.T @ pose.translation
-    ahead = (points @ pose.rotation.T + pose.translation)[:, 2] > NEAR
-    at = _pixels_of(camera, pose, np.where(ahead[:, None], points, np.array(probe.center, float)))
-    seen = ahead & (at > 1.0).all(axis=1) & (at < (camera.width - 2, camera.height - 2)).all(axis=1)
+    at = project(camera, pose.apply(points))
+    seen = (at > 1.0).all(axis=1) & (at < (camera.width - 2, camera.height - 2)).all(axis=1)  # NaN is not
     ray = points - eye
-    away, direction = np.sqrt(_dot(ray, ray)), _unit(ray)
+    away, direction = np.sqrt(dot(ray, ray)), _unit(ray)
     distance, is_matt = _nearest(scene.proxies, np.broadcast_to(eye, points.shape), direction)
     seen &= is_matt & (np.abs(distance - away) < 0.01 * away)
     for ball in scene.probes:
@@ -190,47 +193,19 @@ def are_seen(scene: Scene, camera: Camera, probe: Probe, pose: Pose, points: Arr
 
 
 def _nearest(proxies: tuple[Proxy, ...], origin: Array, rays: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Distance to what rays meet first, and whether that is a matt plane that is not met at a grazing angle, (n,).
+    """Return the distance to what rays meet first, and if that is a matt plane not met at a grazing angle, (n,).
 
     Meshes are left out: what they hide scatters.
     """
-    nearest, is_matt = np.full(len(rays), np.inf), np.zeros(len(rays), bool)
-    for proxy in proxies:
-        if proxy.shape == "mesh" or proxy.marker is not None:
-            continue
-        rotation = rotation_matrix(proxy.rotate)
-        start, ray = (origin - np.array(proxy.at)) @ rotation, rays @ rotation
-        inverse = 1.0 / np.where(np.abs(ray) < 1e-9, 1e-9, ray)
-        half = 0.5 * np.array(proxy.size, float)
-        if proxy.shape == "plane":
-            distance = -start[:, 2] * inverse[:, 2]
-            place = start[:, :2] + distance[:, None] * ray[:, :2]
-            met = (distance > NEAR) & (np.abs(place[:, 0]) < half[0]) & (np.abs(place[:, 1]) < half[1])
-            matt = (ray[:, 2] < -GRAZING) & (proxy.material is None)
-        else:
-            ends = (-half - start) * inverse, (half - start) * inverse
-            first, last = np.minimum(*ends).T, np.maximum(*ends).T
-            distance = np.maximum(np.maximum(first[0], first[1]), first[2])
-            met = (distance > NEAR) & (distance < np.minimum(np.minimum(last[0], last[1]), last[2]))
-            matt = np.zeros(len(rays), bool)
-        closer = met & (distance < nearest)
-        nearest[closer], is_matt[closer] = distance[closer], matt[closer]
-    return nearest, is_matt
-
-
-def _pixels_of(camera: Camera, pose: Pose, points: Array) -> Array:
-    """Return where points (n, 3) are in the picture, (n, 2)."""
-    if len(points) == 0:  # OpenCV projects no points to None
-        return np.zeros((0, 2))
-    zero: Any = np.zeros(3)
-    pixels, _ = cv2.projectPoints(pose.apply(points), zero, zero, camera.matrix(), np.array(camera.distortion))
-    return np.asarray(pixels.reshape(-1, 2), float)
+    known = [proxy for proxy in proxies if proxy.shape != "mesh" and proxy.marker is None]
+    shapes = shapes_of(known)
+    nearest, which = nearest_shape(shapes, origin, rays)
+    matt = np.zeros(len(rays), bool)
+    for number, (proxy, (_, axes, _)) in enumerate(zip(known, shapes, strict=True)):
+        if proxy.shape == "plane" and proxy.material is None:
+            matt |= (which == number) & (rays @ axes[:, 2] < -GRAZING)
+    return nearest, matt
 
 
 def _unit(vectors: Array) -> Array:
-    return np.asarray(vectors / np.maximum(np.sqrt(_dot(vectors, vectors)), 1e-12)[:, None], float)
-
-
-def _dot(a: Array, b: Array) -> Array:
-    """Products of vectors (n, 3), (n,): NumPy's sum over three takes five times as long."""
-    return np.asarray(a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2], float)
+    return np.asarray(vectors / np.maximum(np.sqrt(dot(vectors, vectors)), 1e-12)[:, None], float)

@@ -1,4 +1,4 @@
-"""What the picture says of a mirror ball's rim: how well each piece of an outline explains what is seen across it.
+"""Evidence of a picture for a mirror ball's rim: how well each piece of an outline explains what is seen across it.
 
 At its rim a mirror shows what lies behind it, so the step across the outline is often weak, and the reflections that
 crowd inside it are stronger. They crowd by a known law. With t pixels outward from the rim of a ball of r pixels, the
@@ -79,7 +79,7 @@ def _projections(inward: float, outward: float, shift: float, radius: float, blu
 
 @functools.lru_cache(maxsize=64)
 def _window(radius: float, blur: float) -> tuple[Array, Array]:
-    """What the model, and what a parabola, cannot explain of a window about the rim: two matrices (n, n)."""
+    """Return what the model, and what a parabola, cannot explain of a window about the rim: two matrices (n, n)."""
     t = np.arange(-STEP_WINDOW[0], STEP_WINDOW[1] + 0.5 * STEP, STEP)
     return _left(_bases(t, np.zeros(1), radius, blur)[0]), _left(np.stack([np.ones_like(t), t, t * t], 1))
 
@@ -154,7 +154,7 @@ def _profiles(
 def gather_steps(
     image: Image, points: Array, normals: Array, radius: float, *, shift: float, blur: float = 0.8
 ) -> RimEvidence:
-    """Where there are steps: how much better than a smooth curve the model explains a window about each shift.
+    """Return where there are steps: how much better than a smooth curve the model explains a window about each shift.
 
     A piece of the outline costs ``MOST_COST`` where nothing speaks for a step, and nothing where one is certain,
     however strong it is: a circle is where most pieces have one.
@@ -222,7 +222,7 @@ def gradients(image: Image) -> NDArray[np.float32]:
 
 
 def radial_compression(slopes: NDArray[np.float32], points: Array, normals: Array, radii: Array) -> Array:
-    """How much more radial gradients are just inside outlines than just outside.
+    """Return how much more radial gradients are just inside outlines than just outside.
 
     A ball squeezes what it mirrors toward its rim along the radius, not along the rim: there q'(t) grows beyond bounds.
     So inside the rim gradients point along the radius, and outside it they know nothing of the ball. An edge that is

@@ -1,4 +1,4 @@
-"""Whether a receiver is seen where a mirror ball should stand: cheap evidence that there is none.
+"""True if a receiver is seen where a mirror ball should stand: cheap evidence that there is none.
 
 What lies flat looks the same from every side once it is turned into the receiver's plane. A ball does not: where it
 hides the receiver, its mirror image is seen, at another height, and moves against the receiver with the eye. So the
@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warp_ar.scene import Camera, Pose, Probe
+from warp_ar.scene.pixel_rays import project
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -38,7 +39,7 @@ ALIKE: Final = 0.8
 
 
 def ground_is_seen(views: Sequence[View], camera: Camera, probe: Probe, ground: float) -> bool:
-    """Whether frames show the receiver where a ball would hide it; False where they do not tell.
+    """Return whether frames show the receiver where a ball would hide it; False where they do not tell.
 
     Args:
         views: RGB uint8 frames with ``camera_from_world``.
@@ -51,7 +52,7 @@ def ground_is_seen(views: Sequence[View], camera: Camera, probe: Probe, ground: 
 
 
 def ground_correlations(views: Sequence[View], camera: Camera, probe: Probe, ground: float) -> list[float]:
-    """How alike the receiver that a ball would hide is in frames from different sides.
+    """Return how alike the receiver that a ball would hide is in frames from different sides.
 
     Args:
         views: 8-bit RGB frames and ``camera_from_world`` of each.
@@ -83,7 +84,6 @@ def ground_correlations(views: Sequence[View], camera: Camera, probe: Probe, gro
 def _look_up(view: View, camera: Camera, points: Array, probe: Probe) -> tuple[Array, NDArray[np.bool_]]:
     """Codes of points (n, 3) in a frame, (n,), and which of them are in it and behind the ball."""
     image, pose = view
-    local = pose.apply(points)
     eye = pose.inverse().translation
     away = points - eye
     distance = np.linalg.norm(away, axis=1)
@@ -91,11 +91,9 @@ def _look_up(view: View, camera: Camera, points: Array, probe: Probe) -> tuple[A
     from_ball = eye - np.array(probe.center)
     along = away @ from_ball
     gap = np.sqrt(np.maximum(from_ball @ from_ball - along**2, 0.0))
-    hidden = (gap < 0.9 * probe.radius) & (-along < distance) & (local[:, 2] > 1e-3)
-    local[local[:, 2] <= 1e-3] = (0.0, 0.0, 1.0)
-    zero = np.zeros(3)
-    pixels = cv2.projectPoints(local, zero, zero, camera.matrix(), np.array(camera.distortion))[0].reshape(-1, 2)
-    inside = ((pixels >= 1) & (pixels <= (camera.width - 2, camera.height - 2))).all(1)
+    hidden = (gap < 0.9 * probe.radius) & (-along < distance)
+    pixels = project(camera, pose.apply(points))
+    inside = np.all((pixels >= 1) & (pixels <= (camera.width - 2, camera.height - 2)), axis=1)
     gray = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (0, 0), 1.0)
     at = np.where(inside[:, None], pixels, 0.0).astype(np.float32)
     codes = cv2.remap(gray, at[None, :, 0], at[None, :, 1], cv2.INTER_LINEAR)[0]

@@ -1,4 +1,4 @@
-"""What frames tell of how much light mirror balls reflect, in the place of what the scene says where that is wrong.
+"""Reflectances of mirror balls as frames tell them, in the place of what the scene says where that is wrong.
 
 A scene's reflectance is a guess where nobody has measured it: chrome has 0.55 to 0.65, a silvered ornament 0.85. All
 captured light is off by as much. What is seen twice tells (``ball_reflectance``), on 9 of 10 tables within 5 %. So the
@@ -41,7 +41,7 @@ class ReflectanceWatch:
             table: Linear value of each code, (256, 3).
         """
         self.watches = (camera, scene.marker, scene.proxies, scene.probes)
-        """What frames are of: the same frames tell those that watch the same, the same."""
+        """Things that frames are of: the same frames tell those that watch the same, the same."""
         self.values = tuple(probe.reflectance for probe in scene.probes)
         """RGB of each ball."""
         self._scene, self._camera, self._table = scene, camera, table
@@ -50,7 +50,7 @@ class ReflectanceWatch:
 
     @property
     def is_told(self) -> bool:
-        """Whether frames have taken the place of what the scene says."""
+        """Return whether frames have taken the place of what the scene says."""
         return self.values != tuple(probe.reflectance for probe in self._scene.probes)
 
     def observe(self, image: NDArray[np.uint8], pose: Pose, probes: Sequence[Probe]) -> bool:
@@ -85,7 +85,7 @@ class ReflectanceWatch:
         used: tuple[float, float, float],
         told: Sequence[tuple[float, float, float]],
     ) -> tuple[float, float, float]:
-        """What to take for one ball, by what the scene says, what was taken before and what frames told."""
+        """Return what to take for one ball, by what the scene says, what was taken before and what frames told."""
         median = np.minimum(np.median(told, axis=0), 1.0)
         logarithms = np.log(median)
         if abs(float((logarithms - np.log(said)).mean())) < REFLECTANCE:

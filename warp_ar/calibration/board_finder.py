@@ -1,4 +1,4 @@
-"""Which ChArUco board a picture shows, when nobody says: its dictionary, its columns and rows, its markers' share.
+"""Recognition of a ChArUco board when nobody names it: dictionary, columns and rows, its markers' share.
 
 Markers of one dictionary are read; the numbers of a ChArUco board run along its rows, so that a number of columns says
 where on the board each marker is. The right one is the one under which a plane's homography explains where the markers
@@ -32,9 +32,11 @@ _FEWEST: Final = 5
 """Markers without which a layout is not told from another."""
 _LAYOUTS: Final = range(3, 15)
 """Columns that are tried."""
-_OFF: Final = 0.04
+STRAIGHT: Final = 0.04
 """Median distance, in markers' sides, between where a layout has the corners and where they are: a lens bends a board
 by less, a wrong layout is off by a multiple."""
+BENT: Final = 0.3
+"""The same of a fisheye, where a right layout was off by up to 0.23, a wrong one by 0.7 or more."""
 
 
 def find_markers(image: Image) -> tuple[str, list[Detection]]:
@@ -63,11 +65,15 @@ def smallest_dictionary(name: str, number: int) -> str:
     return f"{family[1]}_{next(size for size in (50, 100, 250, 1000) if number < size)}"
 
 
-def recognise_board(image: Image) -> Marker | None:
+def recognise_board(image: Image, most_off: float = STRAIGHT) -> Marker | None:
     """The ChArUco board in a picture; None where there is none, or too little of it.
 
     The lengths of a board that is not among ``KNOWN`` are in squares of one metre: a camera's intrinsics do not depend
     on them.
+
+    Args:
+        image: uint8 RGB or grey.
+        most_off: ``STRAIGHT``, or ``BENT`` of a fisheye.
     """
     name, found = find_markers(image)
     if len(found) < _FEWEST or len({d.id for d in found}) < len(found):
@@ -80,14 +86,14 @@ def recognise_board(image: Image) -> Marker | None:
         most = max(d.id for d in found)
         if marker.dictionary.rsplit("_", 1)[0] == name.rsplit("_", 1)[0] and most < marker.board.marker_count:
             off, _ = _explain(found, corners, marker.board.columns, 0, ratio)
-            if off < _OFF * side:
+            if off < most_off * side:
                 return marker
     # A board whose top row starts with a marker has OpenCV's layout before 4.6.
     tried = [
         (*_explain(found, corners, columns, first, None), columns, first) for columns in _LAYOUTS for first in (0, 1)
     ]
     off, ratio, columns, first = min(tried)
-    if off > _OFF * side or not 0.3 < ratio < 0.97:
+    if off > most_off * side or not 0.3 < ratio < 0.97:
         return None
     rows = max(3, math.ceil(2 * (max(d.id for d in found) + 1) / columns))
     rows += columns * rows // 2 <= max(d.id for d in found)
@@ -132,7 +138,7 @@ def _explain(
 
 
 def _crossing(quad: NDArray[Any]) -> NDArray[Any]:
-    """Where a quadrilateral's diagonals meet: the middle of a square, in perspective."""
+    """Return where a quadrilateral's diagonals meet: the middle of a square, in perspective."""
     a, b, c, d = (np.append(corner, 1.0) for corner in quad)
     point = np.cross(np.cross(a, c), np.cross(b, d))
     return np.asarray(point[:2] / point[2])

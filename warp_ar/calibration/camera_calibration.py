@@ -1,7 +1,9 @@
-"""Pinhole and distortion of a camera from views of a ChArUco board.
+"""Pinhole and distortion, or fisheye, of a camera from views of a ChArUco board.
 
 References:
     [Z00] Z. Zhang. A flexible new technique for camera calibration. PAMI 2000.
+    [KB06] J. Kannala and S. Brandt. A generic camera model and calibration method for conventional, wide-angle, and
+        fish-eye lenses. PAMI 2006.
 """
 
 from __future__ import annotations
@@ -10,21 +12,24 @@ import dataclasses
 import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from warp_ar.calibration.board_finder import find_markers, recognise_board, smallest_dictionary
-from warp_ar.errors import SinkError, UsageError, reason
+from warp_ar.calibration.board_finder import BENT, STRAIGHT, find_markers, recognise_board, smallest_dictionary
+from warp_ar.errors import SceneError, SinkError, UsageError, reason
 from warp_ar.files import write_whole
 from warp_ar.scene import Camera, CharucoBoard, Marker
+from warp_ar.scene.calibration_file import rational_of_fisheye
 from warp_ar.signature import PROGRAM
 from warp_ar.tracking.card_layout import SHEET
 from warp_ar.tracking.markers import make_board
 
 Image = NDArray[np.uint8]
+_Views: TypeAlias = list[tuple[NDArray[Any], NDArray[Any], NDArray[Any]]]
+"""Of each view the corners in pixels, their numbers, and where they are on the board."""
 
 _MOVED = 0.03
 """Share of the picture's diagonal that a board's corners must have moved for another view of it to be taken."""
@@ -59,11 +64,13 @@ class CameraReport:
     coverage: float
     """Share of the picture's cells where the board has been."""
     warnings: tuple[str, ...]
-    """What would make it better, one line each."""
+    """Advice that would make it better, one line each."""
     marker: Marker
     """The board that was seen."""
     tilts: tuple[float, float]
     """Least and most that the board was tilted, degrees: of views that are alike, a deviation says nothing."""
+    fisheye: tuple[float, ...] = ()
+    """k1 k2 k3 k4 of a fisheye, whose picture the camera's distortion follows; empty for a pinhole."""
 
     @property
     def doubt(self) -> str:
@@ -78,12 +85,15 @@ class CameraReport:
 class BoardViews:
     """Different views of a ChArUco board, collected until they calibrate a camera [Z00]."""
 
-    def __init__(self, marker: Marker | None = None, board: CharucoBoard | None = None) -> None:
+    def __init__(
+        self, marker: Marker | None = None, board: CharucoBoard | None = None, *, fisheye: bool = False
+    ) -> None:
         """Collect nothing yet.
 
         Args:
             marker: the board that was printed; None: whichever ChArUco board the first picture of one shows.
             board: its layout, where only the dictionary is to be told from the pictures.
+            fisheye: Whether the lens is one.
 
         Raises:
             UsageError: if it is no ChArUco board.
@@ -92,19 +102,18 @@ class BoardViews:
             raise UsageError(f'--board: the camera is calibrated with a ChArUco board, such as "{SHEET.board}"')
         self.marker: Marker | None = None
         """The board, as soon as it is known."""
-        self._layout = board
+        self._layout, self._fisheye = board, fisheye
         self._board: Any = None
         self._detector: Any = None
         if marker is not None:
             self._take(marker)
         self._size: tuple[int, int] | None = None
         self._seen = 0
-        self.views: list[tuple[NDArray[Any], NDArray[Any], NDArray[Any]]] = []
-        """Corners in pixels, their numbers, and where they are on the board."""
+        self.views: _Views = []
 
     def _recognised(self, gray: Image) -> Marker | None:
         if self._layout is None:
-            return recognise_board(gray)
+            return recognise_board(gray, BENT if self._fisheye else STRAIGHT)
         name, found = find_markers(gray)
         count = self._layout.marker_count
         if not found or max(d.id for d in found) >= count:
@@ -146,34 +155,35 @@ class BoardViews:
         return True
 
     def covered(self) -> NDArray[np.bool_]:
-        """Where in the picture the board has been, by rows and columns."""
+        """Return where in the picture the board has been, by rows and columns."""
         return _covered(self.views, self._size or (1, 1))
 
     def solve(self) -> CameraReport:
-        """Pinhole and distortion.
+        """Pinhole and distortion, by [KB06] of a fisheye.
 
         Raises:
-            UsageError: if too few views show the board.
+            UsageError: if too few views show the board, or the lens is wider than is followed.
         """
-        size = self._size
+        size, fisheye = self._size, self._fisheye
         if size is None or self.marker is None or len(self.views) < _FEWEST_VIEWS:
             what = "a ChArUco board" if self.marker is None else f"{self.marker.board} ({self.marker.dictionary})"
             raise UsageError(
                 f"{len(self.views)} different views of {what} in {self._seen} pictures; "
                 f"expected {_FEWEST_VIEWS} at the least, {GOOD_VIEWS} for a good result"
             )
-        result = _calibrate(self.views, size)
-        errors = np.ravel(result[-1])
+        result = _calibrate(self.views, size, fisheye)
         # A blurred or bent view must not spoil the others.
-        kept = [view for view, error in zip(self.views, errors, strict=True) if error <= 3 * np.median(errors)]
+        most = 3 * np.median(result.view_errors)
+        kept = [view for view, error in zip(self.views, result.view_errors, strict=True) if error <= most]
         if len(kept) < len(self.views) and len(kept) >= _FEWEST_VIEWS:
-            result = _calibrate(kept, size)
-            errors = np.ravel(result[-1])
-        error, matrix, distortion, rotations, _, deviations, _, _ = result
-        deviation = max(float(np.ravel(deviations)[:2].max()), _spread(kept, size))
-        camera = Camera(
-            *size, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], tuple(map(float, np.ravel(distortion)))
-        )
+            result = _calibrate(kept, size, fisheye)
+        else:
+            kept = self.views
+        error, matrix, rotations = result.error, result.matrix, result.rotations
+        terms = tuple(map(float, np.ravel(result.distortion)))
+        distortion = _rational(size, matrix, terms) if fisheye else terms
+        deviation = max(result.deviation, _spread(kept, size, fisheye))
+        camera = Camera(*size, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], distortion)
         covered = _covered(kept, size)
         tilts = [math.degrees(math.acos(min(1.0, abs(cv2.Rodrigues(r)[0][2, 2])))) for r in rotations]
         warnings = []
@@ -190,21 +200,27 @@ class BoardViews:
         if error > 1.0:
             warnings.append(
                 f"reprojection error {error:.2f} pixels: is the print flat, the picture sharp, the board's text right?"
+                + ("" if fisheye else " Of a very wide lens, try --fisheye")
             )
         return CameraReport(
             camera,
-            float(error),
-            tuple(map(float, errors)),
+            error,
+            tuple(map(float, result.view_errors)),
             deviation,
             float(covered.mean()),
             tuple(warnings),
             self.marker,
             (min(tilts), max(tilts)),
+            terms if fisheye else (),
         )
 
 
 def calibrate_camera(
-    images: Iterable[Image], marker: Marker | None = None, board: CharucoBoard | None = None
+    images: Iterable[Image],
+    marker: Marker | None = None,
+    board: CharucoBoard | None = None,
+    *,
+    fisheye: bool = False,
 ) -> CameraReport:
     """Pinhole and distortion from views of a ChArUco board.
 
@@ -212,19 +228,19 @@ def calibrate_camera(
         images: RGB or grey uint8 pictures, all of one size; views that hardly differ from earlier ones are skipped.
         marker: the board that was printed; None: whichever the pictures show.
         board: its layout, where only the dictionary is to be told from the pictures.
+        fisheye: Whether the lens is one.
 
     Raises:
-        UsageError: if the board is no ChArUco board, sizes differ, or too few views show it.
+        UsageError: if the board is no ChArUco board, sizes differ, too few views show it, or the lens is wider than is
+            followed.
     """
-    views = BoardViews(marker, board)
+    views = BoardViews(marker, board, fisheye=fisheye)
     for image in images:
         views.add(image)
     return views.solve()
 
 
-def _covered(
-    views: Sequence[tuple[NDArray[Any], NDArray[Any], NDArray[Any]]], size: tuple[int, int]
-) -> NDArray[np.bool_]:
+def _covered(views: _Views, size: tuple[int, int]) -> NDArray[np.bool_]:
     rows, columns = _COVERAGE_CELLS
     covered = np.zeros((rows, columns), bool)
     for corners, _, _ in views:
@@ -239,19 +255,67 @@ def _moved(corners: NDArray[Any], ids: NDArray[Any], others: NDArray[Any], other
     return float(np.linalg.norm(corners[here] - others[there], axis=1).mean()) if len(here) else math.inf
 
 
-def _calibrate(views: Sequence[tuple[NDArray[Any], NDArray[Any], NDArray[Any]]], size: tuple[int, int]) -> Any:
+@dataclasses.dataclass(frozen=True)
+class _Solution:
+    """A camera that fits views."""
+
+    error: float
+    """Root mean square reprojection error, pixels."""
+    matrix: NDArray[Any]
+    distortion: NDArray[Any]
+    """k1 k2 p1 p2 k3 of a pinhole, k1 k2 k3 k4 of a fisheye."""
+    rotations: Sequence[NDArray[Any]]
+    """Of the board in each view, as vectors."""
+    deviation: float
+    """Standard deviation of the focal length by independent corners, pixels; 0: not known."""
+    view_errors: NDArray[Any]
+    """``error`` of each view."""
+
+
+def _calibrate(views: _Views, size: tuple[int, int], fisheye: bool) -> _Solution:
+    if fisheye:
+        return _solve_fisheye(views, size)
     plain, full = (_solve(views, size, flags) for flags in (cv2.CALIB_FIX_K3, 0))
     # The sixth-order term bends the corners of the picture wildly where it only fits noise.
-    return full if full[0] < 0.9 * plain[0] else plain
+    return full if full.error < 0.9 * plain.error else plain
 
 
-def _solve(views: Sequence[tuple[NDArray[Any], NDArray[Any], NDArray[Any]]], size: tuple[int, int], flags: int) -> Any:
+def _solve(views: _Views, size: tuple[int, int], flags: int) -> _Solution:
     pixels = [corners.astype(np.float32) for corners, _, _ in views]
     points = [points.astype(np.float32) for _, _, points in views]
-    return cv2.calibrateCameraExtended(points, pixels, size, np.eye(3), np.zeros(5), flags=flags)
+    error, matrix, distortion, rotations, _, deviations, _, errors = cv2.calibrateCameraExtended(
+        points, pixels, size, np.eye(3), np.zeros(5), flags=flags
+    )
+    deviation = float(np.ravel(deviations)[:2].max())
+    return _Solution(float(error), matrix, distortion, rotations, deviation, np.ravel(errors))
 
 
-def _spread(views: Sequence[tuple[NDArray[Any], NDArray[Any], NDArray[Any]]], size: tuple[int, int]) -> float:
+def _solve_fisheye(views: _Views, size: tuple[int, int]) -> _Solution:
+    pixels = [corners.astype(np.float64)[None] for corners, _, _ in views]
+    points = [points.astype(np.float64)[None] for _, _, points in views]
+    flags = cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW
+    try:
+        error, matrix, distortion, rotations, shifts = cv2.fisheye.calibrate(
+            points, pixels, size, np.eye(3), np.zeros(4), flags=flags
+        )
+    except cv2.error as problem:
+        raise UsageError(f"the views fit no fisheye ({reason(problem)}); leave out --fisheye, or add views") from None
+    found = [
+        cv2.fisheye.projectPoints(board, turn, shift, matrix, distortion)[0]
+        for board, turn, shift in zip(points, rotations, shifts, strict=True)
+    ]
+    errors = [np.sqrt(((one - seen) ** 2).sum(-1).mean()) for one, seen in zip(found, pixels, strict=True)]
+    return _Solution(float(error), matrix, distortion, rotations, 0.0, np.array(errors))
+
+
+def _rational(size: tuple[int, int], matrix: NDArray[Any], terms: tuple[float, ...]) -> tuple[float, ...]:
+    try:
+        return rational_of_fisheye(*size, matrix, terms)
+    except SceneError as error:
+        raise UsageError(f"--fisheye: {error}") from None
+
+
+def _spread(views: _Views, size: tuple[int, int], fisheye: bool) -> float:
     """Standard deviation of the focal length by leaving out views in turn (the jackknife), pixels.
 
     Corners of one view are off alike (its blur, what the lens does beside the model), so that the deviation by
@@ -265,7 +329,7 @@ def _spread(views: Sequence[tuple[NDArray[Any], NDArray[Any], NDArray[Any]]], si
     found = []
     for group in range(count):
         rest = [view for number, view in enumerate(views) if number % count != group]
-        matrix = _solve(rest, size, cv2.CALIB_FIX_K3)[1]
+        matrix = (_solve_fisheye(rest, size) if fisheye else _solve(rest, size, cv2.CALIB_FIX_K3)).matrix
         found.append((matrix[0, 0], matrix[1, 1]))
     return float(np.sqrt((count - 1) * np.var(found, axis=0).max()))
 
@@ -293,7 +357,9 @@ def write_camera(report: CameraReport, path: Path) -> None:
     storage.write("image_width", camera.width)
     storage.write("image_height", camera.height)
     storage.write("camera_matrix", camera.matrix())
-    storage.write("distortion_coefficients", np.array(camera.distortion)[None])
+    if report.fisheye:
+        storage.write("fisheye_model", 1)
+    storage.write("distortion_coefficients", np.array(report.fisheye or camera.distortion)[None])
     storage.write("avg_reprojection_error", report.error)
     try:
         write_whole(path, storage.releaseAndGetString().encode())

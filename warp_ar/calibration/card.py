@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import zlib
 from pathlib import Path
 from typing import Any
 
 import cv2
-import imageio.v3
 import numpy as np
+import PIL.Image
 from numpy.typing import NDArray
 
 from warp_ar.errors import SinkError, UsageError, reason
@@ -134,7 +135,9 @@ def _draw_page(marker: Marker, paper: str, per_metre: int) -> Image:
 
 def _png(page: Image, per_metre: int) -> bytes:
     density = (per_metre * 0.0254, per_metre * 0.0254)
-    return sign_png(imageio.v3.imwrite("<bytes>", page, extension=".png", dpi=density))
+    out = io.BytesIO()
+    PIL.Image.fromarray(page).save(out, "png", dpi=density)
+    return sign_png(out.getvalue())
 
 
 def _pdf(page: Image, per_metre: int) -> bytes:

@@ -109,7 +109,7 @@ class SaturationLevels:
         self._tops: list[tuple[int, float]] = []
         self._stays: int | None = None
         self._guess: bool | None = None
-        """Whether the levels are those of a top that need not stay; None: none was tried, and False: it did not."""
+        """True if the levels are those of a top that need not stay; None: none was tried, and False: it did not."""
 
     def observe(
         self,
@@ -164,7 +164,7 @@ class SaturationLevels:
         return bool((before != self.levels).any())
 
     def _may_be_level(self, image: NDArray[np.uint8], top: int) -> bool:
-        """Whether the code around which luma crowds may be the level before a gain has moved."""
+        """Return whether the code around which luma crowds may be the level before a gain has moved."""
         if self._guess is not None or (self.levels != FULL).any():
             return False
         brighter = float((image[::2, ::2] @ LUMA > top + RINGING // 2).mean())
@@ -187,7 +187,7 @@ class SaturationLevels:
 
 
 def _exact_level(codes: NDArray[np.float64], level: int) -> float:
-    """Where a plateau lies whose 8-bit code is known.
+    """Return where a plateau lies whose 8-bit code is known.
 
     Args:
         codes: Of one channel, in steps of 8 bits but not rounded, (n,).
@@ -261,17 +261,20 @@ def luma_top(codes: NDArray[np.uint8]) -> int | None:
     return middle if np.median(off, axis=0).max() <= NEUTRAL_WIDE else None
 
 
-def ball_codes(image: NDArray[Any], balls: Sequence[tuple[float, float, float]]) -> NDArray[Any]:
+def ball_codes(
+    image: NDArray[Any], balls: Sequence[tuple[float, float, float]], inside: float = INSIDE
+) -> NDArray[Any]:
     """Codes of the pixels inside balls, (n, 3), of the picture's type.
 
     Args:
         image: uint8 or uint16 RGB (height, width, 3).
         balls: Centre x, y and radius of each, pixels.
+        inside: Share of the radius within which a pixel is taken.
     """
     height, width = image.shape[:2]
     found = [np.zeros((0, 3), image.dtype)]
     for x, y, radius in balls:
-        r = INSIDE * radius
+        r = inside * radius
         top, bottom = max(int(np.ceil(y - r)), 0), min(int(np.floor(y + r)) + 1, height)
         left, right = max(int(np.ceil(x - r)), 0), min(int(np.floor(x + r)) + 1, width)
         if top >= bottom or left >= right:
@@ -282,7 +285,7 @@ def ball_codes(image: NDArray[Any], balls: Sequence[tuple[float, float, float]])
 
 
 def ball_discs(probes: Sequence[Probe], camera: Camera, pose: Pose) -> list[tuple[float, float, float]]:
-    """Where balls are in the picture, as circles: centre x, y and radius, pixels; none of those behind the camera.
+    """Return balls in the picture as circles: centre x, y and radius, pixels; none of those behind the camera.
 
     Args:
         probes: The balls.

@@ -1,7 +1,8 @@
-"""What a scene's frames say is wrong with its mirror ball."""
+"""Faults that a scene's frames tell of its mirror ball."""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Sequence
 from typing import Final
@@ -10,22 +11,25 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from warp_ar.ball.ball import explains_better
 from warp_ar.ball.ball_finder import find_ball
-from warp_ar.ball.ball_radius import explains_better
 from warp_ar.ball.ball_reflectance import REFLECTANCE, measure_reflectance
-from warp_ar.ball.ball_solve import BallSolution, ground_below, rough_circle, solve_ball
-from warp_ar.ball.ball_views import agreeing_outlines
+from warp_ar.ball.ball_solve import BallSolution, agreeing_outlines, rough_circle, solve_ball, standing_ground
 from warp_ar.ball.ground_seen import ground_is_seen
+from warp_ar.calibration.saturation import ball_codes
 from warp_ar.checks.check_pictures import Look
 from warp_ar.checks.finding import Finding
 from warp_ar.errors import UsageError
 from warp_ar.scene import Camera, Marker, Pose, Probe, Scene
-from warp_ar.tracking.marker_pattern import printed_cells
+from warp_ar.scene.pixel_rays import project
+from warp_ar.tracking.markers import printed_cells
 
 Image = NDArray[np.uint8]
 
 SMALL: Final = 14.0
 """Radius in pixels below which a ball shows too little of the environment."""
+INNER: Final = 0.8
+"""Share of the radius within which the ball is looked at."""
 CLIPPED: Final = 0.2
 """Share of the ball that may clip: lamps and windows do, walls must not."""
 DULL: Final = 0.10
@@ -67,11 +71,8 @@ def inside_contrast(views: Sequence[tuple[Image, Pose]], camera: Camera, probe: 
 
 def disc_contrast(image: Image, circle: tuple[float, float, float]) -> float:
     """Standard deviation over mean of a picture within a circle (x, y, radius), pixels; ``DULL`` is its bound."""
-    return _contrast(_inside_of(image, circle))
-
-
-def _contrast(part: NDArray[np.float64]) -> float:
-    return float(part.std() / max(part.mean(), 1.0))
+    part = ball_codes(image, [circle], INNER).astype(float)
+    return float(part.std() / max(part.mean(), 1.0)) if len(part) else 0.0
 
 
 def _check_ball(
@@ -83,9 +84,8 @@ def _check_ball(
     if not seen:
         text = f"{label}: the ball is outside the picture"
         return [Finding("ball.outside", text, "move camera or ball until all of it is in view; check center")]
-    ground = standing_ground(scene, probe)
-    insides = [_inside_of(image, circle) for image, circle in seen]
-    contrast = float(np.median([_contrast(part) for part in insides]))
+    ground = standing_ground(probe, scene.proxies)
+    contrast = float(np.median([disc_contrast(*one) for one in seen]))
     spread = look.views[:: -(-len(look.views) // SIDES)]
     if ground is not None and ground_is_seen(spread, look.camera, probe, ground):
         return [_why_lost(scene.marker, look, views, label, contrast)]
@@ -98,7 +98,8 @@ def _check_ball(
     if pixels < SMALL:
         text = f"{label}: the ball is {2 * pixels:.0f} pixels wide; expected {2 * SMALL:.0f} or more"
         found.append(Finding("ball.small", text, "move the camera nearer, or use a larger ball"))
-    clipped = float(np.median([(part.min(-1) >= 250).mean() for part in insides]))
+    insides = [ball_codes(image, [circle], INNER).min(-1) >= 250 for image, circle in seen]
+    clipped = float(np.median([part.mean() for part in insides if len(part)]))
     if clipped > CLIPPED:
         text = f"{label}: {clipped:.0%} of the ball clips; walls should not"
         found.append(Finding("ball.clipped", text, "set a shorter exposure, or [source] exposures"))
@@ -138,12 +139,6 @@ def _check_reflectance(
     return [Finding("ball.reflectance", text, remedy)]
 
 
-def standing_ground(scene: Scene, probe: Probe) -> float | None:
-    """Return the height in metres of what the ball stands on; None where the scene has it above nothing or afloat."""
-    ground = ground_below(probe, scene.proxies)
-    return ground if ground is not None and probe.center[2] - probe.radius - ground < 0.3 * probe.radius else None
-
-
 def _compare(probe: Probe, solution: BallSolution, label: str, command: str) -> list[Finding]:
     """The solution against the scene's numbers."""
     if not solution.radius_assumed:
@@ -175,21 +170,11 @@ def _inside(look: Look, circle: tuple[float, float, float]) -> bool:
     return -0.5 * r < x < look.camera.width + 0.5 * r and -0.5 * r < y < look.camera.height + 0.5 * r
 
 
-def _inside_of(image: Image, circle: tuple[float, float, float]) -> NDArray[np.float64]:
-    """Pixels (n, 3) of the inner part of a disc."""
-    x, y, r = circle
-    rows, columns = np.mgrid[: image.shape[0], : image.shape[1]]
-    mask = (columns - x) ** 2 + (rows - y) ** 2 < (0.8 * r) ** 2
-    return image[mask].astype(float) if mask.any() else np.zeros((1, 3))
-
-
 def is_printed(marker: Marker, camera: Camera, pose: Pose, circle: tuple[float, float, float]) -> bool:
     """Return whether a circle (x, y, radius), pixels, lies within the printed marker or board."""
-    corners = pose.apply(printed_cells(marker)[3])
-    if (corners[:, 2] < 1e-3).any():
+    outline = project(camera, pose.apply(printed_cells(marker)[3]))
+    if not np.isfinite(outline).all():
         return False
-    zero = np.zeros(3)
-    outline = cv2.projectPoints(corners, zero, zero, camera.matrix(), np.array(camera.distortion))[0]
     x, y, radius = circle
     return cv2.pointPolygonTest(outline.astype(np.float32), (x, y), measureDist=True) > 0.9 * radius
 
@@ -197,18 +182,15 @@ def is_printed(marker: Marker, camera: Camera, pose: Pose, circle: tuple[float, 
 def _why_lost(
     marker: Marker, look: Look, views: tuple[tuple[Image, Pose], ...], label: str, contrast: float
 ) -> Finding:
-    """What there is instead of the ball: elsewhere, flat paint, or nothing."""
+    """Return what there is instead of the ball: elsewhere, flat paint, or nothing."""
     command = "check center and radius, and that nothing hides the ball"
     if contrast < 0.5 * DULL:
         text = f"{label}: where the ball should be, the picture is flat: painted over, covered or not there"
         return Finding("ball.unfound", text, command)
-    try:
+    text = f"{label}: no ball is seen where the scene has it"
+    with contextlib.suppress(UsageError):
         outline = find_ball(views[0][0], look.camera)
-    except UsageError:
-        return Finding("ball.unfound", f"{label}: no ball is seen where the scene has it", command)
-    if is_printed(marker, look.camera, views[0][1], (*outline.center, outline.radius)):
-        return Finding("ball.unfound", f"{label}: no ball is seen where the scene has it", command)
-    x, y = outline.center
-    where = f"({x:.0f}, {y:.0f}), {2 * outline.radius:.0f} pixels wide"
-    text = f"{label}: no ball where the scene has it; there may be one at {where}"
+        if not is_printed(marker, look.camera, views[0][1], (*outline.center, outline.radius)):
+            x, y = outline.center
+            text += f"; there may be one at ({x:.0f}, {y:.0f}), {2 * outline.radius:.0f} pixels wide"
     return Finding("ball.unfound", text, command)

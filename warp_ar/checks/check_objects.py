@@ -1,4 +1,4 @@
-"""Whether the pictures show the places where virtual objects stand."""
+"""True if the pictures show the places where virtual objects stand."""
 
 from __future__ import annotations
 
@@ -63,8 +63,8 @@ def written_poses(scene: Scene) -> list[Pose]:
     """Some of the poses that a scene without a marker has written down, from all of its frames."""
     if scene.pose is None:
         return []
-    count = len(scene.pose.poses)
-    return [Pose(*scene.pose.at(index)) for index in range(0, count, -(-count // MOST_POSES))]
+    poses = scene.pose.poses
+    return [Pose(np.reshape(r, (3, 3)), np.array(t)) for r, t in poses[:: -(-len(poses) // MOST_POSES)]]
 
 
 def sphere_around(item: Object) -> Probe:
@@ -90,7 +90,7 @@ def _sphere_of(mesh: Mesh) -> tuple[Array, float]:
 
 
 def _reach(item: Object) -> float:
-    """How far a shape that is no mesh reaches from its origin, in metres without its scale."""
+    """Return how far a shape that is no mesh reaches from its origin, in metres without its scale."""
     return max(
         item.major_radius + item.minor_radius,
         math.hypot(item.radius, item.length / 2),

@@ -1,4 +1,4 @@
-"""What a scene's frames say is wrong with its card and camera, by the marker that they show."""
+"""Faults that a scene's frames tell of its card and camera, by the marker that they show."""
 
 from __future__ import annotations
 
@@ -14,12 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warp_ar.calibration.board_finder import KNOWN, find_markers, recognise_board
+from warp_ar.calibration.saturation import NEAR_FULL, SaturationLevels, ball_discs
 from warp_ar.checks.finding import Finding
 from warp_ar.kernels.color import decode_table
 from warp_ar.scene import Camera, Marker, Pose, Scene
+from warp_ar.scene.pixel_rays import project
 from warp_ar.sources.source import Source
-from warp_ar.tracking.marker_pattern import Pattern, make_pattern, printed_cells
-from warp_ar.tracking.markers import Detection, MarkerDetector, find_dictionary
+from warp_ar.tracking.markers import Detection, MarkerDetector, find_dictionary, pattern_of, printed_cells
 from warp_ar.tracking.tracking import Tracker, TrackState
 
 Array = NDArray[np.float64]
@@ -61,6 +62,17 @@ BOARD_VIEWS: Final = 4
 """Frames in which a board is looked for where a single marker is expected: a hand or an edge may hide some of it."""
 BOARD_MARKERS: Final = 5
 """Markers of the dictionary in a picture below which no board is looked for."""
+LEAST_END: Final = 220
+"""Code below which nothing is said: no camera's range ends there (limited range ends at 235, shoulders above), but
+pictures that somebody darkened afterwards do."""
+ALIKE_ENDS: Final = 2.0
+"""Codes between the channels' ends: a range or a shoulder is that of all three, a tint that was laid over pictures
+afterwards is not. Two must tell; nothing clips in the third, as in blue under warm lamps, or it ends there too."""
+LIMITED: Final = (14, 236)
+"""Lowest code that is seen at least, and code at which channels end at most, where limited range (16 to 235) may be
+taken for the full one: within what a codec does to them."""
+FEW: Final = 1e-3
+"""Share of a picture's pixels that may lie beyond its lowest code and its highest: noise, a codec's ringing."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -163,7 +175,7 @@ def check_pictures(scene: Scene, look: Look) -> list[Finding]:
 
 def _marker_twice(marker: Marker, images: Sequence[Image]) -> Finding | None:
     """The finding that pictures show a marker of the scene twice, of which either may be followed."""
-    own = set(_pattern(marker).markers)
+    own = set(pattern_of(marker).markers)
     detector = MarkerDetector(marker.dictionary)
     for image in (images[0], images[-1]):
         counts = collections.Counter(each.id for each in detector.detect(_gray(image)) if each.id in own)
@@ -174,28 +186,17 @@ def _marker_twice(marker: Marker, images: Sequence[Image]) -> Finding | None:
     return Finding("marker.twice", text, "cover or take away the one that the scene does not mean")
 
 
-def _pattern(marker: Marker) -> Pattern:
-    return make_pattern(marker.dictionary, marker.id, marker.size, marker.board)
-
-
-def _project(camera: Camera, pose: Pose, points: Array) -> Array:
-    pixels, _ = cv2.projectPoints(
-        pose.apply(points), np.zeros(3), np.zeros(3), camera.matrix(), np.array(camera.distortion)
-    )
-    return np.asarray(pixels.reshape(-1, 2), float)
-
-
 def _marker_side(marker: Marker, camera: Camera, pose: Pose) -> float:
     """Mean side in pixels of a marker, the median of a board's."""
-    quads = [_project(camera, pose, corners) for corners in _pattern(marker).markers.values()]
+    quads = [project(camera, pose.apply(corners)) for corners in pattern_of(marker).markers.values()]
     return float(np.median([np.linalg.norm(quad - np.roll(quad, 1, 0), axis=1).mean() for quad in quads]))
 
 
 def why_unseen(marker: Marker, look: Look) -> Finding:
-    """What the pictures show instead of the marker."""
+    """Return what the pictures show instead of the marker."""
     image = look.images[len(look.images) // 2]
     wanted = f"{marker.dictionary} {marker.board or f'id {marker.id}'}"
-    ids = set(_pattern(marker).markers)
+    ids = set(pattern_of(marker).markers)
     mirrored = MarkerDetector(marker.dictionary).detect(np.ascontiguousarray(_gray(image)[:, ::-1]))
     if ids & {d.id for d in mirrored}:
         text = "the picture is mirrored: the marker is seen in its mirror image only"
@@ -259,7 +260,7 @@ def board_instead(marker: Marker, images: Sequence[Image]) -> Finding | None:
 
 
 def _is_blurred(image: Image) -> bool:
-    """Whether nothing in a picture that has contrast has a sharp edge."""
+    """Return whether nothing in a picture that has contrast has a sharp edge."""
     gray = cv2.medianBlur(_gray(image), 3).astype(np.float32)
     low, high = np.percentile(gray, (1, 99))
     slope = np.hypot(cv2.Sobel(gray, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(gray, cv2.CV_32F, 0, 1, scale=1 / 8))
@@ -270,12 +271,31 @@ def _gray(image: Image) -> Image:
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
-def _check_focal(marker: Marker, look: Look) -> list[Finding]:
-    """The focal length under which the print's edges fit best, each frame posed anew for each candidate.
+@dataclasses.dataclass(frozen=True)
+class FocalFit:
+    """Focal length under which the print's edges fit best."""
+
+    ratio: float
+    """The focal length over the camera's own."""
+    deviation: float
+    """Standard error of the ratio."""
+    views: int
+    """Frames that tell it."""
+    gain: float
+    """Squared residuals under the camera's own focal length, over the least."""
+
+
+def measure_focal(marker: Marker, look: Look) -> FocalFit | None:
+    """Find the focal length under which the print's edges fit best, each frame posed anew for each candidate.
 
     The squared residuals are a parabola about their least; leaving out one frame after the other says how sure it is.
+
+    Returns:
+        None if fewer than four frames tell it.
     """
-    images = [image for image, _ in look.views[:: -(-len(look.views) // FOCAL_VIEWS)]]
+    images = [image for image, _ in look.views[:: -(-len(look.views) // FOCAL_VIEWS) or 1]]
+    if len(images) < 4:
+        return None
     tracker = Tracker(marker, look.camera, steady=False)
     pictures = [(image, tracker.detect(image)) for image in images]
     # Where it lies is looked for in few frames, and measured in all around there.
@@ -284,20 +304,25 @@ def _check_focal(marker: Marker, look: Look) -> list[Finding]:
     factors = rough[int(np.argmin(few))] * np.array([0.94, 0.97, 1.0, 1.03, 1.06])
     squares = np.array([_squared_errors(marker, look.camera, pictures, factor) for factor in factors])
     kept = np.isfinite(squares).all(0)
-    if kept.sum() < 4:
-        return []
+    if (count := int(kept.sum())) < 4:
+        return None
     squares = squares[:, kept]
-    count = squares.shape[1]
-    best, _ = _lowest(factors, squares.sum(1))
-    left = np.array([_lowest(factors, squares.sum(1) - squares[:, k])[0] for k in range(count)])
+    best = _lowest(factors, squares.sum(1))
+    left = np.array([_lowest(factors, squares.sum(1) - squares[:, k]) for k in range(count)])
     deviation = math.sqrt((count - 1) / count * float(((left - left.mean()) ** 2).sum()))
-    # Views from one side alone leave the least so flat that anything moves it.
     as_given = _squared_errors(marker, look.camera, pictures, 1.0)[kept].sum()
-    if abs(best - 1) < max(FOCAL, 3 * deviation) or as_given < 1.02 * squares.sum(1).min():
+    return FocalFit(best, deviation, count, float(as_given / max(squares.sum(1).min(), 1e-12)))
+
+
+def _check_focal(marker: Marker, look: Look) -> list[Finding]:
+    fit = measure_focal(marker, look)
+    # Views from one side alone leave the least so flat that anything moves it.
+    if fit is None or abs(fit.ratio - 1) < max(FOCAL, 3 * fit.deviation) or fit.gain < 1.02:
         return []
+    given = look.camera.fx
     text = (
-        f"[camera] fx = {look.camera.fx:.0f}: the card's perspective in {count} views fits "
-        f"{best * look.camera.fx:.0f} +/- {2 * deviation * look.camera.fx:.0f}"
+        f"[camera] fx = {given:.0f}: the card's perspective in {fit.views} views fits "
+        f"{fit.ratio * given:.0f} +/- {2 * fit.deviation * given:.0f}"
     )
     return [Finding("camera.focal", text, "python -m warp_ar.calibrate camera PICTURES")]
 
@@ -310,18 +335,17 @@ def _squared_errors(
     return np.array([tracker.error_of(image, found) ** 2 for image, found in pictures])
 
 
-def _lowest(factors: Array, totals: Array) -> tuple[float, float]:
-    """Where the parabola through the totals is lowest, and its curvature."""
+def _lowest(factors: Array, totals: Array) -> float:
+    """Return where the parabola through the totals is lowest."""
     curve, slope, _ = np.polyfit(factors, totals, 2)
-    if curve <= 0:
-        return float(factors[np.argmin(totals)]), 0.0
-    return float(np.clip(-slope / (2 * curve), factors[0], factors[-1])), float(curve)
+    lowest = -slope / (2 * curve) if curve > 0 else factors[np.argmin(totals)]
+    return float(np.clip(lowest, factors[0], factors[-1]))
 
 
 def _cell_values(marker: Marker, look: Look, image: Image, pose: Pose) -> tuple[Array, Array, Array]:
     """White cells' places (n, 3), codes (n, 3), and black cells' codes (m, 3), of those in the picture."""
     cells, white, _, _ = printed_cells(marker)
-    pixels = _project(look.camera, pose, cells)
+    pixels = project(look.camera, pose.apply(cells))
     inside = ((pixels >= 1) & (pixels <= (look.camera.width - 2, look.camera.height - 2))).all(1)
     x, y = np.round(pixels[inside]).astype(int).T
     codes = image[y, x].astype(float)
@@ -329,7 +353,7 @@ def _cell_values(marker: Marker, look: Look, image: Image, pose: Pose) -> tuple[
 
 
 def _check_light(marker: Marker, look: Look, views: Sequence[tuple[Image, Pose]]) -> list[Finding]:
-    """Whether the card's white can be measured, and whether it stays."""
+    """Return whether the card's white can be measured, and whether it stays."""
     found, clipped, dark, ratios, uneven, whites = [], [], [], [], [], []
     for image, pose in views:
         places, white, black = _cell_values(marker, look, image, pose)
@@ -409,11 +433,11 @@ def _check_drift(look: Look, views: Sequence[tuple[Image, Pose]], whites: Array)
 
 def _check_blur(marker: Marker, look: Look, views: Sequence[tuple[Image, Pose]]) -> list[Finding]:
     """Width of printed edges in the picture."""
-    pattern, widths = _pattern(marker), []
+    pattern, widths = pattern_of(marker), []
     taps = np.linspace(-8, 8, 65)
     for image, pose in views:
-        pixels = _project(look.camera, pose, pattern.points)
-        ahead = _project(look.camera, pose, pattern.points + 1e-4 * pattern.normals) - pixels
+        pixels = project(look.camera, pose.apply(pattern.points))
+        ahead = project(look.camera, pose.apply(pattern.points + 1e-4 * pattern.normals)) - pixels
         scale = np.linalg.norm(ahead, axis=1)
         room = pattern.clearances * scale / 1e-4
         chosen = room > 9.0
@@ -434,3 +458,37 @@ def _check_blur(marker: Marker, look: Look, views: Sequence[tuple[Image, Pose]])
 
 def _rise(profile: Array, taps: Any) -> float:
     return float(taps[np.argmax(profile > 0.9)] - taps[np.argmax(profile > 0.1)])
+
+
+def check_saturation(scene: Scene, look: Look) -> list[Finding]:
+    """The finding that the lamps in a mirror ball, or what else clips there, end below the highest code.
+
+    Nothing is found where no ball shows anything that clips.
+
+    Args:
+        scene: With its balls where the scene has them.
+        look: What its frames show.
+    """
+    seen = SaturationLevels()
+    for image, pose in look.views:
+        seen.observe(image, ball_discs(scene.probes, look.camera, pose))
+    told = seen.levels[seen.levels < NEAR_FULL]
+    if len(told) < 2 or told.min() < LEAST_END or np.ptp(told) > ALIKE_ENDS:
+        return []
+    level = round(float(np.median(told)))
+    if max(float((image[::2, ::2] > level + ALIKE_ENDS).mean()) for image, _ in look.views) > FEW:
+        return []
+    text = f"what clips in the ball ends at code {level} of 255"
+    remedy = "turn the camera's HDR and tone mapping modes off, so that what clips has code 255"
+    if _lowest_code(look.images) >= LIMITED[0] and level <= LIMITED[1]:
+        text += " and nothing is black: limited range (16 to 235) shown as if it were full"
+        remedy = "set the camera, the capture card or the recording to full range (0 to 255)"
+    else:
+        text += ": a shoulder, tone mapping, or another range than 0 to 255"
+    return [Finding("camera.saturation", text, remedy)]
+
+
+def _lowest_code(images: Sequence[NDArray[np.uint8]]) -> float:
+    """The lowest code of all but ``FEW`` of the pixels, by the darkest channel of some pictures."""
+    few = images[:: -(-len(images) // 4)]
+    return min(float(np.quantile(image[::2, ::2].min(axis=2), FEW)) for image in few)

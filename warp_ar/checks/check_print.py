@@ -1,4 +1,4 @@
-"""Whether the card was printed at true scale: by the paper that it is printed on, whose size is known.
+"""True if the card was printed at true scale: by the paper that it is printed on, whose size is known.
 
 A print at 97 % looks like everything else at 103 %: nothing on it tells. Its paper does. In units of the print, A4 at
 97 % is 216 mm wide, which is nearly Letter's width, and its upper edge is 179 mm from the board's middle, which is not.
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from warp_ar.calibration.card import PAPERS
 from warp_ar.checks.finding import Finding
 from warp_ar.scene import Camera, CharucoBoard, Marker, Pose
+from warp_ar.scene.pixel_rays import project
 from warp_ar.tracking.card_layout import SHEET, board_top
 
 Image = NDArray[np.uint8]
@@ -111,18 +112,15 @@ def _find_edge(
     window: tuple[float, float],
     lines: Sequence[tuple[tuple[float, float], tuple[float, float]]],
 ) -> float | None:
-    """How far along lines, each with a direction and a start, the paper ends; None where they do not agree."""
+    """Return how far along lines, each with a direction and a start, the paper ends; None where they do not agree."""
     far = np.arange(*window, STEP)
     found = []
     for way, start in lines:
         points = np.array([[start[0] + way[0] * t, start[1] + way[1] * t, 0.0] for t in far])
-        pixels, _ = cv2.projectPoints(
-            pose.apply(points), np.zeros(3), np.zeros(3), camera.matrix(), np.array(camera.distortion)
-        )
-        x, y = pixels.reshape(-1, 2).T
-        if x.min() < 1 or y.min() < 1 or x.max() > gray.shape[1] - 2 or y.max() > gray.shape[0] - 2:
+        pixels = project(camera, pose.apply(points))
+        if not ((pixels >= 1) & (pixels <= (gray.shape[1] - 2, gray.shape[0] - 2))).all():
             continue
-        values = cv2.remap(gray, x.astype(np.float32)[:, None], y.astype(np.float32)[:, None], cv2.INTER_LINEAR).ravel()
+        values = cv2.remap(gray, pixels.astype(np.float32)[:, None], None, cv2.INTER_LINEAR).ravel()
         # The paper is bright up to its edge, and what follows is not.
         falls = values[:-4] - values[4:]
         k = int(falls.argmax())

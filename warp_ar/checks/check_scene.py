@@ -1,4 +1,4 @@
-"""What a scene's numbers alone say is wrong: units, a ball that is sunk into the table, a lens that no camera has."""
+"""Faults that a scene's numbers alone tell: units, a ball that is sunk into the table, a lens that no camera has."""
 
 from __future__ import annotations
 

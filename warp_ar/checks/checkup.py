@@ -6,19 +6,18 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Final
 
-from warp_ar.ball.ball_solve import find_outlines
+from warp_ar.ball.ball_solve import find_outline, standing_ground
 from warp_ar.ball.ground_seen import ground_is_seen
-from warp_ar.checks.check_ball import LOST, check_balls, is_in_view, standing_ground
+from warp_ar.checks.check_ball import LOST, check_balls, is_in_view
 from warp_ar.checks.check_objects import check_objects, written_poses
-from warp_ar.checks.check_pictures import Look, check_pictures, take_look
+from warp_ar.checks.check_pictures import Look, check_pictures, check_saturation, take_look
 from warp_ar.checks.check_print import check_print
 from warp_ar.checks.check_proxies import check_proxies
-from warp_ar.checks.check_saturation import check_saturation
 from warp_ar.checks.check_scene import check_scene
 from warp_ar.checks.finding import Finding, worst_first
 from warp_ar.errors import SceneError, SourceError
 from warp_ar.scene import Camera, Pose, Scene
-from warp_ar.sources.sources import open_source
+from warp_ar.sources.sources import open_source, source_of
 
 FRAMES: Final = 120
 """Frames that are looked at."""
@@ -28,22 +27,16 @@ QUICK_FRAMES: Final = 12
 """Frames that the quick half looks at."""
 SPREAD: Final = 96
 """Frames of ``PIXELS`` over which these are spread: drifts, and views from several sides, take seconds."""
+_NOT_LOOKED: Final = ("source.", "units.", "marker.", "picture.", "camera.aspect", "ball.unfound", "ball.outside")
+"""Beginnings of findings after which a ball was not looked for, or one of several not seen."""
 PIXELS: Final = 640 * 480
 """Of larger pictures so many fewer frames are read that it takes as long."""
-
-
-def source_of(scene: Scene, given: str | int | Path | None = None) -> str | int | Path | None:
-    """What ``open_source`` calls the frames: those that are given, else the scene's own."""
-    if given is not None or scene.source is None:
-        return given
-    spec = scene.source
-    return spec.path or (f"synthetic:{spec.synthetic}" if spec.synthetic is not None else spec.camera)
 
 
 def check_up(
     scene: Scene, source: str | int | Path | None, *, frames: int = FRAMES, quick: bool = False
 ) -> list[Finding]:
-    """What is wrong with a set-up, the worst first.
+    """Return what is wrong with a set-up, the worst first.
 
     Args:
         scene: The scene.
@@ -52,6 +45,23 @@ def check_up(
         quick: Look at a few only, which takes about a second.
     """
     return check_and_look(scene, source, frames=frames, quick=quick)[0]
+
+
+def quick_check(scene: Scene, given: str | int | Path | None) -> tuple[list[Finding], bool]:
+    """Look at a set-up's first frames, if they were recorded, for about a second.
+
+    Args:
+        scene: The scene.
+        given: Its frames, unless they are the scene's own.
+
+    Returns:
+        The findings, the worst first, and True if a frame shows every mirror ball of the scene, which has one.
+    """
+    source = source_of(scene, given)
+    recorded = isinstance(source, Path) or (isinstance(source, str) and Path(source).exists())
+    found = check_up(scene, source if recorded else None, quick=True)
+    seen = recorded and bool(scene.probes) and not any(finding.name.startswith(_NOT_LOOKED) for finding in found)
+    return found, seen
 
 
 def check_and_look(
@@ -105,7 +115,7 @@ def _read(scene: Scene, source: str | int | Path, frames: int | None, tell: Call
 
 
 def check_look(scene: Scene, look: Look, views: int = 4) -> list[Finding]:
-    """What is wrong with a set-up whose frames were looked at already, the worst first.
+    """Return what is wrong with a set-up whose frames were looked at already, the worst first.
 
     Args:
         scene: The scene.
@@ -145,11 +155,12 @@ def ball_is_seen(scene: Scene, camera: Camera, views: Iterable[tuple[Any, Pose]]
     """Return whether any of some posed RGB frames shows any of the scene's mirror balls."""
     views = list(views)
     for probe in scene.probes:
-        ground = standing_ground(scene, probe)
+        ground = standing_ground(probe, scene.proxies)
         if ground is not None and ground_is_seen(views, camera, probe, ground):
             continue  # edges of what lies there may look like a rim
         # Frame by frame, up to the first that does: looking takes a third of a second.
-        if any(outline.support > LOST for view in views for outline, _ in find_outlines([view], camera, probe)):
+        outlines = (find_outline(view, camera, probe) for view in views)
+        if any(outline is not None and outline.support > LOST for outline in outlines):
             return True
     return False
 

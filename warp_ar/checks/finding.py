@@ -1,4 +1,4 @@
-"""What is wrong with a set-up, in words: what was found, what it spoils, what to do."""
+"""Faults of a set-up in words: what was found, what it spoils, what to do."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ class Finding:
     """A fault of the set-up, or a guess."""
 
     name: str
-    """Which check found it, such as ``probe.radius``."""
+    """Name of the check that found it, such as ``probe.radius``."""
     text: str
-    """What was found, with the value and what would be right."""
+    """Description of what was found, with the value and what would be right."""
     remedy: str
-    """What to do: a command, or a key of the scene file."""
+    """Remedy: a command, or a key of the scene file."""
 
     def remedy_for(self, scene: str | None) -> str:
-        """What to do, with the scene's own name where a command takes it; None: it is not written into."""
+        """Return what to do, with the scene's own name where a command takes it; None: it is not written into."""
         if scene is None:
             return self.remedy
         named = self.remedy.replace("calibrate camera PICTURES", f"calibrate camera PICTURES --write {scene}")
@@ -35,7 +35,7 @@ class Finding:
 
     @property
     def cost(self) -> str:
-        """What it spoils, in words."""
+        """Return what it spoils, in words."""
         entry = fault_errors().get(self.name)
         if entry is None:
             return "not measured"

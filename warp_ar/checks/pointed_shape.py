@@ -44,8 +44,10 @@ def point_out(camera: Camera, pose: Pose, kind: str, points: Sequence[tuple[floa
     pixels = np.asarray(points, float)
     eye, rays = -pose.rotation.T @ pose.translation, undistorted(camera, pixels)
     rays = np.column_stack([rays, np.ones(len(rays))]) @ pose.rotation
-    shape = {"plane": _start_plane, "wall": _start_wall, "box": _start_box}[kind](eye, rays)
-    _check(kind, shape)
+    shape = _start(kind, eye, rays)
+    if not _is_sound(shape):
+        sizes = " x ".join(f"{1e3 * side:.0f}" for side in shape[3:])
+        raise UsageError(f"the points make a {kind} of {sizes} mm; expected {_ORDER[kind]}")
 
     def seen(numbers: Array) -> Array:
         return project(camera, pose.apply(corners_of(kind, numbers)))
@@ -81,53 +83,33 @@ def corners_of(kind: str, shape: Array) -> Array:
     return base if kind == "plane" else np.concatenate([base, base + np.array([0.0, 0.0, shape[5]])])
 
 
-def _on_desk(eye: Array, rays: Array) -> Array:
-    """Return where rays meet the desk, (n, 2)."""
+def _at_height(eye: Array, rays: Array, height: float = 0.0) -> Array:
+    """Return where rays meet the desk, or a level above it, (n, 2)."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        far = -eye[2] / rays[:, 2]
+        far = (height - eye[2]) / rays[:, 2]
     if not (np.isfinite(far) & (far > 0)).all():
         raise UsageError("a point lies above the desk's horizon; point out corners that stand on the desk")
     return np.asarray((eye + far[:, None] * rays)[:, :2], float)
 
 
-def _start_plane(eye: Array, rays: Array) -> Array:
-    """Return x, y, angle, width and depth of the rectangle nearest to four corners."""
-    corners = _on_desk(eye, rays)
-    sides = np.roll(corners, -1, 0) - corners
-    width, depth = (float(np.linalg.norm(sides[[k, k + 2]], axis=1).mean()) for k in (0, 1))
-    return np.array([*corners.mean(0), math.atan2(sides[0, 1], sides[0, 0]), width, depth])
-
-
-def _start_wall(eye: Array, rays: Array) -> Array:
-    """Return x, y of the foot's middle, angle, width and height."""
-    left, right = _on_desk(eye, rays[:2])
-    along = right - left
-    width = float(np.linalg.norm(along))
+def _start(kind: str, eye: Array, rays: Array) -> Array:
+    """Return numbers as ``corners_of`` takes them: two points end an edge, others lie above it and behind it."""
+    a, b = _at_height(eye, rays if kind == "plane" else rays[:2])[:2]
+    along, middle = b - a, (a + b) / 2
+    width, height = float(np.linalg.norm(along)), 0.0
     if width < SMALLEST:
-        raise UsageError("the wall's ends are at one place; point out its left and its right end")
-    normal, foot = np.array([along[1], -along[0], 0.0]) / width, np.array([*(left + right) / 2, 0.0])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        far = (foot - eye) @ normal / (rays[2:] @ normal)
-    return np.array([*foot[:2], math.atan2(along[1], along[0]), width, float(np.mean(eye[2] + far * rays[2:, 2]))])
-
-
-def _start_box(eye: Array, rays: Array) -> Array:
-    """Return x, y, angle, width, depth and height."""
-    a, b = _on_desk(eye, rays[:2])
-    along = b - a
-    width = float(np.linalg.norm(along))
-    if width < SMALLEST:
-        raise UsageError("two corners of the box are at one place; point out both ends of an edge of its base")
+        raise UsageError(f"two of the points are at one place; expected {_ORDER[kind]}")
+    start = [math.atan2(along[1], along[0]), width]
+    if kind != "plane":
+        # The height at which the ray of the third point passes the second's upright.
+        above = rays[2]
+        far = float(above[:2] @ (b - eye[:2])) / max(float(above[:2] @ above[:2]), 1e-12)
+        height = float(eye[2] + far * above[2])
+    if kind == "wall":
+        return np.array([*middle, *start, height])
     sideways = np.array([-along[1], along[0]]) / width
-    above, behind = rays[2:]
-    # The height at which the ray of the third point passes the second's upright.
-    far = float(above[:2] @ (b - eye[:2])) / max(float(above[:2] @ above[:2]), 1e-12)
-    height = float(eye[2] + far * above[2])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        last = eye + np.float64(height - eye[2]) / behind[2] * behind
-    depth = float((last[:2] - b) @ sideways)
-    middle = a + along / 2 + sideways * depth / 2
-    return np.array([*middle, math.atan2(along[1], along[0]), width, abs(depth), height])
+    depth = float((_at_height(eye, rays[3:], height)[0] - b) @ sideways)
+    return np.array([*(middle + sideways * depth / 2), *start, abs(depth), height])[: 5 if kind == "plane" else 6]
 
 
 def _is_sound(shape: Array) -> bool:
@@ -137,12 +119,6 @@ def _is_sound(shape: Array) -> bool:
         and ((sides >= SMALLEST) & (sides <= LARGEST)).all()
         and np.abs(shape[:2]).max() <= LARGEST
     )
-
-
-def _check(kind: str, shape: Array) -> None:
-    if not _is_sound(shape):
-        sizes = " x ".join(f"{1e3 * side:.0f}" for side in shape[3:])
-        raise UsageError(f"the points make a {kind} of {sizes} mm; expected {_ORDER[kind]}")
 
 
 def _proxy(kind: str, shape: Array) -> Proxy:

@@ -1,4 +1,4 @@
-"""What callers give a pipeline, checked: one line says what is wrong and what would be right."""
+"""Checks of what callers give a pipeline: one line says what is wrong and what would be right."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from warp_ar.engine.layers import check_outputs, expand_outputs
 from warp_ar.errors import UsageError
 from warp_ar.scene import Scene, load_scene
-from warp_ar.scene.finite import check_finite
+from warp_ar.scene.fields import check_finite
 from warp_ar.stages.request import Estimates
 
 
@@ -50,7 +50,7 @@ def check_exposure(scene: Scene) -> None:
 
 
 def read_scene(scene: object) -> Scene:
-    """What was given as a scene, checked.
+    """Return the scene that was given, checked.
 
     Raises:
         SceneError: It cannot be read, or one of its numbers is not finite.

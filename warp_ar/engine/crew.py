@@ -49,7 +49,7 @@ class _Packed:
 
 
 class _System:
-    """What the operating system gives: a semaphore, a clock, a way to let others run."""
+    """Functions of the operating system: a semaphore, a clock, a way to let others run."""
 
     def __init__(self) -> None:
         self.clock_id = 1
@@ -331,10 +331,7 @@ class Crew:
         self._end()
         for thread in self._threads:
             thread.join()
-        self._threads.clear()
-        self._packed.clear()
-        self._host_steps.clear()
-        del self._called, self._decide, self._finish, self._caller, self._helpers
+        vars(self).clear()
 
 
 def _serve(helper: _Packed, read: tuple[Any, ...]) -> None:

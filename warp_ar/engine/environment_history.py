@@ -16,19 +16,19 @@ from warp_ar.stages.base import Arrays
 KEPT_ARRAYS = ("others_kept_radiance", "others_filled")
 """Remembered radiance of mirror balls after the first; stages carry it over."""
 LIGHT_ARRAYS = ("environment_radiance", "environment_confidence", "environment_clipped")
-"""What is remembered of the environment."""
+"""Arrays of the environment that are remembered."""
 SCALED_ARRAYS = ("environment_radiance", "filled_radiance", "recover_recovered", *KEPT_ARRAYS)
 """Remembered radiance; the filled map is, while something covers a ball."""
 
 
 class CarriedLight:
-    """Whether a pipeline has seen any light yet, and what it keeps of it."""
+    """Memory of the light that a pipeline has seen, if it has seen any."""
 
     def __init__(self, arrays: Arrays, *, wanted: bool) -> None:
         """``wanted``: the environment is one of the outputs."""
         self._arrays, self._wanted = arrays, wanted
         self.known = False
-        """Whether the arrays hold light; else the next frame starts anew."""
+        """True if the arrays hold light; else the next frame starts anew."""
 
     @property
     def environment(self) -> Any:

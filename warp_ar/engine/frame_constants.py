@@ -1,4 +1,4 @@
-"""What changes per frame, in one small block of memory: camera, virtual lights, virtual objects, proxies.
+"""Values that change per frame, in one small block of memory: camera, virtual lights, virtual objects, proxies.
 
 The block is written on the host and uploaded in one copy, so a captured CUDA graph sees new values without being
 captured again. The copy is asynchronous, out of pinned memory that is not written again before it is over.

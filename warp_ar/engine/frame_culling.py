@@ -1,4 +1,4 @@
-"""Which stages can change a pixel of this frame, and why the others cannot.
+"""Stages that can change a pixel of this frame, and the reasons why the others cannot.
 
 A plan knows the scene, not the frame: a light may have no power, an object be out of view. Before a frame a stage is
 asked whether what it writes is as if it did nothing (``Stage.idle``), from the outputs back: what such a stage reads is
@@ -27,7 +27,7 @@ class Demand:
         self._stages, self._outputs = stages, outputs
         self._clear: set[str] = set()
         self._last: tuple[Reach, Mapping[str, str]] | None = None
-        """What was found last, where the next frame of the same reach is the same."""
+        """Result of the last frame, which holds for the next one of the same reach."""
 
     def forget(self) -> None:
         """Take it that no stage's arrays are clear."""

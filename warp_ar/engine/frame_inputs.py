@@ -1,4 +1,4 @@
-"""What the pipeline itself provides for every frame: the picture, the camera, virtual lights and objects, the clock."""
+"""Inputs of every frame that the pipeline provides: the picture, the camera, virtual lights and objects, the clock."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from warp_ar.scene.screen_extents import EMPTY, Outline, Rect, screen_rects
 from warp_ar.sources.deep_frame import Plate, decode_deep
 from warp_ar.stages.base import Arrays, Reach, Rows
 from warp_ar.tracking.drift import ExposureDrift
-from warp_ar.tracking.own_markers import Places
+from warp_ar.tracking.tracking import Places
 
 _CLOCK = struct.Struct("<2f2i")
 """Of the frame's values, one behind the other: ``time``, ``time_step``, ``frame_index``, ``environment_reset``."""
@@ -53,7 +53,7 @@ class SeenFrame:
     image: Any
     """As it was given, or a copy of one's own."""
     slot: Slot | None
-    """Where it is sent to the device from, where copying it there has begun."""
+    """Memory that it is sent to the device from, if copying it there has begun."""
     pose: Pose | None
     lost: bool
     index: int
@@ -65,7 +65,7 @@ class SeenFrame:
     """Seconds since the frame before that was lit."""
     timings: dict[str, StageTiming]
     places: Places = dataclasses.field(default_factory=dict)
-    """Where the markers are that something rides on."""
+    """Places of the markers that something rides on."""
     plate: Plate | None = None
     """The frame at its full depth."""
 
@@ -120,7 +120,7 @@ class FrameInputs:
         self._reflectance = ReflectanceWatch(scene, camera, self.decode) if watches_ball else None
         self._coming: Slot | None = None
         self.covered = False
-        """Whether something covers a ball in the frame: it then tells nothing of the light."""
+        """True if something covers a ball in the frame: it then tells nothing of the light."""
         self._saturation_is_known = False
         self._encoded = 0.0, self.saturation.levels.copy()
         self._bent = 0.0
@@ -153,7 +153,10 @@ class FrameInputs:
         add("probes", wp.array(_probe_values(scene.probes), dtype=Probe, device=device))
         add("decode", wp.array(camera_table(self._camera.transfer), dtype=wp.vec3, device=device))
         add("encode", wp.array(encode_table(self._camera.transfer), dtype=wp.vec3, device=device))
-        add("rays", wp.array(pixel_rays(self._camera), dtype=wp.vec2, device=device))
+        rays = self._arrays.constant(
+            self._camera, lambda: wp.array(pixel_rays(self._camera), dtype=wp.vec2, device=device)
+        )
+        add("rays", rays)
         for name in RECTS:
             add(f"{name}_rows", functools.partial(self._rows, name))
         add("reach", self.reach)
@@ -164,13 +167,13 @@ class FrameInputs:
 
     @property
     def told_reflectance(self) -> tuple[scenes.RGB, ...] | None:
-        """What balls reflect by what frames have told; None while it is what the scene says."""
+        """Reflectance of the balls by what frames have told; None while it is what the scene says."""
         told = self._reflectance
         return None if told is None or not told.is_told else told.values
 
     @property
     def gain(self) -> npt.NDArray[np.float64]:
-        """What the camera multiplies radiance by, against the first frame, RGB: 1 unless its exposure drifts."""
+        """Camera's factor on radiance against the first frame, RGB: 1 unless its exposure drifts."""
         return np.ones(3) if self._drift is None else self._drift.gain
 
     def look(self, frame: SeenFrame) -> tuple[npt.NDArray[np.float64] | None, bool]:
@@ -300,7 +303,7 @@ class FrameInputs:
         self._write_decode()
 
     def _is_covered(self, frame: SeenFrame, *, reset: bool) -> bool:
-        """Whether something covers a ball, if the frame is on the host and light of former frames is known."""
+        """Return whether something covers a ball, if the frame is on the host and light of former frames is known."""
         if self._cover is None or frame.pose is None or isinstance(frame.image, wp.array):
             return False
         if reset:
@@ -318,7 +321,7 @@ class FrameInputs:
         return True
 
     def _write_probes(self) -> None:
-        """Where balls are, and what they reflect by what frames have told so far."""
+        """Write the places of balls, and their reflectance by what frames have told so far."""
         told = None if self._reflectance is None else self._reflectance.values
         self._arrays["probes"].assign(_probe_values(self._probes, told))
 
@@ -373,7 +376,7 @@ class FrameInputs:
         return before != (position.tobytes(), rotation.tobytes())
 
     def _outlines(self) -> dict[str, Outline]:
-        """What of the screen a frame asks about; ``light`` only where it is more than what is lit directly."""
+        """Return the outlines on the screen that a frame needs; ``light`` only if it is more than the directly lit."""
         scene, arrays = self.host_scene, self._arrays
         outlines = {"object": scene.object_outline(), "direct": scene.light_outline()}
         if "relight_bounced" in arrays:
@@ -389,7 +392,7 @@ class FrameInputs:
         return self.rects[name][:2]
 
     def reach(self) -> Reach:
-        """What of this frame virtual objects and lights can reach."""
+        """Return the parts of this frame that virtual objects and lights can reach."""
         rects = (self.rects[name] for name in RECTS)
         objects, light, shadows, balls = (rect[0] < rect[1] and rect[2] < rect[3] for rect in rects)
         falls = bool(self.host_scene.light_outline().polygons)

@@ -21,7 +21,7 @@ class Plan:
     """The stages of a request, in the order in which they run."""
 
     features: Features
-    """What the request calls for."""
+    """Features that the request calls for."""
     stages: tuple[tuple[type[Stage], Wiring], ...]
     left_out: tuple[tuple[str, str], ...]
     """(stage, reason) of every stage that does not run."""
@@ -30,11 +30,11 @@ class Plan:
 
     @property
     def request(self) -> Request:
-        """What the plan was made for."""
+        """Request that the plan was made for."""
         return self.features.request
 
     def needs(self, name: str) -> bool:
-        """Whether some stage reads the input ``name`` or the caller asked for it."""
+        """Return whether some stage reads the input ``name`` or the caller asked for it."""
         return name in self.inputs
 
 

@@ -19,7 +19,7 @@ from warp_ar.stages.request import LAYERS, PICTURE_LAYERS, Request
 RADIANCE = "radiance"
 """Asks for the five layers that the picture is composed of, so that ``Result.radiance`` is there."""
 OUTPUTS = ("image", "environment", "pose", RADIANCE)
-"""What results hold beside layers."""
+"""Outputs of results beside layers."""
 
 _COMPONENTS = {"objects": 4, "coverage": 8, "motion": 2, "ids": 0, "depth": 0}
 """Numbers per pixel of those layers that have not three; 0: the pixel is the number."""

@@ -118,5 +118,5 @@ def _folder_of(variant: _Variant) -> Path:
 
 
 def _is_cached(variant: _Variant) -> bool:
-    """Whether the cache has a module's files; asking hashes the module, which loading needs anyway."""
+    """Return whether the cache has a module's files; asking hashes the module, which loading needs anyway."""
     return bool(wp.config.cache_kernels) and _folder_of(variant).is_dir()

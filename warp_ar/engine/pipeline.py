@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import collections
+import contextlib
+import copy
 import dataclasses
 import difflib
 import functools
@@ -28,23 +30,23 @@ from warp_ar.engine.graph import make_plan
 from warp_ar.engine.layers import LayerArrays, layer_arrays, neutral_layers
 from warp_ar.engine.modules import Progress
 from warp_ar.engine.result import TRACK, Rendered, Result, done_at_once
+from warp_ar.engine.scene_objects import Edit, SceneObjects
 from warp_ar.engine.scheduler import Scheduler, StageTiming
 from warp_ar.engine.short_frames import ShortFrames
 from warp_ar.engine.transfer import Image
-from warp_ar.errors import UsageError
+from warp_ar.errors import UpdateError, UsageError, WarpArError
 from warp_ar.kernels.picture.marker_edge_fit import fit_edges_kernel
 from warp_ar.light.captured import has_places
 from warp_ar.scene import Pose, Scene
-from warp_ar.scene.finite import check_finite
-from warp_ar.scene.kinds import skeleton
+from warp_ar.scene.fields import check_finite
+from warp_ar.scene.kinds import difference
 from warp_ar.sources.deep_frame import Plate, as_plate, check_plate, codes8
 from warp_ar.sources.exposures import BracketPlan, brightened, find_exposure, plan_bracket
 from warp_ar.stages.base import Arrays
 from warp_ar.stages.captured import Captured
 from warp_ar.stages.quality import DEFAULT_PRESET, PRESETS, Quality
 from warp_ar.stages.request import Estimates, Request
-from warp_ar.tracking.own_markers import OwnMarkers, Places, own_markers
-from warp_ar.tracking.tracking import Track, Tracker, TrackState
+from warp_ar.tracking.tracking import OwnMarkers, Places, Track, Tracker, TrackState, given_pose, own_markers
 
 __all__ = ["DEFAULT_FRAME_INTERVAL", "TRACK", "Pipeline", "Result", "resolve_quality"]
 
@@ -73,6 +75,17 @@ def resolve_quality(quality: str | Quality) -> Quality:
     return PRESETS[quality]
 
 
+def _has_places(scene: Scene) -> bool:
+    """Return whether a scene's captured light says where its emitters are."""
+    return scene.captured is not None and has_places(scene.captured.file)
+
+
+def cannot_run(quality: Quality, error: BaseException) -> UsageError:
+    """Return the error to raise where a pipeline cannot be built, such as on a device whose memory is full."""
+    reason = (str(error).splitlines() or [type(error).__name__])[0]
+    return UsageError(f"quality {quality.name!r} cannot run here: {reason}; choose a cheaper one")
+
+
 def _in_turn(method: Callable[Concatenate[Pipeline, _P], _R]) -> Callable[Concatenate[Pipeline, _P], _R]:
     """Have threads that call methods of one pipeline take turns."""
 
@@ -91,7 +104,7 @@ class Pipeline(Closing):
     """
 
     bracket: BracketPlan
-    """Which exposures are merged, and which is shown."""
+    """Exposures that are merged, and the one that is shown."""
 
     def __init__(
         self,
@@ -152,38 +165,49 @@ class Pipeline(Closing):
         self.scene = dataclasses.replace(scene, camera=self.camera)
         self.size = (self.camera.width, self.camera.height)
         self.bracket = plan_bracket(exposures, shown)
-        emitters |= self.scene.captured is not None and has_places(self.scene.captured.file)
+        emitters |= _has_places(self.scene)
         form = outputs, self.bracket.ratios, estimates, emitters, linear
         self.plan = make_plan(Request(self.scene, self.quality, self.size, *form))
-        with translating(self.device), wp.ScopedDevice(self.device):
-            self._build(self._follows_gain(follows_camera, exposures), bands=bands, profile=profile, culling=culling)
+        self._follows_camera = follows_camera
+        self._running: dict[str, Any] = {"bands": bands, "profile": profile, "culling": culling}
+        self._start_over()
+        self._build(Arrays(), {})
 
-    def _follows_gain(self, follows_camera: bool | None, exposures: Sequence[float]) -> bool:
-        """Whether a drift of the camera's gain is followed."""
-        if follows_camera is None:
-            follows_camera = self.scene.source is not None and self.scene.source.metering == "automatic"
+    def _follows_gain(self) -> bool:
+        """Return whether a drift of the camera's gain is followed."""
+        follows = self._follows_camera
+        if follows is None:
+            follows = self.scene.source is not None and self.scene.source.metering == "automatic"
         # Frames of several exposures tell their gain themselves; the paper takes all as the camera saw it.
-        return follows_camera and self.quality.method("recover") != "clipped" and not exposures
+        return follows and self.quality.method("recover") != "clipped" and not self.plan.request.exposures
 
     def _start_over(self) -> None:
-        """What frames leave behind for the next one: nothing as yet."""
-        tracked = self.plan.needs("pose") and self.scene.pose is None
-        self._tracker = Tracker(self.scene.marker, self.camera) if tracked else None
-        self._own_markers = OwnMarkers(self.scene, self.camera)
+        """Begin without a frame."""
         self._begun = 0
         self._start_time: float | None = None
         self._last_time = 0.0
         self._lit_time = 0.0
-        self._index = 0
         self._shown: Any = None
         self._renderer: ThreadPoolExecutor | None = None
         self._ahead: collections.deque[Future[Rendered]] = collections.deque()
 
-    def _build(self, follows: bool, *, bands: int | None, profile: bool, culling: bool) -> None:
-        """Allocate what the plan calls for, and wire its stages."""
-        self._start_over()
+    def _build(self, arrays: Arrays, spare: Mapping[str, Any]) -> None:
+        """Allocate what the plan calls for, and wire its stages.
+
+        Args:
+            arrays: Takes what is allocated.
+            spare: Arrays of before that may be written anew.
+        """
+        with translating(self.device), wp.ScopedDevice(self.device):
+            self._allocate(arrays, spare)
+
+    def _allocate(self, arrays: Arrays, spare: Mapping[str, Any]) -> None:
+        tracked = self.plan.needs("pose") and self.scene.pose is None
+        self._tracker = Tracker(self.scene.marker, self.camera) if tracked else None
+        self._own_markers = OwnMarkers(self.scene, self.camera)
+        self._index = 0  # of frames that these arrays have seen
         self._borrowed = Borrowed(self.device)
-        self._arrays = Arrays()
+        self._arrays = arrays
         self._light = CarriedLight(self._arrays, wanted="environment" in self.plan.request.outputs)
         deep = self.plan.needs("linear_frame")
         self.inputs = FrameInputs(
@@ -191,17 +215,19 @@ class Pipeline(Closing):
             self.camera,
             self._arrays,
             self.device,
-            follows_gain=follows,
+            follows_gain=self._follows_gain(),
             watches_ball=self.plan.features.recovered and not self.plan.request.exposures,
             linear=deep,
         )
-        more: dict[str, Any] = {"bands": bands, "profile": profile, "culling": culling}
         tracking = [fit_edges_kernel] if self._tracker is not None or self._own_markers else []
-        self._scheduler = Scheduler(self.plan, self._arrays, self.device, on_host=tracking, **more)
+        self._scheduler = Scheduler(
+            self.plan, self._arrays, self.device, on_host=tracking, spare=spare, **self._running
+        )
         self._scheduler.launch_first(self.inputs.first_launches)
-        waits = profile or self.plan.request.asks_for_layers or self.plan.request.estimates == "synchronous"
+        request = self.plan.request
+        waits = self._running["profile"] or request.asks_for_layers or request.estimates == "synchronous"
         self._launches_here = self.inputs.transfers is not None and "image" in self._arrays and not waits
-        """Whether the caller's thread launches submitted frames: that waits for nothing on the device."""
+        """True if the caller's thread launches submitted frames: that waits for nothing on the device."""
         short = self.plan.needs("short_frames")
         self._short = ShortFrames(self.plan.features, self._arrays, self.device) if short else None
 
@@ -227,7 +253,7 @@ class Pipeline(Closing):
 
     @property
     def scheduler(self) -> Scheduler:
-        """What runs the stages and times them."""
+        """Scheduler that runs the stages and times them."""
         return self._scheduler
 
     @property
@@ -236,40 +262,81 @@ class Pipeline(Closing):
         return self._arrays
 
     @_in_turn
-    def update(self, scene: Scene) -> bool:
-        """Show another scene from the next frame on, if it differs in numbers alone.
+    def update(self, scene: Scene) -> None:
+        """Show another scene from the next frame on, if it differs in numbers alone; nothing is allocated or compiled.
 
-        Positions, sizes, colours, intensities, the values of materials and the scale of the exposure are numbers. What
-        adds or drops a stage or calls for another kernel is not: build a new pipeline, which can ``continue_from`` this
-        one.
+        Positions, sizes, colours, intensities, the values of materials and the scale of the exposure are numbers. For
+        what adds or drops a stage, an array or a kernel there is ``change``.
 
         Args:
             scene: The new scene; its camera is scaled as it was in the constructor.
 
-        Returns:
-            False if the scene needs a new pipeline; nothing has changed then.
-
         Raises:
+            UpdateError: More than numbers differs; the message names it, and nothing has changed.
             SceneError: The scene's camera does not fit the size of the frames, or a number is not finite.
             UsageError: The pipeline is closed, or another process's.
         """
-        self._check_usable()
-        if not isinstance(scene, Scene):
-            raise UsageError(f"scene is {type(scene).__name__}; expected a Scene, such as load_scene returns")
-        check_exposure(scene)
-        check_finite(scene, leave=("pose",))  # which stays as it was, or calls for another pipeline
-        self._finish()
-        scene = dataclasses.replace(scene, camera=scene.camera.scaled_to(*self.size))
-        if skeleton(scene) != skeleton(self.scene):
-            return False
+        scene = self._check_next(scene)
+        if name := "camera" if self.camera != scene.camera else difference(self.scene, scene):
+            raise UpdateError(f"update: {name} differs, and arrays or kernels are made for it; call change instead")
         plan = make_plan(dataclasses.replace(self.plan.request, scene=scene))
         if plan.stages != self.plan.stages:
-            return False
+            stages = {kind.name for kind, _ in {*plan.stages} ^ {*self.plan.stages}}
+            raise UpdateError(f"update: the scene calls for other work of {', '.join(sorted(stages))}; call change")
         before = self.scene
         placed = scene.objects != before.objects or scene.lights != before.lights
         self.inputs.update(scene, placed=placed, exposed=scene.exposure != before.exposure)
         self.scene, self.plan = scene, plan
-        return True
+
+    def _check_next(self, scene: Scene) -> Scene:
+        """Return a scene that is to be shown next, at the size of the frames, with all that was submitted rendered."""
+        self._check_usable()
+        if not isinstance(scene, Scene):
+            raise UsageError(f"scene is {type(scene).__name__}; expected a Scene, such as load_scene returns")
+        check_exposure(scene)
+        check_finite(scene, leave=("pose",))  # whose numbers the file's reader has checked
+        self._finish()
+        return dataclasses.replace(scene, camera=scene.camera.scaled_to(*self.size))
+
+    @_in_turn
+    def change(self, scene: Scene | None = None, *, quality: str | Quality | None = None) -> None:
+        """Show another scene, at another quality, from the next frame on; light, clock and track of the marker go on.
+
+        What ``update`` can do is done so. For all else arrays are made anew, and kernels of kinds that no pipeline of
+        this machine has had are compiled by the next frame, or by ``warm_up``; ``PipelineSwitcher`` does both beside
+        the frames.
+
+        Args:
+            scene: The next scene; None leaves it.
+            quality: A preset's name or a value; None leaves it.
+
+        Raises:
+            UsageError: ``scene`` is no scene, or the quality is none or cannot run here. What is refused changes
+                nothing.
+            SceneError: The scene's camera does not fit the frames, or a file that it names cannot be used.
+        """
+        scene = self._check_next(self.scene if scene is None else scene)
+        quality = self.quality if quality is None else resolve_quality(quality)
+        if quality == self.quality:
+            with contextlib.suppress(UpdateError):
+                return self.update(scene)
+        emitters = self.plan.request.emitters or _has_places(scene)
+        plan = make_plan(dataclasses.replace(self.plan.request, scene=scene, quality=quality, emitters=emitters))
+        before = copy.copy(self)
+        self.scene, self.camera, self.quality, self.plan = scene, scene.camera, quality, plan
+        try:
+            # Memory that is new to the process takes long to fill.
+            self._build(Arrays(self._scheduler.constants()), self._scheduler.spare())
+        except BaseException as error:
+            vars(self).update(vars(before))
+            self._scheduler.forget()  # what was spare may have been written
+            if isinstance(error, RuntimeError | MemoryError) and not isinstance(error, WarpArError):
+                raise cannot_run(quality, error) from error
+            raise
+        self._go_on(before)
+        before.inputs.close()
+        before._scheduler.close()
+        before._scheduler.let_go()
 
     def warm_up(self, progress: Progress | None = None) -> None:
         """Load every kernel, so that the first frame takes no longer than others; may run beside another pipeline.
@@ -289,6 +356,19 @@ class Pipeline(Closing):
         other._finish()
         self._start_time, self._last_time, self._lit_time = other._start_time, other._last_time, other._lit_time
         self._shown = other._shown
+        self._go_on(other)
+
+    @property
+    def objects(self) -> SceneObjects:
+        """Virtual objects by name or number: ``pipeline.objects["lamp"].world_from_object = matrix``."""
+        return SceneObjects(lambda: self.scene.objects, self._edit_objects)
+
+    @_in_turn
+    def _edit_objects(self, edit: Edit) -> None:
+        self.change(dataclasses.replace(self.scene, objects=tuple(edit(self.scene.objects))))
+
+    def _go_on(self, other: Pipeline) -> None:
+        """Go on with another's track, where it fits, and with what its frames have told."""
         if (self.scene.marker, self.camera) == (other.scene.marker, other.camera) and other._tracker and self._tracker:
             self._tracker = other._tracker
         if self.camera == other.camera and own_markers(self.scene) == own_markers(other.scene):
@@ -456,7 +536,7 @@ class Pipeline(Closing):
         return result
 
     def _take_depth(self, image: Any) -> tuple[Plate | None, Any]:
-        """What of a frame is more than 8 bits, None where there is no such, and its 8-bit codes."""
+        """Return the part of a frame beyond 8 bits, None if there is none, and its 8-bit codes."""
         if not self.plan.request.linear:
             if isinstance(image, np.ndarray) and image.dtype != np.uint8 and image.dtype.kind in "uf":
                 width, height = self.size
@@ -482,8 +562,8 @@ class Pipeline(Closing):
     ) -> Result:
         """Have a frame rendered whose arguments are in order."""
         host_image = image if isinstance(image, np.ndarray) else None
-        if pose is None and self.scene.pose is not None:
-            pose = Pose(*self.scene.pose.at(self._begun))
+        if pose is None:
+            pose = given_pose(self.scene.pose, self._begun)
         self._begun += 1
         handed_over = ahead and host_image is not None
         now = self._last_time + DEFAULT_FRAME_INTERVAL if time_seconds is None else time_seconds

@@ -1,4 +1,4 @@
-"""What a frame became."""
+"""Results of a frame."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ TRACK = "track"
 
 @dataclasses.dataclass(frozen=True)
 class Rendered:
-    """What the stages made of one frame."""
+    """Output of the stages for one frame."""
 
     image_array: Any
     environment_array: Any
@@ -46,7 +46,7 @@ class Rendered:
     others: npt.NDArray[np.float32] | None = None
     """The same where they were kept."""
     emitters_array: Any = None
-    """Where the environment's emitters are, records of ``Emitter``; None: the quality does not find their places."""
+    """Emitters of the environment with their places, records of ``Emitter``; None: the quality does not find them."""
     emitters: npt.NDArray[Any] | None = None
     """The same where they were kept."""
 
@@ -77,7 +77,7 @@ def done_at_once(work: Callable[[], Rendered]) -> Future[Rendered]:
 
 @dataclasses.dataclass(frozen=True)
 class Result:
-    """What one frame became; of a frame that was submitted, all but the pose waits until it has been rendered."""
+    """Result of one frame; of a submitted one, all but the pose waits until it has been rendered."""
 
     pose: Pose | None
     """From marker to camera; None while the marker is lost or when nothing needed it."""
@@ -151,7 +151,7 @@ class Result:
 
     @functools.cached_property
     def emitters(self) -> npt.NDArray[Any] | None:
-        """Where the environment's emitters are, an array of its own: what ``Pipeline.take_light`` takes.
+        """Emitters of the environment with their places, an array of its own: what ``Pipeline.take_light`` takes.
 
         None where the environment was not asked for or not seen yet, or the quality does not find their places.
         """

@@ -21,12 +21,13 @@ import warp as wp
 
 from warp_ar.device import capturing, exclusive, translating, usable_cores
 from warp_ar.engine.crew import Crew
+from warp_ar.engine.environment_history import LIGHT_ARRAYS
 from warp_ar.engine.frame_culling import Demand
 from warp_ar.engine.graph import Plan
 from warp_ar.engine.modules import Progress, load_modules
 from warp_ar.kernels.bands import serve_kernel
 from warp_ar.kernels.launch import Note, noting
-from warp_ar.stages.base import Arrays, Pass, Reach, Rows, Stage
+from warp_ar.stages.base import Arrays, ArraySpec, Pass, Reach, Rows, Stage
 
 Step = tuple[Stage, list[Pass]]
 """A stage and those of its passes that are launched."""
@@ -34,7 +35,7 @@ Step = tuple[Stage, list[Pass]]
 
 @dataclasses.dataclass(frozen=True)
 class StageTiming:
-    """What one stage did in one frame."""
+    """Work of one stage in one frame."""
 
     milliseconds: float
     """On CPU the stage's share of the time that all took, by the time that its bands took; on CUDA, unless the pipeline
@@ -61,6 +62,7 @@ class Scheduler:
         profile: bool = False,
         culling: bool = True,
         on_host: Iterable[wp.Kernel] = (),
+        spare: Mapping[str, Any] | None = None,
     ) -> None:
         """Allocate what the stages declared and build their passes.
 
@@ -72,6 +74,7 @@ class Scheduler:
             profile: On CUDA wait for every frame and time each stage on the device; stages then run one by one.
             culling: Whether stages that can change no pixel of a frame are left out of it.
             on_host: Kernels that the CPU runs for others than stages: they are compiled with the stages'.
+            spare: Arrays that are taken instead of new ones where name, shape and type are the same.
         """
         self.plan = plan
         self._on_host = on_host
@@ -98,7 +101,7 @@ class Scheduler:
         self._marks: dict[tuple[int, ...], tuple[Any, Any]] | None = {} if profile and device.is_cuda else None
         self.clock = time.perf_counter
         """Seconds by which stages are timed on the host."""
-        self._build()
+        self._build(spare or {})
         self._culling = culling
         self._demand = Demand([stage for stage, _ in self._stages], plan.request.resources)
         self._unneeded: Mapping[str, str] = {}
@@ -113,17 +116,24 @@ class Scheduler:
         self._versions = {stage.name: arrays.versions_of(stage.wiring.reads) for stage, _ in self._stages}
         self._left_out: dict[str, StageTiming] = {}
 
-    def _build(self) -> None:
+    def _build(self, spare: Mapping[str, Any]) -> None:
         """Allocate the arrays of the plan's stages, and build their passes."""
         with wp.ScopedDevice(self.device), translating(self.device):
             for kind, wiring in self.plan.stages:
                 stage = kind(self.plan.features, wiring)
                 for name, spec in stage.arrays().items():
-                    self.arrays.add(name, wp.full(spec.shape, spec.fill, dtype=spec.dtype, device=self.device))
+                    self.arrays.add(name, self._array(spec, spare.get(name)))
                     self._fills[name] = spec.fill
                 with noting() as notes:
                     self._stages.append((stage, stage.build(self.arrays, self.device)))
                 self._first_launches += notes
+
+    def _array(self, spec: ArraySpec, spare: Any) -> Any:
+        """Return an array with what it holds at first: the spare one, if it fits."""
+        if spare is None or (spare.shape, spare.dtype) != (spec.shape, spec.dtype):
+            return wp.full(spec.shape, spec.fill, dtype=spec.dtype, device=self.device)
+        spare.fill_(spec.fill)
+        return spare
 
     def launch_first(self, notes: Iterable[Note]) -> None:
         """Have something launched once before the first frame, beside what the stages ask for."""
@@ -136,6 +146,17 @@ class Scheduler:
             self._crew = None
         for stage, _ in self._stages:
             stage.close()
+
+    def let_go(self) -> None:
+        """Free the arrays of one that is closed, now; it cannot be used again.
+
+        Its arrays and stages refer to each other, so they would wait for the garbage collector, which counts objects:
+        these are few, of many megabytes. Results that refer to arrays keep those.
+        """
+        with exclusive(self.device):
+            self.arrays.clear()
+            for owner in (self.arrays, self):
+                vars(owner).clear()
 
     @property
     def crew(self) -> Crew | None:
@@ -171,6 +192,18 @@ class Scheduler:
                     wp.copy(self.arrays[name], other.arrays[name])
                     self.arrays.touch(name)
                 stage.resume(others[stage.name])
+
+    def constants(self) -> dict[Any, Any]:
+        """Return the tables that the next pipeline may share: those that have been filled."""
+        return self.arrays.constants if self._prepared else {}
+
+    def spare(self) -> dict[str, Any]:
+        """Return the arrays that neither a result nor the next pipeline needs; none on CUDA, which has its own pool."""
+        if self.device.is_cuda:
+            return {}
+        needed = {*self.plan.request.resources, *LIGHT_ARRAYS}
+        needed.update(*(stage.remembers for stage, _ in self._stages))
+        return {name: array for name, array in self.arrays.items() if name in self._fills and name not in needed}
 
     def _remembered(self, stage: Stage) -> list[str]:
         """Arrays of a stage that carry over; a method need not have all of them."""
@@ -218,7 +251,7 @@ class Scheduler:
         self._prepared = True
 
     def _has_usual_blocks(self, kernel: wp.Kernel, size: int) -> bool:
-        """Whether a launch takes its module as that is compiled unasked; on CUDA blocks of another size do not."""
+        """Return whether a launch takes its module as compiled unasked; on CUDA blocks of another size do not."""
         return bool(self.device.is_cpu) or size == kernel.module.options["block_dim"]
 
     def warm_up(self, progress: Progress | None = None) -> None:

@@ -23,7 +23,7 @@ from warp_ar.stages.shared.probe_maps import UNWRAPPED
 from warp_ar.stages.unwrap import Unwrap
 
 KEPT_SECONDS = 3.0
-"""How long a frame of another exposure is believed: the light may have changed, and no newer one says so."""
+"""Seconds for which a frame of another exposure is believed: the light may have changed since."""
 
 
 class ShortFrames:

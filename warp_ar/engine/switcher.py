@@ -13,22 +13,24 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeAlias
 
 from warp_ar.device import exclusive, release_memory
-from warp_ar.engine.pipeline import Pipeline
-from warp_ar.errors import UsageError, WarpArError
+from warp_ar.engine.pipeline import Pipeline, cannot_run
+from warp_ar.errors import UpdateError, WarpArError
 from warp_ar.scene import Scene
 from warp_ar.sources.exposures import plan_bracket
 from warp_ar.stages.quality import Quality
 
 Prepare: TypeAlias = Callable[[Pipeline], Any]
-"""What is done with a new pipeline on the builder's thread, before it lights a frame; its result goes to ``Admit``."""
+"""Function that prepares a new pipeline on the builder's thread, before it lights a frame; its result goes to
+``Admit``.
+"""
 
 Admit: TypeAlias = Callable[[Pipeline, Any], bool]
-"""Whether a pipeline that was just built may light frames, asked on the thread that lights them."""
+"""Function that says, on the thread that lights frames, whether a pipeline that was just built may light them."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Target:
-    """What a pipeline is built for. Targets are told apart by identity: make one only when something has changed."""
+    """Description of the pipeline to build. Targets are compared by identity: make one only when something changed."""
 
     scene: Scene
     quality: Quality
@@ -66,13 +68,13 @@ class PipelineSwitcher:
         self._building: Future[tuple[Pipeline, Any]] | None = None
         self._built_for: Target | None = None
         self.pipeline: Pipeline | None = None
-        """What lights the next frame; None until something was taken."""
+        """Pipeline that lights the next frame; None until something was taken."""
         self.swaps = 0
-        """How often another pipeline has taken over, the first included."""
+        """Number of times that another pipeline has taken over, the first included."""
 
     @property
     def busy(self) -> bool:
-        """Whether a pipeline is being built."""
+        """Return whether a pipeline is being built."""
         return self._building is not None
 
     def want(self, target: Target, prepare: Prepare = Pipeline.warm_up) -> bool:
@@ -134,16 +136,15 @@ class PipelineSwitcher:
             self._go_over(pipeline)
 
     def shows(self, target: Target) -> bool:
-        """Whether the next frame is lit as a target asks for."""
+        """Return whether the next frame is lit as a target asks for."""
         return self._shown is target
 
-    def follow(self, target: Target, *, prepare: Prepare = Pipeline.warm_up, wait: bool = False) -> Pipeline | None:
+    def follow(self, target: Target, *, prepare: Prepare = Pipeline.warm_up) -> Pipeline | None:
         """``want`` and ``take`` in one.
 
         Args:
             target: What frames are to be lit by.
             prepare: Makes a new pipeline ready, on the thread that builds it.
-            wait: Build it on this thread, now, instead of beside the frames.
 
         Returns:
             What lights the next frame: the pipeline before, while the new one is built; None while there is none.
@@ -151,16 +152,6 @@ class PipelineSwitcher:
         Raises:
             WarpArError: As ``take``.
         """
-        if wait and target is not self._shown:
-            self._drop_building()
-            self._wanted = target
-            try:
-                ready = self._ready()
-                self._go_over(self._build(target, prepare)[0] if ready is None else ready)
-            except WarpArError:
-                self._wanted = self._shown
-                raise
-            return self.pipeline
         self.want(target, prepare)
         return self.take()
 
@@ -206,11 +197,7 @@ class PipelineSwitcher:
                 pipeline.close()
             if isinstance(error, WarpArError):
                 raise
-            # Such as a device whose memory is full: what runs goes on.
-            reason = (str(error).splitlines() or [type(error).__name__])[0]
-            raise UsageError(
-                f"quality {target.quality.name!r} cannot run here: {reason}; choose a cheaper one"
-            ) from error
+            raise cannot_run(target.quality, error) from error  # and what runs goes on
 
     def _go_over(self, pipeline: Pipeline) -> None:
         before = self.pipeline
@@ -261,26 +248,27 @@ class PipelineSwitcher:
 
 
 def _fits(pipeline: Pipeline, target: Target) -> bool:
-    """Whether a pipeline does what a target asks for, with its numbers changed where that is enough."""
+    """Return whether a pipeline does what a target asks for, with its numbers changed where that is enough."""
     request = pipeline.plan.request
     camera = target.scene.camera
     size = (camera.width, camera.height) if target.size is None else target.size
     same = (request.quality, pipeline.size, request.outputs) == (target.quality, size, target.outputs)
-    return same and pipeline.bracket == plan_bracket(target.exposures, target.shown) and pipeline.update(target.scene)
+    if not same or pipeline.bracket != plan_bracket(target.exposures, target.shown):
+        return False
+    try:
+        pipeline.update(target.scene)
+    except UpdateError:
+        return False
+    return True
 
 
 def let_go(pipeline: Pipeline) -> None:
-    """Close a pipeline and free its arrays now; it cannot be used again.
-
-    Its arrays, stages and scheduler refer to each other, so they would wait for the garbage collector, which counts
-    objects: a pipeline is few objects and many megabytes. Results that refer to arrays keep those.
-    """
+    """Close a pipeline and free its arrays now; it cannot be used again."""
     device, scheduler = pipeline.device, pipeline.scheduler
-    crew = scheduler.crew
     pipeline.close()
+    scheduler.let_go()
     with exclusive(device):
-        for owner in (pipeline.arrays, scheduler, pipeline, *([] if crew is None else [crew])):
-            vars(owner).clear()
+        vars(pipeline).clear()
     release_memory()
 
 

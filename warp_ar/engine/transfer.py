@@ -65,7 +65,7 @@ class Slot:
         self.own = Pinned(shape)
         """Memory for a frame that lies elsewhere."""
         self.source = self.own
-        """What is sent."""
+        """Array that is sent."""
         self.given: Image | None = None
         """The caller's picture, while it is sent from where it lies."""
         self.frame = wp.zeros(shape, dtype=wp.vec3ub, device=device)
@@ -74,7 +74,7 @@ class Slot:
         self.downloaded: Any = None
         """Event after the last picture from here, or from a later slot."""
         self.sent = True
-        """Whether the picture that was copied to here has been sent on its way."""
+        """True if the picture that was copied to here has been sent on its way."""
 
     @property
     def host(self) -> Image:
@@ -105,7 +105,7 @@ class Buffer(Pinned):
 
 
 class _Holder:
-    """What arrays over one piece of memory refer to: it goes when the last of them does."""
+    """Owner of one piece of memory that several arrays refer to: it goes when the last of them does."""
 
     def __init__(self, host: Image) -> None:
         self.__array_interface__ = host.__array_interface__

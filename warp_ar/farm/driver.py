@@ -6,27 +6,20 @@ The driver holds no frame and no list of jobs: of each clip it knows how many jo
 from __future__ import annotations
 
 import collections
-import json
 import shutil
-import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from pathlib import Path
 from typing import Any
 
-from warp_ar.errors import UsageError, reason
+from warp_ar.errors import UsageError
 from warp_ar.farm.dataset import in_kindred_order
 from warp_ar.farm.jobs import Job, JobFile, Outcome, job_of_clip, jobs_of_clip
-from warp_ar.farm.manifest import PROGRESS, Manifest, RunError, bytes_of, changed_input, is_no_space, record_at
+from warp_ar.farm.manifest import Manifest, RunError, bytes_of, changed_input, record_at
 from warp_ar.farm.pools import Pool
-from warp_ar.files import write_whole
 
 TRIES = 2
 """Times that a job may fail."""
-STARTS = 3
-"""Times in a row that a worker may die before it is ready."""
-PROGRESS_SECONDS = 2.0
-"""Between two words of where things stand."""
 LIGHTING = ("segment", "variation")
 """Kinds of jobs that light frames."""
 
@@ -40,7 +33,6 @@ class Driver:
         folder: Path,
         manifest: Manifest,
         pool: Pool,
-        version: str,
         say: Callable[[str], None],
     ) -> None:
         """Find out what is open.
@@ -50,17 +42,9 @@ class Driver:
             folder: Of the run.
             manifest: Of the run, open for writing.
             pool: Workers.
-            version: Of the program, which all workers must be of.
             say: Called with a line for people now and then.
         """
-        self._jobs, self._folder, self._manifest, self._pool = jobs, folder, manifest, pool
-        self._version, self._say = version, say
-        self._running: dict[Future[Any], tuple[int, Job | None]] = {}
-        """The worker of each future, and its job; None while the worker starts."""
-        self._idle: collections.deque[int] = collections.deque()
-        self._starts, self._deaths = collections.Counter[int](), collections.Counter[str]()
-        self._lit, self._busy = collections.Counter[int](), collections.Counter[int]()
-        """Frames of each worker's finished jobs, and the milliseconds that they took."""
+        self._jobs, self._folder, self._manifest, self._pool, self._say = jobs, folder, manifest, pool, say
         self._again: collections.deque[Job] = collections.deque()
         self._open: dict[int, int] = {}
         """Jobs of a surveyed clip that are neither done nor failed."""
@@ -69,8 +53,7 @@ class Driver:
         self._coming = self._list_jobs()
         self._surveyed: collections.deque[Iterator[Job]] = collections.deque()
         self._joins: collections.deque[Job] = collections.deque()
-        self._told, self._started = 0.0, time.monotonic()
-        self._known = self._finished_now = 0
+        self._finished_now = 0
 
     def _list_jobs(self) -> Iterator[Job]:
         """Yield surveys, one clip after another; clips that are surveyed or joined already are opened on the way."""
@@ -125,7 +108,6 @@ class Driver:
             self._say(f"clip {spec.name}: frames = [{spec.first}, {spec.end}], but it ends with frame {length - 1}")
         count = jobs_of_clip(self._jobs, clip, length)
         self._open[clip] = count
-        self._known += count
         self._surveyed.append(self._jobs_of(clip, count, length))
 
     def _jobs_of(self, clip: int, count: int, length: int) -> Iterator[Job]:
@@ -173,14 +155,11 @@ class Driver:
             UsageError: A file that was read before is another one now.
         """
         try:
-            for worker in range(len(self._pool.names)):
-                self._running[self._pool.start(worker)] = worker, None
             self._work(self._next_job)
             if self._jobs.dataset is not None:
                 self._index()
         finally:
             self._pool.close()
-            self._write_progress(ended=True)
         return dict(self._manifest.failed)
 
     def _index(self) -> None:
@@ -204,51 +183,19 @@ class Driver:
 
     def _work(self, next_job: Callable[[], Job | None], arguments: Any = None) -> None:
         """Give out jobs and take results until there are none of either."""
+        running: dict[Future[Outcome], tuple[int, Job]] = {}
+        idle = collections.deque(range(self._pool.size))
         while True:
-            job = None
-            while self._idle and (job := next_job()) is not None:
-                worker = self._idle.popleft()
-                self._running[self._pool.submit(worker, job, arguments)] = worker, job
-            if job is None and self._idle and all(job is None for _, job in self._running.values()):
+            while idle and (job := next_job()) is not None:
+                worker = idle.popleft()
+                running[self._pool.submit(worker, job, arguments)] = worker, job
+            if not running:
                 return
-            done, _ = wait(self._running, PROGRESS_SECONDS, FIRST_COMPLETED)
+            done, _ = wait(running, return_when=FIRST_COMPLETED)
             for future in done:
-                self._hear(future, *self._running.pop(future))
-            if time.monotonic() - self._told > PROGRESS_SECONDS:
-                self._told = time.monotonic()
-                self._write_progress()
-
-    def _hear(self, future: Future[Any], worker: int, job: Job | None) -> None:
-        """Take what a worker gives back: its version as it starts, later records of its jobs."""
-        try:
-            value = future.result()
-        except self._pool.died as error:
-            self._bury(worker, job, error)
-            return
-        self._idle.append(worker)
-        self._starts[worker] = 0
-        if job is not None:
-            self._lit[worker] += int(value.values.get("frames", 0))
-            self._busy[worker] += int(1e3 * value.values.get("seconds", 0))
-            self._take(job, value)
-        elif value != self._version:
-            raise RunError(f"worker {worker} is {value}, the driver is {self._version}; install one version on all")
-
-    def _bury(self, worker: int, job: Job | None, error: BaseException) -> None:
-        """Have a worker that has died started again, and its job given again."""
-        log = self._folder / "log" / f"worker-{worker}.log"
-        if job is None:
-            self._starts[worker] += 1
-            if self._starts[worker] >= STARTS:
-                raise RunError(f"worker {worker} died {STARTS} times before it was ready; see {log}") from error
-        else:
-            key = job.key(self._jobs)
-            self._deaths[key] += 1
-            if self._deaths[key] < self._pool.tries:
-                self._again.append(job)
-            else:
-                self._fail(job, f"its worker died {self._pool.tries} times, killed or crashed; see {log}")
-        self._running[self._pool.start(worker)] = worker, None
+                worker, job = running.pop(future)
+                self._take(job, future.result())
+                idle.append(worker)
 
     def _take(self, job: Job, outcome: Outcome) -> None:
         """Write down what became of a job."""
@@ -262,8 +209,12 @@ class Driver:
             self._manifest.add("try", key, reason=outcome.reason)
             if self._manifest.tries[key] < TRIES:
                 self._again.append(job)
-            else:
-                self._fail(job, outcome.reason)
+                return
+        if outcome.state != "done":
+            self._manifest.add("failed", key, reason=outcome.reason)
+            self._say(f"{key} failed: {outcome.reason}")
+            if job.kind in LIGHTING:
+                self._settle(job.clip, failed=True)
             return
         self._manifest.add("done", key, **outcome.values)
         if job.kind == "survey":
@@ -271,42 +222,3 @@ class Driver:
         elif job.kind in LIGHTING:
             self._finished_now += 1
             self._settle(job.clip, failed=False)
-
-    def _fail(self, job: Job, why: str) -> None:
-        """Give a job up for good."""
-        key = job.key(self._jobs)
-        self._manifest.add("failed", key, reason=why)
-        self._say(f"{key} failed: {why}")
-        if job.kind in LIGHTING:
-            self._settle(job.clip, failed=True)
-
-    def _write_progress(self, *, ended: bool = False) -> None:
-        """Leave word of where things stand for ``farm status``; a disk that is full loses it, no more."""
-        at_work = {worker: job.key(self._jobs) for worker, job in self._running.values() if job is not None}
-        rates = [1e3 * self._lit[n] / max(self._busy[n], 1) for n in range(len(self._pool.names))]
-        told = {
-            "program": "warp_ar",
-            "time": time.time(),
-            "ended": ended,
-            "workers": [
-                {"device": device, "job": at_work.get(n), "fps": round(rates[n], 2)}
-                for n, device in enumerate(self._pool.names)
-            ],
-            "clips_surveyed": len(self._open),
-            "jobs_known": self._known,
-            "jobs_open": sum(self._open.values()),
-            "seconds_left": self._seconds_left(),
-        }
-        try:
-            write_whole(self._folder / PROGRESS, json.dumps(told).encode())
-        except OSError as error:
-            if not is_no_space(error):  # that a job or the manifest tells
-                self._say(f"{self._folder / PROGRESS} cannot be written: {reason(error)}")
-
-    def _seconds_left(self) -> float | None:
-        """Return the time left by the pace of this driver, if other clips have as many jobs; None: too early."""
-        clips = len(self._open)
-        if not self._finished_now or not clips:
-            return None
-        left = sum(self._open.values()) + (len(self._jobs.clips) - clips) * self._known / clips
-        return round((time.monotonic() - self._started) / self._finished_now * left, 1)

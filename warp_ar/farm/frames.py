@@ -7,23 +7,21 @@ import dataclasses
 import fractions
 from collections.abc import Generator
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import av
 import numpy as np
 import numpy.typing as npt
 from av.codec.hwaccel import HWAccel
-from av.video.reformatter import VideoReformatter
 
 from warp_ar.errors import SourceError, reason
-from warp_ar.farm.codes import DecodedPicture, can_convert
 from warp_ar.sources.frame_folder import FrameFolder
 from warp_ar.sources.source import DEFAULT_FPS, Frame, RecordedSource
 from warp_ar.sources.sources import open_source
-from warp_ar.sources.video_file import Taken, VideoFile
+from warp_ar.sources.video_file import VideoFile
 
-CONVERTERS = 2
-"""Threads of a worker that turn decoded pictures into RGB."""
+DECODERS = 4
+"""Threads of a decoder."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -53,24 +51,14 @@ class VideoPart(VideoFile):
         end: Number behind the last.
         fps: Show frame n at n / fps instead of at its own time.
         gpu: Number of the GPU whose decoding unit is to be used, where it has one for this coding; None: none is.
-        converters: Threads that turn decoded pictures into RGB; twice as many decode.
-        decoded: Whether frames have a ``DecodedPicture`` for their image where a device can convert it.
     """
 
+    _decoders = DECODERS
+
     def __init__(
-        self,
-        path: Path,
-        index: FrameIndex,
-        first: int,
-        end: int,
-        fps: float | None,
-        gpu: int | None = None,
-        *,
-        converters: int = CONVERTERS,
-        decoded: bool = False,
+        self, path: Path, index: FrameIndex, first: int, end: int, fps: float | None, gpu: int | None = None
     ) -> None:
-        self._gpu, self._decoded_only = gpu, decoded
-        self._converters, self._decoders = 1 if decoded else converters, 2 * converters
+        self._gpu = gpu
         super().__init__(path, fps=fps)
         self._index, self._first, self._end = index, first, end
         self.length = end - first
@@ -83,12 +71,6 @@ class VideoPart(VideoFile):
                 return super()._open(**how, hwaccel=unit)
             self._gpu = None
         return super()._open(**how)
-
-    def _taken(self, reformatter: VideoReformatter, picture: Any) -> Taken:
-        """As ``VideoFile``'s, or the picture as it is."""
-        if self._decoded_only and self._shape == 1 and can_convert(picture):
-            return cast(Any, DecodedPicture(picture)), picture.time, None
-        return super()._taken(reformatter, picture)
 
     def _decode(self) -> Generator[Frame, None, None]:
         ticks, tick = self._index.ticks, self._index.tick
@@ -180,21 +162,13 @@ def index_frames(path: Path, fps: float | None) -> FrameIndex:
 
 
 def open_part(
-    path: Path,
-    index: FrameIndex,
-    first: int,
-    end: int,
-    fps: float | None,
-    gpu: int | None = None,
-    *,
-    converters: int = CONVERTERS,
-    decoded: bool = False,
+    path: Path, index: FrameIndex, first: int, end: int, fps: float | None, gpu: int | None = None
 ) -> RecordedSource:
     """Frames ``first`` to ``end`` of a recording; arguments as ``VideoPart``."""
     with open_source(path, fps=fps) as source:
         is_video = isinstance(source, VideoFile)
     if is_video:
-        return VideoPart(path, index, first, end, fps, gpu, converters=converters, decoded=decoded)
+        return VideoPart(path, index, first, end, fps, gpu)
     return FolderPart(path, first, end, fps or DEFAULT_FPS)
 
 

@@ -17,7 +17,7 @@ from typing import Any
 
 import warp_ar
 from warp_ar.errors import SceneError
-from warp_ar.farm.dataset import Dataset, JobsError, JobTable, check_dataset, read_dataset
+from warp_ar.farm.dataset import Dataset, JobsError, JobTable, read_dataset
 from warp_ar.files import is_file, is_folder, parse_toml, read_text
 from warp_ar.output.encoders import CODINGS
 from warp_ar.scene import CapturedLight, Scene, load_calibration, load_scene
@@ -227,10 +227,7 @@ def parse_jobs(data: dict[str, Any], label: str) -> JobFile:
         raise JobsError(f"{label}: run.digests: the manifest has a digest of each variation already; leave it out")
     jobs = JobFile(settings, tuple(clips), dataset)
     for scene in {clip.scene: index for index, clip in reversed(list(enumerate(clips)))}.values():
-        base = scene_of(jobs, scene)
-        _check_exposure(label, jobs, clips[scene], base)
-        if dataset is not None:
-            check_dataset(label, dataset, base)
+        _check_exposure(label, jobs, clips[scene], scene_of(jobs, scene))
     return jobs
 
 

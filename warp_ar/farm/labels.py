@@ -9,11 +9,10 @@ depth and normals are those of the pixel's centre.
 from __future__ import annotations
 
 import collections
+import dataclasses
 import json
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import cv2
@@ -27,25 +26,36 @@ from warp_ar.errors import SinkError, reason
 from warp_ar.farm.dataset import Dataset, ObjectSpec
 from warp_ar.farm.jobs import JobFile
 from warp_ar.farm.lighting import Lit
+from warp_ar.files import store
 from warp_ar.kernels.picture.object_masks import trace_object_masks
-from warp_ar.light.captured import latlong_directions, texel_solid_angles
-from warp_ar.output.folder_sink import PNG_OPTIONS
+from warp_ar.output.environment_axes import project_radiance
+from warp_ar.output.shot import mesh_of
+from warp_ar.output.sink import ThreadedSink
+from warp_ar.output.sinks import PNG_OPTIONS
 from warp_ar.scene import Scene
-from warp_ar.scene.mesh_cache import load_kept_mesh
-from warp_ar.scene.shapes import torus_mesh
 
 DEPTH_SCALE = 0.1
 """Millimetres of a step of a depth map; 0 is nothing that is modelled, and whatever is beyond 6.5 m."""
 LAYERS = ("image", "ids", "depth", "normals")
 """Outputs that labels are made from."""
 _THREADS = 2
-_WAITING = 64
-"""Pictures that may wait to be compressed."""
 
 Mask = npt.NDArray[np.bool_]
 
 
-class LabelWriter:
+@dataclasses.dataclass(frozen=True)
+class _Pictures:
+    """Pictures of a frame by their names."""
+
+    shape: tuple[int, ...]
+    files: dict[str, npt.NDArray[Any]]
+
+    def copy(self) -> _Pictures:
+        """Return it as it is: its arrays are nobody else's."""
+        return self
+
+
+class LabelWriter(ThreadedSink):
     """Writes the pictures and labels of one variation."""
 
     def __init__(self, folder: Path, scene: Scene, kinds: Sequence[int], catalogue: Sequence[ObjectSpec]) -> None:
@@ -57,9 +67,9 @@ class LabelWriter:
             kinds: Number in the catalogue of each object.
             catalogue: What objects are drawn from.
         """
+        super().__init__(_THREADS)
+        self.description = str(folder)
         self._folder, self._scene, self._kinds, self._catalogue = folder, scene, kinds, catalogue
-        self._threads = ThreadPoolExecutor(_THREADS, "warp_ar-labels")
-        self._pending: collections.deque[Future[None]] = collections.deque()
         self._tables: dict[str, dict[str, Any]] = {name: {} for name in ("gt", "gt_info", "camera", "light")}
         self._images: list[dict[str, Any]] = []
         self._annotations: list[dict[str, Any]] = []
@@ -68,15 +78,7 @@ class LabelWriter:
         for name in ("rgb", "depth", "normals", "mask", "mask_visib"):
             (folder / name).mkdir()
 
-    def __enter__(self) -> LabelWriter:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._threads.shutdown(wait=True, cancel_futures=error is not None)
-
-    def write(self, lit: Lit, key: int | None) -> None:
+    def label(self, lit: Lit, key: int | None) -> None:
         """Take a frame that was just lit.
 
         Args:
@@ -91,29 +93,39 @@ class LabelWriter:
         number, layers = lit.frame.index, lit.result.layers
         whole = self._trace(lit.pipeline)
         visible = layers["ids"]
-        self._put(f"rgb/{number:06d}.png", cv2.cvtColor(lit.image, cv2.COLOR_RGB2BGR))
         depth = layers["depth"] * (1e3 / DEPTH_SCALE)
         depth = np.where(np.isfinite(depth) & (depth < 65535.5), depth, 0.0)
-        self._put(f"depth/{number:06d}.png", np.rint(depth).astype(np.uint16))
         normals = layers["normals"] @ lit.pose.rotation.T.astype(np.float32)
         codes = (
             np.rint((0.5 + 0.5 * np.clip(normals, -1.0, 1.0)) * 65535.0) * (layers["normals"] != 0).any(2)[..., None]
         )
-        self._put(f"normals/{number:06d}.png", np.ascontiguousarray(codes[..., ::-1]).astype(np.uint16))
+        files = {
+            f"rgb/{number:06d}": cv2.cvtColor(lit.image, cv2.COLOR_RGB2BGR),
+            f"depth/{number:06d}": np.rint(depth).astype(np.uint16),
+            f"normals/{number:06d}": np.ascontiguousarray(codes[..., ::-1]).astype(np.uint16),
+        }
         self._note_frame(lit)
         self._note_light(lit, key)
         poses, infos = [], []
         for index, kind in enumerate(self._kinds):
             silhouette = (whole >> np.uint64(index)) & np.uint64(1) != 0
             seen = visible == index
-            self._put(f"mask/{number:06d}_{index:06d}.png", silhouette.astype(np.uint8) * 255)
-            self._put(f"mask_visib/{number:06d}_{index:06d}.png", seen.astype(np.uint8) * 255)
+            files[f"mask/{number:06d}_{index:06d}"] = silhouette.astype(np.uint8) * 255
+            files[f"mask_visib/{number:06d}_{index:06d}"] = seen.astype(np.uint8) * 255
             poses.append(self._pose(lit, index, kind))
             infos.append(_info(silhouette | seen, seen, depth > 0.0))
             if infos[-1]["px_count_visib"]:
                 self._annotate(number, kind, seen, infos[-1])
         self._tables["gt"][str(number)] = poses
         self._tables["gt_info"][str(number)] = infos
+        self.write(_Pictures(lit.image.shape, files))
+
+    def _check(self, image: Any) -> None:
+        assert isinstance(image, _Pictures)
+
+    def _store(self, index: int, image: Any) -> None:
+        for name, picture in image.files.items():
+            store(self._folder / f"{name}.png", _encode_png(picture))
 
     def _trace(self, pipeline: Pipeline) -> npt.NDArray[np.uint64]:
         """Return the objects behind each pixel, a bit each."""
@@ -156,7 +168,7 @@ class LabelWriter:
             harmonics = None
             if environment is not None:
                 with exclusive(lit.pipeline.device):
-                    harmonics = [_numbers(row) for row in _harmonics(environment.numpy())]
+                    harmonics = [_numbers(row) for row in project_radiance(environment.numpy())]
             self._light = key, harmonics
         lights = []
         for light in self._scene.lights:
@@ -194,20 +206,12 @@ class LabelWriter:
             }
         )
 
-    def _put(self, name: str, picture: npt.NDArray[Any]) -> None:
-        """Have a picture compressed and written."""
-        while self._pending and (self._pending[0].done() or len(self._pending) >= _WAITING):
-            self._pending.popleft().result()
-        self._pending.append(self._threads.submit(_write_png, self._folder / name, picture))
-
     def finish(self) -> int:
-        """Wait for the pictures, write the tables; returns the number of frames.
+        """Write the tables; returns the number of frames.
 
         Raises:
             SinkError: A file cannot be written.
         """
-        while self._pending:
-            self._pending.popleft().result()
         coco = {
             "images": self._images,
             "annotations": self._annotations,
@@ -215,11 +219,7 @@ class LabelWriter:
         }
         names = {**{f"scene_{name}": table for name, table in self._tables.items()}, "scene_gt_coco": coco}
         for name, table in names.items():
-            path = self._folder / f"{name}.json"
-            try:
-                path.write_text(json.dumps(table), encoding="utf-8")
-            except OSError as error:
-                raise SinkError(f"{path} cannot be written: {reason(error)}") from error
+            store(self._folder / f"{name}.json", json.dumps(table).encode())
         return len(self._images)
 
 
@@ -261,28 +261,10 @@ def _numbers(values: Any) -> list[float]:
     return [round(float(v), 9) for v in values]
 
 
-def _harmonics(environment: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
-    """Coefficients (9, 3) of a map's radiance in the real spherical harmonics of order 0 to 2.
-
-    In the order and with the factors of Ramamoorthi and Hanrahan, "An Efficient Representation for Irradiance
-    Environment Maps", 2001: 1; y, z, x; xy, yz, 3zz - 1, xz, xx - yy.
-    """
-    height = len(environment)
-    x, y, z = np.moveaxis(latlong_directions(height), -1, 0)
-    factors = (0.282095, 0.488603, 0.488603, 0.488603, 1.092548, 1.092548, 0.315392, 1.092548, 0.546274)
-    terms = (np.ones_like(x), y, z, x, x * y, y * z, 3.0 * z * z - 1.0, x * z, x * x - y * y)
-    basis = np.stack([f * t for f, t in zip(factors, terms, strict=True)]) * texel_solid_angles(height)
-    return np.asarray(np.einsum("nhw,hwc->nc", basis, environment.astype(np.float64)))
-
-
-def _write_png(path: Path, picture: npt.NDArray[Any]) -> None:
+def _encode_png(picture: npt.NDArray[Any]) -> bytes:
     done, data = cv2.imencode(".png", picture, PNG_OPTIONS if picture.ndim == 3 else ())
-    if not done:
-        raise SinkError(f"{path} cannot be encoded as PNG")
-    try:
-        path.write_bytes(data.tobytes())
-    except OSError as error:
-        raise SinkError(f"{path} cannot be written: {reason(error)}") from error
+    assert done
+    return bytes(data)
 
 
 _LISTED = 50
@@ -321,20 +303,9 @@ def _model(spec: ObjectSpec) -> Any:
     """Triangles of an object in millimetres, about the origin that its pose moves."""
     import trimesh  # here: no other job needs it
 
-    item = spec.item
-    if item.shape == "sphere":
-        mesh = trimesh.creation.icosphere(subdivisions=4, radius=item.radius)
-    elif item.shape == "box":
-        mesh = trimesh.creation.box(item.size)
-    else:
-        if item.shape == "mesh":
-            assert item.file is not None
-            made = load_kept_mesh(item.file)
-        else:
-            made = torus_mesh(item.major_radius, item.minor_radius)
-        mesh = trimesh.Trimesh(made.vertices, made.faces, vertex_normals=made.normals, process=False)
-    mesh.apply_scale(1e3 * item.scale)
-    return mesh
+    made = mesh_of(spec.item)
+    vertices = 1e3 * spec.item.scale * made.vertices
+    return trimesh.Trimesh(vertices, made.faces, vertex_normals=made.normals, process=False)
 
 
 def _write_models(catalogue: Sequence[ObjectSpec], folder: Path) -> None:
@@ -463,8 +434,8 @@ def _datasheet(
         categories="\n".join(rows),
         objects=dataset.objects,
         lights=dataset.lights,
-        low=dataset.exposure.low[0],
-        high=dataset.exposure.high[0],
+        low=dataset.exposure[0],
+        high=dataset.exposure[1],
         margin=dataset.margin,
         step=DEPTH_SCALE,
         recordings="\n".join(clips),

@@ -10,6 +10,7 @@ Only one driver at a time has a run: it holds a lock on the folder, which its de
 
 from __future__ import annotations
 
+import collections
 import contextlib
 import errno
 import hashlib
@@ -18,7 +19,6 @@ import math
 import os
 import secrets
 import shutil
-import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,9 +28,11 @@ import filelock
 from warp_ar.errors import UsageError, WarpArError, printable, reason
 from warp_ar.files import kind_of, parse_json, read_bytes, take_name, write_whole
 
-MANIFEST, RUN, LOCK, RECORD, PROGRESS = "manifest.jsonl", "run.json", "lock", "record.json", "progress.json"
+MANIFEST, RUN, LOCK, RECORD = "manifest.jsonl", "run.json", "lock", "record.json"
 ASIDE = ".aside"
 """Folder of outputs that are not whole yet."""
+_NUMBERS = ("frames", "bytes", "length", "jobs", "seconds", "ended", "worker")
+"""Numbers of a line that says that a job is done."""
 _NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
 
 LOCK_SECONDS = 1.0
@@ -96,9 +98,7 @@ class Manifest:
         key = line["job"]
         match line["state"]:
             case "done":
-                self.done[key] = {
-                    name: line.get(name) for name in ("frames", "bytes", "length", "inputs") if name in line
-                }
+                self.done[key] = {name: line[name] for name in (*_NUMBERS, "inputs") if name in line}
                 self.failed.pop(key, None)
             case "failed":
                 self.failed[key] = line["reason"]
@@ -152,7 +152,7 @@ def parse_line(line: bytes) -> dict[str, Any]:
         raise ValueError(f"state is {told.get('state')!r}")
     if told["state"] == "failed" and not isinstance(told.get("reason"), str):
         raise ValueError("no reason")
-    for name in ("frames", "bytes", "length", "seconds"):
+    for name in _NUMBERS:
         if not isinstance(told.get(name), int | float | None) or not math.isfinite(told.get(name) or 0):
             raise ValueError(f"{name} is no number")
     return told
@@ -200,17 +200,16 @@ def locked(folder: Path) -> Iterator[None]:
         lock.release()
 
 
-def is_locked(folder: Path) -> bool | None:
-    """Return whether a driver has a run, whatever the clocks say; None where the folder does not tell."""
-    if not (folder / LOCK).exists():
-        return False
+def is_locked(folder: Path) -> bool:
+    """Return whether a driver has a run; False where the folder does not tell."""
     try:
-        with filelock.FileLock(folder / LOCK, timeout=0, mode=0o666):
-            return False
+        if (folder / LOCK).exists():
+            filelock.FileLock(folder / LOCK, timeout=0, mode=0o666).acquire().lock.release()
     except filelock.Timeout:
         return True
     except (OSError, NotImplementedError):
-        return None
+        pass
+    return False
 
 
 def begin_run(folder: Path, data: dict[str, Any], version: str) -> None:
@@ -370,12 +369,12 @@ def _digest(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-STALE_SECONDS = 15.0
-"""Since the last word of a driver whose lock cannot be asked for, after which it is taken to be gone."""
+PACE = 50
+"""Latest jobs by whose pace the time that is left is told."""
 
 
 def read_status(folder: Path) -> dict[str, Any]:
-    """Return jobs that are done, that have failed, and that are being done.
+    """Return jobs that are done, that have failed, and that are open.
 
     Raises:
         UsageError: There is no run.
@@ -383,81 +382,58 @@ def read_status(folder: Path) -> dict[str, Any]:
     """
     data, version = load_run(folder)
     manifest = Manifest(folder, write=False)
-    progress = read_kept(folder / PROGRESS) or {}
-    if not _is_progress(progress):
-        progress = {}
-    kinds: dict[str, int] = {}
-    for key in manifest.done:
-        kind = key.rsplit("/", 1)[1].split("-")[0]
-        kinds[kind] = kinds.get(kind, 0) + 1
+    kinds = collections.Counter(_kind(key) for key in manifest.done)
+    lit = [line for key, line in manifest.done.items() if _kind(key) in ("segment", "variation")]
+    failed = sum(_kind(key) in ("segment", "variation") for key in manifest.failed)
+    known = sum(int(line.get("jobs") or 0) for line in manifest.done.values())
+    left = max(known - len(lit) - failed, 0)
+    frames, seconds = collections.Counter[int](), collections.defaultdict[int, float](float)
+    for line in lit:
+        frames[int(line.get("worker") or 0)] += int(line.get("frames") or 0)
+        seconds[int(line.get("worker") or 0)] += float(line.get("seconds") or 0.0)
+    ended = sorted(float(line.get("ended") or 0.0) for line in lit)[-PACE:]
     return {
         "version": version,
         "clips": len(data["clip"]),
-        "done": kinds,
-        "frames": sum(
-            int(record.get("frames") or 0)
-            for key, record in manifest.done.items()
-            if key.rsplit("/", 1)[1].startswith(("segment", "variation"))
-        ),
-        "bytes": sum(int(record.get("bytes") or 0) for record in manifest.done.values()),
+        "done": dict(kinds),
+        "frames": frames.total(),
+        "bytes": sum(int(line.get("bytes") or 0) for line in manifest.done.values()),
         "failed": manifest.failed,
-        "progress": progress,
-        "running": _is_running(folder, progress),
+        "running": is_locked(folder),
+        "jobs_known": known,
+        "jobs_open": left,
+        "workers": {n: round(frames[n] / max(seconds[n], 1e-3), 2) for n in sorted(frames)},
+        "seconds_left": round(left * (ended[-1] - ended[0]) / (len(ended) - 1), 1) if len(ended) > 1 else None,
     }
 
 
-def _is_progress(told: dict[str, Any]) -> bool:
-    """Return whether a driver's word of where things stand is whole."""
-
-    def is_number(value: object) -> bool:
-        return isinstance(value, int | float) and math.isfinite(value)
-
-    workers = told.get("workers")
-    numbers = [told.get(name) for name in ("time", "jobs_open", "jobs_known", "clips_surveyed")]
-    if not isinstance(workers, list) or not all(map(is_number, numbers)):
-        return False
-    left = told.get("seconds_left")
-    return (left is None or is_number(left)) and all(
-        isinstance(worker, dict)
-        and isinstance(worker.get("job"), str | None)
-        and is_number(worker.get("fps"))
-        and "device" in worker
-        for worker in workers
-    )
-
-
-def _is_running(folder: Path, progress: dict[str, Any]) -> bool:
-    """Return whether a driver is at work: by its lock, else by the time of its last word."""
-    locked = is_locked(folder)
-    if locked is None:
-        return not progress.get("ended") and abs(time.time() - float(progress.get("time", 0))) < STALE_SECONDS
-    return locked and bool(progress) and not progress.get("ended")
+def _kind(key: str) -> str:
+    return key.rsplit("/", 1)[1].split("-")[0]
 
 
 def status_lines(folder: Path, status: dict[str, Any]) -> list[str]:
     """The same in words."""
-    done = ", ".join(f"{count} {kind}{'s' if count != 1 else ''}" for kind, count in sorted(status["done"].items()))
-    lines = [f"{folder}: {status['clips']} clips; done: {done or 'nothing yet'}"]
-    lines.append(
-        f"{status['frames']} frames lit, {status['bytes'] / 1e6:.1f} MB written, {len(status['failed'])} jobs failed"
-    )
-    lines += [f"failed: {key}: {why}" for key, why in sorted(status["failed"].items())[:20]]
+    lines = [
+        f"{folder}: {status['clips']} clips; done: {words_of_counts(status['done']) or 'nothing yet'}",
+        f"{status['frames']} frames lit, {status['bytes'] / 1e6:.1f} MB written, {len(status['failed'])} jobs failed",
+        *(f"failed: {key}: {why}" for key, why in sorted(status["failed"].items())[:20]),
+    ]
     if len(status["failed"]) > 20:
-        lines.append(f"and {len(status['failed']) - 20} more; all are in {folder / 'manifest.jsonl'}")
-    progress = status["progress"]
+        lines.append(f"and {len(status['failed']) - 20} more; all are in {folder / MANIFEST}")
+    lines.append(f"{status['jobs_open']} of {status['jobs_known']} jobs of the clips that are surveyed are open")
     if not status["running"]:
-        nothing = progress.get("ended") and not progress["jobs_open"]
-        hint = "nothing that is known is open" if nothing else f"go on with: farm resume {folder}"
-        return [printable(line) for line in (*lines, f"no driver is at work; {hint}")]
-    lines.append(
-        f"{progress['jobs_open']} of {progress['jobs_known']} jobs open, {progress['clips_surveyed']} clips surveyed"
-    )
-    for number, worker in enumerate(progress["workers"]):
-        what = worker["job"] or "waiting"
-        lines.append(f"worker {number} on {worker['device']}: {worker['fps']:.1f} frames/s, {what}")
-    left = progress.get("seconds_left")
-    lines.append("time left: too early to say" if left is None else f"time left: {words_of_seconds(left)}")
+        hint = f"go on with: farm resume {folder}" if status["jobs_open"] else "nothing that is known is open"
+        lines.append(f"no driver is at work; {hint}")
+    else:
+        lines += [f"worker {number}: {rate:.1f} frames/s" for number, rate in status["workers"].items()]
+        left = status["seconds_left"]
+        lines.append("time left: too early to say" if left is None else f"time left: {words_of_seconds(left)}")
     return [printable(line) for line in lines]
+
+
+def words_of_counts(kinds: Mapping[str, int]) -> str:
+    """Jobs of each kind."""
+    return ", ".join(f"{count} {kind}{'s' if count != 1 else ''}" for kind, count in sorted(kinds.items()))
 
 
 def words_of_seconds(seconds: float) -> str:

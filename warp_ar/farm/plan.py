@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 import statistics
 import tempfile
-from collections.abc import Callable
+from collections.abc import Sequence
 from pathlib import Path
 
-from warp_ar.errors import WarpArError
+from warp_ar.errors import WarpArError, say
 from warp_ar.farm.frames import index_frames
 from warp_ar.farm.jobs import Context, Job, JobFile, Outcome, job_of_clip, jobs_of_clip, lit_range, source_of
-from warp_ar.farm.manifest import RunError
+from warp_ar.farm.manifest import RunError, words_of_seconds
+from warp_ar.farm.pools import cores_of, keeping_to
 from warp_ar.farm.work import Work
 
 PROBES = 3
@@ -20,41 +21,15 @@ FRAMES = 16
 """Frames of each."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Plan:
-    """The time and space of a run, on workers that are all as fast as the one that was tried."""
-
-    clips: int
-    jobs: int
-    """Segments or variations."""
-    frames: int
-    """That are lit."""
-    surveyed: int
-    """Frames that are looked at once before."""
-    survey_ms: float
-    """Milliseconds of such a frame."""
-    frame_ms: float
-    """Milliseconds of a frame that is lit and written."""
-    bytes: float
-    """Of all outputs."""
-    survey_bytes: float
-    """That surveys keep in the run's folder."""
-    problems: tuple[str, ...] = ()
-    """Clips that cannot be read, and why."""
-
-    def seconds(self, workers: int) -> float:
-        """Return the seconds that so many workers take; a clip is surveyed by one."""
-        surveys = self.surveyed * self.survey_ms / min(workers, self.clips)
-        return (surveys + self.frames * self.frame_ms / min(workers, self.jobs)) / 1e3
-
-
-def make_plan(jobs: JobFile, device: str, say: Callable[[str], None]) -> Plan:
-    """Count jobs and try a few.
+def tell_plan(jobs: JobFile, devices: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Count jobs and try a few, by the device of the first worker.
 
     Args:
         jobs: The job file.
-        device: ``cpu`` or ``cuda:N``.
-        say: Called with a line for people now and then.
+        devices: Of each worker that there will be.
+
+    Returns:
+        Jobs, times and bytes in words, and why clips cannot be read.
 
     Raises:
         RunError: No job can be tried.
@@ -79,14 +54,27 @@ def make_plan(jobs: JobFile, device: str, say: Callable[[str], None]) -> Plan:
             surveyed += end - first
     if not lengths:
         raise RunError(f"no clip can be tried: {problems[0] if problems else 'there is none'}")
-    trials = [_try(jobs, clip, lengths[clip], device, say) for clip in list(lengths)[:: -(-len(lengths) // PROBES)]]
-    survey_ms, frame_ms, size, kept = (statistics.fmean(values) for values in zip(*trials, strict=True))
-    return Plan(len(lengths), count, lit, surveyed, survey_ms, frame_ms, lit * size, surveyed * kept, tuple(problems))
+    cores = cores_of(devices)
+    with keeping_to(cores[0]):  # as a worker has them
+        tried = [_try(jobs, clip, lengths[clip], devices[0]) for clip in list(lengths)[:: -(-len(lengths) // PROBES)]]
+    survey_ms, frame_ms, size, kept = (statistics.fmean(values) for values in zip(*tried, strict=True))
+    kind = "segments" if jobs.dataset is None else "variations"
+    lines = [
+        f"{len(lengths)} clips, {count} {kind}, {lit} frames to light, {surveyed} to survey",
+        f"a frame: {frame_ms:.1f} ms lit and written, {survey_ms:.1f} ms surveyed, at quality {jobs.settings.quality} "
+        f"on {devices[0]}",
+    ]
+    # Workers that share a core are no faster than one that has it; a clip is surveyed by one.
+    at_once = len({core for own in cores for core in own} or devices) if devices[0] == "cpu" else len(devices)
+    for workers in sorted({1, len(devices)}):
+        busy = min(workers, at_once)
+        seconds = surveyed * survey_ms / min(busy, len(lengths)) + lit * frame_ms / min(busy, count)
+        lines.append(f"{workers} worker{'s' if workers > 1 else ''}: {words_of_seconds(1e-3 * seconds)}")
+    beside = f", beside {surveyed * kept / 1e6:.1f} MB that surveys keep" if surveyed else ""
+    return [*lines, f"output: {lit * size / 1e6:.1f} MB{beside}"], problems
 
 
-def _try(
-    jobs: JobFile, clip: int, length: int, device: str, say: Callable[[str], None]
-) -> tuple[float, float, float, float]:
+def _try(jobs: JobFile, clip: int, length: int, device: str) -> tuple[float, float, float, float]:
     """Do the first job of a clip on a few frames, twice: the second time all is compiled and read.
 
     Returns:

@@ -11,21 +11,22 @@ import contextlib
 import dataclasses
 import math
 import multiprocessing
-import multiprocessing.process
 import multiprocessing.resource_tracker
 import os
 import signal
 import socket
 import sys
 import threading
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
-from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from warp_ar.device import usable_cores
 from warp_ar.errors import UsageError, reason
 from warp_ar.farm.jobs import Context, Job, Outcome, program_version
+from warp_ar.farm.manifest import RunError
 
 CORES = 4
 """Of a worker on CPU: more of them leave stages of few rows waiting."""
@@ -33,30 +34,14 @@ GPU_CORES = 2
 """Of a worker on a GPU, which keeps about so many busy with decoding and encoding."""
 MOST_OF_GPU = 16
 """Workers that share a GPU unless more are asked for: each holds its arrays there."""
+DEATHS = 5
+"""Deaths of its workers after which a job has failed."""
+STARTS = 3
+"""Times in a row that a worker may die before it is ready."""
 CONNECT_SECONDS = 30.0
 """Within which a cluster must answer."""
 KNOCK_SECONDS = 5.0
 """Within which a cluster's host must accept a connection."""
-
-
-class Pool(Protocol):
-    """Workers, wherever they are."""
-
-    names: Sequence[str]
-    """The device of each worker."""
-    died: type[BaseException]
-    """Error of a future whose worker has died."""
-    tries: int
-    """Deaths of its workers after which a job has failed."""
-
-    def start(self, worker: int) -> Future[str]:
-        """Start a worker, anew where it has died; the future gives the version of its program."""
-
-    def submit(self, worker: int, job: Job, arguments: Any) -> Future[Outcome]:
-        """Hand a job to a worker that has none."""
-
-    def close(self) -> None:
-        """End every worker at once."""
 
 
 def devices_of(device: str, workers: int | None) -> list[str]:
@@ -109,70 +94,102 @@ def keeping_to(cores: Sequence[int]) -> Iterator[None]:
         os.sched_setaffinity(0, before)
 
 
-class ProcessPool:
-    """Workers as processes of this machine."""
+class Pool(ABC):
+    """Workers, wherever they are, and a thread for each that waits for it."""
 
-    died: type[BaseException] = BrokenExecutor
-    tries = 5
+    def __init__(self, size: int) -> None:
+        """Have so many workers."""
+        self.size = size
+        self._closed = False
+        multiprocessing.resource_tracker.ensure_running()  # here: its start lets interrupts through again
+        self._threads = [ThreadPoolExecutor(1, "warp_ar-worker", initializer=_hold_interrupts) for _ in range(size)]
+
+    def submit(self, worker: int, job: Job, arguments: Any) -> Future[Outcome]:
+        """Hand a job to a worker that has none; the future raises RunError where the run cannot go on."""
+        return self._threads[worker].submit(self._do, worker, job, arguments)
+
+    @abstractmethod
+    def _do(self, worker: int, job: Job, arguments: Any) -> Outcome:
+        """Have a job done; its state is ``lost`` where its workers always die."""
+
+    @abstractmethod
+    def _end(self) -> None:
+        """End every worker at once."""
+
+    def close(self) -> None:
+        """End every worker at once, and wait for their end."""
+        self._closed = True
+        self._end()
+        for thread in self._threads:
+            thread.shutdown(wait=True, cancel_futures=True)
+
+
+def _hold_interrupts() -> None:
+    """Keep interrupts of the terminal from processes that this thread starts: the driver decides what one ends."""
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+
+
+class ProcessPool(Pool):
+    """Workers as processes of this machine; one that dies is started again, and its job given again."""
 
     def __init__(self, context: Context, devices: Sequence[str]) -> None:
-        """Start nothing yet.
+        """Have the workers started.
 
         Args:
             context: Of the run; each worker gets its own device and number.
             devices: Of each worker.
         """
-        self.names: Sequence[str] = list(devices)
-        self._context, self._cores = context, cores_of(devices)
+        super().__init__(len(devices))
+        self._context, self._devices, self._cores = context, devices, cores_of(devices)
         self._executors: dict[int, ProcessPoolExecutor] = {}
-        self._processes: set[multiprocessing.process.BaseProcess] = set()
+        self._pids: dict[int, int] = {}
+        for worker, thread in enumerate(self._threads):
+            thread.submit(self._ready, worker)
 
-    def start(self, worker: int) -> Future[str]:
-        """As ``Pool.start``."""
-        context = dataclasses.replace(self._context, device=self.names[worker], worker=worker)
-        every = sorted({core for own in self._cores for core in own})
-        executor = ProcessPoolExecutor(
-            1,
-            mp_context=multiprocessing.get_context("spawn"),
-            initializer=_begin,
-            initargs=(context, self._cores[worker], every),
-        )
-        self._executors[worker] = executor
-        before = set(multiprocessing.active_children())
-        with _interrupts_held():
-            future = executor.submit(program_version)  # starts the process
-        self._processes |= set(multiprocessing.active_children()) - before
-        return future
+    def _ready(self, worker: int) -> ProcessPoolExecutor:
+        """Return a worker's executor once it is ready; RunError where it dies before, again and again."""
+        for _ in range(STARTS):
+            if worker not in self._executors:
+                context = dataclasses.replace(self._context, device=self._devices[worker], worker=worker)
+                every = sorted({core for own in self._cores for core in own})
+                self._executors[worker] = ProcessPoolExecutor(
+                    1,
+                    mp_context=multiprocessing.get_context("spawn"),
+                    initializer=_begin,
+                    initargs=(context, self._cores[worker], every),
+                )
+            try:
+                self._pids[worker] = self._executors[worker].submit(os.getpid).result()
+                return self._executors[worker]
+            except BrokenExecutor:
+                del self._executors[worker]
+            if self._closed:
+                break
+        raise RunError(f"worker {worker} died {STARTS} times before it was ready; see {self._log(worker)}")
 
-    def submit(self, worker: int, job: Job, arguments: Any) -> Future[Outcome]:
-        """As ``Pool.submit``."""
-        try:
-            return self._executors[worker].submit(_do, job, arguments)
-        except BrokenExecutor as error:  # it died while it waited for a job
-            future: Future[Outcome] = Future()
-            future.set_exception(error)
-            return future
+    def _do(self, worker: int, job: Job, arguments: Any) -> Outcome:
+        for _ in range(DEATHS):
+            executor = self._ready(worker)
+            try:
+                return executor.submit(_do, job, arguments).result()
+            except BrokenExecutor:
+                del self._executors[worker]
+            if self._closed:
+                break
+        log = self._log(worker)
+        return Outcome("lost", reason=f"its worker died {DEATHS} times, killed or crashed; see {log}")
 
-    def close(self) -> None:
-        """As ``Pool.close``."""
-        for process in self._processes & set(multiprocessing.active_children()):
-            process.kill()
-        for executor in self._executors.values():
+    def _log(self, worker: int) -> Path:
+        return self._context.folder / "log" / f"worker-{worker}.log"
+
+    def _end(self) -> None:
+        own = set(self._pids.values())
+        for process in multiprocessing.active_children():
+            if process.pid in own:
+                process.kill()
+        for executor in list(self._executors.values()):
             executor.shutdown(wait=True, cancel_futures=True)
-
-
-@contextlib.contextmanager
-def _interrupts_held() -> Iterator[None]:
-    """Keep interrupts of the terminal from processes that are started within: the driver decides what one ends."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    multiprocessing.resource_tracker.ensure_running()  # here: its start lets interrupts through again
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 _worker: tuple[Any, Sequence[int]] | None = None
@@ -218,13 +235,11 @@ def _write_to_log(path: Path) -> None:
         sys.stdout = sys.stderr = open(2, "w", closefd=False)  # noqa: SIM115  (for as long as the process lives)
 
 
-class RayPool:
+class RayPool(Pool):
     """Workers as actors: one per GPU of the cluster, or per core where it has none.
 
     Ray decides where an actor runs, starts it again when it or its node dies, and gives it its job again.
     """
-
-    tries = 1
 
     def __init__(self, address: str | None, workers: int | None) -> None:
         """Connect.
@@ -242,22 +257,20 @@ class RayPool:
             raise UsageError("--ray needs Ray: pip install 'warp-ar[farm]'") from error
         self._ray = ray
         _connect(ray, address)
-        self.died: type[BaseException] = ray.exceptions.RayError
         found = ray.cluster_resources()
         self._gpus = int(found.get("GPU", 0))
-        size = workers or self._gpus or max(1, int(found.get("CPU", 1)))
-        self.names: Sequence[str] = [f"ray {'cuda' if self._gpus else 'cpu'}"] * size
+        super().__init__(workers or self._gpus or max(1, int(found.get("CPU", 1))))
         self._actors: list[Any] = []
 
     def employ(self, context: Context) -> RayPool:
         """Have the actors started for a run."""
         from warp_ar.farm.work import Work
 
-        needs = {"num_gpus": share_of_gpu(len(self.names), self._gpus)} if self._gpus else {"num_cpus": 1}
+        needs = {"num_gpus": share_of_gpu(self.size, self._gpus)} if self._gpus else {"num_cpus": 1}
         # A node that is busy or gone comes back, or another does: so does the actor, and its job is given again.
-        actor = self._ray.remote(Work).options(max_restarts=-1, max_task_retries=ProcessPool.tries, **needs)
+        actor = self._ray.remote(Work).options(max_restarts=-1, max_task_retries=DEATHS, **needs)
         device = "cuda" if self._gpus else "cpu"
-        for worker in range(len(self.names)):
+        for worker in range(self.size):
             self._actors.append(actor.remote(dataclasses.replace(context, device=device, worker=worker)))
         return self
 
@@ -267,18 +280,17 @@ class RayPool:
             return str(self._ray.get_runtime_context().worker.node.webui_url or "")
         return ""
 
-    def start(self, worker: int) -> Future[str]:
-        """As ``Pool.start``; Ray starts it."""
-        future: Future[str] = self._actors[worker].version.remote().future()
-        return future
+    def _do(self, worker: int, job: Job, arguments: Any) -> Outcome:
+        actor = self._actors[worker]
+        try:
+            if (version := self._ray.get(actor.version.remote())) != (mine := program_version()):
+                raise RunError(f"worker {worker} is {version}, the driver is {mine}; install one version on all")
+            outcome: Outcome = self._ray.get(actor.do.remote(job, arguments))
+        except self._ray.exceptions.RayError as error:
+            return Outcome("lost", reason=f"its worker died, killed or crashed: {reason(error)}")
+        return outcome
 
-    def submit(self, worker: int, job: Job, arguments: Any) -> Future[Outcome]:
-        """As ``Pool.submit``."""
-        future: Future[Outcome] = self._actors[worker].do.remote(job, arguments).future()
-        return future
-
-    def close(self) -> None:
-        """As ``Pool.close``; the cluster goes on."""
+    def _end(self) -> None:
         for actor in self._actors:
             self._ray.kill(actor, no_restart=True)
         self._ray.shutdown()
@@ -290,23 +302,8 @@ def share_of_gpu(workers: int, gpus: int) -> float:
     return 1 if on_one == 1 else math.floor(1e4 / on_one) / 1e4
 
 
-def _knock(address: str) -> None:
-    """Raise UsageError if nobody listens at ``HOST:PORT``: Ray itself takes half a minute to say so."""
-    host, _, port = address.removeprefix("ray://").rpartition(":")
-    if not host or not port.isdecimal() or int(port) > 65535:
-        raise UsageError(f"--ray {address}: expected HOST:PORT, as `ray start --head` prints it")
-    try:
-        socket.create_connection((host, int(port)), KNOCK_SECONDS).close()
-    except OSError as error:
-        raise _no_cluster(address, error) from error
-
-
-def _no_cluster(address: str, error: BaseException) -> UsageError:
-    return UsageError(f"--ray {address}: no cluster answers ({reason(error)[:200]}); start one with: ray start --head")
-
-
 def _connect(ray: Any, address: str | None) -> None:
-    """Connect to a cluster, in a time that is bounded."""
+    """Connect to a cluster, in a time that is bounded: Ray itself takes half a minute to say that nobody listens."""
     options = {"logging_level": "ERROR", "log_to_driver": False}
     if address is None:
         try:
@@ -314,7 +311,9 @@ def _connect(ray: Any, address: str | None) -> None:
         except ConnectionError:
             ray.init(**options)
         return
-    _knock(address)
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if not host or not port.isdecimal() or int(port) > 65535:
+        raise UsageError(f"--ray {address}: expected HOST:PORT, as `ray start --head` prints it")
     future: Future[Any] = Future()
 
     def connect() -> None:
@@ -323,8 +322,10 @@ def _connect(ray: Any, address: str | None) -> None:
         except Exception as error:  # Ray raises whatever its transport does
             future.set_exception(error)
 
-    threading.Thread(target=connect, name="warp_ar-ray", daemon=True).start()
     try:
+        socket.create_connection((host, int(port)), KNOCK_SECONDS).close()
+        threading.Thread(target=connect, name="warp_ar-ray", daemon=True).start()
         future.result(CONNECT_SECONDS)
     except Exception as error:
-        raise _no_cluster(address, error) from error
+        told = f"--ray {address}: no cluster answers ({reason(error)[:200]}); start one with: ray start --head"
+        raise UsageError(told) from error

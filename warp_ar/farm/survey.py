@@ -17,9 +17,8 @@ of a map, float32 (h, 2 h, 3), and, where the quality finds their places, its em
 A key is written once a texel of the environment has moved by more than one 8-bit step (``CHANGE_FLOOR + CHANGE_SHARE *
 value``) since the last key: the tolerance within which stages that read the environment do not run again either.
 
-Poses and light of a frame rest on the frames before it, so a clip is surveyed in order. But its steps run side by side:
-some threads decode, one follows the marker, one has kernels gather the light of the frame before, one compares and
-packs what came of the one before that. What each step sees, and so every byte, is as if they were one after another.
+Poses and light of a frame rest on the frames before it, so a clip is surveyed in order; while the marker of one is
+looked for, kernels gather the light of the one before, and a thread compares and packs that of those before it.
 """
 
 from __future__ import annotations
@@ -31,29 +30,27 @@ import fractions
 import io
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
 
-from warp_ar.device import usable_cores
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.engine.result import Result
 from warp_ar.errors import SceneError, SourceError, reason
 from warp_ar.farm.frames import FrameIndex, index_frames, open_part
-from warp_ar.farm.jobs import JobFile, inputs_of, lit_range, scene_of, source_of
+from warp_ar.farm.jobs import JobFile, inputs_of, jobs_of_clip, lit_range, scene_of, source_of
 from warp_ar.farm.manifest import describe_inputs
 from warp_ar.kernels.environment.change import CHANGE_FLOOR, CHANGE_SHARE
 from warp_ar.light.captured import Light, find_emitters
 from warp_ar.scene import CapturedLight, Pose, Scene
 from warp_ar.sources.deep_frame import check_linear
-from warp_ar.sources.source import Frame, RecordedSource
+from warp_ar.sources.source import RecordedSource
 from warp_ar.sources.sources import open_source
 from warp_ar.stages.features import has_environment
-from warp_ar.tracking.tracking import Tracker
+from warp_ar.tracking.tracking import given_pose
 
 Map = npt.NDArray[np.float32]
 
@@ -61,11 +58,6 @@ NAME = "survey.npz"
 MAPS = "lights.bin"
 LIGHT = "light.exr"
 """The environment at the clip's end, with the emitters that were found."""
-CONVERTERS = 4
-"""Threads that turn decoded pictures into RGB: with fewer they are the slowest step."""
-AHEAD = 8
-"""Frames at most whose marker has been looked for and whose light has not been gathered: solving for light that clips
-takes as long as some frames, and comes with one of several."""
 WAITING = 4
 """Frames at most whose light waits to be compared with the last that was kept."""
 _MANTISSA = 12
@@ -126,38 +118,6 @@ class Survey:
             raise SourceError(f"{self._maps} cannot be read: {reason(error)}; remove its folder and resume") from error
 
 
-class _Writer:
-    """Maps one after another, and a ZIP of arrays that is the same for the same arrays."""
-
-    def __init__(self, folder: Path) -> None:
-        self._file = zipfile.ZipFile(folder / NAME, "w", zipfile.ZIP_DEFLATED, compresslevel=1)
-        self._maps = open(folder / MAPS, "wb")  # noqa: SIM115  (closed by `close`)
-        self.places = [0]
-
-    def keep(self, *arrays: npt.NDArray[Any] | None) -> None:
-        """Add a map, and its emitters where they are known."""
-        buffer = io.BytesIO()
-        for array in arrays:
-            if array is not None:
-                np.save(buffer, array, allow_pickle=False)
-        self.places.append(self.places[-1] + self._maps.write(zlib.compress(buffer.getbuffer(), 1)))
-
-    def add(self, name: str, values: npt.ArrayLike) -> None:
-        """Add an array to the ZIP."""
-        buffer = io.BytesIO()
-        np.save(buffer, np.asarray(values), allow_pickle=False)
-        info = zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0))
-        info.compress_type = zipfile.ZIP_DEFLATED
-        self._file.writestr(info, buffer.getvalue(), compresslevel=1)
-
-    def close(self) -> None:
-        """Finish both files."""
-        try:
-            self._maps.close()
-        finally:
-            self._file.close()
-
-
 def survey_clip(jobs: JobFile, clip: int, folder: Path, device: str) -> dict[str, Any]:
     """Survey a clip.
 
@@ -177,155 +137,119 @@ def survey_clip(jobs: JobFile, clip: int, folder: Path, device: str) -> dict[str
     index = index_frames(path, fps)
     first, end = lit_range(jobs.clips[clip], index.length)
     scene = scene_of(jobs, clip)
-    poses = np.full((index.length, 12), np.nan)
-    look = _Look(jobs, scene, folder, poses)
-    writer = _Writer(folder)
-    try:
-        if jobs.settings.light != "preroll":
-            _look_at_frames(jobs, clip, look, index, writer, device)
-        writer.add("ticks", index.ticks)
-        writer.add("tick", [index.tick.numerator, index.tick.denominator])
-        writer.add("seekable", index.seekable)
-        writer.add("poses", poses)
-        with open_source(path, fps=fps) as source:
-            writer.add("size", source.size)
-            writer.add("coding", source.curve or ("10bit" if source.deep else "8bit"))
-        writer.add("saturation", look.saturation)
-        writer.add("keys", look.keys)
-        writer.add("places", writer.places)
-    finally:
-        writer.close()
-    found = int(np.isfinite(poses[first:end, 0]).sum())
-    if jobs.settings.light != "preroll" and not found:
-        raise SourceError(f"{path}: no marker was found in frames {first} to {end - 1}: nothing can be placed there")
+    with open_source(path, fps=fps) as source:
+        size, names = source.size, source.names
+        coding = source.curve or ("10bit" if source.deep else "8bit")
+    alone = jobs.settings.light == "preroll"
+    with open(folder / MAPS, "wb") as maps:
+        look = _Look(jobs.settings.light, maps, np.full((index.length, 12), np.nan))
+        if not alone:
+            for number in range(first, end):
+                given = None if scene.pose is None else scene.pose.at(number, names[number] if names else "")
+                if given is not None:
+                    look.poses[number] = np.concatenate([np.ravel(part) for part in given])
+            captures = scene.captured is None and has_environment(scene)
+            if captures or scene.pose is None:
+                source = open_part(path, index, first, end, fps, jobs.settings.gpu_of(device))
+                _look_at_frames(scene, source, look, jobs.settings.quality, device, captures=captures)
+        if look.latest is not None:
+            if jobs.settings.light == "fixed":
+                look.keep(first, *look.latest)
+            last = _rounded(look.latest[0])
+            emitters = find_emitters(last, np.zeros_like(last), 0.0)
+            Light(last, np.ones(last.shape[:2], np.float32), emitters).save(folder / LIGHT)
+    np.savez_compressed(
+        folder / NAME,
+        ticks=index.ticks,
+        tick=[index.tick.numerator, index.tick.denominator],
+        seekable=index.seekable,
+        poses=look.poses,
+        size=size,
+        coding=coding,
+        saturation=look.saturation,
+        keys=look.keys,
+        places=look.places,
+    )
+    found = int(np.isfinite(look.poses[first:end, 0]).sum())
+    if not alone and not found:
+        missing = "marker was found" if scene.pose is None else f"pose of {scene.pose.file} is"
+        raise SourceError(f"{path}: no {missing} in frames {first} to {end - 1}: nothing can be placed there")
     inputs = describe_inputs(inputs_of(jobs, clip))
-    return {"length": index.length, "found": found, "keys": len(look.keys), "inputs": inputs}
+    count = jobs_of_clip(jobs, clip, index.length)
+    return {"length": index.length, "jobs": count, "found": found, "keys": len(look.keys), "inputs": inputs}
 
 
 @dataclasses.dataclass
 class _Look:
     """Poses and light, gathered while frames flow."""
 
-    jobs: JobFile
-    scene: Scene
-    folder: Path
+    light: str
+    """One of ``LIGHTS``."""
+    maps: BinaryIO
+    """File of the maps."""
     poses: npt.NDArray[np.float64]
     keys: list[int] = dataclasses.field(default_factory=list)
+    places: list[int] = dataclasses.field(default_factory=lambda: [0])
     saturation: npt.NDArray[np.float64] = dataclasses.field(default_factory=lambda: np.full(3, 255.0))
     latest: tuple[Map, npt.NDArray[Any] | None] | None = None
     """Environment and emitters of the last frame whose marker was found."""
-    last: Map | None = None
-    """Of the last key."""
-    emitters: npt.NDArray[Any] | None = None
-    """Of the last key, as records of ``Emitter``."""
+    kept: tuple[Map, npt.NDArray[Any] | None] | None = None
+    """Those of the last key."""
 
-    @property
-    def captures(self) -> bool:
-        """Return whether the light is the frames' own, not a file's."""
-        return self.scene.captured is None and has_environment(self.scene)
-
-    def take(self, frame: int, result: Result, writer: _Writer) -> None:
+    def take(self, frame: int, result: Result) -> None:
         """Wait for the pose and the light of a frame; where all of its light is wanted, ``keep`` it."""
         if result.pose is None:
             _ = result.stages  # waits, and raises what went wrong
             return
         self.poses[frame] = (*result.pose.rotation.ravel(), *result.pose.translation)
         self.latest = None if result.environment is None else (result.environment, result.emitters)
-        if self.latest is not None and self.jobs.settings.light == "follow":
-            self.keep(frame, *self.latest, writer)
+        if self.latest is not None and self.light == "follow":
+            self.keep(frame, *self.latest)
 
-    def keep(self, frame: int, environment: Map, emitters: npt.NDArray[Any] | None, writer: _Writer) -> None:
+    def keep(self, frame: int, environment: Map, emitters: npt.NDArray[Any] | None) -> None:
         """Write an environment if it has moved since the last one that was written, or its emitters have."""
-        if self.last is not None:
-            tolerated = CHANGE_FLOOR + CHANGE_SHARE * np.abs(self.last)
-            same = emitters is None or (self.emitters is not None and emitters.tobytes() == self.emitters.tobytes())
-            if same and not (np.abs(environment - self.last) > tolerated).any():
+        if self.kept is not None:
+            last, before = self.kept
+            same = emitters is None or (before is not None and emitters.tobytes() == before.tobytes())
+            if same and not (np.abs(environment - last) > CHANGE_FLOOR + CHANGE_SHARE * np.abs(last)).any():
                 return
-        self.last, self.emitters = _rounded(environment), emitters
-        writer.keep(self.last, emitters)
+        self.kept = _rounded(environment), emitters
+        buffer = io.BytesIO()
+        for array in self.kept:
+            if array is not None:
+                np.save(buffer, array, allow_pickle=False)
+        self.places.append(self.places[-1] + self.maps.write(zlib.compress(buffer.getbuffer(), 1)))
         self.keys.append(frame)
 
 
 def _look_at_frames(
-    jobs: JobFile,
-    clip: int,
-    look: _Look,
-    index: FrameIndex,
-    writer: _Writer,
-    device: str,
+    scene: Scene, source: RecordedSource, look: _Look, quality: str, device: str, *, captures: bool
 ) -> None:
-    """Follow the camera and the light through the clip."""
-    path, fps = source_of(jobs, clip)
-    first, end = lit_range(jobs.clips[clip], index.length)
-    given = look.scene.pose
-    if given is not None:
-        for number in range(first, end):
-            rotation, translation = given.at(number)
-            look.poses[number] = (*np.ravel(rotation), *np.ravel(translation))
-        if not look.captures:
-            return
-    gpu, converters = jobs.settings.gpu_of(device), min(CONVERTERS, usable_cores())
-    with contextlib.ExitStack() as stack:
-        source = stack.enter_context(open_part(path, index, first, end, fps, gpu, converters=converters))
-        linear = keep_depth(source, look.scene)
+    """Follow the camera and, where the frames are to tell it, the light; a thread packs what came of frames before."""
+    with contextlib.closing(source), ThreadPoolExecutor(1, "warp_ar-survey") as packer:
+        linear = keep_depth(source, scene)
         pipeline = Pipeline(
-            look.scene,
+            scene,
             device=device,
-            quality=jobs.settings.quality,
+            quality=quality,
             size=source.size,
-            outputs=("pose", "environment") if look.captures else ("pose",),
+            outputs=("pose", "environment") if captures else ("pose",),
             estimates="synchronous",
             follows_camera=False,
             linear=linear,
         )
+        waiting: collections.deque[Future[None]] = collections.deque()
         with pipeline:
-            tracked = _ahead(_tracker(source, pipeline), source, AHEAD)
-            submitted = (_submit(pipeline, frame, pose) for frame, pose in tracked)
-            for _ in _ahead(lambda lit: look.take(lit[0], lit[1], writer), submitted, WAITING):
-                pass
+            for frame in source:
+                frame.image.flags.writeable = False  # so that it need not be copied to wait for its turn
+                pose = given_pose(scene.pose, frame)
+                result = pipeline.submit(frame.deepest, time_seconds=frame.time, pose=pose)
+                waiting.append(packer.submit(look.take, frame.index, result))
+                if len(waiting) > WAITING:
+                    waiting.popleft().result()
+            for future in waiting:
+                future.result()
             look.saturation = pipeline.inputs.saturation.levels
-    if look.latest is None:
-        return
-    if jobs.settings.light == "fixed":
-        look.keep(first, *look.latest, writer)
-    kept = _rounded(look.latest[0])
-    emitters = find_emitters(kept, np.zeros_like(kept), 0.0)
-    Light(kept, np.ones(kept.shape[:2], np.float32), emitters).save(look.folder / LIGHT)
-
-
-def _ahead(function: Callable[[Any], Any], items: Iterable[Any], count: int) -> Iterator[Any]:
-    """Yield what a function, called by a thread, makes of items in their order; it is ahead by ``count`` at most."""
-    waiting: collections.deque[Future[Any]] = collections.deque()
-    with ThreadPoolExecutor(1, "warp_ar-survey") as thread:
-        try:
-            for item in items:
-                waiting.append(thread.submit(function, item))
-                if len(waiting) > count:
-                    yield waiting.popleft().result()
-            while waiting:
-                yield waiting.popleft().result()
-        finally:
-            thread.shutdown(cancel_futures=True)
-
-
-def _tracker(source: RecordedSource, pipeline: Pipeline) -> Callable[[Frame], tuple[Frame, Any]]:
-    """Return what finds the pose of a frame; None: the pipeline looks for the marker itself.
-
-    Of frames of more than 8 bits the pipeline alone knows the codes that are looked at.
-    """
-    given = pipeline.scene.pose
-    if given is not None:
-        return lambda frame: (frame, Pose(*given.at(frame.index)))
-    if source.keeps_depth:
-        return lambda frame: (frame, None)
-    tracker = Tracker(pipeline.scene.marker, pipeline.camera)
-    return lambda frame: (frame, tracker.track(frame.image, frame.time))
-
-
-def _submit(pipeline: Pipeline, frame: Frame, pose: Any) -> tuple[int, Result]:
-    """Hand a frame over to a pipeline."""
-    frame.image.flags.writeable = False  # so that it need not be copied to wait for its turn
-    return frame.index, pipeline.submit(frame.deepest, time_seconds=frame.time, pose=pose)
 
 
 def keep_depth(source: RecordedSource, scene: Scene) -> bool:

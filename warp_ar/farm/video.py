@@ -10,27 +10,17 @@ from __future__ import annotations
 
 import contextlib
 import fractions
+import heapq
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import av
-import numpy.typing as npt
 
 from warp_ar.errors import SinkError, SourceError, reason
-from warp_ar.farm.codes import LitPicture
-from warp_ar.output.encoders import Encoding, find_encoding, last_packets
-from warp_ar.output.sink import ThreadedSink, check_image, check_radiance
-from warp_ar.output.video_sink import (
-    FRAGMENT_SECONDS,
-    add_stream,
-    of_even_size,
-    rgb_to_yuv,
-    signal_of,
-    tag_for_players,
-    yuv_picture,
-)
+from warp_ar.output.encoders import Encoding, find_encoding
+from warp_ar.output.video_sink import VideoSink, tag_for_players
 from warp_ar.signature import PROGRAM
 
 ENCODER_THREADS = 2
@@ -61,96 +51,20 @@ def part_encoding(coding: str = "8bit") -> Encoding:
     return find_encoding(coding, options={"bf": "0", **own})
 
 
-class PartSink(ThreadedSink):
-    """Video in MP4 whose frames have given time stamps.
+def open_part_sink(path: Path, tick: fractions.Fraction, fps: float, coding: str, transfer: str) -> VideoSink:
+    """Open a segment's video, whose frames come by ``write_at``.
 
     Args:
         path: The file.
-        ticks: Time stamp of every frame that will come, growing.
-        tick: Seconds of a tick.
+        tick: Seconds of a tick of the recording.
         fps: Mean rate of the whole recording: all its parts have one header.
-        coding: One of ``CODINGS``; but for ``8bit`` frames are linear radiance, as those of ``VideoSink``.
+        coding: One of ``CODINGS``.
         transfer: The camera's, by which 10-bit codes are encoded.
 
     Raises:
-        SinkError: A frame cannot be written.
+        SinkError: The encoder is not there.
     """
-
-    def __init__(
-        self,
-        path: Path,
-        ticks: Sequence[int],
-        tick: fractions.Fraction,
-        fps: float,
-        *,
-        coding: str = "8bit",
-        transfer: str = "srgb",
-    ) -> None:
-        super().__init__(1)
-        self._encoding, self._transfer = part_encoding(coding), transfer
-        self.description = str(path)
-        self._path, self._ticks, self._tick, self._fps = path, ticks, tick, fps
-        self._container: Any = None
-
-    def write(self, image: Any) -> None:
-        """Take the next frame: an array, or a ``LitPicture``, whose codes are encoded as they are."""
-        super().write(image)
-
-    def _check(self, image: Any) -> None:
-        if isinstance(image, LitPicture):
-            if self._encoding.coding != "8bit":
-                raise SinkError(f"{self.description}: a picture of 8 bits among those of {self._encoding.coding}")
-        elif self._encoding.coding == "8bit":
-            check_image(image)
-        else:
-            check_radiance(image)
-
-    def _start(self, width: int, height: int) -> None:
-        encoding = self._encoding
-        self._container = av.open(str(self._path), "w", format="mp4")
-        self._container.metadata["comment"] = PROGRAM
-        rate = fractions.Fraction(self._fps).limit_denominator(1001)
-        group = max(1, round(FRAGMENT_SECONDS * self._fps))
-        self._stream = add_stream(self._container, rate, width, height, encoding, {"g": str(group)})
-        if encoding.encoder == "libx265":
-            tag_for_players(self._stream)
-        self._stream.time_base = self._stream.codec_context.time_base = self._tick
-        self._converter = rgb_to_yuv(width, height, self._tick, encoding.coding, encoding.pixel_format)
-
-    def _store(self, index: int, image: npt.NDArray[Any] | av.VideoFrame) -> None:
-        is_coded, coding = isinstance(image, av.VideoFrame), self._encoding.coding
-        try:
-            if isinstance(image, av.VideoFrame):
-                picture = image
-            else:
-                image = of_even_size(image)
-                if coding == "8bit":
-                    picture = av.VideoFrame.from_ndarray(image, format="rgb24")
-                else:
-                    picture = yuv_picture(signal_of(image, coding, self._transfer), coding)
-            if self._container is None:
-                self._start(picture.width, picture.height)
-            picture.pts, picture.time_base = int(self._ticks[index] - self._ticks[0]), self._tick
-            if not is_coded:
-                self._converter.push(picture)
-                picture = self._converter.pull()
-            self._container.mux(self._stream.encode(picture))
-        except (av.FFmpegError, OSError) as error:
-            raise SinkError(f"{self._path}: frame {index} cannot be written: {reason(error)}") from error
-
-    def _finish(self) -> None:
-        container, self._container = self._container, None
-        if container is None:
-            return
-        try:
-            try:
-                if self._error is None:
-                    container.mux(last_packets(self._stream, self._count))
-            finally:
-                container.close()
-        except (av.FFmpegError, OSError) as error:
-            if self._error is None:
-                raise SinkError(f"{self._path} cannot be finished: {reason(error)}") from error
+    return VideoSink(path, fps=fps, encoding=part_encoding(coding), transfer=transfer, tick=tick)
 
 
 def join_parts(
@@ -166,7 +80,7 @@ def join_parts(
     """Put segments into one file, packet by packet, with the sound and the metadata of the recording.
 
     Args:
-        parts: Videos of ``PartSink``, in order.
+        parts: Videos of ``open_part_sink``, in order.
         starts: Time stamp of each one's first frame in the recording, in ticks.
         tick: Seconds of a tick.
         output: The MP4 to write.
@@ -192,34 +106,23 @@ def join_parts(
                     tag_for_players(video)
                 header = bytes(first.streams.video[0].codec_context.extradata or b"")
             video.time_base = tick
-            sound: Iterator[Any] = iter(())
+            sound: Iterator[tuple[float, Any]] = iter(())
             if source is not None:
                 sound = _sound(source, target, float(zero * tick), until)
-                _copy_metadata(source, target, video)
+                target.metadata.update(source.metadata)
+                said = source.streams.video[0].metadata
+                video.metadata.update({name: said[name] for name in _LANGUAGES if name in said})
             target.metadata["comment"] = PROGRAM
             count = 0
-            waiting = next(sound, None)
-            for packet in _video_packets(parts, starts, tick, header, zero):
-                while waiting is not None and waiting[0] <= float(packet.pts * packet.time_base):
-                    target.mux(waiting[1])
-                    waiting = next(sound, None)
-                packet.stream = video
+            pictures = _video_packets(parts, starts, tick, header, zero)
+            for _, packet in heapq.merge(sound, pictures, key=lambda timed: timed[0]):
+                if packet.stream.type == "video":
+                    packet.stream = video
+                    count += 1
                 target.mux(packet)
-                count += 1
-            while waiting is not None:
-                target.mux(waiting[1])
-                waiting = next(sound, None)
     except (av.FFmpegError, OSError, ValueError) as error:
         raise SinkError(f"{output} cannot be joined: {reason(error)}") from error
     return count
-
-
-def _copy_metadata(source: Any, target: Any, video: Any) -> None:
-    """Into a file and its stream of pictures, what is said of a recording."""
-    for name, value in source.metadata.items():
-        target.metadata.setdefault(name, value)
-    said = source.streams.video[0].metadata
-    video.metadata.update({name: said[name] for name in _LANGUAGES if name in said})
 
 
 def _common_scale(tick: fractions.Fraction, source: Any) -> int:
@@ -234,7 +137,7 @@ def _common_scale(tick: fractions.Fraction, source: Any) -> int:
 
 def _video_packets(
     parts: Sequence[Path], starts: Sequence[int], tick: fractions.Fraction, header: bytes, zero: int
-) -> Iterable[Any]:
+) -> Iterator[tuple[float, Any]]:
     """Packets of all segments with their time stamps in the file, in ticks."""
     for path, start in zip(parts, starts, strict=True):
         with av.open(str(path)) as container:
@@ -253,7 +156,7 @@ def _video_packets(
                 packet.time_base = tick
                 packet.pts = packet.dts = int(ticks) + start - zero
                 packet.duration = length
-                yield packet
+                yield float(packet.pts * tick), packet
 
 
 def _sound(source: Any, target: Any, zero: float, until: float | None) -> Iterator[tuple[float, Any]]:

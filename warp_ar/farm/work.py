@@ -38,7 +38,7 @@ from warp_ar.farm.labels import LAYERS, LabelWriter, write_dataset_files
 from warp_ar.farm.lighting import Lighter
 from warp_ar.farm.manifest import aside, is_no_space, publish, publish_file
 from warp_ar.farm.survey import lit_scene, survey_clip
-from warp_ar.farm.video import PartSink, join_parts
+from warp_ar.farm.video import join_parts, open_part_sink
 from warp_ar.files import take_name
 from warp_ar.scene import SourceSpec, dumps_scene
 
@@ -127,26 +127,20 @@ class Work(Closing):
     def _light_segment(self, job: Job, part: Path) -> dict[str, Any]:
         survey = self._lighter.survey(job.clip)
         ticks, tick = shown_ticks(survey.index, source_of(self.context.jobs, job.clip)[1])
-        count = 0
-        rate = mean_rate(ticks, tick)
         own = self.context.jobs.settings.coding
         coding = survey.coding if own == AS_RECORDED else own
-        outputs = ("image",) if coding == "8bit" else (RADIANCE,)
         transfer = str(scene_of(self.context.jobs, job.clip).camera.transfer)
-        stamps = ticks[job.first : job.end].tolist()
+        count = 0
         with contextlib.ExitStack() as stack:
-            sink = stack.enter_context(PartSink(part / PART, stamps, tick, rate, coding=coding, transfer=transfer))
+            sink = stack.enter_context(open_part_sink(part / PART, tick, mean_rate(ticks, tick), coding, transfer))
             digests = None
             if self.context.jobs.settings.digests:
                 digests = stack.enter_context(open((part / PART).with_suffix(DIGESTS), "w", encoding="ascii"))
-            keep_rgb, coded = digests is not None, coding == "8bit"
-            for lit in self._lighter.light(job, outputs=outputs, coded=coded, keep_rgb=keep_rgb):
-                if lit.coded is not None:
-                    sink.write(lit.coded)
-                else:
-                    sink.write(lit.image if coded else lit.radiance)
+            for lit in self._lighter.light(job, outputs=("image",) if coding == "8bit" else (RADIANCE,)):
+                picture = lit.image if coding == "8bit" else lit.radiance
+                sink.write_at(picture, float(int(ticks[job.first + count] - ticks[job.first]) * tick))
                 if digests is not None:
-                    digests.write(digest_of(lit.image if coded else lit.radiance) + "\n")
+                    digests.write(digest_of(picture) + "\n")
                 count += 1
         return {"frames": count}
 
@@ -167,7 +161,7 @@ class Work(Closing):
             lit_frames = self._lighter.light(job, drawn.scene, outputs=LAYERS, every=dataset.every)
             for lit in lit_frames:
                 if lit.result is not None:
-                    labels.write(lit, survey.key_of(lit.frame.index) if len(survey.keys) else None)
+                    labels.label(lit, survey.key_of(lit.frame.index) if len(survey.keys) else None)
             return {"frames": labels.finish()}
 
     def _join(self, job: Job, output: Path) -> dict[str, Any]:

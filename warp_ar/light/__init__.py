@@ -1,1 +1,1 @@
-"""What is known of the environment's light beyond what the ball shows."""
+"""Light of the environment beyond what the ball shows: recovered, captured, measured."""

@@ -1,4 +1,4 @@
-"""Whether recovered light reaches the ball, as the surface around the ball's own shadow shows it.
+"""Test that recovered light reaches the ball, by the surface around the ball's own shadow.
 
 The card says how much light is missing, and shading where it comes from; but what lights them need not light the ball:
 clutter that nobody modelled may hide it there, and what clips in the ball may not be what lights the card. Light that
@@ -46,7 +46,7 @@ SHARES = np.linspace(0.0, 1.0, 41)
 
 @dataclasses.dataclass(frozen=True)
 class Ball:
-    """Where light is looked for."""
+    """Ball in which light is looked for."""
 
     center: Array
     """Metres, (3,)."""
@@ -120,7 +120,7 @@ def costs(given: Array, scatter: float, level: float, known: float | None) -> Ar
 
 
 def share_told(cost: Array, sides: Array | None = None) -> float:
-    """What nearly all of the likelihood has f above, and 1 where the evidence is not worth listening to.
+    """Return f as nearly all of the likelihood has it at least; 1 where the evidence is not worth listening to.
 
     Args:
         cost: From ``costs``, (shares,).
@@ -131,11 +131,11 @@ def share_told(cost: Array, sides: Array | None = None) -> float:
     if sides is not None and (sides[:, -1] - sides.min(axis=1)).min() < 0.5 * CONFIG.search.evidence:
         return 1.0
     likelihood = np.cumsum(np.exp(-0.5 * (cost - cost.min())))
-    return float(SHARES[np.searchsorted(likelihood, CONFIG.evidence.share * likelihood[-1])])
+    return float(SHARES[np.searchsorted(likelihood, CONFIG.shadow.believed * likelihood[-1])])
 
 
 def reaching_factor(problem: Problem, unknowns: Array, ball: Ball) -> float:
-    """What an estimate is to be multiplied by, 0 to 1, for what the planes around the ball show of it.
+    """Return the factor on an estimate, 0 to 1, for what the planes around the ball show of it.
 
     Args:
         problem: The equations.

@@ -26,13 +26,12 @@ from numpy.typing import NDArray
 from warp_ar.errors import SceneError, SinkError, reason
 from warp_ar.exr_file import read_exr_header, read_linear_picture, write_exr
 from warp_ar.files import parse_json, write_whole
-from warp_ar.light.latlong_axes import DESCRIPTIONS, axes_of, from_axes, world_from_marker
+from warp_ar.light.latlong_axes import DESCRIPTIONS, axes_of, from_axes, to_axes, world_from_marker
 from warp_ar.signals import REC_709
 
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 
-AXES = DESCRIPTIONS["z-up"]
 BRIGHT = 6.0
 """Times the mean radiance from which on a texel is part of an emitter."""
 MOST_EMITTERS = 12
@@ -57,7 +56,7 @@ class CapturedEmitter:
     distance: float | None = None
     """Metres from ``origin``; None: as distant as the environment."""
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Where direction and distance count from, metres."""
+    """Point from which direction and distance count, metres."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,25 +76,32 @@ class Light:
     lower_bound: float = 0.0
     """Share of the light that is a lower bound, 0 to 1."""
 
-    def save(self, path: str | Path) -> None:
+    def save(self, path: str | Path, axes: str = "z-up") -> None:
         """Write the light as OpenEXR.
+
+        Args:
+            path: The file.
+            axes: One of ``latlong_axes.AXES``, in which the file has it.
 
         Raises:
             SinkError: The file cannot be written.
+            UsageError: There are no such axes.
         """
         path = Path(path)
+        radiance, confidence = to_axes(self.radiance, axes), to_axes(self.confidence, axes)
+        emitters = tuple(_turned(emitter, world_from_marker(axes)) for emitter in self.emitters)
         header = {
             "compression": OpenEXR.ZIP_COMPRESSION,
             "type": OpenEXR.scanlineimage,
             "software": "warp_ar",
-            "axes": AXES,
+            "axes": DESCRIPTIONS[axes],
             "chromaticities": REC_709,
             "whiteLevel": float(self.white_level),
             "exposure": float(self.exposure or 0.0),
             "lowerBound": float(self.lower_bound),
-            "emitters": json.dumps([dataclasses.asdict(emitter) for emitter in self.emitters]),
+            "emitters": json.dumps([dataclasses.asdict(emitter) for emitter in emitters]),
         }
-        channels = {"RGB": np.ascontiguousarray(self.radiance), "confidence": np.ascontiguousarray(self.confidence)}
+        channels = {"RGB": np.ascontiguousarray(radiance), "confidence": np.ascontiguousarray(confidence)}
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             write_whole(path, lambda part: write_exr(part, OpenEXR.File(header, channels)))
@@ -108,7 +114,7 @@ class Light:
 
         Args:
             path: The file.
-            axes: One of ``AXES``; None: as the file says, else by the convention of its format (`axes_of`).
+            axes: One of ``latlong_axes.AXES``; None: as the file says, else by the custom of its format (`axes_of`).
 
         Raises:
             SceneError: The file cannot be used.
@@ -179,6 +185,13 @@ def texel_solid_angles(height: int) -> Array:
     """Steradians of the texels of each row, (height, 1)."""
     edges = np.cos(np.arange(height + 1) * math.pi / height)
     return np.asarray((edges[:-1] - edges[1:])[:, None] * (math.pi / height))
+
+
+def irradiance_above(radiance: Map) -> Array:
+    """Return the irradiance (3,) of a level plane under a latlong map whose z is up, (height, 2 height, 3)."""
+    height = len(radiance)
+    weight = np.maximum(latlong_directions(height)[..., 2:], 0.0) * texel_solid_angles(height)[..., None]
+    return np.asarray((weight * radiance).sum((0, 1)), float)
 
 
 def find_emitters(

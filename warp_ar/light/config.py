@@ -7,7 +7,7 @@ import enum
 
 
 class Kind(enum.IntEnum):
-    """What a surface point lies on."""
+    """Kind of surface."""
 
     CARD = 0
     """White paper: its reflectance is known."""
@@ -21,7 +21,7 @@ class Kind(enum.IntEnum):
 
 @dataclasses.dataclass(frozen=True)
 class SurfaceConfig:
-    """What surfaces are sampled at, and what is known of them beforehand; tuples are by ``Kind``."""
+    """Sampling of surfaces, and priors on them; tuples are by ``Kind``."""
 
     grid: float = 0.06
     """Metres between points on planes."""
@@ -63,7 +63,7 @@ class SurfaceConfig:
 
 @dataclasses.dataclass(frozen=True)
 class PriorConfig:
-    """What is expected of light that clips, where surfaces do not say."""
+    """Priors on light that clips."""
 
     region: float = 0.12
     """Steradians: a region wider than this (22 degrees across) is split."""
@@ -81,11 +81,6 @@ class PriorConfig:
     """Relative standard deviation of regions about their component's mean."""
     hue: float = 0.5
     """Relative standard deviation of one channel's distribution about that of all."""
-    colour: float = 3.0
-    """Ratio of one channel to the median of all that light which all of them lack may have: emitters are nearly
-    white."""
-    own_clipping: float = 3.0
-    """Ratio of what a channel lacks to what the others do from which it clips for itself, as a blue sky does."""
     least: float = 0.3
     """Radiance below which relative deviations are no longer relative."""
     surface_recovered: float = 0.5
@@ -94,7 +89,7 @@ class PriorConfig:
 
 @dataclasses.dataclass(frozen=True)
 class LeastConfig:
-    """What is missing at least, where nothing but the map tells (``least_missing.py``)."""
+    """Least radiance that is missing where the map alone is known (``priors.least_missing``)."""
 
     least: float = 1.25
     """Radiance by which what clips in all channels is raised, over the level of clipping, where a steradian clips."""
@@ -106,7 +101,7 @@ class LeastConfig:
 
 @dataclasses.dataclass(frozen=True)
 class SearchConfig:
-    """How emitters are looked for."""
+    """Search for emitters."""
 
     evidence: float = 7.0
     """Fall of the cost (twice a log likelihood) that a candidate must be worth."""
@@ -143,6 +138,8 @@ class SearchConfig:
     """Metres beyond which an emitter is taken for a distant one, in how much room there is for it."""
     angle: float = 0.12
     """Radians around a candidate's direction that share its light."""
+    stray: float = 0.05
+    """Share of the light of a lamp's spot that may clip around it: glare, and cells that the spot just touches."""
     radius_share: float = 0.06
     """Radius of an emitter as a share of its distance: of a disc as wide as a cell."""
 
@@ -164,8 +161,6 @@ class SolverConfig:
     known."""
     still: float = 0.02
     """Relative change, of surfaces or of the environment, below which the light is the same."""
-    rest: int = 4
-    """Most estimates in a row that are left out while the light is the same: a moving camera shows more."""
     remembered: int = 12
     """Estimates that count in a mean while the light is the same."""
     sudden: float = 0.25
@@ -174,7 +169,7 @@ class SolverConfig:
 
 @dataclasses.dataclass(frozen=True)
 class CardConfig:
-    """What is asked of a card before its white is believed."""
+    """Tests that a card must pass before its white is believed."""
 
     least_cells: int = 4
     """White cells, and ink cells, that must be seen."""
@@ -190,16 +185,13 @@ class CardConfig:
 
 @dataclasses.dataclass(frozen=True)
 class EvidenceConfig:
-    """How far problems are varied to see what an estimate rests on, and what it may add."""
+    """Errors of what an estimate rests on, and the share of it that they leave."""
 
-    draws: int = 12
-    """Problems that are solved."""
-    seed: int = 1
-    """Of their random numbers: equal input gives equal output."""
     directions: int = 32
     """In which irradiance counts."""
-    block: float = 0.12
-    """Metres of a surface that count, or not, together."""
+    lever: float = 2.0
+    """Most light that may be missing from all directions, over that which is missing at the card, as shares: light
+    that hardly reaches the card is hardly known by it."""
     response: float = 0.016
     """Standard deviation of the logarithm of the response's exponent."""
     white: float = 0.016
@@ -208,49 +200,22 @@ class EvidenceConfig:
     """The same of the ball's."""
     usual_contrast: float = 30.0
     """Ratio of paper to ink above which no print is known: the response is steeper than it is taken to be."""
-    most_contrast: float = 33.0
-    """The same of paper that clips, whose light is known by the ink alone."""
     doubt: float = 2.0
     """Standard deviation of the card's logarithm per logarithm of contrast beyond that."""
-    share: float = 0.1
-    """Of draws that an estimate may be too much for."""
-    safety: float = 1.0
-    """Of what the others allow."""
-    enough: float = 0.5
-    """Factor from which shading is taken, and not compared with the card alone: it knows where light comes from."""
-    lever: float = 2.0
-    """Share of light from all directions that may be missing, over that which is missing at the card: what hardly
-    lights the card is hardly known by it."""
-    unseen: float = 0.5
-    """Share of the card's irradiance that light may have, as a surface that faces it receives it, which the card does
-    not know: from its horizon, and from below it."""
-    flatter: float = 1.5
-    """How much more light there may be, for the same effect on the card, than as the card alone has it."""
-    exposed: float = 0.1
-    """Logarithm of a camera's gain from which a frame is another exposure of what was seen before."""
-    same: float = 0.2
-    """Relative difference of irradiance, over all directions, below which light is what it was."""
-    fitted: float = 0.6
-    """Cost per equation of a channel whose light is as modelled: 0.15 to 0.28 on path-traced desks, to 0.61 on one with
-    rough metal."""
-    misfit: float = 0.5
-    """How much less of a solution is taken per cost of one, per equation, beyond that."""
-    interval: float = 2.5
-    """Standard deviations of the draws that an interval of irradiance reaches to either side."""
-    found: float = 0.3
-    """Relative error of what was found, beside how far draws scatter."""
+    found: float = 0.75
+    """Relative error of the light that was found, either way."""
     capture: float = 0.35
-    """How much less, relatively, the irradiance as captured may be: the ball's reflectance, the unseen cone, the
+    """Relative error of the irradiance as captured, downward: the ball's reflectance, the unseen cone, the
     response. This, the next and ``clipped`` hold in 19 of 20 of the tables of ``bench_never_worse``."""
     overlooked: float = 2.0
-    """How much more it may be: emitters that are too small for the ball's pixels, or saturate unnoticed."""
+    """The same upward: emitters that are too small for the ball's pixels, or saturate unnoticed."""
     clipped: float = 250.0
     """Radiance that what clips may have on average where nothing tells: 19 of 20 rooms have less."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ShadowConfig:
-    """Which points tell whether recovered light reaches the ball (``ball_shadow.py``), and how well."""
+    """Test that recovered light reaches the ball (``ball_shadow.py``)."""
 
     beside: float = 2.0
     """Radii within which light passes the ball whose absence beside the shadow is the ball's own,"""
@@ -262,6 +227,8 @@ class ShadowConfig:
     """Greatest share at points that say how bright the plane is elsewhere."""
     points: int = 8
     """Least number of points, here and elsewhere."""
+    believed: float = 0.1
+    """Share of the likelihood that lies below the share of light that is taken."""
     scatter: float = 0.05
     """Least standard deviation of a point's logarithm: transport that the model leaves out.
 

@@ -35,6 +35,7 @@ from warp_ar.light.problem import Candidate, Problem
 
 Array = NDArray[np.float64]
 
+
 STEP = 1.1
 """Ratio of neighbouring distances that are tried."""
 MOST_STEPS = 4
@@ -118,7 +119,7 @@ class EmitterSearch:
         seen: list[Candidate] = []
         for place in np.argsort(-gain, kind="stable"):
             candidate = candidates[place]
-            if gain[place] < 0.5 * self.evidence or len(seen) == 5:
+            if gain[place] < 0.3 * self.evidence or len(seen) == 5:
                 break
             if any(
                 candidate.distance == s.distance
@@ -140,7 +141,7 @@ class EmitterSearch:
         return added
 
     def settled(self, candidate: Candidate, cost: float, fits: Fits, least: float) -> Candidate:
-        """Where a candidate that is not among the unknowns of ``fits``, and would lead to ``cost``, does best.
+        """Return the best place near a candidate that is not among the unknowns of ``fits`` and would lead to ``cost``.
 
         A step must lower the cost by more than ``least``.
         """

@@ -6,16 +6,84 @@ without it, the more parts and equations there are, the more all of them would s
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import functools
+import os
+import threading
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import ThreadpoolController
 
 from warp_ar.light.config import CONFIG, Kind
 from warp_ar.light.problem import Problem
-from warp_ar.light.solver import solve_nonnegative
 
 Array = NDArray[np.float64]
+
+
+@functools.cache
+def _blas() -> ThreadpoolController:
+    """Find the libraries; that takes as long as four fits."""
+    return ThreadpoolController()
+
+
+_ALONE = threading.Lock()
+
+
+def _renew_lock() -> None:
+    """Let a fork solve although its parent was solving."""
+    global _ALONE
+    _ALONE = threading.Lock()
+
+
+os.register_at_fork(after_in_child=_renew_lock)
+
+
+@contextlib.contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Keep NumPy's BLAS to one thread: products here take microseconds, and waking threads for them more.
+
+    The number belongs to the process, so that one solution is made at a time; sums in another order would be another
+    picture.
+    """
+    with _ALONE, _blas().limit(limits=1, user_api="blas"):
+        yield
+
+
+def solve_nonnegative(hessian: Array, gradient: Array, start: Array | None = None) -> Array:
+    """Minimise x' H x / 2 - g' x over x >= 0.
+
+    Block pivoting: free unknowns that turn negative are held at zero; once none does, held ones that pull upward are
+    let go.
+
+    Args:
+        hessian: H, positive definite, (n, n).
+        gradient: g, (n,).
+        start: Solution of a similar problem: its positive unknowns start free.
+    """
+    free = np.ones(len(gradient), bool) if start is None else start > 0.0
+    x = np.zeros(len(gradient))
+    tolerance = 1e-9 * float(np.abs(gradient).max(initial=0.0))
+    for _ in range(60):
+        x[:] = 0.0
+        index = np.flatnonzero(free)
+        if len(index) == len(x):
+            x[:] = np.linalg.solve(hessian, gradient)
+        elif len(index):
+            x[index] = np.linalg.solve(hessian[index[:, None], index], gradient[index])
+        negative = free & (x < 0.0)
+        if negative.any():
+            free &= ~negative
+            continue
+        pulled = ~free & (hessian @ x - gradient < -tolerance)
+        if not pulled.any():
+            break
+        free |= pulled
+    return np.maximum(x, 0.0)
+
+
 LEAST = CONFIG.priors.least
 
 
@@ -41,7 +109,7 @@ class Equations:
 
     @property
     def unknowns(self) -> int:
-        """How many there are."""
+        """Number of unknowns."""
         return self.first + self.count
 
     def times(self, z: Array) -> Array:
@@ -196,7 +264,7 @@ class _Channel:
         return cost + float(((np.log(u / self.prior_u) / self.spread_u) ** 2).sum())
 
     def _guess_reflectances(self, z: Array) -> None:
-        """What the start's light makes of surfaces that were left open."""
+        """Set the reflectances of surfaces that were left open by the start's light."""
         problem, u_at = self.problem, self.problem.first_surface
         ratio = self.equations.light @ z[: problem.first_mean] - self.target
         z[u_at:] = self.prior_u

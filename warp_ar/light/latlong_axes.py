@@ -27,7 +27,7 @@ DESCRIPTIONS = {
     "y-up": "latlong, row 0 toward +y (up), centre column toward +z, columns grow toward -x",
     "opengl": "latlong, row 0 toward +y (up), centre column toward -z, columns grow toward +x",
 }
-"""What a latlong's attribute ``axes`` says."""
+"""Values of the attribute ``axes`` of a latlong."""
 
 _Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 

@@ -1,4 +1,4 @@
-"""Whether a table mirrors its surroundings, told by frames from several sides.
+"""Reflection of the surroundings in a table, measured from frames from several sides.
 
 A matt point has one radiance from wherever it is looked at. A polished one adds what it mirrors, which is another part
 of the environment from each side, and passes less of what it scatters:
@@ -62,20 +62,20 @@ ROUNDS: Final = 6
 GAIN: Final = 0.06
 """Share of the differences between views that must be explained: matt tables leave 0.01 at most to chance."""
 CLEARLY: Final = 1.5
-"""How many times as much must be explained as by turned surroundings."""
+"""Least ratio of what is explained to what turned surroundings explain."""
 LEAST: Final = 0.3
 """Least g: there is no coat that reflects less than 0.012."""
 CONTRADICTED: Final = -0.12
 """h, below which clipped light takes away what is mirrored beside it: g is then not known."""
 FACTOR: Final = 2.0
-"""How far the reflectance may be off either way."""
+"""Factor by which the reflectance may be off either way."""
 WIDTHS: Final = 0.8
 """Share of the best gain from which on a roughness may be the true one."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Polish:
-    """How a table mirrors."""
+    """Roughness and reflectance of a table."""
 
     roughness: tuple[float, float, float]
     """Likely, least and most."""
@@ -109,7 +109,7 @@ class _Seen:
 
 @dataclasses.dataclass(frozen=True)
 class _Fit:
-    """What one environment and roughness explain."""
+    """Fit of one environment and roughness."""
 
     strength: Array
     """g and, where light clips, h."""
@@ -124,7 +124,7 @@ def estimate_polish(
     environment: NDArray[np.float32],
     table: NDArray[np.float32],
 ) -> Polish | None:
-    """How the first plane of a scene mirrors what the ball shows.
+    """Estimate how the first plane of a scene mirrors what the ball shows.
 
     Args:
         scene: With a plane, a mirror ball and a card.
@@ -209,7 +209,7 @@ def _observe(
 
 
 def _meets(probe: Probe, points: Array, directions: Array) -> NDArray[np.bool_]:
-    """Whether rays come near a ball."""
+    """Return which rays come near a ball."""
     to = np.asarray(probe.center) - points
     along = (to * directions).sum(1)
     return np.asarray((along > 0.0) & ((to**2).sum(1) - along**2 < (1.6 * probe.radius) ** 2))
@@ -260,7 +260,7 @@ def _masking(cosine: Array, alpha: float) -> Array:
 
 
 def _explain(seen: _Seen, environment: NDArray[np.float32], turn: Array, roughness: float, hot: float) -> _Fit:
-    """How well the mirror image of an environment explains the differences between views."""
+    """Fit the mirror image of an environment to the differences between views."""
     clips = cv2.dilate((environment.max(-1) >= hot).astype(np.float32), np.ones((3, 3)))
     known = np.where(clips[..., None] > 0.0, np.minimum(environment, hot), environment).astype(np.float32)
     rest = np.stack([clips, np.ones_like(clips)], axis=-1)

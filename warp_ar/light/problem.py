@@ -10,22 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warp_ar.kernels.recovery.recover_cells import LOST
-from warp_ar.light.clipping_prior import alike, depth_profile
 from warp_ar.light.config import CONFIG, Kind
-from warp_ar.light.noise import measured_noise, shared_errors
-from warp_ar.light.regions import connected_regions, split_regions
-from warp_ar.light.surfaces import Surfaces
+from warp_ar.light.priors import alike, connected_regions, depth_profile, split_regions
+from warp_ar.light.surfaces import Surfaces, measured_noise, shared_errors
 
 Array = NDArray[np.float64]
 
 Trace = Callable[[NDArray[np.float32]], Array]
 """Irradiance at every surface point per unit intensity of emitters (q, 4: position, radius), (n, q)."""
-
-
-ALONE = 2.5
-"""Angles of a candidate's patch within which nothing else clips around a lamp that stands alone, but for"""
-MOST_OF = 0.8
-"""what is left of all that clips there beside this share."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,7 +31,7 @@ class Candidate:
 
 
 def mirroring_points(directions: Array, center: Array, radius: float, camera: Array | None) -> Array:
-    """Where on a ball a camera far away sees what lies in each direction, (m, 3).
+    """Return the points of a ball in which a camera far away sees each direction mirrored, (m, 3).
 
     Args:
         directions: Unit, (m, 3).
@@ -54,26 +46,27 @@ def mirroring_points(directions: Array, center: Array, radius: float, camera: Ar
     return np.asarray(center + radius * halfway / np.maximum(np.linalg.norm(halfway, axis=1, keepdims=True), 1e-3))
 
 
-def candidate_directions(cells: NDArray[Any]) -> Array:
-    """Where what clips in each cell stands, unit, (m, 3).
+def emitter_directions(cells: NDArray[Any]) -> Array:
+    """Return the direction in which an emitter of each cell stands, unit, (m, 3).
 
-    A lamp of a few degrees lies across cells, each of which alone has the direction of its own part. Where hardly
-    anything clips around a patch of that size, the patch is one lamp and all its cells have its direction; inside a
-    window they keep their own.
-
-    Args:
-        cells: Records of ``kernels.recover_cells.Cell``, (rows, columns).
+    A lamp's picture in the ball is wider than a cell, and the equations hardly tell which cell holds its middle. So it
+    is the middle of the spot that clips around the cell, found by mean shift, where nothing else clips within twice
+    ``search.angle``. Within a window or a sky, whose middle is not its brightest part, it is the cell's own direction.
     """
+    search = CONFIG.search
     direction = cells["direction"].reshape(-1, 3).astype(float)
-    lost = cells["missing"].reshape(-1, 3).astype(float).sum(axis=1) * cells["solid_angle"].ravel()
-    emitting = np.flatnonzero((lost > 0.0) & (cells["modelled"].ravel() <= 0.5) & (cells["hidden"].ravel() <= 0.0))
-    own, weight, angle = direction[emitting], lost[emitting], CONFIG.search.angle
-    cosine = own @ own.T
-    near, around = (cosine > np.cos(angle)) * weight, (cosine > np.cos(ALONE * angle)) * weight
-    alone = near.sum(axis=1) > MOST_OF * around.sum(axis=1)
-    total = near[alone] @ own
-    direction[emitting[alone]] = total / np.linalg.norm(total, axis=1, keepdims=True)
-    return direction
+    lost = cells["solid_angle"].ravel() * cells["missing"].reshape(-1, 3).max(axis=1)
+    lost = np.where((cells["modelled"].ravel() > 0.5) | (cells["hidden"].ravel() > 0.0), 0.0, lost)
+    inside = np.flatnonzero(lost > 0.0)
+    found, middle = direction.copy(), direction[inside]
+    for _ in range(3):
+        middle = ((middle @ direction[inside].T > np.cos(search.angle)) * lost[inside]) @ direction[inside]
+        middle /= np.maximum(np.linalg.norm(middle, axis=1, keepdims=True), 1e-12)
+    cosine = middle @ direction[inside].T
+    spot, around = ((cosine > np.cos(angle)) @ lost[inside] for angle in (search.angle, 2.0 * search.angle))
+    alone = around <= (1.0 + search.stray) * spot
+    found[inside[alone]] = middle[alone]
+    return found
 
 
 class Problem:
@@ -101,7 +94,7 @@ class Problem:
             surfaces: The points.
             white: Reflectance of the card's paper.
             trace: Traces emitters at finite distances; None: all light is distant.
-            aim: From ``candidate_directions``, (rows * columns, 3).
+            aim: From ``emitter_directions``, (rows * columns, 3).
             origin: From ``mirroring_points`` for these, (rows * columns, 3).
         """
         self.shape = cells.shape
@@ -144,9 +137,8 @@ class Problem:
         first = np.unique(self.part, return_index=True)[1][int((self.part < 0).any()) :]
         self.component = component[first]
         inside = component >= 0
-        weights = (self.solid_angle * clipped)[inside]
-        area = np.bincount(component[inside], weights, minlength=self.components)
         is_surface = np.bincount(component[inside], self.modelled[inside], minlength=self.components) > 0
+        area = np.bincount(component[inside], (self.solid_angle * clipped)[inside], minlength=self.components)
         usual = (area + 0.01) ** CONFIG.priors.exponent
         usual *= alike(self.lost, self.solid_angle, component, self.components)
         self.expected = np.where(is_surface, 0.0, usual)
@@ -177,7 +169,7 @@ class Problem:
         self.noise, scatter = measured_noise(points, self.surface, self.kinds, self.light, self.exact)
         told = self.surface[self.exact.all(axis=1) & (self.kind >= Kind.PLANE)]
         self.texture = float(np.median(scatter[told] / self.noise[told])) if len(told) else 1.0
-        """How much more than ``noise`` surfaces beside the card scatter: at least 1."""
+        """Ratio of the scatter of surfaces beside the card to ``noise``: at least 1."""
 
     def leave_out(self, points: NDArray[np.bool_]) -> None:
         """Take points out of the equations, (n,): they show something else than their surface, and are of no kind."""
@@ -185,12 +177,7 @@ class Problem:
         self.kind = np.where(points, -1, self.kind)
 
     def _aim_transfer(
-        self,
-        cells: NDArray[Any],
-        transfer: NDArray[Any],
-        mirrored: NDArray[Any],
-        surfaces: Surfaces,
-        clipped: Array,
+        self, cells: NDArray[Any], transfer: NDArray[Any], mirrored: NDArray[Any], surfaces: Surfaces, clipped: Array
     ) -> NDArray[Any]:
         """Transfer from where cells clip; returns that part of it which comes by way of balls."""
         through_balls = mirrored[self.index]
@@ -273,7 +260,7 @@ class Problem:
         shares = [self.card_share(c, bounds[c]) for c in range(3)]
         missing = float(np.mean(shares))
         error = 1.28 * float(np.linalg.norm([doubt, config.response, config.ball]))
-        return float(np.clip(2.0 * config.safety * (missing - error) / max(missing, 1e-9), 0.0, 1.0))
+        return float(np.clip(2.0 * (missing - error) / max(missing, 1e-9), 0.0, 1.0))
 
     def card_share(self, c: int, is_bound: bool) -> float:
         """Share of the card's irradiance that the light as captured leaves open in a channel; 0 where it is not seen.
@@ -335,6 +322,24 @@ class Problem:
         total = self.solid_angle[near] @ self.missing[near]
         return np.asarray(near[:, None] / np.maximum(total, 1e-6), np.float64)
 
+    def push(self, candidate: Candidate) -> None:
+        """Add a candidate to the unknowns."""
+        patch = self.patch(candidate.cell)
+        if np.isfinite(candidate.distance):
+            column = self.power_columns([candidate])[:, 0]
+            near = patch[:, 0] > 0.0
+            block = np.stack([column * (self.lost[near, c].max() > LOST) for c in range(3)])
+        else:
+            inside = np.flatnonzero(patch.any(axis=1))
+            block = (self.transfer[:, inside] @ (patch * self.missing)[inside]).T
+        self.candidates.append(candidate)
+        self.candidate_columns = np.concatenate([self.candidate_columns, block[:, :, None]], axis=2)
+
+    def pop(self) -> None:
+        """Take the last candidate away."""
+        self.candidates.pop()
+        self.candidate_columns = self.candidate_columns[:, :, :-1]
+
     def distant_radiance(self, unknowns: Array) -> Array:
         """Radiance that cells lack by parts and candidates at infinity, (m, 3).
 
@@ -359,39 +364,3 @@ class Problem:
         """Irradiance of points by parts and candidates, each candidate where it stands, (points, 3)."""
         columns = np.concatenate([self.columns, self.candidate_columns], axis=2)
         return np.asarray(np.einsum("cnk,kc->nc", columns, unknowns), np.float64)
-
-    def card_irradiance(self) -> Array:
-        """Irradiance of the card, (3,); where it clips, what it has at least."""
-        return np.asarray(np.median(self.light[self.kind == Kind.CARD], axis=0) / self.white, np.float64)
-
-    def card_cosines(self) -> tuple[Array, Array]:
-        """Cosines at which the card meets light from cells, (m,), and from candidates where they stand, (candidates,).
-
-        The card lies in the world's z = 0 and faces +z.
-        """
-        middle = self.points[self.kind == Kind.CARD].mean(axis=0)
-        cosines = []
-        for one in self.candidates:
-            ray = self.aim[one.cell]
-            if np.isfinite(one.distance):
-                ray = self.origin[one.cell] + one.distance * ray - middle
-            cosines.append(ray[2] / np.linalg.norm(ray))
-        return self.direction[:, 2], np.array(cosines)
-
-    def push(self, candidate: Candidate) -> None:
-        """Add a candidate to the unknowns."""
-        patch = self.patch(candidate.cell)
-        if np.isfinite(candidate.distance):
-            column = self.power_columns([candidate])[:, 0]
-            near = patch[:, 0] > 0.0
-            block = np.stack([column * (self.lost[near, c].max() > LOST) for c in range(3)])
-        else:
-            inside = np.flatnonzero(patch.any(axis=1))
-            block = (self.transfer[:, inside] @ (patch * self.missing)[inside]).T
-        self.candidates.append(candidate)
-        self.candidate_columns = np.concatenate([self.candidate_columns, block[:, :, None]], axis=2)
-
-    def pop(self) -> None:
-        """Take the last candidate away."""
-        self.candidates.pop()
-        self.candidate_columns = self.candidate_columns[:, :, :-1]

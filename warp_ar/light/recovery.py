@@ -1,11 +1,10 @@
 """Light that clipping lost in the ball, found again from surfaces that the same light falls on.
 
 **Unknowns.** Cells of the environment that clip (``kernels/recovery/recover_cells.py``) are grouped to regions:
-connected ones,
-split where they are wider than some steradians. Region r lacks the radiance s_r >= 0, per channel, on top of what the
-ball shows. Beside regions stand *candidates*: emitters or a sun within a region, or where no ball sees, each with its
-power p_j >= 0 (radiance times solid angle, as seen from the ball), a direction and a distance. A surface k has the
-unknown reflectance 1 / u_k; the card's is known.
+connected ones, split where they are wider than some steradians. Region r lacks the radiance s_r >= 0, per channel, on
+top of what the ball shows. Beside regions stand *candidates*: emitters or a sun within a region, or where no ball sees,
+each with its power p_j >= 0 (radiance times solid angle, as seen from the ball), a direction and a distance. A surface
+k has the unknown reflectance 1 / u_k; the card's is known.
 
 **Equations.** A surface point x that shows the radiance L receives
 
@@ -19,23 +18,18 @@ only, and the estimate says so; ink, a twentieth as bright, and surfaces in shad
 their reflectances allow.
 
 **Priors** decide what surfaces do not see. A region's s_r scatters about the mean of its connected component, that
-about one mean of all, times (solid angle)^-1/2: halfway between emitters of equal radiance and emitters of equal power,
-for what is small and still clips tends to be brighter than what is wide; less where channels clip apart from each
-other, and growing inward where it fades (``light/clipping_prior.py``). The common mean is free; where nothing but the
+about one mean of all: less where channels clip apart from each other, and growing inward where it fades
+(``light/priors.py``). The common mean is free; where nothing but the
 card is used it is what makes the card right, and that alone is the method ``white_card``. Clipped pixels that show a
 modelled surface (the card in the ball, a box) are lit, not lights: they stay close to clipping. Channels share their
 distribution: a second pass draws each to the mean of all three, in the hue of their totals.
 
-**What the card hardly sees**, light from its horizon and from below it, is told by surfaces of unknown reflectance
-alone. There is no more of it than some share of what the card shows (``held_to_card``).
-
 **Emitter candidates** are chosen one by one, among all directions that may lack light and a grid of distances, by how
 far they lower the cost to second order, (b' W r)^2 / (b' W b - b' W Z H^-1 Z' W b); the best few are fitted in earnest,
-then moved to neighbouring cells and distances while that helps, along their direction to where the cost is least, and
-kept if the costs of two channels fall by more than ``evidence``. An emitter at the distance D lights x by
-cos D^2 / |p - x|^2: its shadows and the falling off of its light tell D. D counts from where the ball mirrors the
-emitter to the camera, which may lie a ball's radius beside its middle. An emitter that is known moves only for a larger
-gain: emitters stand still.
+then moved to neighbouring cells and distances while that helps, and kept if the costs of two channels fall by more than
+``evidence``. An emitter at the distance D lights x by cos D^2 / |p - x|^2: its shadows and the falling off of its light
+tell D. D counts from where the ball mirrors the emitter to the camera, which may lie a ball's radius beside its middle.
+An emitter that is known moves only for a larger gain: emitters stand still.
 
 Every deviation is relative to an unknown, a mean or a reflectance. The derivative with respect to that unknown is kept:
 without it, the more parts and equations there are, the more all of them would shrink together.
@@ -48,38 +42,20 @@ gives equal output.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from warp_ar.light.ball_shadow import Ball, reaching_factor
-from warp_ar.light.card import CardCheck, check_card, covered_card
-from warp_ar.light.channel import choose_channel, told_channel
 from warp_ar.light.config import CONFIG
 from warp_ar.light.emitters import EmitterSearch
-from warp_ar.light.estimate import Estimate, FoundEmitter
-from warp_ar.light.evidence import (
-    allowed_factor,
-    blocks_of,
-    doubt_of,
-    draw_missing,
-    fitting_share,
-    held_to_card,
-    irradiance_form,
-    irradiance_interval,
-    known_share,
-    likely_gain,
-    most_by_card,
-    spread_directions,
-)
-from warp_ar.light.fit import fit_channel
-from warp_ar.light.least_missing import least_missing
-from warp_ar.light.problem import Candidate, Problem, Trace, candidate_directions, mirroring_points
-from warp_ar.light.solver import ONE_BLAS_THREAD
-from warp_ar.light.steadiness import Steadiness
-from warp_ar.light.stillness import Seen, Stillness
+from warp_ar.light.estimate import Estimate, FoundEmitter, Seen, Steadiness, Stillness
+from warp_ar.light.evidence import CardCheck, check_card, covered_card, doubt_of, irradiance_interval, most_by_card
+from warp_ar.light.fit import fit_channel, one_blas_thread
+from warp_ar.light.priors import least_missing
+from warp_ar.light.problem import Candidate, Problem, Trace, emitter_directions, mirroring_points
 from warp_ar.light.surfaces import Surfaces
 
 Array = NDArray[np.float64]
@@ -91,13 +67,7 @@ class Recovery:
     """Estimates what clipping took, frame by frame; keeps the emitters that it found."""
 
     def __init__(
-        self,
-        surfaces: Surfaces,
-        white: float,
-        center: Sequence[float],
-        *,
-        radius: float = 0.0,
-        method: str = "shading",
+        self, surfaces: Surfaces, white: float, center: Sequence[float], *, radius: float = 0.0, method: str = "shading"
     ) -> None:
         """Prepare.
 
@@ -119,17 +89,12 @@ class Recovery:
         self._frames = 0
         self._solved = 0
         self._stillness = Stillness()
-        self._blocks = blocks_of(surfaces)
-        self._evidence: _Evidence | None = None
-        self._told: _Told | None = None
-        self.gain = np.ones(3)
-        """Of the camera in the next frame that is estimated from, (3,); its values are light times this."""
         self._held: Estimate | None = None
         self._unseen = 0
         self._steadiness = Steadiness()
 
     def rests(self, cells: NDArray[Any], observations: NDArray[Any]) -> bool:
-        """Whether the last estimate still holds, as far as the light tells: then there is nothing to solve for.
+        """Return whether the last estimate still holds, as far as the light tells: then there is nothing to solve for.
 
         Takes note of what it is given, unless it holds.
 
@@ -158,8 +123,8 @@ class Recovery:
             trace: Traces emitters at finite distances; None: all light is distant.
             camera: Where the camera stands, metres, (3,); None: emitters are as seen from the ball's centre.
         """
-        with ONE_BLAS_THREAD:
-            aim = candidate_directions(cells)
+        with one_blas_thread():
+            aim = emitter_directions(cells)
             origin = mirroring_points(aim, self._center, self._radius, camera)
             problem = Problem(cells, transfer, mirrored, observations, self.surfaces, self._white, trace, aim, origin)
             view = np.zeros(3) if camera is None else (camera - self._center) / np.linalg.norm(camera - self._center)
@@ -187,13 +152,12 @@ class Recovery:
             return self._held
         means = np.maximum(means, 0.05)
         best = choose_channel(problem)
-        is_turn = self._search(problem, means)
+        self._search(problem, means)
         problem.share_by_depth()
-        means, bounds, radiance_by_card = _by_card(problem)
-        means, by_card = np.maximum(means, 0.05), problem.member @ radiance_by_card
-        solution = tie_channels(problem, _solve_channels(problem, best, means, bounds))
-        doubt = doubt_of(card.contrast)
-        recovered, powers = held_to_card(problem, solution, by_card, problem.card_cosines(), doubt)
+        means, bounds, _ = _by_card(problem)
+        means = np.maximum(means, 0.05)
+        solution = _solve_channels(problem, best, means, bounds)
+        recovered, powers = problem.member @ solution[: problem.parts], solution[problem.parts :]
         # An emitter that gives nothing in any channel has gone out, or never was.
         self._candidates = [
             candidate for candidate, power in zip(problem.candidates, powers, strict=True) if power.any()
@@ -211,26 +175,15 @@ class Recovery:
                 )
             )
         emitters.sort(key=lambda emitter: -float(emitter.power.sum()))
-        if is_turn or self._evidence is None:
-            c = told_channel(problem, best)
-            fits = [fit_channel(problem, k, problem.start(means[k]), CONFIG.solver.iterations) for k in range(3)]
-            evidence = _weigh(problem, c, fits[c].z, bounds, (recovered, by_card), self._blocks, doubt)
-            taken = recovered
-            if evidence.method == "white_card":
-                solution, taken = np.concatenate([radiance_by_card, np.zeros((len(powers), 3))]), by_card
-            reaching = reaching_factor(problem, solution, Ball(self._center, self._radius))
-            known = known_share(problem, taken, by_card, bounds) * fitting_share(fits)
-            evidence = dataclasses.replace(evidence, factor=known * min(evidence.factor, reaching))
-            self._evidence = self._by_exposures(problem, evidence, {"shading": recovered, "white_card": by_card})
-        evidence = self._evidence
-        if evidence.method == "shading":
-            self._held = self._estimate(problem, recovered, bounds, *evidence.parts, card, tuple(emitters))
-        else:
-            self._held = self._estimate(problem, by_card, bounds, *evidence.parts, card)
+        factor = min(
+            most_by_card(problem, recovered, bounds, doubt_of(card.contrast)),
+            reaching_factor(problem, solution, Ball(self._center, self._radius)),
+        )
+        self._held = self._estimate(problem, recovered, bounds, "shading", factor, card, tuple(emitters))
         return self._held
 
     def _without_card(self, problem: Problem, card: CardCheck) -> Estimate:
-        """What is held while the card is hidden for a while, else what nearly every place lacks at least.
+        """Return the last estimate while the card is hidden for a while, else what nearly every place lacks at least.
 
         Without a surface of known reflectance only the shape of shadows tells how bright an emitter is, and texture,
         gloss and clutter look like shadows.
@@ -238,7 +191,7 @@ class Recovery:
         self._unseen += 1
         if self._held is not None and self._unseen <= CONFIG.card.held:
             return self._held
-        self._held, self._candidates, self._evidence, self._told = None, [], None, None
+        self._held, self._candidates = None, []
         rows, columns = problem.shape
         maps = (side.reshape(rows, columns, 3) for side in (problem.radiance, problem.lost))
         is_light = ~problem.modelled & (problem.hidden <= 0.0)
@@ -246,38 +199,8 @@ class Recovery:
         least = least_missing(*maps, *by_cell).reshape(-1, 3)
         return self._estimate(problem, least, (True, True, True), "least", float(least.any()), card)
 
-    def _by_exposures(self, problem: Problem, evidence: _Evidence, solutions: Mapping[str, Array]) -> _Evidence:
-        """That of another exposure of the same light, where draws scattered less in it.
-
-        At a shorter exposure less clips, and what the card lacks falls below its own error, though what clips still
-        lacks most of the light from its side. How far solutions can be relied on, surfaces and response tell, which
-        stay. It holds only if it gives the light that was known there.
-
-        Args:
-            problem: The frame's equations.
-            evidence: Of the frame.
-            solutions: By method, (cells, 3).
-        """
-        form, told = irradiance_form(problem, spread_directions(CONFIG.evidence.directions)), self._told
-
-        def light(by: _Evidence) -> Array:
-            recovered = problem.radiance + by.factor * solutions[by.method] * problem.missing
-            return np.asarray(form @ recovered / self.gain)
-
-        if told is not None and np.abs(np.log(self.gain / told.gain)).max() > CONFIG.evidence.exposed:
-            difference = np.linalg.norm(light(told.evidence) - told.light, axis=0)
-            same = difference < CONFIG.evidence.same * np.linalg.norm(told.light, axis=0)
-            if told.evidence.spread < evidence.spread and same.all():
-                return told.evidence
-        self._told = _Told(evidence, self.gain.copy(), light(evidence))
-        return evidence
-
-    def _search(self, problem: Problem, means: Array) -> bool:
-        """Try candidates of former frames, one of them moved, and new ones where it is their turn to be looked for.
-
-        Returns:
-            Whether it was.
-        """
+    def _search(self, problem: Problem, means: Array) -> None:
+        """Try candidates of former frames, one of them moved, and new ones where it is their turn to be looked for."""
         config = CONFIG.search
         for candidate in self._candidates:
             if problem.may_hold_candidate[candidate.cell]:
@@ -293,9 +216,6 @@ class Recovery:
         elif before % (config.later_every if settled else config.every) == 1:
             candidates = config.candidates if before < config.first else config.later_candidates
             search.find_candidates(min(left, 1), places=candidates, turn=before // config.every)
-        else:
-            return False
-        return True
 
     def _estimate(
         self,
@@ -311,87 +231,17 @@ class Recovery:
         if factor == 0.0:
             method, emitters = "clipped", ()
         emitters = tuple(dataclasses.replace(emitter, power=factor * emitter.power) for emitter in emitters)
-        spread = self._evidence.spread if self._evidence is not None else None
-        interval = irradiance_interval(problem, recovered, factor, bounds, spread, card.contrast)
+        known = method == "shading"
+        interval = irradiance_interval(problem, recovered, factor, bounds, known=known, contrast=card.contrast)
         cells = (factor * recovered * problem.profile).reshape(*problem.shape, 3).astype(np.float32)
         r, g, b = (0.0 if bounds[c] or factor == 0.0 else problem.card_share(c, is_bound=False) for c in range(3))
         return Estimate(cells, bounds, emitters, method, factor, card, (r, g, b), interval)
 
 
 def _by_card(problem: Problem) -> tuple[Array, tuple[bool, bool, bool], Array]:
-    """What makes the card right: from ``card_means``, and the radiance that parts then lack, (parts, 3)."""
+    """Return ``card_means``, and the radiance that parts lack for the card to be right, (parts, 3)."""
     means, bounds = problem.card_means()
     return means, bounds, problem.expected[problem.component][:, None] * means
-
-
-@dataclasses.dataclass(frozen=True)
-class _Evidence:
-    """What draws say of a frame's solutions."""
-
-    method: str
-    factor: float
-    spread: float
-    """Standard deviation of the missing irradiance over its mean."""
-
-    @property
-    def parts(self) -> tuple[str, float]:
-        return self.method, self.factor
-
-
-@dataclasses.dataclass(frozen=True)
-class _Told:
-    """Evidence, and the light that it gave."""
-
-    evidence: _Evidence
-    gain: Array
-    """Of the camera, (3,)."""
-    light: Array
-    """Irradiance at gain 1, (directions, 3)."""
-
-
-def _weigh(
-    problem: Problem,
-    c: int,
-    z: Array,
-    bounds: tuple[bool, bool, bool],
-    solutions: tuple[Array, Array],
-    blocks: NDArray[np.int64],
-    doubt: float,
-) -> _Evidence:
-    """Which of two solutions, by shading and by the card alone, to take, and how much of it."""
-    form = irradiance_form(problem, spread_directions(CONFIG.evidence.directions))
-    share = 1.0 if bounds[c] else problem.card_share(c, is_bound=False) + doubt
-    missing = draw_missing(problem, c, z, blocks, doubt) @ form.T
-    total = missing.sum(axis=1)
-    spread = float(total.std() / max(total.mean(), 1e-9))
-    found = []
-    for method, recovered in zip(("shading", "white_card"), solutions, strict=True):
-        added = form @ (recovered[:, c] * problem.missing[:, c])
-        factor = min(allowed_factor(added, missing), most_by_card(form @ problem.radiance[:, c], added, share))
-        found.append((likely_gain(factor * added, missing), _Evidence(method, factor, spread)))
-    if found[0][1].factor >= CONFIG.evidence.enough:
-        return found[0][1]
-    return max(found, key=lambda one: one[0])[1]
-
-
-def tie_channels(problem: Problem, solution: Array) -> Array:
-    """A solution without light of one channel only, unless that channel alone clips, (parts + candidates, 3).
-
-    What emitters look like in one channel is told by surfaces that show that channel: texture, or another response in
-    it, makes emitters of one colour. Where all channels lack light, none is more than some times the median of the
-    three.
-
-    Args:
-        problem: The equations.
-        solution: Radiance of parts, then power of candidates, (parts + candidates, 3).
-    """
-    config = CONFIG.priors
-    cells = [np.flatnonzero(problem.part == part) for part in range(problem.parts)]
-    cells += [np.array([candidate.cell]) for candidate in problem.candidates]
-    missing = np.array([problem.solid_angle[own] @ problem.missing[own] for own in cells]).reshape(-1, 3)
-    most = config.colour * np.median(solution, axis=1, keepdims=True)
-    alone = missing > config.own_clipping * np.median(missing, axis=1, keepdims=True)
-    return np.asarray(np.where(alone, solution, np.minimum(solution, most)), np.float64)
 
 
 def _solve_channels(problem: Problem, best: int, means: Array, bounds: tuple[bool, bool, bool]) -> Array:
@@ -430,3 +280,13 @@ def _solve_channels(problem: Problem, best: int, means: Array, bounds: tuple[boo
         ],
         -1,
     )
+
+
+def choose_channel(problem: Problem) -> int:
+    """The channel that surfaces show best; green of equals.
+
+    Args:
+        problem: The equations.
+    """
+    points = problem.exact.sum(axis=0) - problem.bound.sum(axis=0)
+    return int(np.argmax(points + np.array([0.0, 0.5, 0.0])))

@@ -1,1 +1,1 @@
-"""Where results go: pictures, video, environment files, reports."""
+"""Outputs: pictures, video, environment files, reports."""

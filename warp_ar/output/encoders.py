@@ -15,7 +15,7 @@ from av.codec import codecs_available
 from warp_ar.errors import SinkError, UsageError, reason
 
 CODINGS: Final = ("8bit", "10bit", "pq", "hlg")
-"""What a video's numbers are: the camera's codes in 8 or 10 bits, or HDR: BT.2020's primaries in 10 bits."""
+"""Codings of video: the camera's codes in 8 or 10 bits, or HDR: BT.2020's primaries in 10 bits."""
 
 DEFAULT_ENCODERS: Final = {"8bit": "libx264", "10bit": "libx265", "pq": "libx265", "hlg": "libx265"}
 
@@ -41,7 +41,7 @@ _PROBED: Final = 256
 
 @dataclasses.dataclass(frozen=True)
 class Encoding:
-    """How a video is encoded."""
+    """Encoding of a video."""
 
     encoder: str
     """FFmpeg's name."""

@@ -1,4 +1,4 @@
-"""Environments in the axes and layouts of other programs.
+"""Environments in the axes and layouts of other programs, and as spherical harmonics.
 
 A latlong map of this program (``z-up``) has row 0 toward +z and its centre column toward +x, and its columns grow
 toward +y: seen from the ball's place it is a mirror image. Every other latlong here is a picture as it is seen from
@@ -14,13 +14,23 @@ the inside, with the columns growing to the right of who looks at the centre:
 world takes; three.js, whose world is that of ``y-up``, shows the same picture in the right place. All four have +z of
 the marker above, so the maps differ by a mirror image and a turn by quarters: texels change places, none is filtered.
 
+Spherical harmonics are the real orthonormal basis in the order l = 0; l = 1: y, z, x; l = 2: xy, yz, 3z^2 - 1, xz,
+x^2 - y^2, all signs positive (three.js and Filament have the same order and signs). ``radiance`` holds
+
+    L_i = integral of L(w) Y_i(w) dw,   L(w) about sum_i L_i Y_i(w),
+
+and ``irradiance`` A_l L_i, with A = pi, 2 pi/3, pi/4 for the clamped cosine ([RH01] eq. 8), so that a surface with the
+normal n receives E(n) = sum_i E_i Y_i(n). Nothing is windowed: beside a small emitter E may come out negative.
+
 References:
     OpenEXR, Technical Introduction, Environment Maps, and ``ImfEnvmap``.
+    [RH01] Ramamoorthi, Hanrahan 2001, An Efficient Representation for Irradiance Environment Maps.
     OpenGL 4.6 core profile, table 8.19: directions within the faces of a cube map.
 """
 
 from __future__ import annotations
 
+import json
 import math
 
 import numpy as np
@@ -29,15 +39,21 @@ import numpy.typing as npt
 from warp_ar.errors import UsageError
 from warp_ar.files import limits, too_much
 from warp_ar.light.latlong_axes import AXES, DESCRIPTIONS, from_axes, to_axes, world_from_marker
+from warp_ar.signature import PROGRAM
 
 __all__ = [
     "AXES",
+    "BASIS",
     "CUBES",
     "DESCRIPTIONS",
     "FACES",
     "LAYOUTS",
+    "LOBE",
+    "basis",
     "check_axes",
+    "encode_harmonics",
     "from_axes",
+    "project_radiance",
     "to_axes",
     "to_cube",
     "world_from_marker",
@@ -55,7 +71,12 @@ CUBES = {
     "y-up": "cube, faces +x -x +y -y +z -z from the top, y up, each as seen from inside (OpenEXR)",
     "opengl": "cube, faces +x -x +y -y +z -z from the top, y up, each as a face of OpenGL's cube map",
 }
-"""What a cube's attribute ``axes`` says."""
+"""Attribute ``axes`` of a cube."""
+BASIS = ("1", "y", "z", "x", "xy", "yz", "3zz-1", "xz", "xx-yy")
+"""Names of the harmonics."""
+LOBE = math.pi * np.array([1.0, *[2.0 / 3.0] * 3, *[0.25] * 5])
+"""A_l of each harmonic."""
+_NORMS = np.sqrt(np.array([1.0, 3.0, 3.0, 3.0, 15.0, 15.0, 1.25, 15.0, 3.75]) / (4.0 * math.pi))
 
 # Along a row, down a column, for +x, -x, +y, -y, +z, -z.
 _X, _Y, _Z = np.eye(3)
@@ -146,3 +167,67 @@ def sample_latlong(radiance: Radiance, directions: Array) -> Array:
     above = at(top, left) * (1.0 - right) + at(top, left + 1) * right
     below = at(top + 1, left) * (1.0 - right) + at(top + 1, left + 1) * right
     return np.asarray(above * (1.0 - down) + below * down)
+
+
+def project_radiance(radiance: Radiance, axes: str = "z-up") -> Array:
+    """Return the coefficients L_i of a latlong, (9, 3).
+
+    A texel's radiance is constant, and Y_i a product of functions of theta and phi: its integral is one over the
+    columns (a closed form) times one over the rows (Gauss-Legendre over theta with 8 points, exact to rounding).
+
+    Args:
+        radiance: (height, width, 3), z-up.
+        axes: One of ``AXES``, whose x, y and z the basis is told in.
+
+    Raises:
+        UsageError: There are no such axes.
+    """
+    height, width = radiance.shape[:2]
+    nodes, weights = np.polynomial.legendre.leggauss(8)
+    half = 0.5 * math.pi / height
+    theta = (np.arange(height)[:, None] * 2 + 1 + nodes) * half
+    s, c, one = np.sin(theta), np.cos(theta), np.ones_like(theta)
+    rows = (np.stack([one, s, c, s, s * s, s * c, 3.0 * c * c - 1.0, s * c, s * s]) * s * weights * half).sum(-1)
+    phi = (np.arange(width + 1) * 2.0 / width - 1.0) * math.pi
+    sin, cos = np.sin(phi), -np.cos(phi)
+    columns = np.diff(np.stack([phi, cos, phi, sin, -np.cos(2 * phi) / 4, cos, phi, sin, np.sin(2 * phi) / 2]))
+    own = _NORMS[:, None] * np.einsum("kh,hwc,kw->kc", rows, radiance.astype(np.float64), columns, optimize=True)
+    # What Y is of turned directions is linear in what it is of these; any nine in general position tell how.
+    directions = np.random.default_rng(0).normal(size=(64, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    turned, *_ = np.linalg.lstsq(basis(directions), basis(directions @ world_from_marker(axes).T), rcond=None)
+    return np.asarray(turned.T @ own)
+
+
+def basis(directions: Array) -> Array:
+    """Return Y_i of unit directions (n, 3), as (n, 9)."""
+    x, y, z = directions.T
+    own = [np.ones_like(x), y, z, x, x * y, y * z, 3.0 * z * z - 1.0, x * z, x * x - y * y]
+    return np.asarray(_NORMS * np.stack(own, 1))
+
+
+def encode_harmonics(radiance: Radiance, axes: str, white_level: float) -> bytes:
+    """Return the JSON of a latlong's harmonics.
+
+    Args:
+        radiance: (height, width, 3), z-up.
+        axes: As of `project_radiance`.
+        white_level: Value at which the camera clips.
+
+    Raises:
+        UsageError: There are no such axes.
+    """
+    coefficients = project_radiance(radiance, axes)
+    z_up = world_from_marker(axes)[1, 1] == 1.0
+    content = {
+        "program": PROGRAM,
+        "kind": "spherical harmonics",
+        "axes": "x, y, z of the marker, z up" if z_up else "x, y, z = x, z, -y of the marker, y up",
+        "basis": list(BASIS),
+        "normalization": "orthonormal, all signs positive",
+        "color": "linear, sRGB primaries, camera values",
+        "whiteLevel": white_level,
+        "radiance": coefficients.tolist(),
+        "irradiance": (coefficients * LOBE[:, None]).tolist(),
+    }
+    return (json.dumps(content, indent=1) + "\n").encode()

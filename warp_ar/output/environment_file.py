@@ -11,29 +11,43 @@ the poles and edges: half a texel at most.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import datetime
 import functools
 import math
 import pathlib
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 import OpenEXR
 
 from warp_ar.errors import SinkError, UsageError, reason
-from warp_ar.exr_file import read_exr_header, read_linear_picture, write_exr
-from warp_ar.files import write_whole
+from warp_ar.exr_file import exr_header, read_exr_header, read_linear_picture, write_exr
+from warp_ar.files import store
+from warp_ar.light.captured import latlong_directions, texel_solid_angles
 from warp_ar.light.latlong_axes import axes_of
-from warp_ar.output.color_spaces import COLOR_SPACES, convert_light
-from warp_ar.output.environment_axes import CUBES, DESCRIPTIONS, check_axes, from_axes, to_axes, to_cube
-from warp_ar.output.folder_sink import FolderSink
-from warp_ar.output.places import check_replaceable, earlier_frames
-from warp_ar.output.radiance_hdr import encode_hdr
-from warp_ar.signature import PROGRAM, is_signed
+from warp_ar.output.environment_axes import (
+    CUBES,
+    DESCRIPTIONS,
+    check_axes,
+    encode_harmonics,
+    from_axes,
+    to_axes,
+    to_cube,
+)
+from warp_ar.output.places import check_replaceable
+from warp_ar.signals import REC_709, Chromaticities, converted
+from warp_ar.signature import PROGRAM
 
+Radiance = npt.NDArray[np.float32]
+
+COLOR_SPACES: Final[dict[str, Chromaticities]] = {
+    "rec709": REC_709,
+    "acescg": (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767),
+}
+"""Chromaticities of red, green, blue and white, x and y each; ACEScg's are AP1 (ACES S-2014-004)."""
+_REC_709_WORDS = " ".join(f"{value:.4f}" for value in REC_709)
 ENVIRONMENT_SUFFIXES = (".exr", ".hdr", ".json")
 
 _SATURATION = 1.2
@@ -43,7 +57,7 @@ _SATURATION = 1.2
 
 @dataclasses.dataclass(frozen=True)
 class EnvironmentInfo:
-    """What is known of an environment beside its radiance."""
+    """Metadata of an environment beside its radiance."""
 
     white_level: float = 1.0
     """Value at which the camera clips."""
@@ -54,7 +68,7 @@ class EnvironmentInfo:
     taken: datetime.datetime | None = None
     """When it was captured, with its time zone."""
     place: tuple[float, float, float] | None = None
-    """Where: longitude and latitude in degrees, east and north positive, and altitude in metres."""
+    """Longitude and latitude in degrees, east and north positive, and altitude in metres."""
 
     def __post_init__(self) -> None:
         for name in ("white_level", "white_luminance", "exposure"):
@@ -77,40 +91,19 @@ class EnvironmentInfo:
             return self.white_luminance
         return _SATURATION / self.exposure / self.white_level
 
-
-class EnvironmentSink(FolderSink):
-    """A folder of ``NNNN.exr``, numbered from 0, each as `write_environment` writes it.
-
-    The first one also clears away what this program left in folders ``ball_1``, ``ball_2``, ... below: light of an
-    earlier run, of mirror balls that this one may not have.
-    """
-
-    _suffix = ".exr"
-
-    def __init__(self, path: str | pathlib.Path, *, overwrite: bool = False) -> None:
-        super().__init__(path, overwrite=overwrite)
-        stale: list[pathlib.Path] = []
-        for folder in self._path.glob("ball_[1-9]*"):
-            if folder.name.removeprefix("ball_").isdecimal() and folder.is_dir():
-                stale += [one for one in earlier_frames(folder, self._suffix, overwrite=True) if is_signed(one)]
-        if stale:
-            self._earlier += stale
-            say = f"{self.replaced}; " if self.replaced else ""
-            self.replaced = f"{say}{self._path}/ball_*: {len(stale)} environments of an earlier run are removed"
-
-    def _check(self, image: npt.NDArray[Any]) -> None:
-        _check_environment(image)
-
-    def write(self, image: npt.NDArray[Any]) -> None:
-        """Take the next map; the first one clears away those of an earlier run, and folders that are empty then."""
-        emptied = {path.parent for path in self._earlier} - {self._path}
-        super().write(image)
-        for folder in emptied:
-            with contextlib.suppress(OSError):  # it holds something else: that stays, and so does the folder
-                folder.rmdir()
-
-    def _store(self, index: int, image: npt.NDArray[Any]) -> None:
-        write_environment(self._path / f"{index:04d}.exr", image, overwrite=True)
+    def attributes(self) -> dict[str, Any]:
+        """Return what is known as attributes of an OpenEXR."""
+        known: dict[str, Any] = {
+            "whiteLevel": self.white_level,
+            "whiteLuminance": self.luminance_of_one(),
+            "exposure": self.exposure,
+            **dict(zip(("longitude", "latitude", "altitude"), self.place or (), strict=False)),
+        }
+        known = {name: float(value) for name, value in known.items() if value is not None}
+        if self.taken is not None:
+            known["capDate"] = self.taken.astimezone(datetime.UTC).strftime("%Y:%m:%d %H:%M:%S")
+            known["utcOffset"] = 0.0
+        return known
 
 
 def write_environment(
@@ -147,60 +140,37 @@ def write_environment(
     """
     path = pathlib.Path(path)
     info = EnvironmentInfo() if info is None else info
-    _check_environment(radiance)
+    check_environment(radiance)
     check_axes(axes, layout)
     check_replaceable(path, overwrite=overwrite)
     suffix = path.suffix.lower()
     if color_space != "rec709" and suffix in (".hdr", ".json"):
         raise UsageError(f"{path}: color space {color_space!r} is told in OpenEXR alone; name an .exr")
     radiance = convert_light(radiance, "rec709", color_space)
+    described = (DESCRIPTIONS if layout == "latlong" else CUBES)[axes]
+    data: Any
     if suffix == ".json":
-        from warp_ar.output.environment_harmonics import encode_harmonics  # loads Warp
-
         if layout != "latlong":
             raise UsageError(f"{path}: spherical harmonics have no layout {layout}")
-        data: Any = encode_harmonics(radiance, axes, info.white_level)
+        data = encode_harmonics(radiance, axes, info.white_level)
     else:
         picture = to_axes(radiance, axes) if layout == "latlong" else to_cube(radiance, axes, size)
-        described = (DESCRIPTIONS if layout == "latlong" else CUBES)[axes]
         if suffix == ".hdr":
             data = encode_hdr(picture, described)
         else:
-            image = OpenEXR.File(_header(axes, layout, info, color_space), {"RGB": np.ascontiguousarray(picture)})
+            header = exr_header(axes=described, chromaticities=COLOR_SPACES[color_space], **info.attributes())
+            if layout == "cube":
+                header["envmap"] = OpenEXR.ENVMAP_CUBE
+            elif axes != "z-up":
+                # By OpenEXR's word the picture is seen from inside; who believed it of a mirror image would mirror it.
+                header["envmap"] = OpenEXR.ENVMAP_LATLONG
+            image = OpenEXR.File(header, {"RGB": np.ascontiguousarray(picture)})
             data = functools.partial(write_exr, image=image)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(path, data)
-    except (RuntimeError, OSError) as error:
+    except OSError as error:
         raise SinkError(f"{path} cannot be written: {reason(error)}") from error
-
-
-def _header(axes: str, layout: str, info: EnvironmentInfo, color_space: str) -> dict[str, Any]:
-    """Attributes of an OpenEXR."""
-    header: dict[str, Any] = {
-        "compression": OpenEXR.ZIP_COMPRESSION,
-        "type": OpenEXR.scanlineimage,
-        "software": PROGRAM,
-        "axes": (DESCRIPTIONS if layout == "latlong" else CUBES)[axes],
-        "chromaticities": COLOR_SPACES[color_space],
-        "whiteLevel": float(info.white_level),
-    }
-    if layout == "cube":
-        header["envmap"] = OpenEXR.ENVMAP_CUBE
-    elif axes != "z-up":
-        # By OpenEXR's word the picture is seen from inside; who believed it of a mirror image would mirror the world.
-        header["envmap"] = OpenEXR.ENVMAP_LATLONG
-    luminance = info.luminance_of_one()
-    if luminance is not None:
-        header["whiteLuminance"] = float(luminance)
-    if info.exposure is not None:
-        header["exposure"] = float(info.exposure)
-    if info.taken is not None:
-        header["capDate"] = info.taken.astimezone(datetime.UTC).strftime("%Y:%m:%d %H:%M:%S")
-        header["utcOffset"] = 0.0
-    if info.place is not None:
-        header |= dict(zip(("longitude", "latitude", "altitude"), map(float, info.place), strict=True))
-    return header
+    store(path, data)
 
 
 def read_environment(path: str | pathlib.Path, *, axes: str | None = None) -> npt.NDArray[np.float32]:
@@ -224,7 +194,7 @@ def read_environment(path: str | pathlib.Path, *, axes: str | None = None) -> np
 
 
 def read_environment_info(path: str | pathlib.Path) -> EnvironmentInfo:
-    """What the header of an OpenEXR says of an environment.
+    """Read an environment's metadata from the header of an OpenEXR.
 
     Raises:
         SinkError: The file cannot be read, or its header holds a date or place that is none.
@@ -257,6 +227,70 @@ def read_environment_info(path: str | pathlib.Path) -> EnvironmentInfo:
         raise SinkError(f"{path}: {error}") from error
 
 
-def _check_environment(radiance: npt.NDArray[Any]) -> None:
+def check_environment(radiance: npt.NDArray[Any]) -> None:
+    """Check that an array is an environment.
+
+    Raises:
+        SinkError: It is none.
+    """
     if radiance.dtype != np.float32 or radiance.ndim != 3 or radiance.shape[2] != 3 or not radiance.size:
         raise SinkError(f"an environment is float32 (height, width, 3), not {radiance.dtype} {radiance.shape}")
+
+
+def encode_hdr(radiance: npt.NDArray[np.float32], axes: str) -> bytes:
+    """The file's bytes, its scanlines not run-length encoded: those of a camera hardly repeat.
+
+    Channels are right to half a step, 1 part in 256 of a texel's brightest channel at most. What is negative or no
+    number becomes 0, what is infinite the largest value.
+
+    Args:
+        radiance: Linear RGB, (height, width, 3), row 0 at the top.
+        axes: What the header says of the directions.
+    """
+    height, width = radiance.shape[:2]
+    values = np.clip(np.nan_to_num(radiance.astype(np.float64), nan=0.0, posinf=1e38), 0.0, 1e38)
+    brightest = values.max(2)
+    exponent = np.frexp(brightest)[1]
+    # 256 after rounding needs the next exponent.
+    exponent += np.rint(np.ldexp(brightest, 8 - exponent)) > 255
+    mantissas = np.rint(np.ldexp(values, (8 - exponent)[..., None]))
+    seen = (brightest > 0.0) & (exponent > -128)
+    pixels = np.concatenate([mantissas, (exponent + 128)[..., None]], 2) * seen[..., None]
+    # Readers of some programs expect FORMAT on the header's last line.
+    header = [
+        *("#?RADIANCE", f"SOFTWARE={PROGRAM}", f"VIEW_AXES={axes}", f"PRIMARIES={_REC_709_WORDS}"),
+        *("FORMAT=32-bit_rle_rgbe", "", f"-Y {height} +X {width}", ""),
+    ]
+    return b"".join(["\n".join(header).encode(), pixels.astype(np.uint8).tobytes()])
+
+
+def convert_light(radiance: Radiance, source: str, target: str) -> Radiance:
+    """Return linear light, (height, width, 3), in another colour space of ``COLOR_SPACES``, its white adapted.
+
+    Raises:
+        UsageError: There is no such space.
+    """
+    for name in (source, target):
+        if name not in COLOR_SPACES:
+            raise UsageError(f"color space {name!r}: expected {', '.join(COLOR_SPACES)}")
+    return radiance if source == target else converted(radiance, COLOR_SPACES[source], COLOR_SPACES[target])
+
+
+def grey_card_scale(radiance: Radiance) -> float:
+    """Factor on an environment under which a grey card that lies on the marker has a luminance of 0.18.
+
+    The card is Lambertian: its radiance is 0.18 E / pi, with the irradiance E of a surface that faces up.
+
+    Args:
+        radiance: Latlong (height, 2 height, 3), z-up.
+
+    Raises:
+        UsageError: Nothing comes from above.
+    """
+    height = len(radiance)
+    cos_theta = np.clip(latlong_directions(height)[..., 2], 0.0, None) * texel_solid_angles(height)
+    luminance = radiance.astype(np.float64) @ np.array([0.2126, 0.7152, 0.0722])
+    irradiance = float((luminance * cos_theta).sum())
+    if not irradiance > 0.0 or not math.isfinite(irradiance):
+        raise UsageError(f"--grey-card: the light from above is {irradiance:g}; there is nothing to scale by")
+    return math.pi / irradiance

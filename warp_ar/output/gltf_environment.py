@@ -22,10 +22,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from warp_ar.kernels.environment.irradiance import cosine_lobe
 from warp_ar.light.captured import latlong_directions, texel_solid_angles
-from warp_ar.output.environment_axes import cube_directions, to_cube, world_from_marker
-from warp_ar.output.environment_harmonics import project_radiance
+from warp_ar.output.environment_axes import LOBE, cube_directions, project_radiance, to_cube, world_from_marker
 
 Array = npt.NDArray[np.float64]
 
@@ -38,18 +36,16 @@ GAMMA: Final = 2.2
 
 _FILTERED_ROWS = 32
 """Rows of the map that rough cubes are filtered from."""
-_DEGREES = (0, 1, 1, 1, 2, 2, 2, 2, 2)
 _SIGNS = np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0])
 
 
 def irradiance_coefficients(radiance: npt.NDArray[np.float32]) -> Array:
-    """Harmonics of irradiance in glTF's world, y up, (9, 3)."""
-    lobe = np.array([cosine_lobe(degree) for degree in _DEGREES])
-    return np.asarray(project_radiance(radiance, "y-up") * (lobe * _SIGNS)[:, None])
+    """Return harmonics of irradiance in glTF's world, y up, (9, 3)."""
+    return np.asarray(project_radiance(radiance, "y-up") * (LOBE * _SIGNS)[:, None])
 
 
 def specular_cubes(radiance: npt.NDArray[np.float32]) -> list[npt.NDArray[np.float32]]:
-    """Radiance by roughness: cubes (6, size, size, 3), from ``LARGEST`` to ``SMALLEST``, roughness 0 to 1.
+    """Return radiance by roughness: cubes (6, size, size, 3), from ``LARGEST`` to ``SMALLEST``, roughness 0 to 1.
 
     Args:
         radiance: Latlong (height, 2 height, 3), z-up.
@@ -61,7 +57,7 @@ def specular_cubes(radiance: npt.NDArray[np.float32]) -> list[npt.NDArray[np.flo
 
 
 def _filtered(radiance: npt.NDArray[np.float32], size: int, alpha: float) -> npt.NDArray[np.float32]:
-    """A cube of OpenGL's faces as GGX of ``alpha`` sees the environment."""
+    """Return a cube of OpenGL's faces as GGX of ``alpha`` sees the environment."""
     rows = min(_FILTERED_ROWS, len(radiance))
     source = cv2.resize(radiance, (2 * rows, rows), interpolation=cv2.INTER_AREA).reshape(-1, 3).astype(np.float64)
     toward = latlong_directions(rows).reshape(-1, 3)
@@ -79,7 +75,7 @@ def _filtered(radiance: npt.NDArray[np.float32], size: int, alpha: float) -> npt
 
 
 def encode_rgbd(radiance: npt.NDArray[np.float32]) -> bytes:
-    """PNG of a face, (size, size, 3), as RGBD."""
+    """Return the PNG of a face, (size, size, 3), as RGBD."""
     most = np.maximum(radiance.max(-1, keepdims=True), 1e-6)
     divisor = np.clip(np.floor(255.0 / np.maximum(most, 1.0)), 1.0, 255.0) / 255.0
     color = np.clip(radiance * divisor, 0.0, 1.0) ** (1.0 / GAMMA)
@@ -90,7 +86,7 @@ def encode_rgbd(radiance: npt.NDArray[np.float32]) -> bytes:
 
 
 def image_based_light(radiance: npt.NDArray[np.float32], add_image: Any) -> dict[str, Any]:
-    """The extension's entry of one light.
+    """Return the extension's entry of one light.
 
     Args:
         radiance: Latlong (height, 2 height, 3), z-up.

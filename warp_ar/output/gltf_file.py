@@ -22,18 +22,18 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from trimesh.transformations import quaternion_from_matrix
 
-from warp_ar.errors import SinkError, reason
-from warp_ar.files import write_whole
-from warp_ar.output.exchange_materials import ExchangeMaterial, Picture, placed_by
-from warp_ar.output.shot import Body, Matrix, Shot, key_frames
+from warp_ar.files import store
+from warp_ar.output.shot import Body, ExchangeMaterial, Matrix, Picture, Shot, key_frames
 from warp_ar.scene.description import Light
-from warp_ar.scene.materials import RGB
+from warp_ar.scene.materials import IDENTITY
 from warp_ar.signature import PROGRAM
 
 GLTF_SUFFIX = ".glb"
 
 _FLOAT, _INDEX = 5126, 5125
+_VERTICES, _INDICES = 34962, 34963
 _TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 _Y_UP = [-math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]
 """Quaternion, x first, that turns z up to y up."""
@@ -54,36 +54,16 @@ def write_glb(path: Path, shot: Shot) -> list[Path]:
     Raises:
         SinkError: It cannot be written.
     """
-    builder = _Builder(shot)
-    try:
-        write_whole(path, builder.encode())
-    except OSError as error:
-        raise SinkError(f"{path} cannot be written: {reason(error)}") from error
+    store(path, _Builder(shot).encode())
     return [path]
 
 
 def quaternions(rotations: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Unit quaternions, x first, of rotations (n, 3, 3), each on the side of the one before.
-
-    The largest of the four components is found from the diagonal, the others by it [Shepperd 1978].
-    """
-    r = rotations
-    trace = np.trace(r, axis1=1, axis2=2)
-    squares = np.stack([1 + 2 * np.diagonal(r, axis1=1, axis2=2)[:, k] - trace for k in range(3)] + [1 + trace], -1)
-    sums = {(0, 1): r[:, 0, 1] + r[:, 1, 0], (0, 2): r[:, 0, 2] + r[:, 2, 0], (1, 2): r[:, 1, 2] + r[:, 2, 1]}
-    differences = (r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1])
-    products = np.empty((len(r), 4, 4))
-    for k in range(4):
-        products[:, k, k] = squares[:, k]
-    for (a, b), values in sums.items():
-        products[:, a, b] = products[:, b, a] = values
-    for k, values in enumerate(differences):
-        products[:, k, 3] = products[:, 3, k] = values
-    found = np.take_along_axis(products, squares.argmax(-1)[:, None, None], 1)[:, 0]
-    found /= np.linalg.norm(found, axis=-1, keepdims=True)
-    for k in range(1, len(found)):
-        if found[k] @ found[k - 1] < 0.0:
-            found[k] = -found[k]
+    """Return unit quaternions, x first, of rotations (n, 3, 3), each on the side of the one before."""
+    padded = np.tile(np.eye(4), (len(rotations), 1, 1))
+    padded[:, :3, :3] = rotations
+    found = np.array([np.roll(quaternion_from_matrix(matrix, isprecise=True), -1) for matrix in padded])
+    found[1:] *= np.cumprod(np.where((found[1:] * found[:-1]).sum(-1) < 0.0, -1.0, 1.0))[:, None]
     return found
 
 
@@ -103,12 +83,8 @@ class _Builder:
             "scene": 0,
             "scenes": [{"nodes": [0]}],
             "nodes": [{"name": "shot", "rotation": _Y_UP, "children": []}],
-            "bufferViews": [],
-            "accessors": [],
-            "extensionsUsed": [],
         }
-        self._channels: list[dict[str, Any]] = []
-        self._samplers: list[dict[str, Any]] = []
+        self._animation: dict[str, Any] = {"name": "shot", "channels": [], "samplers": []}
         self._times: dict[tuple[float, ...], int] = {}
         self._images: dict[bytes, int] = {}
         self._add_camera()
@@ -120,257 +96,202 @@ class _Builder:
             self._add_environment(shot.radiance)
 
     def encode(self) -> bytes:
-        """The file."""
-        tree = self._tree
-        if self._channels:
-            tree["animations"] = [{"name": "shot", "channels": self._channels, "samplers": self._samplers}]
-        if not tree["extensionsUsed"]:
-            del tree["extensionsUsed"]
-        tree["buffers"] = [{"byteLength": len(self._bytes)}]
-        text = json.dumps(tree, separators=(",", ":")).encode()
+        """Return the file."""
+        if self._animation["channels"]:
+            self._tree["animations"] = [self._animation]
+        self._tree["buffers"] = [{"byteLength": len(self._bytes)}]
+        text = json.dumps(self._tree, separators=(",", ":")).encode()
         text += b" " * (-len(text) % 4)
         data = bytes(self._bytes) + bytes(-len(self._bytes) % 4)
         chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(data), b"BIN\0") + data
         return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
+    def _add(self, kind: str, entry: Any, *, once: bool = False) -> int:
+        """Add an entry to a list of the tree; returns its index, with ``once`` that of an equal one."""
+        entries = self._tree.setdefault(kind, [])
+        if once and entry in entries:
+            return int(entries.index(entry))
+        entries.append(entry)
+        return len(entries) - 1
+
+    def _extend(self, entry: dict[str, Any], extension: str, told: dict[str, Any]) -> None:
+        self._add("extensionsUsed", extension, once=True)
+        entry.setdefault("extensions", {})[extension] = told
+
     def _view(self, data: bytes, target: int | None = None) -> int:
         self._bytes += bytes(-len(self._bytes) % 4)
         view = {"buffer": 0, "byteOffset": len(self._bytes), "byteLength": len(data)}
-        self._tree["bufferViews"].append(view if target is None else {**view, "target": target})
         self._bytes += data
-        return len(self._tree["bufferViews"]) - 1
+        return self._add("bufferViews", view if target is None else {**view, "target": target})
 
-    def _accessor(self, values: npt.NDArray[Any], *, indices: bool = False, bounds: bool = False) -> int:
-        values = np.ascontiguousarray(values, np.uint32 if indices else np.float32)
-        lanes = 1 if values.ndim == 1 else values.shape[1]
-        target = 34963 if indices else 34962 if lanes > 1 and not bounds else None
+    def _accessor(self, values: npt.NDArray[Any], target: int | None = None, *, bounds: bool = False) -> int:
+        values = np.ascontiguousarray(values, np.uint32 if target == _INDICES else np.float32)
         entry: dict[str, Any] = {
             "bufferView": self._view(values.tobytes(), target),
-            "componentType": _INDEX if indices else _FLOAT,
+            "componentType": _INDEX if target == _INDICES else _FLOAT,
             "count": len(values),
-            "type": _TYPES[lanes],
+            "type": _TYPES[1 if values.ndim == 1 else values.shape[1]],
         }
         if bounds:
-            entry["min"], entry["max"] = (
-                np.atleast_1d(values.min(axis=0)).tolist(),
-                np.atleast_1d(values.max(axis=0)).tolist(),
-            )
-        self._tree["accessors"].append(entry)
-        return len(self._tree["accessors"]) - 1
-
-    def _use(self, extension: str) -> None:
-        if extension not in self._tree["extensionsUsed"]:
-            self._tree["extensionsUsed"].append(extension)
+            entry["min"] = np.atleast_1d(values.min(axis=0)).tolist()
+            entry["max"] = np.atleast_1d(values.max(axis=0)).tolist()
+        return self._add("accessors", entry)
 
     def _add_node(self, node: dict[str, Any], placements: dict[int, Matrix]) -> None:
-        """A node below the root, placed by its frames."""
-        index = len(self._tree["nodes"])
-        self._tree["nodes"][0]["children"].append(index)
-        self._tree["nodes"].append(node)
+        """Add a node below the root, placed by its frames."""
+        self._tree["nodes"][0]["children"].append(self._add("nodes", node))
         if not placements:
             return
         matrices = np.stack(list(placements.values()))
         lengths = np.linalg.norm(matrices[:, :3, :3], axis=1)
-        if np.ptp(lengths) > _EVEN * lengths.max():
-            self._place_stretched(index, node, placements, matrices)
+        moved = {"translation": matrices[:, :3, 3]}
+        if np.ptp(lengths) <= _EVEN * lengths.max():
+            scale = float(np.cbrt(np.linalg.det(matrices[0, :3, :3])))
+            if abs(scale - 1.0) > 1e-12:
+                node["scale"] = [scale] * 3
+            self._set_keys(node, placements, {**moved, "rotation": quaternions(matrices[:, :3, :3] / scale)})
             return
-        scale = np.cbrt(np.linalg.det(matrices[0, :3, :3]))
-        turns = quaternions(matrices[:, :3, :3] / scale)
-        node["translation"], node["rotation"] = matrices[0, :3, 3].tolist(), turns[0].tolist()
-        if abs(scale - 1.0) > 1e-12:
-            node["scale"] = [float(scale)] * 3
-        self._add_keys(index, placements, {"translation": matrices[:, :3, 3], "rotation": turns})
-
-    def _add_keys(self, index: int, placements: dict[int, Matrix], values: dict[str, npt.NDArray[Any]]) -> None:
-        """Keyframes of a node, if it has more than one placement."""
-        if len(placements) < 2:
-            return
-        times = self._time_accessor(tuple(frame / self._shot.fps for frame in placements))
-        for path, keys in values.items():
-            self._samplers.append({"input": times, "interpolation": "LINEAR", "output": self._key_values(keys)})
-            self._channels.append({"sampler": len(self._samplers) - 1, "target": {"node": index, "path": path}})
-
-    def _place_stretched(
-        self, index: int, node: dict[str, Any], placements: dict[int, Matrix], matrices: npt.NDArray[np.float64]
-    ) -> None:
-        """Any linear map is U S V^T: a node turns by V^T, and one above it, in its place in the tree, by U S."""
-        inner = {key: node.pop(key) for key in ("mesh",) if key in node}
-        self._tree["nodes"].append({"name": f"{node['name']}_inner", **inner})
-        child = len(self._tree["nodes"]) - 1
-        node["children"] = [child]
+        # Any linear map is U S V^T: a node turns by V^T, and one above it, in its place in the tree, by U S.
+        inner = {"name": f"{node['name']}_inner", "mesh": node.pop("mesh")}
+        node["children"] = [self._add("nodes", inner)]
         outer, scales, turned = np.linalg.svd(matrices[:, :3, :3])
         # Both must be rotations: a mirror goes into the last scale.
-        for way in (outer, turned):
-            mirrored = np.linalg.det(way) < 0.0
-            scales[mirrored, 2] *= -1.0
-            if way is outer:
-                way[mirrored, :, 2] *= -1.0
-            else:
-                way[mirrored, 2, :] *= -1.0
-        values = {"translation": matrices[:, :3, 3], "rotation": quaternions(outer), "scale": scales}
-        turns = quaternions(turned)
-        node.update({key: keys[0].tolist() for key, keys in values.items()})
-        self._tree["nodes"][child]["rotation"] = turns[0].tolist()
-        self._add_keys(index, placements, values)
-        self._add_keys(child, placements, {"rotation": turns})
+        signs, turned_signs = np.sign(np.linalg.det(outer)), np.sign(np.linalg.det(turned))
+        outer[:, :, 2] *= signs[:, None]
+        turned[:, 2, :] *= turned_signs[:, None]
+        scales[:, 2] *= signs * turned_signs
+        self._set_keys(node, placements, {**moved, "rotation": quaternions(outer), "scale": scales})
+        self._set_keys(inner, placements, {"rotation": quaternions(turned)})
 
-    def _time_accessor(self, seconds: tuple[float, ...]) -> int:
+    def _set_keys(
+        self, node: dict[str, Any], placements: dict[int, Matrix], values: dict[str, npt.NDArray[Any]]
+    ) -> None:
+        """Place a node, and move it by keyframes where there are several."""
+        node.update({path: keys[0].tolist() for path, keys in values.items()})
+        if len(placements) < 2:
+            return
+        seconds = tuple(frame / self._shot.fps for frame in placements)
         if seconds not in self._times:
             self._times[seconds] = self._accessor(np.array(seconds), bounds=True)
-        return self._times[seconds]
-
-    def _key_values(self, values: npt.NDArray[Any]) -> int:
-        values = np.ascontiguousarray(values, np.float32)
-        self._tree["accessors"].append(
-            {
-                "bufferView": self._view(values.tobytes()),
-                "componentType": _FLOAT,
-                "count": len(values),
-                "type": _TYPES[values.shape[1]],
-            }
-        )
-        return len(self._tree["accessors"]) - 1
+        index = next(k for k, known in enumerate(self._tree["nodes"]) if known is node)
+        samplers, channels = self._animation["samplers"], self._animation["channels"]
+        for path, keys in values.items():
+            output = self._accessor(keys)
+            channels.append({"sampler": len(samplers), "target": {"node": index, "path": path}})
+            samplers.append({"input": self._times[seconds], "interpolation": "LINEAR", "output": output})
 
     def _add_camera(self) -> None:
         camera = self._shot.camera
-        self._tree["cameras"] = [
-            {
-                "type": "perspective",
-                "perspective": {
-                    "yfov": 2.0 * math.atan(0.5 * camera.height / camera.fy),
-                    "aspectRatio": camera.width / camera.fx / (camera.height / camera.fy),
-                    "znear": 0.01,
-                    "zfar": 1000.0,
-                },
-                "extras": {
-                    "size": [camera.width, camera.height],
-                    "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
-                    "distortion": list(camera.distortion),
-                },
-            }
-        ]
-        self._add_node({"name": "camera", "camera": 0}, self._shot.camera_placements())
+        lens = {
+            "yfov": 2.0 * math.atan(0.5 * camera.height / camera.fy),
+            "aspectRatio": camera.width / camera.fx / (camera.height / camera.fy),
+            "znear": 0.01,
+            "zfar": 1000.0,
+        }
+        extras = {
+            "size": [camera.width, camera.height],
+            "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
+            "distortion": list(camera.distortion),
+        }
+        index = self._add("cameras", {"type": "perspective", "perspective": lens, "extras": extras})
+        self._add_node({"name": "camera", "camera": index}, self._shot.camera_placements())
 
     def _add_body(self, body: Body) -> None:
         mesh = body.mesh
         attributes = {
-            "POSITION": self._positions(mesh.vertices),
-            "NORMAL": self._accessor(mesh.normals),
+            "POSITION": self._accessor(mesh.vertices, _VERTICES, bounds=True),
+            "NORMAL": self._accessor(mesh.normals, _VERTICES),
         }
         for name, coordinates in (("TEXCOORD_0", mesh.uvs), ("TEXCOORD_1", mesh.uvs_second)):
             if coordinates is not None:
                 # v runs down the picture.
-                attributes[name] = self._accessor(coordinates * np.array([1.0, -1.0]) + np.array([0.0, 1.0]))
-        if mesh.tangents is not None and any(material.normal is not None for material in body.materials):
-            attributes["TANGENT"] = self._accessor(mesh.tangents)
+                attributes[name] = self._accessor(coordinates * np.array([1.0, -1.0]) + np.array([0.0, 1.0]), _VERTICES)
+        if mesh.tangents is not None and any("normal" in material.pictures for material in body.materials):
+            attributes["TANGENT"] = self._accessor(mesh.tangents, _VERTICES)
         if body.colors is not None:
-            attributes["COLOR_0"] = self._accessor(body.colors)
+            attributes["COLOR_0"] = self._accessor(body.colors, _VERTICES)
         primitives = [
             {
                 "attributes": attributes,
-                "indices": self._accessor(mesh.faces[body.triangles_of(number)].reshape(-1), indices=True),
+                "indices": self._accessor(mesh.faces[body.triangles_of(number)].reshape(-1), _INDICES),
                 "material": self._add_material(body.name, material),
             }
             for number, material in enumerate(body.materials)
         ]
-        self._tree.setdefault("meshes", []).append({"name": body.name, "primitives": primitives})
-        node = {"name": body.name, "mesh": len(self._tree["meshes"]) - 1, "extras": {"proxy": body.proxy}}
+        index = self._add("meshes", {"name": body.name, "primitives": primitives})
+        node = {"name": body.name, "mesh": index, "extras": {"proxy": body.proxy}}
         self._add_node(node, dict(enumerate(key_frames(body.placements))))
 
-    def _positions(self, vertices: npt.NDArray[np.float32]) -> int:
-        index = self._accessor(vertices, bounds=True)
-        self._tree["bufferViews"][self._tree["accessors"][index]["bufferView"]]["target"] = 34962
-        return index
-
     def _add_material(self, name: str, material: ExchangeMaterial) -> int:
+        own, textures = material.own, {kind: self._texture(picture) for kind, picture in material.pictures.items()}
         surface: dict[str, Any] = {
-            "baseColorFactor": [*material.base_color, material.opacity],
+            "baseColorFactor": [*material.base_color, own.opacity],
             "metallicFactor": material.metallic,
             "roughnessFactor": material.roughness,
         }
-        label = f"{name}_{material.name}" if material.name else name
-        entry: dict[str, Any] = {"name": label, "pbrMetallicRoughness": surface, "doubleSided": material.double_sided}
-        if material.texture is not None:
-            surface["baseColorTexture"] = self._add_texture(material.texture)
-        if material.metallic_roughness is not None:
-            surface["metallicRoughnessTexture"] = self._add_texture(material.metallic_roughness)
-        if material.normal is not None:
-            entry["normalTexture"] = {**self._add_texture(material.normal), "scale": material.normal_scale}
-        if material.occlusion is not None:
-            strength = material.occlusion_strength
-            entry["occlusionTexture"] = {**self._add_texture(material.occlusion), "strength": strength}
-        if material.alpha != "opaque":
-            entry["alphaMode"] = material.alpha.upper()
-            entry |= {"alphaCutoff": material.cutoff} if material.alpha == "mask" else {}
-        if material.unlit:
-            self._use("KHR_materials_unlit")
-            entry.setdefault("extensions", {})["KHR_materials_unlit"] = {}
-        if any(material.emission):
-            self._add_emission(entry, material)
+        label = f"{name}_{own.name}" if own.name else name
+        entry: dict[str, Any] = {"name": label, "pbrMetallicRoughness": surface, "doubleSided": own.double_sided}
+        for kind, place, key, factor in (
+            ("", surface, "baseColorTexture", {}),
+            ("metallic_roughness", surface, "metallicRoughnessTexture", {}),
+            ("normal", entry, "normalTexture", {"scale": own.normal_scale}),
+            ("occlusion", entry, "occlusionTexture", {"strength": own.occlusion_strength}),
+            ("emission", entry, "emissiveTexture", {}),
+        ):
+            if kind in textures:
+                place[key] = {**textures[kind], **factor}
+        if own.alpha != "opaque":
+            entry["alphaMode"] = own.alpha.upper()
+            entry |= {"alphaCutoff": own.cutoff} if own.alpha == "mask" else {}
+        if own.unlit:
+            self._extend(entry, "KHR_materials_unlit", {})
+        if any(own.emission):
+            # Factors go to 1 at most; what is beyond is the strength's.
+            entry["emissiveFactor"] = _bounded(own.emission)
+            if max(own.emission) > 1.0:
+                self._extend(entry, "KHR_materials_emissive_strength", {"emissiveStrength": max(own.emission)})
         if material.specular is not None:
-            self._add_specular(entry, material.specular)
-        self._tree.setdefault("materials", []).append(entry)
-        return len(self._tree["materials"]) - 1
+            # A factor goes to 1 at most; what is beyond is the colour's, which may be any.
+            strength = min(1.0, max(material.specular) / _DIELECTRIC)
+            color = [0.0 if strength == 0.0 else value / (_DIELECTRIC * strength) for value in material.specular]
+            told = {"specularFactor": strength, "specularColorFactor": color}
+            self._extend(entry, "KHR_materials_specular", told)
+        return self._add("materials", entry)
 
-    def _add_specular(self, entry: dict[str, Any], specular: RGB) -> None:
-        """A factor goes to 1 at most; what is beyond is the colour's, which may be any."""
-        self._use("KHR_materials_specular")
-        factor = max(specular) / _DIELECTRIC
-        strength = min(1.0, factor)
-        color = [0.0 if strength == 0.0 else value / (_DIELECTRIC * strength) for value in specular]
-        told = {"specularFactor": strength, "specularColorFactor": color}
-        entry.setdefault("extensions", {})["KHR_materials_specular"] = told
-
-    def _add_texture(self, picture: Picture) -> dict[str, Any]:
-        """A reference to a picture with its sampler and its place; equal pictures are held once."""
-        wraps = [_WRAPS[wrap] for wrap in picture.wrap]
-        magnified = _NEAREST if picture.nearest else _LINEAR
-        sampler = {"wrapS": wraps[0], "wrapT": wraps[1], "magFilter": magnified, "minFilter": _TRILINEAR}
-        samplers = self._tree.setdefault("samplers", [])
-        if sampler not in samplers:
-            samplers.append(sampler)
-        if picture.digest not in self._images:
-            self._images[picture.digest] = self._add_image(picture.encode())
-        texture = {"source": self._images[picture.digest], "sampler": samplers.index(sampler)}
-        textures = self._tree.setdefault("textures", [])
-        if texture not in textures:
-            textures.append(texture)
-        made: dict[str, Any] = {"index": textures.index(texture)}
-        if picture.uv_set:
-            made["texCoord"] = picture.uv_set
-        if placed := placed_by(picture):
-            self._use("KHR_texture_transform")
-            made["extensions"] = {"KHR_texture_transform": placed}
+    def _texture(self, picture: Picture) -> dict[str, Any]:
+        """Return a reference to a picture with its sampler and its place; equal pictures are held once."""
+        use = picture.use
+        wrap_s, wrap_t = (_WRAPS[wrap] for wrap in use.wrap)
+        magnified = _NEAREST if use.nearest else _LINEAR
+        sampler = {"wrapS": wrap_s, "wrapT": wrap_t, "magFilter": magnified, "minFilter": _TRILINEAR}
+        digest = picture.digest
+        if digest not in self._images:
+            self._images[digest] = self._add_image(picture.encode())
+        texture = {"source": self._images[digest], "sampler": self._add("samplers", sampler, once=True)}
+        made: dict[str, Any] = {"index": self._add("textures", texture, once=True)}
+        if use.uv_set:
+            made["texCoord"] = use.uv_set
+        if use.transform != IDENTITY:
+            # Here v runs down.
+            across, up, turn, c, f = picture.placing
+            offset = [c + use.transform[1], 1.0 - use.transform[4] - f]
+            self._extend(made, "KHR_texture_transform", {"offset": offset, "rotation": turn, "scale": [across, up]})
         return made
 
-    def _add_emission(self, entry: dict[str, Any], material: ExchangeMaterial) -> None:
-        """Factors go to 1 at most; what is beyond is the strength's."""
-        entry["emissiveFactor"] = list(_bounded(material.emission))
-        if material.glow is not None:
-            entry["emissiveTexture"] = self._add_texture(material.glow)
-        if max(material.emission) > 1.0:
-            self._use("KHR_materials_emissive_strength")
-            strength = {"emissiveStrength": max(material.emission)}
-            entry.setdefault("extensions", {})["KHR_materials_emissive_strength"] = strength
-
     def _add_image(self, png: bytes) -> int:
-        self._tree.setdefault("images", []).append({"bufferView": self._view(png), "mimeType": "image/png"})
-        return len(self._tree["images"]) - 1
+        return self._add("images", {"bufferView": self._view(png), "mimeType": "image/png"})
 
     def _add_environment(self, radiance: npt.NDArray[np.float32]) -> None:
-        from warp_ar.output.gltf_environment import EXTENSION, image_based_light  # here, for it loads Warp
+        from warp_ar.output.gltf_environment import EXTENSION, image_based_light
 
-        self._use(EXTENSION)
-        lights = [image_based_light(radiance, self._add_image)]
-        self._tree.setdefault("extensions", {})[EXTENSION] = {"lights": lights}
-        self._tree["scenes"][0]["extensions"] = {EXTENSION: {"light": 0}}
+        self._extend(self._tree, EXTENSION, {"lights": [image_based_light(radiance, self._add_image)]})
+        self._extend(self._tree["scenes"][0], EXTENSION, {"light": 0})
 
     def _add_light(self, index: int, light: Light) -> None:
-        self._use("KHR_lights_punctual")
         entry: dict[str, Any] = {
             "name": f"light_{index}",
             "type": light.kind,
-            "color": list(_bounded(light.color)),
+            "color": _bounded(light.color),
             "intensity": light.intensity * max(1.0, *light.color),
         }
         if light.kind == "spot":
@@ -381,11 +302,12 @@ class _Builder:
             entry["extras"] = {"radius": light.radius, "attenuation": list(light.attenuation)}
         lights = self._tree.setdefault("extensions", {}).setdefault("KHR_lights_punctual", {"lights": []})["lights"]
         lights.append(entry)
-        node = {"name": f"light_{index}", "extensions": {"KHR_lights_punctual": {"light": len(lights) - 1}}}
+        node: dict[str, Any] = {"name": f"light_{index}"}
+        self._extend(node, "KHR_lights_punctual", {"light": len(lights) - 1})
         self._add_node(node, dict(enumerate(key_frames(self._shot.light_placements(light)))))
 
 
-def _bounded(color: Sequence[float]) -> Sequence[float]:
-    """A colour within 0..1; the light's intensity has taken its largest channel."""
+def _bounded(color: Sequence[float]) -> list[float]:
+    """Return a colour within 0..1; the light's intensity has taken its largest channel."""
     most = max(1.0, *color)
     return [value / most for value in color]

@@ -6,18 +6,24 @@
 The first part, ``picture``, is that sum as linear radiance, there where all five layers are. Radiance and ratios are
 16-bit floats, as compositors expect; depth, positions, motion and numbers of surfaces have 32 bits. A part is named as
 its layer, and so are its channels (``objects.R``), but for those that OpenEXR names itself: ``R``, ``G``, ``B``, ``A``
-of the picture and ``Z`` of the depth. ``coverage`` becomes Cryptomatte's ``CryptoObject``.
+of the picture and ``Z`` of the depth. ``coverage`` becomes Cryptomatte's ``CryptoObject``: a name's hash as a float,
+and a manifest that tells names by hashes [Cry].
 
 PNGs lie in a folder per layer: the plate in the codes of the camera; numbers of surfaces, 1 more than in ``ids``, 0 for
 none; depth in tenths of a millimetre, 0 where there is nothing or it is beyond 6.5535 m; normals as 32767.5 (n + 1).
+
+References:
+    [Cry] Friedman, Jones, "Cryptomatte Specification" 1.2, Psyop, 2016.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-import functools
+import difflib
+import json
 import pathlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import cv2
@@ -25,16 +31,19 @@ import numpy as np
 import numpy.typing as npt
 import OpenEXR
 
+from warp_ar.closing import Closing
 from warp_ar.engine.layers import compose_layers
-from warp_ar.errors import SinkError, reason
-from warp_ar.exr_file import write_exr
-from warp_ar.files import write_whole
-from warp_ar.output.cryptomatte import matte_channels, matte_header
-from warp_ar.output.folder_sink import FolderSink
+from warp_ar.engine.result import Result
+from warp_ar.errors import SinkError, UsageError
+from warp_ar.exr_file import LARGEST, exr_header, store_exr
+from warp_ar.files import store
 from warp_ar.output.sink import make_folder
+from warp_ar.output.sinks import EnvironmentSink, FolderSink
+from warp_ar.scene import Scene
+from warp_ar.scene.object_shapes import surface_names
 from warp_ar.signals import REC_709
-from warp_ar.signature import PROGRAM, sign_png
-from warp_ar.stages.request import PICTURE_LAYERS
+from warp_ar.signature import sign_png
+from warp_ar.stages.request import LAYERS, PICTURE_LAYERS
 
 Layers = Mapping[str, npt.NDArray[Any]]
 
@@ -42,11 +51,19 @@ PICTURES = ("plate", "ids", "depth", "normals")
 """Layers that PNG can hold."""
 DEPTH_STEP = 1e-4
 """Metres per step of a depth in a PNG."""
+MATTES = "CryptoObject"
+"""Name of the layer of mattes."""
 
-_HALF_MAX = 65504.0
-_COMPONENTS = {"objects": "RGBA", "normals": "XYZ", "position": "XYZ", "motion": "XY", "ids": "I"}
-_FULL = ("position", "motion", "depth", "normals")
-"""Layers of 32 bits."""
+# Channels of a layer that are not R, G and B, and whether they have 32 bits.
+_CHANNELS: dict[str, tuple[tuple[str, ...], type]] = {
+    "depth": (("Z",), np.float32),
+    "ids": (("ids.I",), np.uint32),
+    "objects": (tuple(f"objects.{c}" for c in "RGBA"), np.float16),
+    "motion": (tuple(f"motion.{c}" for c in "XY"), np.float32),
+    "position": (tuple(f"position.{c}" for c in "XYZ"), np.float32),
+    "normals": (tuple(f"normals.{c}" for c in "XYZ"), np.float32),
+    "picture": (tuple("RGB"), np.float16),
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,7 +79,7 @@ class LayerFrame:
     exposure_scale: float = 1.0
     """Factor on the composed radiance in the picture."""
     transfer: str = "srgb"
-    """How the picture encodes radiance."""
+    """Transfer function by which the picture encodes radiance."""
     camera_from_world: npt.NDArray[np.float64] | None = None
     """(4, 4), camera axes x right, y down, z forward, metres; None where it is not known."""
     camera_matrix: npt.NDArray[np.float64] | None = None
@@ -84,46 +101,27 @@ def write_layers(path: pathlib.Path, frame: LayerFrame) -> None:
     Raises:
         SinkError: The file cannot be written.
     """
-    layers = frame.layers
-    parts = []
+    layers = dict(frame.layers)
     if set(PICTURE_LAYERS) <= layers.keys():
-        picture = compose_layers(layers)
-        parts.append(_part("picture", {c: _half(picture[..., k]) for k, c in enumerate("RGB")}, frame))
+        layers = {"picture": compose_layers(layers), **layers}
+    if "ids" in layers:
+        layers["ids"] = layers["ids"] + 1
+    parts = []
     for name, values in layers.items():
         if name == "coverage":
-            channels: dict[str, Any] = matte_channels(values, frame.names)
-            parts.append(_part(name, channels, frame, matte_header(frame.names)))
-        else:
-            parts.append(_part(name, _channels(name, values), frame))
-    try:
-        write_whole(path, functools.partial(write_exr, image=OpenEXR.File(parts)))
-    except (RuntimeError, OSError) as error:
-        raise SinkError(f"{path} cannot be written: {reason(error)}") from error
+            parts.append(_part(name, matte_channels(values, frame.names), frame, matte_header(frame.names)))
+            continue
+        names, kind = _CHANNELS.get(name, (tuple(f"{name}.{c}" for c in "RGB"), np.float16))
+        values = values[..., None] if values.ndim == 2 else values
+        values = (np.clip(values, -LARGEST, LARGEST) if kind is np.float16 else values).astype(kind)
+        channels = {channel: np.ascontiguousarray(values[..., k]) for k, channel in enumerate(names)}
+        parts.append(_part(name, channels, frame, {}))
+    store_exr(path, OpenEXR.File(parts))
 
 
-def _half(values: npt.NDArray[Any]) -> npt.NDArray[np.float16]:
-    return np.ascontiguousarray(np.clip(values, -_HALF_MAX, _HALF_MAX), np.float16)
-
-
-def _channels(name: str, values: npt.NDArray[Any]) -> dict[str, npt.NDArray[Any]]:
-    if name == "depth":
-        return {"Z": np.ascontiguousarray(values, np.float32)}
-    if name == "ids":
-        return {"ids.I": np.ascontiguousarray(values + 1).astype(np.uint32)}
-    keep: Callable[[Any], Any] = functools.partial(np.ascontiguousarray, dtype=np.float32) if name in _FULL else _half
-    return {f"{name}.{c}": keep(values[..., k]) for k, c in enumerate(_COMPONENTS.get(name, "RGB"))}
-
-
-def _part(name: str, channels: dict[str, Any], frame: LayerFrame, more: Mapping[str, Any] | None = None) -> Any:
-    header: dict[str, Any] = {
-        "compression": OpenEXR.ZIP_COMPRESSION,
-        "type": OpenEXR.scanlineimage,
-        "software": PROGRAM,
-        "chromaticities": REC_709,
-        "exposureScale": float(frame.exposure_scale),
-        "transfer": frame.transfer,
-        **(more or {}),
-    }
+def _part(name: str, channels: dict[str, Any], frame: LayerFrame, more: Mapping[str, Any]) -> Any:
+    scale = float(frame.exposure_scale)
+    header = exr_header(chromaticities=REC_709, exposureScale=scale, transfer=frame.transfer, **more)
     if frame.camera_from_world is not None:
         header["cameraFromWorld"] = frame.camera_from_world.astype(np.float32)
         # OpenEXR's own attribute maps rows, to a camera that looks along its -z with y up.
@@ -134,8 +132,58 @@ def _part(name: str, channels: dict[str, Any], frame: LayerFrame, more: Mapping[
     return OpenEXR.Part(header, channels, name)
 
 
+def murmur3(data: bytes) -> int:
+    """Return MurmurHash3 x86 of bytes, 32 bits, seed 0."""
+    mask = 0xFFFFFFFF
+    state, whole = 0, len(data) // 4 * 4
+    for at in (*range(0, whole, 4), *[whole] * (len(data) > whole)):
+        block = int.from_bytes(data[at : at + 4], "little") * 0xCC9E2D51 & mask
+        state ^= (block << 15 | block >> 17) * 0x1B873593 & mask
+        if at < whole:
+            state = ((state << 13 | state >> 19) & mask) * 5 + 0xE6546B64 & mask
+    state ^= len(data)
+    for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35)):
+        state = (state ^ state >> shift) * factor & mask
+    return state ^ state >> 16
+
+
+def matte_bits(name: str) -> int:
+    """Return the bits of a name's float: its hash, kept off denormal, infinite and NaN ones [Cry]."""
+    bits = murmur3(name.encode())
+    return bits ^ 1 << 23 if bits >> 23 & 255 in (0, 255) else bits
+
+
+def matte_header(names: Sequence[str]) -> Mapping[str, str]:
+    """Return attributes of an OpenEXR that holds the mattes of surfaces of these names."""
+    key = f"cryptomatte/{murmur3(MATTES.encode()):08x}"[: len("cryptomatte/") + 7]
+    manifest = {name: f"{matte_bits(name):08x}" for name in names}
+    return {
+        f"{key}/name": MATTES,
+        f"{key}/hash": "MurmurHash3_32",
+        f"{key}/conversion": "uint32_to_float32",
+        f"{key}/manifest": json.dumps(manifest),
+    }
+
+
+def matte_channels(coverage: npt.NDArray[np.float32], names: Sequence[str]) -> dict[str, npt.NDArray[np.float32]]:
+    """Return the channels of the mattes.
+
+    Args:
+        coverage: (height, width, 2 n) number of a surface (-1: none) and its share in turn, as the layer ``coverage``.
+        names: Of the surfaces, by number.
+    """
+    hashes = np.array([*map(matte_bits, names), 0], np.uint32).view(np.float32)  # the last for -1
+    channels: dict[str, npt.NDArray[np.float32]] = {}
+    for rank in range(coverage.shape[2] // 2):
+        which, share = coverage[..., 2 * rank], coverage[..., 2 * rank + 1]
+        layer = f"{MATTES}{rank // 2:02d}"
+        for channel, values in zip("BA" if rank % 2 else "RG", (hashes[which.astype(int)], share), strict=True):
+            channels[f"{layer}.{channel}"] = np.ascontiguousarray(values)
+    return channels
+
+
 def encode_picture(name: str, frame: LayerFrame) -> bytes:
-    """PNG of a layer of ``PICTURES``."""
+    """Return the PNG of a layer of ``PICTURES``."""
     values = frame.layers[name]
     if name == "plate":
         picture: npt.NDArray[Any] = cv2.cvtColor(frame.frame, cv2.COLOR_RGB2BGR)
@@ -179,8 +227,127 @@ class LayerSink(FolderSink):
     def _store(self, index: int, image: Any) -> None:
         write_layers(self._path / f"{index:04d}.exr", image)
         for name in self._pictures:
-            path = self._path / name / f"{index:04d}.png"
-            try:
-                write_whole(path, encode_picture(name, image))
-            except OSError as error:
-                raise SinkError(f"{path} cannot be written: {reason(error)}") from error
+            store(self._path / name / f"{index:04d}.png", encode_picture(name, image))
+
+
+def parse_layers(text: str | None) -> tuple[str, ...]:
+    """Return names of layers, separated by commas; None or ``all`` means every one.
+
+    Raises:
+        UsageError: A name is unknown, or there is none.
+    """
+    if text is None or text == "all":
+        return tuple(LAYERS)
+    names = tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
+    for name in names or (text,):
+        if name not in LAYERS:
+            close = difflib.get_close_matches(name, LAYERS, 1)
+            hint = f"did you mean {close[0]!r}? " if close else ""
+            raise UsageError(f"--layers: {name!r} is no layer; {hint}expected all, or some of {', '.join(LAYERS)}")
+    return names
+
+
+class SideFiles(Closing):
+    """Folders of what is written of every frame beside the picture: the captured light, and the layers."""
+
+    def __init__(
+        self,
+        *,
+        environment: pathlib.Path | None = None,
+        layers: pathlib.Path | None = None,
+        names: tuple[str, ...] = tuple(LAYERS),
+        pictures: bool = False,
+        overwrite: bool = False,
+    ) -> None:
+        """Open the folders.
+
+        Args:
+            environment: Folder for the captured light of every frame; None: it is not written. Of several mirror balls
+                whose light is interpolated, the first one's lies in it, those of the others in folders ``ball_1`` and
+                so on below it.
+            layers: Folder for layers; None: they are not written.
+            names: Which layers.
+            pictures: Whether layers that PNG can hold are written as PNG besides.
+            overwrite: Whether numbered files that this program did not write may be replaced.
+
+        Raises:
+            SinkError: A folder cannot be written to.
+        """
+        self._stack = contextlib.ExitStack()
+        self.outputs: tuple[str, ...] = ()
+        """Outputs that the pipeline's results must hold."""
+        self.lights: EnvironmentSink | None = None
+        """Takes the captured light."""
+        self._other_lights: list[EnvironmentSink] = []
+        self._environment, self._overwrite = environment, overwrite
+        self._layers: LayerSink | None = None
+        with contextlib.ExitStack() as stack:
+            if environment is not None:
+                self.lights = stack.enter_context(EnvironmentSink(environment, overwrite=overwrite))
+                self.outputs += ("environment",)
+            if layers is not None:
+                held = tuple(name for name in names if name in PICTURES) if pictures else ()
+                self._layers = stack.enter_context(LayerSink(layers, overwrite=overwrite, pictures=held))
+                self.outputs += names
+            self._stack = stack.pop_all()
+
+    @property
+    def replaced(self) -> tuple[str, ...]:
+        """Words for what the first frame replaces."""
+        return tuple(sink.replaced for sink in (self.lights, self._layers) if sink is not None and sink.replaced)
+
+    @property
+    def written(self) -> str:
+        """Words for how much is stored, which begin with a comma; empty where nothing is asked for."""
+        lights = "" if self.lights is None else f", and {self.lights.written} environments"
+        if self._other_lights:
+            lights += f" of each of {len(self._other_lights) + 1} mirror balls"
+        return lights if self._layers is None else f"{lights}, and layers of {self._layers.written}"
+
+    def write(self, frame: npt.NDArray[np.uint8], result: Result, scene: Scene) -> None:
+        """Take the next frame.
+
+        Args:
+            frame: The camera's, uint8 RGB (height, width, 3).
+            result: What it became.
+            scene: As it was lit, its camera of the frame's size.
+
+        Raises:
+            SinkError: An earlier one could not be written.
+        """
+        if self.lights is not None and result.environment is not None:
+            self.lights.write(result.environment)
+            for ball, radiance in enumerate(result.environments[1:], 1):
+                self._lights_of(ball).write(radiance)
+        if self._layers is not None:
+            self._layers.write(layer_frame(frame, result, scene))
+
+    def _lights_of(self, ball: int) -> EnvironmentSink:
+        """Takes the captured light of a mirror ball after the first; opened where there is some."""
+        if ball > len(self._other_lights):
+            assert self._environment is not None
+            sink = EnvironmentSink(self._environment / f"ball_{ball}", overwrite=self._overwrite)
+            self._other_lights.append(self._stack.enter_context(sink))
+        return self._other_lights[ball - 1]
+
+    def close(self) -> None:
+        """Close the folders."""
+        self._stack.close()
+
+
+def layer_frame(frame: npt.NDArray[np.uint8], result: Result, scene: Scene) -> LayerFrame:
+    """The layers of a result as files take them; arguments as those of `SideFiles.write`."""
+    camera = scene.camera.scaled_to(frame.shape[1], frame.shape[0])
+    from_world: Any = None
+    if result.pose is not None:
+        from_world = np.eye(4)
+        from_world[:3, :3], from_world[:3, 3] = result.pose.rotation, result.pose.translation
+    return LayerFrame(
+        result.layers,
+        frame,
+        surface_names(scene),
+        result.exposure_scale,
+        str(camera.transfer),
+        from_world,
+        camera.matrix(),
+    )

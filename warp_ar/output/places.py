@@ -1,4 +1,4 @@
-"""Where output may go: never onto what is read, and onto a file of somebody else's only where that is allowed.
+"""Rules for places of output: never onto what is read, and onto a file of somebody else's only if that is allowed.
 
 What this program wrote, by its signature, is replaced, and the sink says that it was; any other file is left alone
 unless overwriting is asked for.
@@ -6,16 +6,19 @@ unless overwriting is asked for.
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import filelock
 
-from warp_ar.errors import SinkError, UsageError, reason
-from warp_ar.files import is_same_file, kind_of
+from warp_ar.errors import SinkError, UsageError, reason, say
+from warp_ar.files import is_same_file, kind_of, store
+from warp_ar.scene import Scene
+from warp_ar.scene.scene_files import files_of
 from warp_ar.signature import is_signed
 
 _NUMBERED = re.compile(r"[0-9]{4,}\.(png|exr)")
@@ -94,6 +97,15 @@ def check_places(reads: Mapping[str, Sequence[Path]], writes: Mapping[str, Path]
         entries.append((written, place))
 
 
+def reads_of(scene: Scene, options: argparse.Namespace) -> dict[str, list[Path]]:
+    """Return files and folders that a command reads, by what they are, as ``check_places`` takes them."""
+    named = {f"--{name}": getattr(options, name, None) for name in ("source", "calibration", "light")}
+    reads = {name: [Path(value)] for name, value in named.items() if value is not None and "://" not in str(value)}
+    reads["the scene"] = [] if scene.path is None else [scene.path]
+    reads["what the scene names,"] = [path for path in files_of(scene) if path != scene.path]
+    return reads
+
+
 @contextlib.contextmanager
 def folder_to_oneself(folder: Path) -> Iterator[None]:
     """Keep other runs from writing frames into a folder; the lock's file is removed at the end.
@@ -115,3 +127,54 @@ def folder_to_oneself(folder: Path) -> Iterator[None]:
         with contextlib.suppress(OSError):
             os.unlink(lock.lock_file)
         lock.release()
+
+
+class OwnFiles:
+    """A folder, and the files that a command may write there."""
+
+    def __init__(
+        self,
+        folder: Path,
+        names: Iterable[str],
+        *,
+        overwrite: bool,
+        role: str = "--out",
+        reads: Mapping[str, Sequence[Path]] | None = None,
+    ) -> None:
+        """Refuse before anything is computed; say on stderr what will be replaced.
+
+        Args:
+            folder: Made if it is not there.
+            names: Of all files that may be written.
+            overwrite: Whether files that this program did not write may be replaced.
+            role: Of the folder, in messages.
+            reads: What the command reads, by what it is ("--extra").
+
+        Raises:
+            SinkError: A file may not be replaced, or the folder cannot be made.
+            UsageError: A file is one that is read.
+        """
+        self._folder, self._names, self._role = folder, tuple(names), role
+        replaced = []
+        for name in self._names:
+            check_places(reads or {}, {role: folder / name})
+            replaced.append(check_replaceable(folder / name, overwrite=overwrite))
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise SinkError(f"{role} {folder} cannot be made: {reason(error)}") from error
+        for words in filter(None, replaced):
+            say(words)
+
+    def write(self, name: str, data: str | bytes) -> Path:
+        """Write a file, text as UTF-8; returns its path.
+
+        Raises:
+            SinkError: It cannot be written; what stood there stays.
+            ValueError: It is none of ``names``.
+        """
+        if name not in self._names:
+            raise ValueError(f"{name} is not among the files that were looked at: {', '.join(self._names)}")
+        path = self._folder / name
+        store(path, data.encode() if isinstance(data, str) else data, label=f"{self._role} {path}")
+        return path

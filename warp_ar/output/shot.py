@@ -1,33 +1,189 @@
 """A shot as other programs take it: the camera's way and lens, surfaces with their materials and motion, lights.
 
 Lengths are metres, angles radians but where a name says degrees, the world is the marker's, z up. Radiance is in camera
-values: 1 is where the camera clips. Exchange formats know fewer materials than scenes do; ``ExchangeMaterial`` is what
-all of them can say.
+values: 1 is where the camera clips.
+
+Exchange formats know fewer materials than scenes do: metallic-roughness, or an explicit specular colour, with pictures
+(UsdPreviewSurface and glTF). A mesh with materials of its own keeps all of them, each for its triangles. A Phong lobe
+of exponent n becomes GGX of alpha = sqrt(2 / (n + 2)), which is as wide, and its colour the reflectance straight on; a
+mirror becomes a metal without roughness.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+import hashlib
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
-from warp_ar.output.exchange_materials import ExchangeMaterial, texture_plan, used_materials, vertex_colors
 from warp_ar.scene import Camera, Pose, Scene
 from warp_ar.scene.description import Light, Object, Proxy
 from warp_ar.scene.geometry import Mesh, make_mesh, rotation_matrix
-from warp_ar.scene.mesh_cache import load_kept_mesh
-from warp_ar.scene.names import surface_names
-from warp_ar.scene.object_shapes import ObjectShape, object_shapes, part_placements
+from warp_ar.scene.materials import (
+    RGB,
+    Color,
+    EmissiveMaterial,
+    FileMaterial,
+    MeshMaterial,
+    MetallicRoughnessMaterial,
+    MirrorMaterial,
+    PhongMaterial,
+    TextureUse,
+)
+from warp_ar.scene.mesh_files import load_mesh
+from warp_ar.scene.object_materials import materials_of
+from warp_ar.scene.object_shapes import ObjectShape, object_shapes, part_placements, surface_names
 from warp_ar.scene.shapes import box_mesh, disk_mesh, sphere_mesh, torus_mesh, tube_mesh
+from warp_ar.scene.textures import load_emission, load_texture
+from warp_ar.signature import sign_png
+from warp_ar.srgb import decode_srgb, encode_srgb
 
+Array = npt.NDArray[np.float64]
+Codes = npt.NDArray[np.uint8]
 Matrix = npt.NDArray[np.float64]
 
 FILM_WIDTH = 0.036
 """Metres of film that lenses are told for: 36 mm. Only its ratio to the focal length matters to a picture."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Picture:
+    """A picture, and how it lies on the surface."""
+
+    codes: Codes
+    """RGB, or RGBA where alpha counts, (h, w, 3 or 4), row 0 at the top."""
+    use: TextureUse = dataclasses.field(default_factory=lambda: TextureUse(0))
+    """Its texture coordinates, its place on the surface and its borders."""
+
+    @property
+    def placing(self) -> tuple[float, float, float, float, float]:
+        """Scale along u and v, counter-clockwise turn in radians, then offsets, for v that points up."""
+        a, b, c, d, e, f = self.use.transform
+        turn = math.atan2(d, a)
+        return math.hypot(a, d), e * math.cos(turn) - b * math.sin(turn), turn, c, f
+
+    def encode(self) -> bytes:
+        """Return the PNG."""
+        order = cv2.COLOR_RGB2BGR if self.codes.shape[2] == 3 else cv2.COLOR_RGBA2BGRA
+        done, data = cv2.imencode(".png", cv2.cvtColor(self.codes, order))
+        assert done
+        return sign_png(data.tobytes())
+
+    @property
+    def digest(self) -> bytes:
+        """Equal for equal codes."""
+        return hashlib.blake2b(self.codes.tobytes(), person=b"%d" % self.codes.shape[1]).digest()
+
+
+@dataclasses.dataclass(frozen=True)
+class ExchangeMaterial:
+    """A material as UsdPreviewSurface and glTF know it."""
+
+    base_color: RGB = (0.8, 0.8, 0.8)
+    """Linear; multiplies the texture."""
+    metallic: float = 0.0
+    roughness: float = 1.0
+    """Perceptual: alpha is its square."""
+    specular: RGB | None = None
+    """Reflectance straight on where it is given; None: by ``metallic``, 0.04 for what is no metal."""
+    pictures: Mapping[str, Picture] = dataclasses.field(default_factory=dict)
+    """By what they are of: "" (base colour and opacity), emission, metallic_roughness, normal, occlusion."""
+    own: MeshMaterial = dataclasses.field(default_factory=MeshMaterial)
+    """The scene's material, for all that formats tell alike: alpha, emission, factors of pictures."""
+
+
+def exchange_materials_of(item: Object, mesh: Mesh) -> tuple[ExchangeMaterial, ...]:
+    """Return the materials of an object's triangles, in the order of ``Mesh.materials``."""
+    return tuple(_exchange_material(item, mesh, material) for material in materials_of(item).materials)
+
+
+def _exchange_material(item: Object, mesh: Mesh, own: MeshMaterial) -> ExchangeMaterial:
+    uses = {"": own.base, "emission": own.emissive}
+    uses |= {name: getattr(own, name) for name in ("metallic_roughness", "normal", "occlusion")}
+    pictures = {}
+    for name, use in uses.items():
+        if use is not None and (mesh.uvs if use.uv_set == 0 else mesh.uvs_second) is not None:
+            channels = 4 if name == "" and own.alpha != "opaque" else 3
+            pictures[name] = Picture(np.ascontiguousarray(mesh.images[use.image][..., :channels]), use)
+    if isinstance(item.material, EmissiveMaterial) and item.material.image is not None and mesh.uvs is not None:
+        pictures["emission"] = Picture(load_emission(item.material.image)[0])
+    if not any(own.emission):
+        pictures.pop("emission", None)
+    material = own.surface
+    assert not isinstance(material, FileMaterial | EmissiveMaterial)
+    color = material.base_color
+    factor, texture = _colored(color, pictures.pop("", None), mesh)
+    if texture is not None:
+        pictures = {"": texture, **pictures}
+    if isinstance(material, PhongMaterial):
+        specular = _mean_color(material.specular)
+        if own.specular is not None:
+            shown = to_linear(mesh.images[own.specular.image][..., :3]).mean(axis=(0, 1))
+            specular = (specular[0] * shown[0], specular[1] * shown[1], specular[2] * shown[2])
+        return ExchangeMaterial(factor, 0.0, (2.0 / (material.shininess + 2.0)) ** 0.25, specular, pictures, own)
+    if isinstance(material, MetallicRoughnessMaterial):
+        return ExchangeMaterial(factor, material.metallic, material.roughness, None, pictures, own)
+    if isinstance(material, MirrorMaterial):
+        return ExchangeMaterial(factor, 1.0, 0.0, None, pictures, own)
+    return ExchangeMaterial(factor, 0.0, 1.0, (0.0, 0.0, 0.0), pictures, own)
+
+
+def _colored(color: Color, base: Picture | None, mesh: Mesh) -> tuple[RGB, Picture | None]:
+    """Return factor and texture of a colour; a texture that the mesh brings is multiplied by the material's."""
+    if not isinstance(color, Path):
+        return color, base
+    own = load_texture(color)
+    if mesh.uvs is None:
+        return _mean_color(color), None
+    if base is None:
+        return (1.0, 1.0, 1.0), Picture(own)
+    height, width = (max(a, b) for a, b in zip(own.shape[:2], base.codes.shape[:2], strict=True))
+    both = cv2.resize(base.codes, (width, height))
+    product = to_linear(cv2.resize(own, (width, height))) * to_linear(both[..., :3])
+    codes = np.rint(255.0 * encode_srgb(np.clip(product, 0.0, 1.0))).astype(np.uint8)
+    return (1.0, 1.0, 1.0), Picture(np.concatenate([codes, both[..., 3:]], axis=-1), base.use)
+
+
+def _mean_color(color: Color) -> RGB:
+    if not isinstance(color, Path):
+        return color
+    r, g, b = to_linear(load_texture(color)).mean(axis=(0, 1)).tolist()
+    return r, g, b
+
+
+def to_linear(codes: Codes) -> Array:
+    """Return linear values of sRGB codes."""
+    return decode_srgb(codes.astype(np.float64) / 255.0)
+
+
+def texture_plan(path: Path, name: str, materials: Sequence[ExchangeMaterial]) -> dict[tuple[int, str], Path]:
+    """Return where the pictures of a body go that cannot lie in the file itself, by material and what they are of.
+
+    Equal pictures share a file.
+    """
+    found: dict[tuple[int, str], Path] = {}
+    known: dict[bytes, Path] = {}
+    for number, material in enumerate(materials):
+        for kind, picture in material.pictures.items():
+            parts = (path.stem, name, str(number) if number else "", kind)
+            file = path.with_name("_".join(part for part in parts if part) + ".png")
+            found[number, kind] = known.setdefault(picture.digest, file)
+    return found
+
+
+def used_materials(item: Object, mesh: Mesh) -> tuple[tuple[ExchangeMaterial, ...], npt.NDArray[np.int64] | None]:
+    """Return the materials that triangles have, and which of them each has, (m,); None: all the first."""
+    materials = exchange_materials_of(item, mesh)
+    if len(materials) == 1 or mesh.triangle_materials is None:
+        return materials[:1], None
+    used, numbers = np.unique(mesh.triangle_materials, return_inverse=True)
+    return tuple(materials[number] for number in used), None if len(used) == 1 else numbers.reshape(-1)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,12 +199,12 @@ class Body:
     placements: tuple[Matrix, ...]
     """``world_from_mesh``, (4, 4), of every frame; one where it stands still."""
     numbers: npt.NDArray[np.int64] | None = None
-    """Which of ``materials`` each triangle has, (m,); None: all the first."""
+    """Index into ``materials`` of each triangle, (m,); None: all the first."""
     colors: npt.NDArray[np.float32] | None = None
     """Factors of base colour and alpha at vertices, (n, 4), linear."""
 
     def triangles_of(self, number: int) -> npt.NDArray[np.int64]:
-        """Which triangles have a material."""
+        """Return the triangles that have a material."""
         if self.numbers is None:
             return np.arange(len(self.mesh.faces))
         return np.flatnonzero(self.numbers == number)
@@ -56,7 +212,7 @@ class Body:
 
 @dataclasses.dataclass(frozen=True)
 class Shot:
-    """What an exchange file tells."""
+    """Content of an exchange file."""
 
     scene: Scene
     """Its camera is that of the frames."""
@@ -81,7 +237,7 @@ class Shot:
 
     @property
     def seconds(self) -> tuple[float, ...]:
-        """When the frames were taken."""
+        """Times of the frames."""
         return tuple(index / self.fps for index in range(len(self.poses)))
 
     def camera_placements(self) -> dict[int, Matrix]:
@@ -106,7 +262,8 @@ class Shot:
         item = shape.item
         mesh = shape.mesh or mesh_of(item)
         materials, numbers = used_materials(item, mesh)
-        return Body(name, mesh, materials, False, self._placements(shape), numbers, vertex_colors(item, mesh))
+        colors = mesh.colors if isinstance(item.material, FileMaterial) else None
+        return Body(name, mesh, materials, False, self._placements(shape), numbers, colors)
 
     def _placements(self, shape: ObjectShape) -> tuple[Matrix, ...]:
         """``world_from_mesh`` of every frame; one where it stands still."""
@@ -142,17 +299,19 @@ def mesh_of(item: Object | Proxy) -> Mesh:
     if isinstance(item, Object) and item.mesh is not None:
         return item.mesh
     if item.file is not None:
-        return load_kept_mesh(item.file)
-    if isinstance(item, Object) and item.shape == "sphere":
-        return sphere_mesh(item.radius)
-    if isinstance(item, Object) and item.shape == "torus":
-        return torus_mesh(item.major_radius, item.minor_radius)
+        return load_mesh(item.file)
+    if isinstance(item, Object):
+        match item.shape:
+            case "sphere":
+                return sphere_mesh(item.radius)
+            case "torus":
+                return torus_mesh(item.major_radius, item.minor_radius)
+            case "disk":
+                return disk_mesh(item.radius)
+            case "tube":
+                return tube_mesh(item.radius, item.length)
     if item.shape == "box":
         return box_mesh(item.size)
-    if isinstance(item, Object) and item.shape == "disk":
-        return disk_mesh(item.radius)
-    if isinstance(item, Object) and item.shape == "tube":
-        return tube_mesh(item.radius, item.length)
     x, y = (0.5 * length for length in item.size[:2])
     corners = [[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0]]
     return make_mesh(corners, [[0, 1, 2], [0, 2, 3]], [[0, 0, 1]] * 4, [[0, 0], [1, 0], [1, 1], [0, 1]])

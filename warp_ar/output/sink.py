@@ -1,4 +1,4 @@
-"""What every sink of frames is, and how those that encode do so on threads of their own.
+"""The base of all sinks of frames, and how those that encode do so on threads of their own.
 
 A sink encodes while the next frame is being made, a few frames deep at most. What fails there is raised by the next
 `write`, or by `close`. Whether a place can be written at all is found out when it is opened.
@@ -25,7 +25,7 @@ from warp_ar.errors import SinkError, reason
 from warp_ar.files import kind_of
 
 FRAMES_WAITING = 4
-"""How many frames may wait to be encoded before `Sink.write` waits."""
+"""Frames that may wait to be encoded before `Sink.write` waits."""
 
 _open: weakref.WeakSet[ThreadedSink] = weakref.WeakSet()
 """Sinks whose last frame is not stored yet."""
@@ -46,7 +46,7 @@ def close_open_sinks() -> None:
 
 
 class Sink(Closing):
-    """Where frames go: a context manager."""
+    """Destination of frames: a context manager."""
 
     description: str
     """One line for people, with a note where the frames are changed."""
@@ -55,7 +55,7 @@ class Sink(Closing):
     """Frames that are stored; of a sink that failed, those that are whole."""
 
     replaced: str = ""
-    """What is lost by its first frame, in words; empty where that is nothing."""
+    """Files that its first frame replaces, in words; empty if there are none."""
 
     @abstractmethod
     def write(self, image: npt.NDArray[Any]) -> None:
@@ -191,7 +191,7 @@ def _started_pool(threads: int) -> ThreadPoolExecutor:
 
 
 class NullSink(Sink):
-    """Takes frames and forgets them; ``count`` tells how many there were."""
+    """Takes frames and forgets them; ``count`` is their number."""
 
     description = "nowhere"
 
@@ -207,49 +207,15 @@ class NullSink(Sink):
         """Do nothing."""
 
 
-class TeeSink(Sink):
-    """Gives each frame to several sinks, and closes them all even if one fails."""
-
-    def __init__(self, *sinks: Sink) -> None:
-        self._sinks = sinks
-        self.description = " and ".join(sink.description for sink in sinks) or NullSink.description
-        self.replaced = "; ".join(sink.replaced for sink in sinks if sink.replaced)
-
-    def write(self, image: npt.NDArray[Any]) -> None:
-        """Give the frame to every sink, in order."""
-        for sink in self._sinks:
-            sink.write(image)
-
-    def write_at(self, image: npt.NDArray[Any], seconds: float) -> None:
-        """Give the frame and its time to every sink, in order."""
-        for sink in self._sinks:
-            sink.write_at(image, seconds)
-
-    def close(self) -> None:
-        """Close every sink, in order; of several errors the last is raised, the others in its context."""
-        with contextlib.ExitStack() as stack:
-            for sink in reversed(self._sinks):
-                stack.callback(sink.close)
-
-
-def check_image(image: npt.NDArray[Any]) -> None:
-    """Check that an array is a frame.
+def check_image(image: npt.NDArray[Any], kind: type = np.uint8) -> None:
+    """Check that an array is a frame: of codes (uint8), or of linear radiance (float32).
 
     Raises:
         SinkError: It is none.
     """
-    if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or not image.size:
-        raise SinkError(f"a frame is uint8 RGB (height, width, 3), not {image.dtype} {image.shape}")
-
-
-def check_radiance(image: npt.NDArray[Any]) -> None:
-    """Check that an array is a frame of linear radiance.
-
-    Raises:
-        SinkError: It is none.
-    """
-    if image.dtype != np.float32 or image.ndim != 3 or image.shape[2] != 3 or not image.size:
-        raise SinkError(f"a frame of radiance is float32 RGB (height, width, 3), not {image.dtype} {image.shape}")
+    if image.dtype != kind or image.ndim != 3 or image.shape[2] != 3 or not image.size:
+        what = "a frame is uint8" if kind is np.uint8 else "a frame of radiance is float32"
+        raise SinkError(f"{what} RGB (height, width, 3), not {image.dtype} {image.shape}")
 
 
 def make_folder(path: pathlib.Path) -> None:

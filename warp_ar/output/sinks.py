@@ -1,37 +1,168 @@
-"""Frames out: numbered PNGs and OpenEXRs, video, and environments as OpenEXR."""
+"""Frames out: folders of numbered pictures, of environments, and video.
+
+A folder holds PNGs of 8 or 16 bits, OpenEXRs of linear radiance (channels R, G, B of 16-bit floats, Rec. 709's
+primaries), or environments. Other files in it are left alone; a frame appears under its name only when it is whole.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import fractions
 import os
 import pathlib
 from collections.abc import Mapping
-from typing import Final
+from typing import Any, Final
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import OpenEXR
 
 from warp_ar.errors import SinkError, UsageError, reason
-from warp_ar.files import kind_of
+from warp_ar.exr_file import LARGEST, exr_header, store_exr
+from warp_ar.files import kind_of, store
 from warp_ar.output.encoders import CODINGS, find_encoding
-from warp_ar.output.environment_file import EnvironmentSink, read_environment, write_environment
-from warp_ar.output.folder_sink import DeepPngSink, FolderSink, RadianceSink
-from warp_ar.output.sink import NullSink, Sink, TeeSink
+from warp_ar.output.environment_file import check_environment, read_environment, write_environment
+from warp_ar.output.places import earlier_frames
+from warp_ar.output.sink import NullSink, Sink, ThreadedSink, check_image, make_folder
 from warp_ar.output.video_sink import VIDEO_SUFFIXES, VideoSink
+from warp_ar.signals import REC_709
+from warp_ar.signature import is_signed, sign_png
 
 __all__ = [
-    "DeepPngSink",
     "EnvironmentSink",
     "FolderSink",
     "NullSink",
-    "RadianceSink",
     "Sink",
-    "TeeSink",
     "VideoSink",
     "open_sink",
     "read_environment",
     "write_environment",
 ]
 
-FOLDER_CODINGS: Final = ("8bit", "16bit", "exr")
-"""What pictures of a folder hold."""
+FOLDER_CODINGS: Final = {"8bit": "numbered frames", "16bit": "numbered frames of 16 bits", "exr": "numbered OpenEXRs"}
+"""Contents of a folder's pictures, and their words."""
+FOLDER_THREADS = 2
+"""Threads that compress the frames of a folder."""
+
+# Camera frames hardly repeat, so looking for repetitions costs time and saves no byte; neighbours are alike.
+PNG_OPTIONS = (
+    *(cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB),
+    *(cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY),
+)
+
+
+class FolderSink(ThreadedSink):
+    """A folder of numbered frames, ``0000.png`` or ``0000.exr`` the first.
+
+    Numbered frames that stood there go with the first new one, so that what the folder holds is of one run.
+
+    Args:
+        path: The folder.
+        overwrite: Whether numbered frames that this program did not write may go.
+        coding: One of ``FOLDER_CODINGS``; all but ``8bit`` take linear radiance.
+        transfer: The camera's, by which codes of 16 bits are encoded.
+
+    Raises:
+        SinkError: The folder cannot be made or written to, or holds frames that may not go.
+    """
+
+    _suffix = ".png"
+
+    def __init__(
+        self, path: str | pathlib.Path, *, overwrite: bool = False, coding: str = "8bit", transfer: str = "srgb"
+    ) -> None:
+        self._path, self._coding, self._transfer = pathlib.Path(path), coding, transfer
+        if coding == "exr":
+            self._suffix = ".exr"
+        try:
+            kind = kind_of(self._path)
+        except OSError as error:
+            raise SinkError(f"{self._path} cannot be written to: {reason(error)}") from error
+        if kind not in ("folder", "nothing"):
+            what = "a file" if kind == "file" else kind
+            raise SinkError(f"{self._path} is {what}; name a folder, or a video ending in {', '.join(VIDEO_SUFFIXES)}")
+        make_folder(self._path)
+        self._earlier: list[pathlib.Path] = []
+        self._find_earlier(self._path, self._suffix, overwrite=overwrite)
+        self.description = f"{self._path} ({FOLDER_CODINGS[coding]})"
+        super().__init__(FOLDER_THREADS)
+
+    def _find_earlier(self, folder: pathlib.Path, suffix: str, *, overwrite: bool) -> None:
+        """Note the numbered frames that the first new one replaces; raises SinkError where they may not go."""
+        self._earlier += earlier_frames(folder, suffix, overwrite=overwrite)
+        if self._earlier:
+            self.replaced = f"{self._path}: {len(self._earlier)} numbered frames of an earlier run are replaced"
+
+    def _check(self, image: Any) -> None:
+        check_image(image, np.uint8 if self._coding == "8bit" else np.float32)
+
+    def write(self, image: Any) -> None:
+        """Take the next frame; the first one clears away those of an earlier run.
+
+        Raises:
+            SinkError: It is no frame, another frame could not be written, or an earlier run's cannot be replaced.
+        """
+        self._check(image)
+        earlier, self._earlier = self._earlier, []
+        # The last first: who is killed meanwhile leaves the beginning of the earlier run, all parts of its frames.
+        for path in reversed(earlier):
+            try:
+                path.unlink(missing_ok=True)
+            except OSError as error:
+                raise SinkError(f"{path} cannot be replaced: {reason(error)}") from error
+        super().write(image)
+
+    def _store(self, index: int, image: Any) -> None:
+        path = self._path / f"{index:04d}{self._suffix}"
+        if self._coding == "exr":
+            half = np.clip(image, -LARGEST, LARGEST).astype(np.float16)
+            channels = {name: np.ascontiguousarray(half[..., k]) for k, name in enumerate("RGB")}
+            store_exr(path, OpenEXR.File(exr_header(chromaticities=REC_709), channels))
+            return
+        if self._coding == "16bit":
+            from warp_ar.kernels.color import encode_codes  # here, for it loads Warp: the page is to be there before
+
+            image = np.rint(65535.0 * encode_codes(self._transfer, image)).astype(np.uint16)
+        done, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), PNG_OPTIONS)
+        if not done:
+            raise SinkError(f"{path} cannot be encoded as PNG")
+        store(path, sign_png(data.tobytes()))
+
+
+class EnvironmentSink(FolderSink):
+    """A folder of ``NNNN.exr``, numbered from 0, each as `write_environment` writes it.
+
+    The first one also clears away what this program left in folders ``ball_1``, ``ball_2``, ... below: light of an
+    earlier run, of mirror balls that this one may not have.
+    """
+
+    _suffix = ".exr"
+
+    def __init__(self, path: str | pathlib.Path, *, overwrite: bool = False) -> None:
+        super().__init__(path, overwrite=overwrite)
+        stale: list[pathlib.Path] = []
+        for folder in self._path.glob("ball_[1-9]*"):
+            if folder.name.removeprefix("ball_").isdecimal() and folder.is_dir():
+                stale += [one for one in earlier_frames(folder, self._suffix, overwrite=True) if is_signed(one)]
+        if stale:
+            self._earlier += stale
+            say = f"{self.replaced}; " if self.replaced else ""
+            self.replaced = f"{say}{self._path}/ball_*: {len(stale)} environments of an earlier run are removed"
+
+    def _check(self, image: Any) -> None:
+        check_environment(image)
+
+    def write(self, image: npt.NDArray[Any]) -> None:
+        """Take the next map; the first one clears away those of an earlier run, and folders that are empty then."""
+        emptied = {path.parent for path in self._earlier} - {self._path}
+        super().write(image)
+        for folder in emptied:
+            with contextlib.suppress(OSError):  # it holds something else: that stays, and so does the folder
+                folder.rmdir()
+
+    def _store(self, index: int, image: npt.NDArray[Any]) -> None:
+        write_environment(self._path / f"{index:04d}.exr", image, overwrite=True)
 
 
 def open_sink(
@@ -46,7 +177,7 @@ def open_sink(
     encoder_options: Mapping[str, str] | None = None,
     tick: fractions.Fraction | None = None,
 ) -> Sink:
-    """A sink for ``path``: a video for .mp4, .mkv and .mov, a folder of pictures for a name without an ending.
+    """Open a sink: a video for .mp4, .mkv and .mov, a folder of pictures for a name without an ending.
 
     Folders that are missing on the way are made.
 
@@ -66,25 +197,24 @@ def open_sink(
         SinkError: The path cannot be written, may not be replaced, or its ending is unknown; the encoder does not work.
         UsageError: ``fps`` is not a positive number, or the coding or an option does not fit the path.
     """
-    if coding not in FOLDER_CODINGS + CODINGS:
-        raise UsageError(f"coding {coding!r}: expected {', '.join(dict.fromkeys(CODINGS + FOLDER_CODINGS))}")
+    known = dict.fromkeys((*CODINGS, *FOLDER_CODINGS))
+    if coding not in known:
+        raise UsageError(f"coding {coding!r}: expected {', '.join(known)}")
     named_as_folder = str(path).endswith(("/", os.sep))
     path = pathlib.Path(path)
-    if path.suffix.lower() in VIDEO_SUFFIXES and not named_as_folder:
-        if coding not in CODINGS:
-            raise UsageError(f"coding {coding!r}: {path} is a video, which holds {', '.join(CODINGS)}")
-        encoding = find_encoding(coding, encoder, encoder_options)
-        return VideoSink(path, fps=fps, size=size, overwrite=overwrite, encoding=encoding, transfer=transfer, tick=tick)
+    is_video = path.suffix.lower() in VIDEO_SUFFIXES and not named_as_folder
     try:
-        is_folder = kind_of(path) == "folder"
+        if not is_video and path.suffix and not named_as_folder and kind_of(path) != "folder":
+            endings = ", ".join(VIDEO_SUFFIXES)
+            raise SinkError(f"{path} ends in {path.suffix}; use {endings}, or a folder for PNG frames")
     except OSError as error:
         raise SinkError(f"{path} cannot be written: {reason(error)}") from error
-    if not is_folder and path.suffix and not named_as_folder:
-        raise SinkError(f"{path} ends in {path.suffix}; use {', '.join(VIDEO_SUFFIXES)}, or a folder for PNG frames")
-    if coding not in FOLDER_CODINGS:
-        raise UsageError(f"coding {coding!r}: {path} is a folder, which holds {', '.join(FOLDER_CODINGS)}")
+    what, held = ("video", CODINGS) if is_video else ("folder", FOLDER_CODINGS)
+    if coding not in held:
+        raise UsageError(f"coding {coding!r}: {path} is a {what}, which holds {', '.join(held)}")
+    if is_video:
+        encoding = find_encoding(coding, encoder, encoder_options)
+        return VideoSink(path, fps=fps, size=size, overwrite=overwrite, encoding=encoding, transfer=transfer, tick=tick)
     if encoder is not None or encoder_options:
         raise UsageError(f"encoder {encoder or ', '.join(encoder_options or ())}: {path} is a folder; name a video")
-    if coding == "16bit":
-        return DeepPngSink(path, overwrite=overwrite, transfer=transfer)
-    return RadianceSink(path, overwrite=overwrite) if coding == "exr" else FolderSink(path, overwrite=overwrite)
+    return FolderSink(path, overwrite=overwrite, coding=coding, transfer=transfer)

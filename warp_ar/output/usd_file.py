@@ -16,13 +16,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from warp_ar.errors import SinkError, UsageError, reason
-from warp_ar.files import write_whole
-from warp_ar.output.exchange_materials import ExchangeMaterial, texture_plan
-from warp_ar.output.shot import FILM_WIDTH, Body, Matrix, Shot, key_frames
+from warp_ar.errors import UsageError
+from warp_ar.files import store
+from warp_ar.output.shot import FILM_WIDTH, Body, ExchangeMaterial, Matrix, Shot, key_frames, texture_plan
 from warp_ar.scene.description import Light
-from warp_ar.scene.materials import RGB
-from warp_ar.scene.mesh_materials import IDENTITY
+from warp_ar.scene.materials import IDENTITY
 from warp_ar.signature import PROGRAM
 
 USD_SUFFIXES = (".usda", ".usdc", ".usd")
@@ -36,7 +34,7 @@ _TENTHS = 10.0
 
 
 def load_usd() -> Any:
-    """The modules of USD.
+    """Return the modules of USD.
 
     Raises:
         UsageError: It is not installed.
@@ -93,15 +91,12 @@ def write_usd(path: Path, shot: Shot) -> list[Path]:
         prim = _write_dome(pxr, stage, f"/shot/lights/environment_{ball}", file)
         prim.SetCustomDataByKey("at", pxr.Gf.Vec3d(*at))
         prim.SetActive(False)
-    try:
-        write_whole(path, lambda part: _export(stage, part), suffix=path.suffix)
-    except OSError as error:
-        raise SinkError(f"{path} cannot be written: {reason(error)}") from error
+    store(path, lambda part: _export(stage, part), suffix=path.suffix)
     return written
 
 
 def _write_dome(pxr: Any, stage: Any, path: str, file: Path) -> Any:
-    """The light of an environment; returns its prim."""
+    """Write the light of an environment; returns its prim."""
     dome = pxr.UsdLux.DomeLight.Define(stage, path)
     dome.CreateIntensityAttr(1.0)
     dome.CreateTextureFileAttr(f"./{file.name}")
@@ -161,7 +156,7 @@ def _write_body(pxr: Any, stage: Any, body: Body, path: Path) -> list[Path]:
     prim.SetNormalsInterpolation(pxr.UsdGeom.Tokens.vertex)
     prim.CreateSubdivisionSchemeAttr(pxr.UsdGeom.Tokens.none)
     prim.CreateExtentAttr(pxr.Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(mesh.bounds)))
-    prim.CreateDoubleSidedAttr(any(material.double_sided for material in body.materials))
+    prim.CreateDoubleSidedAttr(any(material.own.double_sided for material in body.materials))
     primvars = pxr.UsdGeom.PrimvarsAPI(prim)
     for name, coordinates in zip(_COORDINATES, (mesh.uvs, mesh.uvs_second), strict=True):
         if coordinates is not None:
@@ -192,13 +187,9 @@ def _write_materials(pxr: Any, stage: Any, body: Body, prim: Any, path: Path) ->
     for number, material in enumerate(body.materials):
         for kind, picture in material.pictures.items():
             file = plan[number, kind]
-            if file in written:
-                continue
-            try:
-                write_whole(file, picture.encode())
-            except OSError as error:
-                raise SinkError(f"{file} cannot be written: {reason(error)}") from error
-            written[file] = None
+            if file not in written:
+                store(file, picture.encode())
+                written[file] = None
         where = f"/shot/materials/{body.name}" + (f"_{number}" if number else "")
         files = {kind: plan[number, kind] for kind in material.pictures}
         bound = _Material(pxr, stage, where, material, files).write(colored=body.colors is not None)
@@ -216,109 +207,94 @@ class _Material:
 
     def __init__(self, pxr: Any, stage: Any, where: str, material: ExchangeMaterial, files: dict[str, Path]) -> None:
         self._pxr, self._stage, self._where, self._material, self._files = pxr, stage, where, material, files
-        self._names = pxr.Sdf.ValueTypeNames
+        self._types = {"diffuseColor": "Color3f", "emissiveColor": "Color3f", "specularColor": "Color3f"}
+        self._types |= {"normal": "Normal3f", "useSpecularWorkflow": "Int"}
         self._surface = self._shader("surface", "UsdPreviewSurface")
 
     def write(self, *, colored: bool) -> Any:
-        """The material; ``colored``: where no picture does, the mesh's ``displayColor`` gives the base colour."""
-        material, names = self._material, self._names
-        own, black = material.base_color, (0.0, 0.0, 0.0)
+        """Return the material; with ``colored`` the mesh's ``displayColor`` is the base colour where no picture is."""
+        material, own, files = self._material, self._material.own, self._files
         if material.specular is not None:
-            self._surface.CreateInput("useSpecularWorkflow", names.Int).Set(1)
-            self._surface.CreateInput("specularColor", names.Color3f).Set(self._pxr.Gf.Vec3f(*material.specular))
+            self._set("useSpecularWorkflow", 1)
+            self._set("specularColor", self._pxr.Gf.Vec3f(*material.specular))
         # What is shown as it is neither reflects nor waits for light.
-        shown = "emissiveColor" if material.unlit else "diffuseColor"
-        if material.unlit:
-            self._color("diffuseColor", black)
-        if colored and material.texture is None:
-            self._read_vertex_colors(shown)
+        shown = "emissiveColor" if own.unlit else "diffuseColor"
+        if own.unlit:
+            self._set("diffuseColor", self._pxr.Gf.Vec3f(0.0))
+        if "" in files:
+            self._read("", {shown: "rgb"}, (*material.base_color, own.opacity), space="sRGB")
+        elif colored:
+            reader = self._shader("colors", "UsdPrimvarReader_float3")
+            reader.CreateInput("varname", self._pxr.Sdf.ValueTypeNames.String).Set("displayColor")
+            self._connect(shown, reader, "result", "Float3")
         else:
-            self._color(shown, own, "")
-        if any(material.emission) and not material.unlit:
-            self._color("emissiveColor", material.emission, "emission")
-        self._set_lobe()
-        self._set_relief()
-        self._set_alpha()
-        material = self._pxr.UsdShade.Material.Define(self._stage, self._where)
-        material.CreateSurfaceOutput().ConnectToSource(self._surface.ConnectableAPI(), "surface")
-        return material
+            self._set(shown, self._pxr.Gf.Vec3f(*material.base_color))
+        if "emission" in files and not own.unlit:
+            self._read("emission", {"emissiveColor": "rgb"}, (*own.emission, 1.0), space="sRGB")
+        elif any(own.emission) and not own.unlit:
+            self._set("emissiveColor", self._pxr.Gf.Vec3f(*own.emission))
+        if "metallic_roughness" in files:
+            factors = (1.0, material.roughness, material.metallic, 1.0)
+            self._read("metallic_roughness", {"roughness": "g", "metallic": "b"}, factors)
+        else:
+            self._set("roughness", material.roughness)
+            self._set("metallic", material.metallic)
+        if "normal" in files:
+            s = own.normal_scale
+            self._read("normal", {"normal": "rgb"}, (2.0 * s, 2.0 * s, 2.0, 1.0), (-s, -s, -1.0, 0.0))
+        if "occlusion" in files:
+            s = own.occlusion_strength
+            self._read("occlusion", {"occlusion": "r"}, (s, s, s, 1.0), (1.0 - s, 1.0 - s, 1.0 - s, 0.0))
+        if own.alpha != "opaque" and "" in files:
+            texture = self._pxr.UsdShade.Shader.Get(self._stage, f"{self._where}/texture")
+            self._connect("opacity", texture, "a", "Float")
+        elif own.alpha != "opaque":
+            self._set("opacity", own.opacity)
+        if own.alpha == "mask":
+            self._set("opacityThreshold", own.cutoff)
+        made = self._pxr.UsdShade.Material.Define(self._stage, self._where)
+        made.CreateSurfaceOutput().ConnectToSource(self._surface.ConnectableAPI(), "surface")
+        return made
 
     def _shader(self, name: str, kind: str) -> Any:
         shader = self._pxr.UsdShade.Shader.Define(self._stage, f"{self._where}/{name}")
         shader.CreateIdAttr(kind)
         return shader
 
-    def _color(self, name: str, factor: RGB, kind: str | None = None) -> None:
-        entry = self._surface.CreateInput(name, self._names.Color3f)
-        if kind is None or kind not in self._files:
-            entry.Set(self._pxr.Gf.Vec3f(*factor))
-            return
-        opacity = 1.0 if kind else self._material.opacity
-        texture = self._texture(kind, (*factor, opacity), (0.0,) * 4, "sRGB")
-        entry.ConnectToSource(texture.CreateOutput("rgb", self._names.Float3))
+    def _input(self, name: str) -> Any:
+        kind = getattr(self._pxr.Sdf.ValueTypeNames, self._types.get(name, "Float"))
+        return self._surface.CreateInput(name, kind)
 
-    def _read_vertex_colors(self, name: str) -> None:
-        reader = self._shader("colors", "UsdPrimvarReader_float3")
-        reader.CreateInput("varname", self._names.String).Set("displayColor")
-        entry = self._surface.CreateInput(name, self._names.Color3f)
-        entry.ConnectToSource(reader.CreateOutput("result", self._names.Float3))
+    def _set(self, name: str, value: Any) -> None:
+        self._input(name).Set(value)
 
-    def _set_lobe(self) -> None:
-        material = self._material
-        values = {"roughness": ("g", material.roughness), "metallic": ("b", material.metallic)}
-        entries = {name: self._surface.CreateInput(name, self._names.Float) for name in values}
-        if material.metallic_roughness is None:
-            for name, (_, value) in values.items():
-                entries[name].Set(value)
-            return
-        factors = (1.0, material.roughness, material.metallic, 1.0)
-        texture = self._texture("metallic_roughness", factors, (0.0,) * 4, "raw")
-        for name, (channel, _) in values.items():
-            entries[name].ConnectToSource(texture.CreateOutput(channel, self._names.Float))
+    def _connect(self, name: str, shader: Any, output: str, kind: str) -> None:
+        self._input(name).ConnectToSource(shader.CreateOutput(output, getattr(self._pxr.Sdf.ValueTypeNames, kind)))
 
-    def _set_relief(self) -> None:
-        material = self._material
-        if material.normal is not None:
-            s = material.normal_scale
-            texture = self._texture("normal", (2.0 * s, 2.0 * s, 2.0, 1.0), (-s, -s, -1.0, 0.0), "raw")
-            entry = self._surface.CreateInput("normal", self._names.Normal3f)
-            entry.ConnectToSource(texture.CreateOutput("rgb", self._names.Float3))
-        if material.occlusion is not None:
-            s = material.occlusion_strength
-            texture = self._texture("occlusion", (s, s, s, 1.0), (1.0 - s, 1.0 - s, 1.0 - s, 0.0), "raw")
-            entry = self._surface.CreateInput("occlusion", self._names.Float)
-            entry.ConnectToSource(texture.CreateOutput("r", self._names.Float))
-
-    def _set_alpha(self) -> None:
-        material = self._material
-        if material.alpha == "opaque":
-            return
-        entry = self._surface.CreateInput("opacity", self._names.Float)
-        if "" in self._files:
-            texture = self._pxr.UsdShade.Shader.Get(self._stage, f"{self._where}/texture")
-            entry.ConnectToSource(texture.CreateOutput("a", self._names.Float))
-        else:
-            entry.Set(material.opacity)
-        if material.alpha == "mask":
-            self._surface.CreateInput("opacityThreshold", self._names.Float).Set(material.cutoff)
-
-    def _texture(self, kind: str, scale: Sequence[float], bias: Sequence[float], space: str) -> Any:
-        """A picture, read by its texture coordinates, times ``scale`` and plus ``bias``."""
-        picture, names, gf = self._material.pictures[kind], self._names, self._pxr.Gf
+    def _read(
+        self,
+        kind: str,
+        entries: dict[str, str],
+        scale: Sequence[float],
+        bias: Sequence[float] | None = None,
+        space: str = "raw",
+    ) -> None:
+        """Connect inputs to channels of a picture, read by its texture coordinates, times ``scale`` plus ``bias``."""
+        picture, names, gf = self._material.pictures[kind], self._pxr.Sdf.ValueTypeNames, self._pxr.Gf
         name = kind or "texture"
         texture = self._shader(name, "UsdUVTexture")
         texture.CreateInput("file", names.Asset).Set(f"./{self._files[kind].name}")
         texture.CreateInput("sourceColorSpace", names.Token).Set(space)
         texture.CreateInput("scale", names.Float4).Set(gf.Vec4f(*scale))
-        if any(bias):
+        if bias is not None:
             texture.CreateInput("bias", names.Float4).Set(gf.Vec4f(*bias))
-        for entry, wrap in zip(("wrapS", "wrapT"), picture.wrap, strict=True):
+        for entry, wrap in zip(("wrapS", "wrapT"), picture.use.wrap, strict=True):
             texture.CreateInput(entry, names.Token).Set(wrap)
-        coordinates = _COORDINATES[picture.uv_set]
+        coordinates = _COORDINATES[picture.use.uv_set]
         reader = self._shader(coordinates, "UsdPrimvarReader_float2")
         reader.CreateInput("varname", names.String).Set(coordinates)
         source = reader.CreateOutput("result", names.Float2)
-        if picture.transform != IDENTITY:
+        if picture.use.transform != IDENTITY:
             across, up, turn, c, f = picture.placing
             place = self._shader(f"{name}_place", "UsdTransform2d")
             place.CreateInput("in", names.Float2).ConnectToSource(source)
@@ -327,7 +303,8 @@ class _Material:
             place.CreateInput("translation", names.Float2).Set(gf.Vec2f(c, f))
             source = place.CreateOutput("result", names.Float2)
         texture.CreateInput("st", names.Float2).ConnectToSource(source)
-        return texture
+        for entry, channel in entries.items():
+            self._connect(entry, texture, channel, "Float3" if channel == "rgb" else "Float")
 
 
 def _write_light(pxr: Any, stage: Any, where: str, light: Light, shot: Shot) -> None:

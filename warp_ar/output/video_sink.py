@@ -6,8 +6,10 @@ all but about its last second; `close` turns MP4 and MOV into the ordinary form 
 
 from __future__ import annotations
 
+import contextlib
 import fractions
 import math
+import os
 import pathlib
 from collections.abc import Mapping
 from typing import Any
@@ -20,16 +22,16 @@ import numpy.typing as npt
 from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
 
 from warp_ar.errors import SinkError, UsageError, reason
+from warp_ar.files import create_new, name_aside, take_name
 from warp_ar.output.encoders import Encoding, find_encoding, last_packets
 from warp_ar.output.places import check_replaceable
-from warp_ar.output.sink import ThreadedSink, check_image, check_radiance, make_folder
-from warp_ar.output.whole_fragments import WholeFragments
+from warp_ar.output.sink import ThreadedSink, check_image, make_folder
 from warp_ar.signals import REC_709, REC_2020, converted, hlg_of_light, pq_of_light
 from warp_ar.signature import PROGRAM
 
 _FORMATS = {".mp4": "mp4", ".mkv": "matroska", ".mov": "mov"}
 VIDEO_SUFFIXES = tuple(_FORMATS)
-"""What `VideoSink` writes."""
+"""Endings of a video's name."""
 
 FRAGMENT_SECONDS = 0.5
 """Longest time between key frames, and so between the fragments that reach the disk."""
@@ -48,6 +50,12 @@ _MPEG4_TICKS = 60000
 """Ticks a second of MPEG-4 part 2, which counts them in 16 bits."""
 _FULL_CHROMA = "yuv444p10le"
 _WORDS = {"libx264": "H.264", "libx265": "H.265"}
+
+
+_MEDIA = {True: b"mdat", False: b"\x1f\x43\xb6\x75"}
+"""First bytes of pictures: a box of MP4, a cluster of Matroska."""
+_SEEK_SIZE = 0x10000
+"""FFmpeg's way to ask for the size of a file."""
 
 
 class VideoSink(ThreadedSink):
@@ -112,24 +120,20 @@ class VideoSink(ThreadedSink):
         self._file: WholeFragments | None = None
         self._stream: Any = None
         self._converter: Any = None
-        self.description = f"{self._path} ({self._words}, {fps:g} fps)"
         super().__init__(1)
         if size is not None:
             self._shape = (size[1], size[0], 3)
-            self._describe()
+        self._describe()
 
     def _describe(self) -> None:
-        assert self._shape is not None
-        height, width = self._shape[:2]
-        self.description = f"{self._path} ({self._words}, {width}x{height}, {self._fps:g} fps)"
+        height, width = (self._shape or (0, 0))[:2]
+        size = f"{width}x{height}, " if self._shape else ""
+        self.description = f"{self._path} ({self._words}, {size}{self._fps:g} fps)"
         if height % 2 or width % 2:
             self.description += f", padded to {width + width % 2}x{height + height % 2}: 4:2:0 needs even sizes"
 
     def _check(self, image: Any) -> None:
-        if self._encoding.coding == "8bit":
-            check_image(image)
-        else:
-            check_radiance(image)
+        check_image(image, np.uint8 if self._encoding.coding == "8bit" else np.float32)
 
     def write(self, image: npt.NDArray[Any]) -> None:
         """Take the next frame; the first one settles the size."""
@@ -181,33 +185,28 @@ class VideoSink(ThreadedSink):
             self._converter.push(picture)
             picture = self._converter.pull()
             self._container.mux(self._stream.encode(picture))
-            self._check_file()
+            self._file.check()  # type: ignore[union-attr]
         except (av.FFmpegError, OSError) as error:
             self._broken = True
             raise SinkError(f"{self._path}: frame {index} cannot be written: {reason(error)}") from error
 
-    def _check_file(self) -> None:
-        if self._file is not None and self._file.error is not None:
-            raise self._file.error
-
     def _finish(self) -> None:
-        container, self._container = self._container, None
+        if self._file is None or self._container is None:
+            return
         try:
             try:
-                if container is not None and not self._broken:
-                    container.mux(last_packets(self._stream, self._count))
+                if not self._broken:
+                    self._container.mux(last_packets(self._stream, self._count))
             finally:
-                if container is not None:
-                    container.close()
-                if self._file is not None:
-                    self._file.close()
-            self._check_file()
+                self._container.close()
+                self._file.close()
+            self._file.check()
         except (av.FFmpegError, OSError) as error:
             # After a frame that could not be written, the end cannot be either: once is enough.
             if self._error is None:
                 raise SinkError(f"{self._path} cannot be finished: {reason(error)}") from error
         finally:
-            if self._broken or (self._file is not None and self._file.error is not None):
+            if self._broken or self._file.error is not None:
                 self.written = _count_frames(self._path)
 
 
@@ -312,3 +311,138 @@ def yuv_picture(signal: npt.NDArray[np.float64], coding: str) -> av.VideoFrame:
         rows[:, : plane.width] = np.rint(np.clip(value, 4.0, 1019.0)).astype(np.uint16)
         plane.update(rows.tobytes())
     return picture
+
+
+class WholeFragments:
+    """File through which FFmpeg writes a video.
+
+    The file is made aside and takes its name with its first fragment, so that what stood there stays until then.
+    Boxes of MP4 and MOV (a fragment is two, ``moof`` and ``mdat``) are kept back until they are complete and written at
+    once; one that does not fit onto the disk is cut off again. Matroska, whose readers take a cut-off end for the end,
+    is written as it comes. What goes wrong is kept in ``error``, for FFmpeg goes on all the same.
+    """
+
+    def __init__(self, path: pathlib.Path, *, boxes: bool) -> None:
+        """Make the file.
+
+        Args:
+            path: Its name at last.
+            boxes: Whether it is made of boxes, as MP4 and MOV are.
+
+        Raises:
+            OSError: It cannot be made.
+        """
+        self._path, self._boxes = pathlib.Path(os.path.realpath(path)), boxes
+        part = name_aside(self._path)
+        self._part: pathlib.Path | None = part
+        try:
+            self._file = create_new(part)
+        except BaseException:  # a signal, when the file may be there already
+            with contextlib.suppress(OSError):
+                part.unlink()
+            raise
+        self._pending = bytearray()
+        self._start = self._size = self._at = 0  # of what is pending; of the file; where FFmpeg is
+        self._closed = False
+        self.error: OSError | None = None
+        """Error that ended the writing; nothing has been written since."""
+
+    def write(self, data: bytes) -> int:
+        """Take bytes at the current place."""
+        if self.error is not None:
+            return len(data)
+        if self._at != self._start + len(self._pending):
+            self._flush(everything=True)
+            self._start = self._at
+        self._pending += data
+        self._at += len(data)
+        self._flush(everything=not self._boxes or self._start < self._size)
+        return len(data)
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        """Go to a place, or tell the size."""
+        size = max(self._size, self._start + len(self._pending))
+        if whence == _SEEK_SIZE:
+            return size
+        self._at = offset + {os.SEEK_SET: 0, os.SEEK_CUR: self._at, os.SEEK_END: size}[whence]
+        return self._at
+
+    def tell(self) -> int:
+        """Return FFmpeg's place in the file."""
+        return self._at
+
+    def read(self, size: int = -1) -> bytes:
+        """Read at the current place: FFmpeg reads back what it finishes."""
+        self._flush(everything=True)
+        data = os.pread(self._file, max(self._size - self._at, 0) if size < 0 else size, self._at)
+        self._at += len(data)
+        return data
+
+    def _flush(self, *, everything: bool) -> None:
+        length = len(self._pending) if everything else _whole_boxes(self._pending)
+        if not length:
+            return
+        data = bytes(self._pending[:length])
+        try:
+            written = 0
+            while written < length:
+                written += os.pwrite(self._file, data[written:], self._start + written)
+        except OSError as error:
+            self.error = error
+            with contextlib.suppress(OSError):
+                os.ftruncate(self._file, self._size)
+            return
+        del self._pending[:length]
+        self._start += length
+        self._size = max(self._size, self._start)
+        if self._part is not None and (_MEDIA[self._boxes] in data):
+            # Where an open file cannot be renamed, it takes its name when it is closed.
+            with contextlib.suppress(PermissionError):
+                take_name(self._part, self._path)
+                self._part = None
+
+    def check(self) -> None:
+        """Raise what ended the writing, if anything did.
+
+        Raises:
+            OSError: The file could not be written on.
+        """
+        if self.error is not None:
+            raise OSError(*self.error.args) from self.error
+
+    def close(self) -> None:
+        """Write what is left and let the file go; one that holds nothing is removed."""
+        if self._closed:
+            return
+        self._closed = True
+        if self.error is None:
+            self._flush(everything=True)
+        own = os.fstat(self._file)
+        os.close(self._file)
+        try:
+            if self._part is not None and self._size and self.error is None:
+                take_name(self._part, self._path)
+            elif self._part is not None:
+                self._part.unlink(missing_ok=True)
+            elif not os.path.samestat(own, os.stat(self._path)):
+                raise OSError("another file took its name while it was written, as by a second run with this output")
+        except FileNotFoundError:
+            self.error = self.error or OSError("it, or its folder, was removed while it was written")
+        except OSError as error:
+            self.error = self.error or error
+
+
+def _whole_boxes(data: bytearray) -> int:
+    """Bytes of complete boxes at the start; a ``moof`` waits for the ``mdat`` behind it."""
+    at = whole = 0
+    while at + 8 <= len(data):
+        size = int.from_bytes(data[at : at + 4], "big")
+        kind = bytes(data[at + 4 : at + 8])
+        if size == 1 and at + 16 <= len(data):
+            size = int.from_bytes(data[at + 8 : at + 16], "big")
+        if size < 8 or at + size > len(data):
+            break
+        at += size
+        if kind != b"moof":
+            whole = at
+    return whole

@@ -59,8 +59,15 @@ FEATURELESS = 6.0
 """Standard deviation of codes below which a picture shows nothing."""
 MOVED = 0.75
 """Correlation over well exposed pixels below which a picture shows something else."""
+RELIT = 0.1
+"""Logarithm by which places that looked alike may come to differ: 0.03 under the same light."""
+GAMMAS = (0.9, 2.7)
+"""Gamma at code 40 between which cameras' responses are: 1 is linear, sRGB has 2.1."""
 HATS = 8
 """Unknowns of a response: values at codes evenly spaced in (c / 255)^(1 / 2)."""
+
+
+_LOG_SRGB = np.log(np.maximum(decode_table("srgb")[:, 1].astype(float), 1e-4))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,11 +75,25 @@ class Aligned:
     """Pictures of one ball laid over each other."""
 
     circles: tuple[Circle, ...]
-    """Where the ball is in each: column, row, radius in pixels."""
+    """Place of the ball in each: column, row, radius in pixels."""
     patches: tuple[Image, ...]
     """The balls, all of one size and place, uint8 RGB."""
     correlation: tuple[float, ...]
-    """Of each with its neighbour toward the first; 1 for the first, NaN where too little is well exposed in both."""
+    """Of each with the one that it was laid over; 1 for the anchor, NaN where too little is well exposed in both."""
+    changed: tuple[float, ...]
+    """Of each against the same, the factor by which places that looked alike came to differ, as a logarithm; NaN where
+    too little is well exposed in both."""
+
+    @property
+    def strangers(self) -> tuple[str, ...]:
+        """Reason for each picture to be left out; empty where there is none."""
+        return tuple(map(_stranger, self.correlation, self.changed))
+
+
+def _stranger(alike: float, changed: float) -> str:
+    if alike < MOVED and not changed <= RELIT:
+        return f"it shows something else ({alike:.0%} alike)"
+    return f"its light is another, by {math.expm1(changed):.0%} from place to place" if changed > RELIT else ""
 
 
 def cut_ball(image: Image, circle: Circle, size: int) -> Image:
@@ -176,37 +197,68 @@ def register(reference: Image, other: Image, disc: NDArray[np.bool_]) -> tuple[A
     return move, alike(move)
 
 
-def align(images: Sequence[Image], circles: Sequence[Circle], exposures: Sequence[float] | None = None) -> Aligned:
-    """Lay pictures of one ball over each other, each over its neighbour toward the first.
+def align(
+    images: Sequence[Image], circles: Sequence[Circle], exposures: Sequence[float] | None = None, anchor: int = 0
+) -> Aligned:
+    """Lay pictures of one ball over each other, each over the anchor.
+
+    One that shows another thing, or shares too little with it, is laid over the nearest in exposure that was well laid
+    before: what is wrong with a picture spoils no other.
 
     Args:
         images: uint8 RGB, in order of exposure.
-        circles: About where the ball is in each.
+        circles: About where the ball is in each; exact for the anchor.
         exposures: Of each, if known: pictures more than ``FAR`` apart have nothing in common to be aligned by.
+        anchor: Number of the picture that the others are laid over.
     """
-    size = int(min(PATCH, max(48, 2.1 * circles[0][2])))
+    size = int(min(PATCH, max(48, 2.1 * circles[anchor][2])))
+    disc = _disc(size)
+    times = exposures or [1.0] * len(images)
+    found = list(circles)
+    patches = [cut_ball(image, circle, size) for image, circle in zip(images, circles, strict=True)]
+    correlation, changed = [math.nan] * len(images), [math.nan] * len(images)
+    correlation[anchor], good = 1.0, [anchor]
+    for k in sorted(set(range(len(images))) - {anchor}, key=lambda k: abs(k - anchor)):
+        (x, y, radius), rough = circles[k], patches[k]
+        for base in (anchor, *sorted(good[1:], key=lambda other: abs(k - other))):
+            if abs(math.log(times[k] / times[base])) > math.log(FAR):
+                continue
+            move, told = register(patches[base], rough, disc)
+            if math.isnan(told) or told < correlation[k]:
+                continue
+            pixel = 2.1 * radius / size
+            found[k] = x + pixel * move[0], y + pixel * move[1], radius * math.exp(move[2])
+            patches[k] = cut_ball(images[k], found[k], size)
+            correlation[k], changed[k] = told, _change(patches[base], patches[k])
+            if not _stranger(told, changed[k]):
+                good.append(k)
+                break
+    return Aligned(tuple(found), tuple(patches), tuple(correlation), tuple(changed))
+
+
+def _disc(size: int) -> NDArray[np.bool_]:
+    """Pixels of a ball in its square, but for the rim."""
     rows, columns = np.mgrid[:size, :size] - (size - 1) / 2
-    disc = np.hypot(rows, columns) < 0.93 * size / 2.1
-    found, patches, correlation = [circles[0]], [cut_ball(images[0], circles[0], size)], [1.0]
-    for k, (image, (x, y, radius)) in enumerate(zip(images[1:], circles[1:], strict=True)):
-        apart = 1.0 if exposures is None else abs(math.log(exposures[k] / exposures[k + 1]))
-        if apart > math.log(FAR):
-            found.append((x, y, radius))
-            patches.append(cut_ball(image, (x, y, radius), size))
-            correlation.append(math.nan)
-            continue
-        move, told = register(patches[-1], cut_ball(image, (x, y, radius), size), disc)
-        pixel = 2.1 * radius / size
-        circle = x + pixel * move[0], y + pixel * move[1], radius * math.exp(move[2])
-        found.append(circle)
-        patches.append(cut_ball(image, circle, size))
-        correlation.append(told)
-    return Aligned(tuple(found), tuple(patches), tuple(correlation))
+    return np.asarray(np.hypot(rows, columns) < 0.93 * size / 2.1)
+
+
+def _change(first: Image, other: Image) -> float:
+    """Return by how much places as bright as each other in one picture differ in the other, as a logarithm.
+
+    The tone curve drops out. Light that comes from elsewhere does not.
+    """
+    (u, v), *_ = _collect((first, other))
+    if len(u) < LEAST_PIXELS:
+        return math.nan
+    level = (u.mean(1) / 8).astype(int)
+    ratio = (_LOG_SRGB[v.astype(int)] - _LOG_SRGB[u.astype(int)]).mean(1)
+    middle = np.array([np.median(ratio[level == k]) if (level == k).any() else 0.0 for k in range(32)])
+    return 1.4826 * float(np.median(np.abs(ratio - middle[level])))
 
 
 @dataclasses.dataclass(frozen=True)
 class Ratios:
-    """What pixels say of the ratios of neighbouring exposures."""
+    """Ratios that pixels tell, of neighbouring exposures."""
 
     pairs: tuple[tuple[Array, Array], ...]
     """Codes (m, 3) well exposed in both pictures of each neighbouring pair."""
@@ -217,9 +269,7 @@ class Ratios:
 
 
 def _collect(patches: Sequence[Image]) -> tuple[tuple[Array, Array], ...]:
-    size = len(patches[0])
-    rows, columns = np.mgrid[:size, :size] - (size - 1) / 2
-    disc = np.hypot(rows, columns) < 0.93 * size / 2.1
+    disc = _disc(len(patches[0]))
     smooth = [cv2.GaussianBlur(patch, (0, 0), 1.5) for patch in patches]
     # Beside edges a misalignment makes a ratio of its own.
     plain = [
@@ -306,12 +356,24 @@ class Exposures:
     curve: Array | None
     """Linear value of each code, (256, 3), where sRGB does not hold; else None."""
     notes: tuple[str, ...]
-    """What a user should know, a line each."""
+    """Notes that a user should know, a line each."""
 
 
 def _off(claimed: Sequence[float], seen: Sequence[float]) -> float:
     """Largest logarithm by which a step is off what the pixels say."""
     return max((abs(math.log(c / s)) for c, s in zip(claimed, seen, strict=True) if math.isfinite(s)), default=0.0)
+
+
+def _wrong_one(claim: Sequence[float], seen: Sequence[float]) -> tuple[int, float] | None:
+    """Return the number of the picture whose claim alone is wrong, and by how much: the pixels bear out all others."""
+    off = [math.log(c / s) if math.isfinite(s) else 0.0 for c, s in zip(claim, seen, strict=True)]
+    if len(off) < 3 or max(map(abs, off)) < CONTRADICTS:
+        return None
+    total = np.cumsum([0.0, *off])
+    wrong = [k for k in range(len(total)) if np.abs(np.diff(np.delete(total, k))).max() <= HOLDS]
+    if len(wrong) != 1:
+        return None
+    return wrong[0], math.exp(total[wrong[0]] - total[wrong[0] - 1 if wrong[0] else 1])
 
 
 def _total(steps: Sequence[float]) -> float:
@@ -323,7 +385,7 @@ def _number(value: float) -> str:
 
 
 def _believed(steps: dict[str, tuple[float, ...]], seen: Sequence[float], figures: str) -> tuple[str, list[str]]:
-    """Which of the claims holds, by its name, and what is to be said of it.
+    """Return which of the claims holds, by its name, and what is to be said of it.
 
     Raises:
         UsageError: EXIF and names contradict each other, and the pixels bear out neither.
@@ -346,6 +408,7 @@ def agree_exposures(
     exif: Sequence[float] | None,
     names: Sequence[float] | None,
     given: Sequence[float] | None = None,
+    labels: Sequence[str] = (),
 ) -> Exposures:
     """Find out which exposures hold.
 
@@ -355,6 +418,7 @@ def agree_exposures(
         exif: Exposure of each by its EXIF, None where it does not tell.
         names: The same by the files' names.
         given: The same as the user gives them, before which the others have no say.
+        labels: Names of the pictures.
 
     Raises:
         UsageError: EXIF, names and pixels contradict each other; the message has all figures.
@@ -383,6 +447,15 @@ def agree_exposures(
     claim = steps[best]
     ratios = tuple(np.cumprod([1.0, *claim]).tolist())
     off = _off(claim, seen.steps)
+    wrong = _wrong_one(claim, seen.steps)
+    if wrong is not None:
+        which, times = wrong
+        notes.append(
+            f"{labels[which] if labels else f'picture {which + 1}'}: {best} give{'s' * (best == 'EXIF')} it "
+            f"{_number(times)} times the exposure that pixels tell, and all others agree: the pixels are believed"
+        )
+        ratios = tuple(ratio / times if k == which else ratio for k, ratio in enumerate(ratios))
+        return Exposures(tuple(ratio / ratios[0] for ratio in ratios), None, tuple(notes))
     if off <= HOLDS:
         return Exposures(ratios, None, tuple(notes))
     bent = estimate_response(seen, claim)
@@ -398,13 +471,19 @@ def agree_exposures(
         f"the response is not {transfer} (off by {math.exp(off):.2f} in one step, {_number(float(dark))} times at code "
         "40): it was estimated from the bracket"
     )
+    gamma = math.log(bent.curve[40, 1]) / math.log(40 / 255)
+    if not GAMMAS[0] <= gamma <= GAMMAS[1]:
+        notes.append(
+            f"no known camera has this response: gamma {gamma:.1f} in the darks, not {GAMMAS[0]} to {GAMMAS[1]}; "
+            f"if a time is wrong instead, {transfer} holds, and --exposures pixels is right ({figures} times)"
+        )
     return Exposures(ratios, bent.curve, tuple(notes))
 
 
 def thin_exposures(
     ratios: Sequence[float], shown: int, names: Sequence[str]
 ) -> tuple[tuple[int, ...], tuple[str, ...]]:
-    """Which pictures of a bracket to use: of those that are within ``WAVERING`` of each other, one.
+    """Return which pictures of a bracket to use: of those that are within ``WAVERING`` of each other, one.
 
     Args:
         ratios: Exposures.

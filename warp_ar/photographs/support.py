@@ -1,17 +1,29 @@
-"""The plane that a ball stands on, from what a hand picks in one photograph: the camera's pose without a marker."""
+"""The plane that things stand on, from what a hand picks in one photograph: the camera's pose without a marker."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from warp_ar.errors import UsageError
-from warp_ar.scene import Camera, Pose
+from warp_ar.scene import (
+    Camera,
+    CapturedLight,
+    LambertMaterial,
+    MetallicRoughnessMaterial,
+    Object,
+    Pose,
+    PoseSpec,
+    Proxy,
+    Scene,
+    SourceSpec,
+)
 from warp_ar.scene.pixel_rays import undistorted
 
 Array = NDArray[np.float64]
@@ -26,7 +38,83 @@ class Support:
     tilt_deviation: float
     """Standard deviation of the plane's normal, degrees."""
     error: float
-    """Pixels by which the picked points miss the plane's rectangle; 0 where nothing is left over to tell."""
+    """Pixels by which the picked points miss those of the plane; 0 where nothing is left over to tell."""
+
+    def radius_of(self, sphere: Sequence[float]) -> float:
+        """Return the radius of a ball that stands on the plane, from its centre in the camera's frame over its radius.
+
+        Of all balls r sphere on the same rays it is the one whose centre is r above the plane.
+        """
+        up = self.pose.rotation[:, 2]
+        return max(float(up @ self.pose.translation / (up @ np.array(sphere) - 1.0)), 1e-3)
+
+
+def plane_from_points(camera: Camera, points: Sequence[Sequence[float]], pixels: Sequence[Sequence[float]]) -> Support:
+    """The plane z = 0 of a world in which points are known, from the pixels that show them.
+
+    Args:
+        camera: The camera.
+        points: Four or more, metres, z up.
+        pixels: Column and row of each.
+
+    Raises:
+        UsageError: No camera sees the points like that.
+    """
+    world, seen = np.array(points, float), np.array(pixels, float)
+    matrix, bent = camera.matrix(), np.array(camera.distortion)
+    found, turn, translation = cv2.solvePnP(world, seen, matrix, bent, flags=cv2.SOLVEPNP_SQPNP)
+    if not found:
+        raise UsageError("no camera sees these points at these pixels; is one of them another?")
+    turn, translation = cv2.solvePnPRefineLM(world, seen, matrix, bent, turn, translation)
+    off = cv2.projectPoints(world, turn, translation, matrix, bent)[0][:, 0] - seen
+    pose = Pose(cv2.Rodrigues(turn)[0], translation.ravel())
+    return Support(pose, math.nan, float(np.sqrt((off**2).sum(1).mean())))
+
+
+def focal_range(camera: Camera, find: Callable[[Camera], Support], picked: float = 1.0) -> tuple[Camera, float, float]:
+    """Return a camera with the focal length under which picked points fit best, and the least and the largest that fit.
+
+    Args:
+        camera: Its focal length is not known.
+        find: Finds the plane under a camera.
+        picked: Pixels by which points may miss more than under the best.
+    """
+    lengths = math.hypot(camera.width, camera.height) * np.geomspace(0.4, 8.0, 121)
+    tried = [dataclasses.replace(camera, fx=float(f), fy=float(f)) for f in lengths]
+    errors = np.array([find(one).error for one in tried])
+    fits = lengths[errors <= errors.min() + picked]
+    return tried[int(errors.argmin())], float(fits.min()), float(fits.max())
+
+
+def scene_on(
+    support: Support, camera: Camera, picture: Path, light: CapturedLight, at: tuple[float, float], unit: float
+) -> Scene:
+    """Return a scene that shows a photograph, with a mirror and a chalk ball to either side of a place on the plane.
+
+    Args:
+        support: The plane.
+        camera: Of the photograph.
+        picture: The photograph.
+        light: What lights the balls.
+        at: The place, x and y.
+        unit: Radius of the balls.
+    """
+    (x, y), (a, b, c) = at, map(float, support.pose.translation)
+    metal, chalk = MetallicRoughnessMaterial((0.95, 0.95, 0.95), 1.0, 0.05), LambertMaterial((0.8, 0.8, 0.8))
+    balls = [
+        Object("sphere", radius=unit, at=(x + side * 3.0 * unit, y, unit), material=material)
+        for side, material in ((1.0, metal), (-1.0, chalk))
+    ]
+    return Scene(
+        camera=camera,
+        name=light.file.stem,
+        source=SourceSpec(path=picture.resolve()),
+        proxies=(Proxy("plane", at=(x, y, 0.0), size=(40.0 * unit, 40.0 * unit)),),
+        objects=tuple(balls),
+        captured=light,
+        pose=PoseSpec(((tuple(map(float, support.pose.rotation.reshape(-1))), (a, b, c)),)),
+        has_marker=False,
+    )
 
 
 def plane_from_rectangle(

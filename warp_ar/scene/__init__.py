@@ -21,8 +21,8 @@ from warp_ar.scene.description import (
     ProxyMaterial,
     Scene,
     SourceSpec,
-    Vec3,
 )
+from warp_ar.scene.fields import Vec3
 from warp_ar.scene.materials import (
     RGB,
     Color,
@@ -34,7 +34,7 @@ from warp_ar.scene.materials import (
     MirrorMaterial,
     PhongMaterial,
 )
-from warp_ar.scene.object_materials import object_from_trimesh
+from warp_ar.scene.object_materials import object_at, object_from_trimesh
 from warp_ar.scene.pose import Pose
 from warp_ar.scene.reader import bundled_scenes, load_scene, loads_scene
 from warp_ar.scene.writer import dumps_scene
@@ -75,5 +75,6 @@ __all__ = [
     "load_calibration",
     "load_scene",
     "loads_scene",
+    "object_at",
     "object_from_trimesh",
 ]

@@ -15,20 +15,10 @@ import numpy.typing as npt
 
 from warp_ar.kernels import structs
 from warp_ar.scene.description import Object
-from warp_ar.scene.emissive_picture import load_emission
 from warp_ar.scene.geometry import Mesh
-from warp_ar.scene.materials import (
-    RGB,
-    Color,
-    EmissiveMaterial,
-    LambertMaterial,
-    MetallicRoughnessMaterial,
-    MirrorMaterial,
-    PhongMaterial,
-)
-from warp_ar.scene.mesh_materials import MeshMaterial, TextureUse
+from warp_ar.scene.materials import RGB, Color, EmissiveMaterial, MeshMaterial, TextureUse
 from warp_ar.scene.object_materials import is_closed, materials_of
-from warp_ar.scene.texture_codes import linear_texture
+from warp_ar.scene.textures import linear_texture, load_emission
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -42,7 +32,7 @@ _LARGEST: Final = 256
 
 
 class AreaTable(NamedTuple):
-    """What the area lights of ``structs.RayScene`` are made from."""
+    """Input of the area lights of ``structs.RayScene``."""
 
     lights: npt.NDArray[Any]
     """Records of ``structs.AreaLight``, one per object that emits."""
@@ -53,12 +43,12 @@ class AreaTable(NamedTuple):
 
 
 def emits(material: MeshMaterial) -> bool:
-    """Whether a material sends out light of its own."""
+    """Return whether a material sends out light of its own."""
     return material.unlit or any(material.emission)
 
 
 def emits_light(item: Object) -> bool:
-    """Whether an object is a light.
+    """Return whether an object is a light.
 
     Raises:
         SceneError: Its mesh cannot be read.
@@ -104,7 +94,7 @@ def make_area_table(objects: Sequence[Object], meshes: Sequence[Mesh | None]) ->
 
 
 def _varies(item: Object) -> bool:
-    """Whether emission varies within triangles."""
+    """Return whether emission varies within triangles."""
     if isinstance(item.material, EmissiveMaterial):
         return item.material.image is not None
     return any(
@@ -139,12 +129,7 @@ def _faces_of(item: Object, mesh: Mesh | None) -> tuple[Any, ...]:
 def _constant(material: MeshMaterial) -> RGB:
     if not material.unlit:
         return material.emission
-    surface = material.surface
-    color: Color = (1.0, 1.0, 1.0)
-    if isinstance(surface, PhongMaterial):
-        color = surface.diffuse
-    elif isinstance(surface, LambertMaterial | MetallicRoughnessMaterial | MirrorMaterial):
-        color = surface.base_color
+    color: Color = getattr(material.surface, "base_color", (1.0, 1.0, 1.0))
     return (1.0, 1.0, 1.0) if isinstance(color, Path) else color
 
 

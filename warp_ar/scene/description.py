@@ -1,4 +1,4 @@
-"""What a scene is made of: frozen dataclasses, one per section of a scene file.
+"""Parts of a scene: frozen dataclasses, one per section of a scene file.
 
 Metres, degrees, linear RGB. The world is the marker's frame: origin at the marker's (or board's) centre, x right, y up
 the printed page, z out of the page.
@@ -7,48 +7,62 @@ the printed page, z out of the page.
 from __future__ import annotations
 
 import dataclasses
+import functools
+import itertools
 import math
-from pathlib import Path
-from typing import Final, Literal, TypeAlias
+from pathlib import Path, PurePosixPath
+from typing import Annotated, ClassVar, Final, Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from warp_ar.errors import SceneError
-from warp_ar.scene.checks import check_choice, check_number, check_vector, fail
+from warp_ar.scene.fields import LIGHT_COLOR, Checked, Key, Length, Place, Share, Turn, Vec3, fail
 from warp_ar.scene.geometry import Mesh, rotation_matrix
-from warp_ar.scene.keys import AREA_LIGHT_KEYS, LIGHT_KEYS, OBJECT_KEYS, PROXY_KEYS
 from warp_ar.scene.materials import OF_THE_FILE, RGB, EmissiveMaterial, Material
-
-Vec3: TypeAlias = tuple[float, float, float]
+from warp_ar.scene.messages import MOST_PIXELS, SMALLEST
 
 FloatMatrix: TypeAlias = npt.NDArray[np.float64]
 
 SCHEMA: Final = 1
 """The version of the format that this program reads."""
+ORIGIN: Final[Vec3] = (0.0, 0.0, 0.0)
+NO_DISTORTION: Final = (0.0, 0.0, 0.0, 0.0, 0.0)
+SILVERED: Final = (0.85, 0.85, 0.85)
+"""Reflectance of a silvered ornament."""
+Size: TypeAlias = Annotated[tuple[float, ...], Key("metres", "[0.2, 0.1]", low=SMALLEST, sizes=(), required=True)]
+MeshFile: TypeAlias = Annotated[Path | None, Key("metres inside", '"table.ply"', right="a mesh", required=True)]
+Intensity: TypeAlias = Annotated[float, Key("camera values", "2.2", low=0.0)]
+ObjectName: TypeAlias = Annotated[str | None, Key("-", '"lamp"')]
+LightPlace: TypeAlias = Annotated[Vec3, Key("metres", "[0.07, -0.06, 0.4]", required=True)]
+Angle: TypeAlias = Annotated[
+    float, Key("degrees", "13.0", low=0.0, high=90.0, required=True, beside="target = [0.0, 0.0, 0.0]")
+]
+Pixel: TypeAlias = Annotated[float, Key("pixels", "239.5")]
+Focal: TypeAlias = Annotated[float, Key("pixels", "640.0", low=SMALLEST)]
 
 
 @dataclasses.dataclass(frozen=True)
-class Camera:
+class Camera(Checked):
     """OpenCV's pinhole camera; pixel centres lie at integers."""
 
-    width: int
+    width: Annotated[int, Key("pixels", "640", low=1, high=MOST_PIXELS)]
     """Width of the picture in pixels."""
-    height: int
+    height: Annotated[int, Key("pixels", "480", low=1, high=MOST_PIXELS)]
     """Height of the picture in pixels."""
-    fx: float
+    fx: Focal
     """Focal length along x in pixels."""
-    fy: float
+    fy: Focal
     """Focal length along y in pixels."""
-    cx: float
+    cx: Pixel
     """Column of the principal point in pixels."""
-    cy: float
+    cy: Pixel
     """Row of the principal point in pixels."""
-    distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    distortion: Annotated[tuple[float, ...], Key("-", "[-0.12, 0.05, 0.0, 0.0, 0.0]", sizes=(4, 5, 8))] = NO_DISTORTION
     """OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6]]: 4, 5 or 8 values."""
-    transfer: str | Path = "srgb"
-    """How values were encoded: "srgb", "linear", "gamma:G" (linear = value ** G), or a measured response's file."""
-    field_of_view: float | None = None
+    transfer: Annotated[str | Path, Key("-", '"gamma:2.2"')] = "srgb"
+    """Encoding of values: "srgb", "linear", "gamma:G" (linear = value ** G), or a measured response's file."""
+    field_of_view: Annotated[float | None, Key("degrees", "60.0", low=5.0, high=150.0)] = None
     """Horizontal field of view in degrees of a camera that was never calibrated, instead of its numbers: a guess, with
     square pixels, a central principal point and no distortion, for whatever size the frames have."""
 
@@ -108,23 +122,29 @@ class Camera:
 
 @dataclasses.dataclass(frozen=True)
 class SourceSpec:
-    """Where frames come from: exactly one of ``path``, ``camera`` and ``synthetic`` is given."""
+    """Source of frames: exactly one of ``path``, ``camera`` and ``synthetic`` is given."""
 
-    path: Path | None = None
+    path: Annotated[Path | None, Key("-", '"frames"', right="a folder of frames or a video")] = None
     """A folder of frames in name order, or a video file."""
-    camera: int | None = None
+    camera: Annotated[int | None, Key("-", "0", low=0, high=1023)] = None
     """Index of a capture device."""
-    synthetic: str | None = None
+    synthetic: Annotated[str | None, Key("-", '"moving_card"', right="the name of a generated source")] = None
     """Name of a generated source."""
-    fps: float | None = None
+    fps: Annotated[float | None, Key("frames per second", "24.0", low=1e-3, high=1e5, beside='path = "frames"')] = None
     """Frames per second; the source's own if left out."""
-    exposures: tuple[float, ...] | None = None
+    exposures: Annotated[
+        tuple[float, ...] | None,
+        Key("seconds", "[0.016, 0.001]", low=1e-6, high=1e3, sizes=(2, 3, 4, 5, 6, 7, 8), beside="camera = 0"),
+    ] = None
     """Exposure times in seconds that frames have in turn: recorded so, or to be asked of the device."""
-    shown: float | None = None
+    shown: Annotated[
+        float | None, Key("seconds", "0.001", low=1e-6, high=1e3, beside="camera = 0\nexposures = [0.016, 0.001]")
+    ] = None
     """Exposure time in seconds of the frames that are lit and shown; the longest if left out."""
-    metering: Literal["fixed", "automatic"] | None = None
-    """Whether the camera's exposure and white balance may drift; what dims all alike is then not the light; fixed if
-    left out."""
+    metering: Annotated[Literal["fixed", "automatic"] | None, Key("-", '"automatic"', beside="camera = 0")] = None
+    """Metering: "automatic" if the camera's exposure and white balance may drift; what dims all alike is then not the
+    light; fixed if left out.
+    """
 
 
 @dataclasses.dataclass(frozen=True)
@@ -186,87 +206,105 @@ class GridBoard:
 
 
 Board: TypeAlias = CharucoBoard | GridBoard
+SIDES: Final = {"plane": 2, "rect": 2, "box": 3}
+"""Numbers of ``size``, by shape."""
+
+
+def _check_sides(item: Proxy | Object | AreaLight, shape: str) -> None:
+    """Check the lengths of a shape that has some; more than it has are not looked at."""
+    count = SIDES.get(shape, 0)
+    if len(item.size) < count or any(length < SMALLEST for length in item.size[:count]):  # NaN passes
+        fail(item, "size", f"expected {count} lengths above 0, metres")
+
+
+INTRINSICS: Final = ("width", "height", "fx", "fy", "cx", "cy", "distortion")
+"""Keys of a camera's numbers."""
+
+
+TURNS: Final = (0, 90, 180, 270)
+"""Degrees by which a marker's print may be turned."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Marker:
+class Marker(Checked):
     """The printed marker, or board of markers, that the world is fixed to."""
 
-    dictionary: str = "DICT_4X4_50"
+    dictionary: Annotated[str, Key("-", '"DICT_APRILTAG_36h11"')] = "DICT_4X4_50"
     """OpenCV's name of the dictionary, ArUco or AprilTag."""
-    id: int = 0
-    """Which marker of the dictionary; unused with a board."""
-    size: float = 0.08
+    id: Annotated[int, Key("-", "7")] = 0
+    """Number of the marker in the dictionary; unused with a board."""
+    size: Annotated[float, Key("metres", "0.08", low=SMALLEST, required=True)] = 0.08
     """Side of the black square in metres; unused with a board."""
-    white: float = 0.85
+    white: Annotated[float, Key("reflectance, 0 to 1", "0.85", low=0.01, high=1.0)] = 0.85
     """Diffuse reflectance of the card's white paper."""
-    board: Board | None = None
+    board: Annotated[Board | None, Key("metres", '"charuco 5x7 0.035 0.026"')] = None
     """A board instead of a single marker."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Probe:
-    """A mirror ball."""
-
-    center: Vec3
-    """Centre in metres."""
-    radius: float
-    """Radius in metres."""
-    reflectance: RGB = (0.85, 0.85, 0.85)
-    """Share of light that the ball reflects; a silvered ornament if left out. A file may give one number for grey.
-    Frames that show otherwise are believed, but for the quality ``paper``."""
-    marker: Marker | None = None
-    """A marker or board of its own, in whose frame its centre is: it may be moved; lost, its last light remains."""
+    turn: Annotated[int, Key("degrees", "180", low=0, high=270, beside="size = 0.08")] = 0
+    """Turn of the print against the one that OpenCV draws, counterclockwise: 0, 90, 180 or 270; 180 has the pictures
+    that AprilTag's authors publish stand upright."""
 
     def __post_init__(self) -> None:
-        """Raise a SceneError that names the first value that cannot be."""
-        check_vector(self, "center")
-        check_number(self, "radius", above=0.0)
-        check_vector(self, "reflectance", low=0.0, high=1.0)
+        """Check all values."""
+        if self.board is None:  # which has its own size
+            super().__post_init__()
+
+
+OwnMarker: TypeAlias = Annotated[Marker | None, Key("-", "{ id = 7, size = 0.05 }")]
 
 
 @dataclasses.dataclass(frozen=True)
-class ProxyMaterial:
-    """How a proxy's surface mirrors, beside what it scatters; glTF's rough dielectric."""
+class Probe(Checked):
+    """A mirror ball."""
 
-    roughness: float = 0.1
+    center: Annotated[Vec3, Key("metres", "[-0.12, 0.03, 0.0346]")]
+    """Centre in metres."""
+    radius: Length
+    """Radius in metres."""
+    reflectance: Annotated[RGB, Key("0 to 1 per channel", "[0.85, 0.85, 0.87]", low=0.01, high=1.0)] = SILVERED
+    """Share of light that the ball reflects; a silvered ornament if left out. A file may give one number for grey.
+    Frames that show otherwise are believed, but for the quality ``paper``."""
+    marker: OwnMarker = None
+    """A marker or board of its own, in whose frame its centre is: it may be moved; lost, its last light remains."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ProxyMaterial(Checked):
+    """Mirroring of a proxy's surface, beside its diffuse part; glTF's rough dielectric."""
+
+    roughness: Share = 0.1
     """Perceptual, as glTF has it: 0 is a mirror, 1 as wide as can be; a polished table has about 0.1."""
-    reflectance: RGB = (0.04, 0.04, 0.04)
+    reflectance: Annotated[RGB, Key("0 to 1 per channel", "[0.04, 0.04, 0.05]", low=0.0, high=1.0)] = (0.04, 0.04, 0.04)
     """Specular reflectance where it is seen from ahead, glTF's F0; 0.04 is lacquer or glass. A file may give one number
     for grey."""
 
-    def __post_init__(self) -> None:
-        """Raise a SceneError that names the first value that cannot be."""
-        check_number(self, "roughness", low=0.0, high=1.0)
-        check_vector(self, "reflectance", low=0.0, high=1.0)
-
 
 @dataclasses.dataclass(frozen=True)
-class Proxy:
+class Proxy(Checked):
     """Simplified physical geometry: receives virtual light and shadow, and hides what is behind it."""
 
-    shape: Literal["plane", "box", "mesh"]
+    USES: ClassVar = {"plane": ("size",), "box": ("size",), "mesh": ("file",)}
+
+    shape: Annotated[Literal["plane", "box", "mesh"], Key("-", '"plane"')]
     """A plane lies in its own x and y and faces its own +z."""
-    at: Vec3 = (0.0, 0.0, 0.0)
+    at: Place = ORIGIN
     """Centre (mesh: origin) in metres."""
-    rotate: Vec3 = (0.0, 0.0, 0.0)
+    rotate: Turn = ORIGIN
     """Degrees about the fixed x, then y, then z axis."""
-    size: tuple[float, ...] = ()
+    size: Size = ()
     """Whole lengths in metres: x and y of a plane; x, y and z of a box; empty for a mesh."""
-    file: Path | None = None
+    file: MeshFile = None
     """Mesh file, in metres."""
-    marker: Marker | None = None
+    marker: OwnMarker = None
     """A marker or board of its own, in whose frame it stands; while that is lost it is not there."""
-    material: ProxyMaterial | None = None
-    """How it mirrors what is virtual; matt if left out."""
+    material: Annotated[ProxyMaterial | None, Key("-", "{ roughness = 0.1 }")] = None
+    """Mirroring of what is virtual; matt if left out."""
 
     def __post_init__(self) -> None:
-        """Raise a SceneError that names the first value that cannot be."""
-        check_choice(self, "shape", PROXY_KEYS)
-        check_vector(self, "at")
-        check_vector(self, "rotate")
+        """Check all values."""
+        super().__post_init__()
         if self.shape == "mesh" and self.file is None:
             fail(self, "file", "a mesh needs its file")
+        _check_sides(self, self.shape)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -277,13 +315,13 @@ class Animation:
     degrees about the fixed x, then y, then z axis.
     """
 
-    turn: Vec3 = (0.0, 0.0, 0.0)
+    turn: Annotated[Vec3, Key("degrees per second", "[0.0, 0.0, 30.0]")] = ORIGIN
     """Degrees per second about the fixed axes."""
-    pivot: Vec3 | None = None
+    pivot: Annotated[Vec3 | None, Key("metres", "[0.0, 0.0, 0.0]", beside="turn = [0.0, 0.0, 30.0]")] = None
     """Point in metres that ``turn`` leaves in place; the body's own ``at`` if left out, so that it spins in place."""
-    sway: Vec3 = (0.0, 0.0, 0.0)
+    sway: Annotated[Vec3, Key("metres", "[0.02, 0.0, 0.0]")] = ORIGIN
     """Furthest excursion of a swing to and fro, in metres."""
-    period: float = 4.0
+    period: Annotated[float, Key("seconds", "3.0", low=1e-3, beside="sway = [0.02, 0.0, 0.0]")] = 4.0
     """Duration of one swing in seconds."""
 
     def rotation_at(self, seconds: float) -> FloatMatrix:
@@ -291,29 +329,32 @@ class Animation:
         return rotation_matrix([rate * seconds for rate in self.turn])
 
     def position_at(self, seconds: float, at: Vec3) -> FloatMatrix:
-        """Where a body that starts at ``at`` stands, (3,) in metres."""
+        """Return the place of a body that starts at ``at``, (3,) in metres."""
         pivot = np.array(at if self.pivot is None else self.pivot)
         swing = np.array(self.sway) * math.sin(2.0 * math.pi * (seconds / self.period))
         position: FloatMatrix = self.rotation_at(seconds) @ (np.array(at) - pivot) + pivot + swing
         return position
 
 
+Motion: TypeAlias = Annotated[Animation | None, Key("-", "{ sway = [0.05, 0.0, 0.0] }")]
+
+
 @dataclasses.dataclass(frozen=True)
 class Play:
-    """How an animation of a glTF file's nodes is played."""
+    """Playing of an animation of a glTF file's nodes."""
 
-    animation: str | int = 0
+    animation: Annotated[str | int, Key("-", '"Open"')] = 0
     """Name of the animation in the file, or its number from 0 on."""
-    loop: bool = True
-    """Whether it begins anew after its last key; else it holds that pose."""
-    start: float = 0.0
+    loop: Annotated[bool, Key("-", "false")] = True
+    """True if it begins anew after its last key; else it holds that pose."""
+    start: Annotated[float, Key("seconds", "2.0")] = 0.0
     """Time at which it begins, in seconds after the first frame; before, it holds its first pose."""
-    speed: float = 1.0
+    speed: Annotated[float, Key("-", "0.5", low=SMALLEST)] = 1.0
     """Seconds of the animation per second."""
-    offset: float = 0.0
+    offset: Annotated[float, Key("seconds", "1.5", low=0.0)] = 0.0
     """Time of the animation with which it begins, in seconds."""
-    paused: bool = False
-    """Whether it holds the pose that it begins with."""
+    paused: Annotated[bool, Key("-", "true")] = False
+    """True if it holds the pose that it begins with."""
 
     def time_at(self, seconds: float, duration: float) -> float:
         """Time of the animation, ``seconds`` after the first frame; ``duration`` is that of its last key."""
@@ -326,54 +367,61 @@ class Play:
 
 
 @dataclasses.dataclass(frozen=True)
-class Object:
+class Object(Checked):
     """A virtual object; a point p of its shape stands at R (scale p) + at. Fields unused by its shape are zero."""
 
-    shape: Literal["mesh", "sphere", "box", "torus", "rect", "disk", "tube"]
+    USES: ClassVar = {
+        "mesh": ("file",),
+        "sphere": ("radius",),
+        "box": ("size",),
+        "torus": ("major_radius", "minor_radius"),
+        "rect": ("size",),
+        "disk": ("radius",),
+        "tube": ("radius", "length"),
+    }
+
+    shape: Annotated[Literal["mesh", "sphere", "box", "torus", "rect", "disk", "tube"], Key("-", '"sphere"')]
     """All but meshes are centred at their origin; a torus and a tube lie around their z axis, a rect and a disk face
     their own +z."""
-    file: Path | None = None
+    file: MeshFile = None
     """Mesh file; under another material than its own its textures of the base colour multiply the first colour."""
-    radius: float = 0.0
+    radius: Length = 0.0
     """Radius of a sphere, a disk or a tube in metres."""
-    size: tuple[float, ...] = (0.0, 0.0, 0.0)
+    size: Size = ORIGIN
     """Whole lengths of a box, or of a rect along x and y, in metres."""
-    length: float = 0.0
+    length: Length = 0.0
     """Length of a tube in metres; its ends are open."""
-    major_radius: float = 0.0
+    major_radius: Annotated[float, Key("metres", "0.05", low=SMALLEST, required=True)] = 0.0
     """Distance of a torus's tube from its axis in metres."""
-    minor_radius: float = 0.0
+    minor_radius: Length = 0.0
     """Radius of a torus's tube in metres, below the major radius."""
-    at: Vec3 = (0.0, 0.0, 0.0)
+    at: Place = ORIGIN
     """Position in metres."""
-    rotate: Vec3 = (0.0, 0.0, 0.0)
+    rotate: Turn = ORIGIN
     """Degrees about the fixed x, then y, then z axis."""
-    scale: float = 1.0
+    scale: Annotated[float, Key("-", "0.026", low=SMALLEST)] = 1.0
     """Factor on all lengths of the shape."""
-    material: Material = OF_THE_FILE
-    """How it reflects light."""
-    animate: Animation | None = None
-    """How it moves."""
-    play: Play | None = None
-    """An animation of its glTF file that moves the file's nodes; without, they stand as at the start."""
-    marker: Marker | None = None
+    material: Annotated[Material, Key("-", '{ model = "mirror" }')] = OF_THE_FILE
+    """Material: its reflection of light."""
+    animate: Motion = None
+    """Movement."""
+    play: Annotated[Play | None, Key("-", "{ animation = 0 }", beside='shape = "mesh"\nfile = "watch.glb"')] = None
+    """An animation of its glTF file: of nodes, skins and morph targets; without, they stand as at the start."""
+    marker: OwnMarker = None
     """A marker or board of its own, in whose frame it stands; while that is lost it is not there."""
+    name: ObjectName = None
+    """Name by which a program finds it, ``pipeline.objects["lamp"]``."""
     mesh: Mesh | None = dataclasses.field(default=None, repr=False)
     """A mesh in memory instead of a file, as ``object_from_trimesh`` gives; a scene file cannot say it."""
 
     def __post_init__(self) -> None:
-        """Raise a SceneError that names the first value that cannot be."""
-        check_choice(self, "shape", OBJECT_KEYS)
-        check_vector(self, "at")
-        check_vector(self, "rotate")
-        check_number(self, "scale", above=0.0)
+        """Check all values."""
+        super().__post_init__()
         if self.shape == "mesh" and self.file is None and self.mesh is None:
             fail(self, "file", "a mesh needs its file, or a mesh in memory as object_from_trimesh gives")
-        for key in OBJECT_KEYS[self.shape]:
-            if key not in ("file", "size"):
-                check_number(self, key, above=0.0)
         if self.shape == "torus" and self.minor_radius >= self.major_radius:
             fail(self, "minor_radius", f"expected less than major_radius, {self.major_radius:g}")
+        _check_sides(self, self.shape)
 
     def pose_at(self, seconds: float) -> tuple[FloatMatrix, FloatMatrix]:
         """Rotation R (3, 3) and position (3,) in metres, ``seconds`` after the first frame."""
@@ -384,52 +432,51 @@ class Object:
 
 
 @dataclasses.dataclass(frozen=True)
-class Light:
+class Light(Checked):
     """A virtual light.
 
     A white Lambertian surface that faces a point light of intensity I at distance d has linear camera value
     I / (pi (a + b d + c d^2)) with attenuation (a, b, c); one that faces a directional light has I / pi.
     """
 
-    kind: Literal["point", "spot", "directional"]
-    """Where its light goes."""
-    intensity: float
+    USES: ClassVar = {
+        "point": ("at", "attenuation", "radius"),
+        "spot": ("at", "target", "direction", "inner_angle", "outer_angle", "attenuation", "radius"),
+        "directional": ("direction",),
+    }
+
+    kind: Annotated[Literal["point", "spot", "directional"], Key("-", '"point"')]
+    """Kind of light, by the directions in which it shines."""
+    intensity: Intensity
     """Radiant intensity (point, spot) or irradiance (directional), in camera values."""
-    color: RGB = (1.0, 1.0, 1.0)
+    color: Annotated[RGB, LIGHT_COLOR] = (1.0, 1.0, 1.0)
     """Factor on the intensity per channel."""
-    at: Vec3 = (0.0, 0.0, 0.0)
+    at: LightPlace = ORIGIN
     """Position of a point or spot light in metres."""
-    target: Vec3 | None = None
+    target: Annotated[Vec3 | None, Key("metres", "[0.135, 0.04, 0.01]")] = None
     """Point in metres that a spot light shines at; it stays when the light moves."""
-    direction: Vec3 | None = None
+    direction: Annotated[Vec3 | None, Key("-", "[0.3, 0.0, -1.0]", beside='kind = "directional"')] = None
     """The way the light travels, of any length; instead of a target. It turns with the light."""
-    inner_angle: float = 0.0
+    inner_angle: Angle = 0.0
     """Half angle of a spot in degrees within which it is full."""
-    outer_angle: float = 0.0
+    outer_angle: Angle = 0.0
     """Half angle in degrees at which a spot is zero, after a linear fall from the inner angle."""
-    attenuation: Vec3 = (0.0, 0.0, 1.0)
+    attenuation: Annotated[Vec3, Key("1, 1/m, 1/m²", "[0.0, 0.0, 1.0]", low=0.0)] = (0.0, 0.0, 1.0)
     """Constant, linear and quadratic term of the fall with distance; (0, 0, 1) is the inverse square."""
-    radius: float = 0.0
+    radius: Annotated[float, Key("metres", "0.02", low=0.0)] = 0.0
     """Radius in metres of the sphere that emits (point, spot), for soft shadows; 0 is a point."""
-    animate: Animation | None = None
-    """How it moves."""
-    marker: Marker | None = None
+    animate: Motion = None
+    """Movement."""
+    marker: OwnMarker = None
     """A marker or board of its own, in whose frame it stands; while that is lost it is not there."""
 
     def __post_init__(self) -> None:
-        """Raise a SceneError that names the first value that cannot be."""
-        check_choice(self, "kind", LIGHT_KEYS)
-        check_number(self, "intensity", low=0.0)
-        check_vector(self, "color", low=0.0)
-        check_vector(self, "at")
-        check_vector(self, "attenuation", low=0.0)
-        check_number(self, "radius", low=0.0)
+        """Check all values."""
+        super().__post_init__()
         if self.kind == "spot" and self.target is None and self.direction is None:
             fail(self, "target", "a spot light needs a target or a direction")
-        if self.direction is not None:
-            check_vector(self, "direction")
-            if not any(self.direction):
-                fail(self, "direction", "expected the way the light travels, such as (0, 0, -1)")
+        if self.direction is not None and not any(self.direction):
+            fail(self, "direction", "expected the way the light travels, such as (0, 0, -1)")
 
     def pose_at(self, seconds: float) -> tuple[FloatMatrix, FloatMatrix]:
         """Position (3,) in metres and unit direction (3,) that the light travels, ``seconds`` after the first frame.
@@ -447,39 +494,47 @@ class Light:
 
 
 @dataclasses.dataclass(frozen=True)
-class AreaLight:
+class AreaLight(Checked):
     """A virtual light with an extent, which the picture shows: an object that emits."""
 
-    kind: Literal["rect", "disk", "sphere", "tube"]
+    USES: ClassVar = {
+        "rect": ("at", "rotate", "size", "image", "two_sided", "name"),
+        "disk": ("at", "rotate", "radius", "two_sided", "name"),
+        "sphere": ("at", "rotate", "radius", "name"),
+        "tube": ("at", "rotate", "radius", "length", "name"),
+    }
+
+    kind: Annotated[Literal["rect", "disk", "sphere", "tube"], Key("-", '"rect"')]
     """A rect and a disk shine where their own +z points; a tube lies around its z axis."""
-    intensity: float
+    intensity: Intensity
     """Radiance in camera values: 1 is what the camera clips."""
-    color: RGB = (1.0, 1.0, 1.0)
+    color: Annotated[RGB, LIGHT_COLOR] = (1.0, 1.0, 1.0)
     """Factor on the radiance per channel."""
-    at: Vec3 = (0.0, 0.0, 0.0)
+    at: LightPlace = ORIGIN
     """Centre in metres."""
-    rotate: Vec3 = (0.0, 0.0, 0.0)
+    rotate: Turn = ORIGIN
     """Degrees about the fixed x, then y, then z axis; [180, 0, 0] turns a rect or disk down."""
-    size: tuple[float, ...] = ()
+    size: Size = ()
     """Whole lengths of a rect along x and y in metres."""
-    radius: float = 0.0
+    radius: Length = 0.0
     """Radius of a disk, sphere or tube in metres."""
-    length: float = 0.0
+    length: Length = 0.0
     """Length of a tube in metres; its ends are open."""
-    image: Path | None = None
+    image: Annotated[Path | None, Key("-", '"picture.png"', right="a picture")] = None
     """Picture that multiplies the radiance of a rect: sRGB-encoded, or linear radiance (HDR, OpenEXR)."""
-    two_sided: bool = False
-    """Whether the back of a rect or disk shines too; else it is not there from behind, but throws a shadow."""
-    animate: Animation | None = None
-    """How it moves."""
-    marker: Marker | None = None
+    two_sided: Annotated[bool, Key("-", "true")] = False
+    """True if the back of a rect or disk shines too; else it is not there from behind, but throws a shadow."""
+    animate: Motion = None
+    """Movement."""
+    marker: OwnMarker = None
     """A marker or board of its own, in whose frame it stands; while that is lost it is not there."""
+    name: ObjectName = None
+    """Name by which a program finds it among the objects."""
 
     def __post_init__(self) -> None:
-        """Raise a SceneError that names the first value that cannot be."""
-        check_choice(self, "kind", AREA_LIGHT_KEYS)
-        check_number(self, "intensity", low=0.0)
-        check_vector(self, "color", low=0.0)
+        """Check all values."""
+        super().__post_init__()
+        _check_sides(self, self.kind)
 
     def as_object(self) -> Object:
         """The object that it is in a ``Scene``."""
@@ -493,6 +548,7 @@ class AreaLight:
             material=EmissiveMaterial(self.color, self.intensity, self.image, self.two_sided),
             animate=self.animate,
             marker=self.marker,
+            name=self.name,
         )
 
 
@@ -501,30 +557,47 @@ LATLONG_AXES: Final = ("z-up", "blender", "y-up", "opengl")
 
 
 @dataclasses.dataclass(frozen=True)
-class CapturedLight:
+class CapturedLight(Checked):
     """Light of the environment from a file instead of from a mirror ball in the frames."""
 
-    file: Path
+    file: Annotated[Path, Key("-", '"light.exr"', right="a captured light (OpenEXR or HDR)")]
     """Latlong OpenEXR or Radiance HDR, as ``warp_ar.capture`` writes it, or of another program."""
-    scale: float = 1.0
+    scale: Annotated[float, Key("-", "0.5", low=SMALLEST)] = 1.0
     """Factor from the file's values to those of the frames' camera."""
-    rotate: Vec3 = (0.0, 0.0, 0.0)
+    rotate: Turn = ORIGIN
     """Degrees about the fixed x, then y, then z axis, from the file's axes to the scene's."""
-    axes: str | None = None
+    axes: Annotated[str | None, Key("-", '"y-up"', words=LATLONG_AXES)] = None
     """Axes of the file: "z-up", "blender", "y-up" or "opengl"; if left out, as the file says, else y-up of an OpenEXR
     and blender of an HDR."""
 
-    def __post_init__(self) -> None:
-        """Raise a SceneError that names the first value that cannot be."""
-        check_number(self, "scale", above=0.0)
-        check_vector(self, "rotate")
-        if self.axes is not None:
-            check_choice(self, "axes", LATLONG_AXES)
+
+@dataclasses.dataclass(frozen=True)
+class PoseKeys:
+    """Keys of a file by which a ``PoseSpec`` is said, in one of four ways."""
+
+    R: Annotated[
+        tuple[float, ...] | None, Key("-", "[1, 0, 0, 0, 0, -1, 0, 1, 0]", sizes=(9,), beside="t = [0.0, 0.1, 0.6]")
+    ] = None
+    """Rotation of camera_from_world, row by row, as OpenCV has it: x right, y down, z forward."""
+    t: Annotated[Vec3 | None, Key("metres", "[0.0, 0.1, 0.6]", beside="R = [1, 0, 0, 0, 0, -1, 0, 1, 0]")] = None
+    """Translation of camera_from_world, beside R or quaternion."""
+    quaternion: Annotated[
+        tuple[float, ...] | None, Key("-", "[0.7, 0.7, 0.0, 0.0]", sizes=(4,), beside="t = [0.0, 0.1, 0.6]")
+    ] = None
+    """Rotation of camera_from_world as COLMAP has it: w, x, y, z."""
+    position: Annotated[Vec3 | None, Key("metres", "[0.0, -0.6, 0.1]")] = None
+    """Place of the camera, instead of camera_from_world."""
+    rotate: Annotated[Vec3 | None, Key("degrees", "[-20.0, 0.0, 0.0]", beside="position = [0.0, -0.6, 0.3]")] = None
+    """About the fixed x, then y, then z axis, from a level camera that looks along +y."""
+    file: Annotated[
+        Path | None, Key("-", '"images.txt"', right="poses: COLMAP's images, OpenTrackIO, USD, or JSON")
+    ] = None
+    """A pose for every frame: COLMAP's or NeRF's by name, JSON of R and t, OpenTrackIO, USD."""
 
 
 @dataclasses.dataclass(frozen=True)
 class PoseSpec:
-    """Where the camera stands, instead of what a marker says; ``camera_from_world``: x_camera = R x_world + t.
+    """Pose of the camera, instead of what a marker says; ``camera_from_world``: x_camera = R x_world + t.
 
     Axes of the camera are those of OpenCV and COLMAP: x right, y down, z forward.
     """
@@ -532,11 +605,48 @@ class PoseSpec:
     poses: tuple[tuple[tuple[float, ...], Vec3], ...]
     """(R as 9 numbers row by row, t in metres) of every frame, or one for all."""
     file: Path | None = None
-    """Where they were read from."""
+    """File that they were read from."""
+    names: tuple[str, ...] = ()
+    """Names of the pictures that they are of; empty where the file has none."""
 
-    def at(self, index: int) -> tuple[FloatMatrix, FloatMatrix]:
-        """R (3, 3) and t (3,) of a frame; after the last, poses start again, as a looped clip does."""
-        rotation, translation = self.poses[index % len(self.poses)]
+    @functools.cached_property
+    def _places(self) -> dict[str, list[int]]:
+        """Numbers of the poses by the last part of their names, and by that without its suffix."""
+        found: dict[str, list[int]] = {}
+        for index, name in enumerate(map(PurePosixPath, self.names)):
+            found.setdefault(f"/{name.name}", []).append(index)
+            found.setdefault(name.stem, []).append(index)
+        return found
+
+    def _index_of(self, name: str) -> int | None:
+        """Number of the pose of a picture: the one whose path agrees with most of its own, from the end on."""
+        path = PurePosixPath(name)
+        indices = self._places.get(f"/{path.name}") or self._places.get(path.stem, [])
+        folders = path.parts[-2::-1]
+
+        def common(index: int) -> int:
+            pairs = zip(folders, PurePosixPath(self.names[index]).parts[-2::-1], strict=False)
+            return sum(1 for _ in itertools.takewhile(lambda pair: pair[0] == pair[1], pairs))
+
+        best = sorted(indices, key=common)
+        if not best or (len(best) > 1 and common(best[-1]) == common(best[-2])):
+            return None
+        return best[-1]
+
+    def at(self, index: int, name: str = "") -> tuple[FloatMatrix, FloatMatrix] | None:
+        """R (3, 3) and t (3,) of a frame; None where it has none.
+
+        Args:
+            index: Of the frame in its clip, which counts where frames or poses have no names.
+            name: Path of its picture.
+        """
+        if name and self.names:
+            place = self._index_of(name)
+        else:
+            place = 0 if len(self.poses) == 1 else index if index < len(self.poses) else None
+        if place is None:
+            return None
+        rotation, translation = self.poses[place]
         return np.array(rotation).reshape(3, 3), np.array(translation)
 
 
@@ -544,7 +654,7 @@ class PoseSpec:
 class Exposure:
     """A simulated shorter exposure."""
 
-    scale: float | Literal["auto"] = 1.0
+    scale: Annotated[float | Literal["auto"], Key("-", "0.5", low=0.0)] = 1.0
     """Factor on the frame's light, 1 = off; "auto" keeps highlights below clipping when virtual light is added."""
 
 
@@ -559,9 +669,9 @@ class Scene:
     name: str = "scene"
     """Name to show; the file's own if left out."""
     source: SourceSpec | None = None
-    """Where frames come from, if the file says."""
+    """Source of frames, if the file says."""
     marker: Marker = Marker()
-    """What fixes the world."""
+    """Marker that fixes the world."""
     probes: tuple[Probe, ...] = ()
     """Mirror balls that show the environment."""
     proxies: tuple[Proxy, ...] = ()
@@ -573,9 +683,9 @@ class Scene:
     captured: CapturedLight | None = None
     """Light of the environment from a file; mirror balls are then objects like others."""
     pose: PoseSpec | None = None
-    """Where the camera stands, where no marker tells."""
+    """Pose of the camera, if no marker tells."""
     has_marker: bool = True
-    """Whether a printed card lies at the origin; not where the file gives a pose and no marker."""
+    """True if a printed card lies at the origin; not where the file gives a pose and no marker."""
     exposure: Exposure = Exposure()
     """Simulated exposure."""
     path: Path | None = dataclasses.field(default=None, compare=False)
@@ -583,5 +693,5 @@ class Scene:
 
     @property
     def has_gloss(self) -> bool:
-        """Whether a receiver mirrors what is virtual."""
+        """Return whether a receiver mirrors what is virtual."""
         return any(proxy.material is not None for proxy in self.proxies)

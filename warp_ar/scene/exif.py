@@ -1,23 +1,22 @@
-"""What a photograph's EXIF says of its exposure and its camera."""
+"""Exposure and camera by a photograph's EXIF."""
 
 from __future__ import annotations
 
 import dataclasses
 import io
-import logging
 import math
 import re
 import struct
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
-import exifread
-from PIL import Image, UnidentifiedImageError
+from PIL import ExifTags, Image
 
 from warp_ar.errors import SceneError
 from warp_ar.files import read_bytes
-from warp_ar.pictures import check_picture
+from warp_ar.pictures import check_picture, picture_size
 from warp_ar.scene.description import Camera
 
 FULL_FRAME_DIAGONAL: Final = math.hypot(36.0, 24.0)
@@ -33,25 +32,11 @@ LEAST_SIDE: Final = 400
 _TURNED: Final = (5, 6, 7, 8)
 """EXIF orientations that exchange width and height."""
 
-# What exifread and Pillow have been seen to raise on damaged files; they do not document it.
+# What Pillow has been seen to raise on damaged files; it does not document it.
 _READING_ERRORS: Final = (
-    OSError,
-    UnidentifiedImageError,
-    Image.DecompressionBombError,
-    ValueError,
-    TypeError,
-    LookupError,
-    AttributeError,
-    ArithmeticError,
-    AssertionError,
-    RecursionError,
-    MemoryError,
-    SyntaxError,
-    struct.error,
+    *(OSError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, MemoryError, SyntaxError),
+    *(struct.error, Image.DecompressionBombError),
 )
-
-# It logs that a picture has no EXIF: that is no event.
-logging.getLogger("exifread").setLevel(logging.ERROR)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,20 +69,24 @@ class PhotoInfo:
 
     @property
     def is_whole(self) -> bool:
-        """Whether the picture has the shape of a sensor: of a cut-out the focal length in pixels is not known."""
+        """Return whether the picture has the shape of a sensor: a cut-out's focal length in pixels is not known."""
         if min(self.width, self.height) < LEAST_SIDE:
             return False
         shape = max(self.width, self.height) / min(self.width, self.height)
         return any(abs(shape / known - 1.0) < SHAPE_TOLERANCE for known in SENSOR_SHAPES[1:])
 
+    @property
+    def by_35mm(self) -> float | None:
+        """Focal length in pixels by the equivalent for 35 mm film, across the diagonal."""
+        if self.focal_35mm is None:
+            return None
+        return self.focal_35mm / FULL_FRAME_DIAGONAL * math.hypot(self.width, self.height)
+
     def focal_length(self) -> float | None:
         """Focal length in pixels, None where EXIF does not tell or the picture was cut."""
         if not self.is_whole:
             return None
-        if self.focal_35mm is None:
-            return self.focal_pixels
-        by_35mm = self.focal_35mm / FULL_FRAME_DIAGONAL * math.hypot(self.width, self.height)
-        return by_35mm if self.focal_pixels is None or self.contradiction else self.focal_pixels
+        return self.by_35mm if self.focal_pixels is None or self.contradiction else self.focal_pixels
 
     @property
     def contradiction(self) -> str:
@@ -106,14 +95,12 @@ class PhotoInfo:
         Programs that resize pictures rewrite the size that the sensor's resolution refers to; the equivalent for 35 mm
         film does not depend on it.
         """
-        if self.focal_35mm is None or self.focal_pixels is None:
-            return ""
-        by_35mm = self.focal_35mm / FULL_FRAME_DIAGONAL * math.hypot(self.width, self.height)
-        if abs(math.log(by_35mm / self.focal_pixels)) < AGREEING:
+        film, pixels = self.by_35mm, self.focal_pixels
+        if film is None or pixels is None or abs(math.log(film / pixels)) < AGREEING:
             return ""
         return (
-            f"EXIF contradicts itself: focal length {self.focal_pixels:.0f} pixels by the sensor's resolution, "
-            f"{by_35mm:.0f} by the 35 mm equivalent, which is taken"
+            f"EXIF contradicts itself: focal length {pixels:.0f} pixels by the sensor's resolution, {film:.0f} by the "
+            "35 mm equivalent, which is taken"
         )
 
     def camera(self, transfer: str | Path = "srgb") -> Camera | None:
@@ -128,36 +115,43 @@ class PhotoInfo:
 def read_exif(path: str | Path) -> PhotoInfo:
     """EXIF of a photograph; pictures without any give their size alone.
 
+    Follows:
+        orientation, exposure time, ISO, f-number; focal length by FocalPlaneXResolution or the 35 mm equivalent.
+
+    Names:
+        focal lengths that contradict each other (the 35 mm equivalent is taken).
+
     Raises:
-        SceneError: The file is missing or no picture.
+        SceneError: Damaged.
     """
     path = Path(path)
     data = read_bytes(path, "picture_bytes", SceneError, f"{path}: the photograph")
     check_picture(data, SceneError, f"{path}: the photograph")
     try:
         with Image.open(io.BytesIO(data)) as picture:
-            width, height = picture.size
-        tags = exifread.process_file(io.BytesIO(data), details=False)
+            width, height = picture_size(data) or picture.size  # Pillow's own is that of a TIFF turned upright
+            first = picture.getexif()
+            tags = {**first, **first.get_ifd(ExifTags.IFD.Exif)}
     except _READING_ERRORS as error:
         raise SceneError(f"{path}: no photograph whose EXIF can be read ({' '.join(str(error).split())})") from error
-    if _number(tags, "Image Orientation") in _TURNED:
+    base = ExifTags.Base
+    if _number(tags, base.Orientation) in _TURNED:
         width, height = height, width
-    resolution = _number(tags, "EXIF FocalPlaneXResolution")
-    unit = {2: 25.4, 3: 10.0, 4: 1.0}.get(int(_number(tags, "EXIF FocalPlaneResolutionUnit") or 2), 25.4)
-    focal = _number(tags, "EXIF FocalLength")
-    sides = [_number(tags, f"EXIF ExifImage{side}") or 0.0 for side in ("Width", "Length")]
+    resolution, focal = _number(tags, base.FocalPlaneXResolution), _number(tags, base.FocalLength)
+    unit = {2: 25.4, 3: 10.0, 4: 1.0}.get(int(_number(tags, base.FocalPlaneResolutionUnit) or 2), 25.4)
+    longest = max(_number(tags, side) or 0.0 for side in (base.ExifImageWidth, base.ExifImageHeight))
     pixels = None
-    if resolution and focal and sides[0]:
-        pixels = focal * resolution / unit * max(width, height) / max(sides)
+    if resolution and focal and longest:
+        pixels = focal * resolution / unit * max(width, height) / longest
     return PhotoInfo(
         width,
         height,
-        seconds=_number(tags, "EXIF ExposureTime"),
-        iso=_number(tags, "EXIF ISOSpeedRatings") or _number(tags, "EXIF PhotographicSensitivity"),
-        f_number=_number(tags, "EXIF FNumber"),
-        focal_35mm=_number(tags, "EXIF FocalLengthIn35mmFilm"),
+        seconds=_number(tags, base.ExposureTime),
+        iso=_number(tags, base.ISOSpeedRatings),
+        f_number=_number(tags, base.FNumber),
+        focal_35mm=_number(tags, base.FocalLengthIn35mmFilm),
         focal_pixels=pixels,
-        model=" ".join(str(tags.get("Image Model", "")).split()),
+        model=" ".join(str(tags.get(base.Model, "")).replace("\0", " ").split()),
     )
 
 
@@ -184,16 +178,14 @@ def camera_by_exif(path: Path, transfer: str | Path = "srgb") -> Camera:
     return camera
 
 
-def _number(tags: dict[str, Any], name: str) -> float | None:
+def _number(tags: Mapping[int, Any], tag: int) -> float | None:
     """First value of a tag as a number above 0."""
-    values = getattr(tags.get(name), "values", None)
-    if not isinstance(values, list) or not values:
-        return None
+    value = tags.get(tag)
     try:
-        value = float(values[0])
-    except (TypeError, ValueError, ZeroDivisionError):
+        number = float(value[0] if isinstance(value, tuple) else value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, LookupError, ArithmeticError):
         return None
-    return value if math.isfinite(value) and value > 0.0 else None
+    return number if math.isfinite(number) and number > 0.0 else None
 
 
 def exposure_in_name(path: str | Path) -> float | None:

@@ -17,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from warp_ar.scene.mesh_materials import MeshMaterial
+from warp_ar.scene.materials import MeshMaterial
 
 FloatArray = npt.NDArray[np.float32]
 IntArray = npt.NDArray[np.int32]
@@ -45,15 +45,15 @@ class Mesh:
     colors: FloatArray | None = None
     """Factor of the base colour and of alpha, (n, 4), linear."""
     tangents: FloatArray | None = None
-    """Where u grows, (n, 4): a unit vector across the normal, and 1 or -1 for the side that v grows to."""
+    """Directions in which u grows, (n, 4): a unit vector across the normal, and 1 or -1 for the side of v."""
     triangle_materials: IntArray | None = None
-    """Which of ``materials`` each triangle has, (m,); None: all the first."""
+    """Index into ``materials`` of each triangle, (m,); None: all the first."""
     materials: tuple[MeshMaterial, ...] = ()
     """The file's own; none: it says nothing of how it looks."""
     images: tuple[ByteArray, ...] = ()
     """Pictures that the materials name, each (h, w, 4) RGBA, row 0 at the top (v = 1)."""
     notes: tuple[str, ...] = ()
-    """What the file holds and is not shown, by name."""
+    """Parts of the file that are not shown, by name."""
 
     @property
     def texture(self) -> ByteArray | None:
@@ -84,6 +84,18 @@ def rotation_matrix(rotate: Sequence[float]) -> npt.NDArray[np.float64]:
             [cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx],
             [sz * cy, sz * sy * sx + cz * cx, sz * sy * cx - cz * sx],
             [-sy, cy * sx, cy * cx],
+        ]
+    )
+
+
+def quaternion_matrix(quaternion: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Rotation of a unit quaternion, x first, (3, 3)."""
+    x, y, z, w = quaternion
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
         ]
     )
 
@@ -121,30 +133,40 @@ def smooth_normals(vertices: npt.ArrayLike, faces: npt.ArrayLike) -> FloatArray:
     Returns:
         Unit normals, (n, 3).
     """
-    points = np.asarray(vertices, dtype=np.float64)
     corners = np.asarray(faces, dtype=np.int64)
-    place = _places(points)
+    place = _places(np.asarray(vertices, dtype=np.float64))
     count = int(place.max(initial=-1)) + 1
-
-    a, b, c = (points[corners[:, k]] for k in range(3))
-    cross = np.cross(b - a, c - a)
-    area = np.linalg.norm(cross, axis=1)
-    longest = np.max([np.sum((q - p) ** 2, axis=1) for p, q in ((a, b), (b, c), (c, a))], axis=0)
-    solid = area > _ZERO_AREA * longest
-    a, b, c, area, corners = a[solid], b[solid], c[solid], area[solid], corners[solid]
-    face_normals = cross[solid] / area[:, None]
-
+    unit, angle, solid = _face_normals(vertices, corners)
     total, fallback = np.zeros((count, 3)), np.tile([0.0, 0.0, 1.0], (count, 1))
-    for k, (p, q, r) in enumerate(((a, b, c), (b, c, a), (c, a, b))):
-        angle = np.arctan2(area, np.sum((q - p) * (r - p), axis=1))
-        where = place[corners[:, k]]
-        fallback[where] = face_normals
-        for axis in range(3):
-            total[:, axis] += np.bincount(where, weights=angle * face_normals[:, axis], minlength=count)
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    normals = np.where(length > 1e-6, total / np.maximum(length, 1e-6), fallback)  # an angle's sum of 1e-6 is rounding
-    result: FloatArray = normals[place].astype(np.float32)
+    for k in range(3):
+        where = place[corners[solid, k]]
+        fallback[where] = unit[solid]
+        total += _sums(where, angle[solid, k, None] * unit[solid], count)
+    result: FloatArray = _unit_or(total, fallback)[place].astype(np.float32)
     return result
+
+
+def _face_normals(vertices: npt.ArrayLike, corners: npt.NDArray[np.int64]) -> tuple[Any, Any, Any]:
+    """Unit normals of triangles (0 of those without area), angles at their corners, and which have area."""
+    sides = np.asarray(vertices, dtype=np.float64)[corners]
+    edges = np.roll(sides, -1, axis=1) - sides
+    cross = np.cross(edges[:, 0], -edges[:, 2])
+    area = np.linalg.norm(cross, axis=1)
+    solid = area > _ZERO_AREA * (edges**2).sum(axis=2).max(axis=1, initial=0.0)
+    unit = np.where(solid[:, None], cross / np.where(solid, area, 1.0)[:, None], 0.0)
+    cosine = -(edges * np.roll(edges, 1, axis=1)).sum(axis=2)
+    return unit, np.arctan2(area[:, None], cosine) * (np.linalg.norm(edges, axis=2) > 0.0), solid
+
+
+def _sums(group: npt.NDArray[np.int64], values: npt.NDArray[Any], count: int) -> npt.NDArray[np.float64]:
+    """Sums of vectors, (n, 3), of each of ``count`` groups."""
+    return np.stack([np.bincount(group, values[:, axis], count) for axis in range(3)], axis=-1)
+
+
+def _unit_or(vectors: npt.NDArray[Any], fallback: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Vectors of length 1; others where they are too short for a direction: a sum of angles of 1e-6 is rounding."""
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.where(length > 1e-6, vectors / np.maximum(length, 1e-6), fallback)
 
 
 def _places(points: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
@@ -173,16 +195,9 @@ def creased_normals(
     Returns:
         The vertex that each corner was, (3 m,), and its unit normal, (3 m, 3); corner k of face f is 3 f + k.
     """
-    points = np.asarray(vertices, dtype=np.float64)
     corners = np.asarray(faces, dtype=np.int64)
-    sides = points[corners]
-    edges = np.roll(sides, -1, axis=1) - sides
-    cross = np.cross(edges[:, 0], -edges[:, 2])
-    area = np.linalg.norm(cross, axis=1)
-    solid = area > _ZERO_AREA * (edges**2).sum(axis=2).max(axis=1)
-    unit = np.where(solid[:, None], cross / np.where(solid, area, 1.0)[:, None], 0.0)
-
-    place = _places(points)[corners]
+    unit, angle, _ = _face_normals(vertices, corners)
+    place = _places(np.asarray(vertices, dtype=np.float64))[corners]
     following = np.roll(place, -1, axis=1)
     ends = np.sort(np.stack([place.ravel(), following.ravel()], axis=1), axis=1)
     order = np.lexsort(ends.T)
@@ -200,16 +215,10 @@ def creased_normals(
     stop = np.where(forward, second, after(second))
     group = _joined(3 * len(corners), np.concatenate([first, after(first)]), np.concatenate([start, stop]))
 
-    lengths = np.linalg.norm(edges, axis=2)
-    cosine = -(edges * np.roll(edges, 1, axis=1)).sum(axis=2)
-    angle = np.arctan2(area[:, None], cosine) * (lengths > 0.0)
-    total = np.stack(
-        [np.bincount(group, (angle * unit[:, axis, None]).ravel(), 3 * len(corners)) for axis in range(3)], axis=-1
-    )[group]
-    length = np.linalg.norm(total, axis=1, keepdims=True)
     own = np.repeat(unit, 3, axis=0)
+    total = _sums(group, angle.reshape(-1, 1) * own, 3 * len(corners))[group]
     fallback = np.where((own**2).sum(axis=1, keepdims=True) > 0.5, own, [0.0, 0.0, 1.0])
-    normals: FloatArray = np.where(length > 1e-6, total / np.maximum(length, 1e-6), fallback).astype(np.float32)
+    normals: FloatArray = _unit_or(total, fallback).astype(np.float32)
     return corners.ravel(), normals
 
 
@@ -258,20 +267,12 @@ def tangent_frames(
     along = np.where((length > 0.0) & np.isfinite(length), along / np.where(length > 0.0, length, 1.0), 0.0)
     along[area == 0.0] = 0.0
 
-    edges = np.roll(p, -1, axis=1) - p
-    angle = np.arctan2(
-        np.linalg.norm(np.cross(p1, p2), axis=1)[:, None], -(edges * np.roll(edges, 1, axis=1)).sum(axis=2)
-    )
-    key = 2 * corners + (side < 0.0)[:, None]
-    total = np.stack(
-        [np.bincount(key.ravel(), (angle * along[:, axis, None]).ravel(), 2 * len(points)) for axis in range(3)],
-        axis=-1,
-    )[key.ravel()]
+    _, angle, _ = _face_normals(points, corners)
+    key = (2 * corners + (side < 0.0)[:, None]).ravel()
+    total = _sums(key, angle.reshape(-1, 1) * np.repeat(along, 3, axis=0), 2 * len(points))[key]
     normal = np.asarray(normals, dtype=np.float64)[corners.ravel()]
     flat = total - (total * normal).sum(axis=1, keepdims=True) * normal
-    size = np.linalg.norm(flat, axis=1, keepdims=True)
     other = np.cross(normal, np.where(np.abs(normal[:, :1]) < 0.5, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]))
     other /= np.linalg.norm(other, axis=1, keepdims=True)
-    unit = np.where(size > 1e-6, flat / np.maximum(size, 1e-6), other)
-    frames: FloatArray = np.concatenate([unit, np.repeat(side, 3)[:, None]], axis=1).astype(np.float32)
+    frames: FloatArray = np.concatenate([_unit_or(flat, other), np.repeat(side, 3)[:, None]], axis=1).astype(np.float32)
     return corners.ravel(), frames

@@ -1,33 +1,262 @@
-"""glTF 2.0 and GLB: nodes, meshes, primitives, materials and pictures.
+"""glTF 2.0 and GLB: nodes, meshes, primitives, materials, pictures and animations.
 
 Read here and not through trimesh, which drops samplers, texture transforms, the second set of texture coordinates,
 vertex colours beside a texture, and the strength of emission.
 
 References:
-    Khronos, glTF 2.0 specification; appendix A has what is said of skins and morph targets.
+    Khronos, glTF 2.0 specification; 3.8 and 3.9 have materials, appendix A what is said of skins and morph targets.
+    KHR_texture_transform, KHR_materials_emissive_strength, KHR_materials_unlit, EXT_texture_webp.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import struct
-from pathlib import Path
-from typing import Any, Final
+import functools
+import math
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, Final, TypeAlias
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from warp_ar.errors import SceneError
 from warp_ar.files import limits, too_much
-from warp_ar.pictures import decode_picture, picture_size
-from warp_ar.scene.gltf_animation import animation_names, moves_morph_targets, read_animation
-from warp_ar.scene.gltf_arrays import GltfArrays
-from warp_ar.scene.gltf_materials import SUPPORTED, GltfMaterials
-from warp_ar.scene.mesh_assets import Assets, fail, image_bytes, objects, read_gltf
-from warp_ar.scene.mesh_parts import LARGEST, MeshPart
-from warp_ar.scene.node_animation import Anchor, NodeTrack
-from warp_ar.scene.texture_codes import encode_texture
+from warp_ar.pictures import picture_size
+from warp_ar.scene.geometry import creased_normals
+from warp_ar.scene.gltf_file import GltfFile
+from warp_ar.scene.materials import IDENTITY, MeshMaterial, MetallicRoughnessMaterial, TextureUse, Wrap
+from warp_ar.scene.mesh_parts import LARGEST, MeshPart, strip_triangles, unit_or
+from warp_ar.scene.mesh_source import MeshSource
+from warp_ar.scene.node_animation import INTERPOLATIONS, WIDTHS, Anchor, NodeTrack, Sampler, part_transforms
+from warp_ar.scene.textures import decode_rgba
+
+SUPPORTED: Final = (
+    "KHR_materials_emissive_strength",
+    "KHR_materials_unlit",
+    "KHR_mesh_quantization",
+    "KHR_texture_transform",
+    "EXT_texture_webp",
+)
+"""Extensions that are followed."""
+
+_WRAPS: Final[dict[int, Wrap]] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
+_NEAREST: Final = 9728
+_BRIGHTEST: Final = 1e6
+"""Largest radiance that a material may send out: exposure and encoding keep their digits."""
+
+
+class GltfMaterials:
+    """Reads the materials of one file, each once."""
+
+    def __init__(self, file: GltfFile, take_image: Callable[[int], int]) -> None:
+        """Read nothing yet.
+
+        Args:
+            file: The file.
+            take_image: Gives the number in ``Mesh.images`` of an image of the file.
+        """
+        self._file, self._take_image = file, take_image
+        self._materials, self._textures, self._samplers, self._images = (
+            file.objects(key) for key in ("materials", "textures", "samplers", "images")
+        )
+        self._known: dict[int, MeshMaterial] = {}
+
+    def read(self, index: object) -> MeshMaterial:
+        """A material by its number, as the file has it; None is glTF's default.
+
+        Raises:
+            SceneError: There is none, or it names a texture that is not there, or a factor is no number.
+        """
+        if index is None:
+            return self._material({}, "")
+        number = self._file.index(index, len(self._materials), "a mesh names material")
+        if number not in self._known:
+            item = self._materials[number]
+            self._known[number] = self._material(item, str(item.get("name", ""))[:80])
+        return self._known[number]
+
+    def _material(self, item: dict[str, Any], name: str) -> MeshMaterial:
+        file, label = self._file, f"material {name!r}" if name else "a material"
+        reflection = file.table(item, "pbrMetallicRoughness", label)
+        extensions = file.table(item, "extensions", label)
+        color = file.numbers(reflection, "baseColorFactor", (1.0, 1.0, 1.0, 1.0), 1.0, label)
+        metallic = file.number(reflection, "metallicFactor", 1.0, 1.0, label)
+        roughness = file.number(reflection, "roughnessFactor", 1.0, 1.0, label)
+        normal, occlusion = (file.table(item, key, label) for key in ("normalTexture", "occlusionTexture"))
+        strength = file.table(extensions, "KHR_materials_emissive_strength", label)
+        glow = file.number(strength, "emissiveStrength", 1.0, _BRIGHTEST, label)
+        red, green, blue = file.numbers(item, "emissiveFactor", (0.0, 0.0, 0.0), 1.0, label)
+        emission = glow * red, glow * green, glow * blue
+        mode = item.get("alphaMode", "OPAQUE")
+        if mode not in ("OPAQUE", "MASK", "BLEND"):
+            file.fail(f"{label} has alphaMode {str(mode)[:20]!r}; OPAQUE, MASK or BLEND are right")
+        return MeshMaterial(
+            surface=MetallicRoughnessMaterial(color[:3], metallic, roughness),  # type: ignore[arg-type]
+            name=name,
+            alpha=mode.lower(),
+            opacity=color[3],
+            cutoff=file.number(item, "alphaCutoff", 0.5, 1e6, label),
+            double_sided=item.get("doubleSided") is True,
+            unlit="KHR_materials_unlit" in extensions,
+            emission=emission,
+            base=self._use(reflection, "baseColorTexture", label),
+            metallic_roughness=self._use(reflection, "metallicRoughnessTexture", label),
+            normal=self._use(item, "normalTexture", label),
+            normal_scale=file.number(normal, "scale", 1.0, 1e3, label, low=-1e3),
+            occlusion=self._use(item, "occlusionTexture", label),
+            occlusion_strength=file.number(occlusion, "strength", 1.0, 1.0, label),
+            emissive=self._use(item, "emissiveTexture", label) if any(emission) else None,
+        )
+
+    def _use(self, item: dict[str, Any], key: str, label: str) -> TextureUse | None:
+        file = self._file
+        reference = file.table(item, key, label)
+        if not reference:
+            return None
+        index = file.index(reference.get("index"), len(self._textures), f"{label} names texture")
+        texture, label = self._textures[index], f"texture {index}"
+        webp = file.table(file.table(texture, "extensions", label), "EXT_texture_webp", label)
+        source = webp.get("source", texture.get("source"))
+        if source is None:
+            file.source.note("a texture in a format of an extension")
+            return None
+        transform = file.table(file.table(reference, "extensions", label), "KHR_texture_transform", label)
+        uv_set = transform.get("texCoord", reference.get("texCoord", 0))
+        if uv_set not in (0, 1):
+            file.source.note("texture coordinates beyond the second set")
+            return None
+        settings: dict[str, Any] = {}
+        if (sampler := texture.get("sampler")) is not None:
+            settings = self._samplers[file.index(sampler, len(self._samplers), f"{label} names sampler")]
+        wraps = [settings.get(name, 10497) for name in ("wrapS", "wrapT")]
+        if any(not isinstance(wrap, int) or wrap not in _WRAPS for wrap in wraps):
+            file.fail(f"{label} wraps as {str(wraps)[:30]}; {', '.join(map(str, _WRAPS))} are right")
+        return TextureUse(
+            image=self._take_image(file.index(source, len(self._images), f"{label} names image")),
+            uv_set=int(uv_set),
+            transform=self._transform(transform, label),
+            wrap=(_WRAPS[wraps[0]], _WRAPS[wraps[1]]),
+            nearest=settings.get("magFilter") == _NEAREST,
+        )
+
+    def _transform(self, item: dict[str, Any], label: str) -> tuple[float, ...]:
+        """KHR_texture_transform for coordinates whose v points up.
+
+        glTF's v runs down, and (u', v') = T R S (u, v). With w = 1 - v the rows are those of u' and 1 - v'.
+        """
+        if not item:
+            return IDENTITY
+        x, y = self._file.numbers(item, "offset", (0.0, 0.0), 1e6, label, low=-1e6)
+        width, height = self._file.numbers(item, "scale", (1.0, 1.0), 1e6, label, low=-1e6)
+        angle = self._file.number(item, "rotation", 0.0, 1e6, label, low=-1e6)
+        cos, sin = math.cos(angle), math.sin(angle)
+        a, b = cos * width, sin * height
+        d, e = -sin * width, cos * height
+        return (a, -b, b + x, -d, e, 1.0 - e - y)
+
+
+_WEIGHTS: Final = "weights"
+"""Path of a channel that moves morph targets."""
+_SHORTEST: Final = 1e-12
+"""Length of a quaternion that still is a direction."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class GltfAnimation:
+    """One animation of a file."""
+
+    samplers: Mapping[int, Mapping[str, Sampler]]
+    """By node, then by the property that they move."""
+    weights: Mapping[int, Sampler]
+    """Of the morph targets, by the node that the mesh hangs on."""
+    duration: float
+    """Time of the last key, in seconds."""
+
+
+def animation_names(file: GltfFile) -> list[str]:
+    """Names of a file's animations, by number; empty where one has none.
+
+    Raises:
+        SceneError: They are no list of objects.
+    """
+    return [str(item.get("name", ""))[:60] for item in file.objects("animations")]
+
+
+def read_animation(file: GltfFile, wanted: str | int) -> GltfAnimation:
+    """Read one animation.
+
+    Args:
+        file: The file.
+        wanted: Name of the animation, or its number from 0 on.
+
+    Raises:
+        SceneError: There is no such animation, or it is damaged.
+    """
+    number = _find(file, wanted)
+    item, label = file.objects("animations")[number], f"animation {number}"
+    known: dict[tuple[int, str], Sampler] = {}
+    found: dict[int, dict[str, Sampler]] = {}
+    samplers, count = file.objects("samplers", item), len(file.objects("nodes"))
+    for channel in file.objects("channels", item):
+        target = channel.get("target")
+        if not isinstance(target, dict):
+            file.fail(f"{label} has a channel without a target")
+        prop = target.get("path")
+        if not isinstance(prop, str) or prop not in (*WIDTHS, _WEIGHTS):
+            file.source.note(f"animated {str(prop)[:30]}")
+            continue
+        if target.get("node") is None:  # said by an extension, if at all
+            continue
+        node = file.index(target["node"], count, f"{label} moves node")
+        index = file.index(channel.get("sampler"), len(samplers), f"{label} has a channel of sampler")
+        if prop in found.setdefault(node, {}):
+            file.fail(f"{label} moves the {prop} of node {node} twice")
+        if (index, prop) not in known:
+            known[index, prop] = _read_sampler(file, samplers[index], prop, f"{label}, sampler {index}")
+        found[node][prop] = known[index, prop]
+    duration = max((float(sampler.times[-1]) for sampler in known.values()), default=0.0)
+    weights = {node: moved.pop(_WEIGHTS) for node, moved in found.items() if _WEIGHTS in moved}
+    return GltfAnimation({node: moved for node, moved in found.items() if moved}, weights, duration)
+
+
+def _find(file: GltfFile, wanted: str | int) -> int:
+    names = animation_names(file)
+    if not names:
+        file.fail("it has no animation; leave out the object's animation")
+    if isinstance(wanted, int):
+        return file.index(wanted, len(names), "asked for is animation")
+    if wanted not in names:
+        known = ", ".join(repr(name) for name in names[:8]) + (", ..." if len(names) > 8 else "")
+        file.fail(f"animation {wanted!r} is asked for; it has {known}")
+    return names.index(wanted)
+
+
+def _read_sampler(file: GltfFile, item: dict[str, Any], prop: str, label: str) -> Sampler:
+    way, width = item.get("interpolation", "LINEAR"), WIDTHS.get(prop, 1)
+    if way not in INTERPOLATIONS:
+        file.fail(f"{label} has the interpolation {str(way)[:20]!r}; {', '.join(INTERPOLATIONS)} are right")
+    times = np.asarray(file.array(item.get("input"), f"{label}: input", 1), dtype=np.float64)[:, 0]
+    values = np.asarray(file.array(item.get("output"), f"{label}: output", width), dtype=np.float64)
+    count, each = len(times), 3 if way == "CUBICSPLINE" else 1
+    if prop == _WEIGHTS and count and len(values) and not len(values) % (each * count):
+        width = len(values) // (each * count)
+        values = values.reshape(-1, width)
+    if not count:
+        file.fail(f"{label} has no keyframe")
+    if not (np.abs(times) < LARGEST).all() or (np.diff(times) < 0.0).any() or times[0] < 0.0:
+        file.fail(f"{label} has times that are not finite, below 0, or not in order")
+    if len(values) != each * count:
+        file.fail(f"{label} has {count} times and {len(values)} values; {each * count} are right")
+    if not (np.abs(values) < LARGEST).all():
+        file.fail(f"{label} has a value that is not finite, or above {LARGEST:g}")
+    shaped: npt.NDArray[np.float64] = values.reshape(count, 3, width) if each == 3 else values
+    keys = shaped[:, 1] if each == 3 else shaped
+    if prop == "rotation" and not (np.linalg.norm(keys, axis=1) > _SHORTEST).all():
+        file.fail(f"{label} has a rotation without length")
+    return Sampler(times, shaped, way, prop == "rotation")
+
+
+Array = npt.NDArray[np.float64]
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _UP: Final = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
@@ -39,227 +268,186 @@ _MOST_PLACES: Final = 20_000
 _COMPRESSED: Final = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
 
 
+Bending: TypeAlias = Callable[[float], MeshPart | None]
+"""Function that gives a part at a time of the animation, with the same faces."""
+_Bones: TypeAlias = Callable[[float], Array]
+"""Function that gives the transform of each vertex at a time, (n, 4, 4), to +Z up."""
+
+
 @dataclasses.dataclass
 class GltfContents:
-    """What a file holds, in its world turned to +Z up."""
+    """Contents of a file, in its world turned to +Z up."""
 
     parts: list[MeshPart]
     """Triangles, one part per primitive and place."""
-    images: list[npt.NDArray[np.uint8]]
-    """Pictures that materials name, RGBA."""
-    notes: list[str]
-    """What is not shown."""
     carriers: list[int] = dataclasses.field(default_factory=list)
     """Number of the anchor that each part hangs on, and in whose coordinates it is; -1: in the world."""
     anchors: tuple[Anchor, ...] = ()
     """Nodes that the animation moves."""
     duration: float = 0.0
     """Of the animation, in seconds."""
+    bends: list[Bending | None] = dataclasses.field(default_factory=list)
+    """Of each part; None: it keeps its shape."""
 
 
-def load_gltf(path: Path, data: bytes, assets: Assets, *, animation: str | int | None = None) -> GltfContents:
+def load_gltf(source: MeshSource, *, animation: str | int | None = None) -> GltfContents:
     """Read the triangles of a file's scene, with materials.
 
+    Follows:
+        nodes and their animations; triangles, strips, fans; sparse accessors; core materials, samplers; tangents,
+        COLOR_0, TEXCOORD_0 and 1; skins and morph targets; KHR_texture_transform, KHR_materials_unlit,
+        KHR_materials_emissive_strength, KHR_mesh_quantization, EXT_texture_webp.
+
+    Names:
+        other extensions; ICC profiles, as glTF says.
+
     Args:
-        path: The file, for messages.
-        data: Its bytes.
-        assets: Finds the files that it names.
+        source: The file.
         animation: Name or number of the animation that is to move it; None: all stands as at the start.
 
     Raises:
-        SceneError: It is damaged, too large, names what is missing, or cannot be read without an extension.
+        SceneError: Damaged; meshes compressed by Draco or meshopt.
     """
-    return _Reader(path, data, assets).contents(animation)
+    return _Reader(source).contents(animation)
 
 
-@dataclasses.dataclass
-class _Rig:
-    """What an animation moves."""
+@dataclasses.dataclass(frozen=True)
+class _Place:
+    """Place of a node."""
 
-    anchors: list[Anchor] = dataclasses.field(default_factory=list)
-    places: dict[int, tuple[int, npt.NDArray[np.float64]]] = dataclasses.field(default_factory=dict)
-    """By node that moves: its anchor, and its transform below that."""
-    below: dict[int, tuple[int, npt.NDArray[np.float64]]] = dataclasses.field(default_factory=dict)
-    """Likewise of all nodes; those that stand still have anchor -1."""
-    duration: float = 0.0
+    world: Array
+    """In the file's world as it starts, (4, 4)."""
+    carrier: int = -1
+    """Number of the anchor that it hangs on; -1: none."""
+    below: Array = dataclasses.field(default_factory=lambda: _UP)
+    """Below its anchor, or in the world turned to +Z up, (4, 4)."""
 
 
 class _Reader:
     """Walks one file."""
 
-    def __init__(self, path: Path, data: bytes, assets: Assets) -> None:
-        self._path, self._assets = path, assets
-        self._header, self._buffers = read_gltf(path, data, assets)
-        self._arrays = GltfArrays(path, self._header, self._buffers)
-        self._materials = GltfMaterials(path, self._header, self._take_image, self._note)
-        self._nodes, self._meshes, self._skins = (
-            objects(path, self._header, key) for key in ("nodes", "meshes", "skins")
-        )
+    def __init__(self, source: MeshSource) -> None:
+        self._source, self._file = source, GltfFile(source)
+        self._materials = GltfMaterials(self._file, self._take_image)
+        self._nodes, self._meshes, self._skins = (self._file.objects(key) for key in ("nodes", "meshes", "skins"))
         self._primitives: dict[tuple[int, int], MeshPart | None] = {}
         self._images: dict[int, int] = {}
-        self._decoded: list[npt.NDArray[np.uint8]] = []
         self._pixels = self._elements = 0
-        self._notes: dict[str, None] = {}
-        self._parents: dict[int, int] = {}
+        self._anchors: list[Anchor] = []
+        self._places: dict[int, _Place] = {}
 
     def contents(self, animation: str | int | None) -> GltfContents:
         """All that the scene shows."""
         self._look_at_extensions()
-        if animation is None and animation_names(self._path, self._header):
-            self._note("animations (an object's key play names one)")
-        if objects(self._path, self._header, "cameras"):
-            self._note("cameras")
+        if animation is None and animation_names(self._file):
+            self._source.note("animations (an object's key play names one)")
+        if self._file.objects("cameras"):
+            self._source.note("cameras")
         if len(self._nodes) > _MOST_PLACES:
-            fail(self._path, f"it has {len(self._nodes):,} nodes; at most {_MOST_PLACES:,} are read: join them")
-        parts: list[MeshPart] = []
-        world = self._world_transforms()
-        shown = [node["mesh"] for index in world if "mesh" in (node := self._nodes[index])]
-        places = sum(
-            len(objects(self._path, self._meshes[number], "primitives"))
-            for number in self._indices(shown, "nodes' meshes", len(self._meshes))
+            self._file.fail(f"it has {len(self._nodes):,} nodes; at most {_MOST_PLACES:,} are read: join them")
+        still = GltfAnimation({}, {}, 0.0)
+        moves = still if animation is None else read_animation(self._file, animation)
+        self._place_nodes(moves)
+        shown = [self._nodes[index] for index in self._places]
+        meshes = self._file.indices(
+            [node["mesh"] for node in shown if "mesh" in node], len(self._meshes), "a node's mesh is"
         )
-        if places > _MOST_PLACES:
-            fail(self._path, f"its nodes place {places:,} primitives; at most {_MOST_PLACES:,} are read: join them")
-        rig = _Rig() if animation is None else self._rig(animation, world)
+        count = sum(len(self._file.objects("primitives", self._meshes[number])) for number in meshes)
+        if count > _MOST_PLACES:
+            self._file.fail(f"its nodes place {count:,} primitives; at most {_MOST_PLACES:,} are read: join them")
+        parts: list[MeshPart] = []
         carriers: list[int] = []
-        for index, transform in world.items():
-            node = self._nodes[index]
+        bends: list[Bending | None] = []
+        for node, (index, place) in zip(shown, self._places.items(), strict=True):
             if "mesh" in node:
-                place = rig.places.get(index)
-                if "skin" in node:
-                    place = None
-                parts += self._mesh(node, _UP @ transform if place is None else place[1], world)
-                carriers += [-1 if place is None else place[0]] * (len(parts) - len(carriers))
-        self._note_still([self._nodes[index] for index in world], animation)
-        return GltfContents(parts, self._decoded, list(self._notes), carriers, tuple(rig.anchors), rig.duration)
-
-    def _note(self, what: str) -> None:
-        self._notes.setdefault(what)
-
-    def _note_still(self, shown: list[dict[str, Any]], animation: str | int | None) -> None:
-        """Say, once for both, that skins and morph targets do not move, where an animation would have them do so."""
-        animated = bool(animation_names(self._path, self._header))
-        skins = animated and any("skin" in node and "mesh" in node for node in shown)
-        morphs = animated and moves_morph_targets(self._path, self._header, animation)
-        if still := [name for name, there in (("skins", skins), ("morph targets", morphs)) if there]:
-            self._note(f"movement of {' and '.join(still)} (they stand as at the start)")
+                # A skinned mesh stands where its joints are, whatever its own node says.
+                place = place if "skin" not in node else _Place(place.world, below=_UP @ place.world)
+                for part, bend in self._mesh(node, place.below, moves.weights.get(index)):
+                    parts.append(part)
+                    bends.append(bend)
+                    carriers.append(place.carrier)
+        return GltfContents(parts, carriers, tuple(self._anchors), moves.duration, bends)
 
     def _look_at_extensions(self) -> None:
-        used, required = (self._header.get(key, []) for key in ("extensionsUsed", "extensionsRequired"))
+        used, required = (self._file.header.get(key, []) for key in ("extensionsUsed", "extensionsRequired"))
         if not isinstance(used, list) or not isinstance(required, list):
-            fail(self._path, "extensionsUsed or extensionsRequired is no list")
+            self._file.fail("extensionsUsed or extensionsRequired is no list")
         for name in required:
             if name in _COMPRESSED:
-                fail(self._path, f"it is compressed with {name}; save it without compression")
+                self._file.fail(f"it is compressed with {name}; save it without compression")
         # A file should list all that it uses; what a material has and the list lacks is left out as well.
-        own = [item.get("extensions") for item in objects(self._path, self._header, "materials")]
+        own = [item.get("extensions") for item in self._file.objects("materials")]
         found = [name for table in own if isinstance(table, dict) for name in table]
         for name in dict.fromkeys(str(name)[:60] for name in [*used, *required, *found]):
             if name not in SUPPORTED:
-                self._note(name)
+                self._source.note(name)
 
     # ---- nodes ---------------------------------------------------------------------------------------------------
 
-    def _indices(self, value: object, what: str, count: int) -> list[int]:
-        if value is None:
-            return []
-        if not isinstance(value, list):
-            fail(self._path, f"{what} are {str(value)[:30]!r}; a list of numbers is right")
-        for entry in value:
-            if isinstance(entry, bool) or not isinstance(entry, int) or not 0 <= entry < count:
-                fail(self._path, f"{what} hold {str(entry)[:20]}; there are {count}, counted from 0")
-        return value
-
-    def _world_transforms(self) -> dict[int, npt.NDArray[np.float64]]:
-        """Transform of every node of the scene that is shown, (4, 4)."""
-        scenes = objects(self._path, self._header, "scenes")
-        number = self._header.get("scene", 0)
+    def _place_nodes(self, moves: GltfAnimation) -> None:
+        """Find where every node of the scene that is shown stands, and what hangs on those that move."""
+        scenes, count = self._file.objects("scenes"), len(self._nodes)
+        below = [
+            self._file.indices(node.get("children"), count, f"a child of node {index} is")
+            for index, node in enumerate(self._nodes)
+        ]
         if scenes:
-            (number,) = self._indices([number], "the scene's number", len(scenes))
-            waiting = [(node, np.eye(4)) for node in self._roots(scenes[number])]
+            number = self._file.index(self._file.header.get("scene", 0), len(scenes), "the scene is")
+            roots = self._file.indices(scenes[number].get("nodes"), count, "the scene has node")
         else:
-            count = len(self._nodes)
-            children = {
-                child for node in self._nodes for child in self._indices(node.get("children"), "children", count)
-            }
-            waiting = [(node, np.eye(4)) for node in range(len(self._nodes)) if node not in children]
-            if self._nodes and not waiting:
-                fail(self._path, "its nodes stand below each other in a circle")
-        found: dict[int, npt.NDArray[np.float64]] = {}
-        waiting.reverse()
+            roots = sorted(set(range(count)) - {child for children in below for child in children})
+            if self._nodes and not roots:
+                self._file.fail("its nodes stand below each other in a circle")
+        waiting = [(node, _Place(np.eye(4))) for node in reversed(roots)]
         while waiting:
-            index, parent = waiting.pop()
-            if index in found:
-                fail(self._path, f"node {index} is reached twice: nodes form no tree")
-            node = self._nodes[index]
-            local = self._local(node, index)
+            index, above = waiting.pop()
+            if index in self._places:
+                self._file.fail(f"node {index} is reached twice: nodes form no tree")
+            local = self._local(self._nodes[index], index)
             with np.errstate(invalid="ignore", over="ignore"):
-                found[index] = parent @ local
-            if not (np.abs(found[index]) < LARGEST).all():
-                fail(self._path, f"node {index} has a transform that is not finite, or above {LARGEST:g}")
-            children_of = self._indices(node.get("children"), f"children of node {index}", len(self._nodes))
-            self._parents.update(dict.fromkeys(children_of, index))
-            waiting += [(child, found[index]) for child in reversed(children_of)]
-        return found
+                world = above.world @ local
+            if not (np.abs(world) < LARGEST).all():
+                self._file.fail(f"node {index} has a transform that is not finite, or above {LARGEST:g}")
+            if (samplers := moves.samplers.get(index)) is None:
+                place = _Place(world, above.carrier, above.below @ local)
+            else:
+                if "matrix" in self._nodes[index]:
+                    right = "translation, rotation and scale are right"
+                    self._file.fail(f"an animation moves node {index}, which has a matrix; {right}")
+                track = dataclasses.replace(self._track(self._nodes[index], index), samplers=samplers)
+                place = _Place(world, len(self._anchors), np.eye(4))
+                self._anchors.append(Anchor(above.carrier, above.below, track))
+            self._places[index] = place
+            waiting += [(child, place) for child in reversed(below[index])]
 
-    def _roots(self, scene: dict[str, Any]) -> list[int]:
-        return self._indices(scene.get("nodes"), "the scene's nodes", len(self._nodes))
+    def _numbers(self, node: dict[str, Any], index: int, key: str, *default: float) -> Array:
+        return np.array(self._file.numbers(node, key, default, LARGEST, f"node {index}", low=-LARGEST))
 
-    def _numbers(self, node: dict[str, Any], index: int, key: str, default: list[float]) -> npt.NDArray[np.float64]:
-        value = node.get(key, default)
-        sound = isinstance(value, list) and len(value) == len(default)
-        if not sound or any(isinstance(v, bool) or not isinstance(v, int | float) for v in value):
-            fail(self._path, f"node {index} has {key} {str(value)[:30]!r}; {len(default)} numbers are right")
-        return np.array([float(v) if abs(v) < LARGEST else np.inf for v in value])
-
-    def _local(self, node: dict[str, Any], index: int) -> npt.NDArray[np.float64]:
+    def _local(self, node: dict[str, Any], index: int) -> Array:
         if "matrix" in node:
-            return self._numbers(node, index, "matrix", [0.0] * 16).reshape(4, 4).T
+            return self._numbers(node, index, "matrix", *[0.0] * 16).reshape(4, 4).T
         with np.errstate(invalid="ignore", over="ignore"):  # the caller asks whether it is finite
             return self._track(node, index).transform_at(0.0)
 
     def _track(self, node: dict[str, Any], index: int) -> NodeTrack:
         """A node's translation, rotation and scale."""
-        rotation = self._numbers(node, index, "rotation", [0.0, 0.0, 0.0, 1.0])
+        rotation = self._numbers(node, index, "rotation", 0.0, 0.0, 0.0, 1.0)
         length = float(np.sqrt((rotation * rotation).sum()))
         if not 0.0 < length < np.inf:
-            fail(self._path, f"node {index} has a rotation without length")
-        scale = self._numbers(node, index, "scale", [1.0, 1.0, 1.0])
-        return NodeTrack(self._numbers(node, index, "translation", [0.0, 0.0, 0.0]), rotation / length, scale, {})
-
-    def _rig(self, wanted: str | int, world: dict[int, npt.NDArray[np.float64]]) -> _Rig:
-        """The nodes that an animation moves, and what hangs on them."""
-        animation = read_animation(self._path, self._header, self._arrays, wanted, self._note)
-        rig = _Rig(duration=animation.duration)
-        numbers: dict[int, int] = {}
-        for index in world:  # each after its parent
-            carrier, below = rig.below.get(self._parents.get(index, -1), (-1, _UP))
-            node, samplers = self._nodes[index], animation.samplers.get(index)
-            if samplers is None:
-                rig.below[index] = carrier, below @ self._local(node, index)
-            else:
-                if "matrix" in node:
-                    fail(self._path, f"an animation moves node {index}, which has a matrix; translation, rotation and "
-                         "scale are right")  # fmt: skip
-                track = dataclasses.replace(self._track(node, index), samplers=samplers)
-                numbers[index] = len(rig.anchors)
-                rig.anchors.append(Anchor(carrier, below, track))
-                rig.below[index] = numbers[index], np.eye(4)
-            if rig.below[index][0] >= 0:
-                rig.places[index] = rig.below[index]
-        return rig
+            self._file.fail(f"node {index} has a rotation without length")
+        scale = self._numbers(node, index, "scale", 1.0, 1.0, 1.0)
+        return NodeTrack(self._numbers(node, index, "translation", 0.0, 0.0, 0.0), rotation / length, scale, {})
 
     # ---- meshes --------------------------------------------------------------------------------------------------
 
     def _mesh(
-        self, node: dict[str, Any], transform: npt.NDArray[np.float64], world: dict[int, npt.NDArray[np.float64]]
-    ) -> list[MeshPart]:
-        (number,) = self._indices([node["mesh"]], "a node's mesh", len(self._meshes))
-        primitives = objects(self._path, self._meshes[number], "primitives")
-        parts = []
-        for primitive in primitives:
+        self, node: dict[str, Any], transform: Array, weights: Sampler | None
+    ) -> Iterator[tuple[MeshPart, Bending | None]]:
+        """Yield the primitives of a node at time 0, placed by ``transform`` or their joints, and what bends them."""
+        number = node["mesh"]
+        for primitive in self._file.objects("primitives", self._meshes[number]):
             if primitive.get("mode", _TRIANGLES) not in (_TRIANGLES, _STRIP, _FAN):
-                self._note("points and lines")
+                self._source.note("points and lines")
                 continue
             # The same triangles may stand at thousands of nodes.
             alike = "weights" not in node
@@ -271,30 +459,27 @@ class _Reader:
                 continue
             self._elements += len(part.faces)
             if self._elements > limits().mesh_elements:
-                raise SceneError(too_much(f"{self._path}", self._elements, "faces", "mesh_elements"))
-            bones = self._bones(node, primitive, world) if "skin" in node else None
-            # A skinned mesh stands where its joints are, whatever its own node says.
-            moved = part.moved(transform) if bones is None else part.bent(np.einsum("ij,njk->nik", _UP, bones))
-            if moved is not None:
-                parts.append(moved)
-        return parts
+                raise SceneError(too_much(f"{self._source.path}", self._elements, "faces", "mesh_elements"))
+            bones, moves = self._bones(node, primitive) if "skin" in node else (None, False)
+            morph = None if weights is None else self._morph(primitive, part, weights)
+            bend = functools.partial(_bend, part, morph, bones, transform)
+            if (placed := bend(0.0)) is not None:
+                yield placed, bend if moves or morph is not None else None
 
     def _primitive(self, primitive: dict[str, Any], mesh: dict[str, Any], node: dict[str, Any]) -> MeshPart | None:
-        attributes = primitive.get("attributes")
-        if not isinstance(attributes, dict):
-            fail(self._path, "a primitive has no attributes")
+        attributes = self._file.table(primitive, "attributes", "a primitive")
         if "POSITION" not in attributes:
-            self._note("primitives without positions")
+            self._source.note("primitives without positions")
             return None
-        vertices = np.asarray(self._arrays.read(attributes["POSITION"], "POSITION", (3,)), dtype=np.float64)
+        vertices = np.asarray(self._file.array(attributes["POSITION"], "POSITION", 3), dtype=np.float64)
         count = len(vertices)
 
-        def attribute(name: str, *widths: int) -> npt.NDArray[np.float64] | None:
+        def attribute(name: str, *widths: int) -> Array | None:
             if name not in attributes:
                 return None
-            values = self._arrays.read(attributes[name], name, widths)
+            values = self._file.array(attributes[name], name, *widths)
             if len(values) != count:
-                fail(self._path, f"{name} has {len(values)} elements, POSITION {count}")
+                self._file.fail(f"{name} has {len(values)} elements, POSITION {count}")
             return np.asarray(values, dtype=np.float64)
 
         vertices, normals = self._morphed(primitive, mesh, node, vertices, attribute("NORMAL", 3))
@@ -303,11 +488,11 @@ class _Reader:
             colors = np.concatenate([colors, np.ones((count, 1))], axis=1)
         faces = self._faces(primitive, count)
         if len(faces) > limits().mesh_elements:
-            raise SceneError(too_much(f"{self._path}", len(faces), "faces", "mesh_elements"))
+            raise SceneError(too_much(f"{self._source.path}", len(faces), "faces", "mesh_elements"))
         if not len(faces):
             return None
         return MeshPart.checked(
-            f"{self._path}",
+            f"{self._source.path}",
             vertices,
             faces,
             normals,
@@ -320,14 +505,10 @@ class _Reader:
 
     def _faces(self, primitive: dict[str, Any], count: int) -> npt.NDArray[np.int64]:
         if "indices" in primitive:
-            indices = self._arrays.read(primitive["indices"], "indices", (1,))[:, 0]
+            indices = self._file.array(primitive["indices"], "indices", 1)[:, 0]
             if indices.dtype.kind != "u":
-                fail(self._path, "indices are no whole numbers without sign")
-            indices = indices.astype(np.int64)
-            if len(indices) and int(indices.max()) >= count:
-                raise SceneError(
-                    f"{self._path}: a face has vertex index {int(indices.max())}; there are {count} vertices from 0 on"
-                )
+                self._file.fail("indices are no whole numbers without sign")
+            indices = np.asarray(indices, dtype=np.int64)
         else:
             indices = np.arange(count, dtype=np.int64)
         mode = primitive.get("mode", _TRIANGLES)
@@ -335,141 +516,122 @@ class _Reader:
             return indices[: len(indices) // 3 * 3].reshape(-1, 3)
         if len(indices) < 3:
             return np.zeros((0, 3), np.int64)
-        a, b, c = indices[:-2], indices[1:-1], indices[2:]
-        if mode == _FAN:
-            return np.stack([np.broadcast_to(indices[0], b.shape), b, c], axis=-1)
-        odd = np.arange(len(a)) % 2 == 1
-        return np.stack([a, np.where(odd, c, b), np.where(odd, b, c)], axis=-1)
+        if mode == _STRIP:
+            return strip_triangles(indices)
+        return np.stack([np.full(len(indices) - 2, indices[0]), indices[1:-1], indices[2:]], axis=-1)
 
     def _morphed(
         self,
         primitive: dict[str, Any],
         mesh: dict[str, Any],
         node: dict[str, Any],
-        vertices: npt.NDArray[np.float64],
-        normals: npt.NDArray[np.float64] | None,
-    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64] | None]:
+        vertices: Array,
+        normals: Array | None,
+    ) -> tuple[Array, Array | None]:
         """Vertices moved by morph targets at the weights that the file starts with."""
-        targets = objects(self._path, primitive, "targets")
+        targets = self._file.objects("targets", primitive)
         weights = node.get("weights", mesh.get("weights"))
         if not targets or not isinstance(weights, list):
             return vertices, normals
         for weight, target in zip(weights, targets, strict=False):
-            if isinstance(weight, bool) or not isinstance(weight, int | float) or not abs(weight) < LARGEST:
-                fail(self._path, f"a morph target has the weight {str(weight)[:20]!r}, which is no finite number")
-            for name, values in (("POSITION", vertices), ("NORMAL", normals)):
-                if weight and name in target and values is not None:
-                    delta = self._arrays.read(target[name], f"{name} of a morph target", (3,))
-                    if len(delta) != len(values):
-                        fail(self._path, f"{name} of a morph target has {len(delta)} elements, not {len(values)}")
-                    moved = values + weight * np.asarray(delta, dtype=np.float64)
-                    vertices, normals = (moved, normals) if name == "POSITION" else (vertices, moved)
+            weight = self._file.number({"weight": weight}, "weight", 0.0, LARGEST, "a morph target", low=-LARGEST)
+            if weight:
+                vertices = vertices + weight * self._delta(target, "POSITION", len(vertices))
+                normals = None if normals is None else normals + weight * self._delta(target, "NORMAL", len(vertices))
         return vertices, normals
 
-    def _bones(
-        self,
-        node: dict[str, Any],
-        primitive: dict[str, Any],
-        world: dict[int, npt.NDArray[np.float64]],
-    ) -> npt.NDArray[np.float64] | None:
-        """Transform of each vertex by the joints as they stand, (n, 4, 4); None: nothing says which."""
-        (number,) = self._indices([node["skin"]], "a node's skin", len(self._skins))
-        skin, attributes = self._skins[number], primitive["attributes"]
-        joints = self._indices(skin.get("joints"), "joints of a skin", len(self._nodes))
-        if not joints or "JOINTS_0" not in attributes or "WEIGHTS_0" not in attributes:
+    def _delta(self, target: dict[str, Any], name: str, count: int) -> Array:
+        """Return what a morph target adds to an attribute of so many vertices, (count, 3), zeros without one."""
+        if name not in target:
+            return np.zeros((count, 3))
+        delta = self._file.array(target[name], f"{name} of a morph target", 3)
+        if len(delta) != count:
+            self._file.fail(f"{name} of a morph target has {len(delta)} elements, not {count}")
+        return np.asarray(delta, dtype=np.float64)
+
+    def _morph(self, primitive: dict[str, Any], part: MeshPart, weights: Sampler) -> Bending | None:
+        """Return a function from a time to the part at its weights; None: it has no morph targets."""
+        targets, attributes = self._file.objects("targets", primitive), primitive["attributes"]
+        targets = targets[: weights.at(0.0).size]
+        if not targets:
             return None
+        vertices = np.asarray(self._file.array(attributes["POSITION"], "POSITION", 3), dtype=np.float64)
+        normals = self._file.array(attributes["NORMAL"], "NORMAL", 3) if "NORMAL" in attributes else None
+        count, names = len(vertices), ("POSITION", "NORMAL")
+        deltas, turns = (np.stack([self._delta(target, name, count) for target in targets]) for name in names)
+        where = np.arange(count) if part.source is None else part.source
+
+        def morph(seconds: float) -> MeshPart:
+            weight = weights.at(seconds)[: len(targets)]
+            placed = (vertices + np.tensordot(weight, deltas, 1))[where]
+            if normals is None:  # every corner is a vertex of its own
+                turned = creased_normals(placed, part.faces, 0.0)[1].astype(np.float64)
+            else:
+                turned = unit_or((normals + np.tensordot(weight, turns, 1))[where], part.normals)
+            return dataclasses.replace(part, vertices=placed, normals=turned)
+
+        return morph
+
+    def _bones(self, node: dict[str, Any], primitive: dict[str, Any]) -> tuple[_Bones | None, bool]:
+        """Transforms of the vertices by the joints, and whether these move; None: nothing says which joints."""
+        number = self._file.index(node["skin"], len(self._skins), "a node's skin is")
+        skin, attributes = self._skins[number], primitive["attributes"]
+        joints = self._file.indices(skin.get("joints"), len(self._nodes), "a joint of a skin is node")
+        if not joints or "JOINTS_0" not in attributes or "WEIGHTS_0" not in attributes:
+            return None, False
         if "JOINTS_1" in attributes:
-            self._note("joints beyond four per vertex")
+            self._source.note("joints beyond four per vertex")
         inverse = np.tile(np.eye(4), (len(joints), 1, 1))
         if "inverseBindMatrices" in skin:
-            values = self._arrays.read(skin["inverseBindMatrices"], "inverseBindMatrices", (16,))
+            values = self._file.array(skin["inverseBindMatrices"], "inverseBindMatrices", 16)
             if len(values) < len(joints):
-                fail(self._path, f"a skin has {len(joints)} joints and {len(values)} inverse bind matrices")
+                self._file.fail(f"a skin has {len(joints)} joints and {len(values)} inverse bind matrices")
             inverse = values[: len(joints)].reshape(-1, 4, 4).transpose(0, 2, 1)
-        count = len(self._arrays.read(attributes["POSITION"], "POSITION", (3,)))
-        places = self._arrays.read(attributes["JOINTS_0"], "JOINTS_0", (4,))
-        weights = np.asarray(self._arrays.read(attributes["WEIGHTS_0"], "WEIGHTS_0", (4,)), dtype=np.float64)
+        count = len(self._file.array(attributes["POSITION"], "POSITION", 3))
+        places = self._file.array(attributes["JOINTS_0"], "JOINTS_0", 4)
+        weights = np.asarray(self._file.array(attributes["WEIGHTS_0"], "WEIGHTS_0", 4), dtype=np.float64)
         if len(places) != count or len(weights) != count or places.dtype.kind != "u":
-            fail(self._path, f"JOINTS_0 and WEIGHTS_0 are not of {count} vertices")
+            self._file.fail(f"JOINTS_0 and WEIGHTS_0 are not of {count} vertices")
         if count and int(places.max()) >= len(joints):
-            fail(self._path, f"JOINTS_0 holds {int(places.max())}; the skin has {len(joints)} joints, from 0 on")
-        bones = np.stack([world.get(joint, np.eye(4)) for joint in joints]) @ inverse
+            self._file.fail(f"JOINTS_0 holds {int(places.max())}; the skin has {len(joints)} joints, from 0 on")
+        standing = [self._places.get(joint, _Place(np.eye(4))) for joint in joints]
+        bones = np.stack([place.below for place in standing]) @ inverse
         total = weights.sum(axis=1, keepdims=True)
         if not (np.isfinite(bones).all() and np.isfinite(total).all() and (total > 0.0).all()):
-            fail(self._path, "a skin has bind matrices or weights that are not finite, or weights without sum")
-        weights = weights / total
-        return np.asarray(np.einsum("nj,njab->nab", weights, bones[places.astype(np.int64)]), dtype=np.float64)
+            self._file.fail("a skin has bind matrices or weights that are not finite, or weights without sum")
+        places, weights, anchors = places.astype(np.int64), weights / total, tuple(self._anchors)
+        carriers = [place.carrier for place in standing]
+
+        def at(seconds: float) -> Array:
+            now = part_transforms(anchors, carriers, seconds) @ bones
+            return np.asarray(np.einsum("nj,njab->nab", weights, now[places]), dtype=np.float64)
+
+        return at, max(carriers) >= 0
 
     # ---- pictures ------------------------------------------------------------------------------------------------
 
-    def _take_image(self, index: object) -> int:
-        if not isinstance(index, int) or index not in self._images:
-            data = image_bytes(self._path, self._header, index, self._buffers, self._assets)
-            assert isinstance(index, int)
-            size = picture_size(data) or (0, 0)
-            self._pixels += size[0] * size[1]
+    def _take_image(self, index: int) -> int:
+        if index not in self._images:
+            data = self._file.image(index)
+            width, height = picture_size(data) or (0, 0)
+            self._pixels += width * height
             if self._pixels > _MOST_IMAGES * limits().picture_pixels:
-                raise SceneError(too_much(f"{self._path}: its pictures", self._pixels, "pixels", "picture_pixels"))
-            self._images[index] = len(self._decoded)
-            self._decoded.append(decode_rgba(data, f"{self._path}: its image {index}"))
+                raise SceneError(
+                    too_much(f"{self._source.path}: its pictures", self._pixels, "pixels", "picture_pixels")
+                )
+            self._images[index] = len(self._source.images)
+            self._source.images.append(decode_rgba(data, f"{self._source.path}: its image {index}"))
         return self._images[index]
 
 
-def _upward(uvs: npt.NDArray[np.float64] | None) -> npt.NDArray[np.float64] | None:
+def _bend(
+    part: MeshPart, morph: Bending | None, bones: _Bones | None, transform: Array, seconds: float
+) -> MeshPart | None:
+    """A primitive at a time: bent by its morph targets, then placed by its joints or its node."""
+    part = part if morph is None else morph(seconds) or part
+    return part.moved(transform) if bones is None else part.bent(bones(seconds))
+
+
+def _upward(uvs: Array | None) -> Array | None:
     """Texture coordinates with v up the picture; glTF's runs down."""
     return None if uvs is None else uvs * np.array([1.0, -1.0]) + np.array([0.0, 1.0])
-
-
-def decode_rgba(data: bytes, label: str) -> npt.NDArray[np.uint8]:
-    """A picture as (h, w, 4) RGBA of 8 bits; grey becomes RGB, alpha is 255 where there is none.
-
-    Raises:
-        SceneError: It cannot be decoded.
-    """
-    # glTF: pictures lie as they are, whatever their EXIF says.
-    picture = decode_picture(data, cv2.IMREAD_UNCHANGED, SceneError, label)
-    clear = transparent_code(data)
-    if clear is not None and picture.dtype in (np.uint8, np.uint16):
-        return _with_clear_code(picture, data, clear)
-    if picture.dtype in (np.float32, np.float64):
-        alpha = picture[..., 3:] if picture.ndim == 3 else picture[..., :0]
-        codes = encode_texture(np.clip(np.nan_to_num(picture), 0.0, 1.0), encoded=True)
-        picture = codes if not alpha.size else np.concatenate([codes[..., :3], np.uint8(255 * np.clip(alpha, 0, 1))], 2)
-    if picture.dtype == np.uint16:
-        picture = np.round(picture / 257.0).astype(np.uint8)
-    if picture.dtype != np.uint8 or picture.ndim not in (2, 3):
-        raise SceneError(f"{label} has {picture.dtype} values; 8 or 16 bits are right")
-    channels = 1 if picture.ndim == 2 else picture.shape[2]
-    if channels == 2:  # grey and alpha
-        picture = np.concatenate([np.repeat(picture[..., :1], 3, axis=2), picture[..., 1:]], axis=2)
-    elif channels != 4:
-        code = cv2.COLOR_GRAY2RGBA if channels == 1 else cv2.COLOR_BGR2RGBA
-        return np.asarray(cv2.cvtColor(picture, code), dtype=np.uint8)
-    else:
-        picture = picture[..., [2, 1, 0, 3]]
-    return np.ascontiguousarray(picture, dtype=np.uint8)
-
-
-def transparent_code(data: bytes) -> tuple[int, ...] | None:
-    """Return the grey or the colour that is transparent in a PNG, which OpenCV leaves out; None if there is none."""
-    if not data.startswith(b"\x89PNG") or data[25:26] not in (b"\0", b"\2"):
-        return None
-    at = data.find(b"tRNS", 33)
-    count = 1 if data[25] == 0 else 3
-    if at < 0 or at > data.find(b"IDAT") or len(data) < at + 4 + 2 * count:
-        return None
-    return struct.unpack_from(f">{count}H", data, at + 4)
-
-
-def _with_clear_code(picture: npt.NDArray[Any], data: bytes, clear: tuple[int, ...]) -> npt.NDArray[np.uint8]:
-    """Return RGBA of 8 bits in which one code of a PNG is transparent."""
-    depth = data[24]
-    scale = 255 // ((1 << depth) - 1) if depth < 8 else 1  # grey of fewer bits was spread over 8
-    color = (
-        picture[..., None] if picture.ndim == 2 else picture[..., 2::-1] if picture.shape[2] > 2 else picture[..., :1]
-    )
-    same = (color[..., : len(clear)] == np.array(clear) * scale).all(2)
-    codes = np.round(color / 257.0) if color.dtype == np.uint16 else color
-    codes = np.broadcast_to(codes, (*codes.shape[:2], 3))
-    alpha = np.where(same, 0, 255)[..., None]
-    return np.ascontiguousarray(np.concatenate([codes, alpha], 2), dtype=np.uint8)

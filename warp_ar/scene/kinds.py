@@ -1,4 +1,4 @@
-"""Which kinds of shape, material and light a scene has: what arrays and kernels are made for, but no numbers."""
+"""Kinds of shape, material and light of a scene: what arrays and kernels are made for, but no numbers."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from warp_ar.kernels import structs
 from warp_ar.kernels.rays.trace import TraceConfig
 from warp_ar.scene.area_lights import emits
 from warp_ar.scene.geometry import rotation_matrix
-from warp_ar.scene.mesh_materials import MeshMaterial
+from warp_ar.scene.materials import MeshMaterial
 from warp_ar.scene.object_materials import materials_of, reflects_diffusely, reflects_glossily
 from warp_ar.scene.ray_mesh import mesh_key
 
@@ -39,12 +39,12 @@ def light_kind(light: scenes.Light) -> int:
 
 
 def has_sized_lights(scene: scenes.Scene) -> bool:
-    """Whether any virtual light has a radius, and so a soft shadow."""
+    """Return whether any virtual light has a radius, and so a soft shadow."""
     return any(light.radius > 0.0 for light in scene.lights)
 
 
 def trace_config(scene: scenes.Scene) -> TraceConfig:
-    """Which kinds of shape the rays of ``scene`` can meet, and whether triangles must be asked for more."""
+    """Return the kinds of shape that the rays of ``scene`` can meet, and whether triangles must be asked for more."""
     made_of = [materials_of(item) for item in scene.objects]
     return TraceConfig(
         objects=tuple(sorted({shape_kind(item) for item in scene.objects})),
@@ -59,29 +59,35 @@ def material_model(material: MeshMaterial) -> int:
     return _MODELS[type(material.surface)]
 
 
-def skeleton(scene: scenes.Scene) -> Any:
-    """What of a scene arrays and kernels are made for; scenes that share it differ in numbers alone."""
-    objects = tuple(
-        (
-            item.shape,
-            item.marker,
-            mesh_key(item),
-            item.play and item.play.animation,
-            type(item.material),
-            tuple(value for value in vars(item.material).values() if isinstance(value, Path)),
-            any(map(reflects_diffusely, materials_of(item).materials)),
-            any(map(reflects_glossily, materials_of(item).materials)),
-            tuple(map(emits, materials_of(item).materials)),
-        )
-        for item in scene.objects
-    )
-    lights = tuple((light.kind, light.marker) for light in scene.lights)
-    place = scene.camera, scene.marker, scene.has_marker, scene.pose, scene.captured
-    return *place, scene.probes, scene.proxies, objects, lights
+def skeleton(scene: scenes.Scene) -> tuple[tuple[str, Any], ...]:
+    """Return what arrays and kernels are made for, each by its name; scenes that share it differ in numbers alone."""
+    whole = ("camera", "marker", "has_marker", "pose", "captured", "probes", "proxies")
+    parts = [(name, getattr(scene, name)) for name in whole]
+    parts += [("the number of objects", len(scene.objects)), ("the number of lights", len(scene.lights))]
+    for index, item in enumerate(scene.objects):
+        label, made_of = f"objects[{index}]", materials_of(item).materials
+        pictures = tuple(value for value in vars(item.material).values() if isinstance(value, Path))
+        lobes = any(map(reflects_diffusely, made_of)), any(map(reflects_glossily, made_of))
+        parts += [
+            (f"{label}.shape", item.shape),
+            (f"{label}.marker", item.marker),
+            (f"the mesh of {label}", mesh_key(item)),
+            (f"{label}.play", item.play and item.play.animation),
+            (f"{label}.material", (type(item.material), pictures, lobes, tuple(map(emits, made_of)))),
+        ]
+    for index, light in enumerate(scene.lights):
+        parts += [(f"lights[{index}].kind", light.kind), (f"lights[{index}].marker", light.marker)]
+    return tuple(parts)
+
+
+def difference(before: scenes.Scene, after: scenes.Scene) -> str:
+    """Return the name of a part by which the skeletons of two scenes differ; empty where they are the same."""
+    pairs = zip(skeleton(before), skeleton(after), strict=False)  # where numbers differ, so does an earlier part
+    return next((name for (name, old), (_, new) in pairs if old != new), "")
 
 
 def proxies_face(scene: scenes.Scene) -> bool:
-    """Whether light that proxies send can reach one: not if there is one plane or box, or planes that look one way."""
+    """Return whether proxies' light can reach a proxy: not of one plane or box, or planes that look one way."""
     if any(proxy.shape == "mesh" for proxy in scene.proxies):
         return True  # which may face itself
     normals = [rotation_matrix(proxy.rotate)[:, 2] for proxy in scene.proxies if proxy.shape == "plane"]

@@ -1,38 +1,29 @@
-"""Meshes and textures from files: glTF by ``scene.gltf``, other formats through trimesh, pictures through OpenCV."""
+"""Meshes from files and from trimesh, still or moved by an animation of the file."""
 
 from __future__ import annotations
 
 import contextlib
-import io
-import logging
-import struct
-import zipfile
-import zlib
+import dataclasses
+import functools
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from warp_ar.errors import SceneError
 from warp_ar.files import is_file, read_bytes
-from warp_ar.pictures import read_picture
-from warp_ar.scene.geometry import Mesh, creased_normals, smooth_normals
-from warp_ar.scene.gltf import GltfContents, load_gltf
-from warp_ar.scene.gltf_animation import animation_names
-from warp_ar.scene.mesh_assets import Assets, check_counts, read_gltf
-from warp_ar.scene.mesh_materials import MeshMaterial
-from warp_ar.scene.mesh_parts import LARGEST, MeshPart, join_parts
-from warp_ar.scene.moving_mesh import moving_mesh
+from warp_ar.scene.geometry import Mesh
+from warp_ar.scene.gltf import Bending, GltfContents, animation_names, load_gltf
+from warp_ar.scene.gltf_file import GltfFile
+from warp_ar.scene.materials import MeshMaterial
+from warp_ar.scene.mesh_parts import LARGEST, MeshPart, filled, join_parts
+from warp_ar.scene.mesh_source import MeshSource
 from warp_ar.scene.mtl import read_library_material
-from warp_ar.scene.node_animation import MovingMesh
-from warp_ar.scene.polygon_files import READERS
-from warp_ar.scene.texture_codes import encode_texture
-from warp_ar.srgb import decode_srgb
-
-ByteArray = npt.NDArray[np.uint8]
+from warp_ar.scene.node_animation import Anchor, MovingMesh, MovingPart, part_transforms
+from warp_ar.scene.polygon_files import READERS, Corners, linear_rgba, parts_of
 
 MESH_SUFFIXES: Final = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
 """Mesh files that :func:`load_mesh` reads."""
@@ -40,57 +31,10 @@ MESH_SUFFIXES: Final = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
 GLTF_SUFFIXES: Final = (".glb", ".gltf")
 """Those of glTF."""
 
-CREASE: Final = 40.0
-"""Degrees: where a file of a drawing format (OBJ, STL, OFF) has no normals, an edge that turns more is sharp."""
-_DRAWN: Final = (".obj", ".stl", ".off")
-_STL_HEADER: Final = 80
-"""Bytes before the triangles of a binary STL."""
-_STL_TEXT: Final = 1 << 12
-"""Bytes within which a text has its first facet."""
-
-# What trimesh and Pillow have been seen to raise on damaged files; its readers do not document it.
-_LOADER_ERRORS: Final = (
-    ValueError,
-    LookupError,
-    TypeError,
-    AttributeError,
-    AssertionError,
-    ArithmeticError,
-    OSError,
-    NotImplementedError,
-    NameError,
-    SyntaxError,
-    EOFError,
-    BufferError,
-    ImportError,  # an encoding or compression that needs a package which is not there
-    RecursionError,
-    MemoryError,
-    struct.error,
-    zipfile.BadZipFile,
-    zlib.error,
-)
-
-# trimesh reports damaged files to its logger as well, traceback included; the exception says all that a user can use.
-logging.getLogger("trimesh").addHandler(logging.NullHandler())
-
-
-def load_texture(path: str | Path) -> ByteArray:
-    """Read a picture as a base colour texture.
-
-    Args:
-        path: PNG, JPEG, BMP, TIFF, WebP, GIF or PNM; deeper than 8 bits is reduced, alpha dropped, grey becomes RGB.
-
-    Returns:
-        (h, w, 3) RGB, sRGB-encoded, row 0 at the top.
-
-    Raises:
-        SceneError: The file is missing, no picture, or too large.
-    """
-    image = read_picture(path, cv2.IMREAD_COLOR_RGB, SceneError, f"{path}: the texture")
-    if image.dtype.kind == "f":  # linear values
-        return encode_texture(np.clip(np.nan_to_num(image), 0.0, 1.0), encoded=True)
-    result: ByteArray = np.asarray(image / 257.0 if image.dtype == np.uint16 else image, dtype=np.uint8)
-    return result
+_DAMAGES: Final = (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError, MemoryError)
+"""Errors that readers raise on damaged files, beside their own."""
+MOST_PARTS: Final = 256
+"""Parts that an animation moves: each is a shape of its own, and a ray asks all of them."""
 
 
 def load_mesh(path: str | Path) -> Mesh:
@@ -133,9 +77,9 @@ def load_moving_mesh(path: Path, animation: str | int) -> MovingMesh:
     Raises:
         SceneError: As :func:`load_mesh`; or there is no such animation, or it is damaged.
     """
-    contents = _read_file(path, animation)[0]
+    contents, source = _read_file(path, animation)
     with _said_in_words(path):
-        return moving_mesh(f"{path}", contents)
+        return moving_mesh(source, contents)
 
 
 def animations_of(path: Path) -> list[str]:
@@ -146,14 +90,14 @@ def animations_of(path: Path) -> list[str]:
     """
     data = read_bytes(path, "mesh_bytes", SceneError)
     with _said_in_words(path):
-        return animation_names(path, read_gltf(path, data, Assets(path))[0])
+        return animation_names(GltfFile(MeshSource(path, data)))
 
 
-def _load(path: Path) -> tuple[Mesh, Assets]:
+def _load(path: Path) -> tuple[Mesh, MeshSource]:
     """A mesh, and what it was read from."""
-    contents, assets = _read_file(path)
+    contents, source = _read_file(path)
     with _said_in_words(path):
-        return join_parts(f"{path}", contents.parts, contents.images, contents.notes), assets
+        return join_parts(source, contents.parts), source
 
 
 @contextlib.contextmanager
@@ -163,46 +107,28 @@ def _said_in_words(path: Path) -> Iterator[None]:
         yield
     except SceneError:
         raise
-    except _LOADER_ERRORS as error:
+    except _DAMAGES as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
         raise SceneError(f"{path}: the mesh cannot be read; is the file whole? ({reason})") from error
 
 
-def _read_file(path: Path, animation: str | int | None = None) -> tuple[GltfContents, Assets]:
+def _read_file(path: Path, animation: str | int | None = None) -> tuple[GltfContents, MeshSource]:
     """Parts of a file, one or more, and what they were read from."""
-    if path.suffix.lower() not in MESH_SUFFIXES:
+    suffix = path.suffix.lower()
+    if suffix not in MESH_SUFFIXES:
         raise SceneError(f"{path}: unknown mesh format {path.suffix!r}; use one of {', '.join(MESH_SUFFIXES)}")
     if not is_file(path):
         raise SceneError(f"{path}: no such mesh file")
-    data = read_bytes(path, "mesh_bytes", SceneError)
-    suffix = path.suffix.lower()
-    assets = Assets(path)
-    check_counts(path, data)
-    with _said_in_words(path):
+    source = MeshSource(path, read_bytes(path, "mesh_bytes", SceneError))
+    # What is not finite is named when it is looked through.
+    with _said_in_words(path), np.errstate(all="ignore"):
         if suffix in GLTF_SUFFIXES:
-            contents = load_gltf(path, data, assets, animation=animation)
+            contents = load_gltf(source, animation=animation)
         else:
-            images: list[ByteArray] = []
-            notes: list[str] = []
-            contents = GltfContents(_read_parts(path, data, assets, images, notes), images, notes)
+            contents = GltfContents(READERS[suffix](source))
         if not contents.parts:
             raise SceneError(f"{path}: holds no triangle; a mesh with faces is needed (a point cloud has none)")
-        return contents, assets
-
-
-def _read_parts(path: Path, data: bytes, assets: Assets, images: list[ByteArray], notes: list[str]) -> list[MeshPart]:
-    """Return the parts of a file without a scene graph."""
-    suffix = path.suffix.lower()
-    crease = CREASE if suffix in _DRAWN else None
-    with np.errstate(all="ignore"):  # what is not finite is named when it is looked through
-        if suffix in READERS:
-            return READERS[suffix](path, data, assets, images, notes, crease)
-        import trimesh  # here, since it takes half a second and most scenes need no file
-
-        if data[:_STL_HEADER].lower().lstrip().startswith(b"solid") and b"facet" in data[:_STL_TEXT].lower():
-            data = data.lower()  # trimesh knows the words in lower case alone
-        scene = trimesh.load_scene(io.BytesIO(data), file_type=suffix[1:], process=False)
-        return _scene_parts(f"{path}", scene, images, notes, crease)
+        return contents, source
 
 
 def mesh_from_trimesh(source: Any) -> Mesh:
@@ -218,78 +144,129 @@ def mesh_from_trimesh(source: Any) -> Mesh:
 
     if not isinstance(source, trimesh.Trimesh | trimesh.Scene):
         raise SceneError(f"a mesh is {type(source).__name__}; a trimesh.Trimesh or trimesh.Scene is needed")
-    label = "a mesh in memory"
+    taken = MeshSource(Path("a mesh in memory"))
     scene = source if isinstance(source, trimesh.Scene) else trimesh.Scene(source)
-    images: list[ByteArray] = []
-    notes: list[str] = []
-    try:
-        parts = _scene_parts(label, scene, images, notes, CREASE)
-    except SceneError:
-        raise
-    except _LOADER_ERRORS as error:
-        raise SceneError(f"{label} cannot be taken ({type(error).__name__}: {' '.join(str(error).split())})") from error
+    with _said_in_words(taken.path):
+        parts = _scene_parts(taken, scene)
     if not parts:
-        raise SceneError(f"{label} holds no triangle")
-    return join_parts(label, parts, images, notes)
+        raise SceneError(f"{taken.path} holds no triangle")
+    return join_parts(taken, parts)
 
 
-def _scene_parts(
-    label: str, scene: Any, images: list[ByteArray], notes: list[str], crease: float | None
-) -> list[MeshPart]:
+def _scene_parts(source: MeshSource, scene: Any) -> list[MeshPart]:
     """Parts of a scene of trimesh, in its world."""
     known: dict[int, MeshMaterial | None] = {}
-    parts = []
+    parts: list[MeshPart | None] = []
     for node in scene.graph.nodes_geometry:
         transform, name = scene.graph[node]
         geometry = scene.geometry[name]
         if not (np.abs(transform) < LARGEST).all():
-            raise SceneError(f"{label}: node {node!r} has a transform that is not finite")
+            raise SceneError(f"{source.path}: node {node!r} has a transform that is not finite")
         if np.asarray(getattr(geometry, "faces", ()), dtype=np.int64).size == 0:
             continue
-        source = getattr(geometry.visual, "material", None)
-        if id(source) not in known:
-            known[id(source)] = read_library_material(label, source, images, notes)
-        moved = _read_part(label, geometry, known[id(source)], crease).moved(np.asarray(transform, dtype=np.float64))
-        if moved is not None:
-            parts.append(moved)
-    return parts
+        material = getattr(geometry.visual, "material", None)
+        if id(material) not in known:
+            known[id(material)] = read_library_material(source, material)
+        own = _read_part(source, geometry, known[id(material)])
+        parts += [part.moved(np.asarray(transform, dtype=np.float64)) for part in own]
+    return [part for part in parts if part is not None]
 
 
-def _read_part(label: str, geometry: Any, material: MeshMaterial | None, crease: float | None) -> MeshPart:
+def _read_part(source: MeshSource, geometry: Any, material: MeshMaterial | None) -> list[MeshPart]:
     """Triangles of a mesh of trimesh, with its normals, texture coordinates and colours."""
-    faces = np.asarray(geometry.faces, dtype=np.int64)
-    vertices = np.asarray(geometry.vertices, dtype=np.float64)
-    # trimesh computes normals when asked; only its cache tells whether the file had them.
-    given = "vertex_normals" in geometry._cache
-    normals = np.asarray(geometry.vertex_normals, dtype=np.float64) if given else None
-    visual = geometry.visual
-    uvs = getattr(visual, "uv", None)
-    if uvs is not None:
-        uvs = np.asarray(uvs, dtype=np.float64)[:, :2]
-    colors = None
+    faces, visual = np.asarray(geometry.faces, dtype=np.int64), geometry.visual
+    corners = Corners(faces.ravel(), np.full(len(faces), 3))
+    # trimesh computes normals when asked; only its cache tells whether the mesh has them.
+    if "vertex_normals" in geometry._cache:
+        corners.vertex_normal = np.asarray(geometry.vertex_normals, dtype=np.float64)
+    if (uvs := getattr(visual, "uv", None)) is not None:
+        corners.vertex_uv = np.asarray(uvs, dtype=np.float64)[:, :2]
     kind = getattr(visual, "kind", None) if getattr(visual, "defined", False) else None
-    if kind in ("vertex", "face"):
-        values = linear_color(np.asarray(visual.vertex_colors if kind == "vertex" else visual.face_colors))
-        if kind == "face" and len(values) == len(faces) and faces.max(initial=-1) < len(vertices):
-            # A colour for each triangle: its corners are its own.
-            corners = faces.ravel()
-            normals = _corner_normals(vertices, faces, crease) if normals is None else normals[corners]
-            vertices, values = vertices[corners], np.repeat(values, 3, axis=0)
-            uvs = None if uvs is None or len(uvs) <= corners.max(initial=-1) else uvs[corners]
-            faces = np.arange(len(corners), dtype=np.int64).reshape(-1, 3)
-        colors = values if len(values) == len(vertices) else None
-    return MeshPart.checked(
-        label, vertices, faces, normals, uvs=(uvs, None), colors=colors, material=material, crease=crease
+    if kind == "vertex":
+        corners.vertex_color = linear_rgba(np.asarray(visual.vertex_colors, dtype=np.float64), 255.0)
+    elif kind == "face":
+        corners.color = linear_rgba(np.asarray(visual.face_colors, dtype=np.float64), 255.0)
+    return parts_of(source, np.asarray(geometry.vertices, dtype=np.float64), corners, material=material)
+
+
+def moving_mesh(source: MeshSource, contents: GltfContents) -> MovingMesh:
+    """One mesh for all that stands still, and one for every moving node that triangles hang on.
+
+    Args:
+        source: The file.
+        contents: Of the file, with an animation.
+
+    Raises:
+        SceneError: More than ``MOST_PARTS`` nodes move, or a vertex lies too far off.
+    """
+    bends = contents.bends or [None] * len(contents.parts)
+    placed = sorted(
+        zip(contents.carriers, contents.parts, bends, strict=True), key=lambda one: (one[0], one[2] is not None)
     )
+    groups = [list(group) for _, group in itertools.groupby(placed, lambda one: (one[0], one[2] is not None))]
+    if len(groups) > MOST_PARTS:
+        raise SceneError(
+            f"{source.path}: its animation moves {len(groups):,} parts; at most {MOST_PARTS} are: join meshes, or "
+            "leave out the object's play"
+        )
+    joint = join_parts(source, [part for _, part, _ in placed])
+    anchors, renamed = _used(contents.anchors, [on for on, _, _ in placed])
+    parts = []
+    vertex = face = 0
+    for group in groups:
+        vertices, faces = (sum(len(getattr(part, name)) for _, part, _ in group) for name in ("vertices", "faces"))
+        mesh = _cut(joint, vertex, vertices, face, faces)
+        own = [bend for _, _, bend in group if bend is not None]
+        bend = functools.partial(_bent, mesh, own) if own else None
+        parts.append(MovingPart(mesh, renamed.get(group[0][0], -1), bend))
+        vertex, face = vertex + vertices, face + faces
+    transforms = part_transforms(anchors, [renamed.get(on, -1) for on, _, _ in placed], 0.0)
+    rest = [_at_rest(part, transform) for (_, part, _), transform in zip(placed, transforms, strict=True)]
+    return MovingMesh(join_parts(source, rest), tuple(parts), anchors, contents.duration)
 
 
-def _corner_normals(vertices: npt.NDArray[Any], faces: npt.NDArray[np.int64], crease: float | None) -> Any:
-    """Normals of every corner of a mesh whose triangles are about to get corners of their own."""
-    if crease is not None:
-        return creased_normals(vertices, faces, crease)[1]
-    return smooth_normals(vertices, faces)[faces.ravel()]
+def _bent(mesh: Mesh, bends: list[Bending], seconds: float) -> Mesh:
+    """A mesh whose primitives are bent as they are at a time of the animation."""
+    parts = [part for bend in bends if (part := bend(seconds)) is not None]
+    vertices, normals = (
+        np.concatenate([getattr(part, name) for part in parts]).astype(np.float32) for name in ("vertices", "normals")
+    )
+    # A damaged skin may place vertices so far out that their squares overflow single precision.
+    vertices = np.clip(np.nan_to_num(vertices), -LARGEST, LARGEST)
+    tangents = filled(parts, [part.tangents for part in parts], (1.0, 0.0, 0.0, 1.0))
+    own = None if tangents is None else tangents.astype(np.float32)
+    return dataclasses.replace(mesh, vertices=vertices, normals=normals, tangents=own)
 
 
-def linear_color(colors: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
-    """Linear RGBA of (n, 3 or 4) colours of 8 bits, sRGB-encoded as programs write them; PLY's alpha is not used."""
-    return np.concatenate([decode_srgb(colors[:, :3] / 255.0), np.ones((len(colors), 1))], axis=1)
+def _used(anchors: tuple[Anchor, ...], carriers: list[int]) -> tuple[tuple[Anchor, ...], dict[int, int]]:
+    """The anchors that triangles hang on, and those above them; their new numbers by the old."""
+    needed: set[int] = set()
+    for carrier in carriers:
+        number = carrier
+        while number >= 0 and number not in needed:
+            needed.add(number)
+            number = anchors[number].parent
+    renamed = {old: new for new, old in enumerate(sorted(needed))}
+    kept = (dataclasses.replace(anchors[old], parent=renamed.get(anchors[old].parent, -1)) for old in renamed)
+    return tuple(kept), renamed
+
+
+def _cut(joint: Mesh, vertex: int, vertices: int, face: int, faces: int) -> Mesh:
+    """A run of vertices and faces, with all materials and pictures."""
+
+    def run(values: npt.NDArray[Any] | None, start: int, count: int) -> Any:
+        return None if values is None else np.ascontiguousarray(values[start : start + count])
+
+    own = {
+        name: run(getattr(joint, name), vertex, vertices)
+        for name in ("vertices", "normals", "uvs", "uvs_second", "colors", "tangents")
+    }
+    numbers = run(joint.triangle_materials, face, faces)
+    cut_faces = np.ascontiguousarray(joint.faces[face : face + faces] - np.int32(vertex))
+    return dataclasses.replace(joint, faces=cut_faces, triangle_materials=numbers, **own)
+
+
+def _at_rest(part: MeshPart, transform: npt.NDArray[np.float64]) -> MeshPart:
+    """A part where it stands at time 0; a node may have no size at first: what hangs on it then is a point."""
+    point = np.tile(transform[:3, 3], (len(part.vertices), 1))
+    return part.moved(transform) or dataclasses.replace(part, vertices=point)

@@ -10,8 +10,8 @@ import numpy.typing as npt
 
 from warp_ar.errors import SceneError
 from warp_ar.scene.geometry import Mesh, creased_normals, make_mesh, smooth_normals, tangent_frames
-from warp_ar.scene.materials import LambertMaterial
-from warp_ar.scene.mesh_materials import MeshMaterial, TextureUse
+from warp_ar.scene.materials import LambertMaterial, MeshMaterial, TextureUse
+from warp_ar.scene.mesh_source import MeshSource
 
 Array = npt.NDArray[np.float64]
 
@@ -38,7 +38,7 @@ class MeshPart:
     material: MeshMaterial | None = None
     """None: the file says nothing."""
     source: npt.NDArray[np.int64] | None = None
-    """Which of the vertices that it was made from each vertex is, (n,); None: they are the same."""
+    """Index of the vertex that each was made from, (n,); None: they are the same."""
 
     @classmethod
     def checked(
@@ -138,11 +138,11 @@ class MeshPart:
         # The cofactors are the inverse's transpose but for a factor, and do not overflow where that does.
         cofactors = np.stack([np.cross(linear[(k + 1) % 3], linear[(k + 2) % 3]) for k in range(3)])
         turned = self.normals @ (cofactors * np.sign(determinant)).T
-        normals = _unit(turned, self.normals)
+        normals = unit_or(turned, self.normals)
         tangents = self.tangents
         if tangents is not None:
             side = tangents[:, 3:] * np.sign(determinant)
-            tangents = np.concatenate([_unit(tangents[:, :3] @ linear.T, tangents[:, :3]), side], axis=1)
+            tangents = np.concatenate([unit_or(tangents[:, :3] @ linear.T, tangents[:, :3]), side], axis=1)
         faces = self.faces[:, ::-1] if determinant < 0.0 else self.faces
         return dataclasses.replace(self, vertices=vertices, faces=faces, normals=normals, tangents=tangents)
 
@@ -152,56 +152,61 @@ class MeshPart:
             transforms = transforms[self.source]
         linear = transforms[:, :3, :3]
         vertices = np.einsum("nij,nj->ni", linear, self.vertices) + transforms[:, :3, 3]
-        normals = _unit(np.einsum("nij,nj->ni", linear, self.normals), self.normals)
+        normals = unit_or(np.einsum("nij,nj->ni", linear, self.normals), self.normals)
         tangents = self.tangents
         if tangents is not None:
-            along = _unit(np.einsum("nij,nj->ni", linear, tangents[:, :3]), tangents[:, :3])
+            along = unit_or(np.einsum("nij,nj->ni", linear, tangents[:, :3]), tangents[:, :3])
             tangents = np.concatenate([along, tangents[:, 3:]], axis=1)
         return dataclasses.replace(self, vertices=vertices, normals=normals, tangents=tangents)
 
 
-def join_parts(
-    label: str, parts: list[MeshPart], images: list[npt.NDArray[np.uint8]], notes: list[str], *, spans: bool = True
-) -> Mesh:
+def strip_triangles(indices: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Return the triangles, (m, 3), of strips with an index below 0 between them; all are wound as a strip's first."""
+    place = np.arange(len(indices))
+    start = np.maximum.accumulate(np.where(indices < 0, place + 1, 0))
+    odd = ((place - start) % 2 == 1)[:-2]
+    a, b, c = indices[:-2], indices[1:-1], indices[2:]
+    found = np.stack([a, np.where(odd, c, b), np.where(odd, b, c)], axis=-1)
+    return found[(found >= 0).all(axis=1)]
+
+
+def join_parts(source: MeshSource, parts: list[MeshPart]) -> Mesh:
     """One mesh of all parts.
 
     Args:
-        label: The file, for messages.
+        source: The file, with what materials name.
         parts: One or more.
-        images: What their materials name, RGBA.
-        notes: As ``Mesh.notes``.
-        spans: Whether to look through the pictures for what roughness and metallic they give.
 
     Raises:
         SceneError: A vertex lies too far off after all transforms.
     """
     vertices = np.concatenate([part.vertices for part in parts])
     if not (np.abs(vertices) < LARGEST).all():
-        raise SceneError(f"{label}: its nodes put a vertex beyond {LARGEST:g}")
+        raise SceneError(f"{source.path}: its nodes put a vertex beyond {LARGEST:g}")
     materials: dict[MeshMaterial, int] = {}
     said = any(part.material is not None for part in parts) or any(part.colors is not None for part in parts)
     numbers = []
     for part in parts:
-        material = _without_lost(part, notes) if said else MeshMaterial()
+        material = _without_lost(part, source) if said else MeshMaterial()
         numbers.append(np.full(len(part.faces), materials.setdefault(material, len(materials)), dtype=np.int32))
     starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
-    known = tuple(_with_spans(material, images) if spans else material for material in materials)
+    known = tuple(_with_spans(material, source.images) for material in materials)
     return make_mesh(
         vertices,
         np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)]),
         np.concatenate([part.normals for part in parts]),
-        _filled(parts, [part.uvs[0] for part in parts], (0.0, 0.0)),
-        uvs_second=_filled(parts, [part.uvs[1] for part in parts], (0.0, 0.0)),
-        colors=_filled(parts, [part.colors for part in parts], (1.0, 1.0, 1.0, 1.0)),
-        tangents=_filled(parts, [part.tangents for part in parts], (1.0, 0.0, 0.0, 1.0)),
+        filled(parts, [part.uvs[0] for part in parts], (0.0, 0.0)),
+        uvs_second=filled(parts, [part.uvs[1] for part in parts], (0.0, 0.0)),
+        colors=filled(parts, [part.colors for part in parts], (1.0, 1.0, 1.0, 1.0)),
+        tangents=filled(parts, [part.tangents for part in parts], (1.0, 0.0, 0.0, 1.0)),
         triangle_materials=np.concatenate(numbers) if len(known) > 1 else None,
         materials=known if said else (),
-        images=tuple(images),
-        notes=tuple(notes),
+        images=tuple(source.images),
+        notes=tuple(source.notes),
     )
 
 
-def _without_lost(part: MeshPart, notes: list[str]) -> MeshMaterial:
+def _without_lost(part: MeshPart, source: MeshSource) -> MeshMaterial:
     """A part's material without textures for which the part has no coordinates."""
     if part.material is None:
         # Vertex colours are what the surface reflects, no factor of some other colour.
@@ -213,8 +218,7 @@ def _without_lost(part: MeshPart, notes: list[str]) -> MeshMaterial:
         if isinstance(use, TextureUse) and part.uvs[use.uv_set] is None:
             gone: dict[str, Any] = {field.name: None}
             material = dataclasses.replace(material, **gone)
-            notes.append("a texture on triangles without texture coordinates")
-    notes[:] = dict.fromkeys(notes)
+            source.note("a texture on triangles without texture coordinates")
     return material
 
 
@@ -227,7 +231,7 @@ def _with_spans(material: MeshMaterial, images: list[npt.NDArray[np.uint8]]) -> 
     return dataclasses.replace(material, roughness_span=roughness, metallic_span=metallic)
 
 
-def _filled(parts: list[MeshPart], values: list[Array | None], default: tuple[float, ...]) -> Array | None:
+def filled(parts: list[MeshPart], values: list[Array | None], default: tuple[float, ...]) -> Array | None:
     """Values of all parts' vertices, the default where a part has none; None where none has."""
     if all(value is None for value in values):
         return None
@@ -245,7 +249,8 @@ def _finite(values: Any, count: int, largest: float) -> Array | None:
     return np.asarray(values, dtype=np.float64)
 
 
-def _unit(vectors: Array, other: Array) -> Array:
+def unit_or(vectors: Array, other: Array) -> Array:
+    """Vectors (n, 3) of length 1; ``other`` where one has no direction."""
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     usable = np.isfinite(length) & (length > 0.0)
     return np.where(usable, vectors / np.where(usable, length, 1.0), other)

@@ -28,7 +28,7 @@ def show_key(key: str) -> str:
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
-    """What to say after "unknown": the nearest known word, or all of them."""
+    """Return the words after "unknown": the nearest known word, or all of them."""
     known = list(known)
     close = difflib.get_close_matches(word.lower(), [name.lower() for name in known], n=1, cutoff=0.6)
     if close:

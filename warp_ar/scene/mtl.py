@@ -10,6 +10,8 @@ References:
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
 import math
 import re
 from typing import Any, Final, cast
@@ -19,10 +21,17 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_ar.errors import SceneError
-from warp_ar.scene.gltf import decode_rgba
-from warp_ar.scene.materials import RGB, LambertMaterial, Material, MetallicRoughnessMaterial, PhongMaterial
-from warp_ar.scene.mesh_assets import Assets
-from warp_ar.scene.mesh_materials import MeshMaterial, TextureUse
+from warp_ar.scene.materials import (
+    RGB,
+    LambertMaterial,
+    Material,
+    MeshMaterial,
+    MetallicRoughnessMaterial,
+    PhongMaterial,
+    TextureUse,
+    Wrap,
+)
+from warp_ar.scene.mesh_source import MeshSource
 
 ByteArray = npt.NDArray[np.uint8]
 
@@ -32,6 +41,8 @@ _LEFT_OUT: Final = {
     "disp": "displacement maps",
     "map_ns": "maps of Ns",
     "refl": "reflection maps",
+    "decal": "decals",
+    "map_tr": "maps of Tr",
     "tf": "transmission (Tf)",
     "pc": "clearcoat (Pc)",
     "ps": "sheen (Ps)",
@@ -44,8 +55,39 @@ CHALK: Final[RGB] = (0.8, 0.8, 0.8)
 _MADE_UP: Final = (2, 2)
 """Size of the picture that trimesh makes up where there is none."""
 
-_OPTIONS: Final = {"-bm": 1, "-blendu": 1, "-blendv": 1, "-cc": 1, "-clamp": 1, "-imfchan": 1, "-mm": 2, "-texres": 1}
-"""Options of a map, and how many words follow; -o, -s and -t have one to three numbers."""
+_OPTIONS: Final = {
+    **dict.fromkeys(("-blendu", "-blendv", "-boost", "-bm", "-cc", "-clamp", "-imfchan", "-texres", "-type"), 1),
+    "-mm": 2,
+    **dict.fromkeys(("-o", "-s", "-t"), 3),
+}
+"""Options of a map, and how many words follow; of three numbers the last two may be left out."""
+_NOT_FOLLOWED: Final = {
+    "-boost": ("sharpness of maps (-boost)", ["0"]),
+    "-cc": ("colour correction of maps (-cc)", ["off"]),
+    "-mm": ("ranges of maps (-mm)", ["0", "1"]),
+    "-t": ("turbulence of maps (-t)", ["0", "0", "0"]),
+}
+"""Options that change a map and are not followed: in words, and as they change nothing."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Map:
+    """A picture that a library names, and how it lies on the surface."""
+
+    picture: ByteArray
+    """RGBA."""
+    transform: tuple[float, ...]
+    """As ``TextureUse.transform``."""
+    clamped: bool
+    """True if it does not repeat."""
+    channel: int | None
+    """Channel that a map of one number is in, if the library says."""
+    strength: float
+    """Factor of a bump or normal map."""
+
+    def values(self) -> ByteArray:
+        """Return the numbers of a map of one number, (h, w): those of green, where nothing is said."""
+        return self.picture[..., 1 if self.channel is None else self.channel]
 
 
 def parse_library(text: str) -> dict[str, dict[str, Any]]:
@@ -63,91 +105,74 @@ def parse_library(text: str) -> dict[str, dict[str, Any]]:
     return found
 
 
-def read_library(
-    label: str, values: dict[str, Any], images: list[ByteArray], notes: list[str], assets: Assets
-) -> MeshMaterial:
+def read_library(source: MeshSource, values: dict[str, Any], base: TextureUse | None = None) -> MeshMaterial:
     """Return a material of `parse_library`.
 
+    Follows:
+        Kd, Ks, Ns, Ke, d, Tr, illum, Pr, Pm; map_Kd, map_Ks, map_Ke, map_d, map_Pr, map_Pm, norm, map_Kn; their -s, -o,
+        -clamp, -imfchan; -bm of normal maps.
+
     Args:
-        label: The file, for messages.
+        source: The mesh's file; takes the material's pictures, and what is not shown of it.
         values: Words of the material by key.
-        images: Pictures so far, RGBA; those of the material are added.
-        notes: What is not shown so far; what the material has of it is added.
-        assets: Finds the files that the library names.
+        base: Picture of its colour, where it is known.
+
+    Raises:
+        SceneError: Damaged.
+    """
+    return _Library(source, values).read(base)
+
+
+def read_library_material(source: MeshSource, material: Any) -> MeshMaterial | None:
+    """Return a material of trimesh, or None; None if it says nothing.
 
     Raises:
         SceneError: A picture is missing or damaged.
     """
-    return _Library(label, values, images, notes, assets).read(None)
-
-
-def read_library_material(label: str, source: Any, images: list[ByteArray], notes: list[str]) -> MeshMaterial | None:
-    """Return a material of trimesh; None if it says nothing.
-
-    Args:
-        label: The mesh, for messages.
-        source: trimesh's material, or None.
-        images: Pictures so far, RGBA; those of the material are added.
-        notes: What is not shown so far; what the material has of it is added.
-
-    Raises:
-        SceneError: A picture is missing or damaged.
-    """
-    if source is None:
+    if material is None:
         return None
-    if type(source).__name__ == "PBRMaterial":
-        return _PbrInMemory(label, source, images).read()
-    values = getattr(source, "kwargs", None) or {}
-    image = _own_picture(label, source, images)
-    if not values and image is None:
-        return None
-    values = {"name": getattr(source, "name", ""), **values}
-    return _Library(label, values, images, notes, None).read(image)
-
-
-def _own_picture(label: str, source: Any, images: list[ByteArray]) -> TextureUse | None:
-    """The colour's picture that trimesh has opened."""
-    image = getattr(source, "image", None)
+    if type(material).__name__ == "PBRMaterial":
+        return _PbrInMemory(source, material).read()
+    values = getattr(material, "kwargs", None) or {}
+    image = getattr(material, "image", None)
     # Where a file has coordinates but no texture, trimesh makes a grey one up; only pictures from files have a format.
     made_up = getattr(image, "format", None) is None and getattr(image, "size", None) == _MADE_UP
-    return None if image is None or made_up else _add_picture(label, image, images)
+    base = None if image is None or made_up else _add_picture(source, image)
+    if not values and base is None:
+        return None
+    return read_library(source, {"name": getattr(material, "name", ""), **values}, base)
 
 
-def _add_picture(label: str, image: Any, images: list[ByteArray]) -> TextureUse:
+def _add_picture(source: MeshSource, image: Any) -> TextureUse:
     try:
-        images.append(np.asarray(image.convert("RGBA"), dtype=np.uint8).copy())
+        source.images.append(np.asarray(image.convert("RGBA"), dtype=np.uint8).copy())
     except (OSError, ValueError, SyntaxError, MemoryError, EOFError) as error:
-        raise SceneError(f"{label}: a texture of the mesh cannot be read ({' '.join(str(error).split())})") from error
-    return TextureUse(len(images) - 1)
+        reason = " ".join(str(error).split())
+        raise SceneError(f"{source.path}: a texture of the mesh cannot be read ({reason})") from error
+    return TextureUse(len(source.images) - 1)
 
 
 class _Library:
     """Reads one material of a library."""
 
-    def __init__(
-        self,
-        label: str,
-        values: dict[str, Any],
-        images: list[ByteArray],
-        notes: list[str],
-        assets: Assets | None,
-    ) -> None:
-        self._label, self._values = label, values
-        self._images, self._notes, self._assets = images, notes, assets
+    def __init__(self, source: MeshSource, values: dict[str, Any]) -> None:
+        self._source, self._values = source, values
 
     def read(self, base: TextureUse | None) -> MeshMaterial:
         """The material, with the picture of its colour if it has one."""
         for key, words in _LEFT_OUT.items():
-            if key in self._values and words not in self._notes:
-                self._notes.append(words)
-        base = base or self._use(self._picture("map_kd"))
+            if key in self._values:
+                self._source.note(words)
+        color = self._map("map_kd", color=True) if base is None else None
         white = (1.0, 1.0, 1.0)
-        diffuse = self._color("kd", white if base is not None else CHALK)
+        diffuse = self._color("kd", CHALK if base is None and color is None else white)
         specular = self._color("ks", (0.0, 0.0, 0.0))
         opacity = self._number("d", 1.0 - self._number("tr", 0.0, 0.0, 1.0), 0.0, 1.0)
-        base, alpha = self._with_alpha(base, opacity)
-        maps = self._picture("map_pr"), self._picture("map_pm")
-        specular_map = self._picture("map_ks")
+        mask = self._map("map_d")
+        alpha = "mask" if mask is not None else "blend" if opacity < 1.0 else "opaque"
+        base = base or self._use(color if mask is None else self._masked(color, mask))
+        maps = self._map("map_pr"), self._map("map_pm")
+        specular_map = self._map("map_ks", color=True)
         # A lobe without an exponent is none: some programs use Ks for numbers of their own.
         shiny = (any(specular) and "ns" in self._values) or specular_map is not None
         surface: Material
@@ -166,10 +191,11 @@ class _Library:
             surface = PhongMaterial(diffuse, specular, self._number("ns", 32.0, 0.0, 1e4))
         else:
             surface, specular_map = LambertMaterial(diffuse), None
-        glow = self._picture("map_ke")
+        glow = self._map("map_ke", color=True)
         emission = self._color("ke", white if glow is not None else (0.0, 0.0, 0.0), most=1e6)
         if glow is not None and not any(emission):
             emission = white
+        normal = self._map("norm" if "norm" in self._values else "map_kn")
         return MeshMaterial(
             surface=surface,
             name=str(self._values.get("name") or "")[:80],
@@ -179,60 +205,83 @@ class _Library:
             base=base,
             specular=self._use(specular_map),
             metallic_roughness=self._use(self._pack(*maps)),
-            normal=self._use(self._picture("norm") if "norm" in self._values else self._picture("map_kn")),
+            normal=self._use(normal),
+            normal_scale=1.0 if normal is None else normal.strength,
             emissive=self._use(glow),
         )
 
-    def _use(self, picture: ByteArray | None) -> TextureUse | None:
-        if picture is None:
+    def _use(self, one: _Map | None) -> TextureUse | None:
+        if one is None:
             return None
-        self._images.append(picture)
-        return TextureUse(len(self._images) - 1)
+        self._source.images.append(one.picture)
+        way: Wrap = "clamp" if one.clamped else "repeat"
+        return TextureUse(len(self._source.images) - 1, transform=one.transform, wrap=(way, way))
 
-    def _with_alpha(self, base: TextureUse | None, opacity: float) -> tuple[TextureUse | None, str]:
-        """The colour's picture with the alpha that ``map_d`` says, and what alpha does."""
-        mask = self._picture("map_d")
-        if mask is None:
-            return base, "blend" if opacity < 1.0 else "opaque"
+    def _masked(self, color: _Map | None, mask: _Map) -> _Map:
+        """The colour's picture with the alpha that ``map_d`` says."""
         # A picture without alpha says it in its brightness.
-        shown = mask[..., 3] if mask[..., 3].min() < 255 else mask[..., 1]
-        color = np.full((*shown.shape, 4), 255, np.uint8) if base is None else self._images[base.image].copy()
-        if color.shape[:2] != shown.shape:
-            shown = cv2.resize(shown, color.shape[1::-1], interpolation=cv2.INTER_LINEAR)
-        color[..., 3] = shown
-        return self._use(color), "mask"
+        own = mask.channel is None and mask.picture[..., 3].min() < 255
+        shown = mask.picture[..., 3] if own else mask.values()
+        if color is None:
+            color = dataclasses.replace(mask, picture=np.full((*shown.shape, 4), 255, np.uint8))
+        return self._with_channels(color, {3: (mask, shown)})
 
-    def _pack(self, roughness: ByteArray | None, metallic: ByteArray | None) -> ByteArray | None:
+    def _pack(self, roughness: _Map | None, metallic: _Map | None) -> _Map | None:
         """Two pictures in the channels of one."""
-        first = roughness if roughness is not None else metallic
+        first = roughness or metallic
         if first is None:
             return None
-        packed = np.full_like(first, 255)
-        for channel, picture in ((1, roughness), (2, metallic)):
-            if picture is not None:
-                fitted = picture
-                if picture.shape != first.shape:
-                    fitted = np.asarray(cv2.resize(picture, first.shape[1::-1]), dtype=np.uint8)
-                packed[..., channel] = fitted[..., 1]
-        return packed
+        white = dataclasses.replace(first, picture=np.full_like(first.picture, 255))
+        found = {1: roughness, 2: metallic}
+        return self._with_channels(white, {k: (one, one.values()) for k, one in found.items() if one is not None})
 
-    def _picture(self, key: str) -> ByteArray | None:
-        """A picture that the library names."""
+    def _with_channels(self, into: _Map, channels: dict[int, tuple[_Map, ByteArray]]) -> _Map:
+        """A picture with other pictures' numbers in its channels."""
+        picture = into.picture.copy()
+        for channel, (one, values) in channels.items():
+            if (one.transform, one.clamped) != (into.transform, into.clamped):
+                self._source.note("maps of one material that are placed differently")
+            if values.shape != picture.shape[:2]:
+                values = np.asarray(cv2.resize(values, picture.shape[1::-1]), dtype=np.uint8)
+            picture[..., channel] = values
+        return dataclasses.replace(into, picture=picture)
+
+    def _map(self, key: str, *, color: bool = False) -> _Map | None:
+        """A picture that the library names, in sRGB if it is one of colour."""
         words = self._values.get(key)
-        if not isinstance(words, list) or not words or self._assets is None:
+        if not isinstance(words, list) or not all(isinstance(word, str) for word in words):
             return None
-        rest = [str(word) for word in words]
-        while len(rest) > 1 and rest[0].startswith("-"):
-            option, rest = rest[0].lower(), rest[1:]
-            if option in _OPTIONS:
-                rest = rest[_OPTIONS[option] :]
-            else:  # -o, -s, -t
-                self._notes.extend(["offsets and scales of maps"] * ("offsets and scales of maps" not in self._notes))
-                count = 0
-                while rest and count < 3 and _is_number(rest[0]):
-                    rest, count = rest[1:], count + 1
-        name = " ".join(rest)
-        return decode_rgba(self._assets.get(name), f"{self._label}: {name}")
+        rest = list(words)
+        name: list[str] = []
+        said: dict[str, list[str]] = {}
+        while rest:
+            word, option = rest.pop(0), ""
+            if rest and (word.lower() in _OPTIONS or (not name and re.match("-[A-Za-z]", word))):
+                option = word.lower()
+            if not option:
+                name.append(word)
+                continue
+            most = _OPTIONS.get(option, 3)
+            numbers = list(itertools.takewhile(_is_number, rest[:most]))
+            said[option] = numbers if most == 3 else rest[:most]
+            del rest[: len(said[option])]
+            unchanged = _NOT_FOLLOWED.get(option, ("", said[option]))[1]
+            if option not in _OPTIONS:
+                self._source.note(f"the option {option[:20]} of maps")
+            elif said[option] != unchanged[: len(said[option])]:
+                self._source.note(_NOT_FOLLOWED[option][0])
+        path = " ".join(name)
+        u, v = ([float(word) for word in said.get(key, [])][:2] for key in ("-s", "-o"))
+        (su, sv), (ou, ov) = [*u, *(1.0, 1.0)[len(u) :]], [*v, *(0.0, 0.0)[len(v) :]]
+        channel = said.get("-imfchan", ["l"])[0].lower()
+        strength = said.get("-bm", ["1"])[0]
+        return _Map(
+            self._source.picture(path, color=color),
+            (su, 0.0, ou, 0.0, sv, ov),
+            said.get("-clamp", ["off"])[0].lower() == "on",
+            {"r": 0, "g": 1, "b": 2, "m": 3}.get(channel),
+            float(strength) if _is_number(strength) else 1.0,
+        )
 
     def _color(self, key: str, default: RGB, most: float = 1.0) -> RGB:
         value = self._values.get(key, default)
@@ -258,8 +307,8 @@ def _is_number(value: object) -> bool:
 class _PbrInMemory:
     """A material of glTF that trimesh holds."""
 
-    def __init__(self, label: str, source: Any, images: list[ByteArray]) -> None:
-        self._label, self._source, self._images = label, source, images
+    def __init__(self, file: MeshSource, source: Any) -> None:
+        self._file, self._source = file, source
 
     def read(self) -> MeshMaterial:
         """The material; alpha, factors and pictures as trimesh has them."""
@@ -294,4 +343,4 @@ class _PbrInMemory:
 
     def _picture(self, name: str) -> TextureUse | None:
         image = getattr(self._source, name, None)
-        return None if image is None else _add_picture(self._label, image, self._images)
+        return None if image is None else _add_picture(self._file, image)

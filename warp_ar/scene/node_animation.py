@@ -10,7 +10,7 @@ with d = t_{k+1} - t_k and s = (t - t_k) / d, glTF 2.0 (appendix C) has three wa
   normalized afterwards.
 
 A node's transform is T R S. What hangs on one moving node is one ``MovingPart``: a mesh in that node's coordinates,
-which is never built again.
+which is never built again, but for what skins and morph targets bend: its vertices are those of the frame's time.
 
 References:
     Khronos, glTF 2.0 specification, 3.11 and appendix C.
@@ -20,15 +20,17 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
-from typing import Final
+from collections.abc import Callable, Mapping
+from typing import Final, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from warp_ar.scene.geometry import Mesh
+from warp_ar.scene.geometry import Mesh, quaternion_matrix
 
 Array = npt.NDArray[np.float64]
+Bend: TypeAlias = Callable[[float], Mesh]
+"""Function that gives a mesh at a time of the animation; only vertices, normals and tangents change."""
 
 WIDTHS: Final[Mapping[str, int]] = {"translation": 3, "rotation": 4, "scale": 3}
 """Numbers of what a channel moves."""
@@ -44,11 +46,11 @@ class Sampler:
     times: Array
     """Seconds, (n,), not decreasing."""
     values: Array
-    """(n, w); of ``CUBICSPLINE`` (n, 3, w): tangent in, value, tangent out."""
+    """(n, w); of ``CUBICSPLINE`` (n, 3, w): tangent in, value, tangent out. For morph targets w is their number."""
     interpolation: str
     """One of ``INTERPOLATIONS``."""
     turns: bool = False
-    """Whether values are quaternions, x first."""
+    """True if values are quaternions, x first."""
 
     def at(self, seconds: float) -> Array:
         """The value, (w,); a quaternion is a unit one."""
@@ -100,21 +102,9 @@ def _unit(quaternion: Array) -> Array:
     return quaternion / length if length > 0.0 else np.array([0.0, 0.0, 0.0, 1.0])
 
 
-def quaternion_matrix(quaternion: Array) -> Array:
-    """Rotation of a unit quaternion, x first, (3, 3)."""
-    x, y, z, w = quaternion
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class NodeTrack:
-    """How one node moves in its parent."""
+    """Movement of one node in its parent."""
 
     translation: Array
     """(3,); where no sampler says another."""
@@ -156,6 +146,8 @@ class MovingPart:
     """In the coordinates of its anchor."""
     anchor: int
     """Number of its moving node; -1: it stands still, in the file's world."""
+    bend: Bend | None = None
+    """The mesh at other times; None: it is always the same."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""What virtual objects are made of: the scene's material, or those of the mesh's file.
+"""Materials of virtual objects: the scene's, or those of the mesh's file.
 
 An object has one or more ``MeshMaterial``: its own file's, or the scene's alone. Where a scene gives a material to a
 mesh whose file has pictures of its base colour, these multiply the material's first colour, triangle by triangle.
@@ -14,9 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from warp_ar.errors import printable
+from warp_ar.errors import SceneError, printable
 from warp_ar.scene.description import Object, Scene
-from warp_ar.scene.emissive_picture import load_emission
 from warp_ar.scene.geometry import Mesh
 from warp_ar.scene.materials import (
     Color,
@@ -24,31 +23,36 @@ from warp_ar.scene.materials import (
     FileMaterial,
     LambertMaterial,
     Material,
+    MeshMaterial,
     MetallicRoughnessMaterial,
     MirrorMaterial,
     PhongMaterial,
 )
-from warp_ar.scene.mesh_cache import load_kept_mesh
-from warp_ar.scene.mesh_files import load_moving_mesh, mesh_from_trimesh
-from warp_ar.scene.mesh_materials import MeshMaterial
+from warp_ar.scene.mesh_files import load_mesh, load_moving_mesh, mesh_from_trimesh
 from warp_ar.scene.node_animation import MovingMesh
+from warp_ar.scene.textures import load_emission
 
 _LOG = logging.getLogger(__name__)
 _NO_FILE = (MeshMaterial(),)
 
+_NOT_SIMILAR = 1e-4
+"""Largest relative error of a similarity in single precision or a few digits."""
+_UPRIGHT = 1e-7
+"""Cosine of the turn about y below which those about x and z are one."""
+
 
 @dataclasses.dataclass(frozen=True)
 class ObjectMaterials:
-    """What an object is made of, as far as it decides which kernels and light its scene calls for."""
+    """Features of an object's materials that decide which kernels and light its scene calls for."""
 
     materials: tuple[MeshMaterial, ...]
     """One or more, in the order of ``Mesh.materials``."""
     detailed: bool
-    """Whether kernels must ask the triangle: it has several materials, pictures, colours, alpha or emission."""
+    """True if kernels must ask the triangle: it has several materials, pictures, colours, alpha or emission."""
     holed: bool
-    """Whether rays may pass through some triangles."""
+    """True if rays may pass through some triangles."""
     bumpy: bool
-    """Whether a material has a normal map."""
+    """True if a material has a normal map."""
 
 
 def object_from_trimesh(source: Any, **fields: Any) -> Object:
@@ -62,6 +66,49 @@ def object_from_trimesh(source: Any, **fields: Any) -> Object:
         SceneError: It holds no triangle, a vertex that is not finite, or a face with an index out of range.
     """
     return Object("mesh", mesh=mesh_from_trimesh(source), **fields)
+
+
+def object_at(item: Object, world_from_object: Any) -> Object:
+    """An object moved to where a 4x4 matrix puts it: its ``at``, ``rotate`` and ``scale`` are replaced.
+
+    Args:
+        item: The object.
+        world_from_object: Similarity that takes points of the shape, in columns, to the world, in metres.
+
+    Raises:
+        SceneError: The matrix is no 4x4 of finite numbers, or no rotation, one positive scale and translation.
+    """
+    try:
+        matrix = np.asarray(world_from_object, np.float64)
+    except (TypeError, ValueError):
+        matrix = np.empty(0)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise SceneError("world_from_object: expected a 4x4 matrix of finite numbers")
+    if np.abs(matrix[3] - (0.0, 0.0, 0.0, 1.0)).max() > _NOT_SIMILAR:
+        right = "expected 0, 0, 0, 1; the translation stands in the last column"
+        raise SceneError(f"world_from_object: its last row is {matrix[3].tolist()}; {right}")
+    linear = matrix[:3, :3]
+    lengths = np.linalg.norm(linear, axis=0)
+    scale = float(lengths.mean())
+    told = f"world_from_object: its axes have the lengths {np.round(lengths, 6).tolist()}"
+    if lengths.min() <= 0.0 or np.ptp(lengths) > _NOT_SIMILAR * scale:
+        raise SceneError(f"{told}; expected one positive scale for all; stretch the mesh's vertices instead")
+    turned = linear / scale
+    if np.abs(turned.T @ turned - np.eye(3)).max() > _NOT_SIMILAR:
+        raise SceneError(
+            "world_from_object: it shears; expected axes at right angles; shear the mesh's vertices instead"
+        )
+    if np.linalg.det(turned) < 0.0:
+        raise SceneError("world_from_object: it mirrors; expected a rotation; mirror the mesh's vertices instead")
+    cosine = float(np.hypot(turned[0, 0], turned[1, 0]))
+    about_y = np.arctan2(-turned[2, 0], cosine)
+    if cosine > _UPRIGHT:
+        about_x, about_z = np.arctan2(turned[2, 1], turned[2, 2]), np.arctan2(turned[1, 0], turned[0, 0])
+    else:  # x and z turn about the same axis: z stays
+        about_x, about_z = np.arctan2(-turned[1, 2], turned[1, 1]), 0.0
+    x, y, z = (float(np.degrees(angle)) for angle in (about_x, about_y, about_z))
+    at = (float(matrix[0, 3]), float(matrix[1, 3]), float(matrix[2, 3]))
+    return dataclasses.replace(item, at=at, rotate=(x, y, z), scale=scale)
 
 
 def mesh_of(item: Object) -> Mesh | None:
@@ -80,7 +127,7 @@ def mesh_of(item: Object) -> Mesh | None:
 
 
 def moving_mesh_of(item: Object) -> MovingMesh | None:
-    """What an object plays, kept as ``file_mesh`` keeps a mesh; None: its nodes stand still.
+    """Return the animation that an object plays, kept as ``file_mesh`` keeps a mesh; None: its nodes stand still.
 
     Raises:
         SceneError: Its file has no such animation, or cannot be read.
@@ -99,7 +146,7 @@ def _read_moving(path: Path, stamp: tuple[int, int], animation: str | int) -> Mo
 
 
 def file_stamp(path: Path) -> tuple[int, int]:
-    """What is another one once a file has changed."""
+    """Return a stamp that differs once a file has changed."""
     try:
         status = path.stat()
     except OSError:
@@ -118,7 +165,7 @@ def file_mesh(path: Path) -> Mesh:
 
 @functools.lru_cache(maxsize=4)
 def _read_mesh(path: Path, stamp: tuple[int, int]) -> Mesh:
-    mesh = load_kept_mesh(path)
+    mesh = load_mesh(path)
     if mesh.notes:
         _say(path, mesh.notes)
     return mesh
@@ -130,7 +177,7 @@ def _say(path: Path, notes: tuple[str, ...]) -> None:
 
 
 def materials_of(item: Object) -> ObjectMaterials:
-    """What an object is made of.
+    """Return the materials of an object.
 
     Raises:
         SceneError: Its mesh cannot be read.
@@ -163,7 +210,7 @@ def materials_of(item: Object) -> ObjectMaterials:
 
 
 def _emissive(item: Object, material: EmissiveMaterial, mesh: Mesh | None) -> MeshMaterial:
-    """What sends out light as a material of triangles; its picture is the scene's."""
+    """Return an emissive material as one of triangles; its picture is the scene's."""
     peak = 1.0 if material.image is None else load_emission(material.image)[1]
     red, green, blue = (peak * material.intensity * factor for factor in material.color)
     closed = item.shape in ("sphere", "box", "torus") or (mesh is not None and is_closed(mesh))
@@ -176,7 +223,7 @@ def _emissive(item: Object, material: EmissiveMaterial, mesh: Mesh | None) -> Me
 
 @functools.lru_cache(maxsize=64)
 def is_closed(mesh: Mesh) -> bool:
-    """Whether nobody outside of a mesh sees a triangle from behind: every edge has its way back."""
+    """Return whether nobody outside of a mesh sees a triangle from behind: every edge has its way back."""
     corners = mesh.vertices[mesh.faces].reshape(-1, 3)
     _, place = np.unique(corners, axis=0, return_inverse=True)
     faces = place.reshape(-1, 3).astype(np.int64)
@@ -197,7 +244,7 @@ def scene_materials(scene: Scene) -> tuple[MeshMaterial, ...]:
 
 
 def is_detailed(scene: Scene) -> bool:
-    """Whether any object's triangles or points must be asked for what they are made of.
+    """Return whether any object's triangles or points must be asked for what they are made of.
 
     Raises:
         SceneError: A mesh cannot be read.
@@ -210,7 +257,7 @@ def _is_black(color: Color) -> bool:
 
 
 def reflects_diffusely(material: MeshMaterial | Material) -> bool:
-    """Whether a material shows the environment's irradiance."""
+    """Return whether a material shows the environment's irradiance."""
     surface: Any = material
     least = 1.0
     if isinstance(material, MeshMaterial):
@@ -218,17 +265,15 @@ def reflects_diffusely(material: MeshMaterial | Material) -> bool:
             return False
         surface, least = material.surface, material.metallic_span[0]
     match surface:
-        case LambertMaterial():
+        case LambertMaterial() | PhongMaterial():
             return not _is_black(surface.base_color)
-        case PhongMaterial():
-            return not _is_black(surface.diffuse)
         case MetallicRoughnessMaterial():
             return least * surface.metallic < 1.0 and not _is_black(surface.base_color)
     return isinstance(surface, FileMaterial)
 
 
 def reflects_glossily(material: MeshMaterial | Material) -> bool:
-    """Whether a material shows the environment's prefiltered light."""
+    """Return whether a material shows the environment's prefiltered light."""
     surface: Any = material
     if isinstance(material, MeshMaterial):
         if material.unlit:

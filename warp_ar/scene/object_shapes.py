@@ -6,6 +6,7 @@ Layers, mattes and exchange files number and name shapes; where nothing is playe
 from __future__ import annotations
 
 import dataclasses
+import re
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +14,7 @@ import numpy.typing as npt
 from warp_ar.scene.description import Object, Scene
 from warp_ar.scene.geometry import Mesh
 from warp_ar.scene.mesh_parts import LARGEST
-from warp_ar.scene.node_animation import MovingMesh
+from warp_ar.scene.node_animation import Bend, MovingMesh
 from warp_ar.scene.object_materials import moving_mesh_of
 
 Array = npt.NDArray[np.float64]
@@ -27,7 +28,7 @@ class ObjectShape:
     index: int
     """Of the object in its scene."""
     moving: MovingMesh | None = None
-    """What the object plays; None: it is one shape."""
+    """Animation that the object plays; None: it is one shape."""
     part: int = 0
     """Of ``moving``."""
 
@@ -35,6 +36,11 @@ class ObjectShape:
     def mesh(self) -> Mesh | None:
         """Triangles of the part; None where the object is one shape."""
         return None if self.moving is None else self.moving.parts[self.part].mesh
+
+    @property
+    def bend(self) -> Bend | None:
+        """Function from a time to the part's triangles; None: they are always the same."""
+        return None if self.moving is None else self.moving.parts[self.part].bend
 
 
 def object_shapes(scene: Scene) -> tuple[ObjectShape, ...]:
@@ -110,3 +116,15 @@ def shape_label(shape: ObjectShape) -> str:
     """Words for a shape, as in the name of its matte."""
     name = shape.item.file.stem if shape.item.file else shape.item.shape
     return f"object_{shape.index}_{name}" + (f"_part_{shape.part}" if shape.part else "")
+
+
+def surface_names(scene: Scene) -> tuple[str, ...]:
+    """A name for every surface, in the order of the layer ``ids``: virtual objects, proxies, mirror balls.
+
+    Letters, digits and underscores, each name once: ``object_0_bunny`` by its file or its shape, ``proxy_1_plane``. Of
+    an object whose file moves it in parts, each part has a name: ``object_0_truck``, ``object_0_truck_part_1``.
+    """
+    objects = map(shape_label, object_shapes(scene))
+    proxies = (f"proxy_{k}_{one.file.stem if one.file else one.shape}" for k, one in enumerate(scene.proxies))
+    balls = (f"ball_{k}" for k in range(len(scene.probes)))
+    return tuple(re.sub(r"\W", "_", name, flags=re.ASCII) for name in (*objects, *proxies, *balls))

@@ -1,4 +1,4 @@
-"""OBJ, PLY and OFF: polygons with all that the file declares of their corners, cut into triangles.
+"""OBJ, PLY, OFF and STL: polygons with all that the file declares of their corners, cut into triangles.
 
 Polygons are cut by ear clipping where they are concave, so that areas and winding are kept. Colours are sRGB-encoded,
 in 8 or 16 bits or from 0 to 1. What a file declares and is not shown is named in the mesh's notes.
@@ -11,26 +11,24 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Iterator
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
 from warp_ar.errors import SceneError
-from warp_ar.scene.gltf import decode_rgba
-from warp_ar.scene.materials import LambertMaterial
-from warp_ar.scene.mesh_assets import Assets
-from warp_ar.scene.mesh_materials import MeshMaterial, TextureUse
-from warp_ar.scene.mesh_parts import MeshPart
+from warp_ar.scene.materials import LambertMaterial, MeshMaterial, TextureUse
+from warp_ar.scene.mesh_parts import MeshPart, strip_triangles
+from warp_ar.scene.mesh_source import MeshSource
 from warp_ar.scene.mtl import parse_library, read_library
 from warp_ar.srgb import decode_srgb
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
-ByteArray = npt.NDArray[np.uint8]
 
+CREASE: Final = 40.0
+"""Degrees: where a drawing (OBJ, OFF, STL) has no normals, an edge that turns more is sharp."""
 FLAT: Final = 1e-12
 """Share of a polygon's squared size below which a corner has no turn: float64 rounding of its cross product."""
 _UNCOLORED: Final = (0.8, 0.8, 0.8, 1.0)
@@ -39,7 +37,7 @@ _UNCOLORED: Final = (0.8, 0.8, 0.8, 1.0)
 
 @dataclasses.dataclass
 class Corners:
-    """Polygons, one corner after another."""
+    """Polygons, one corner after another, and what is said of them and of their vertices."""
 
     vertex: Indices
     """Vertex of each corner, (n,)."""
@@ -51,6 +49,27 @@ class Corners:
     """Normal of each corner, (n, 3)."""
     color: Array | None = None
     """Linear RGBA of each polygon, (p, 4)."""
+    vertex_uv: Array | None = None
+    """Texture coordinates of each vertex, (v, 2)."""
+    vertex_normal: Array | None = None
+    """Normal of each vertex, (v, 3)."""
+    vertex_color: Array | None = None
+    """Linear RGBA of each vertex, (v, 4)."""
+
+    def check(self, source: MeshSource, count: int) -> None:
+        """Check that all corners are among ``count`` vertices, and take what is said of these.
+
+        Raises:
+            SceneError: They are not.
+        """
+        index = self.vertex
+        if index.size and not (index.min() >= 0 and index.max() < count):
+            wrong = int(index.max() if index.max() >= count else index.min())
+            raise SceneError(f"{source.path}: a face has vertex index {wrong}; there are {count} vertices from 0 on")
+        if self.uv is None and self.vertex_uv is not None:
+            self.uv = self.vertex_uv[index]
+        if self.normal is None and self.vertex_normal is not None:
+            self.normal = self.vertex_normal[index]
 
 
 def triangles_of(vertices: Array, corners: Corners) -> tuple[Indices, Indices]:
@@ -131,49 +150,39 @@ def clip_ears(points: Array) -> Indices:
 
 
 def part_of(
-    label: str,
+    source: MeshSource,
     vertices: Array,
     corners: Corners,
+    cut: tuple[Indices, Indices],
     *,
-    colors: Array | None = None,
     material: MeshMaterial | None = None,
-    crease: float | None,
-    chosen: npt.NDArray[np.bool_] | None = None,
-    cut: tuple[Indices, Indices] | None = None,
+    crease: float | None = CREASE,
+    whole: bool = True,
 ) -> MeshPart | None:
-    """Return the triangles of polygons as a part of a mesh; None where there are none.
+    """Return triangles of polygons as a part of a mesh; None where there are none.
 
     Args:
-        label: The file, for messages.
+        source: The file.
         vertices: (v, 3).
-        corners: The polygons.
-        colors: Linear RGBA of vertices, (v, 4).
+        corners: The polygons, checked.
+        cut: Those of `triangles_of` that are of this part.
         material: The part's.
-        crease: Degrees from which on an edge is sharp where the file has no normals.
-        chosen: Polygons that are of this part, (p,); None: all.
-        cut: What `triangles_of` gives, where it is known.
+        crease: Degrees from which on an edge is sharp where the file has no normals; None: none is.
+        whole: Whether all vertices are of this part.
 
     Raises:
-        SceneError: A face names a vertex that is not there, or a vertex is not finite.
+        SceneError: A vertex is not finite.
     """
-    if corners.vertex.size and not (corners.vertex.min() >= 0 and corners.vertex.max() < len(vertices)):
-        wrong = int(corners.vertex.max() if corners.vertex.max() >= len(vertices) else corners.vertex.min())
-        raise SceneError(f"{label}: a face has vertex index {wrong}; there are {len(vertices)} vertices from 0 on")
-    triangles, owners = triangles_of(vertices, corners) if cut is None else cut
-    if chosen is not None:
-        triangles, owners = triangles[chosen[owners]], owners[chosen[owners]]
+    triangles, owners = cut
     if not len(triangles):
         return None
     flat = triangles.ravel()
-    of_corners = [values[flat] for values in (corners.uv, corners.normal) if values is not None]
-    if corners.color is not None:
-        of_corners.append(np.repeat(corners.color[owners], 3, 0))
     index = corners.vertex[flat]
-    if not of_corners:
-        used, faces = (None, index) if chosen is None else np.unique(index, return_inverse=True)
-        where = np.arange(len(vertices)) if used is None else used
-        first = None
-    else:
+    face = None if corners.color is None else np.repeat(corners.color[owners], 3, 0)
+    of_corners = [values[flat] for values in (corners.uv, corners.normal) if values is not None]
+    of_corners += [] if face is None else [face]
+    first = None
+    if of_corners:
         rows = np.column_stack([index.astype(np.float64), *of_corners])
         rows = np.ascontiguousarray(np.where(np.isfinite(rows), rows, 0.0) + 0.0)
         keys = rows.view(np.dtype((np.void, rows.dtype.itemsize * rows.shape[1]))).ravel()
@@ -181,30 +190,57 @@ def part_of(
         order = np.argsort(first)  # as they come in the file
         first, faces = first[order], np.argsort(order)[faces]
         where = index[first]
+    elif whole:
+        where, faces = np.arange(len(vertices)), index
+    else:
+        where, faces = np.unique(index, return_inverse=True)
 
     def taken(values: Array | None) -> Array | None:
         return None if values is None else values[flat][first]
 
-    own = None if colors is None else colors[where]
-    if corners.color is not None:
-        face = np.repeat(corners.color[owners], 3, 0)[first]
-        own = face if own is None else own * face
+    colors = None if corners.vertex_color is None else corners.vertex_color[where]
+    if face is not None:
+        colors = face[first] if colors is None else colors * face[first]
+    if colors is not None and (colors[:, 3] < 1.0).any():
+        material = material or MeshMaterial(surface=LambertMaterial((1.0, 1.0, 1.0)))
+        material = dataclasses.replace(material, alpha="blend") if material.alpha == "opaque" else material
     return MeshPart.checked(
-        label,
+        f"{source.path}",
         vertices[where],
         faces.reshape(-1, 3).astype(np.int64),
         taken(corners.normal),
         uvs=(taken(corners.uv), None),
-        colors=own,
+        colors=colors,
         material=material,
         crease=crease,
     )
 
 
+def parts_of(source: MeshSource, vertices: Array, corners: Corners, **how: Any) -> list[MeshPart]:
+    """Return all triangles of polygons as one part, or none; arguments and errors as those of `part_of`."""
+    corners.check(source, len(vertices))
+    part = part_of(source, vertices, corners, triangles_of(vertices, corners), **how)
+    return [] if part is None else [part]
+
+
 def linear_rgba(values: Array, largest: float) -> Array:
-    """Return linear RGBA, (n, 4), of sRGB-encoded colours, (n, 3 or more), of which ``largest`` is white."""
+    """Return linear RGBA, (n, 4), of sRGB-encoded colours, (n, 3 or 4), of which ``largest`` is white.
+
+    Alpha that is nowhere above 1 is of steps of 1, whatever white is.
+    """
     shown = np.clip(np.nan_to_num(values[:, :3] / largest), 0.0, 1.0)
-    return np.concatenate([decode_srgb(shown), np.ones((len(values), 1))], axis=1)
+    alpha = values[:, 3:4] if values.shape[1] > 3 else np.ones((len(values), 1))
+    alpha = np.clip(np.nan_to_num(alpha / (largest if alpha.max(initial=0.0) > 1.0 else 1.0)), 0.0, 1.0)
+    return np.concatenate([decode_srgb(shown), alpha], axis=1)
+
+
+def _shown_colors(source: MeshSource, values: Array, largest: float) -> Array:
+    """Return linear RGBA as `linear_rgba`; programs that do not know alpha write 0."""
+    colors = linear_rgba(values, largest)
+    if len(colors) and not colors[:, 3].any():
+        source.note("alpha of colours, which is 0 everywhere")
+        colors[:, 3] = 1.0
+    return colors
 
 
 def decode_text(data: bytes) -> str:
@@ -215,18 +251,25 @@ def decode_text(data: bytes) -> str:
         return data.decode("latin-1")
 
 
+_NOT_SHOWN: Final = {
+    **dict.fromkeys(("curv", "curv2", "surf"), "free-form curves and surfaces"),
+    **dict.fromkeys(("l", "p"), "points and lines"),
+}
+"""Statements of an OBJ that are named, in words."""
+
+
 class _Obj:
     """Reads an OBJ line by line."""
 
-    def __init__(self, path: Path, data: bytes, assets: Assets, images: list[ByteArray], notes: list[str]) -> None:
-        self._label, self._assets, self._images, self._notes = f"{path}", assets, images, notes
+    def __init__(self, source: MeshSource) -> None:
+        self._source = source
         self._rows: dict[str, list[list[str]]] = {"v": [], "vt": [], "vn": []}
         self._tokens: list[str] = []
         self._faces: list[tuple[int, int, int, int, int]] = []  # corners, material, and v, vt, vn before it
         self._materials: dict[str, int] = {}
         self._libraries: list[str] = []
         self._material = self._number("")
-        for line in re.sub(r"\\[ \t]*\r?\n", " ", decode_text(data)).splitlines():
+        for line in re.sub(r"\\[ \t]*\r?\n", " ", decode_text(source.data)).splitlines():
             self._read(line)
 
     def _number(self, name: str) -> int:
@@ -248,39 +291,36 @@ class _Obj:
                 self._material = self._number(name)
             elif name:
                 self._libraries.append(name)
-        elif key in ("curv", "curv2", "surf"):
-            self._notes.extend(["free-form curves and surfaces"] * ("free-form curves and surfaces" not in self._notes))
+        elif key in _NOT_SHOWN:
+            self._source.note(_NOT_SHOWN[key])
 
-    def parts(self, crease: float | None) -> list[MeshPart]:
+    def parts(self) -> list[MeshPart]:
         """Return a part for each material."""
         vertices, colors = self._vertices()
         corners, materials = self._corners()
+        corners.vertex_color = colors
+        corners.check(self._source, len(vertices))
         library = self._library()
+        triangles, owners = triangles_of(vertices, corners)
         found = []
-        cut = None
-        if not corners.vertex.size or (corners.vertex.min() >= 0 and corners.vertex.max() < len(vertices)):
-            cut = triangles_of(vertices, corners)
         for name, number in self._materials.items():
-            chosen = None if (materials == number).all() else materials == number
+            chosen = materials[owners] == number
             values = library.get(name)
             if name and values is None and library:
-                self._notes.append(f"the material {name[:60]}, which no library has")
+                self._source.note(f"the material {name[:60]}, which no library has")
             material = None
-            if values is not None and (chosen is None or chosen.any()):
-                material = read_library(self._label, values, self._images, self._notes, self._assets)
-            part = part_of(
-                self._label, vertices, corners, colors=colors, material=material, crease=crease, chosen=chosen, cut=cut
-            )
+            if values is not None and chosen.any():
+                material = read_library(self._source, values)
+            cut = triangles[chosen], owners[chosen]
+            part = part_of(self._source, vertices, corners, cut, material=material, whole=bool(chosen.all()))
             found += [] if part is None else [part]
-            if chosen is None:
-                break
         return found
 
     def _vertices(self) -> tuple[Array, Array | None]:
         """Return positions and linear colours: x y z [w] or x y z r g b [a]."""
         rows = self._rows["v"]
         if any(len(row) < 3 for row in rows):
-            raise SceneError(f"{self._label}: a vertex has fewer than 3 numbers")
+            raise SceneError(f"{self._source.path}: a vertex has fewer than 3 numbers")
         vertices = np.array([row[:3] for row in rows], dtype=np.float64).reshape(-1, 3)
         colored = [len(row) >= 6 for row in rows]
         if not any(colored):
@@ -304,7 +344,9 @@ class _Obj:
         """Return v, vt, vn of each corner as the file counts them, (n, 3); 0 where it has none."""
         rows = [[int(number or 0) for number in token.split("/")] for token in self._tokens]
         if any(not 1 <= len(row) <= 3 or row[0] == 0 for row in rows):
-            raise SceneError(f"{self._label}: a face names no vertex; corners are v, v/vt or v/vt/vn, counted from 1")
+            raise SceneError(
+                f"{self._source.path}: a face names no vertex; corners are v, v/vt or v/vt/vn, counted from 1"
+            )
         return np.array([[*row, 0, 0][:3] for row in rows], np.int64).reshape(-1, 3)
 
     def _attribute(self, key: str, index: Indices, size: int) -> Array | None:
@@ -313,7 +355,7 @@ class _Obj:
         if not rows or not len(index) or (index < 0).all():
             return None
         if index.max() >= len(rows):
-            raise SceneError(f"{self._label}: a face names {key} {int(index.max()) + 1}; there are {len(rows)}")
+            raise SceneError(f"{self._source.path}: a face names {key} {int(index.max()) + 1}; there are {len(rows)}")
         values = np.array([[*row, "0", "0"][:size] for row in rows], np.float64)
         return np.where((index >= 0)[:, None], values[np.maximum(index, 0)], 0.0)
 
@@ -321,33 +363,37 @@ class _Obj:
         """Return the materials of all libraries by name; the first of a name counts."""
         found: dict[str, dict[str, Any]] = {}
         for said in dict.fromkeys(self._libraries):
-            names = [said] if self._assets.has(said) else said.split()
-            for name in names:
-                data = self._assets.library(name)
-                if data is None:
-                    shown = re.split(r"[/\\]", name)[-1][:60]
-                    self._notes.append(f"the material library {shown}, which is not there")
+            for name in [said] if self._source.has(said) else said.split():
+                if self._source.has(name):
+                    found = {**parse_library(decode_text(self._source.get(name, "text_bytes"))), **found}
                 else:
-                    found = {**parse_library(decode_text(data)), **found}
+                    shown = re.split(r"[/\\]", name)[-1][:60]
+                    self._source.note(f"the material library {shown}, which is not there")
         return found
 
 
-def read_obj(
-    path: Path, data: bytes, assets: Assets, images: list[ByteArray], notes: list[str], crease: float | None
-) -> list[MeshPart]:
-    """Read an OBJ with its material libraries: a part for each material."""
-    return _Obj(path, data, assets, images, notes).parts(crease)
+def read_obj(source: MeshSource) -> list[MeshPart]:
+    """Read an OBJ with its material libraries: a part for each material.
 
-
-def read_off(
-    path: Path, data: bytes, assets: Assets, images: list[ByteArray], notes: list[str], crease: float | None
-) -> list[MeshPart]:
-    """Read an OFF: colours, normals and texture coordinates of vertices (COFF, NOFF, STOFF), colours of faces.
+    Follows:
+        colours of vertices, of 1 or 255; several libraries; continued lines; UTF-8, Latin-1.
 
     Raises:
-        ValueError: It is binary, of another dimension than three, cut off, or no OFF.
+        SceneError: Damaged.
     """
-    lines = [line.split("#")[0].split() for line in decode_text(data).splitlines()]
+    return _Obj(source).parts()
+
+
+def read_off(source: MeshSource) -> list[MeshPart]:
+    """Read an OFF.
+
+    Follows:
+        text; COFF, NOFF, STOFF; colours of vertices and faces with alpha, of 1, 255 or 65,535.
+
+    Raises:
+        ValueError: Damaged; BINARY, 4OFF, nOFF.
+    """
+    lines = [line.split("#")[0].split() for line in decode_text(source.data).splitlines()]
     lines = [line for line in lines if line]
     kind = re.fullmatch(r"(ST)?(C)?(N)?(4)?(n)?OFF", lines[0][0]) if lines else None
     if kind is not None:
@@ -356,39 +402,67 @@ def read_off(
     if not lines or "BINARY" in lines[0] or (kind is not None and (kind[4] or kind[5])):
         raise ValueError("no OFF of text in three dimensions")
     count, polygons = int(lines[0][0]), int(lines[0][1])
+    source.check_count(count, 1)
+    source.check_count(polygons, 1)
     rows, faces = lines[1 : 1 + count], lines[1 + count : 1 + count + polygons]
     if len(rows) < count or len(faces) < polygons:
         raise ValueError(f"cut off after {len(lines)} lines")
     wide = min(map(len, rows), default=3)
     values = np.array([row[:wide] for row in rows], np.float64).reshape(-1, wide)
-    at = 3
-    normals = uvs = colors = None
-    if kind is not None and kind[3]:
-        normals, at = values[:, 3:6], 6
-    rest = wide - at - (2 if kind is not None and kind[1] else 0)
-    if rest >= 3:
-        whole = not any(re.search(r"[.eE]", word) for row in rows for word in row[at : at + 3])
-        colors, at = linear_rgba(values[:, at : at + 3], _white(values[:, at : at + 3], whole)), at + min(rest, 4)
-    if kind is not None and kind[1] and wide >= at + 2:
-        uvs = values[:, at : at + 2]
     lengths = np.array([int(face[0]) for face in faces], np.int64)
     if any(len(face) < 1 + length for face, length in zip(faces, lengths.tolist(), strict=True)):
         raise ValueError("a face has fewer corners than it says")
-    index = np.array([int(word) for face in faces for word in face[1 : 1 + int(face[0])]], np.int64)
-    corners = Corners(index, lengths)
-    inside = bool(index.size) and index.min() >= 0 and index.max() < count
-    corners.normal = normals[index] if normals is not None and inside else None
-    corners.uv = uvs[index] if uvs is not None and inside else None
+    corners = Corners(np.array([int(word) for face in faces for word in face[1 : 1 + int(face[0])]], np.int64), lengths)
+    at = 3
+    if kind is not None and kind[3]:
+        corners.vertex_normal, at = values[:, 3:6], 6
+    rest = wide - at - (2 if kind is not None and kind[1] else 0)
+    if rest >= 3:
+        whole = not any(re.search(r"[.eE]", word) for row in rows for word in row[at : at + 3])
+        given = values[:, at : at + min(rest, 4)]
+        corners.vertex_color = _shown_colors(source, given, _white(given[:, :3], whole))
+        at += min(rest, 4)
+    if kind is not None and kind[1] and wide >= at + 2:
+        corners.vertex_uv = values[:, at : at + 2]
     extra = [face[1 + int(face[0]) :] for face in faces]
     if any(len(words) >= 3 for words in extra):
         whole = not any(re.search(r"[.eE]", word) for words in extra for word in words[:3])
-        told = np.array([words[:3] if len(words) >= 3 else ("-1",) * 3 for words in extra], np.float64)
-        corners.color = linear_rgba(told, _white(told, whole))
+        # A face may have no colour, or one without alpha.
+        told = np.array([[*words[:4], "nan"][:4] if len(words) >= 3 else ("-1",) * 4 for words in extra], np.float64)
+        white = _white(told[:, :3], whole)
+        told[:, 3] = np.where(np.isnan(told[:, 3]), white, told[:, 3])
+        corners.color = _shown_colors(source, told, white)
         corners.color[told[:, 0] < 0.0] = _UNCOLORED
     elif any(extra):
-        notes.append("colours of faces by their number in a table")
-    part = part_of(f"{path}", values[:, :3], corners, colors=colors, crease=crease)
-    return [] if part is None else [part]
+        source.note("colours of faces by their number in a table")
+    return parts_of(source, values[:, :3], corners)
+
+
+def read_stl(source: MeshSource) -> list[MeshPart]:
+    """Read an STL.
+
+    Follows:
+        binary, text in any case; several solids.
+
+    Raises:
+        ValueError: Damaged.
+    """
+    data = source.data
+    count = int.from_bytes(data[80:84], "little")
+    is_text = data.lstrip()[:5].lower() == b"solid" and b"facet" in data[:_STL_TEXT].lower()
+    if is_text and len(data) != 84 + 50 * count:
+        words = re.findall(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)", data, re.IGNORECASE)
+        vertices = np.array([list(map(float, row)) for row in words], np.float64).reshape(-1, 3)
+        vertices = vertices[: len(vertices) // 3 * 3]
+    else:
+        source.check_count(count, 1)
+        if len(data) < 84 + 50 * count:
+            raise ValueError(f"cut off: {count} triangles are promised")
+        rows = np.frombuffer(data, [("normal", "<3f4"), ("corners", "<9f4"), ("more", "<u2")], count, 84)
+        vertices = rows["corners"].reshape(-1, 3).astype(np.float64)
+        if (rows["more"] & 0x8000).any() or b"COLOR=" in data[:80]:
+            source.note("colours of triangles")
+    return parts_of(source, vertices, Corners(np.arange(len(vertices)), np.full(len(vertices) // 3, 3)))
 
 
 def _white(values: Array, whole: bool) -> float:
@@ -397,17 +471,23 @@ def _white(values: Array, whole: bool) -> float:
     return 65535.0 if largest > 255.0 else 255.0 if whole or largest > 1.0 else 1.0
 
 
+_STL_TEXT: Final = 1 << 12
+"""Bytes within which a text has its first facet."""
 _PLY_TYPES: Final = {
     **dict.fromkeys(("char", "int8"), "i1"), **dict.fromkeys(("uchar", "uint8"), "u1"),
     **dict.fromkeys(("short", "int16"), "i2"), **dict.fromkeys(("ushort", "uint16"), "u2"),
     **dict.fromkeys(("int", "int32"), "i4"), **dict.fromkeys(("uint", "uint32"), "u4"),
     **dict.fromkeys(("float", "float32"), "f4"), **dict.fromkeys(("double", "float64"), "f8"),
 }  # fmt: skip
-_PLY_COLORS: Final = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
-_PLY_UVS: Final = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"), ("texcoord_u", "texcoord_v"))
-_PLY_UNSEEN: Final = frozenset(
-    {"confidence", "intensity", "quality", "flags", "alpha", "diffuse_alpha", "a", "texnumber", "curvature", "radius"}
+_PLY_INDICES: Final = ("vertex_indices", "vertex_index")
+_PLY_COLORS: Final = tuple(
+    tuple(start + name for name in names[:count])
+    for names in (("red", "green", "blue", "alpha"), ("r", "g", "b", "a"))
+    for start in ("", "diffuse_", "color_", "ambient_")
+    for count in (4, 3)
 )
+_PLY_UVS: Final = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"), ("texcoord_u", "texcoord_v"))
+_PLY_UNSEEN: Final = frozenset({"confidence", "intensity", "quality", "flags", "texnumber", "curvature", "radius"})
 """Properties that say nothing of how a surface looks, or are not used on purpose."""
 _Property = tuple[str, str, str | None]
 """Name, type, and for a list the type of its length."""
@@ -416,110 +496,85 @@ _Property = tuple[str, str, str | None]
 class _Ply:
     """Reader of a PLY, its elements one after another; ValueError where it is damaged."""
 
-    def __init__(self, data: bytes) -> None:
-        head, found, body = data.partition(b"end_header")
-        if not data.startswith(b"ply") or not found:
+    def __init__(self, source: MeshSource) -> None:
+        head, found, body = source.data.partition(b"end_header")
+        if not source.data.startswith(b"ply") or not found:
             raise ValueError("no PLY file, or cut off in its header")
-        self.texture: str | None = None
+        self._source = source
+        self.textures: list[str] = []
         self._elements: list[tuple[str, int, list[_Property]]] = []
         self._order = ""
         for line in decode_text(head).splitlines():
             self._declare(line)
-        self._words: list[bytes] = []
-        self._at = 0
         self._data = body[2:] if body.startswith(b"\r\n") else body[1:]
-        if self._order == "ascii":
-            self._words = self._data.split()
-        self.values = {name: self._element(name, count, list_) for name, count, list_ in self._elements}
         self.kinds = {name: {key: kind for key, kind, _ in list_} for name, _, list_ in self._elements}
+        if not self._order:  # text: read as if all were doubles
+            self._data, self._order = np.array(self._data.split(), np.float64).tobytes(), "="
+            self._elements = [
+                (name, count, [(key, "f8", length and "f8") for key, _, length in list_])
+                for name, count, list_ in self._elements
+            ]
+        self._at = 0
+        self.values: dict[str, dict[str, Any]] = {}
+        for name, count, properties in self._elements:
+            source.check_count(count, 1)
+            self.values[name] = self._element(count, properties)
 
     def _declare(self, line: str) -> None:
         words = line.split()
         if words[:1] == ["format"] and len(words) > 1:
-            self._order = {"ascii": "ascii", "binary_little_endian": "<", "binary_big_endian": ">"}[words[1]]
+            self._order = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}[words[1]]
         elif words[:1] == ["element"]:
             self._elements.append((words[1], int(words[2]), []))
         elif words[:2] == ["property", "list"]:
-            self._elements[-1][2].append((words[4], _PLY_TYPES[words[3]], _PLY_TYPES[words[2]]))
+            self._elements[-1][2].append((words[4].lower(), _PLY_TYPES[words[3]], _PLY_TYPES[words[2]]))
         elif words[:1] == ["property"]:
-            self._elements[-1][2].append((words[2], _PLY_TYPES[words[1]], None))
+            self._elements[-1][2].append((words[2].lower(), _PLY_TYPES[words[1]], None))
         elif words[:2] == ["comment", "TextureFile"]:
-            self.texture = " ".join(words[2:])
+            self.textures.append(" ".join(words[2:]))
 
-    def _element(self, name: str, count: int, properties: list[_Property]) -> dict[str, Any]:
+    def _element(self, count: int, properties: list[_Property]) -> dict[str, Any]:
         """Return an element's values by property: arrays, and of lists (values of all rows, length of each row)."""
-        if all(length is None for _, _, length in properties):
-            table = self._rows(count, [1] * len(properties), properties)
-            return {key: table[key] for key, _, _ in properties}
         start = self._at
         first = self._row(properties) if count else [[] for _ in properties]
-        sizes = [1 if n is None else len(values) for values, (_, _, n) in zip(first, properties, strict=True)]
-        self._at = start
-        try:
-            table = self._rows(count, sizes, properties)
-            same = all(
-                (table[f"#{key}"] == size).all() for (key, _, n), size in zip(properties, sizes, strict=True) if n
-            )
-        except ValueError:
-            same = False
-        if same:
-            return {
-                key: table[key] if n is None else (table[key].ravel(), np.full(count, size, np.int64))
-                for (key, _, n), size in zip(properties, sizes, strict=True)
-            }
-        self._at = start
-        rows = [self._row(properties) for _ in range(count)]
-        found: dict[str, Any] = {}
-        for column, (key, _, length) in enumerate(properties):
-            values = np.array([value for row in rows for value in row[column]], np.float64)
-            found[key] = values if length is None else (values, np.array([len(row[column]) for row in rows], np.int64))
-        return found
-
-    def _rows(self, count: int, sizes: list[int], properties: list[_Property]) -> dict[str, Array]:
-        """Return all rows of an element whose lists have these lengths; lengths stand under ``#`` and the name."""
-        fields: list[tuple[str, str, int]] = []
-        for (key, kind, length), size in zip(properties, sizes, strict=True):
-            fields += [] if length is None else [(f"#{key}", length, 1)]
-            fields.append((key, kind, size))
-        if self._order == "ascii":
-            width = sum(size for _, _, size in fields)
-            words = self._words[self._at : self._at + count * width]
-            if len(words) < count * width:
-                raise ValueError("cut off")
-            values = np.array([float(word) for word in words], np.float64).reshape(count, width)
-            self._at += count * width
-            ends = np.cumsum([size for _, _, size in fields]).tolist()
-            return {
-                key: values[:, end - size : end] if size != 1 or not _is_scalar(key, properties) else values[:, end - 1]
-                for (key, _, size), end in zip(fields, ends, strict=True)
-            }
-        kinds = np.dtype([(key, self._order + kind, (size,)) for key, kind, size in fields])
-        if self._at + count * kinds.itemsize > len(self._data):
-            raise ValueError(f"cut off after {len(self._data)} bytes")
-        table = np.frombuffer(self._data, kinds, count, self._at)
-        self._at += count * kinds.itemsize
+        fields: list[tuple[str, str, tuple[int]]] = []
+        for column, ((_, kind, length), values) in enumerate(zip(properties, first, strict=True)):
+            fields += [] if length is None else [(f"length {column}", self._order + length, (1,))]
+            fields.append((f"{column}", self._order + kind, (len(values),)))
+        rows = np.dtype(fields)
+        fits = start + count * rows.itemsize <= len(self._data)
+        table = np.frombuffer(self._data, rows, count if fits else 0, start)
+        lists = [column for column, (_, _, length) in enumerate(properties) if length is not None]
+        if fits and all((table[f"length {column}"] == len(first[column])).all() for column in lists):
+            self._at = start + table.nbytes  # rows whose lists are alike are one table
+            columns = [
+                (table[f"{column}"].astype(np.float64).ravel(), np.full(count, len(values)))
+                for column, values in enumerate(first)
+            ]
+        else:
+            self._at = start
+            found = [self._row(properties) for _ in range(count)]
+            columns = [
+                (np.array([v for row in found for v in row[k]], np.float64), np.array([len(row[k]) for row in found]))
+                for k in range(len(properties))
+            ]
         return {
-            key: table[key][:, 0].astype(np.float64) if _is_scalar(key, properties) else table[key].astype(np.float64)
-            for key, _, _ in fields
+            key: column if length else column[0] for (key, _, length), column in zip(properties, columns, strict=True)
         }
 
     def _row(self, properties: list[_Property]) -> list[list[float]]:
         """Return the next row, each property as a list."""
-        row = []
-        for _, kind, length in properties:
-            count = 1 if length is None else int(self._next(length, 1)[0])
-            row.append(self._next(kind, count))
-        return row
+        return [
+            self._next(kind, 1 if length is None else int(self._next(length, 1)[0])) for _, kind, length in properties
+        ]
 
     def _next(self, kind: str, count: int) -> list[float]:
-        size = 1 if self._order == "ascii" else np.dtype(kind).itemsize
-        end = len(self._words) if self._order == "ascii" else len(self._data)
-        if count < 0 or self._at + count * size > end:
+        size = np.dtype(kind).itemsize
+        if count < 0 or self._at + count * size > len(self._data):
             raise ValueError(f"cut off, or a list of {count} entries")
-        start, self._at = self._at, self._at + count * size
-        if self._order == "ascii":
-            return [float(word) for word in self._words[start : self._at]]
-        found: list[float] = np.frombuffer(self._data, self._order + kind, count, start).astype(np.float64).tolist()
+        values = np.frombuffer(self._data, self._order + kind, count, self._at)
+        self._at += count * size
+        found: list[float] = values.astype(np.float64).tolist()
         return found
 
     def columns(self, element: str, choices: tuple[tuple[str, ...], ...]) -> tuple[Array | None, float]:
@@ -534,61 +589,79 @@ class _Ply:
     def colors(self, element: str) -> Array | None:
         """Return linear RGBA of an element's rows."""
         values, largest = self.columns(element, _PLY_COLORS)
-        return None if values is None else linear_rgba(values, largest if largest > 1.0 else _white(values, False))
+        if values is None:
+            return None
+        return _shown_colors(self._source, values, largest if largest > 1.0 else _white(values, False))
 
-    def unseen(self) -> list[str]:
-        """Return the properties of vertices and faces that are not shown, in words."""
-        lists = {"vertex_indices", "vertex_index", "texcoord"}
+    def unseen(self) -> Iterator[tuple[str, str]]:
+        """Yield the elements and names of the properties of vertices and faces that are not shown."""
+        lists = {*_PLY_INDICES, "texcoord"}
         known = {"x", "y", "z", "nx", "ny", "nz", *sum(_PLY_COLORS, ()), *sum(_PLY_UVS, ()), *lists} | _PLY_UNSEEN
-        return [
-            f"the property {key[:40]} of each {element}"
-            for element in ("vertex", "face")
-            for key in self.values.get(element, {})
-            if key not in known
-        ]
+        for element in ("vertex", "face"):
+            yield from ((element, key) for key in self.values.get(element, {}) if key not in known)
 
 
-def _is_scalar(key: str, properties: list[_Property]) -> bool:
-    return key.startswith("#") or any(key == name and length is None for name, _, length in properties)
+def read_ply(source: MeshSource) -> list[MeshPart]:
+    """Read a PLY of text or binary of either order.
 
+    Follows:
+        text, binary; tristrips; colours of vertices and faces with alpha, 8 or 16 bits or floats; texcoord, texnumber;
+        names of several programs.
 
-def read_ply(
-    path: Path, data: bytes, assets: Assets, images: list[ByteArray], notes: list[str], crease: float | None
-) -> list[MeshPart]:
-    """Read a PLY: colours, normals and texture coordinates of vertices, colours and texture coordinates of faces."""
-    ply = _Ply(data)
+    Raises:
+        ValueError: Damaged.
+    """
+    ply = _Ply(source)
     vertices, _ = ply.columns("vertex", (("x", "y", "z"),))
     faces = ply.values.get("face", {})
-    listed = next((faces[key] for key in ("vertex_indices", "vertex_index") if isinstance(faces.get(key), tuple)), None)
+    listed = next((faces[key] for key in _PLY_INDICES if isinstance(faces.get(key), tuple)), None)
+    strips = ply.values.get("tristrips", {})
+    stripped = next((strips[key] for key in _PLY_INDICES if isinstance(strips.get(key), tuple)), None)
+    if stripped is not None and (listed is None or not len(listed[1])):
+        rows = np.insert(stripped[0].astype(np.int64), np.cumsum(stripped[1]), -1)
+        triangles = strip_triangles(rows)
+        faces, listed = {}, (triangles.ravel(), np.full(len(triangles), 3))
+    elif stripped is not None:
+        source.note("strips of triangles beside faces")
     if vertices is None or listed is None:
         return []
-    index, lengths = listed[0].astype(np.int64), listed[1]
-    corners = Corners(index, lengths)
-    inside = bool(index.size) and index.min() >= 0 and index.max() < len(vertices)
-    normals, _ = ply.columns("vertex", (("nx", "ny", "nz"),))
-    uvs, _ = ply.columns("vertex", _PLY_UVS)
-    if inside:
-        corners.normal = None if normals is None else normals[index]
-        corners.uv = None if uvs is None else uvs[index]
+    corners = Corners(listed[0].astype(np.int64), listed[1])
+    corners.vertex_normal, _ = ply.columns("vertex", (("nx", "ny", "nz"),))
+    corners.vertex_uv, _ = ply.columns("vertex", _PLY_UVS)
+    corners.vertex_color, corners.color = ply.colors("vertex"), ply.colors("face") if faces else None
     texcoord = faces.get("texcoord")
     if isinstance(texcoord, tuple):
-        if (texcoord[1] == 2 * lengths).all():
+        if (texcoord[1] == 2 * listed[1]).all():
             corners.uv = texcoord[0].reshape(-1, 2)
         elif texcoord[1].any():
-            notes.append("texture coordinates of faces that do not fit their corners")
-    corners.color = ply.colors("face")
-    notes += ply.unseen()
-    material = None
-    if ply.texture and corners.uv is not None:
-        if assets.has(ply.texture):
-            images.append(decode_rgba(assets.get(ply.texture), f"{path}: {ply.texture}"))
-            material = MeshMaterial(surface=LambertMaterial((1.0, 1.0, 1.0)), base=TextureUse(len(images) - 1))
-        else:
-            notes.append(f"the texture {ply.texture[:60]}, which is not there")
-    part = part_of(f"{path}", vertices, corners, colors=ply.colors("vertex"), material=material, crease=crease)
-    return [] if part is None else [part]
+            source.note("texture coordinates of faces that do not fit their corners")
+    for element, key in ply.unseen():
+        source.note(f"the property {key[:40]} of each {element}")
+    corners.check(source, len(vertices))
+    triangles, owners = triangles_of(vertices, corners)
+    textures = ply.textures if corners.uv is not None else []
+    own = np.zeros(len(listed[1]), np.int64)
+    if len(textures) > 1 and isinstance(faces.get("texnumber"), np.ndarray):
+        own = faces["texnumber"].astype(np.int64)
+    parts = []
+    for number in np.unique(own):
+        material = None
+        if textures and source.has(name := textures[max(min(number, len(textures) - 1), 0)]):
+            source.images.append(source.picture(name, color=True))
+            material = MeshMaterial(surface=LambertMaterial((1.0, 1.0, 1.0)), base=TextureUse(len(source.images) - 1))
+        elif textures:
+            source.note(f"the texture {name[:60]}, which is not there")
+        chosen = own[owners] == number
+        cut = triangles[chosen], owners[chosen]
+        whole = bool(chosen.all())
+        parts.append(part_of(source, vertices, corners, cut, material=material, crease=None, whole=whole))
+    return [part for part in parts if part is not None]
 
 
-Reader = Callable[[Path, bytes, Assets, list[ByteArray], list[str], float | None], list[MeshPart]]
-READERS: Final[dict[str, Reader]] = {".obj": read_obj, ".off": read_off, ".ply": read_ply}
+READERS: Final[dict[str, Callable[[MeshSource], list[MeshPart]]]] = {
+    ".obj": read_obj,
+    ".off": read_off,
+    ".ply": read_ply,
+    ".stl": read_stl,
+}
 """Readers by ending."""

@@ -1,41 +1,49 @@
-"""Camera poses from files: COLMAP's images, OpenTrackIO samples, USD, or JSON of R and t; one per frame."""
+"""Camera poses from files: COLMAP's images, NeRF's transforms, OpenTrackIO, USD, or JSON of R and t.
+
+References:
+    SMPTE RIS-OSVP, "OpenTrackIO" 1.0: transforms in metres, z up, the camera along +y; degrees about z, x, y in turn.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import re
+import struct
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from warp_ar.errors import SceneError
-from warp_ar.files import parse_json, read_text
-from warp_ar.scene.camera_paths import USD_SUFFIXES, read_colmap_binary, read_track, read_usd
-from warp_ar.scene.description import Vec3
-from warp_ar.scene.geometry import rotation_matrix
+from warp_ar.files import limits, parse_json, read_bytes, read_text, too_much
+from warp_ar.scene.description import PoseSpec
+from warp_ar.scene.fields import Vec3
+from warp_ar.scene.geometry import quaternion_matrix, rotation_matrix
 
 RawPose = tuple[tuple[float, ...], Vec3]
+"""R, 9 numbers row by row, and t in metres: ``camera_from_world``, OpenCV's axes."""
+Matrix = npt.NDArray[np.float64]
 
+USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
+MOST_FRAMES = 1_000_000
+"""Poses of a file."""
 TURNED = 1e-3
 """Largest deviation of R R^T from the unit matrix."""
+_LEVEL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+"""``world_from_camera`` of a level camera that looks along +y, z up."""
+_Z_FROM_Y_UP = _LEVEL.T
+"""From a y-up world to the z-up one of a marker: x stays."""
+_OPENCV = np.diag([1.0, -1.0, -1.0])
+"""From OpenCV's axes of a camera to OpenGL's, or back."""
 
 
-def rotation_of_quaternion(w: float, x: float, y: float, z: float) -> tuple[float, ...]:
-    """Rotation matrix, 9 numbers row by row, of a quaternion of any length, w first as COLMAP has it."""
-    n = math.hypot(w, x, y, z)  # squares of tiny numbers would be 0
-    w, x, y, z = w / n, x / n, y / n, z / n
-    return (
-        *(1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
-        *(2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
-        *(2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
-    )
-
-
-def check_rotation(rotation: Sequence[float]) -> bool:
-    """Whether 9 numbers are a rotation matrix."""
-    matrix = np.array(rotation, float).reshape(3, 3)
-    return bool(np.abs(matrix @ matrix.T - np.eye(3)).max() < TURNED and np.linalg.det(matrix) > 0)
+def pose_of_placement(rotation: Matrix, position: Matrix) -> RawPose:
+    """``camera_from_world`` of ``world_from_camera``, OpenCV's axes."""
+    inverse = rotation.T
+    x, y, z = map(float, -inverse @ position)
+    return tuple(map(float, inverse.reshape(-1))), (x, y, z)
 
 
 def pose_of_position(position: Sequence[float], rotate: Sequence[float]) -> RawPose:
@@ -43,56 +51,101 @@ def pose_of_position(position: Sequence[float], rotate: Sequence[float]) -> RawP
 
     Unturned it looks along the world's +y, its x along the world's x, upright: world z is up.
     """
-    level = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-    rotation = (rotation_matrix(rotate) @ level).T
-    translation = -rotation @ np.array(position, float)
-    x, y, z = map(float, translation)
-    return tuple(map(float, rotation.reshape(-1))), (x, y, z)
+    return pose_of_placement(rotation_matrix(rotate) @ _LEVEL, np.array(position, float))
 
 
-def load_poses(path: Path) -> tuple[RawPose, ...]:
-    """Poses of a clip's frames in order.
+def rotation_of_quaternion(w: float, x: float, y: float, z: float) -> tuple[float, ...]:
+    """Rotation matrix, 9 numbers row by row, of a quaternion of any length, w first as COLMAP has it."""
+    n = math.hypot(w, x, y, z)  # squares of tiny numbers would be 0
+    return tuple(map(float, quaternion_matrix(np.array([x, y, z, w]) / n).reshape(-1)))
 
-    COLMAP's ``images.txt`` and ``images.bin`` have them by name: they are put in order of name, as frames of a folder
-    are. JSON holds a list of objects with ``R`` (9 numbers or 3 rows) and ``t``, ``camera_from_world`` as OpenCV's
-    ``solvePnP`` gives, or OpenTrackIO samples, which may also stand one on each line of a ``.jsonl``. USD holds one
-    camera, whose frames are those from its start to its end.
+
+def check_rotation(rotation: Sequence[float]) -> bool:
+    """Return whether 9 numbers are a rotation matrix."""
+    matrix = np.array(rotation, float).reshape(3, 3)
+    return bool(np.abs(matrix @ matrix.T - np.eye(3)).max() < TURNED and np.linalg.det(matrix) > 0)
+
+
+def natural_key(name: str) -> list[tuple[int, int, str]]:
+    """Sorts runs of digits by value; the last part keeps ``f01`` and ``f1`` in one order on every machine."""
+    parts = [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", name) if part]
+    return [*parts, (2, 0, name)]
+
+
+def load_pose_file(path: Path) -> PoseSpec:
+    """Read the poses of a clip's frames.
+
+    JSON holds a list of objects with ``R`` (9 numbers or 3 rows) and ``t``, ``camera_from_world`` as OpenCV's
+    ``solvePnP`` gives, and a ``name`` if all have one, or OpenTrackIO samples, which may also stand one on each line of
+    a ``.jsonl``.
+
+    Follows:
+        by pictures' names: COLMAP's images.txt (with or without points) and images.bin, NeRF's transforms.json, JSON
+        with names; else frames in turn: JSON, OpenTrackIO, the one camera of a USD.
+
+    Names:
+        frames without a pose.
+
+    Returns:
+        Poses by name, in natural order of the names; else in the file's order.
 
     Raises:
-        SceneError: The file cannot be used.
+        SceneError: Damaged; Alembic.
     """
     suffix = path.suffix.lower()
-    poses: tuple[RawPose, ...]
     if suffix == ".abc":
         raise SceneError(f"{path}: Alembic is not read; turn it into USD, as docs/formats.md shows for Blender")
     if suffix in USD_SUFFIXES:
-        poses = read_usd(path)
+        found = [("", pose) for pose in read_usd(path)]
     elif suffix == ".bin":
-        images = sorted(read_colmap_binary(path))
-        poses = tuple((rotation_of_quaternion(*quaternion), shift) for _, quaternion, shift in images)
+        found = _read_colmap_binary(path)
     else:
         text = read_text(path, SceneError, expected="COLMAP's images.txt, or JSON")
         if suffix == ".jsonl":
             lines = (line for line in text.splitlines() if line.strip())
-            poses = read_track(path, [parse_json(line, str(path), SceneError) for line in lines])
+            samples = [parse_json(line, str(path), SceneError) for line in lines]
+            found = [("", pose) for pose in read_track(path, samples)]
         else:
-            poses = _read_json(path, text) if suffix == ".json" else _read_colmap(path, text)
-    if not poses:
+            found = _read_json(path, text) if suffix == ".json" else _read_colmap(path, text)
+    if not found:
         raise SceneError(f"{path}: holds no pose; expected COLMAP's images, OpenTrackIO samples, or a list of R and t")
-    return poses
+    found = [(name.replace("\\", "/"), pose) for name, pose in found]
+    named = all(name for name, _ in found)
+    if named:
+        found.sort(key=lambda item: natural_key(item[0]))
+    return PoseSpec(tuple(pose for _, pose in found), path, tuple(name for name, _ in found) if named else ())
 
 
-def _read_json(path: Path, text: str) -> tuple[RawPose, ...]:
+def _read_json(path: Path, text: str) -> list[tuple[str, RawPose]]:
     entries = parse_json(text, str(path), SceneError)
+    if isinstance(entries, dict) and isinstance(entries.get("frames"), list):
+        return [_nerf_pose(f"{path}: frame {index}", entry) for index, entry in enumerate(entries["frames"])]
     if isinstance(entries, dict) and "transforms" in entries:
         entries = [entries]
     if isinstance(entries, list) and entries and isinstance(entries[0], dict) and "transforms" in entries[0]:
-        return read_track(path, entries)
+        return [("", pose) for pose in read_track(path, entries)]
     if not isinstance(entries, list):
         raise SceneError(
             f'{path}: expected a list of poses such as {{"R": [1, 0, 0, 0, 1, 0, 0, 0, 1], "t": [0, 0, 1]}}'
         )
-    return tuple(_json_pose(f"{path}: pose {index}", entry) for index, entry in enumerate(entries))
+    poses = [_json_pose(f"{path}: pose {index}", entry) for index, entry in enumerate(entries)]
+    names = [entry.get("name", "") for entry in entries]
+    if not all(isinstance(name, str) for name in names):
+        raise SceneError(f"{path}: name of a pose: expected the name of a picture")
+    return list(zip(names, poses, strict=True))
+
+
+def _nerf_pose(label: str, entry: Any) -> tuple[str, RawPose]:
+    """Pose of a frame of NeRF's ``transforms.json``: ``world_from_camera``, OpenGL's axes of the camera."""
+    try:
+        name, matrix = entry["file_path"], np.array(entry["transform_matrix"], float)
+        good = isinstance(name, str) and matrix.shape in ((3, 4), (4, 4)) and bool(np.isfinite(matrix).all())
+        good = good and check_rotation(matrix[:3, :3].ravel().tolist())
+    except (TypeError, KeyError, ValueError, OverflowError):
+        good = False
+    if not good:
+        raise SceneError(f"{label}: expected file_path and transform_matrix, rotation and translation in 4 rows of 4")
+    return name, pose_of_placement(matrix[:3, :3] @ _OPENCV, matrix[:3, 3])
 
 
 def _json_pose(label: str, entry: Any) -> RawPose:
@@ -110,22 +163,153 @@ def _json_pose(label: str, entry: Any) -> RawPose:
     return tuple(rotation.tolist()), (x, y, z)
 
 
-def _read_colmap(path: Path, text: str) -> tuple[RawPose, ...]:
-    """Lines ``ID QW QX QY QZ TX TY TZ CAMERA NAME``, each followed by one of points, which is not looked at."""
-    lines = [line for line in text.splitlines() if not line.lstrip().startswith("#")]
+def _colmap_pose(label: str, numbers: Sequence[float]) -> RawPose:
+    """Pose of a quaternion and a translation, 7 numbers."""
+    if not all(map(math.isfinite, numbers)) or not 0.0 < math.hypot(*numbers[:4]) < math.inf:
+        raise SceneError(f"{label}: expected QW QX QY QZ TX TY TZ, a rotation and a translation")
+    w, x, y, z, *shift = numbers
+    return rotation_of_quaternion(w, x, y, z), (shift[0], shift[1], shift[2])
+
+
+def _read_colmap(path: Path, text: str) -> list[tuple[str, RawPose]]:
+    """Lines ``ID QW QX QY QZ TX TY TZ CAMERA NAME``, each followed by one of points, which some programs leave out."""
     found: list[tuple[str, RawPose]] = []
-    for number, line in enumerate(lines[::2]):
-        if not line.strip():
-            continue
+    of_points = False
+    for line in text.splitlines():
         words = line.split(maxsplit=9)
-        try:
-            w, x, y, z, *shift = map(float, words[1:8])
-            length = math.hypot(w, x, y, z)
-            if len(words) < 10 or not 0.0 < length < math.inf or not all(map(math.isfinite, shift)):
-                raise ValueError
-        except ValueError:
-            raise SceneError(
-                f"{path}: image {number}: expected ID QW QX QY QZ TX TY TZ CAMERA NAME, as COLMAP writes"
-            ) from None
-        found.append((words[9], (rotation_of_quaternion(w, x, y, z), (shift[0], shift[1], shift[2]))))
-    return tuple(pose for _, pose in sorted(found, key=lambda item: item[0]))
+        count = len(line.split())
+        # A line of points has triples of numbers.
+        named = count >= 10 and not (count % 3 == 0 and all(map(_is_number, line.split())))
+        if line.lstrip().startswith("#") or (of_points and not named) or (not words and not of_points):
+            of_points = of_points and line.lstrip().startswith("#")
+            continue
+        label = f"{path}: image {len(found)}"
+        if not named or not all(map(_is_number, words[:9])):
+            raise SceneError(f"{label}: expected ID QW QX QY QZ TX TY TZ CAMERA NAME, as COLMAP writes")
+        found.append((words[9], _colmap_pose(label, [float(word) for word in words[1:8]])))
+        of_points = True
+    return found
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _read_colmap_binary(path: Path) -> list[tuple[str, RawPose]]:
+    """Poses of COLMAP's ``images.bin``, by name."""
+    data = read_bytes(path, "mesh_bytes", SceneError)
+    found: list[tuple[str, tuple[float, ...]]] = []
+    try:
+        (count,), at = struct.unpack_from("<Q", data), 8
+        if count > limits().mesh_elements:
+            raise SceneError(too_much(str(path), count, "images", "mesh_elements"))
+        for _ in range(count):
+            numbers = struct.unpack_from("<7d", data, at + 4)
+            end = data.index(b"\0", at + 64)
+            found.append((data[at + 64 : end].decode("utf-8", "replace"), numbers))
+            (points,) = struct.unpack_from("<Q", data, end + 1)
+            at = end + 9 + 24 * points
+    except (struct.error, ValueError, OverflowError) as error:  # overflow: more points than any file holds
+        raise SceneError(f"{path}: cut off after {len(data):,} bytes, or no images.bin of COLMAP") from error
+    return [(name, _colmap_pose(f"{path}: image {name!r}", numbers)) for name, numbers in found]
+
+
+def read_track(path: Path, samples: Sequence[Any]) -> tuple[RawPose, ...]:
+    """Poses of OpenTrackIO samples, one each.
+
+    Args:
+        path: For messages.
+        samples: JSON objects with ``transforms``, the last relative to those before it.
+
+    Raises:
+        SceneError: A sample is none.
+    """
+    return tuple(_read_sample(f"{path}: sample {index}", sample) for index, sample in enumerate(samples))
+
+
+def _read_sample(label: str, sample: Any) -> RawPose:
+    transforms = sample.get("transforms") if isinstance(sample, Mapping) else None
+    if not isinstance(transforms, list) or not transforms:
+        raise SceneError(f"{label}: expected transforms, a list of translation and rotation, as OpenTrackIO has it")
+    rotation, position = np.eye(3), np.zeros(3)
+    for transform in transforms:
+        x, y, z = _numbers(label, transform, "translation", ("x", "y", "z"))
+        turn = rotation_of_track(*_numbers(label, transform, "rotation", ("pan", "tilt", "roll")))
+        position = position + rotation @ np.array([x, y, z])
+        rotation = rotation @ turn
+    return pose_of_placement(rotation @ _LEVEL, position)
+
+
+def rotation_of_track(pan: float, tilt: float, roll: float) -> Matrix:
+    """Rotation of OpenTrackIO's angles in degrees: about z, then the turned x, then the turned y."""
+    return rotation_matrix((tilt, 0.0, pan)) @ rotation_matrix((0.0, roll, 0.0))
+
+
+def _numbers(label: str, transform: Any, name: str, keys: tuple[str, ...]) -> list[float]:
+    values = transform.get(name) if isinstance(transform, Mapping) else None
+    found: list[Any] = [values.get(key) for key in keys] if isinstance(values, Mapping) else []
+    good = [isinstance(one, int | float) and not isinstance(one, bool) and math.isfinite(one) for one in found]
+    if not found or not all(good):
+        raise SceneError(f"{label}: transforms: expected {name} with {', '.join(keys)}, finite numbers")
+    return [float(one) for one in found]
+
+
+def read_usd(path: Path) -> tuple[RawPose, ...]:
+    """Poses of the only camera of a USD file, one per frame from its start to its end.
+
+    Raises:
+        SceneError: usd-core is not installed, or the file cannot be used.
+    """
+    read_bytes(path, "mesh_bytes", SceneError)  # it is there, regular, and not too large
+    try:
+        import pxr.Tf
+        import pxr.Usd
+        import pxr.UsdGeom
+        import pxr.UsdUtils
+    except ImportError as error:
+        raise SceneError(f'{path}: USD files need usd-core; install it with pip install "warp-ar[exchange]"') from error
+    quiet = pxr.UsdUtils.CoalescingDiagnosticDelegate()  # takes what USD would print while it lives
+    try:
+        stage = pxr.Usd.Stage.Open(str(path), pxr.Usd.Stage.LoadAll)
+    except pxr.Tf.ErrorException as error:
+        raise SceneError(f"{path}: no USD file that can be read; is it whole?") from error
+    finally:
+        quiet.TakeUncoalescedDiagnostics()
+        del quiet
+    cameras = [prim for prim in stage.Traverse() if prim.IsA(pxr.UsdGeom.Camera)]
+    if len(cameras) != 1:
+        names = ", ".join(str(prim.GetPath()) for prim in cameras[:4])
+        raise SceneError(f"{path}: expected one camera, found {len(cameras)}{f' ({names})' if names else ''}")
+    start, end = stage.GetStartTimeCode(), stage.GetEndTimeCode()
+    # Blender says time codes alone, one for each frame: what USD takes for frames then is 24, whatever they are.
+    told = stage.GetFramesPerSecond() if stage.HasAuthoredMetadata("framesPerSecond") else 0.0
+    step = stage.GetTimeCodesPerSecond() / (told or stage.GetTimeCodesPerSecond())
+    finite = math.isfinite(start) and math.isfinite(end) and math.isfinite(step) and step > 0.0
+    count = math.floor((end - start) / step + 1e-6) + 1 if finite and end >= start else 1
+    if count > MOST_FRAMES:
+        raise SceneError(f"{path}: {count:,} frames; expected {MOST_FRAMES:,} at most")
+    up = str(pxr.UsdGeom.GetStageUpAxis(stage))
+    unit = float(pxr.UsdGeom.GetStageMetersPerUnit(stage))
+    camera = pxr.UsdGeom.Xformable(cameras[0])
+    poses = []
+    for index in range(count):
+        rows = np.array(camera.ComputeLocalToWorldTransform(start + step * index))
+        poses.append(_pose_of_usd(f"{path}: frame {index}", rows.T, unit, up))
+    return tuple(poses)
+
+
+def _pose_of_usd(label: str, matrix: Matrix, unit: float, up: str) -> RawPose:
+    """Pose of a placement of a camera that looks along -z; scale of its rig does not turn it."""
+    axes, position = matrix[:3, :3], unit * matrix[:3, 3]
+    lengths = np.linalg.norm(axes, axis=0)
+    if not np.isfinite(matrix).all() or (lengths == 0.0).any():
+        raise SceneError(f"{label}: the camera's placement is no finite, regular matrix")
+    rotation = axes / lengths
+    if not check_rotation(rotation.ravel().tolist()):
+        raise SceneError(f"{label}: the camera is mirrored or skewed; expected a rotation and a translation")
+    turn = _Z_FROM_Y_UP if up == "Y" else np.eye(3)
+    return pose_of_placement(turn @ rotation @ _OPENCV, turn @ position)

@@ -21,7 +21,7 @@ from warp_ar.scene.shapes import box_mesh, disk_mesh, rect_mesh, silhouette_tole
 FloatArray = npt.NDArray[np.float64]
 
 BOX_MARGIN: Final = 2.0**-18
-"""How much larger than its triangle a box of the BVH is, in radii of the mesh; see ``kernels/rays/shapes.py``."""
+"""Margin of a triangle's box in the BVH, in radii of the mesh; see ``kernels/rays/shapes.py``."""
 BVH_CONSTRUCTOR: Final = "sah"
 """On CUDA; Warp's own choice there is quicker to build, and a fifth to a half slower to walk."""
 BVH_LEAF_SIZE: Final = 1
@@ -37,7 +37,7 @@ class RayMesh:
     mesh: Any
     """``wp.Mesh`` whose corners are not shared: corner k of face f is point 3 f + k."""
     center: FloatArray
-    """Where its origin lies in the coordinates of the source, (3,)."""
+    """Origin in the coordinates of the source, (3,)."""
     half: FloatArray
     """Half sizes of its bounding box, (3,)."""
     normals: npt.NDArray[np.float32]
@@ -49,7 +49,7 @@ class RayMesh:
 
     @property
     def tree_address(self) -> int:
-        """What ``structs.Shape.tree`` is to be."""
+        """Value of ``structs.Shape.tree``."""
         return 0 if self.tree is None else int(self.tree.ptr)
 
 
@@ -58,8 +58,8 @@ def make_ray_mesh(mesh: Mesh, device: Any) -> RayMesh:
 
     The BVH is built over triangles that span the enlarged boxes; then the true corners take their place. Nothing is
     refitted afterwards, so the boxes keep their margin, and the triangles that rays are tested against are exact.
-    Meshes stand still in their own space: the tree is built once, so it is the one that is walked fastest. On CPU that
-    is one of ``kernels.wide_bvh``, and Warp's own, which only holds the triangles, the one that is built fastest.
+    Most meshes stand still in their own space: the tree is built once, so it is the one that is walked fastest. On CPU
+    that is one of ``kernels.wide_bvh``, and Warp's own, which only holds the triangles, the one that is built fastest.
 
     Args:
         mesh: The triangles.
@@ -67,21 +67,48 @@ def make_ray_mesh(mesh: Mesh, device: Any) -> RayMesh:
     """
     low, high = (bound.astype(np.float64) for bound in mesh.bounds)
     center = 0.5 * (low + high)
-    # Vertices at one position stay at one position to the last bit: every corner is computed the same way.
-    corners = (mesh.vertices.astype(np.float64) - center).astype(np.float32)[mesh.faces]
-    half = np.abs(corners).reshape(-1, 3).max(axis=0).astype(np.float64)
-    margin = np.float32(BOX_MARGIN * np.linalg.norm(half))
-    boxes = np.stack([corners.min(axis=1) - margin, corners.max(axis=1) + margin, corners[:, 0]], axis=1)
-    points = wp.array(boxes.reshape(-1, 3), dtype=wp.vec3, device=device)
+    corners, half, margin, boxes = _corners(mesh, center)
+    points = wp.array(boxes, dtype=wp.vec3, device=device)
     indices = wp.array(np.arange(corners.shape[0] * 3, dtype=np.int32), dtype=wp.int32, device=device)
     on_cpu = points.device.is_cpu
     constructor = "median" if on_cpu else BVH_CONSTRUCTOR
     ray_mesh = wp.Mesh(points=points, indices=indices, bvh_constructor=constructor, bvh_leaf_size=BVH_LEAF_SIZE)
     wp.copy(points, wp.array(corners.reshape(-1, 3), dtype=wp.vec3, device=device))
-    tree = build_wide_bvh(corners, float(margin)) if on_cpu else None
+    tree = build_wide_bvh(corners, margin) if on_cpu else None
     uvs = np.zeros((len(mesh.vertices), 2), np.float32) if mesh.uvs is None else mesh.uvs
     normals = mesh.normals[mesh.faces].reshape(-1, 3)
     return RayMesh(ray_mesh, center, half, normals, uvs[mesh.faces].reshape(-1, 2), tree)
+
+
+def _corners(
+    mesh: Mesh, center: FloatArray
+) -> tuple[npt.NDArray[np.float32], FloatArray, float, npt.NDArray[np.float32]]:
+    """Corners of the triangles about a centre, (m, 3, 3), half sizes, margin, and triangles that span the boxes."""
+    # Vertices at one position stay at one position to the last bit: every corner is computed the same way.
+    corners = (mesh.vertices.astype(np.float64) - center).astype(np.float32)[mesh.faces]
+    half = np.abs(corners).reshape(-1, 3).max(axis=0).astype(np.float64)
+    margin = np.float32(BOX_MARGIN * np.linalg.norm(half))
+    boxes = np.stack([corners.min(axis=1) - margin, corners.max(axis=1) + margin, corners[:, 0]], axis=1)
+    return corners, half, float(margin), boxes.reshape(-1, 3)
+
+
+def bend_ray_mesh(ray_mesh: RayMesh, mesh: Mesh) -> RayMesh:
+    """Have rays meet a mesh whose vertices are elsewhere now: Warp's BVH is refitted, the CPU's tree built again.
+
+    Args:
+        ray_mesh: What rays have met so far, of which no other scene has a share; its place in memory stays.
+        mesh: With the same faces.
+    """
+    corners, half, margin, boxes = _corners(mesh, ray_mesh.center)
+    points, tree = ray_mesh.mesh.points, None
+    if ray_mesh.tree is None:
+        points.assign(boxes)
+        ray_mesh.mesh.refit()
+    else:
+        tree = build_wide_bvh(corners, margin)
+    points.assign(corners.reshape(-1, 3))
+    normals = mesh.normals[mesh.faces].reshape(-1, 3)
+    return dataclasses.replace(ray_mesh, half=half, normals=normals, tree=tree)
 
 
 _SHARED: weakref.WeakKeyDictionary[Mesh, weakref.WeakValueDictionary[str, RayMesh]] = weakref.WeakKeyDictionary()
@@ -100,9 +127,11 @@ def shared_ray_mesh(mesh: Mesh, device: Any) -> RayMesh:
 
 
 def mesh_key(item: ObjectShape | scenes.Object | scenes.Proxy) -> Any:
-    """What a mesh is made from: a file, or the radii and tolerance of a torus; None for what rays meet analytically."""
+    """Return the key of a mesh: file, part, or a torus's radii and tolerance; None for what rays meet analytically."""
     if isinstance(item, ObjectShape):
-        return mesh_key(item.item) if item.mesh is None else item.mesh
+        if item.mesh is None:
+            return mesh_key(item.item)
+        return item.mesh if item.bend is None else (item.index, item.mesh)  # another object's is bent otherwise
     if item.shape == "mesh":
         return item.mesh if isinstance(item, scenes.Object) and item.mesh is not None else item.file
     if not isinstance(item, scenes.Object):
@@ -129,11 +158,13 @@ _MAKERS: Final[dict[str, Any]] = {"rect": rect_mesh, "disk": disk_mesh, "tube": 
 
 
 def make_mesh(key: Any) -> Mesh:
-    """What ``mesh_key`` says."""
+    """Make the mesh of a ``mesh_key``."""
     if isinstance(key, Mesh):
         return key
     if isinstance(key, Path):
         return file_mesh(key)
+    if isinstance(key[-1], Mesh):
+        return key[-1]
     return _MAKERS[key[0]](*key[1:]) if key[0] in _MAKERS else torus_mesh(*key)
 
 

@@ -16,12 +16,13 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_ar import scene as scenes
+from warp_ar.device import exclusive
 from warp_ar.errors import SceneError
 from warp_ar.kernels import structs
 from warp_ar.scene.area_lights import make_area_table
 from warp_ar.scene.geometry import Mesh, rotation_matrix
-from warp_ar.scene.kinds import light_kind, material_model, shape_kind, trace_config
-from warp_ar.scene.mesh_materials import MeshMaterial
+from warp_ar.scene.kinds import light_kind, material_model, shape_kind
+from warp_ar.scene.materials import MeshMaterial
 from warp_ar.scene.mesh_parts import LARGEST
 from warp_ar.scene.object_materials import is_detailed, materials_of, mesh_of
 from warp_ar.scene.object_shapes import ObjectShape, object_shapes, part_placements, split_linear
@@ -29,6 +30,7 @@ from warp_ar.scene.pose import Pose
 from warp_ar.scene.ray_mesh import (
     FloatArray,
     RayMesh,
+    bend_ray_mesh,
     make_mesh,
     make_ray_mesh,
     mesh_key,
@@ -36,16 +38,15 @@ from warp_ar.scene.ray_mesh import (
     texture_density,
 )
 from warp_ar.scene.screen_extents import Outline, ball_outline, bounced_faces, box_faces, lit_faces, shaded_faces
-from warp_ar.scene.texture_codes import DECODE
 from warp_ar.scene.texture_pack import TexturePack, mask_cutoff
-from warp_ar.scene.walk_table import WalkTable
+from warp_ar.scene.textures import DECODE
 
 _ALPHA: Final = {"opaque": structs.OPAQUE, "mask": structs.MASKED, "blend": structs.BLENDED}
 _NOWHERE: Final[Mapping[scenes.Marker, Pose | None]] = {}
 _AWAY: Final = (0.0, 0.0, -1e5)
 _BEHIND: Final = -1e3
 _AWAY_SCALE: Final = 1e-6
-"""Where shapes wait whose marker is lost: no ray meets them, and no kernel has to ask."""
+"""Scale of shapes whose marker is lost: no ray meets them, and no kernel has to ask."""
 
 
 class HostScene:
@@ -60,6 +61,7 @@ class HostScene:
         self.scene = scene
         self._meshes: dict[Any, tuple[Mesh, RayMesh, int]] = {}
         self._corners = 0
+        self._bent: dict[Any, float] = {}
         textures = TexturePack()
         self._shapes = object_shapes(scene)
         self._objects = self._shape_records(self._shapes, device)
@@ -80,6 +82,8 @@ class HostScene:
         self._glossy = np.array([proxy.material is not None for proxy in scene.proxies], bool)
         self._lights_edited = False
         self._gain = np.ones(3)
+        self.ray_scene = ray_scene = structs.RayScene()
+        self._add_corners(ray_scene, device)
         self.write_objects(np.zeros_like(self._objects), 0.0)
         self.write_proxies(np.zeros_like(self._proxies))
         self.write_lights(np.zeros_like(self._lights), 0.0)
@@ -88,7 +92,6 @@ class HostScene:
         for record, values in zip(records, textures.records, strict=True):
             for name, value in values.items():
                 record[name] = value
-        ray_scene = structs.RayScene()
         ray_scene.objects = wp.array(self._objects, dtype=structs.Shape, device=device)
         ray_scene.proxies = wp.array(self._proxies, dtype=structs.Shape, device=device)
         ray_scene.materials = wp.array(materials, dtype=structs.Material, device=device)
@@ -98,21 +101,11 @@ class HostScene:
         ray_scene.texels = wp.array(texels, dtype=wp.uint32, device=device)
         ray_scene.decode_table = wp.array(DECODE, dtype=wp.float32, device=device)
         ray_scene.pixel_spread = 1.0 / max(scene.camera.fx, scene.camera.fy)
-        self._add_corners(ray_scene, device)
-        self.ray_scene = ray_scene
-        self._walks: WalkTable | None = None
-        if wp.get_device(device).is_cpu:
-            kinds = trace_config(scene)
-            self._walks = WalkTable(kinds.detail, kinds.stretched)
-            self._walks.write(ray_scene)
-            ray_scene.walks = self._walks.address
         self._write_area_lights(device)
 
     def set_pixel_spread(self, spread: float) -> None:
         """Take another angle of a pixel in the picture, radians, than the scene's own camera has."""
         self.ray_scene.pixel_spread = spread
-        if self._walks is not None:
-            self._walks.write(self.ray_scene)
 
     def _write_area_lights(self, device: Any) -> None:
         """The table of what emits; numbers of a scene with the same ``skeleton`` may change it."""
@@ -133,7 +126,7 @@ class HostScene:
         scene.emitting_shares = wp.array(table.shares, dtype=wp.float32, device=device)
 
     def _add_corners(self, ray_scene: Any, device: Any) -> None:
-        """What the corners and triangles of all meshes hold; what no mesh calls for stays empty."""
+        """Add the corners and triangles of all meshes; arrays that no mesh calls for stay empty."""
         meshes = list(self._meshes.values())
         rays = [mesh for _, mesh, _ in meshes]
         ray_scene.vertex_normals = _vectors([mesh.normals for mesh in rays], 3, wp.vec3, device)
@@ -179,7 +172,7 @@ class HostScene:
 
     @property
     def shape_count(self) -> int:
-        """How many records ``write_objects`` writes: one per object, or per part of one that its file moves."""
+        """Return the number of records of ``write_objects``: one per object, or per part of one that its file moves."""
         return len(self._shapes)
 
     def _place_objects(self) -> None:
@@ -238,7 +231,7 @@ class HostScene:
         mesh = mesh_of(item)
         surface = material.surface
         assert not isinstance(surface, scenes.FileMaterial | scenes.EmissiveMaterial)
-        first = surface.diffuse if isinstance(surface, scenes.PhongMaterial) else surface.base_color
+        first = surface.base_color
         specular = surface.specular if isinstance(surface, scenes.PhongMaterial) else (0.0, 0.0, 0.0)
         for color in (first, specular):
             if isinstance(color, Path) and mesh is not None and mesh.uvs is None:
@@ -282,17 +275,39 @@ class HostScene:
             Whether anything is not where ``records_out`` had it.
         """
         placed: dict[int, FloatArray] = {}
+        bent = False
         for record, shape, center in zip(self._objects, self._shapes, self._centers, strict=True):
             item = shape.item
             if shape.moving is not None:
                 if shape.index not in placed:
                     placed[shape.index] = part_placements(item, shape.moving, seconds)
-                center = self._meshes[shape.mesh][1].center
+                bent |= self._bend(record, shape, seconds)
+                center = self._meshes[mesh_key(shape)][1].center
                 _place_part(record, item, placed[shape.index][shape.part], center, places)
             elif item.animate is not None or item.marker is not None or seconds == 0.0:
                 rotation, position = item.pose_at(seconds)
                 _place(record, item, rotation, position + rotation @ center, places)
-        return _update(records_out, self._objects)
+        return _update(records_out, self._objects) or bent
+
+    def _bend(self, record: Any, shape: ObjectShape, seconds: float) -> bool:
+        """Give a part that bends the triangles of a time since the first frame; False: it has them."""
+        if shape.bend is None or shape.moving is None or shape.item.play is None:
+            return False
+        key, now = mesh_key(shape), shape.item.play.time_at(seconds, shape.moving.duration)
+        if self._bent.get(key, 0.0) == now:
+            return False
+        self._bent[key] = now
+        bent, (mesh, ray_mesh, first) = shape.bend(now), self._meshes[key]
+        scene, device = self.ray_scene, ray_mesh.mesh.device
+        with exclusive(device):
+            ray_mesh = bend_ray_mesh(ray_mesh, bent)
+            scene.vertex_normals[first : first + len(ray_mesh.normals)].assign(ray_mesh.normals)
+            if bent.tangents is not None and scene.vertex_tangents is not None and scene.vertex_tangents.size:
+                tangents = bent.tangents[bent.faces].reshape(-1, 4)
+                scene.vertex_tangents[first : first + len(tangents)].assign(tangents)
+        self._meshes[key] = mesh, ray_mesh, first
+        record["extent"], record["tree"] = ray_mesh.half, ray_mesh.tree_address
+        return True
 
     def set_gain(self, gain: npt.NDArray[np.float64]) -> None:
         """Have lights shine in the camera values of a camera whose gain is another one now, RGB; 1 at first."""
@@ -355,7 +370,7 @@ class HostScene:
         return _update(records_out, self._lights)
 
     def object_outline(self) -> Outline:
-        """Where virtual objects are."""
+        """Return the outline of virtual objects."""
         self._follow_objects()
         return self._outline
 
@@ -368,7 +383,7 @@ class HostScene:
             self._shaded = None
 
     def light_outline(self, *, bounced: bool = False) -> Outline:
-        """Where virtual light or its shadows can fall on proxies; if ``bounced``, what is lit sends on as well."""
+        """Return the outline of virtual light and its shadows on proxies; if ``bounced``, with its reflections."""
         if self._lit is None:
             faces = [box_faces(record) for record in _present(self._proxies)]
             shining = self._shining()
@@ -392,7 +407,7 @@ class HostScene:
         return self._lights[self._lights["intensity"].any(axis=1)]
 
     def mirror_outline(self, *, receivers: bool = False) -> Outline:
-        """Where mirror balls are, and ``receivers`` that mirror."""
+        """Return the outline of mirror balls, and of ``receivers`` that mirror."""
         if not receivers:
             return self._balls
         if self._mirrors is None or self._mirrors[0] is not self._balls:
@@ -401,7 +416,7 @@ class HostScene:
         return self._mirrors[1]
 
     def shadow_outline(self) -> Outline:
-        """Where virtual objects can change the environment on proxies."""
+        """Return the outline within which virtual objects can change the environment on proxies."""
         self._follow_objects()
         if self._shaded is None:
             proxies = [box_faces(record) for record in _present(self._proxies)]

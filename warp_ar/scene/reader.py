@@ -3,7 +3,7 @@
 Metres, degrees, linear RGB. The world is the marker's frame: origin at the marker's (or board's) centre, x right, y up
 the printed page, z out of the page. Paths are relative to the scene file. What a file leaves out has the default of its
 field; sections other than ``[camera]`` are optional, and ``[marker]`` must be there as soon as anything has a place in
-the world. Sections are read by ``read_camera``, ``read_physical`` and ``read_virtual``.
+the world.
 
 A scene built or changed in Python is checked by ``loads_scene(dumps_scene(scene))``.
 """
@@ -11,33 +11,32 @@ A scene built or changed in Python is checked by ``loads_scene(dumps_scene(scene
 from __future__ import annotations
 
 import importlib.resources
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from warp_ar.errors import SceneError, reason
-from warp_ar.files import is_file, is_folder, parse_toml, read_text
+from warp_ar.files import is_file, is_folder, limits, parse_toml, read_text, too_much
+from warp_ar.scene import sections
 from warp_ar.scene.description import (
+    INTRINSICS,
     SCHEMA,
     AreaLight,
-    Camera,
     CapturedLight,
     Exposure,
     Light,
     Marker,
     Object,
+    PoseKeys,
     Probe,
     Proxy,
     Scene,
     SourceSpec,
 )
-from warp_ar.scene.keys import IN_MEMORY, INTRINSICS, keys_of
+from warp_ar.scene.fields import fields_of
 from warp_ar.scene.messages import nearest
-from warp_ar.scene.read_camera import POSE_KEYS, read_camera, read_exposure, read_pose, read_source
-from warp_ar.scene.read_physical import read_captured, read_marker, read_probe, read_proxy
-from warp_ar.scene.read_virtual import read_light, read_object
 from warp_ar.scene.scene_files import SceneFiles
-from warp_ar.scene.scene_table import SceneTable
+from warp_ar.scene.sections import SceneTable
 
 _TOP_KEYS: Final = ("schema", "name")
 _SECTIONS: Final = ("camera", "source", "marker", "probe", "proxy", "object", "light", "pose", "exposure")
@@ -47,7 +46,7 @@ FRAMES: Final = frozenset(
 )
 """Endings of what is taken for frames, not for a scene."""
 FRAMES_GO: Final = "; frames go to --source"
-"""What to say where frames may have been named as a scene."""
+"""Words for frames that may have been named as a scene."""
 
 
 def bundled_scenes() -> dict[str, Path]:
@@ -63,7 +62,7 @@ def _scene_in(folder: Path) -> Path:
         SceneError: It holds none, or several.
     """
     try:
-        found = sorted(path for path in folder.glob("*.toml") if is_file(path))
+        found = sorted(path for path in folder.glob("[!.]*.toml") if is_file(path))
     except OSError as error:
         raise SceneError(f"{folder}: cannot be read: {reason(error)}") from error
     if len(found) != 1:
@@ -76,7 +75,7 @@ def _desks_beside(path: Path) -> list[str]:
     """Folders with a scene beside a path that is not there, as one would write them."""
     try:
         beside = sorted(folder for folder in path.parent.iterdir() if is_folder(folder))[:200]
-        return [str(folder) for folder in beside if any(folder.glob("*.toml"))]
+        return [str(folder) for folder in beside if any(folder.glob("[!.]*.toml"))]
     except (OSError, ValueError):
         return []
 
@@ -107,7 +106,7 @@ def load_scene(path_or_name: str | Path, files: SceneFiles | None = None) -> Sce
 
 
 def _check_top(top: SceneTable, data: dict[str, Any], label: str) -> None:
-    """What every scene file must have."""
+    """Check the keys that every scene file must have."""
     if "schema" not in top:
         top.fail("schema", f"expected schema = {SCHEMA} at the top of the file")
     if top.data["schema"] is True or top.data["schema"] != SCHEMA:
@@ -136,22 +135,22 @@ class _Sections:
 
     def __init__(self, data: dict[str, Any], label: str, files: SceneFiles) -> None:
         self.data, self.label, self.files = data, label, files
-        self.marker: Marker | None = self.one("marker", keys_of(Marker), read_marker)
+        self.marker: Marker | None = self.one("marker", fields_of(Marker), sections.read_marker)
 
-    def table(self, section: str, data: Any, keys: Sequence[str]) -> SceneTable:
-        return SceneTable(self.label, self.files, section, data, keys)
-
-    def one(self, section: str, keys: Sequence[str], read: Callable[[SceneTable], _T]) -> _T | None:
-        """What a section says that stands once; None without it."""
-        return read(self.table(section, self.data[section], keys)) if section in self.data else None
+    def one(self, section: str, keys: Iterable[str], read: Callable[[SceneTable], _T]) -> _T | None:
+        """Return what a section says that stands once; None without it."""
+        if section not in self.data:
+            return None
+        return read(SceneTable(self.label, self.files, section, self.data[section], list(keys)))
 
     def many(
-        self, section: str, keys: Sequence[str], read: Callable[[SceneTable], _T], *, single: bool = False
+        self, section: str, keys: Iterable[str], read: Callable[[SceneTable], _T], *, single: bool = False
     ) -> tuple[_T, ...]:
-        """What a section says that may stand several times; if ``single``, ``[section]`` is one."""
+        """Return what a section says that may stand several times; if ``single``, ``[section]`` is one."""
+        known = list(keys)
 
         def placed(name: str, item: Any) -> _T:
-            table = self.table(name, item, keys)
+            table = SceneTable(self.label, self.files, name, item, known)
             table.world = self.marker
             return read(table)
 
@@ -161,21 +160,12 @@ class _Sections:
         if not isinstance(value, list):
             right = f"there may be several: write [[{section}]] instead of [{section}]"
             raise SceneError(f"{self.label}: {section}: {right}")
+        if len(value) > limits().scene_entries:
+            raise SceneError(too_much(self.label, len(value), f"[[{section}]] tables", "scene_entries"))
         return tuple(placed(f"{section}[{i}]", item) for i, item in enumerate(value))
 
-    def camera(self) -> Camera:
-        """``[camera]``, which may ask the first picture of ``[source]``."""
-        keys = (*INTRINSICS, "transfer", "calibration", "field_of_view")
-        camera = self.one("camera", keys, lambda table: read_camera(table, self.data.get("source")))
-        assert camera is not None  # ``_check_top`` has asked
-        return camera
-
-    def objects(self) -> tuple[Object, ...]:
-        """``[[object]]``, without the keys that only a program can give."""
-        return self.many("object", [key for key in keys_of(Object) if ("object", key) not in IN_MEMORY], read_object)
-
     def check_placed(self) -> None:
-        """Whatever has a place in the world needs a world.
+        """Check that what has a place in the world has a world.
 
         Raises:
             SceneError: There is neither a marker nor a pose.
@@ -208,25 +198,33 @@ def loads_scene(text: str, path: str | Path | None = None, files: SceneFiles | N
     top = SceneTable(label, files, "", own, (*_TOP_KEYS, *_SECTIONS))
     _check_top(top, data, label)
     lights, captured = _split_lights(data.get("light", []), label)
-    sections = _Sections({**data, "light": lights}, label, files)
-    shining = sections.many("light", keys_of(Light, AreaLight), read_light)
+    read = _Sections({**data, "light": lights}, label, files)
+    light_keys = {**fields_of(Light), **fields_of(AreaLight)}
+    shining = read.many("light", light_keys, sections.read_light)
     emitting = tuple(light.as_object() for light in shining if isinstance(light, AreaLight))
-    objects = sections.objects()
+    objects = read.many("object", fields_of(Object), sections.read_object)
+    camera_keys = (*INTRINSICS, "transfer", "calibration", "field_of_view")
+    camera = read.one("camera", camera_keys, lambda table: sections.read_camera(table, data.get("source")))
+    assert camera is not None  # ``_check_top`` has asked
+    own_light = None
+    if captured is not None:
+        table = SceneTable(label, files, *captured, list(fields_of(CapturedLight)))
+        own_light = sections.read_fields(table, CapturedLight)
     scene = Scene(
         schema=SCHEMA,
         name=top.text("name", "scene" if path is None else path.stem),
-        camera=sections.camera(),
-        source=sections.one("source", keys_of(SourceSpec), read_source),
-        marker=sections.marker or Marker(),
-        probes=sections.many("probe", keys_of(Probe), read_probe, single=True),
-        proxies=sections.many("proxy", keys_of(Proxy), read_proxy),
+        camera=camera,
+        source=read.one("source", fields_of(SourceSpec), sections.read_source),
+        marker=read.marker or Marker(),
+        probes=read.many("probe", fields_of(Probe), sections.read_probe, single=True),
+        proxies=read.many("proxy", fields_of(Proxy), sections.read_proxy),
         objects=objects + emitting,
         lights=tuple(light for light in shining if isinstance(light, Light)),
-        captured=None if captured is None else read_captured(sections.table(*captured, keys_of(CapturedLight))),
-        pose=sections.one("pose", POSE_KEYS, read_pose),
+        captured=own_light,
+        pose=read.one("pose", fields_of(PoseKeys), sections.read_pose),
         has_marker="marker" in data or "pose" not in data,
-        exposure=sections.one("exposure", keys_of(Exposure), read_exposure) or Exposure(),
+        exposure=read.one("exposure", fields_of(Exposure), sections.read_exposure) or Exposure(),
         path=path,
     )
-    sections.check_placed()
+    read.check_placed()
     return scene

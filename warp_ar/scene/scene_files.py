@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,9 @@ class SceneFiles:
     cameras: frozenset[int] | None = None
     """Indices of capture devices that may be named; None: all."""
 
+    names: Mapping[str, Path] = dataclasses.field(default_factory=dict)
+    """Files of a scene from outside that it names by their names alone, wherever they lie."""
+
     @classmethod
     def of(cls, folder: Path, known: Iterable[Path], cameras: Iterable[int] = ()) -> SceneFiles:
         """Return the resolver of a scene from outside.
@@ -43,6 +46,8 @@ class SceneFiles:
         Raises:
             OSError: It cannot be a path; so with RuntimeError and ValueError.
         """
+        if text in self.names:
+            return self.names[text]
         path = (self.folder / text).resolve()
         if self.known is None:
             path.exists()  # a name that is too long for the system is refused here

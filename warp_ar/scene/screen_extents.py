@@ -1,4 +1,4 @@
-"""What of the screen objects, lights and shadows can touch.
+"""Parts of the screen that objects, lights and shadows can touch.
 
 Boxes around shapes are clipped by what reaches them; what is left is a set of convex polygons, an `Outline`, of which
 each frame asks the smallest rectangle of pixels whose rays can meet it.
@@ -27,7 +27,7 @@ Rect = tuple[int, int, int, int]
 EMPTY: Final[Rect] = (0, 0, 0, 0)
 
 SHADOW_REACH: Final = 12.0
-"""How far an object's shadow of the environment is followed, in radii of the sphere around it.
+"""Distance over which an object's shadow of the environment is followed, in radii of the sphere around it.
 
 A sphere that rests on a desk hides (r / d)^3 of an even sky's light from a point at distance d: under 1/512 from 8
 radii on. A lamp's shadow ends within 12 radii if the lamp stands 10 degrees high or more.
@@ -282,9 +282,9 @@ class _Joined:
     corners: FloatArray
     """Of all, (n, 3)."""
     starts: list[int]
-    """Where those of each that has any begin."""
+    """First index of each that has any."""
     places: tuple[int, ...]
-    """Which of the outlines these are."""
+    """Indices of these outlines."""
     radius: float
     """No corner is farther from the origin."""
 

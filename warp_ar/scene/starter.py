@@ -1,72 +1,26 @@
-"""The scene file that a new desk starts from: what one must set, each key with what it means."""
+"""Scene files that are written: a new desk's, each key with what it means, and results put into one's own."""
 
 from __future__ import annotations
 
 import json
+import re
 import textwrap
-from collections.abc import Sequence
-from typing import TypeAlias
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
+import tomlkit
+from tomlkit.exceptions import TOMLKitError
+
+from warp_ar.errors import SceneError, SinkError, reason
+from warp_ar.files import read_text, write_whole
 from warp_ar.scene.description import SCHEMA, Marker, Scene
+from warp_ar.scene.reader import loads_scene
 from warp_ar.scene.reference import keys
 
 FIELD_OF_VIEW = 60.0
 """Degrees that are guessed of a camera: between a phone's main camera (65 to 70) and a laptop's (50 to 60)."""
 _WIDTH = 110
-
-
-_Section: TypeAlias = tuple[str, str, list[tuple[str, str, str]]]
-"""Head, comment, and entries: section and key as the reference names them, and the value."""
-
-
-def _sections(source: str | int, marker: Marker, center: Sequence[float], radius: float, mesh: str) -> list[_Section]:
-    """What a new desk's file has."""
-    board = "" if marker.board is None else str(marker.board)
-    spot = ", ".join(repr(float(value)) for value in center)
-    return [
-        (
-            "[camera]",
-            "Guessed until it is measured: `python -m warp_ar.calibrate camera` replaces the guess by camera.yml.",
-            [("camera", "field_of_view", f"{FIELD_OF_VIEW}")],
-        ),
-        ("[source]", "", [("source", "camera" if isinstance(source, int) else "path", json.dumps(source))]),
-        (
-            "[marker]",
-            "The printed card. If its rulers are not 100 mm long, multiply both lengths of the board by their length "
-            "over 100 mm.",
-            [("marker", "dictionary", json.dumps(marker.dictionary)), ("marker", "board", json.dumps(board))],
-        ),
-        (
-            "[probe]",
-            "The mirror ball on the card's cross. Its radius is half of what a caliper shows across it; the center's "
-            "third number is the same.",
-            [("probe", "radius", f"{radius:g}"), ("probe", "center", f"[{spot}]")],
-        ),
-        (
-            "[[proxy]]",
-            "The table, which receives shadows.",
-            [("proxy", "shape", '"plane"'), ("proxy", "at", "[0.0, 0.0, 0.0]"), ("proxy", "size", "[1.6, 1.2]")],
-        ),
-        (
-            "[[object]]",
-            "What is not there: a teapot to the right of the card.",
-            [
-                *(("object", "shape", '"mesh"'), ("object", "file", json.dumps(mesh))),
-                *(("object", "at", "[0.19, 0.02, 0.0]"), ("object", "rotate", "[0.0, 0.0, -25.0]")),
-                ("object", "scale", "0.026"),
-            ],
-        ),
-        (
-            "[object.material]",
-            "",
-            [
-                ("object.material", "model", '"metallic_roughness"'),
-                ("object.material", "base_color", "[1.0, 0.77, 0.34]"),
-                ("object.material", "metallic", "1.0"),
-                ("object.material", "roughness", "0.25"),
-            ],
-        ),
-    ]
 
 
 def starter_scene(
@@ -87,15 +41,57 @@ def starter_scene(
         radius: Its radius, metres.
         mesh: Path of the object's mesh, relative to the file.
     """
-    parts = _sections(source, marker, center, radius, mesh)
-    lines = [
-        "# Metres, degrees, linear RGB. The origin is the middle of the card's board: x right, y up the page, z up."
-    ]
-    lines += [f"schema = {SCHEMA}", f"name = {json.dumps(name, ensure_ascii=False)}"]
-    for head, comment, entries in parts:
-        lines += ["", *(f"# {line}" for line in textwrap.wrap(comment, _WIDTH)), head]
-        for section, key, value in entries:
-            lines += [*key_comment(section, key), f"{key} = {value}"]
+    text = f"""\
+# Metres, degrees, linear RGB. The origin is the middle of the card's board: x right, y up the page, z up.
+schema = {SCHEMA}
+name = {json.dumps(name, ensure_ascii=False)}
+
+# Guessed until it is measured: `python -m warp_ar.calibrate camera` replaces the guess by camera.yml.
+[camera]
+field_of_view = {FIELD_OF_VIEW}
+
+[source]
+{"camera" if isinstance(source, int) else "path"} = {json.dumps(source)}
+
+# The printed card. If its rulers are not 100 mm long, multiply both lengths of the board by their length over
+# 100 mm.
+[marker]
+dictionary = {json.dumps(marker.dictionary)}
+board = {json.dumps("" if marker.board is None else str(marker.board))}
+
+# The mirror ball on the card's cross. Its radius is half of what a caliper shows across it; the center's third
+# number is the same.
+[probe]
+radius = {radius:g}
+center = {[float(value) for value in center]}
+
+# The table, which receives shadows.
+[[proxy]]
+shape = "plane"
+at = [0.0, 0.0, 0.0]
+size = [1.6, 1.2]
+
+# What is not there: a teapot to the right of the card.
+[[object]]
+shape = "mesh"
+file = {json.dumps(mesh)}
+at = [0.19, 0.02, 0.0]
+rotate = [0.0, 0.0, -25.0]
+scale = 0.026
+
+[object.material]
+model = "metallic_roughness"
+base_color = [1.0, 0.77, 0.34]
+metallic = 1.0
+roughness = 0.25
+"""
+    section, lines = "", []
+    for line in text.splitlines():
+        if head := re.fullmatch(r"\[+([\w.]+)\]+", line):
+            section = head[1]
+        elif section and (key := re.match(r"(\w+) = ", line)):
+            lines += key_comment(section, key[1])
+        lines.append(line)
     return "\n".join(lines) + "\n"
 
 
@@ -107,7 +103,7 @@ def key_comment(section: str, name: str) -> list[str]:
 
 
 def guesses(scene: Scene) -> list[str]:
-    """What a scene only guesses, one line each, with what measures it."""
+    """List a scene's guesses, one line each, with what measures it."""
     found = []
     if (field := scene.camera.field_of_view) is not None:
         where = "" if scene.path is None else f" --write {scene.path.parent}"
@@ -116,3 +112,62 @@ def guesses(scene: Scene) -> list[str]:
             f"python -m warp_ar.calibrate camera PICTURES{where} measures it"
         )
     return found
+
+
+def amend_scene(
+    path: Path, section: str, values: Mapping[str, Any], *, index: int = 0, remove: tuple[str, ...] = ()
+) -> None:
+    """Set keys of one section of a scene file.
+
+    Args:
+        path: The file.
+        section: Such as ``probe``; of several of its kind, the one at ``index``.
+        values: Keys with numbers, texts, lists of numbers, or a section below: its own keys.
+        index: Which of several.
+        remove: Keys that the new ones stand for; what a new desk's file says of them goes with them.
+
+    Raises:
+        SceneError: The file cannot be read, has no such section, or would no longer be a scene; it is left as it was.
+        SinkError: It cannot be written.
+    """
+    text = read_text(path, SceneError, expected="TOML")
+    try:
+        document = tomlkit.parse(text)
+    except TOMLKitError as error:
+        raise SceneError(f"{path}: not valid TOML: {error}") from error
+    table: Any = document.get(section)
+    if isinstance(table, list):
+        table = table[index] if index < len(table) else None
+    if table is None:
+        raise SceneError(f"{path}: [{section}] is missing: there is nothing to write {', '.join(values)} into")
+    gone = [key for key in remove if key in table]
+    for key in gone:
+        del table[key]
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            _set_below(table, key, value)
+        else:
+            table[key] = value
+    made = tomlkit.dumps(document)
+    for key in gone:
+        made = made.replace("\n".join(["", *key_comment(section, key), ""]), "\n")
+    loads_scene(made, path)
+    try:
+        write_whole(path, made.encode(), keep_links=True)
+    except OSError as error:
+        raise SinkError(f"{path}: cannot be written: {reason(error)}") from error
+
+
+def _set_below(table: Any, key: str, values: Mapping[str, Any]) -> None:
+    """Put a section below another, before the comment that stands above what follows in the file."""
+    body = table.value.body
+    follows: list[Any] = []
+    while body and body[-1][0] is None:
+        follows.insert(0, body.pop()[1])
+    below = tomlkit.table()
+    for name, value in values.items():
+        below[name] = value
+    table.add(tomlkit.nl())
+    table.append(key, below)
+    for item in follows:
+        table.add(item)

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Final, NoReturn, Self, cast
 
 from warp_ar.errors import SceneError, WarpArError
 from warp_ar.files import is_file
-from warp_ar.scene.description import Vec3
+from warp_ar.scene.fields import Vec3
 from warp_ar.scene.messages import LARGEST, SMALLEST, nearest, show_key, show_value
 
+MISSING: Final = dataclasses.MISSING
 MOST: Final = 10**9
 """Of a whole number of which nothing else is said."""
 
@@ -19,7 +21,7 @@ class Table:
     """One table of a file; a kind of file has a class of its own, with its error."""
 
     error: ClassVar[type[WarpArError]] = SceneError
-    """What is raised."""
+    """Error that is raised."""
 
     def __init__(self, label: str, folder: Path, section: str, data: object, keys: Sequence[str]) -> None:
         """Check the keys.
@@ -50,7 +52,7 @@ class Table:
         return key in self.data
 
     def name(self, key: str) -> str:
-        """How messages call a key."""
+        """Return the name by which messages call a key."""
         return f"{self.section}.{show_key(key)}" if self.section else show_key(key)
 
     def fail(self, key: str, right: str) -> NoReturn:
@@ -71,8 +73,8 @@ class Table:
                 value = show_value(self.data.get(kind, default))
                 self.fail(key, f"not used with {kind} = {value}; its own keys are {used}")
 
-    def flag(self, key: str, default: bool) -> bool:
-        """Whether something is so."""
+    def flag(self, key: str, default: bool | None = None) -> bool:
+        """Return whether something is so."""
         value = self.data.get(key, default)
         if not isinstance(value, bool):
             self.fail(key, "expected true or false")

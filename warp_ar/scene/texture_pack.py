@@ -19,10 +19,15 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_ar.kernels import structs
-from warp_ar.scene.emissive_picture import RADIANCE_SUFFIXES, load_emission
-from warp_ar.scene.mesh_files import load_texture
-from warp_ar.scene.mesh_materials import IDENTITY, MeshMaterial, TextureUse
-from warp_ar.scene.texture_codes import DECODE, encode_texture, linear_texture
+from warp_ar.scene.materials import IDENTITY, MeshMaterial, TextureUse
+from warp_ar.scene.textures import (
+    DECODE,
+    RADIANCE_SUFFIXES,
+    encode_texture,
+    linear_texture,
+    load_emission,
+    load_texture,
+)
 
 ByteArray = npt.NDArray[np.uint8]
 
@@ -160,5 +165,5 @@ def _picture(image: ByteArray | None, path: Path | None) -> ByteArray:
 
 
 def mask_cutoff(material: MeshMaterial) -> float | None:
-    """What ``mip_levels`` is to know of a material's base colour."""
+    """Return the alpha cutoff for ``mip_levels`` of a material's base colour."""
     return {"opaque": None, "mask": material.cutoff, "blend": 0.5}[material.alpha]

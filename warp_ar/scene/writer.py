@@ -3,26 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 from warp_ar.errors import SceneError
-from warp_ar.scene.description import (
-    Animation,
-    Board,
-    CapturedLight,
-    Light,
-    Object,
-    Play,
-    PoseSpec,
-    Probe,
-    Proxy,
-    ProxyMaterial,
-    Scene,
-    SourceSpec,
-)
-from warp_ar.scene.keys import INTRINSICS, LIGHT_KEYS, MATERIALS, OBJECT_KEYS, PROXY_KEYS, keys_of
+from warp_ar.scene.description import INTRINSICS, Board, Marker, PoseSpec, Scene
+from warp_ar.scene.fields import fields_of, not_used
+from warp_ar.scene.materials import MATERIALS
 
 
 def dumps_scene(scene: Scene, folder: str | Path | None = None) -> str:
@@ -35,93 +23,63 @@ def dumps_scene(scene: Scene, folder: str | Path | None = None) -> str:
 
     Returns:
         The text. A camera read from a calibration file is written as its numbers.
+
+    Raises:
+        SceneError: An object's mesh is in memory alone.
     """
-    writer = _Writer(None if folder is None else Path(folder).resolve())
-    lines = [f"schema = {scene.schema}", f"name = {writer.value(scene.name)}"]
-    lines += [*writer.frames(scene), *writer.physical(scene), *writer.virtual(scene)]
-    lines += ["", "[exposure]", *writer.table(scene.exposure, ("scale",))]
+    base = None if folder is None else Path(folder).resolve()
+    if any(item.mesh is not None for item in scene.objects):
+        raise SceneError("object: a mesh in memory cannot be written; export it, and give the object its file")
+    own = ("field_of_view",) if scene.camera.field_of_view is not None else INTRINSICS
+    entries: list[tuple[str, Any, Iterable[str] | None]] = [("[camera]", scene.camera, (*own, "transfer"))]
+    entries += [("[source]", scene.source, None)] * (scene.source is not None)
+    entries += [("[marker]", scene.marker, _marker_keys(scene.marker))] * scene.has_marker
+    entries += [("[pose]", scene.pose, ())] * (scene.pose is not None)
+    for section, items in (("probe", scene.probes), ("proxy", scene.proxies), ("object", scene.objects)):
+        entries += [(f"[[{section}]]", item, None) for item in items]
+    entries += [("[[light]]", item, None) for item in (*scene.lights, scene.captured) if item is not None]
+    entries += [("[exposure]", scene.exposure, None)]
+    lines = [f"schema = {scene.schema}", f"name = {_value(scene.name, base)}"]
+    for head, item, keys in entries:
+        lines += ["", head, *_table(item, keys, base)]
     return "\n".join(lines) + "\n"
 
 
-class _Writer:
-    """Lines of a scene file, section by section."""
+def _table(item: Any, keys: Iterable[str] | None, base: Path | None) -> list[str]:
+    """Return the lines of a section and of the tables below it."""
+    if isinstance(item, PoseSpec):
+        rotation, translation = item.poses[0]
+        given: dict[str, Any] = {"R": rotation, "t": translation} if item.file is None else {"file": item.file}
+        return [f"{key} = {_value(value, base)}" for key, value in given.items()]
+    values = _values(item, keys)
+    material = values.pop("material", None)
+    lines = [f"{key} = {_value(value, base)}" for key, value in values.items()]
+    if material is not None:
+        section = "object" if type(material) in MATERIALS.values() else "proxy"
+        model = next((name for name, kind in MATERIALS.items() if isinstance(material, kind)), None)
+        lines += ["", f"[{section}.material]", *([] if model is None else [f"model = {_value(model, base)}"])]
+        lines += _table(material, None, base)
+    return lines
 
-    def __init__(self, base: Path | None) -> None:
-        self.base = base
 
-    def value(self, item: Any) -> str:
-        return _value(item, self.base)
+def _values(item: Any, keys: Iterable[str] | None = None) -> dict[str, Any]:
+    """Return what a dataclass gives for its keys, without those that its kind does not use."""
+    if keys is None and isinstance(item, Marker):
+        keys = [key for key in _marker_keys(item) if key != "white"]
+    names = list(fields_of(type(item))) if keys is None else list(keys)
+    if uses := getattr(item, "USES", None):
+        unused = not_used(uses, getattr(item, names[0]))
+        names = [name for name in names if name not in unused]
+    return {name: value for name in names if (value := getattr(item, name)) is not None}
 
-    def table(self, item: Any, keys: Iterable[str]) -> list[str]:
-        """Lines of the keys that have a value."""
-        entries = ((key, getattr(item, key)) for key in keys)
-        return [f"{key} = {self.value(entry)}" for key, entry in entries if entry is not None]
 
-    def animation(self, item: Object | Light) -> list[str]:
-        if item.animate is None:
-            return []
-        fields = {key: getattr(item.animate, key) for key in keys_of(Animation)}
-        return [f"animate = {self.value({key: entry for key, entry in fields.items() if entry is not None})}"]
-
-    def own_marker(self, item: Object | Light | Proxy | Probe) -> list[str]:
-        if item.marker is None:
-            return []
-        own = item.marker
-        fields = {"id": own.id, "size": own.size} if own.board is None else {"board": own.board}
-        return [f"marker = {self.value({'dictionary': own.dictionary, **fields})}"]
-
-    def frames(self, scene: Scene) -> list[str]:
-        """Camera, source, marker and pose."""
-        guessed = scene.camera.field_of_view is not None
-        own = ("field_of_view",) if guessed else INTRINSICS
-        lines = ["", "[camera]", *self.table(scene.camera, (*own, "transfer"))]
-        if scene.source is not None:
-            lines += ["", "[source]", *self.table(scene.source, keys_of(SourceSpec))]
-        keys: tuple[str, ...] = ("dictionary", "id", "size", "white")
-        if scene.marker.board is not None:
-            keys = ("dictionary", "board", "white")
-        if scene.has_marker:
-            lines += ["", "[marker]", *self.table(scene.marker, keys)]
-        if scene.pose is not None:
-            lines += ["", "[pose]", *_pose_lines(scene.pose, self.value)]
-        return lines
-
-    def physical(self, scene: Scene) -> list[str]:
-        """Mirror balls and proxies."""
-        lines: list[str] = []
-        for probe in scene.probes:
-            lines += ["", "[[probe]]", *self.table(probe, ("center", "radius", "reflectance")), *self.own_marker(probe)]
-        for proxy in scene.proxies:
-            lines += ["", "[[proxy]]", *self.table(proxy, ("shape", "at", "rotate", *PROXY_KEYS[proxy.shape]))]
-            lines += self.own_marker(proxy)
-            if proxy.material is not None:
-                lines += ["", "[proxy.material]", *self.table(proxy.material, keys_of(ProxyMaterial))]
-        return lines
-
-    def virtual(self, scene: Scene) -> list[str]:
-        """Objects and lights, the captured one last."""
-        lines: list[str] = []
-        for item in scene.objects:
-            if item.mesh is not None:
-                raise SceneError("object: a mesh in memory cannot be written; export it, and give the object its file")
-            model = next(name for name, kind in MATERIALS.items() if isinstance(item.material, kind))
-            lines += ["", "[[object]]", *self.table(item, ("shape", *OBJECT_KEYS[item.shape], "at", "rotate", "scale"))]
-            lines += self.animation(item)
-            if item.play is not None:
-                lines += [f"play = {self.value({key: getattr(item.play, key) for key in keys_of(Play)})}"]
-            lines += self.own_marker(item)
-            keys = keys_of(type(item.material))
-            lines += ["", "[object.material]", f"model = {self.value(model)}", *self.table(item.material, keys)]
-        for light in scene.lights:
-            lines += ["", "[[light]]", *self.table(light, ("kind", *LIGHT_KEYS[light.kind], "color", "intensity"))]
-            lines += [*self.animation(light), *self.own_marker(light)]
-        if scene.captured is not None:
-            lines += ["", "[[light]]", *self.table(scene.captured, keys_of(CapturedLight))]
-        return lines
+def _marker_keys(marker: Marker) -> tuple[str, ...]:
+    own = ("id", "size") if marker.board is None else ("board",)
+    return ("dictionary", *own, "white", *(("turn",) if marker.turn else ()))
 
 
 def _value(item: Any, base: Path | None) -> str:
-    """A value as TOML; paths inside ``base`` are relative to it."""
+    """Return a value as TOML; paths inside ``base`` are relative to it."""
     if isinstance(item, Path):
         item = (item.relative_to(base) if base and item.is_relative_to(base) else item).as_posix()
     if isinstance(item, bool):
@@ -130,16 +88,10 @@ def _value(item: Any, base: Path | None) -> str:
         return json.dumps(item, ensure_ascii=False).replace("\x7f", "\\u007F")  # TOML, unlike JSON, escapes DEL
     if isinstance(item, Board):
         return _value(str(item), base)
-    if isinstance(item, Mapping):
-        return "{ " + ", ".join(f"{key} = {_value(entry, base)}" for key, entry in item.items()) + " }"
     if isinstance(item, tuple):
         return "[" + ", ".join(_value(entry, base) for entry in item) + "]"
+    if hasattr(item, "__dataclass_fields__"):
+        item = _values(item)
+    if isinstance(item, Mapping):
+        return "{ " + ", ".join(f"{key} = {_value(entry, base)}" for key, entry in item.items()) + " }"
     return repr(float(item)) if isinstance(item, float) else repr(item)  # NumPy's say their type
-
-
-def _pose_lines(spec: PoseSpec, value: Callable[[Any], str]) -> list[str]:
-    """Keys of ``[pose]``: the file that poses are from, or the only one."""
-    if spec.file is not None:
-        return [f"file = {value(spec.file)}"]
-    rotation, translation = spec.poses[0]
-    return [f"R = {value(rotation)}", f"t = {value(translation)}"]

@@ -8,24 +8,22 @@ from __future__ import annotations
 
 import itertools
 import math
-import threading
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from warp_ar.errors import SourceError, UsageError, reason
+from warp_ar.errors import SourceError, UsageError
 from warp_ar.sources.frame_folder import rgb8
-from warp_ar.sources.live_source import LiveSource
-from warp_ar.sources.source import DEFAULT_FPS, check_exposures, check_fps, check_size, distinct
+from warp_ar.sources.source import DEFAULT_FPS, LiveSource, check_exposures, check_fps, check_size, distinct
 
 Image = npt.NDArray[np.uint8]
 
 BRACKET_SECONDS = 0.4
-"""How often a capture device is asked for its other exposures, during which the picture stands still."""
+"""Seconds between requests for a device's other exposures, during which the picture stands still."""
 
 SETTLE_FRAMES = 5
 """Frames after which a device is expected to have taken on its first exposure."""
@@ -34,24 +32,13 @@ MOST_WAIT = 12
 """Frames within which a device must have taken on another."""
 
 CLOSE_SECONDS = 3.0
-"""How long closing waits for a picture that is being read: a driver may hang."""
+"""Seconds that closing waits for a picture that is being read: a driver may hang."""
 
 MOST_MISSES = 3
 """Times in a row that it may fail to."""
 
 LEAST_RATIO = 1.8
 """Of neighbouring exposures of a device: nearer ones cannot be told apart by what they show."""
-
-
-class _Capture(Protocol):
-    """The part of ``cv2.VideoCapture`` that `CaptureDevice` uses."""
-
-    def isOpened(self) -> bool: ...
-    def read(self) -> tuple[bool, npt.NDArray[Any] | None]: ...
-    def get(self, key: int, /) -> float: ...
-    def getBackendName(self) -> str: ...
-    def set(self, key: int, value: float, /) -> bool: ...
-    def release(self) -> None: ...
 
 
 class _Bracketing:
@@ -61,7 +48,7 @@ class _Bracketing:
     whether it has: over the pixels that are well exposed there, the ratio of linear values is that of the times.
     """
 
-    def __init__(self, capture: _Capture, exposures: tuple[float, ...], name: str) -> None:
+    def __init__(self, capture: Any, exposures: tuple[float, ...], name: str) -> None:
         self._capture, self.exposures, self._name = capture, exposures, name
         backend = capture.getBackendName()
         self._logarithmic = backend in ("DSHOW", "MSMF")
@@ -122,7 +109,7 @@ class _Bracketing:
         self._since, self._reference = now, None
 
     def _shows(self, sparse: npt.NDArray[np.float32]) -> bool:
-        """Whether a picture is as bright as the exposure that was asked for makes it, rather than another."""
+        """Return whether a picture is as bright as the exposure that was asked for makes it, rather than another."""
         assert self._reference is not None
         well = (self._reference > 0.05) & (self._reference < 0.9)
         if well.sum() < 30:
@@ -157,7 +144,7 @@ class CaptureDevice(LiveSource):
         fps: Rate to ask the device for, in frames per second.
         grace: Seconds without a frame after which the device counts as unplugged.
         exposures: Exposure times in seconds between which to alternate: mostly the longest, the others now and then.
-        opener: Makes the capture; another one serves tests and unusual backends.
+        opener: Makes what is like ``cv2.VideoCapture``; another one serves tests and unusual backends.
 
     Raises:
         SourceError: The device cannot be opened, gives no frame or does not let its exposure be set; while iterating,
@@ -172,11 +159,10 @@ class CaptureDevice(LiveSource):
         fps: float | None = None,
         grace: float = 2.0,
         exposures: Sequence[float] = (),
-        opener: Callable[[Any], _Capture] = _open_device,
+        opener: Callable[[Any], Any] = _open_device,
     ) -> None:
-        super().__init__()
+        super().__init__(f"capture device {device}" if isinstance(device, int) else str(device))
         check_fps(fps)
-        self._name = f"capture device {device}" if isinstance(device, int) else str(device)
         self._grace = grace
         check_exposures(exposures)
         self.exposures = distinct(exposures)
@@ -186,7 +172,6 @@ class CaptureDevice(LiveSource):
                 f"{LEAST_RATIO:g} times the next or more"
             )
         self._bracketing: _Bracketing | None = None
-        self._stop = threading.Event()
         self._capture = opener(device)
         try:
             if not self._capture.isOpened():
@@ -210,8 +195,7 @@ class CaptureDevice(LiveSource):
         self.description = f"{self._name} ({self.size[0]}x{self.size[1]}, {self.fps:g} fps)"
         if self._bracketing is None:
             self._newest.put(first, time.monotonic())
-        self._thread = threading.Thread(target=self._run, name="warp-ar-capture", daemon=True)
-        self._thread.start()
+        self._start_reading()
 
     def _read(self) -> Image | None:
         """The next frame; None once nothing has come for the time of grace, or when told to stop."""
@@ -232,29 +216,14 @@ class CaptureDevice(LiveSource):
         return rgb8(picture[..., 2::-1] if picture.ndim == 3 else picture, self._name)
 
     def _run(self) -> None:
-        error = None
-        while not self._stop.is_set():
-            try:
-                image = self._read()
-                if image is None:
-                    if not self._stop.is_set():
-                        error = SourceError(f"{self._name} gave no frame for {self._grace:g} s; was it unplugged?")
-                    break
-                check_size(image, self.size, self._name, None)
-                now, exposure = time.monotonic(), None
-                if self._bracketing is not None:
-                    exposure = self._bracketing.label(image, now)
-                    if exposure is None:
-                        continue
-            except SourceError as problem:
-                error = problem
-                break
-            except Exception as problem:  # whatever it is, who waits for a picture is told
-                error = SourceError(f"{self._name}: {reason(problem)}")
-                error.__cause__ = problem
-                break
-            self._newest.put(image, now, exposure)
-        self._newest.close(error)
+        while (image := self._read()) is not None:
+            check_size(image, self.size, self._name, None)
+            now = time.monotonic()
+            exposure = None if self._bracketing is None else self._bracketing.label(image, now)
+            if self._bracketing is None or exposure is not None:
+                self._newest.put(image, now, exposure)
+        if not self._stop.is_set():
+            raise SourceError(f"{self._name} gave no frame for {self._grace:g} s; was it unplugged?")
 
     def close(self) -> None:
         """End the reader and release the device; one whose driver hangs is left to it."""

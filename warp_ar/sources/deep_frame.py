@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from warp_ar.errors import UsageError
 from warp_ar.kernels.color import decode_codes, encode_codes
-from warp_ar.signals import srgb_of_light
+from warp_ar.srgb import encode_srgb
 
 Radiance = npt.NDArray[np.float32]
 
@@ -90,7 +90,7 @@ def decode_deep(codes: npt.NDArray[np.uint16], table: Radiance) -> Radiance:
 @functools.cache
 def _srgb_steps() -> npt.NDArray[np.uint8]:
     """8-bit sRGB codes over the square root of light, which keeps dark codes apart."""
-    return np.rint(255.0 * srgb_of_light((np.arange(_STEPS) / (_STEPS - 1.0)) ** 2)).astype(np.uint8)
+    return np.rint(255.0 * encode_srgb((np.arange(_STEPS) / (_STEPS - 1.0)) ** 2)).astype(np.uint8)
 
 
 def srgb8(radiance: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:

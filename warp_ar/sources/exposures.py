@@ -8,6 +8,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -23,7 +24,7 @@ MOST_EXPOSURES = 8
 
 @dataclasses.dataclass(frozen=True)
 class BracketPlan:
-    """Which exposures of a source are merged, and which is shown."""
+    """Exposures of a source that are merged, and the one that is shown."""
 
     ratios: tuple[float, ...]
     """Exposures over the shown one, longest first; empty if there is no bracket."""
@@ -32,11 +33,11 @@ class BracketPlan:
     left_out: tuple[float, ...] = ()
     """Exposures over the shown one that frames have and that are not merged."""
     notes: tuple[str, ...] = ()
-    """What was merged or left out, a line each."""
+    """Notes of what was merged or left out, a line each."""
 
     @property
     def reference(self) -> int:
-        """Which of ``ratios`` the shown frames have."""
+        """Return which of ``ratios`` the shown frames have."""
         return self.ratios.index(1.0) if self.ratios else 0
 
 
@@ -100,7 +101,7 @@ def _spread(times: Sequence[float], shown: float) -> list[float]:
 
 
 def find_exposure(exposure_time: float | None, plan: BracketPlan) -> int | None:
-    """Which of a bracket's exposures a frame has: the nearest by ratio; the shown one if it does not tell.
+    """Return which of a bracket's exposures a frame has: the nearest by ratio; the shown one if it does not tell.
 
     Args:
         exposure_time: Seconds.
@@ -130,7 +131,4 @@ def brightened(image: npt.NDArray[np.uint8], decode: npt.NDArray[Any], ratio: fl
         values = decode[:, channel].astype(np.float64)
         half = 0.5 * (values[1:] + values[:-1])
         table[:, channel] = np.searchsorted(half, np.minimum(values / ratio, 1.0))
-    result = np.empty_like(image)
-    for channel in range(3):
-        result[..., channel] = table[image[..., channel], channel]
-    return result
+    return np.asarray(cv2.LUT(image, table[None]), np.uint8)

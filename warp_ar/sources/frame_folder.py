@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 import os
 import pathlib
-import re
 from collections.abc import Generator, Sequence
 from typing import Any
 
@@ -24,6 +23,7 @@ from warp_ar.errors import SourceError
 from warp_ar.exr_file import read_linear_picture
 from warp_ar.files import parse_json, read_text
 from warp_ar.pictures import foreign_words, read_picture
+from warp_ar.scene.pose_file import natural_key
 from warp_ar.sources.deep_frame import Plate, finite_light, srgb8
 from warp_ar.sources.source import (
     DEFAULT_FPS,
@@ -41,7 +41,7 @@ Image = npt.NDArray[np.uint8]
 
 LINEAR_SUFFIX = ".exr"
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", LINEAR_SUFFIX})
-"""What `FrameFolder` takes for a frame; other files in a folder are ignored."""
+"""Endings that `FrameFolder` takes for a frame's; other files in a folder are ignored."""
 
 SIDECAR = "exposures.json"
 """Optional file in a frame folder, seconds of exposure: ``{"0000.png": 0.008, ...}`` by file name, or ``[0.016,
@@ -77,7 +77,7 @@ class FrameFolder(RecordedSource):
         self._paths = [path]
         if path.is_dir():
             images = (name for name in names_in(path) if pathlib.Path(name).suffix.lower() in IMAGE_SUFFIXES)
-            self._paths = [path / name for name in sorted(images, key=_natural_key)]
+            self._paths = [path / name for name in sorted(images, key=natural_key)]
         if not self._paths:
             for name in sorted(names_in(path)):
                 if words := foreign_words(pathlib.Path(name).suffix.lower()):
@@ -95,12 +95,17 @@ class FrameFolder(RecordedSource):
         self.size, self.fps, self.length = (width, height), fps, len(self._paths)
         self.description = f"{path} ({self.length} images, {width}x{height})"
 
+    @property
+    def names(self) -> tuple[str, ...]:  # type: ignore[override]
+        """Paths of its pictures in order."""
+        return tuple(path.as_posix() for path in self._paths)
+
     def _decode(self) -> Generator[Frame, None, None]:
         for index, path in enumerate(self._paths):
             image, plate = read_frame(path)
             check_size(image, self.size, str(path), index)
             kept = plate if self.keeps_depth else None
-            yield Frame(index, index / self.fps, image, self._exposures.get(path.name), kept)
+            yield Frame(index, index / self.fps, image, self._exposures.get(path.name), kept, path.as_posix())
 
 
 def read_image(path: pathlib.Path) -> Image:
@@ -179,9 +184,3 @@ def _read_exposures(folder: pathlib.Path) -> dict[str, float] | tuple[float, ...
     if isinstance(table, list):
         return tuple(map(float, table))
     return {name: float(seconds) for name, seconds in table.items()}
-
-
-def _natural_key(name: str) -> list[tuple[int, int, str]]:
-    """Sorts runs of digits by value; the last part keeps ``f01`` and ``f1`` in one order on every machine."""
-    parts = [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", name) if part]
-    return [*parts, (2, 0, name)]

@@ -18,11 +18,8 @@ import numpy.typing as npt
 from av.video.reformatter import VideoReformatter
 
 from warp_ar.errors import SourceError, reason
-from warp_ar.files import limits, too_much
-from warp_ar.sources.deep_video import pixel_shape, square_width
-from warp_ar.sources.live_source import LiveSource
-from warp_ar.sources.source import DEFAULT_FPS, check_fps, check_size
-from warp_ar.sources.video_file import rgb_from_video
+from warp_ar.sources.source import DEFAULT_FPS, LiveSource, check_fps, check_size
+from warp_ar.sources.video_file import pixel_shape, rgb_from_video, video_stream
 
 Image = npt.NDArray[np.uint8]
 
@@ -30,9 +27,9 @@ SCHEMES = ("rtsp", "rtsps", "http", "https", "rtmp", "rtmps", "srt", "udp", "tcp
 """Of addresses that are streams."""
 
 GRACE_SECONDS = 15.0
-"""How long a line may be broken."""
+"""Seconds that a line may be broken."""
 OPEN_SECONDS = 5.0
-"""How long one attempt to open it may take, and how long it may be silent."""
+"""Seconds that one attempt to open it may take, and that it may be silent."""
 FIRST_PAUSE = 0.1
 LONGEST_PAUSE = 2.0
 """Seconds before another attempt."""
@@ -70,21 +67,18 @@ class NetworkStream(LiveSource):
     """
 
     def __init__(self, address: str, *, fps: float | None = None, grace: float = GRACE_SECONDS) -> None:
-        super().__init__()
+        super().__init__(_without_password(address))
         check_fps(fps)
         self._address, self._grace = address, grace
-        self._name = _without_password(address)
         self.reconnects = 0
-        """How often the line was opened again."""
-        self._stop = threading.Event()
+        """Number of times that the line was opened again."""
         self._ready = threading.Event()
         self._problem = ""
         self._failed: SourceError | None = None
         self.size = (0, 0)
         self.fps = fps or DEFAULT_FPS
         self._told_fps = fps is not None
-        self._thread = threading.Thread(target=self._run, name="warp-ar-stream", daemon=True)
-        self._thread.start()
+        self._start_reading()
         self._ready.wait()
         if self._failed is not None:
             self._thread.join()
@@ -104,33 +98,23 @@ class NetworkStream(LiveSource):
                     if self._stop.is_set():
                         break
                 self._problem = "the stream ended"
-            except SourceError as error:
-                self._end(error)
-                return
             except (av.FFmpegError, OSError, ValueError) as error:
                 # What FFmpeg calls a wait that was cut short depends on where it was.
                 silent = time.monotonic() - heard > 0.9 * OPEN_SECONDS
                 self._problem = f"no picture came for {OPEN_SECONDS:g} s" if silent else reason(error)
-            except Exception as error:  # whatever it is, who waits for a picture is told
-                failed = SourceError(f"{self._name}: {type(error).__name__}: {reason(error)}")
-                failed.__cause__ = error
-                self._end(failed)
-                return
             if self._stop.is_set():
                 break
             first = not self._ready.is_set()
             if first or time.monotonic() - last > self._grace:
                 what = "cannot be opened" if first and not came else f"gave no picture for {self._grace:g} s"
-                self._end(SourceError(f"{self._name} {what} ({self._problem}); check its address, and that it is on"))
-                return
+                raise SourceError(f"{self._name} {what} ({self._problem}); check its address, and that it is on")
             self._stop.wait(pause)
             pause = min(2.0 * pause, LONGEST_PAUSE)
             self.reconnects += 1
-        self._end(None)
 
     def _end(self, error: SourceError | None) -> None:
         self._failed = error
-        self._newest.close(error)
+        super()._end(error)
         self._ready.set()
 
     def _take(self, image: Image) -> None:
@@ -147,18 +131,8 @@ class NetworkStream(LiveSource):
         with contextlib.closing(
             av.open(self._address, options={**_OPTIONS, **_PROBING, **(_RTSP if rtsp else {})}, timeout=waits)
         ) as container:
-            if not container.streams.video:
-                raise SourceError(f"{self._name} has no video stream; choose one with pictures")
-            stream = container.streams.video[0]
-            context = stream.codec_context
-            if context is None:
-                raise SourceError(f"{self._name} has a video stream of no known codec; choose another encoding")
+            stream = video_stream(container, self._name)
             shape = pixel_shape(stream)
-            width, height = max(context.width, square_width(context.width, shape)), context.height
-            if width * height > limits().picture_pixels:
-                label = f"{self._name} is {width}x{height}: a frame of it"
-                raise SourceError(too_much(label, width * height, "pixels", "picture_pixels"))
-            context.options = {"max_pixels": str(limits().picture_pixels)}
             rate = float(stream.average_rate or stream.guessed_rate or 0.0)
             if rate > 0.0 and not self._told_fps:
                 self.fps = rate

@@ -15,11 +15,11 @@ from collections.abc import Sequence
 
 from warp_ar.errors import SourceError, UsageError
 from warp_ar.pictures import foreign_words
+from warp_ar.scene import Scene
 from warp_ar.sources.capture_device import CaptureDevice
 from warp_ar.sources.frame_folder import IMAGE_SUFFIXES, FrameFolder
-from warp_ar.sources.live_source import QueueSource
 from warp_ar.sources.network_stream import SCHEMES, NetworkStream
-from warp_ar.sources.source import DEFAULT_FPS, Frame, Source, check_exposures, check_fps, existing_path
+from warp_ar.sources.source import DEFAULT_FPS, Frame, QueueSource, Source, check_exposures, check_fps, existing_path
 from warp_ar.sources.synthetic import Synthetic
 from warp_ar.sources.video_file import VideoFile
 
@@ -32,7 +32,9 @@ __all__ = [
     "Source",
     "Synthetic",
     "VideoFile",
+    "open_scene_source",
     "open_source",
+    "source_of",
 ]
 
 
@@ -80,3 +82,25 @@ def open_source(
     if words := foreign_words(path.suffix.lower()):
         raise SourceError(f"{path} is {words}")
     return VideoFile(path, fps=fps, loop=loop, exposures=exposures)
+
+
+def source_of(scene: Scene, given: str | int | pathlib.Path | None = None) -> str | int | pathlib.Path | None:
+    """Return the name by which ``open_source`` knows the frames: of those that are given, else of the scene's own."""
+    if given is not None or scene.source is None:
+        return given
+    spec = scene.source
+    return spec.path or (f"synthetic:{spec.synthetic}" if spec.synthetic is not None else spec.camera)
+
+
+def open_scene_source(scene: Scene, given: str | int | pathlib.Path | None, *, loop: bool) -> Source:
+    """Open the source that is given, or else the scene's own with what the scene says of it.
+
+    Raises:
+        SourceError: It cannot be opened.
+        UsageError: There is none.
+    """
+    if (where := source_of(scene, given)) is None:
+        raise UsageError(f"scene {scene.name!r} names no source; give one with --source")
+    if given is not None or (spec := scene.source) is None:
+        return open_source(where, loop=loop)
+    return open_source(where, fps=spec.fps, loop=loop, exposures=spec.exposures or ())

@@ -1,4 +1,4 @@
-"""What a stage is: what it reads and writes, the methods it has, and the passes that do its work.
+"""Stages: what they read and write, the methods they have, and the passes that do their work.
 
 A stage has two lives. While a plan is made, only its class speaks: ``wire`` says, from the request's features alone,
 what it would read and write, or why the scene does not call for it. Nothing of Warp is touched then. When a pipeline is
@@ -51,7 +51,7 @@ class ArraySpec:
 
 @dataclasses.dataclass(frozen=True)
 class Reach:
-    """What of a frame virtual objects and lights can reach, known on the host before any stage runs."""
+    """Reach of virtual objects and lights in a frame, known on the host before any stage runs."""
 
     objects: bool = True
     """A virtual object may be in the picture."""
@@ -86,15 +86,17 @@ class Pass:
     enabled: Callable[[], bool] | None = None
     """Predicate of the frames in which the pass takes part, asked once, after ``Stage.begin``; None means always."""
     reads: tuple[str, ...] | None = None
-    """What of the stage's resources it reads: on CUDA it begins when that is there. None means all."""
+    """Resources of the stage that it reads: on CUDA it begins when these are there. None means all."""
     beforehand: bool = False
     """On CUDA a pass on the host that is done before anything of the frame is launched: what comes before it in the
     frame has nothing to do with what it changes, and so the graph need not be cut for it."""
 
 
-def clearing(array: Any) -> Pass:
-    """A stage's first pass on CUDA: zero where its rectangle will not reach, while the device has little to do."""
-    return Pass(lambda rows: array.zero_(), reads=())
+def over_rows(
+    rows: int | None, launcher: Callable[..., None], *given: Any, extent: Callable[[], Rows] | None = None, **named: Any
+) -> Pass:
+    """A pass that splits ``rows`` into bands for a launcher that takes ``rows``; ``given`` are its other arguments."""
+    return Pass(lambda band: launcher(*given, rows=band, **named), rows, extent)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,21 +128,21 @@ class Numerics:
         return f"{bound}: {self.cause}"
 
 
-class Arrays(Mapping[str, Any]):
+class Arrays(dict[str, Any]):
     """The named arrays of a pipeline, with a version each: a number that grows whenever the contents change."""
 
-    def __init__(self) -> None:
-        self._arrays: dict[str, Any] = {}
+    def __init__(self, constants: dict[Any, Any] | None = None) -> None:
+        """Begin empty, but for the ``constants`` of another pipeline of the device."""
+        super().__init__()
         self._versions: dict[str, int] = {}
+        self.constants: dict[Any, Any] = {} if constants is None else constants
+        """Tables that nothing but their key decides, and that nobody writes again."""
 
-    def __getitem__(self, name: str) -> Any:
-        return self._arrays[name]
-
-    def __iter__(self) -> Any:
-        return iter(self._arrays)
-
-    def __len__(self) -> int:
-        return len(self._arrays)
+    def constant(self, key: Any, make: Callable[[], Any]) -> Any:
+        """Return the table of a key, made where it is not there."""
+        if key not in self.constants:
+            self.constants[key] = make()
+        return self.constants[key]
 
     def add(self, name: str, array: Any) -> None:
         """Add a resource under a new name; its version starts at 0, which means never written.
@@ -148,10 +150,9 @@ class Arrays(Mapping[str, Any]):
         Raises:
             ValueError: There is one of that name.
         """
-        if name in self._arrays:
+        if name in self:
             raise ValueError(f"resource {name!r} is already there: two stages may not own one resource")
-        self._arrays[name] = array
-        self._versions[name] = 0
+        self[name], self._versions[name] = array, 0
 
     def touch(self, name: str) -> None:
         """Say that the contents of ``name`` changed."""
@@ -159,23 +160,16 @@ class Arrays(Mapping[str, Any]):
 
     def touch_all(self, names: Iterable[str]) -> None:
         """The same of several."""
-        versions = self._versions
         for name in names:
-            versions[name] += 1
+            self._versions[name] += 1
 
     def version(self, name: str) -> int:
         """Version of ``name``: 0 until it is first written."""
         return self._versions[name]
 
-    def versions(self, names: Iterable[str]) -> tuple[int, ...]:
-        """Versions of several."""
-        return tuple(map(self._versions.__getitem__, names))
-
     def versions_of(self, names: Sequence[str]) -> Callable[[], Any]:
-        """What gives the versions of several, in a form that is only compared; made once, asked in every frame."""
-        if not names:
-            return tuple
-        return functools.partial(operator.itemgetter(*names), self._versions)
+        """Return a function of the versions of several, in a form that is only compared; it is asked in every frame."""
+        return functools.partial(operator.itemgetter(*names), self._versions) if names else tuple
 
 
 NO_BALL = "the scene has no mirror ball, so the environment is unknown"
@@ -199,7 +193,7 @@ class Stage(abc.ABC):
     summary: ClassVar[str]
     """Work of the stage, in one line for ``explain``."""
     subject: ClassVar[str] = ""
-    """What its methods are about, for tables; only where there is a choice."""
+    """Subject of its methods, for tables; only where there is a choice."""
     unread: ClassVar[str] = ""
     """Why a plan can do without it where nothing reads what it writes."""
     converges: ClassVar[bool] = False
@@ -220,6 +214,8 @@ class Stage(abc.ABC):
     def __init__(self, features: Features, wiring: Wiring) -> None:
         self.features, self.wiring = features, wiring
         self.request = features.request
+        width, height = self.request.size
+        self.height, self.shape = height, (height, width)
 
     @classmethod
     def method_for(cls, features: Features) -> str:

@@ -74,6 +74,13 @@ class Captured(Stage):
 
         return [Pass(copy, on_host=True)]
 
+    def resume(self, other: Stage) -> None:
+        """Go on with a map that stands for that of the same file."""
+        assert isinstance(other, Captured)
+        before, now = other.request.scene.captured, self.request.scene.captured
+        if before == now and other._radiance.shape == self._radiance.shape:
+            self._radiance, self._emitters = other._radiance, other._emitters
+
     def replace(self, radiance: npt.NDArray[np.float32], emitters: npt.NDArray[Any] | None = None) -> None:
         """Light the frames to come by another map, at the quality's size and in the scene's axes.
 

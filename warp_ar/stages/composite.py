@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_ar.kernels.picture import composite
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring, over_rows
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.picture import layers_of
 
@@ -39,15 +39,9 @@ class Composite(Stage):
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The picture."""
-        width, height = self.request.size
-        return {"image": ArraySpec((height, width), wp.vec3ub)}
+        return {"image": ArraySpec(self.shape, wp.vec3ub)}
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """One pass over all pixels."""
-        image, frame, layers = arrays["image"], arrays["frame"], layers_of(arrays)
-        tables = arrays["decode"], arrays["encode"]
-
-        def launch(rows: Rows | None) -> None:
-            composite.composite(arrays["params"], frame, *tables, layers, image, rows=rows)
-
-        return [Pass(launch, rows=self.request.size[1])]
+        given = (arrays[name] for name in ("params", "frame", "decode", "encode"))
+        return [over_rows(self.height, composite.composite, *given, layers_of(arrays), arrays["image"])]

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-from warp_ar.kernels.receiver.coverage import count_coverage, make_count_coverage_kernel
+from warp_ar.kernels.receiver.surfaces import count_coverage
 from warp_ar.kernels.structs import vec8
 from warp_ar.scene.kinds import trace_config
-from warp_ar.stages.base import NOT_ASKED, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.base import NOT_ASKED, Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring, over_rows
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.lighting import trace_variant
 
@@ -34,17 +34,10 @@ class Coverage(Stage):
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """Four numbers of surfaces and their shares per pixel."""
-        width, height = self.request.size
-        return {"coverage": ArraySpec((height, width), vec8)}
+        return {"coverage": ArraySpec(self.shape, vec8)}
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """One pass over all pixels."""
         config = trace_variant(trace_config(self.request.scene), device)
-        samples = self.request.quality.edge_samples
-        make_count_coverage_kernel(config, samples)
-        inputs = tuple(arrays[name] for name in ("params", "rays", "ray_scene", "probes", "surface_ids", "coverage"))
-
-        def launch(rows: Rows | None) -> None:
-            count_coverage(config, samples, *inputs, rows=rows)
-
-        return [Pass(launch, rows=self.request.size[1])]
+        given = (arrays[name] for name in ("params", "rays", "ray_scene", "probes", "surface_ids", "coverage"))
+        return [over_rows(self.height, count_coverage, config, self.request.quality.edge_samples, *given)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -10,7 +11,7 @@ import warp as wp
 from warp_ar.kernels.picture import declip
 from warp_ar.kernels.structs import make_picture
 from warp_ar.scene.kinds import trace_config
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring, over_rows
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.lighting import trace_variant
 
@@ -37,12 +38,12 @@ class Declip(Stage):
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The frame's radiance near what clips, tiles that say where that is, and a pyramid of hues."""
-        width, height = self.request.size
+        tiles = ArraySpec(declip.tile_shape(*self.shape), wp.int32)
         return {
-            "declipped": ArraySpec((height, width), wp.vec3),
-            "declip_marked": ArraySpec(declip.tile_shape(height, width), wp.int32),
-            "declip_active": ArraySpec(declip.tile_shape(height, width), wp.int32),
-            "declip_levels": ArraySpec((declip.level_texels(height, width),), wp.vec4),
+            "declipped": ArraySpec(self.shape, wp.vec3),
+            "declip_marked": tiles,
+            "declip_active": tiles,
+            "declip_levels": ArraySpec((declip.level_texels(*self.shape),), wp.vec4),
         }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
@@ -50,32 +51,19 @@ class Declip(Stage):
         ball = self.features.declipped_by_ball
         kinds = trace_variant(trace_config(self.request.scene), device).proxies
         config = declip.DeclipConfig(ball, kinds if ball else ())
-        declip.make_complete_core_kernel(config)
         frame, decode, out, levels = (arrays[name] for name in ("frame", "decode", "declipped", "declip_levels"))
         marked, active = arrays["declip_marked"], arrays["declip_active"]
         picture, shape = make_picture(frame, None, arrays["rays"]), frame.shape
         half = declip.level_shapes(*shape)[0][0]
-
-        def core(rows: Rows | None) -> None:
-            declip.complete_core(
-                config,
-                picture,
-                levels,
-                arrays["params"],
-                arrays["ray_scene"],
-                arrays["probes"],
-                arrays["environment"] if ball else None,
-                out,
-                rows=rows,
-            )
-
+        seen = arrays["params"], arrays["ray_scene"], arrays["probes"], arrays["environment"] if ball else None
+        fill = Pass(lambda rows: declip.fill_levels(active, shape, levels))
         return [
-            Pass(lambda rows: declip.mark_tiles(frame, marked, rows=rows), rows=marked.shape[0]),
+            over_rows(marked.shape[0], declip.mark_tiles, frame, marked),
             Pass(lambda rows: declip.widen_tiles(marked, active)),
-            Pass(lambda rows: declip.pull_frame(active, frame, decode, levels, rows=rows), rows=half),
-            Pass(lambda rows: declip.fill_levels(active, shape, levels)),
-            Pass(lambda rows: declip.complete(active, frame, decode, levels, out, rows=rows), rows=shape[0]),
-            Pass(lambda rows: declip.pull_completed(active, frame, out, levels, rows=rows), rows=half),
-            Pass(lambda rows: declip.fill_levels(active, shape, levels)),
-            Pass(core, rows=shape[0]),
+            over_rows(half, declip.pull_frame, active, frame, decode, None, levels),
+            fill,
+            over_rows(shape[0], declip.complete, active, frame, decode, levels, out),
+            over_rows(half, declip.pull_frame, active, frame, decode, out, levels),
+            dataclasses.replace(fill),
+            over_rows(shape[0], declip.complete_core, config, picture, levels, *seen, out),
         ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import warp as wp
@@ -10,27 +10,20 @@ import warp as wp
 from warp_ar.kernels.cells import cell_shape, cell_stride
 from warp_ar.kernels.environment.environment_samples import SampleSets
 from warp_ar.kernels.launch import count_partials
-from warp_ar.kernels.receiver import environment_shadow
 from warp_ar.kernels.receiver import environment_shadow_filter as filters
 from warp_ar.kernels.receiver import environment_shadow_wavefront as wavefront
-from warp_ar.kernels.receiver.environment_shadow_cells import EnvironmentShadowConfig, ShadowCells, shaded_shape
-from warp_ar.stages.base import (
-    NO_BALL,
-    NO_OBJECT,
-    Arrays,
-    ArraySpec,
-    LeftOut,
-    Numerics,
-    Pass,
-    Reach,
-    Rows,
-    Stage,
-    Wiring,
+from warp_ar.kernels.receiver.environment_shadow import (
+    EnvironmentShadowConfig,
+    ShadowCells,
+    shade_environment,
+    shaded_shape,
 )
+from warp_ar.kernels.structs import filled
+from warp_ar.stages import base
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring, over_rows
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.environment_sets import METHODS, Method, lists_texels, sample_names, sample_slots
 from warp_ar.stages.shared.lighting import (
-    distant_light_arrays,
     distant_light_reads,
     distant_variant,
     make_distant_light,
@@ -39,7 +32,7 @@ from warp_ar.stages.shared.lighting import (
 from warp_ar.stages.shared.picture import GrowingRows, find_picture, frame_reads
 
 DRAWN = ("pose", "objects", "environment_samples", "probe_places")
-"""What says where the samples are and what hides them."""
+"""Resources that say where the samples are and what hides them."""
 
 
 def find_stride(method: Method, rows: int) -> int:
@@ -57,7 +50,6 @@ def shadow_cells(features: Features) -> tuple[int, int]:
 def shadow_config(features: Features, device: Any) -> EnvironmentShadowConfig:
     """Return the compile-time configuration of the kernels."""
     method = METHODS[EnvironmentShadow.method_for(features)]
-    partials = 1 if device.is_cpu else count_partials(*shadow_cells(features))
     return EnvironmentShadowConfig(
         distant_variant(features, device),
         method.count * (sample_slots(features) if lists_texels(features) else 1),
@@ -65,7 +57,7 @@ def shadow_config(features: Features, device: Any) -> EnvironmentShadowConfig:
         method.bounce,
         method.secondary,
         features.emitters,
-        partials,
+        count_partials(*shadow_cells(features), device),
     )
 
 
@@ -75,8 +67,7 @@ class EnvironmentShadow(Stage):
     name: ClassVar[str] = "environment_shadow"
     methods: ClassVar[Mapping[str, str]] = {
         "none": "none (the paper)",
-        "coarse6": "32 rays, every sixth pixel, and an estimate of reflected light",
-        "coarse": "32 rays, every fifth pixel, and an estimate of reflected light",
+        "coarse": "32 rays, every sixth pixel, and an estimate of reflected light",
         "bounce": "64 rays, every second pixel, and reflected light by a ray for half of them",
         "brute_force": "every texel of the environment at every pixel",
     }
@@ -97,20 +88,14 @@ class EnvironmentShadow(Stage):
         """Needs something that throws a shadow, something that it falls on, and light."""
         scene, quality = features.request.scene, features.request.quality
         if not scene.objects:
-            return LeftOut(NO_OBJECT)
+            return LeftOut(base.NO_OBJECT)
         if not scene.proxies:
             return LeftOut("the scene has no proxy for a shadow to fall on")
         if not features.environment:
-            return LeftOut(NO_BALL)
+            return LeftOut(base.NO_BALL)
         if not features.shadowed:
             return LeftOut(f"the quality {quality.name!r} leaves out shadows of the environment")
-        reads = [
-            "pose",
-            "objects",
-            "environment_samples",
-            "environment",
-            *distant_light_reads(features),
-        ]
+        reads = ["pose", "objects", "environment_samples", "environment", *distant_light_reads(features)]
         if features.others:
             reads += [name for name in ("others_environment", "probe_places") if name not in reads]
         if METHODS[quality.method(cls.name)].bounce == "traced":
@@ -123,10 +108,9 @@ class EnvironmentShadow(Stage):
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The ratio, and the estimates that it is averaged from."""
-        width, height = self.request.size
         cells = shadow_cells(self.features)
         specs = {
-            "shadow_ratio": ArraySpec((height, width), wp.vec3, wp.vec3(1.0, 1.0, 1.0)),
+            "shadow_ratio": ArraySpec(self.shape, wp.vec3, wp.vec3(1.0, 1.0, 1.0)),
             "environment_shadow_ratio": ArraySpec(cells, wp.vec4),
             "environment_shadow_filtered": ArraySpec(cells, wp.vec3),
             "environment_shadow_surface": ArraySpec(cells, wp.int32, -1),
@@ -134,20 +118,13 @@ class EnvironmentShadow(Stage):
             "environment_shadow_changed": ArraySpec(shaded_shape(*cells), wp.int32, -1),
             "environment_shadow_bounced": ArraySpec(cells, wp.vec3),
         }
-        return {**specs, **distant_light_arrays(self.features, self.name)}
+        return specs
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Estimates, then their mean."""
         config = shadow_config(self.features, device)
         wave = None if device.is_cpu else wavefront.make_wavefront(config, *arrays[f"{self.name}_ratio"].shape, device)
-        if wave is None:
-            environment_shadow.make_environment_shadow_kernel(config)
-        filters.make_filter_ratio_kernel(config.side)
-        if filters.spreads_apart(find_stride(METHODS[self.method], self.request.size[1]), device):
-            filters.make_spread_mixed_kernel(config.distant)
-        else:
-            filters.make_spread_ratio_kernel(config.distant)
-        distant = make_distant_light(self.features, arrays, self.name)
+        distant = make_distant_light(self.features, arrays)
         distant.environment = arrays["environment"]
         if self.features.others:
             distant.others = make_other_balls(self.features, arrays, self.wiring.reads)
@@ -155,20 +132,7 @@ class EnvironmentShadow(Stage):
         picture = find_picture(arrays, frame=config.bounce == "traced")
         sets = SampleSets()
         sets.directions, sets.flux, sets.samples = (arrays[name] for name in sample_names(self.features))
-
         given = params, picture, scene, distant, sets
-
-        def estimate(rows: Rows | None) -> None:
-            environment_shadow.shade_environment(config, *given, cells, rows=rows)
-
-        def average(rows: Rows | None) -> None:
-            filters.filter_ratio(config, params, cells, rows=rows)
-
-        def spread(rows: Rows | None) -> None:
-            filters.spread_ratio(
-                config, params, arrays["rays"], scene, arrays["probes"], cells, arrays["shadow_ratio"], rows=rows
-            )
-
         shadow_rows, stride, count = arrays["shadow_rows"], int(cells.stride), cells.surface.shape[0]
 
         def cell_rows() -> Rows:
@@ -176,35 +140,23 @@ class EnvironmentShadow(Stage):
             reach = config.side  # the filter looks beyond the rows that it writes
             return max(start // stride - reach, 0), min(-(-stop // stride) + reach, count)
 
-        estimates = [Pass(estimate, rows=count, extent=cell_rows)]
-        if wave is not None:
-            estimates = self._wavefront(config, given, cells, wave)
+        if wave is None:
+            estimates = [over_rows(count, shade_environment, config, *given, cells, extent=cell_rows)]
+        else:  # rays need not wait for the light's filtered forms, nor for each other
+            drawn = tuple(name for name in self.wiring.reads if name in DRAWN)
+            estimates = [
+                Pass(lambda rows, one=one: one(config, given, cells, wave), reads=reads)  # type: ignore[misc]
+                for one, reads in zip(wavefront.PASSES, (drawn, None, None, None), strict=True)
+            ]
+        seen = params, arrays["rays"], scene, arrays["probes"], cells, arrays["shadow_ratio"]
         return [
             *estimates,
-            Pass(average, rows=count, extent=cell_rows),
-            Pass(spread, rows=self.request.size[1], extent=GrowingRows(shadow_rows)),
-        ]
-
-    def _wavefront(
-        self, config: EnvironmentShadowConfig, given: wavefront.Given, cells: ShadowCells, wave: wavefront.Wavefront
-    ) -> list[Pass]:
-        """Estimates, kernel by kernel: rays need not wait for the light's filtered forms, nor for each other."""
-
-        def launcher(one: Callable[..., None]) -> Callable[[Rows | None], None]:
-            return lambda rows: one(config, given, cells, wave)
-
-        drawn = tuple(name for name in self.wiring.reads if name in DRAWN)
-        return [
-            Pass(launcher(wavefront.find_occluded), reads=drawn),
-            Pass(launcher(wavefront.sum_light)),
-            Pass(launcher(wavefront.trace_secondary)),
-            Pass(launcher(wavefront.reduce_partials)),
+            over_rows(count, filters.filter_ratio, config, params, cells, extent=cell_rows),
+            over_rows(self.height, filters.spread_ratio, config, *seen, extent=GrowingRows(shadow_rows)),
         ]
 
     def _cells(self, arrays: Arrays) -> ShadowCells:
         """The stage's own arrays as its kernels read and write them."""
-        cells = ShadowCells()
-        cells.stride = find_stride(METHODS[self.method], self.request.size[1])
-        for name in ("ratio", "bounced", "surface", "shaded", "filtered", "changed"):
-            setattr(cells, name, arrays[f"{self.name}_{name}"])
-        return cells
+        names = "ratio", "bounced", "surface", "shaded", "filtered", "changed"
+        stride = find_stride(METHODS[self.method], self.height)
+        return filled(ShadowCells(), stride=stride, **{name: arrays[f"{self.name}_{name}"] for name in names})

@@ -9,7 +9,7 @@ import warp as wp
 
 from warp_ar.kernels.picture import expose
 from warp_ar.kernels.structs import make_picture
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring, over_rows
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.picture import box_reads, clipped_evidence, frame_reads, layers_of
 
@@ -52,43 +52,31 @@ class Expose(Stage):
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The picture, the scale, the table of codes; for ``auto`` the counts."""
-        width, height = self.request.size
         specs = {
-            "image": ArraySpec((height, width), wp.vec3ub),
+            "image": ArraySpec(self.shape, wp.vec3ub),
             "expose_scale": ArraySpec((1,), wp.float32),
             "expose_codes": ArraySpec((256,), wp.vec3ub),
         }
         if self.request.scene.exposure.scale == "auto":
-            strips = -(-height // expose.AUTO_STRIDE)
+            strips = -(-self.height // expose.AUTO_STRIDE)
             specs["expose_levels"] = ArraySpec((strips, expose.LEVELS), wp.int32)
         return specs
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """The scale, the codes, the picture."""
-        method = self.features.exposure_method
-        expose.make_expose_kernel(method)
         params, decode, encode = (arrays[name] for name in ("params", "decode", "encode"))
         picture = make_picture(arrays["frame"], decode, None, arrays["linear_frame"])
         scale, codes = arrays["expose_scale"], arrays["expose_codes"]
         layers = layers_of(arrays)
-        passes: list[Pass] = []
         if self.request.scene.exposure.scale == "auto":
             levels = arrays["expose_levels"]
-
-            def count(rows: Rows | None) -> None:
-                expose.count_levels(params, picture, layers, levels, rows=rows)
-
-            passes.append(Pass(count, rows=levels.shape[0]))
-            passes.append(Pass(lambda rows: expose.adapt_scale(params, levels, scale)))
+            passes = [
+                over_rows(levels.shape[0], expose.count_levels, params, picture, layers, levels),
+                Pass(lambda rows: expose.adapt_scale(params, levels, scale)),
+            ]
         else:
-            passes.append(Pass(lambda rows: expose.read_scale(params, scale)))
+            passes = [Pass(lambda rows: expose.read_scale(params, scale))]
         passes.append(Pass(lambda rows: expose.expose_codes(decode, encode, scale, codes)))
-
         clipped = clipped_evidence(self.request, self.wiring, arrays)
-        exposure = expose.make_exposure(encode, scale, codes)
-
-        def launch(rows: Rows | None) -> None:
-            expose.expose(method, params, picture, layers, clipped, exposure, arrays["image"], rows=rows)
-
-        passes.append(Pass(launch, rows=self.request.size[1]))
-        return passes
+        given = picture, layers, clipped, expose.make_exposure(encode, scale, codes), arrays["image"]
+        return [*passes, over_rows(self.height, expose.expose, self.features.exposure_method, params, *given)]

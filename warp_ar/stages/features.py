@@ -1,4 +1,4 @@
-"""What a request calls for, answered once before any stage is wired.
+"""Features that a request calls for, found once before any stage is wired.
 
 Stages ask here instead of asking each other: whether light is recovered, which layers are laid over the frame, which
 forms of the environment exist. Nobody asks here whether a stage has readers: the graph finds that out.
@@ -96,7 +96,7 @@ class Features:
 
     @property
     def balls(self) -> str:
-        """Which of several mirror balls light objects, in words; empty where there is one or none."""
+        """Mirror balls that light objects, of several, in words; empty where there is one or none."""
         scene = self.request.scene
         count = len(scene.probes)
         if count < 2 or not self.observed or not (scene.objects or self.others):
@@ -111,7 +111,7 @@ class Features:
 
     @property
     def _first_alone(self) -> str:
-        """What is made from the first ball's light only, in words."""
+        """Forms that are made from the first ball's light only, in words."""
         names = ["the light of a path-traced reference"]
         if self.lit and self.relight_method not in (FLAT, *MEASURED):
             names.append("the key light of receivers")
@@ -198,7 +198,7 @@ def find_features(request: Request) -> Features:
             emitters=emitters,
             several=others > 0,
             gathered=area_samples == 0,
-            mirrors="reflected" in layers,
+            layers=layers,
         ),
     )
 
@@ -234,7 +234,7 @@ def sheds_light(scene: Scene) -> bool:
 
 
 def area_method(quality: Quality) -> str:
-    """How light of objects that emit is found."""
+    """Return the method by which light of objects that emit is found."""
     method = quality.method("area_light")
     return method if method in AREA_SAMPLES else "coarse"
 
@@ -261,16 +261,18 @@ def _find_layers(scene: Scene, quality: Quality) -> tuple[str, ...]:
 
 
 def _find_forms(
-    scene: Scene, form: DiffuseForm, *, emitters: bool, several: bool, gathered: bool, mirrors: bool
+    scene: Scene, form: DiffuseForm, *, emitters: bool, several: bool, gathered: bool, layers: tuple[str, ...]
 ) -> DistantLightConfig:
     materials = scene_materials(scene)
     environment = has_environment(scene)
+    # Shadows ask how much light the receiver has.
+    diffuse = "shadow_ratio" in layers or any(map(reflects_diffusely, materials))
     return DistantLightConfig(
         trace=trace_config(scene),
         models=tuple(sorted(set(map(material_model, materials)))),
         textures=is_detailed(scene),
-        diffuse=form if environment and any(map(reflects_diffusely, materials)) else "none",
-        specular=environment and (any(map(reflects_glossily, materials)) or mirrors),
+        diffuse=form if environment and diffuse else "none",
+        specular=environment and (any(map(reflects_glossily, materials)) or "reflected" in layers),
         probes=bool(scene.probes),
         emitters=emitters,
         captured=scene.captured is not None,

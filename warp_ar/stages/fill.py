@@ -1,4 +1,4 @@
-"""What no ball shows is filled in from what the camera sees beyond it, and from what it does show."""
+"""Directions that no ball shows, filled in from the camera's picture and from confident neighbours."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ class Fill(Stage):
         self._is_filled = True
 
     def changed(self, name: str) -> bool:
-        """Whether some texel moved by more than ``CHANGE_FLOOR + CHANGE_SHARE * value`` since readers last ran.
+        """Return whether some texel moved by more than ``CHANGE_FLOOR + CHANGE_SHARE * value`` since readers last ran.
 
         On CUDA always: to know it there, the host would have to wait for the device. So for the balls after the first.
         """

@@ -10,10 +10,10 @@ import warp as wp
 
 from warp_ar.kernels.receiver import gloss
 from warp_ar.scene.kinds import light_kind, proxies_face, trace_config
-from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring
+from warp_ar.stages import base
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Stage, Wiring, over_rows
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.lighting import (
-    distant_light_arrays,
     distant_light_reads,
     make_distant_light,
     mirrored_shading,
@@ -45,7 +45,7 @@ class Gloss(Stage):
         if not features.request.scene.has_gloss:
             return LeftOut("no proxy has a material: the receiver is matt")
         if not features.environment:
-            return LeftOut(NO_BALL)
+            return LeftOut(base.NO_BALL)
         if "reflected" not in features.layers:
             return LeftOut("nothing virtual can be mirrored, or the quality leaves mirrors as the camera saw them")
         reads = {"pose", *frame_reads(features), "objects", *distant_light_reads(features)}
@@ -58,39 +58,33 @@ class Gloss(Stage):
         return None if reach.balls else "no receiver with a material is in the picture"
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """The change, before and after averaging, how proxies mirror, and tables that materials need."""
-        width, height = self.request.size
+        """The change, before and after averaging, and how proxies mirror."""
         return {
-            "reflected": ArraySpec((height, width), wp.vec3),
-            "gloss_change": ArraySpec((height, width), wp.vec3),
-            "gloss_surface": ArraySpec((height, width), wp.int32),
+            "reflected": ArraySpec(self.shape, wp.vec3),
+            "gloss_change": ArraySpec(self.shape, wp.vec3),
+            "gloss_surface": ArraySpec(self.shape, wp.int32),
             "gloss_surfaces": ArraySpec((len(self.request.scene.proxies),), gloss.Gloss),
-            **distant_light_arrays(self.features, self.name),
         }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """What each pixel mirrors, then the mean over neighbours, in rows of receivers with a material and of balls."""
+        """Reflections of each pixel, then means over neighbours, in rows of receivers with a material and of balls."""
         config = self._config(device)
-        gloss.make_gloss_kernel(config)
         arrays["gloss_surfaces"].assign(self._surfaces())
         sight, layers = gloss.Sight(), gloss.GlossLayers()
         for field, name in (("shadow_ratio", "shadow_ratio"), ("added", "added_light")):
             if name in self.wiring.reads:
                 setattr(layers, field, arrays[name])
         sight.scene, sight.picture, sight.probes = arrays["ray_scene"], find_picture(arrays), arrays["probes"]
-        sight.distant, sight.layers = make_distant_light(self.features, arrays, self.name), layers
+        sight.distant, sight.layers = make_distant_light(self.features, arrays), layers
         lights = arrays["light_array"] if config.lights else None
         own = arrays["gloss_change"], arrays["gloss_surface"]
         mirror_ball = arrays["mirror_ball"] if "mirror_ball" in self.wiring.reads else None
-
-        def mirror(rows: Rows | None) -> None:
-            gloss.gloss(config, arrays["params"], sight, lights, arrays["gloss_surfaces"], *own, rows=rows)
-
-        def smooth(rows: Rows | None) -> None:
-            gloss.smooth_gloss(*own, mirror_ball, arrays["reflected"], rows=rows)
-
-        height, extents = self.request.size[1], [GrowingRows(arrays["ball_rows"]) for _ in range(2)]
-        return [Pass(one, rows=height, extent=extent) for one, extent in zip((mirror, smooth), extents, strict=True)]
+        given = arrays["params"], sight, lights, arrays["gloss_surfaces"], *own
+        extents = [GrowingRows(arrays["ball_rows"]) for _ in range(2)]
+        return [
+            over_rows(self.height, gloss.gloss, config, *given, extent=extents[0]),
+            over_rows(self.height, gloss.smooth_gloss, *own, mirror_ball, arrays["reflected"], extent=extents[1]),
+        ]
 
     def _config(self, device: Any) -> gloss.GlossConfig:
         """Return the compile-time configuration of the kernel."""

@@ -8,18 +8,16 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_ar.kernels.launch import takes_few_blocks
 from warp_ar.kernels.objects.reflect import DistantLight
 from warp_ar.kernels.receiver import mirror_ball
-from warp_ar.kernels.receiver.receiver import RelightConfig, make_receiver
+from warp_ar.kernels.receiver.receiver import RelightConfig
 from warp_ar.scene.kinds import trace_config
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring, clearing
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Stage, Wiring, over_rows
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.lighting import (
-    distant_light_arrays,
     distant_light_reads,
+    find_receiver,
     make_distant_light,
-    make_other_balls,
     mirrored_shading,
     relight_config,
     relight_reads,
@@ -29,14 +27,14 @@ from warp_ar.stages.shared.lighting import (
     shares_kernels,
     trace_variant,
 )
-from warp_ar.stages.shared.picture import GrowingRows, find_picture, frame_reads
+from warp_ar.stages.shared.picture import GrowingRows, clear_first, frame_reads
 
-SAMPLES: Mapping[str, int] = {"single": 1, "smooth": 4, "brute_force": 64}
-"""Rays per pixel, by method; cheapest first, after ``none``."""
+SIDES: Mapping[str, int] = {"single": 1, "smooth": 2, "brute_force": 8}
+"""Roots of rays per pixel, by method; cheapest first, after ``none``."""
 
 
 def mirror_config(features: Features) -> mirror_ball.MirrorBallConfig:
-    """What the mirrored part of a request's scene calls for."""
+    """Return the configuration that a request's scene calls for."""
     layers = features.layers
     shading = mirrored_shading(features) if "virtual" in layers else None
     lit = "added_light" in layers
@@ -49,7 +47,7 @@ def mirror_config(features: Features) -> mirror_ball.MirrorBallConfig:
 
 
 def mirror_variant(features: Features, device: Any) -> mirror_ball.MirrorBallConfig:
-    """What is compiled: where any scene shares it, a scene without objects or lights finds none when it looks."""
+    """Return the configuration to compile: where scenes share it, one without objects or lights finds none."""
     if not shares_kernels(device):
         return mirror_config(features)
     return mirror_ball.MirrorBallConfig(
@@ -61,12 +59,12 @@ def mirror_variant(features: Features, device: Any) -> mirror_ball.MirrorBallCon
 
 
 def mirrored_relighting(features: Features) -> RelightConfig:
-    """How the receiver that a ball shows responds: cells of the frame say nothing about it."""
+    """Return the response of the receiver that a ball shows: cells of the frame say nothing about it."""
     return dataclasses.replace(relight_config(features), ambient_visibility=False, bounced=False)
 
 
 def _reads(features: Features, *, lit: bool) -> set[str]:
-    """What objects and, if ``lit``, the receiver are lit by."""
+    """Return the resources by which objects and, if ``lit``, the receiver are lit."""
     reads = {"pose", *frame_reads(features)}
     if "virtual" in features.layers:
         reads |= {"objects", *distant_light_reads(features)}
@@ -106,7 +104,7 @@ class MirrorBall(Stage):
         quality = features.request.quality
         if not features.request.scene.probes:
             return LeftOut("the scene has no mirror ball")
-        if quality.method(cls.name) not in SAMPLES:
+        if quality.method(cls.name) not in SIDES:
             return LeftOut(f"the quality {quality.name!r} leaves the ball as the camera saw it")
         if "mirror_ball" not in features.layers:
             return LeftOut("the scene has nothing virtual that a ball could mirror")
@@ -120,41 +118,23 @@ class MirrorBall(Stage):
         return "virtual light falls on nothing" if dark else None
 
     def reads_for(self, reach: Reach) -> tuple[str, ...]:
-        """How the receiver responds matters only where virtual light falls on it."""
+        """The response of the receiver matters only where virtual light falls on it."""
         if reach.falls:
             return self.wiring.reads
         unlit = _reads(self.features, lit=False)
         return tuple(name for name in self.wiring.reads if name in unlit)
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """The change, and the table of reflectance where materials need it."""
-        width, height = self.request.size
-        return {
-            "mirror_ball": ArraySpec((height, width), wp.vec3),
-            **distant_light_arrays(self.features, self.name),
-        }
+        """The change."""
+        return {"mirror_ball": ArraySpec(self.shape, wp.vec3)}
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """One pass over the rows in which a ball can be."""
         config = mirror_config(self.features)
         variant = mirror_variant(self.features, device)
-        mirror_ball.make_mirror_ball_kernel(variant)
         reads = self.wiring.reads
-        relighting = mirrored_relighting(self.features)
-        irradiance = self.features.irradiance
-        lit = config.relight is not None
-        samples = SAMPLES[self.request.quality.method(self.name)]
-        receiver = make_receiver(
-            relighting,
-            find_picture(arrays),
-            probes=arrays["probes"],
-            key_lights=arrays["key_lights"] if "key_lights" in reads else None,
-            irradiance=arrays[irradiance] if lit and irradiance in reads else None,
-            emitters=arrays["emitters"] if "emitters" in reads else None,
-            others=make_other_balls(self.features, arrays, reads),
-        )
-        shading = config.shade
-        distant = DistantLight() if shading is None else make_distant_light(self.features, arrays, self.name)
+        receiver = find_receiver(mirrored_relighting(self.features), self.features, arrays, reads)
+        distant = DistantLight() if config.shade is None else make_distant_light(self.features, arrays)
         inputs = (
             arrays["params"],
             arrays["ray_scene"],
@@ -163,25 +143,7 @@ class MirrorBall(Stage):
             receiver,
             arrays["shadow_ratio"] if config.ratio else None,
         )
-
-        out = arrays["mirror_ball"]
-
-        cleared = takes_few_blocks(mirror_ball.launch_shape(out.shape, samples, device), device)
-        first = [clearing(out)] if cleared else []
-
-        def launch(rows: Rows | None) -> None:
-            mirror_ball.mirror_ball(variant, *inputs, out, samples=samples, cleared=cleared, rows=rows)
-
-        if device.is_cpu or samples > 1 or not config.ratio:
-            return [*first, Pass(launch, rows=self.request.size[1], extent=GrowingRows(arrays["ball_rows"]))]
-        # All but the shadows comes first, and need not wait for them.
-        shows = wp.full(out.shape, wp.vec2(-1.0, -1.0), dtype=wp.vec2, device=device)
-        early = tuple(name for name in reads if name != "shadow_ratio")
-
-        def trace(rows: Rows | None) -> None:
-            mirror_ball.mirror_ball(variant, *inputs[:-1], None, out, shows_out=shows, cleared=cleared)
-
-        def shade(rows: Rows | None) -> None:
-            mirror_ball.shade_mirrored(arrays["params"], receiver.picture, arrays["shadow_ratio"], shows, out)
-
-        return [*first, Pass(trace, reads=early), Pass(shade)]
+        out, extent = arrays["mirror_ball"], GrowingRows(arrays["ball_rows"])
+        side, first = SIDES[self.request.quality.method(self.name)], clear_first(out, device)
+        given: dict[str, Any] = {"alone": bool(first), "extent": extent}
+        return [*first, over_rows(self.height, mirror_ball.mirror_ball, variant, *inputs, side, out, **given)]

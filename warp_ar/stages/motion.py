@@ -10,7 +10,7 @@ import warp as wp
 from warp_ar.kernels.picture.motion import find_motion, remember
 from warp_ar.kernels.structs import FrameParams, Shape
 from warp_ar.scene.object_shapes import object_shapes
-from warp_ar.stages.base import NOT_ASKED, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.base import NOT_ASKED, Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring, over_rows
 from warp_ar.stages.features import Features
 
 
@@ -35,10 +35,9 @@ class Motion(Stage):
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The motion, and the frame before."""
-        width, height = self.request.size
         count = max(1, len(object_shapes(self.request.scene)))
         return {
-            "motion": ArraySpec((height, width), wp.vec2),
+            "motion": ArraySpec(self.shape, wp.vec2),
             "motion_params": ArraySpec((1,), FrameParams, FrameParams()),
             "motion_objects": ArraySpec((count,), Shape, Shape()),
         }
@@ -48,11 +47,7 @@ class Motion(Stage):
         params, scene = arrays["params"], arrays["ray_scene"]
         before, objects = arrays["motion_params"], arrays["motion_objects"]
         surfaces = arrays["surface_ids"], arrays["position"], arrays["motion"]
-
-        def launch(rows: Rows | None) -> None:
-            find_motion(params, before, scene, objects, *surfaces, rows=rows)
-
         return [
-            Pass(launch, rows=self.request.size[1]),
+            over_rows(self.height, find_motion, params, before, scene, objects, *surfaces),
             Pass(lambda rows: remember(params, scene, before, objects)),
         ]

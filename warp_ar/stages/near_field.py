@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -12,28 +11,14 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_ar.kernels.objects import near_field
-from warp_ar.kernels.objects.near_field_rays import SHARP_ALPHA
 from warp_ar.kernels.picture import frame_levels
 from warp_ar.scene import MetallicRoughnessMaterial, PhongMaterial
-from warp_ar.scene.mesh_materials import MeshMaterial
+from warp_ar.scene.materials import MeshMaterial
 from warp_ar.scene.object_materials import reflects_glossily, scene_materials
-from warp_ar.stages.base import (
-    NO_BALL,
-    NO_OBJECT,
-    OUT_OF_PICTURE,
-    Arrays,
-    ArraySpec,
-    LeftOut,
-    Numerics,
-    Pass,
-    Reach,
-    Rows,
-    Stage,
-    Wiring,
-)
+from warp_ar.stages import base
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Stage, Wiring, over_rows
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.lighting import (
-    distant_light_arrays,
     distant_light_reads,
     distant_variant,
     make_distant_light,
@@ -83,7 +68,7 @@ def near_field_config(features: Features, device: Any) -> near_field.NearFieldCo
     rays = RAYS[features.near_field]
     materials = scene_materials(features.request.scene)
     widths = [width for item in materials if reflects_glossily(item) for width in lobe_widths(item)]
-    sharp = [width < SHARP_ALPHA for width in widths]
+    sharp = [width < near_field.SHARP_ALPHA for width in widths]
     # The forms themselves stay the scene's: they are what the kernel writes.
     forms, variant = features.distant, distant_variant(features, device)
     return near_field.NearFieldConfig(
@@ -117,9 +102,9 @@ class NearField(Stage):
     def wire(cls, features: Features) -> Wiring | LeftOut:
         """Needs objects and an environment that lights them."""
         if not features.request.scene.objects:
-            return LeftOut(NO_OBJECT)
+            return LeftOut(base.NO_OBJECT)
         if not features.environment:
-            return LeftOut(NO_BALL)
+            return LeftOut(base.NO_BALL)
         reads = [*frame_reads(features), "pose", "objects", "hit_object", "hits", *distant_light_reads(features)]
         if features.distant.diffuse != "none":
             reads.append("environment_samples")
@@ -129,26 +114,23 @@ class NearField(Stage):
 
     def idle(self, reach: Reach) -> str | None:
         """Without an object in the picture nothing shows its surroundings."""
-        return None if reach.objects else OUT_OF_PICTURE
+        return None if reach.objects else base.OUT_OF_PICTURE
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """Irradiance and what is mirrored, before and after averaging."""
-        width, height = self.request.size
         config = self.features.distant
         specs = {}
         if config.diffuse != "none":
-            specs["near_irradiance"] = specs["near_field_irradiance"] = ArraySpec((height, width), wp.vec3)
+            specs["near_irradiance"] = specs["near_field_irradiance"] = ArraySpec(self.shape, wp.vec3)
         if config.specular:
-            specs["near_reflected"] = specs["near_field_reflected"] = ArraySpec((height, width), wp.vec4)
-            specs["near_field_transmitted"] = ArraySpec((height, width), wp.vec4)
-            specs["near_field_levels"] = ArraySpec((frame_levels.level_texels(height, width),), wp.vec3)
-        return {**specs, **distant_light_arrays(self.features, self.name)}
+            specs["near_reflected"] = specs["near_field_reflected"] = ArraySpec(self.shape, wp.vec4)
+            specs["near_field_transmitted"] = ArraySpec(self.shape, wp.vec4)
+            specs["near_field_levels"] = ArraySpec((frame_levels.level_texels(*self.shape),), wp.vec3)
+        return specs
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Estimates, then their mean."""
         config = near_field_config(self.features, device)
-        near_field.make_near_field_kernel(config)
-        near_field.make_filter_kernel(config)
         params, scene, visible = arrays["params"], arrays["ray_scene"], find_visible(arrays)
         picture, layers = find_picture(arrays), near_field.ReceiverLayers()
         if config.ratio:
@@ -157,39 +139,28 @@ class NearField(Stage):
             layers.added = arrays["added_light"]
         if self.features.distant.specular:
             layers.levels = arrays["near_field_levels"]
-        distant = make_distant_light(self.features, arrays, self.name)
+        distant = make_distant_light(self.features, arrays)
         samples = arrays["environment_samples"] if config.distant.diffuse != "none" else None
         raw, near = near_field.NearLight(), near_field.NearLight()
         for light, prefix in ((raw, "near_field_"), (near, "near_")):
             for name in ("irradiance", "reflected", "transmitted"):
                 if prefix + name in arrays:
                     setattr(light, name, arrays[prefix + name])
-
-        def estimate(rows: Rows | None) -> None:
-            near_field.estimate_near_field(
-                config, params, picture, layers, scene, distant, samples, visible, raw, rows=rows
-            )
-
-        def average(rows: Rows | None) -> None:
-            near_field.filter_near_field(config, params, scene, visible, raw, near, rows=rows)
-
-        height = self.request.size[1]
-        extent = arrays["object_rows"]
-        passes = [Pass(estimate, rows=height, extent=extent), Pass(average, rows=height, extent=extent)]
-        return [*self._shrink(params, picture, layers), *passes]
+        height, extent = self.height, arrays["object_rows"]
+        given = params, picture, layers, scene, distant, samples, visible, raw
+        return [
+            *self._shrink(params, picture, layers),
+            over_rows(height, near_field.estimate_near_field, config, *given, extent=extent),
+            over_rows(height, near_field.filter_near_field, config, params, scene, visible, raw, near, extent=extent),
+        ]
 
     def _shrink(self, params: Any, picture: Any, layers: Any) -> list[Pass]:
         """Levels of the frame, where an object mirrors it."""
         if not self.features.distant.specular:
             return []
-        width, height = self.request.size
-        levels = layers.levels
-
-        def shrink(rows: Rows | None) -> None:
-            frame_levels.shrink_frame(params, picture, layers, levels, rows=rows)
-
-        def shrink_further(rows: Rows | None, level: int) -> None:
-            frame_levels.shrink_level(height, width, level, levels, rows=rows)
-
-        further = [functools.partial(shrink_further, level=level) for level in range(3, frame_levels.LAST_LEVEL + 1)]
-        return [Pass(shrink, rows=frame_levels.level_size(height, width, 2)[0]), *(Pass(one) for one in further)]
+        rows = frame_levels.level_size(*self.shape, 1)[0]
+        further = range(2, frame_levels.LAST_LEVEL + 1)
+        return [
+            over_rows(rows, frame_levels.shrink_frame, params, picture, layers, layers.levels),
+            *(over_rows(None, frame_levels.shrink_level, *self.shape, level, layers.levels) for level in further),
+        ]

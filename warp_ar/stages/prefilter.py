@@ -130,9 +130,10 @@ class Prefilter(Stage):
             weights = wp.array(mip_weights(height, lobe).astype(np.float32), dtype=wp.float32, device=device)
             passes.append(Pass(lambda rows: prefilter.mix_mips(mips, weights, height, levels, rows=rows), rows=texels))
         else:
-            samples = make_lobe_samples(height, lobe, int(self.method.removeprefix("fis")), device)
+            drawn = make_lobe_samples(height, lobe, int(self.method.removeprefix("fis")), device)
+            samples = drawn.directions, drawn.weights
             passes.append(
-                Pass(lambda rows: prefilter.sample_lobes(mips, samples, height, levels, rows=rows), rows=texels)
+                Pass(lambda rows: prefilter.sample_lobes(mips, *samples, height, levels, rows=rows), rows=texels)
             )
         row_energy, energy = arrays["prefilter_row_energy"], arrays["prefilter_energy"]
         return [

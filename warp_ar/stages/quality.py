@@ -30,102 +30,36 @@ class Quality:
         return dataclasses.replace(self, name="custom", methods=tuple(sorted(merged.items())))
 
 
-def _preset(name: str, environment_height: int, edge_samples: int, **methods: str) -> Quality:
-    return Quality(name, tuple(sorted(methods.items())), environment_height, edge_samples)
+_NAMES = ("paper", "low", "medium", "high", "reference")
+_HEIGHTS, _EDGE_SAMPLES = (64, 64, 64, 128, 256), (1, 1, 4, 4, 16)
+_METHODS: Mapping[str, tuple[str, str, str, str, str]] = {
+    "unwrap": ("sphere_map", "", "", "", ""),
+    "irradiance": ("sphere_mip", "clusters", "clusters", "clusters", "brute_force"),
+    "prefilter": ("sphere_mip", "energy_mip", "energy_mip", "energy_mip", "fis128"),
+    "light_shadow": ("hard", "hard", "soft", "soft", "soft"),
+    "area_light": ("point", "point", "coarse", "fine", "brute_force"),
+    "relight": ("paper", "reflectance", "reflectance", "bounce", "brute_force"),
+    "recover": ("clipped", "shading", "shading", "shading", "shading"),
+    "environment_shadow": ("none", "coarse", "coarse", "bounce", "brute_force"),
+    "expose": ("paper", "box", "ball", "ball", "ball"),
+    "mirror_ball": ("none", "none", "single", "smooth", "brute_force"),
+    "shade": ("environment", "environment", "few_rays", "one_bounce", "one_bounce"),
+}
+"""Method of each stage by preset; empty: its default."""
 
 
-PRESETS: Mapping[str, Quality] = MappingProxyType(
-    {
-        preset.name: preset
-        for preset in (
-            _preset(
-                "paper",
-                64,
-                1,
-                unwrap="sphere_map",
-                irradiance="sphere_mip",
-                prefilter="sphere_mip",
-                light_shadow="hard",
-                area_light="point",
-                relight="paper",
-                recover="clipped",
-                environment_shadow="none",
-                expose="paper",
-                mirror_ball="none",
-                shade="environment",
-            ),
-            _preset(
-                "low",
-                64,
-                1,
-                irradiance="clusters",
-                prefilter="energy_mip",
-                light_shadow="hard",
-                area_light="point",
-                relight="reflectance",
-                recover="shading",
-                environment_shadow="coarse6",
-                expose="box",
-                mirror_ball="none",
-                shade="environment",
-            ),
-            _preset(
-                "medium",
-                64,
-                4,
-                irradiance="clusters",
-                prefilter="energy_mip",
-                light_shadow="soft",
-                area_light="coarse",
-                relight="reflectance",
-                recover="shading",
-                environment_shadow="coarse",
-                expose="ball",
-                mirror_ball="single",
-                shade="environment",
-            ),
-            _preset(
-                "high",
-                128,
-                16,
-                irradiance="clusters",
-                prefilter="energy_mip",
-                light_shadow="soft",
-                area_light="fine",
-                relight="bounce",
-                recover="shading",
-                environment_shadow="bounce",
-                expose="ball",
-                mirror_ball="smooth",
-                shade="one_bounce",
-            ),
-            _preset(
-                "reference",
-                256,
-                16,
-                irradiance="brute_force",
-                prefilter="fis128",
-                light_shadow="soft",
-                area_light="brute_force",
-                relight="brute_force",
-                recover="shading",
-                environment_shadow="brute_force",
-                expose="ball",
-                mirror_ball="brute_force",
-                shade="one_bounce",
-            ),
-        )
-    }
-)
+def _preset(index: int) -> Quality:
+    methods = tuple(sorted((stage, names[index]) for stage, names in _METHODS.items() if names[index]))
+    return Quality(_NAMES[index], methods, _HEIGHTS[index], _EDGE_SAMPLES[index])
+
+
+PRESETS: Mapping[str, Quality] = MappingProxyType({name: _preset(index) for index, name in enumerate(_NAMES)})
 DEFAULT_PRESET = "medium"
 AUTO = "auto"
 """Name of the quality that is chosen to keep to a budget."""
 DEFAULT_BUDGET_MS = 33.0
 """Milliseconds per frame of that budget, where none is given: thirty frames per second."""
 BUDGETS: Mapping[str, float] = MappingProxyType({"low": 1e3 / 30.0, "medium": 50.0, "high": 250.0})
-"""Milliseconds per frame of the bundled scene ``desk`` at 640x480 on two CPU cores, tracking included. A preset errs
-least by the cost table within ``SHARE`` of its budget: docs/accuracy.md gives the rule and what departs from it,
-``python -m bench.write_cost_tables`` applies it. ``paper`` is the paper's method, ``reference`` the last methods that
-end within a lifetime: neither has a budget."""
-SHARE = 0.8
-"""Of a budget, what is planned with: the rest is for slower moments, as ``--quality auto`` has it."""
+"""Milliseconds that a whole frame of a bundled scene, 640x480 on two CPU cores, may take at a preset; docs/accuracy.md
+marks those that take more. ``paper`` is the paper's method, ``reference`` the last methods that end within a lifetime:
+neither has a budget."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, ClassVar
@@ -11,18 +10,18 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_ar.kernels.cells import cell_shape, cell_stride
-from warp_ar.kernels.launch import count_partials, takes_few_blocks
+from warp_ar.kernels.launch import count_partials
 from warp_ar.kernels.receiver import receiver_cells, relight
-from warp_ar.kernels.receiver.receiver import Receiver, ReceiverCells, RelightConfig, make_receiver
+from warp_ar.kernels.receiver.receiver import Receiver, ReceiverCells, RelightConfig
 from warp_ar.kernels.structs import PLANE
 from warp_ar.scene.kinds import trace_config
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring, clearing
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring, over_rows
 from warp_ar.stages.features import Features, sheds_light
 from warp_ar.stages.request import Request
 from warp_ar.stages.shared.edge_lists import edge_arrays, make_edge_lists
 from warp_ar.stages.shared.environment_sets import SAMPLES
-from warp_ar.stages.shared.lighting import make_other_balls, relight_config, relight_reads, relight_variant
-from warp_ar.stages.shared.picture import GrowingRows, find_picture
+from warp_ar.stages.shared.lighting import find_receiver, relight_config, relight_reads, relight_variant
+from warp_ar.stages.shared.picture import GrowingRows, clear_first
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,11 +55,7 @@ class Relight(Stage):
     }
     summary: ClassVar[str] = "virtual light and its shadows on the receiver"
     subject: ClassVar[str] = "virtual light on the receiver"
-    settings: ClassVar[tuple[str, ...]] = (
-        "edge_samples",
-        "light_shadow",
-        "area_light",
-    )
+    settings: ClassVar[tuple[str, ...]] = ("edge_samples", "light_shadow", "area_light")
     unseen_method: ClassVar[str | None] = "paper"
     numerics: ClassVar[Numerics] = Numerics(
         precision="float32 over an integer table; sums over samples and patches",
@@ -96,10 +91,9 @@ class Relight(Stage):
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The added radiance, and cells of what it is made from."""
-        width, height = self.request.size
-        specs = {"added_light": ArraySpec((height, width), wp.vec3)}
+        specs = {"added_light": ArraySpec(self.shape, wp.vec3)}
         if self.request.quality.edge_samples > 1:
-            specs["relight_visibility"] = ArraySpec((height, width), wp.int32)
+            specs["relight_visibility"] = ArraySpec(self.shape, wp.int32)
             specs |= edge_arrays(self.request, self.name)
         if self.features.ambient_visibility:
             cells = _cells(self.request, _grain(self.features).ambient)
@@ -118,44 +112,18 @@ class Relight(Stage):
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Cells, then one pass over the rows that light can reach."""
         config = relight_variant(relight_config(self.features), self.features, device)
-        relight.make_relight_kernel(config)
-        receiver = self._receiver(config, arrays)
+        receiver = find_receiver(config, self.features, arrays, self.wiring.reads, make_cells(self.features, arrays))
         inputs = arrays["params"], arrays["ray_scene"], arrays["light_array"], receiver
-        added = arrays["added_light"]
+        added, light_rows = arrays["added_light"], arrays["light_rows"]
         visibility = arrays["relight_visibility"] if config.edge_samples > 1 else None
-
-        cleared = takes_few_blocks(added.shape, device)
-
-        def launch(rows: Rows | None) -> None:
-            relight.relight(config, *inputs, added, visibility, cleared=cleared, rows=rows)
-
-        height, light_rows = self.request.size[1], arrays["light_rows"]
-        passes = [clearing(added)] if cleared else []
+        passes = clear_first(added, device)
+        named: dict[str, Any] = {"alone": bool(passes), "extent": GrowingRows(light_rows)}
         passes += self._cell_passes(config, inputs, arrays, device)
-        passes.append(Pass(launch, rows=height, extent=GrowingRows(light_rows)))
+        passes.append(over_rows(self.height, relight.relight, config, *inputs, added, visibility, **named))
         if config.edge_samples > 1:
-            lists = make_edge_lists(arrays, device, self.name)
-
-            def smooth(rows: Rows | None) -> None:
-                relight.smooth_edges(config, *inputs, visibility, added, edge_lists=lists, rows=rows)
-
-            relight.make_smooth_edges_kernel(config, left=lists is not None)
-            if lists is not None:
-                relight.make_sample_edges_kernel(config)
-            passes.append(Pass(smooth, rows=height, extent=light_rows))
+            named = {"edge_lists": make_edge_lists(arrays, device, self.name), "extent": light_rows}
+            passes.append(over_rows(self.height, relight.smooth_edges, config, *inputs, visibility, added, **named))
         return passes
-
-    def _receiver(self, config: RelightConfig, arrays: Arrays) -> Receiver:
-        """Return the receiver as kernels read it."""
-        names = {
-            "key_lights": "key_lights",
-            "irradiance": self.features.irradiance,
-            "emitters": "emitters",
-        }
-        known = {word: arrays[name] for word, name in names.items() if name in self.wiring.reads}
-        cells = make_cells(self.features, arrays)
-        others = make_other_balls(self.features, arrays, self.wiring.reads)
-        return make_receiver(config, find_picture(arrays), probes=arrays["probes"], others=others, cells=cells, **known)
 
     def _cell_passes(
         self, config: RelightConfig, inputs: tuple[Any, Any, Any, Receiver], arrays: Arrays, device: Any
@@ -163,7 +131,7 @@ class Relight(Stage):
         """Ambient visibility and bounced light of cells, where the method knows them."""
         params, scene, _, receiver = inputs
         cells, light_rows = receiver.cells, arrays["light_rows"]
-        place = receiver_cells.CellConfig(_keep_planes(config, self.request))
+        place = _keep_planes(config, self.request)
         passes: list[Pass] = []
 
         def rows_of(size: int, count: int, margin: int) -> Callable[[], Rows]:
@@ -177,49 +145,36 @@ class Relight(Stage):
 
             return extent
 
+        def ambient_pass(bounced: bool) -> Pass:
+            samples = arrays["environment_samples"][: _grain(self.features).samples]
+            extent = rows_of(int(cells.ambient_stride), shape[0], 2)
+            named: dict[str, Any] = {"bounced": bounced, "sums_out": sums, "extent": extent}
+            estimate = receiver_cells.estimate_ambient_visibility
+            return over_rows(shape[0], estimate, place, *inputs, samples, cells, **named)
+
         if config.ambient_visibility:
-            shape = cells.ambient_visibility.shape
-            partials = 1 if device.is_cpu else count_partials(*shape, receiver_cells.MAX_PARTIALS)
-            sums = None
+            shape, sums = cells.ambient_visibility.shape, None
+            partials = count_partials(*shape, device, receiver_cells.MAX_PARTIALS)
             if partials > 1:
                 sums = wp.empty(receiver_cells.partial_sums_shape(partials, *shape), dtype=wp.vec3, device=device)
-            samples = arrays["environment_samples"][: _grain(self.features).samples]
-
-            def estimate(rows: Rows | None, bounced: bool = False) -> None:
-                receiver_cells.estimate_ambient_visibility(
-                    place, *inputs, samples, cells, bounced=bounced, sums_out=sums, rows=rows
-                )
-
-            receiver_cells.make_ambient_visibility_kernel(place)
-            ambient_rows = rows_of(int(cells.ambient_stride), shape[0], 2)
-            passes.append(Pass(estimate, rows=shape[0], extent=ambient_rows))
+            passes.append(ambient_pass(bounced=False))
         if config.bounced:
-            patches, listed, lit_count = (arrays[f"relight_{name}"] for name in ("patches", "listed", "count"))
-            wide = _stride(self.request, _grain(self.features).patch)
-
-            def send(rows: Rows | None) -> None:
-                receiver_cells.send_light(place, *inputs, wide, patches, rows=rows)
-
-            def arrange(rows: Rows | None) -> None:
-                receiver_cells.list_patches(patches, listed, lit_count, rows=rows)
-
-            def gather(rows: Rows | None) -> None:
-                receiver_cells.gather_light(place, params, scene, receiver, listed, lit_count, wide, cells, rows=rows)
-
-            receiver_cells.make_send_light_kernel(place)
-            receiver_cells.make_gather_light_kernel(place)
-            lit_patches, height = rows_of(wide, len(patches), 0), len(cells.bounced)
-            passes.append(Pass(send, rows=len(patches), extent=lit_patches))
-            passes.append(Pass(arrange, rows=len(patches), extent=lit_patches))
-            passes.append(Pass(gather, rows=height, extent=rows_of(int(cells.bounced_stride), height, 2)))
+            patches, listed, count = (arrays[f"relight_{name}"] for name in ("patches", "listed", "count"))
+            wide, height = _stride(self.request, _grain(self.features).patch), len(cells.bounced)
+            lit, lit_cells = rows_of(wide, len(patches), 0), rows_of(int(cells.bounced_stride), height, 2)
+            gather = receiver_cells.gather_light, place, params, scene, receiver, listed, count, wide, cells
+            passes += [
+                over_rows(len(patches), receiver_cells.send_light, place, *inputs, wide, patches, extent=lit),
+                over_rows(len(patches), receiver_cells.list_patches, patches, listed, count, extent=lit),
+                over_rows(height, *gather, extent=lit_cells),
+            ]
             if config.ambient_visibility:
-                again = functools.partial(estimate, bounced=True)
-                passes.append(Pass(again, rows=shape[0], extent=ambient_rows))
+                passes.append(ambient_pass(bounced=True))
         return passes
 
 
 def _keep_planes(config: RelightConfig, request: Request) -> RelightConfig:
-    """Where all proxies are planes, cells know that: most of their rays are then left out."""
+    """Keep the kinds of proxies where all are planes: cells then leave out most of their rays."""
     proxies = trace_config(request.scene).proxies
     if not set(proxies) <= {int(PLANE)}:
         return config

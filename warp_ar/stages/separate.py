@@ -7,9 +7,9 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_ar.kernels.picture.separate import SeparateLayers, make_separate_layers_kernel, separate_layers
-from warp_ar.kernels.structs import make_picture
-from warp_ar.stages.base import NOT_ASKED, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.kernels.picture.separate import SeparateLayers, separate_layers
+from warp_ar.kernels.structs import filled, make_picture
+from warp_ar.stages.base import NOT_ASKED, Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring, over_rows
 from warp_ar.stages.features import Features
 from warp_ar.stages.request import LAYERS, PICTURE_LAYERS
 from warp_ar.stages.shared.picture import box_reads, clipped_evidence, layers_of
@@ -56,21 +56,16 @@ class Separate(Stage):
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The layers that are asked for."""
-        width, height = self.request.size
         return {
-            name: ArraySpec((height, width), wp.vec4 if name == LAYERS["objects"].resource else wp.vec3)
+            name: ArraySpec(self.shape, wp.vec4 if name == LAYERS["objects"].resource else wp.vec3)
             for name in self.wiring.writes
         }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """One pass over all pixels."""
         features, reads = self.features, self.wiring.reads
-        method = features.exposure_method
-        make_separate_layers_kernel(method)
-        out = SeparateLayers()
-        for name in PICTURE_LAYERS:
-            if LAYERS[name].resource in self.wiring.writes:
-                setattr(out, name, arrays[LAYERS[name].resource])
+        asked = {name: LAYERS[name].resource for name in PICTURE_LAYERS if LAYERS[name].resource in self.wiring.writes}
+        out = filled(SeparateLayers(), **{name: arrays[resource] for name, resource in asked.items()})
         layers = layers_of({name: arrays[name] for name in (*SOURCES.values(), "reflected") if name in reads})
         plate = "plate" in self.wiring.writes
         inputs = (
@@ -80,8 +75,4 @@ class Separate(Stage):
             clipped_evidence(self.request, self.wiring, arrays),
             arrays["expose_scale"] if plate and features.exposed else None,
         )
-
-        def launch(rows: Rows | None) -> None:
-            separate_layers(method, *inputs, out, rows=rows)
-
-        return [Pass(launch, rows=self.request.size[1])]
+        return [over_rows(self.height, separate_layers, features.exposure_method, *inputs, out)]

@@ -7,36 +7,20 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_ar.kernels.launch import takes_few_blocks
 from warp_ar.kernels.objects.near_field import NearLight
-from warp_ar.kernels.objects.shade import (
-    make_object_light,
-    shade,
-)
-from warp_ar.stages.base import (
-    NO_OBJECT,
-    OUT_OF_PICTURE,
-    Arrays,
-    ArraySpec,
-    LeftOut,
-    Numerics,
-    Pass,
-    Reach,
-    Rows,
-    Stage,
-    Wiring,
-    clearing,
-)
+from warp_ar.kernels.objects.shade import make_object_light, shade
+from warp_ar.kernels.structs import filled
+from warp_ar.stages import base
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Stage, Wiring, over_rows
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.edge_lists import edge_arrays, make_edge_lists
 from warp_ar.stages.shared.lighting import (
-    distant_light_arrays,
     distant_light_reads,
     make_distant_light,
     shade_config,
     shade_variant,
 )
-from warp_ar.stages.shared.picture import GrowingRows, find_visible
+from warp_ar.stages.shared.picture import GrowingRows, clear_first, find_visible
 
 
 class Shade(Stage):
@@ -50,11 +34,7 @@ class Shade(Stage):
     }
     summary: ClassVar[str] = "shades virtual objects by the environment and virtual lights, shadowed and anti-aliased"
     subject: ClassVar[str] = "what virtual objects reflect"
-    settings: ClassVar[tuple[str, ...]] = (
-        "edge_samples",
-        "light_shadow",
-        "area_light",
-    )
+    settings: ClassVar[tuple[str, ...]] = ("edge_samples", "light_shadow", "area_light")
     unseen_method: ClassVar[str | None] = "environment"
     numerics: ClassVar[Numerics] = Numerics(
         precision="float32; log1p for exponents, cross products for peaks",
@@ -68,7 +48,7 @@ class Shade(Stage):
     def wire(cls, features: Features) -> Wiring | LeftOut:
         """Reads only the forms of light that its materials reflect."""
         if not features.request.scene.objects:
-            return LeftOut(NO_OBJECT)
+            return LeftOut(base.NO_OBJECT)
         config = shade_config(features)
         reads = ["pose", "objects", "hit_object", "hits"]
         if config.lights:
@@ -80,15 +60,13 @@ class Shade(Stage):
 
     def idle(self, reach: Reach) -> str | None:
         """Without an object in the picture nothing is covered."""
-        return None if reach.objects else OUT_OF_PICTURE
+        return None if reach.objects else base.OUT_OF_PICTURE
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """The shaded objects, lists of edges and, for metallic-roughness, the table of its reflectance."""
-        width, height = self.request.size
+        """The shaded objects and lists of edges."""
         return {
-            "virtual": ArraySpec((height, width), wp.vec4),
+            "virtual": ArraySpec(self.shape, wp.vec4),
             **edge_arrays(self.request, self.name),
-            **distant_light_arrays(self.features, self.name),
         }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
@@ -96,17 +74,12 @@ class Shade(Stage):
         config = shade_config(self.features)
         variant = shade_variant(config, self.features, device)
         lists = make_edge_lists(arrays, device, self.name)
-        near = NearLight()
-        for name in self.features.near_names if config.near_field else ():
-            setattr(near, name.removeprefix("near_"), arrays[name])
-        distant = make_distant_light(self.features, arrays, self.name)
+        names = self.features.near_names if config.near_field else ()
+        near = filled(NearLight(), **{name.removeprefix("near_"): arrays[name] for name in names})
+        distant = make_distant_light(self.features, arrays)
         light = make_object_light(distant, arrays["light_array"] if config.lights else None, near)
+        out, extent = arrays["virtual"], GrowingRows(arrays["object_rows"])
         inputs = arrays["params"], arrays["rays"], arrays["ray_scene"], light, find_visible(arrays)
-
-        cleared = lists is not None and takes_few_blocks(arrays["virtual"].shape, device)
-
-        def launch(rows: Rows | None) -> None:
-            shade(variant, *inputs, arrays["virtual"], edge_lists=lists, cleared=cleared, rows=rows)
-
-        first = [clearing(arrays["virtual"])] if cleared else []
-        return [*first, Pass(launch, rows=self.request.size[1], extent=GrowingRows(arrays["object_rows"]))]
+        first = clear_first(out, device) if lists is not None else []
+        given: dict[str, Any] = {"edge_lists": lists, "cleared": bool(first), "extent": extent}
+        return [*first, over_rows(self.height, shade, variant, *inputs, out, **given)]

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_ar.kernels.picture import summed_area
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring, over_rows
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.picture import SUMMED, SUMMED_CUT, box_reads, frame_reads
 
@@ -36,26 +36,25 @@ class SummedArea(Stage):
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The table; where there are two, also the frame that the second one sums."""
-        width, height = self.request.size
-        specs = {name: ArraySpec((height, width), wp.uint32) for name in self.wiring.writes}
+        specs = {name: ArraySpec(self.shape, wp.uint32) for name in self.wiring.writes}
         if SUMMED_CUT in specs:
-            specs["summed_area_cut_frame"] = ArraySpec((height, width), wp.vec3ub)
+            specs["summed_area_cut_frame"] = ArraySpec(self.shape, wp.vec3ub)
         return specs
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Along rows, then down columns; the same for what 8 bits cut off."""
-        frame, height = arrays["frame"], self.request.size[1]
+        frame = arrays["frame"]
         passes = self._sum(frame, arrays[SUMMED])
         if SUMMED_CUT not in self.wiring.writes:
             return passes
         cut, known = arrays["summed_area_cut_frame"], (frame, arrays["decode"], arrays["linear_frame"])
-        passes.append(Pass(lambda rows: summed_area.write_cut(*known, cut, rows=rows), rows=height))
+        passes.append(over_rows(self.height, summed_area.write_cut, *known, cut))
         return [*passes, *self._sum(cut, arrays[SUMMED_CUT])]
 
     def _sum(self, frame: wp.array, table: wp.array) -> list[Pass]:
         """Passes that write the table of one frame."""
-        width, height = self.request.size
+        groups = summed_area.column_groups(self.shape[1])
         return [
-            Pass(lambda rows: summed_area.sum_rows(frame, table, rows=rows), rows=height),
-            Pass(lambda rows: summed_area.sum_columns(table, groups=rows), rows=summed_area.column_groups(width)),
+            over_rows(self.height, summed_area.sum_rows, frame, table),
+            over_rows(groups, summed_area.sum_columns, table),
         ]

@@ -8,9 +8,9 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_ar.kernels.rays.visibility import VisibleObjects
-from warp_ar.kernels.receiver.surfaces import make_surfaces, make_trace_surfaces_kernel, trace_surfaces
+from warp_ar.kernels.receiver.surfaces import make_surfaces, trace_surfaces
 from warp_ar.scene.kinds import trace_config
-from warp_ar.stages.base import NOT_ASKED, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.base import NOT_ASKED, Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring, over_rows
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.lighting import trace_variant
 from warp_ar.stages.shared.picture import find_visible
@@ -38,23 +38,17 @@ class Surfaces(Stage):
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """One surface per pixel."""
-        width, height = self.request.size
         return {
-            "surface_ids": ArraySpec((height, width), wp.int32, -1),
-            "depth": ArraySpec((height, width), wp.float32),
-            "normals": ArraySpec((height, width), wp.vec3),
-            "position": ArraySpec((height, width), wp.vec3),
+            "surface_ids": ArraySpec(self.shape, wp.int32, -1),
+            "depth": ArraySpec(self.shape, wp.float32),
+            "normals": ArraySpec(self.shape, wp.vec3),
+            "position": ArraySpec(self.shape, wp.vec3),
         }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """One pass over all pixels."""
         config = trace_variant(trace_config(self.request.scene), device)
-        make_trace_surfaces_kernel(config)
         inputs = tuple(arrays[name] for name in ("params", "rays", "ray_scene", "probes"))
         visible = find_visible(arrays) if "hits" in self.wiring.reads else VisibleObjects()
         out = make_surfaces(*(arrays[name] for name in self.wiring.writes))
-
-        def launch(rows: Rows | None) -> None:
-            trace_surfaces(config, *inputs, visible, out, rows=rows)
-
-        return [Pass(launch, rows=self.request.size[1])]
+        return [over_rows(self.height, trace_surfaces, config, *inputs, visible, out)]

@@ -25,7 +25,6 @@ class Unwrap(Stage):
     name: ClassVar[str] = "unwrap"
     methods: ClassVar[Mapping[str, str]] = {
         "sphere_map": "OpenGL's sphere mapping, as if ball and light were far away (the paper)",
-        "bilinear": "one sample between pixels, at its exact place",
         "area": "the mean over what a texel covers",
     }
     summary: ClassVar[str] = "reads the light off the mirror ball, exactly for a camera nearby"
@@ -49,9 +48,7 @@ class Unwrap(Stage):
         Exact too for frames of several exposures: the sphere map is a texture of one.
         """
         method = super().method_for(features)
-        if method == "sphere_map" and features.merged:
-            return "bilinear"
-        return method if method in cls.methods else "area"
+        return method if method in cls.methods and not features.merged else "area"
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
@@ -88,7 +85,6 @@ class Unwrap(Stage):
         kinds = sorted({_KINDS[proxy.shape] for proxy in self.request.scene.proxies})
         config = unwrap.ProjectConfig(tuple(kinds))
         config = config.general() if shares_kernels(device) else config
-        method = self.method
         height = self.request.quality.environment_height
         linear = "linear_frame" in self.wiring.reads
 
@@ -109,14 +105,14 @@ class Unwrap(Stage):
         own = 0 if others else unwrap.ALL_ALIKE
 
         def gather(rows: Rows | None) -> None:
-            unwrap.gather_probe(*frame, probes, corners, view, method=method, own=own, rows=rows)
+            unwrap.gather_probe(*frame, probes, corners, view, own=own, rows=rows)
 
         passes = [Pass(project, rows=height + 1), Pass(gather, rows=height)]
         for ball, other in enumerate(other_views(self.features, arrays, OTHERS), 1):
             alone = probes[ball : ball + 1], corners[:, :, ball : ball + 1], other
             passes.append(
                 Pass(
-                    lambda rows, alone=alone: unwrap.gather_probe(*frame, *alone, method=method, rows=rows),  # type: ignore[misc]
+                    lambda rows, alone=alone: unwrap.gather_probe(*frame, *alone, rows=rows),  # type: ignore[misc]
                     rows=height,
                 )
             )

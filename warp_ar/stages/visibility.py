@@ -10,19 +10,8 @@ import warp as wp
 from warp_ar.kernels.rays.visibility import trace_pixels
 from warp_ar.kernels.structs import Hit
 from warp_ar.scene.kinds import trace_config
-from warp_ar.stages.base import (
-    NO_OBJECT,
-    OUT_OF_PICTURE,
-    Arrays,
-    ArraySpec,
-    LeftOut,
-    Numerics,
-    Pass,
-    Reach,
-    Rows,
-    Stage,
-    Wiring,
-)
+from warp_ar.stages import base
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Stage, Wiring, over_rows
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.lighting import trace_variant
 from warp_ar.stages.shared.picture import GrowingRows, find_visible
@@ -45,28 +34,20 @@ class Visibility(Stage):
     def wire(cls, features: Features) -> Wiring | LeftOut:
         """Left out of scenes without virtual objects."""
         if not features.request.scene.objects:
-            return LeftOut(NO_OBJECT)
+            return LeftOut(base.NO_OBJECT)
         return Wiring(reads=("pose", "objects"), writes=("hit_object", "hits"))
 
     def idle(self, reach: Reach) -> str | None:
         """Without an object in the picture no pixel sees one."""
-        return None if reach.objects else OUT_OF_PICTURE
+        return None if reach.objects else base.OUT_OF_PICTURE
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """One hit per pixel."""
-        width, height = self.request.size
-        return {
-            "hit_object": ArraySpec((height, width), wp.int32, -1),
-            "hits": ArraySpec((height, width), Hit, Hit()),
-        }
+        return {"hit_object": ArraySpec(self.shape, wp.int32, -1), "hits": ArraySpec(self.shape, Hit, Hit())}
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """One pass over the rows where objects are or were."""
         config = trace_variant(trace_config(self.request.scene), device)
         inputs = [arrays[name] for name in ("params", "rays", "ray_scene")]
-        visible = find_visible(arrays)
-
-        def launch(rows: Rows | None) -> None:
-            trace_pixels(config, *inputs, visible, rows=rows)
-
-        return [Pass(launch, rows=self.request.size[1], extent=GrowingRows(arrays["object_rows"]))]
+        extent = GrowingRows(arrays["object_rows"])
+        return [over_rows(self.height, trace_pixels, config, *inputs, find_visible(arrays), extent=extent)]

@@ -19,7 +19,7 @@ Image = NDArray[np.uint8]
 SHEET: Final = Marker(dictionary="DICT_4X4_50", board=CharucoBoard(5, 4, 0.032, 0.024))
 """The sheet's board: of few and large cells, which a camera of 640 x 480 still reads at arm's length."""
 BALL_PLACE: Final = (0.0, 0.114)
-"""Where the ball touches the sheet, metres: behind the board, which it therefore does not hide from the front."""
+"""Place where the ball touches the sheet, metres: behind the board, which it therefore does not hide from the front."""
 RINGS: Final = (0.020, 0.025, 0.030, 0.035, 0.040)
 """Radii in metres of the rings around that place: a ball hides the ring of its own radius from straight above."""
 GREYS: Final = (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -50,7 +50,7 @@ def ball_center(radius: float) -> tuple[float, float, float]:
 
 
 def board_top(height: float) -> float:
-    """How far the board's middle lies below the upper edge of paper of a height; metres."""
+    """Return how far the board's middle lies below the upper edge of paper of a height; metres."""
     return _TOP + BALL_PLACE[1] + (height - _LETTER_HEIGHT) / 2
 
 

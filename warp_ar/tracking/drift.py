@@ -27,16 +27,16 @@ from __future__ import annotations
 import copy
 from typing import Self
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from warp_ar.kernels.color import decode_table, without_contrast
 from warp_ar.scene import Camera, Scene
 from warp_ar.scene.geometry import rotation_matrix
+from warp_ar.scene.pixel_rays import project
 from warp_ar.scene.pose import Pose
 from warp_ar.sources.deep_frame import Plate
-from warp_ar.tracking.marker_pattern import printed_cells
+from warp_ar.tracking.markers import printed_cells
 
 Array = NDArray[np.float64]
 
@@ -49,7 +49,7 @@ LEAST = 0.05
 AGREEING = 0.7
 """Share of points that must agree."""
 SPREAD = 0.3
-"""How far they may lie off the median, as a share of its length."""
+"""Distance that they may lie off the median, as a share of its length."""
 FURTHEST = 0.06
 """The same at most, logarithm: an emitter that changes far away lights what is near alike, within more."""
 NOISE = 0.09
@@ -61,7 +61,7 @@ PATIENCE = 4
 DARK, BRIGHT = 12, 250
 """Codes between which a channel is taken to tell: beyond them are quantisation and clipping."""
 CONTRASTS = np.linspace(0.0, 1.0, 5)
-"""Contrasts that are tried."""
+"""Contrasts that are tried, none first."""
 MOST_PRINT = 30.0
 """Ratio of paper to ink: print that reflects 3 % on paper that reflects 90 %."""
 BINS = (0.2, 0.35, 0.5, 0.65, 0.8)
@@ -89,7 +89,7 @@ class ExposureDrift:
             camera: Of the frames.
         """
         self.watches = (camera, scene.marker, scene.proxies, scene.probes)
-        """What frames are of: the same frames tell those that watch the same, the same."""
+        """Things that frames are of: the same frames tell those that watch the same, the same."""
         self._camera = camera
         self._plain = decode_table(camera.transfer).astype(np.float64)
         self._points, self._is_card, self._is_ink = still_points(scene)
@@ -102,14 +102,14 @@ class ExposureDrift:
         self._disagreements: list[Array] = []
         self._next_looks = FIRST_LOOKS
         self.gain: Array = np.ones(3)
-        """What the camera multiplies radiance by, against its first frame, RGB."""
+        """Factor of the camera on radiance, against its first frame, RGB."""
         self.saturation = np.full(3, 255.0)
         """Code at which each channel saturates, as far as frames have told."""
         self.contrast = 0.0
         """Of the camera's tone curve, as ``without_contrast`` takes it."""
 
     def copied(self) -> Self:
-        """What has been seen so far, for another pipeline to go on from; what it sees changes nothing here."""
+        """Return what has been seen so far, for another pipeline to go on from; what it sees changes nothing here."""
         other = copy.copy(self)
         other._first, other._first_gain = self._first.copy(), self._first_gain.copy()
         other._disagreements = list(self._disagreements)
@@ -151,13 +151,13 @@ class ExposureDrift:
             codes: Of the points now, (n, 3).
             contrast: That the camera is taken to have.
         """
-        values = without_contrast(self._plain, contrast, self.saturation)
-        table = np.log(np.maximum(values, 1e-6))
-        now, first = (
-            np.stack([np.interp(part[:, c], np.arange(256), table[:, c]) for c in range(3)], -1)
-            for part in (codes, self._first)
-        )
-        return np.asarray(now - first + np.log(self._first_gain))
+        change = self._logarithm(codes, contrast) - self._logarithm(self._first, contrast)
+        return np.asarray(change + np.log(self._first_gain))
+
+    def _logarithm(self, codes: Array, contrast: float) -> Array:
+        """Of the radiance that codes (n, 3) stand for under a contrast, (n, 3)."""
+        table = np.log(np.maximum(without_contrast(self._plain, contrast, self.saturation), 1e-6))
+        return np.stack([np.interp(codes[:, c], np.arange(256), table[:, c]) for c in range(3)], -1)
 
     def _weigh(self, change: Array, is_card: NDArray[np.bool_]) -> Array | None:
         """Logarithm of the gain; None where points do not tell.
@@ -202,8 +202,7 @@ class ExposureDrift:
         self._next_looks = 2 * len(self._disagreements)
         disagree = np.median(self._disagreements, axis=0)
         best = int(np.argmin(disagree))
-        plain = disagree[int(np.flatnonzero(CONTRASTS == 0.0)[0])]
-        if disagree[best] < BETTER * plain:
+        if disagree[best] < BETTER * disagree[0]:
             self.contrast = max(self.contrast, float(CONTRASTS[best]))
 
     def _print_contrast(self, codes: Array) -> float:
@@ -211,13 +210,12 @@ class ExposureDrift:
         shown = [codes[part & ~np.isnan(codes).any(axis=1)] for part in (self._is_card, self._is_ink)]
         if min(len(part) for part in shown) < BIN_POINTS:
             return 0.0
-        middle = [np.median(part, axis=0) for part in shown]
-        for contrast in CONTRASTS:
-            table = without_contrast(self._plain, float(contrast), self.saturation)
-            paper, ink = (np.array([np.interp(m[c], np.arange(256), table[:, c]) for c in range(3)]) for m in middle)
-            if paper.sum() <= MOST_PRINT * ink.sum():
-                return float(contrast)
-        return float(CONTRASTS[-1])
+        middle = np.array([np.median(part, axis=0) for part in shown])
+        for contrast in map(float, CONTRASTS):
+            paper, ink = np.exp(self._logarithm(middle, contrast)).sum(axis=1)
+            if paper <= MOST_PRINT * ink:
+                break
+        return contrast
 
 
 def codes_around(
@@ -233,16 +231,10 @@ def codes_around(
         plate: The frame at its full depth: its codes are then fractions of 8-bit ones.
     """
     result = np.full((len(points), 3), np.nan)
-    local = points @ pose.rotation.T + pose.translation
-    ahead = np.flatnonzero(local[:, 2] > 1e-6)
-    if len(ahead) == 0:
-        return result
-    zero = np.zeros(3)
-    pixels = cv2.projectPoints(local[ahead], zero, zero, camera.matrix(), np.array(camera.distortion))[0][:, 0]
-    at = np.round(np.clip(pixels, -1e6, 1e6)).astype(np.int64)
-    inside = ((at >= 2) & (at < np.array([camera.width, camera.height]) - 2)).all(axis=1)
-    ahead, at = ahead[inside], at[inside]
-    around = at + _OFFSETS[:, None]
+    pixels = project(camera, pose.apply(points))
+    at = np.round(np.clip(np.nan_to_num(pixels, nan=-1.0), -1e6, 1e6)).astype(np.int64)
+    inside = np.flatnonzero(((at >= 2) & (at < np.array([camera.width, camera.height]) - 2)).all(axis=1))
+    around = at[inside] + _OFFSETS[:, None]
     rows, columns = around[..., 1], around[..., 0]
     if plate is None:
         codes = image.reshape(-1, 3).take(rows * image.shape[1] + columns, axis=0)
@@ -251,8 +243,18 @@ def codes_around(
         codes = plate.codes_at(rows, columns, str(camera.transfer))
         sums = codes.sum(axis=0)
     tells = np.flatnonzero(((codes.min(axis=0) > DARK) & (codes.max(axis=0) < BRIGHT)).all(axis=1))
-    result[ahead[tells]] = sums[tells] / len(_OFFSETS)
+    result[inside[tells]] = sums[tells] / len(_OFFSETS)
     return result
+
+
+def under_boxes(scene: Scene, points: Array) -> NDArray[np.bool_]:
+    """Return which points (n, 3) lie in boxes that stand still, or within a centimetre of one."""
+    hidden = np.zeros(len(points), bool)
+    for box in scene.proxies:
+        if box.shape == "box" and box.marker is None:
+            within = (points - np.array(box.at)) @ rotation_matrix(box.rotate)
+            hidden |= (np.abs(within) < 0.5 * np.array(box.size) + 0.01).all(axis=1)
+    return hidden
 
 
 def still_points(scene: Scene) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
@@ -272,10 +274,6 @@ def still_points(scene: Scene) -> tuple[Array, NDArray[np.bool_], NDArray[np.boo
             if probe.marker is not None:
                 continue
             hidden |= np.linalg.norm(points - np.array(probe.center), axis=1) < 2.5 * probe.radius
-        for box in scene.proxies:
-            if box.shape == "box":
-                within = (points - np.array(box.at)) @ rotation_matrix(box.rotate)
-                hidden |= (np.abs(within) < 0.5 * np.array(box.size) + 0.01).all(axis=1)
-        found.append(points[~hidden])
+        found.append(points[~hidden & ~under_boxes(scene, points)])
     number = np.repeat(np.arange(len(found)), [len(part) for part in found])
     return np.concatenate(found), number == 0, number == 1

@@ -14,7 +14,7 @@ from warp_ar.device import start_warp
 from warp_ar.kernels.color import decode_table
 from warp_ar.kernels.picture import marker_edge_fit
 from warp_ar.scene import Camera, Pose
-from warp_ar.tracking.marker_pattern import Pattern
+from warp_ar.tracking.markers import Pattern
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]

@@ -16,6 +16,10 @@ No derivative is taken, so noise averages out. What shifts all edges the same wa
 clipped white, a transfer curve that is not quite known, ink that spreads. A camera that moves smears edges by their
 direction, and so they shift. The shift of an edge with normal n in the picture is n'Sn, the three numbers of S unknown.
 
+Objects, lights, proxies and mirror balls may ride on markers of their own, each followed as the world's is. What rides
+on one stands where its marker is in the world: with the camera's poses from both, world_from_marker = world_from_camera
+camera_from_marker. Poses that a scene gives belong to the frames that it names.
+
 References:
     [HS90] C. Harris and C. Stennett. RAPID, a video rate object tracker. BMVC 1990.
     [CB14] T. Collins and A. Bartoli. Infinitesimal plane-based pose estimation. IJCV 2014: the two poses of a plane, as
@@ -28,7 +32,8 @@ import contextlib
 import dataclasses
 import enum
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TypeGuard
 
 import cv2
@@ -37,10 +42,11 @@ from numpy.typing import NDArray
 
 from warp_ar.errors import UsageError
 from warp_ar.kernels.picture.marker_edge_fit import CORRELATED, NOISE_FLOOR
-from warp_ar.scene import Camera, Marker, Pose
+from warp_ar.scene import Camera, Light, Marker, Object, Pose, Probe, Proxy, Scene
+from warp_ar.scene.description import PoseSpec
+from warp_ar.sources.source import Frame, Source
 from warp_ar.tracking.edge_fit import Box, EdgeFitter
-from warp_ar.tracking.marker_pattern import make_pattern
-from warp_ar.tracking.markers import Detection, MarkerDetector
+from warp_ar.tracking.markers import Detection, MarkerDetector, pattern_of
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -103,7 +109,7 @@ _FORGET = 0.4
 
 
 class TrackState(enum.Enum):
-    """What a track's pose rests on."""
+    """Basis of a track's pose."""
 
     TRACKED = "tracked"
     """The marker was measured in this frame."""
@@ -116,12 +122,12 @@ class TrackState(enum.Enum):
 
 @dataclasses.dataclass(frozen=True)
 class Track:
-    """Where the marker is in one frame."""
+    """Place of the marker in one frame."""
 
     pose: Pose | None
     """``camera_from_world``, or None when lost."""
     state: TrackState
-    """What the pose rests on."""
+    """Basis of the pose."""
     quality: float
     """0 to 1: the share of the printed edges that support the pose, lowered by its uncertainty (1 degree or 1 % of
     distance halve it)."""
@@ -167,7 +173,7 @@ class _Fit:
     pattern: float
     """Correlation of the cells' brightness with the print."""
     edges: bool
-    """Whether it rests on edges; else on the detected corners only."""
+    """True if it rests on edges; else on the detected corners only."""
 
 
 class Tracker:
@@ -185,7 +191,7 @@ class Tracker:
     """
 
     def __init__(self, marker: Marker, camera: Camera, *, hold: float = 0.2, steady: bool = True) -> None:
-        self._pattern = make_pattern(marker.dictionary, marker.id, marker.size, marker.board)
+        self._pattern = pattern_of(marker)
         self._detector = MarkerDetector(marker.dictionary)
         self._shape = (camera.height, camera.width)
         self._matrix = np.asarray(camera.matrix(), float)
@@ -235,7 +241,7 @@ class Tracker:
         return self._detect(image)
 
     def error_of(self, image: Image, found: list[Detection]) -> float:
-        """How well the print fits where it was found, whatever earlier frames say.
+        """Return how well the print fits where it was found, whatever earlier frames say.
 
         Args:
             image: As for ``track``.
@@ -480,7 +486,7 @@ def _inverse(information: Array) -> Array:
 
 
 def _is_inside(corners: NDArray[np.float32], box: Box) -> bool:
-    """Whether corners lie well within a part of the image."""
+    """Return whether corners lie well within a part of the image."""
     rows, columns = box
     low, high = corners.min(0), corners.max(0)
     return bool(
@@ -503,3 +509,76 @@ def _pose_rows(jacobian: Array, arm: Array) -> Array:
     rows = np.empty((len(arm), 2, 6))
     rows[..., 0], rows[..., 1], rows[..., 2], rows[..., 3:] = y * c - z * b, z * a - x * c, x * b - y * a, jacobian
     return rows
+
+
+Places = Mapping[Marker, Pose | None]
+"""``world_from_marker`` of each marker, None where it is lost."""
+
+
+def own_markers(scene: Scene) -> tuple[Marker, ...]:
+    """Markers that anything of a scene rides on, each once."""
+    items: tuple[Object | Light | Proxy | Probe, ...] = (*scene.objects, *scene.lights, *scene.proxies, *scene.probes)
+    return tuple(dict.fromkeys(item.marker for item in items if item.marker is not None))
+
+
+class OwnMarkers:
+    """Follows every marker that something rides on."""
+
+    def __init__(self, scene: Scene, camera: Camera) -> None:
+        """Follow the markers of a scene.
+
+        Args:
+            scene: Whose objects, lights, proxies and balls ride on them.
+            camera: Of the frames.
+        """
+        self._trackers = {marker: Tracker(marker, camera) for marker in own_markers(scene)}
+
+    def __bool__(self) -> bool:
+        """Return whether there are any."""
+        return bool(self._trackers)
+
+    def track(self, image: NDArray[np.uint8], time: float, camera_from_world: Pose | None) -> Places:
+        """Return where the markers are in the world; all are lost where the world is.
+
+        Args:
+            image: (h, w, 3) RGB of 8 bits.
+            time: Seconds.
+            camera_from_world: By the world's own marker, or known from elsewhere.
+        """
+        found = {marker: tracker.track(image, time).pose for marker, tracker in self._trackers.items()}
+        if camera_from_world is None:
+            return dict.fromkeys(found)
+        world = camera_from_world.inverse()
+        return {marker: None if pose is None else world.after(pose) for marker, pose in found.items()}
+
+
+_NO_POSE = Track(None, TrackState.LOST, 0.0, None, math.inf)
+
+
+def given_pose(spec: PoseSpec | None, frame: Frame | int) -> Pose | Track | None:
+    """Return the pose of a frame.
+
+    Args:
+        spec: The scene's poses, if it gives any.
+        frame: The frame, or its number where no more is known of it.
+
+    Returns:
+        A pose; a lost track where the file has none for the frame; None: the marker tells.
+    """
+    if spec is None:
+        return None
+    found = spec.at(frame) if isinstance(frame, int) else spec.at(frame.index - frame.begins, frame.name)
+    return _NO_POSE if found is None else Pose(*found)
+
+
+def tell_missing_poses(spec: PoseSpec | None, source: Source) -> str:
+    """Return a line that counts the frames without a pose; empty where each has one, or nobody knows yet."""
+    if spec is None or spec.file is None or source.live:
+        return ""
+    frames = source.names or ("",) * (source.length or 0)
+    missing = [index for index, name in enumerate(frames) if spec.at(index, name) is None]
+    if not missing:
+        return ""
+    first = Path(frames[missing[0]]).name or f"frame {missing[0]}"
+    are = "1 frame has" if len(missing) == 1 else f"{len(missing)} of {len(frames)} frames have"
+    return f"{spec.file}: {are} no pose there, {first} first; nothing virtual is shown in them"

@@ -5,14 +5,10 @@ A browser opens its camera only to this machine or over TLS.
 
 from __future__ import annotations
 
-import asyncio
 import dataclasses
 import datetime
-import errno
-import ipaddress
 import socket
 import ssl
-import tempfile
 from pathlib import Path
 from typing import Final
 
@@ -50,54 +46,22 @@ def make_context(host: str) -> ssl.SSLContext:
         host: The name or address that the page is opened at.
 
     Raises:
-        UsageError: The package that makes certificates is not installed.
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "warp_ar.pem"
-        path.touch(mode=0o600)
-        path.write_bytes(make_certificate(host))
-        return load_context(path)
-
-
-def make_certificate(host: str) -> bytes:
-    """A key and its certificate, PEM; arguments as those of ``make_context``.
-
-    Raises:
-        UsageError: `cryptography` is not installed.
+        UsageError: The package that makes certificates is not installed, or ``host`` is no name for one.
     """
     try:
-        from cryptography import x509
-        from cryptography.hazmat.primitives import hashes, serialization
-        from cryptography.hazmat.primitives.asymmetric import ec
-        from cryptography.x509.oid import NameOID
+        import trustme
     except ImportError as error:
         raise UsageError(
             "--tls without a file makes a certificate: pip install 'warp-ar[tls]', or name a PEM file"
         ) from error
-    names: list[x509.GeneralName] = []
-    for name in dict.fromkeys(("localhost", "127.0.0.1", socket.gethostname(), host)):
-        try:
-            names.append(x509.IPAddress(ipaddress.ip_address(name)))
-        except ValueError:
-            names.append(x509.DNSName(name))
-    key = ec.generate_private_key(ec.SECP256R1())
-    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "warp_ar")])
-    now = datetime.datetime.now(datetime.UTC)
-    certificate = (
-        x509.CertificateBuilder()
-        .subject_name(subject)
-        .issuer_name(subject)
-        .public_key(key.public_key())
-        .serial_number(x509.random_serial_number())
-        .not_valid_before(now - datetime.timedelta(hours=1))
-        .not_valid_after(now + datetime.timedelta(days=30))
-        .add_extension(x509.SubjectAlternativeName(names), critical=False)
-        .sign(key, hashes.SHA256())
-    )
-    private = key.private_bytes(
-        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
-    )
-    return bytes(private + certificate.public_bytes(serialization.Encoding.PEM))
+    until = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=30)
+    try:
+        made = trustme.CA(organization_name="warp_ar").issue_cert("localhost", "127.0.0.1", host, not_after=until)
+    except ValueError as error:
+        raise UsageError(f"--host {host}: no name that a certificate can have: {error}; name a PEM file") from error
+    context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+    made.configure_cert(context)
+    return context
 
 
 LOOPBACK: Final = ("127.0.0.1", "::1", "localhost")
@@ -117,7 +81,7 @@ def own_address() -> str | None:
 
 @dataclasses.dataclass(frozen=True)
 class Address:
-    """Where the page is served, and what it takes to see it."""
+    """Address of the page, with its token and certificate."""
 
     host: str = "127.0.0.1"
     """Address to listen on."""
@@ -130,7 +94,7 @@ class Address:
 
     @property
     def loopback(self) -> bool:
-        """Whether only this machine can reach it."""
+        """Reachability from this machine alone."""
         return self.host in LOOPBACK
 
     @property
@@ -140,8 +104,8 @@ class Address:
 
     @property
     def outside_url(self) -> str | None:
-        """The same for other machines, where the page is served at all of this one's addresses and one is known."""
-        own = own_address() if self.host in EVERYWHERE else None
+        """The same for other machines; None where they cannot reach the page, or this one's address is not known."""
+        own = own_address() if self.host in EVERYWHERE else None if self.loopback else self.host
         return None if own is None else self._url(own)
 
     def _url(self, host: str) -> str:
@@ -150,29 +114,23 @@ class Address:
         return f"http{'s' * (self.tls is not None)}://{host}:{self.port}/{token}"
 
 
-async def listen(host: str, port: int) -> list[socket.socket]:
-    """Sockets that listen at all addresses that a name stands for.
+def listen(host: str, port: int, tries: int) -> socket.socket:
+    """Listen at an address, at the first port that is free.
+
+    Args:
+        host: Address, or a name, of whose addresses the first is taken.
+        port: First port to try; 0 takes any that is free.
+        tries: Ports to try.
 
     Raises:
-        OSError: There is none, or it is taken.
+        UsageError: There is no such address, or all the ports are taken.
     """
-    found = await asyncio.get_running_loop().getaddrinfo(
-        host or None, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
-    )
-    listeners: list[socket.socket] = []
-    try:
-        for family, address in dict.fromkeys((family, address) for family, _, _, _, address in found):
-            # A free port that was found for the first address is taken for the others too.
-            chosen = listeners[0].getsockname()[1] if listeners else port
-            try:
-                own = socket.create_server((address[0], chosen), family=family, backlog=BACKLOG)
-            except OSError as error:
-                if listeners and error.errno in (errno.EADDRNOTAVAIL, errno.EAFNOSUPPORT):
-                    continue  # a machine without the other kind of address
-                raise
-            listeners.append(own)
-    except OSError:
-        for own in listeners:
-            own.close()
-        raise
-    return listeners
+    for number in range(port, port + tries):
+        try:
+            family, _, _, _, place = socket.getaddrinfo(
+                host or None, number, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+            )[0]
+            return socket.create_server((str(place[0]), number), family=family, backlog=BACKLOG)
+        except OSError as error:
+            problem = f"cannot serve at {host} port {number}: {error.strerror or error}"
+    raise UsageError(f"{problem}; choose another --port")

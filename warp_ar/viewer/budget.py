@@ -1,4 +1,4 @@
-"""The page's budget: what a time per frame buys on this device, and how far off that is.
+"""Budget of the page: methods that a time per frame buys on this device, with the error of the picture.
 
 Errors come from the cost table, costs from measurements on this device, both as for ``--quality auto``; they are
 measured here one method at a time between other work, so that frames and edits go on meanwhile.
@@ -19,15 +19,17 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_ar.accuracy.controller import Controller
-from warp_ar.accuracy.cost_table import Setting, chosen, load_errors, relevant_settings, turn
+from warp_ar.accuracy.cost_table import Setting, chosen, load_errors, load_presets, relevant_settings, turn
 from warp_ar.accuracy.costs import BASE, Costs, cost_key, measure_steps, read_costs, write_costs
 from warp_ar.cache_folder import cache_folder
 from warp_ar.engine.graph import make_plan
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.scene import Pose
 from warp_ar.stages.quality import AUTO, DEFAULT_BUDGET_MS, PRESETS, Quality
-from warp_ar.viewer.messages import Notify, begin, failure
+from warp_ar.viewer.protocol import Notify, begin, failure
 
+START: Final = dataclasses.replace(BASE, name=AUTO)
+"""Quality under a budget until something can be chosen."""
 _COST_FRAMES: Final = 30
 """Frames whose median tells what a preset costs."""
 _TOLD: Final = 0.03
@@ -37,19 +39,23 @@ _SETTLED: Final = 10
 
 
 class BudgetSetting:
-    """Holds the budget and what it buys. The thread that lights frames calls its methods, unless they say otherwise."""
+    """Holds the budget and its choice. The thread that lights frames calls its methods, unless they say otherwise."""
 
     def __init__(self, notify: Notify, folder: Path | None = None) -> None:
         """Start switched off.
 
         Args:
             notify: Takes ``record`` whenever it has changed, on any thread.
-            folder: Where costs are kept; None means the user's cache folder.
+            folder: Folder of kept costs; None means the user's cache folder.
         """
         self._notify, self._folder = notify, folder or cache_folder()
         self._errors = load_errors()
-        self._budget: float | None = None
-        self._last_budget = DEFAULT_BUDGET_MS
+        self.budget: float | None = None
+        """Milliseconds per frame; None while switched off."""
+        self.last_budget = DEFAULT_BUDGET_MS
+        """The last one that was set, or the default."""
+        self.stopped = False
+        """True: nothing more is measured. Set from any thread."""
         self._controller: Controller | None = None
         self._key: str | None = None
         self._costs: Costs | None = None
@@ -58,48 +64,31 @@ class BudgetSetting:
         self._began = 0.0
         self._failed: str | None = None
         self._settings: tuple[Setting, ...] = ()
-        self._stopped = False
+        self._preset_errors: dict[str, float] = {}
+        self._table: dict[str, float] = {}
         self._preset_ms: dict[str, collections.deque[float]] = {}
         self._since_restart = 0
 
     @property
-    def budget(self) -> float | None:
-        """Milliseconds per frame; None while switched off."""
-        return self._budget
-
-    @property
-    def last_budget(self) -> float:
-        """The last one that was set, or the default."""
-        return self._last_budget
-
-    @property
     def measuring(self) -> bool:
-        """Whether costs are being measured: frames do well to leave time for that."""
+        """True while costs are being measured: frames do well to leave time for that."""
         return self._progress is not None
 
     def switch(self, budget: float | None) -> None:
         """Set the budget, or with None switch off. From any thread."""
-        self._last_budget = budget or self._last_budget
-        self._budget = budget
-
-    def stop(self) -> None:
-        """Measure no more. From any thread."""
-        self._stopped = True
-
-    def start_quality(self) -> Quality:
-        """What runs under a budget until something can be chosen."""
-        return dataclasses.replace(BASE, name=AUTO)
+        self.last_budget = budget or self.last_budget
+        self.budget = budget
 
     def look(self, pipeline: Pipeline, image: npt.NDArray[np.uint8], pose: Pose | None, helper: Executor) -> None:
         """Learn the costs for what ``pipeline`` shows: from the cache, else by measuring as soon as there is a budget.
 
         Args:
-            pipeline: What lights the frames, with the scene as it is edited.
+            pipeline: Pipeline of the frames, with the scene as it is edited.
             image: A frame that shows what the scene needs to see.
             pose: The camera's in it.
             helper: Runs the measurements, a step at a time.
         """
-        if self.measuring or self._stopped:
+        if self.measuring or self.stopped:
             return
         scene, size = pipeline.scene, pipeline.size
         # Edits change costs as load does; only another scene, its frames' size or an unknown setting ask for a new
@@ -107,12 +96,13 @@ class BudgetSetting:
         key = f"{scene.name} {size}"
         if key != self._key:
             self._key = key
+            self._preset_errors, self._table = load_presets(scene.name), load_presets(scene.name, "ms")
             self._settings = relevant_settings(scene, size)
             plan = make_plan(dataclasses.replace(pipeline.plan.request, quality=BASE))
             self._cache_key = cost_key(plan, pipeline.device, self._settings)
             self._adopt(read_costs(self._folder, self._cache_key, self._settings))
             self._notify(self.record())
-        if self._costs is None and self._budget is not None and key != self._failed:
+        if self._costs is None and self.budget is not None and key != self._failed:
             self._progress, self._began = 0.0, time.monotonic()
             self._notify(self.record())
             steps = measure_steps(scene, image.copy(), pose, str(pipeline.device), size, self._settings)
@@ -121,7 +111,7 @@ class BudgetSetting:
     def _step(self, helper: Executor, steps: Generator[float, None, Costs], key: str) -> None:
         progress = None
         try:
-            if not self._stopped:
+            if not self.stopped:
                 progress = next(steps)
         except StopIteration as end:
             write_costs(self._folder, self._cache_key, end.value)
@@ -132,7 +122,7 @@ class BudgetSetting:
         finally:
             self._progress = progress
         self._notify(self.record())
-        if progress is not None and not self._stopped:
+        if progress is not None and not self.stopped:
             begin(helper, self._notify, self._step, helper, steps, key)
 
     def _adopt(self, costs: Costs | None) -> None:
@@ -140,17 +130,17 @@ class BudgetSetting:
         if costs is None:
             self._controller, self._offer = None, {}
             return
-        controller = Controller(costs, self._errors, self._last_budget)
+        controller = Controller(costs, self._errors, self.last_budget)
         self._controller, self._offer = controller, self._list(controller, costs)
 
     def choose(self, milliseconds: float | None, now: float) -> Quality | None:
-        """What to run under the budget, or None while that is not known or there is no budget.
+        """Return the quality under the budget, or None while that is not known or there is no budget.
 
         Args:
-            milliseconds: What the last frame took; None if it says nothing about the present choice.
+            milliseconds: Time of the last frame; None if it says nothing about the present choice.
             now: Seconds on a clock that does not jump.
         """
-        controller, budget = self._controller, self._budget
+        controller, budget = self._controller, self.budget
         if controller is None or budget is None:
             return None
         if controller.budget_ms != budget:
@@ -160,31 +150,38 @@ class BudgetSetting:
         return dataclasses.replace(turn(BASE, controller.settings), name=AUTO)
 
     def observe(self, preset: str, milliseconds: float | None) -> Quality | None:
-        """Note what a frame took; what to run from now on, as ``choose`` has it.
+        """Note the time of a frame; return the quality from now on, as ``choose`` has it.
 
         Args:
             preset: Name of the quality that it was lit by.
-            milliseconds: What it took; None if it says nothing about that quality.
+            milliseconds: Its time; None if it says nothing about that quality.
         """
         self._since_restart += 1
-        counts = milliseconds is not None and not self.measuring
-        if counts and milliseconds is not None and self._since_restart > _SETTLED:
-            self._preset_ms.setdefault(preset, collections.deque(maxlen=_COST_FRAMES)).append(milliseconds)
-        return self.choose(milliseconds if counts else None, time.monotonic())
+        if self.measuring:
+            milliseconds = None
+        self.note(preset, milliseconds if self._since_restart > _SETTLED else None)
+        return self.choose(milliseconds, time.monotonic())
 
-    def costs(self) -> dict[str, float]:
-        """Median milliseconds per frame of every preset that has run on this scene. From any thread."""
-        return {name: round(statistics.median(ms), 2) for name, ms in list(self._preset_ms.items()) if ms}
+    def note(self, preset: str, milliseconds: float | None) -> None:
+        """Note the time of a frame as what a preset costs; None says nothing."""
+        if milliseconds is not None:
+            self._preset_ms.setdefault(preset, collections.deque(maxlen=_COST_FRAMES)).append(milliseconds)
+
+    def costs(self) -> dict[str, dict[str, Any]]:
+        """Return each preset's milliseconds a frame: the median here, else the cost table's, scaled by this machine's.
+
+        ``frames`` counts those that tell it; of what the table does not have nothing is told until it has run. From any
+        thread.
+        """
+        ran = {name: (statistics.median(ms), len(ms)) for name, ms in list(self._preset_ms.items()) if ms}
+        ratios = [ran[name][0] / ms for name, ms in self._table.items() if name in ran] or [1.0]
+        scaled = {name: (ms * statistics.mean(ratios), 0) for name, ms in self._table.items()}
+        return {name: {"ms": round(ms, 2), "frames": count} for name, (ms, count) in (scaled | ran).items()}
 
     def forget_costs(self, preset: str | None = None) -> None:
-        """What a preset took says nothing of it any more; None means all: another scene is shown. From any thread."""
+        """Forget the times of a preset; None means all: another scene is shown. From any thread."""
         for name in [preset] if preset is not None else list(self._preset_ms):
             self._preset_ms.pop(name, None)
-
-    @staticmethod
-    def rules(quality: Quality) -> bool:
-        """Whether a quality is a budget's choice."""
-        return quality.name == AUTO
 
     def restart(self) -> None:
         """Forget the frames so far: another pipeline lights those to come."""
@@ -193,21 +190,34 @@ class BudgetSetting:
             self._controller.restart()
 
     def state(self) -> dict[str, Any] | None:
-        """What is chosen now; None while nothing is. From any thread."""
+        """Return the present choice; None while there is none. From any thread."""
         controller = self._controller
-        if controller is None or self._budget is None:
+        if controller is None or self.budget is None:
             return None
         return {
             "settings": dict(controller.settings),
             "expected_ms": round(controller.expected_ms, 2),
-            "expected_error": round(controller.expected_error, 5),
+            "expected_error": self._whole_error(controller.expected_error),
             "factor": round(controller.factor, 4),
         }
 
     def record(self) -> dict[str, Any]:
-        """All that can be bought, as a message for the page. From any thread."""
+        """Return all choices as a message for the page. From any thread."""
         told = {"measuring": self._progress, "remaining": self._remaining(), "known": self._controller is not None}
-        return {"type": "budget", **told, **self._offer}
+        errors = {name: round(error, 3) for name, error in self._preset_errors.items()}
+        return {"type": "budget", **told, "errors": errors, **self._offer}
+
+    def _whole_error(self, error: float) -> float:
+        """Return the error of a whole picture by the sum of its methods' errors, which are not independent.
+
+        Presets have been measured both ways: theirs is as measured, others lie between.
+        """
+        sums = {
+            name: sum(self._errors[setting.name][chosen(PRESETS[name], setting)] for setting in self._settings)
+            for name in self._preset_errors
+        }
+        known = sorted((total, self._preset_errors[name]) for name, total in sums.items())
+        return round(float(np.interp(error, *np.transpose(known))), 3) if known else error
 
     def _remaining(self) -> float | None:
         """Seconds that the measurements still take, at the pace so far; None while there is too little to tell by."""
@@ -225,20 +235,9 @@ class BudgetSetting:
             "choices": [
                 {
                     "ms": round(choice.milliseconds, 3),
-                    "error": round(choice.error, 5),
+                    "error": self._whole_error(choice.error),
                     "methods": [methods[name].index(dict(choice.settings)[name]) for name in names],
                 }
                 for choice in controller.choices
             ],
-            "presets": {name: cost for name in PRESETS if (cost := self._cost_of(PRESETS[name], costs)) is not None},
-        }
-
-    def _cost_of(self, quality: Quality, costs: Costs) -> dict[str, float] | None:
-        """What a preset should cost and err; None where it has methods that are not measured."""
-        methods = {setting.name: chosen(quality, setting) for setting in self._settings}
-        if any(method not in costs.methods[setting] for setting, method in methods.items()):
-            return None
-        return {
-            "ms": round(costs.excess(methods), 3),
-            "error": round(sum(self._errors[setting][method] for setting, method in methods.items()), 5),
         }

@@ -1,12 +1,15 @@
 """State that the page's threads share: the source, the wanted scene, its edits and the lock of all these.
 
-A desk of one's own names the camera of its machine. Where there is none, a picture says so until a browser's camera
-comes.
+A desk of one's own names the camera of its machine. Where there is none, the page says so until a browser's camera
+comes, whose pictures are taken here.
 """
 
 from __future__ import annotations
 
+import collections
 import dataclasses
+import itertools
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -19,12 +22,16 @@ import numpy.typing as npt
 
 from warp_ar.checks.finding import Finding
 from warp_ar.errors import SourceError, UsageError
-from warp_ar.scene import Camera, Scene, SourceSpec
+from warp_ar.pictures import decode_picture
+from warp_ar.scene import Camera, Scene
 from warp_ar.sources.source import Frame, Source
-from warp_ar.sources.sources import MOST_INDEX, QueueSource, Source, open_source
+from warp_ar.sources.sources import MOST_INDEX, QueueSource, open_scene_source, source_of
 from warp_ar.stages.quality import PRESETS
+from warp_ar.viewer import protocol
 from warp_ar.viewer.edits import Wanted, wanted_record
-from warp_ar.viewer.messages import Notify
+from warp_ar.viewer.protocol import Notify
+
+Image = npt.NDArray[np.uint8]
 
 MOST_EDITS: Final = 100
 """Edits that can be undone."""
@@ -32,194 +39,146 @@ TOGETHER_SECONDS: Final = 1.0
 """Changes of one value that follow each other so soon are one edit: a drag, a slider."""
 
 
-@dataclasses.dataclass(frozen=True)
-class _Edit:
-    label: str
-    """What was done, in words."""
-    other: Wanted
-    """What is wanted on the other side of the edit."""
-
-
 class History:
-    """Edits in order. Not locked: whoever owns it holds a lock."""
+    """Edits in order, each with its words and the state on its other side. Whoever owns it holds a lock."""
 
     def __init__(self) -> None:
-        self._done: list[_Edit] = []
-        self._undone: list[_Edit] = []
+        self.done: list[tuple[str, Wanted]] = []
+        self.undone: list[tuple[str, Wanted]] = []
         self._last = -TOGETHER_SECONDS
-
-    @property
-    def undo_label(self) -> str | None:
-        """What would be undone; None where nothing can be."""
-        return self._done[-1].label if self._done else None
-
-    @property
-    def redo_label(self) -> str | None:
-        """What would be done again; None where nothing can be."""
-        return self._undone[-1].label if self._undone else None
 
     def note(self, label: str, before: Wanted, now: float) -> None:
         """Note an edit.
 
         Args:
-            label: What it does, in words; successive edits with the same words may become one.
-            before: What was wanted before it.
+            label: Its words; successive edits with the same words may become one.
+            before: State before it.
             now: Seconds on a clock that does not jump.
         """
-        self._undone.clear()
-        same = bool(self._done) and self._done[-1].label == label and now - self._last < TOGETHER_SECONDS
+        self.undone.clear()
+        same = bool(self.done) and self.done[-1][0] == label and now - self._last < TOGETHER_SECONDS
         self._last = now
         if not same:
-            self._done = [*self._done, _Edit(label, before)][-MOST_EDITS:]
+            self.done = [*self.done, (label, before)][-MOST_EDITS:]
 
-    def undo(self, wanted: Wanted) -> Wanted | None:
-        """What was wanted before the last edit; None where there is none."""
-        return self._move(wanted, self._done, self._undone)
-
-    def redo(self, wanted: Wanted) -> Wanted | None:
-        """What was wanted before the last undo; None where there is none."""
-        return self._move(wanted, self._undone, self._done)
-
-    def _move(self, wanted: Wanted, source: list[_Edit], target: list[_Edit]) -> Wanted | None:
+    def move(self, wanted: Wanted, *, back: bool) -> Wanted | None:
+        """Take the last edit back, or make the one again that was taken back last; None where there is none."""
+        source, target = (self.done, self.undone) if back else (self.undone, self.done)
         if not source:
             return None
-        edit = source.pop()
-        target.append(_Edit(edit.label, wanted))
+        label, other = source.pop()
+        target.append((label, wanted))
         self._last = -TOGETHER_SECONDS
         # The quality is no edit: a budget chooses it too.
-        return dataclasses.replace(edit.other, quality=wanted.quality)
+        return dataclasses.replace(other, quality=wanted.quality)
 
     def drop(self, before: Wanted) -> None:
-        """Forget the last edit if ``before`` is what was wanted before it: it could not be made."""
-        if self._done and dataclasses.replace(self._done[-1].other, quality=before.quality) == before:
-            self._done.pop()
+        """Forget the last edit if ``before`` is the state before it: it could not be made."""
+        if self.done and dataclasses.replace(self.done[-1][1], quality=before.quality) == before:
+            self.done.pop()
 
     def clear(self) -> None:
         """Forget all."""
-        self._done.clear()
-        self._undone.clear()
+        self.done.clear()
+        self.undone.clear()
 
 
 REMEDY: Final = "press “My camera”, which opens the camera of the machine that shows this page"
-_WORDS: Final = ("No camera here.", 'Press "My camera".')
-_GREY, _WHITE = 64, 235
-_PICTURE_SECONDS: Final = 0.5
-"""Between pictures, which are all the same."""
 
 
 class NoCamera(Source):
-    """One grey picture with words, again and again."""
+    """One grey picture again and again: pipelines are built meanwhile, and the page says what to do."""
 
-    live = True
-    length = None
-    fps = 1.0 / _PICTURE_SECONDS
+    live, length, fps = True, None, 2.0
 
     def __init__(self, size: tuple[int, int], error: SourceError) -> None:
-        """Say what is wrong.
+        """Keep the fault.
 
         Args:
             size: (width, height) of the picture, pixels.
-            error: Why the capture device cannot be opened.
+            error: Error of the capture device.
         """
         self.size, self.description, self.error = size, "no camera", error
         self.finding = Finding("source.absent", str(error).partition(";")[0], REMEDY)
-        """What is wrong, and what to do on the page."""
+        """Fault, and its remedy on the page."""
         self._closed = threading.Event()
 
     def __iter__(self) -> Iterator[Frame]:
         """The picture, until the source is closed."""
-        image, start, index = _picture(self.size), time.monotonic(), 0
-        while not self._closed.is_set():
-            yield Frame(index, time.monotonic() - start, image)
-            index += 1
-            self._closed.wait(_PICTURE_SECONDS)
+        image, self.start = np.full((self.size[1], self.size[0], 3), 64, np.uint8), time.monotonic()
+        for index in itertools.count():
+            yield Frame(index, time.monotonic() - self.start, image)
+            if self._closed.wait(1.0 / self.fps):
+                return
 
     def close(self) -> None:
         """End the pictures."""
         self._closed.set()
 
 
-def _picture(size: tuple[int, int]) -> npt.NDArray[np.uint8]:
-    """Words in the middle of a grey picture, RGB (height, width, 3)."""
-    image = np.full((size[1], size[0], 3), _GREY, np.uint8)
-    scale = size[0] / 640
-    for line, words in enumerate(_WORDS):
-        (width, height), _ = cv2.getTextSize(words, cv2.FONT_HERSHEY_SIMPLEX, scale, 2)
-        place = ((size[0] - width) // 2, size[1] // 2 + round((2.0 * line - 0.5) * height))
-        cv2.putText(image, words, place, cv2.FONT_HERSHEY_SIMPLEX, scale, (_WHITE,) * 3, 2, cv2.LINE_AA)
-    return image
-
-
 CAMERA: Final = "camera"
-"""What a picture is compared with when it is not another preset."""
+"""Name of a comparison with the camera's picture."""
 TRACED: Final = "traced"
 DIFFERENCE: Final = "difference"
 CONVERGING: Final = (TRACED, DIFFERENCE)
-"""What a held picture is compared with: the reference, or how far from it the picture is, in colours."""
+"""Comparisons of a held picture: with the reference, or with the difference to it in colours."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Feed:
-    """Where frames come from, and what changes together with that."""
+    """Source of frames, with the state that changes together with it."""
 
     source: Source
     camera: Camera | None = None
     """Another camera than the scene's."""
     wanted: Wanted | None = None
-    """What to show from then on."""
+    """State to show from then on."""
     owner: object = None
     """The viewer whose camera it is."""
+    estimated: bool = False
+    """True once frames have told the camera's focal length."""
 
     @property
     def is_browser(self) -> bool:
-        """Whether a browser pushes the frames."""
+        """True if a browser pushes the frames."""
         return isinstance(self.source, QueueSource)
 
 
-def _where(spec: SourceSpec) -> str | int | Path:
-    if spec.path is not None:
-        return spec.path
-    return spec.camera if spec.camera is not None else f"synthetic:{spec.synthetic}"
-
-
 def open_feed(scene: Scene, given: str | int | Path | None, wanted: Wanted | None = None) -> Feed:
-    """A scene's own source, or the one that was given instead; of a capture device that is not there a ``NoCamera``.
+    """Open a scene's own source, or the one that was given; of a capture device that is not there a ``NoCamera``.
 
     Raises:
         WarpArError: It cannot be opened, or the scene names none.
     """
-    spec = scene.source
-    if given is None and spec is None:
-        raise UsageError(f"scene {scene.name!r} names no source; give one with --source")
     try:
-        if given is not None:
-            return Feed(open_source(given, loop=True), wanted=wanted)
-        assert spec is not None
-        return Feed(open_source(_where(spec), fps=spec.fps, loop=True, exposures=spec.exposures or ()), wanted=wanted)
+        return Feed(open_scene_source(scene, given, loop=True), wanted=wanted)
     except SourceError as error:
-        if not _is_device(given if given is not None or spec is None else spec.camera):
+        if not _is_device(source_of(scene, given)):
             raise
         return Feed(NoCamera((scene.camera.width, scene.camera.height), error), wanted=wanted)
 
 
 def _is_device(source: str | int | Path | None) -> bool:
-    """Whether a source is a capture device that there may be."""
+    """Return True for a capture device that there may be."""
     if isinstance(source, str) and source.isdecimal() and len(source) <= 4 and not Path(source).exists():
         source = int(source)
     return isinstance(source, int) and 0 <= source <= MOST_INDEX
 
 
 class Controls:
-    """What to show, and whether. Methods may be called from any thread; whoever waits holds ``changed``."""
+    """State of the page: source, scene, comparison, playing or held.
+
+    Methods may be called from any thread; whoever waits holds ``changed``.
+    """
 
     def __init__(self, feed: Feed, wanted: Wanted, notify: Notify) -> None:
         self._notify = notify
         self.changed = threading.Condition()
         """Guards all of this; notified at every change."""
         self.wanted = wanted
-        """What viewers see now, or will once it is built."""
+        """State that viewers see now, or will once it is built."""
         self.compare = ""
-        """What stands beside the picture: nothing, ``CAMERA`` or a preset."""
+        """Second picture: nothing, ``CAMERA``, one of ``CONVERGING`` or a preset."""
         self.playing = True
         self.watchers = 0
         """Viewers; without any, no frame is lit."""
@@ -237,76 +196,74 @@ class Controls:
 
     @property
     def leaving(self) -> bool:
-        """Whether the present source shall be left."""
+        """True if the present source shall be left."""
         return self.stopped or self._next is not None
 
+    def wait(self, seconds: float | None = None) -> None:
+        """Wait so long, or without an end, until the present source shall be left."""
+        with self.changed:
+            self.changed.wait_for(lambda: self.leaving, timeout=seconds)
+
+    def _adopt(self, wanted: Wanted | None) -> None:
+        """Want something else, or with None the same, and tell viewers; to be called with the lock held.
+
+        So the last that they hear is the state that is.
+        """
+        if wanted is not None:
+            self.wanted = wanted
+            self._touch()
+        self._notify(self.scene_message())
+
     def change(self, make: Callable[[Wanted], Wanted], label: str | None = None) -> None:
-        """Make what is wanted anew from what was.
+        """Make the wanted state anew from the one before.
 
         Args:
-            make: Gives what is wanted from then on.
-            label: What the edit does, in words; None is no edit, and cannot be undone.
+            make: Function from the wanted state to the next.
+            label: Words of the edit; None is no edit, and cannot be undone.
         """
         with self.changed:
-            before = self.wanted
-            self.wanted = make(before)
-            if label is not None and self.wanted != before:
+            before, wanted = self.wanted, make(self.wanted)
+            if label is not None and wanted != before:
                 self._history.note(label, before, time.monotonic())
-            self._touch()
-            self._tell()
+            self._adopt(wanted)
 
     def undo(self) -> None:
         """Take the last edit back; without one nothing happens."""
-        self._step_to(self._history.undo)
+        with self.changed:
+            self._adopt(self._history.move(self.wanted, back=True))
 
     def redo(self) -> None:
         """Make the edit again that was taken back last; without one nothing happens."""
-        self._step_to(self._history.redo)
-
-    def _step_to(self, step: Callable[[Wanted], Wanted | None]) -> None:
         with self.changed:
-            wanted = step(self.wanted)
-            if wanted is not None:
-                self.wanted = wanted
-                self._touch()
-            self._tell()
+            self._adopt(self._history.move(self.wanted, back=False))
 
     def give_back(self, good: Wanted, refused: Wanted) -> None:
-        """Want again what was wanted before an edit that could not be built, unless something else is wanted by now."""
+        """Want again the state before an edit that could not be built, unless something else is wanted by now."""
         with self.changed:
-            if self.wanted is not refused:
-                return
-            self.wanted = good
-            self._history.drop(good)
-            self._touch()
-            self._tell()
+            if self.wanted is refused:
+                self._history.drop(good)
+                self._adopt(good)
 
     def start_anew(self, wanted: Wanted) -> None:
         """Want another scene; edits of the one before are forgotten."""
         with self.changed:
-            self.wanted = wanted
             self._history.clear()
-            self._touch()
-            self._tell()
+            self._adopt(wanted)
 
     def scene_message(self) -> dict[str, Any]:
-        """The scene as it is edited, and what can be undone."""
+        """Return the message of the scene as it is edited, with the edits that can be undone."""
         with self.changed:
-            undo, redo = self._history.undo_label, self._history.redo_label
+            undo, redo = (edits[-1][0] if edits else None for edits in (self._history.done, self._history.undone))
             return {"type": "scene", "scene": wanted_record(self.wanted), "undo": undo, "redo": redo}
 
     def camera_of(self, feed: Feed, wanted: Wanted | None = None) -> Camera:
-        """What is known of the camera that took a feed's frames."""
+        """Return the camera that took a feed's frames, as far as it is known."""
         wanted = wanted or self.wanted
         return wanted.camera_of(feed.source.size) or feed.camera or wanted.scene.camera
 
     def _touch(self) -> None:
         self.edits += 1
         self.changed.notify_all()
-
-    def _tell(self) -> None:
-        """Tell viewers the scene; to be called with the lock held, so that what they hear last is what is."""
-        self._notify(self.scene_message())
 
     def set_compare(self, other: str) -> None:
         """Choose what stands beside the picture.
@@ -354,27 +311,22 @@ class Controls:
             current.close()
 
     def adopt(self) -> bool:
-        """Take the feed that was asked for last; whether there was one."""
+        """Take the feed that was asked for last; return True if there was one."""
         with self.changed:
             if self._next is None:
                 return False
             self.feed, self._next = self._next, None
             if self.feed.wanted is not None:
-                self.wanted = self.feed.wanted
                 self._history.clear()
-            self._touch()
-            self._tell()
+            self._adopt(self.feed.wanted or self.wanted)
         return True
 
-    def use_camera(self, camera: Camera, source: Source) -> bool:
-        """Say what camera takes a source's frames; False if the source has been left."""
+    def use_estimate(self, camera: Camera, feed: Feed) -> bool:
+        """Take the camera that frames of a feed have told; False if the feed has been left."""
         with self.changed:
-            if self._next is not None and self._next.source is source:
-                self._next = dataclasses.replace(self._next, camera=camera)
-            elif self._next is None and self.feed.source is source:
-                self.feed = dataclasses.replace(self.feed, camera=camera)
-            else:
+            if self._next is not None or self.feed is not feed:
                 return False
+            self.feed = dataclasses.replace(feed, camera=camera, estimated=True)
             self._touch()
         return True
 
@@ -384,3 +336,94 @@ class Controls:
         for feed in (self.feed, self._next):
             if feed is not None:
                 feed.source.close()
+
+
+DEFAULT_FIELD_OF_VIEW: Final = 60.0
+"""Horizontal, degrees: between a phone's main camera (65 to 70) and a laptop's (50 to 60)."""
+
+
+def guessed_camera(width: int, height: int, transfer: Any = "srgb", focal: float | None = None) -> Camera:
+    """Return a camera with square pixels, a central principal point, no distortion, and the default field of view."""
+    focal = focal or 0.5 * width / math.tan(0.5 * math.radians(DEFAULT_FIELD_OF_VIEW))
+    return Camera(width, height, focal, focal, 0.5 * (width - 1), 0.5 * (height - 1), transfer=transfer)
+
+
+_LEAD_MS: Final = 40.0
+"""Typical time for a picture of a browser's camera to be packed, sent and unpacked."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Pushed:
+    """A picture of a browser's camera on its way to being lit."""
+
+    image: Image
+    id: int
+    taken: float
+    """Time at which it came, seconds of ``time.monotonic``."""
+    stamp: float
+    """Time at which it was taken, milliseconds of the browser's own clock."""
+
+
+class BrowserCamera:
+    """Takes pictures that a viewer pushes. Methods may be called from any thread."""
+
+    def __init__(self, controls: Controls, notify: Notify) -> None:
+        self._controls, self._notify = controls, notify
+        self._choosing = threading.Lock()
+        """Held by who makes a camera the source: of two viewers who ask at once one is refused."""
+        self._pushed: collections.deque[Pushed] = collections.deque(maxlen=4)
+
+    def use(self, width: int, height: int, owner: object) -> None:
+        """Make ``owner``'s camera the source.
+
+        Raises:
+            UsageError: Another viewer's camera is.
+        """
+        controls = self._controls
+        with self._choosing:
+            feed = controls.newest_feed
+            if feed.is_browser and feed.owner is not owner:
+                raise UsageError("another viewer's camera is the source; it must be switched off there first")
+            source = QueueSource((width, height), description="the browser's camera")
+            controls.switch(Feed(source, guessed_camera(width, height), owner=owner))
+
+    def is_of(self, owner: object) -> bool:
+        """Return True if ``owner``'s camera is the source."""
+        feed = self._controls.newest_feed
+        return feed.is_browser and feed.owner is owner
+
+    def size(self, owner: object) -> tuple[int, int] | None:
+        """Return the size of the pictures that ``owner`` may push now; None if it is not the source."""
+        return self._controls.newest_feed.source.size if self.is_of(owner) else None
+
+    def push(self, taken: protocol.Picture, owner: object) -> None:
+        """Take a picture; blocks while it is decoded.
+
+        The page hears of it again, as ``taken``, when it is its turn to be lit: sooner, another would only take its
+        place.
+
+        Raises:
+            ProtocolError: It cannot be decoded.
+        """
+        picture = decode_picture(taken.jpeg, cv2.IMREAD_COLOR_RGB, protocol.ProtocolError, "picture")
+        feed = self._controls.newest_feed
+        if feed.owner is not owner or feed.source.size != (picture.shape[1], picture.shape[0]):
+            return  # switched off meanwhile
+        assert isinstance(feed.source, QueueSource)
+        now = time.monotonic()
+        self._pushed.append(Pushed(picture, taken.id, now, taken.taken))
+        feed.source.push(picture, now)
+
+    def begin(self, image: Image, busy_ms: float) -> Pushed | None:
+        """Say that a frame is about to be lit; return its record if it was pushed.
+
+        Args:
+            image: The frame.
+            busy_ms: Time that lighting a frame takes.
+        """
+        pushed = next((item for item in tuple(self._pushed) if item.image is image), None)
+        if pushed is not None:
+            # The next one shall come when this one is done, not sooner, and not have waited by then.
+            wait = max(busy_ms - _LEAD_MS, 0.0)
+            self._notify({"type": "taken", "id": pushed.id, "wait": round(wait, 1)})
+        return pushed

@@ -7,11 +7,14 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
+import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import Any, Final, TypeVar, cast
 
 import numpy as np
+import numpy.typing as npt
 
 from warp_ar.checks.check_print import card_scale
 from warp_ar.errors import SceneError, UsageError
@@ -25,9 +28,7 @@ from warp_ar.scene import (
     Light,
     Material,
     MetallicRoughnessMaterial,
-    MirrorMaterial,
     Object,
-    PhongMaterial,
     Play,
     Probe,
     Proxy,
@@ -35,21 +36,28 @@ from warp_ar.scene import (
     dumps_scene,
     loads_scene,
 )
+from warp_ar.scene.geometry import rotation_matrix
+from warp_ar.scene.materials import MATERIALS
 from warp_ar.scene.mesh_files import GLTF_SUFFIXES, animations_of
 from warp_ar.scene.object_materials import file_stamp, mesh_of, moving_mesh_of
+from warp_ar.scene.scene_files import files_of
 from warp_ar.stages import STAGES
 from warp_ar.stages.quality import Quality
 from warp_ar.tracking.card_layout import RINGS, SHEET, ball_center
 from warp_ar.viewer.protocol import EFFECTS, Command
 
+_T = TypeVar("_T")
+
 NONE = -1
 """Number of no animation: everything stands as the file's nodes do."""
+_LIGHT_REACH, _STEP, _GOLDEN, _PLACES = 0.03, 0.02, 2.399963, 400
+"""Of places for what is new: metres around a light, metres and radians of the spiral's steps, and how many."""
 _DIGITS = 4
 """Of seconds that the page sets, in scene files: a tenth of a millisecond."""
 
 
 def names_of(item: Object) -> tuple[str, ...]:
-    """Names of the animations of an object's file, by number; one without a name is told by its number."""
+    """Return the names of the animations of an object's file, by number; one without a name gets its number."""
     if item.file is None or item.mesh is not None or item.file.suffix.lower() not in GLTF_SUFFIXES:
         return ()
     return _names(item.file, file_stamp(item.file))
@@ -64,7 +72,7 @@ def _names(path: Path, stamp: tuple[int, int]) -> tuple[str, ...]:
 
 
 def play_record(item: Object) -> dict[str, Any]:
-    """What the page shows of an object's animations."""
+    """Return the record of an object's animations for the page."""
     names = names_of(item)
     if not names:
         return {}
@@ -77,7 +85,7 @@ def play_record(item: Object) -> dict[str, Any]:
 
 
 def set_play(item: Object, key: str, value: float, seconds: float) -> Object:
-    """The object with one value of its animation changed; its pose at that moment stays.
+    """Return the object with one value of its animation changed; its pose at that moment stays.
 
     Args:
         item: An object with a glTF file.
@@ -112,7 +120,7 @@ MOST_PARTS: Final = 16
 RULER: Final = 0.1
 """Metres that each ruler of the card has in a print at true scale."""
 _SCALES: Final = (0.5, 1.5)
-"""What a ruler may measure over what it should: beyond that it was read wrong."""
+"""Least and largest ratio of a ruler's length to what it should be: beyond these it was read wrong."""
 
 _LISTS: Final = {"object": "objects", "light": "lights", "proxy": "proxies", "probe": "probes"}
 # No key that names a file is among them.
@@ -123,44 +131,30 @@ _KEYS: Final[Mapping[str, tuple[str, ...]]] = {
     "probe": ("center", "radius", "reflectance"),
     "exposure": ("scale",),
     "marker": ("dictionary", "id", "size"),
+    "material": ("base_color", "diffuse", "specular", "shininess", "metallic", "roughness", "color", "intensity"),
 }
-_MATERIAL_KEYS: Final = (
-    "base_color",
-    "diffuse",
-    "specular",
-    "shininess",
-    "metallic",
-    "roughness",
-    "color",
-    "intensity",
-)
-_MODELS: Final[Mapping[str, type[Material]]] = {
-    "lambert": LambertMaterial,
-    "phong": PhongMaterial,
-    "metallic_roughness": MetallicRoughnessMaterial,
-    "mirror": MirrorMaterial,
-    "emissive": EmissiveMaterial,
-    "file": FileMaterial,
-}
-_PLANE, _BOX = Proxy("plane", size=(0.2, 0.15)), Proxy("box", at=(0.12, -0.08, 0.03), size=(0.06, 0.06, 0.06))
-_NEW: Final[Mapping[str, Object | Light]] = {
-    "sphere": Object("sphere", radius=0.03, at=(0.12, -0.08, 0.03), material=MetallicRoughnessMaterial()),
-    "box": Object("box", size=(0.05, 0.05, 0.05), at=(0.12, -0.08, 0.025), material=LambertMaterial()),
-    "torus": Object(
+_NEW: Final[Mapping[tuple[str, str], Object | Light | Proxy]] = {
+    ("object", "sphere"): Object("sphere", radius=0.03, at=(0.12, -0.08, 0.03), material=MetallicRoughnessMaterial()),
+    ("object", "box"): Object("box", size=(0.05, 0.05, 0.05), at=(0.12, -0.08, 0.025), material=LambertMaterial()),
+    ("object", "torus"): Object(
         "torus",
         major_radius=0.03,
         minor_radius=0.011,
         at=(0.12, -0.08, 0.011),
         material=MetallicRoughnessMaterial((1.0, 0.77, 0.34), 1.0, 0.25),
     ),
-    "point": Light("point", 0.12, at=(0.05, -0.05, 0.2)),
-    "spot": Light("spot", 1.0, at=(0.0, -0.1, 0.35), target=(0.05, 0.05, 0.0), inner_angle=12.0, outer_angle=20.0),
-    "directional": Light("directional", 0.6, direction=(0.4, 0.5, -1.0)),
+    ("light", "point"): Light("point", 0.12, at=(0.05, -0.05, 0.2)),
+    ("light", "spot"): Light(
+        "spot", 1.0, at=(0.0, -0.1, 0.35), target=(0.05, 0.05, 0.0), inner_angle=12.0, outer_angle=20.0
+    ),
+    ("light", "directional"): Light("directional", 0.6, direction=(0.4, 0.5, -1.0)),
+    ("proxy", "plane"): Proxy("plane", size=(0.2, 0.15)),
+    ("proxy", "box"): Proxy("box", at=(0.12, -0.08, 0.03), size=(0.06, 0.06, 0.06)),
 }
 
 
 def checked(scene: Scene) -> Scene:
-    """The scene as its file would be read.
+    """Return the scene as its file would be read.
 
     Raises:
         SceneError: The file would be refused.
@@ -169,13 +163,13 @@ def checked(scene: Scene) -> Scene:
 
 
 def use_card(scene: Scene, radius: float, ruler: float) -> Scene:
-    """The scene with the printed card as its marker and a mirror ball on the card's cross.
+    """Return the scene with the printed card as its marker and a mirror ball on the card's cross.
 
     Args:
         scene: The scene; its balls go, its objects and lights stay, and it gets a table if it has none. Where its
             marker was another one, walls and boxes go as well: they stood around that marker.
         radius: Of the ball, metres.
-        ruler: What the print's rulers of 100 mm measure, metres.
+        ruler: Length that the print's rulers of 100 mm have, metres.
 
     Raises:
         UsageError: The radius is no ball's that stands on the card, or the ruler was read wrong.
@@ -209,18 +203,30 @@ def use_card(scene: Scene, radius: float, ruler: float) -> Scene:
 
 
 def card_ruler(scene: Scene) -> float | None:
-    """What the rulers of the scene's printed card measure, metres; None where its marker is another one."""
+    """Return the length of the rulers of the scene's printed card, metres; None where its marker is another one."""
     scale = card_scale(scene.marker)
     return None if scale is None else RULER * scale
 
 
+def _items(scene: Scene, part: str, index: int) -> list[Any]:
+    """Return the scene's objects, lights, proxies or balls, of which one is to be changed.
+
+    Raises:
+        UsageError: There is no such one.
+    """
+    items = list(getattr(scene, _LISTS[part]))
+    if index >= len(items):
+        raise UsageError(f"{part} {index}: the scene has {len(items)}")
+    return items
+
+
 def set_value(scene: Scene, part: str, index: int, key: str, value: Any) -> Scene:
-    """The scene with one key of one part changed.
+    """Return the scene with one key of one part changed.
 
     Args:
         scene: The scene.
         part: ``object``, ``light``, ``proxy``, ``probe``, ``exposure`` or ``marker``.
-        index: Which one.
+        index: Number of the part.
         key: A key of the scene file's section, or of its material.
         value: A number, a tuple of numbers or a word.
 
@@ -228,51 +234,44 @@ def set_value(scene: Scene, part: str, index: int, key: str, value: Any) -> Scen
         UsageError: There is no such part, or it has no such key that could be edited.
         SceneError: The scene file would refuse the value.
     """
-    if part in ("exposure", "marker"):
-        section = dataclasses.replace(getattr(scene, part), **{_key(part, key): value})
-        if part == "marker" and key in ("id", "size"):
-            section = dataclasses.replace(section, board=None)  # a marker of its own instead of a board's
-        changed: dict[str, Any] = {part: section}
-        return checked(dataclasses.replace(scene, **changed))
-    items = list(getattr(scene, _LISTS[part]))
-    if index >= len(items):
-        raise UsageError(f"{part} {index}: the scene has {len(items)}")
-    item = items[index]
-    if isinstance(item, Object) and (key == "model" or key in _MATERIAL_KEYS):
-        items[index] = dataclasses.replace(item, material=_material(_shown_material(item), key, value))
-    else:
-        changes = {_key(part, key): value}
-        if part == "light" and key in ("target", "direction"):
-            changes["direction" if key == "target" else "target"] = None
-        items[index] = dataclasses.replace(item, **changes)
-    return _with_list(scene, part, tuple(items))
-
-
-def _with_list(scene: Scene, part: str, items: tuple[Any, ...]) -> Scene:
-    changed: dict[str, Any] = {_LISTS[part]: items}
-    return checked(dataclasses.replace(scene, **changed))
-
-
-def _key(part: str, key: str) -> str:
-    if key not in _KEYS[part]:
+    items = _items(scene, part, index) if part in _LISTS else []
+    item = items[index] if items else getattr(scene, part)
+    if isinstance(item, Object) and (key == "model" or key in _KEYS["material"]):
+        changes: dict[str, Any] = {"material": _material(_shown_material(item), key, value)}
+    elif key not in _KEYS[part]:
         raise UsageError(f"{part}: key {key!r} cannot be edited; expected {', '.join(_KEYS[part])}")
-    return key
+    else:
+        changes = {key: value}
+        if key in ("target", "direction"):
+            changes["direction" if key == "target" else "target"] = None
+        if part == "marker" and key in ("id", "size"):
+            changes["board"] = None  # a marker of its own instead of a board's
+    made: Any = dataclasses.replace(item, **changes)
+    return _replaced(scene, part, index, made) if items else checked(dataclasses.replace(scene, **{part: made}))
+
+
+def _replaced(scene: Scene, part: str, index: int, *made: Any) -> Scene:
+    """Return the scene with other items in place of one."""
+    items = _items(scene, part, index)
+    items[index : index + 1] = made
+    lists: dict[str, Any] = {_LISTS[part]: tuple(items)}
+    return checked(dataclasses.replace(scene, **lists))
 
 
 def _shown_material(item: Object) -> Material:
-    """An object's material; what has no file is chalk where no material is given."""
+    """Return an object's material: chalk for an object without a file and without a material."""
     return LambertMaterial() if isinstance(item.material, FileMaterial) and item.shape != "mesh" else item.material
 
 
 def _material(material: Material, key: str, value: Any) -> Material:
     if key == "model":
-        if value not in _MODELS:
-            raise UsageError(f"material: model {value!r}; expected {', '.join(_MODELS)}")
+        if value not in MATERIALS:
+            raise UsageError(f"material: model {value!r}; expected {', '.join(MATERIALS)}")
         if value == "file":
             return FileMaterial()
         first = iter(vars(material).values())  # of every model but the file's own its colour
         color: Any = next(first, LambertMaterial.base_color)
-        made: Any = _MODELS[value]
+        made: Any = MATERIALS[value]
         if made is EmissiveMaterial and isinstance(color, Path):
             color = EmissiveMaterial.color
         return cast(Material, made(color))
@@ -285,14 +284,12 @@ def _material(material: Material, key: str, value: Any) -> Material:
 
 
 def add_part(scene: Scene, part: str, kind: str) -> Scene:
-    """The scene with a new object, light or proxy of ``kind``."""
-    if part == "proxy":
-        return add_item(scene, part, _PLANE if kind == "plane" else _BOX)
-    return add_item(scene, part, _NEW[kind])
+    """Return the scene with a new object, light or proxy of ``kind``."""
+    return add_item(scene, part, _NEW[part, kind])
 
 
 def add_item(scene: Scene, part: str, item: Object | Light | Proxy) -> Scene:
-    """The scene with one object, light or proxy more.
+    """Return the scene with one object, light or proxy more; objects and lights stand apart from those before.
 
     Raises:
         UsageError: It has as many as it may have.
@@ -301,29 +298,24 @@ def add_item(scene: Scene, part: str, item: Object | Light | Proxy) -> Scene:
     items = getattr(scene, _LISTS[part])
     if len(items) >= MOST_PARTS:
         raise UsageError(f"{len(items)} are in the scene already; {MOST_PARTS} at most: take one away first")
-    return _with_list(scene, part, (*items, item))
+    lists: dict[str, Any] = {_LISTS[part]: (*items, _apart(scene, item))}
+    return checked(dataclasses.replace(scene, **lists))
 
 
-def remove_part(scene: Scene, part: str, index: int) -> Scene:
-    """The scene without one object, light or proxy.
-
-    Args:
-        scene: The scene.
-        part: "object", "light" or "proxy".
-        index: Which of them, counted from 0.
+def set_animation(scene: Scene, index: int, key: str, value: float, seconds: float) -> Scene:
+    """Return the scene with one value of an object's animation changed; arguments as those of ``set_play``.
 
     Raises:
-        UsageError: It has not as many.
+        SceneError: As ``set_play``.
+        UsageError: There is no such object.
     """
-    items = getattr(scene, _LISTS[part])
-    if index >= len(items):
-        raise UsageError(f"{part} {index}: the scene has {len(items)}")
-    return _with_list(scene, part, items[:index] + items[index + 1 :])
+    item = _items(scene, "object", index)[index]
+    return _replaced(scene, "object", index, set_play(item, key, value, seconds))
 
 
 @dataclasses.dataclass(frozen=True)
 class Wanted:
-    """What the viewers want to see."""
+    """State that the viewers want to see."""
 
     scene: Scene
     """The scene, edited."""
@@ -337,35 +329,30 @@ class Wanted:
     """(stage, method) that differ from the preset's."""
     cameras: tuple[Camera, ...] = ()
     """Cameras that were calibrated, one for each size of frames, instead of the scene's."""
+    materials: tuple[tuple[int, Material], ...] = ()
+    """Materials that objects had before their models were changed, with the objects' numbers; the newest last."""
 
     def camera_of(self, size: tuple[int, int]) -> Camera | None:
-        """The calibrated camera of frames of a size; None where none was calibrated."""
+        """Return the calibrated camera of frames of a size; None where none was calibrated."""
         return next((camera for camera in self.cameras if (camera.width, camera.height) == size), None)
 
     def with_camera(self, camera: Camera) -> Wanted:
-        """With a calibrated camera for frames of its size."""
+        """Return this with a calibrated camera for frames of its size."""
         others = (own for own in self.cameras if (own.width, own.height) != (camera.width, camera.height))
         return dataclasses.replace(self, cameras=(*others, camera))
 
     def shown_scene(self) -> Scene:
-        """The scene without what is hidden or switched off: the one that a file of this picture holds."""
-        scene = self.scene
-
-        def seen(part: str, effect: str) -> tuple[Any, ...]:
-            items = getattr(scene, _LISTS[part])
-            return tuple(x for i, x in enumerate(items) if effect not in self.off and (part, i) not in self.hidden)
-
-        return dataclasses.replace(
-            scene,
-            objects=seen("object", "objects"),
-            lights=seen("light", "lights"),
-            probes=seen("probe", "environment"),
-            proxies=seen("proxy", "receiver"),
-            exposure=Exposure() if "exposure" in self.off else scene.exposure,
-        )
+        """Return the scene without what is hidden or switched off: the one that a file of this picture holds."""
+        effects = {"object": "objects", "light": "lights", "probe": "environment", "proxy": "receiver"}
+        lists: dict[str, Any] = {}
+        for part, effect in effects.items():
+            items = [] if effect in self.off else enumerate(getattr(self.scene, _LISTS[part]))
+            lists[_LISTS[part]] = tuple(item for index, item in items if (part, index) not in self.hidden)
+        exposure = Exposure() if "exposure" in self.off else self.scene.exposure
+        return dataclasses.replace(self.scene, **lists, exposure=exposure)
 
     def shown_quality(self) -> Quality:
-        """The quality without what is switched off."""
+        """Return the quality without what is switched off."""
         methods = dict(self.methods)
         if "relief" in self.off:
             methods["relight"] = "flat"
@@ -374,17 +361,28 @@ class Wanted:
         return self.quality.with_methods(**methods) if methods else self.quality
 
     def without_part(self, part: str, index: int) -> Wanted:
-        """With one object, light or proxy removed; what is hidden stays hidden."""
-        hidden = {(t, i - (t == part and i > index)) for t, i in self.hidden if (t, i) != (part, index)}
-        return dataclasses.replace(self, scene=remove_part(self.scene, part, index), hidden=frozenset(hidden))
+        """Return this with one object, light or proxy removed; what is hidden stays hidden."""
+        hidden = frozenset((t, i - (t == part and i > index)) for t, i in self.hidden if (t, i) != (part, index))
+        return dataclasses.replace(self, scene=_replaced(self.scene, part, index), hidden=hidden, materials=())
+
+    def with_value(self, part: str, index: int, key: str, value: Any) -> Wanted:
+        """Return this with one value changed; an object that had a material of the chosen model gets that again."""
+        scene = set_value(self.scene, part, index, key, value)
+        if part != "object" or key != "model":
+            return dataclasses.replace(self, scene=scene)
+        item, made = self.scene.objects[index], scene.objects[index]
+        kept = (*self.materials[-MOST_PARTS:], (index, _shown_material(item)))
+        had = (old for number, old in reversed(kept) if number == index and type(old) is type(made.material))
+        made = dataclasses.replace(made, material=next(had, made.material))
+        return dataclasses.replace(self, scene=_replaced(scene, "object", index, made), materials=kept)
 
     def with_part_shown(self, part: str, index: int, on: bool) -> Wanted:
-        """With one object, light or proxy shown or hidden."""
+        """Return this with one object, light or proxy shown or hidden."""
         item = {(part, index)}
         return dataclasses.replace(self, hidden=self.hidden - item if on else self.hidden | item)
 
     def with_method(self, stage: str, method: str) -> Wanted:
-        """With a stage on another method than the preset's; an empty name goes back.
+        """Return this with a stage on another method than the preset's; an empty name goes back.
 
         Raises:
             UsageError: There is no such stage or method.
@@ -396,37 +394,8 @@ class Wanted:
         return dataclasses.replace(self, methods=tuple(sorted((s, r) for s, r in methods.items() if r)))
 
     def with_effect(self, name: str, on: bool) -> Wanted:
-        """With an effect switched."""
+        """Return this with an effect switched."""
         return dataclasses.replace(self, off=self.off - {name} if on else self.off | {name})
-
-
-def beside(scene: Scene, folder: Path) -> Scene:
-    """Return the scene with files in a folder named as if they lay beside its own file."""
-
-    def named(path: Any) -> Any:
-        return Path(path.name) if isinstance(path, Path) and path.is_relative_to(folder) else path
-
-    captured = scene.captured
-    return dataclasses.replace(
-        scene,
-        camera=dataclasses.replace(scene.camera, transfer=named(scene.camera.transfer)),
-        objects=tuple(dataclasses.replace(item, file=named(item.file)) for item in scene.objects),
-        captured=None if captured is None else dataclasses.replace(captured, file=named(captured.file)),
-    )
-
-
-def set_animation(scene: Scene, index: int, key: str, value: float, seconds: float) -> Scene:
-    """The scene with one value of an object's animation changed; arguments as those of ``set_play``.
-
-    Raises:
-        SceneError: As ``set_play``.
-        UsageError: There is no such object.
-    """
-    if index >= len(scene.objects):
-        raise UsageError(f"object {index}: the scene has {len(scene.objects)}")
-    items = list(scene.objects)
-    items[index] = set_play(items[index], key, value, seconds)
-    return _with_list(scene, "object", tuple(items))
 
 
 Edit = Callable[[Wanted], Wanted]
@@ -441,44 +410,53 @@ def make_edit(command: Command, original: Wanted, seconds: float = 0.0) -> tuple
         seconds: Time of the newest frame since the first.
     """
     fields = command.fields
-    part, index = fields.get("part", "object"), fields.get("index", 0)
-    words = _named(part, index)
+    part, index, key, on = (fields.get(name) for name in ("part", "index", "key", "on"))
+    names = {None: "object", "object": "object", "light": "light", "proxy": "shape", "probe": "mirror ball"}
+    words = f"{names[part]} {(index or 0) + 1}" if part in names else f"the {part}"
 
-    def of_scene(change: Callable[..., Scene], *arguments: Any) -> Edit:
-        return lambda w: dataclasses.replace(w, scene=change(w.scene, *arguments))
+    def of_scene(change: Callable[..., Scene], *more: Any) -> Edit:
+        return lambda w: dataclasses.replace(w, scene=change(w.scene, *fields.values(), *more))
 
-    match command.type:
-        case "set":
-            return of_scene(set_value, *fields.values()), f"set {fields['key']} of {words}"
-        case "animate":
-            what = "pause" if fields["key"] == "paused" else fields["key"]
-            return of_scene(set_animation, *fields.values(), seconds), f"set the {what} of {words}"
-        case "add":
-            return of_scene(add_part, *fields.values()), f"add {fields['kind']}"
-        case "remove":
-            return lambda w: w.without_part(**fields), f"remove {words}"
-        case "show":
-            return lambda w: w.with_part_shown(**fields), f"{'show' if fields['on'] else 'hide'} {words}"
-        case "effect":
-            name = fields["name"].replace("_", " ")
-            return lambda w: w.with_effect(**fields), f"switch {name} {'on' if fields['on'] else 'off'}"
-        case "method":
-            return lambda w: w.with_method(**fields), f"choose the method of {fields['stage'].replace('_', ' ')}"
-        case "card":
-            return of_scene(use_card, *fields.values()), "use the printed card"
-        case "reset":
-            return lambda w: dataclasses.replace(original, quality=w.quality, cameras=w.cameras), "undo all edits"
-    return None
+    edits: dict[str, tuple[Edit, str]] = {
+        "set": (lambda w: w.with_value(**fields), f"set {key} of {words}"),
+        "animate": (of_scene(set_animation, seconds), f"set the {'pause' if key == 'paused' else key} of {words}"),
+        "add": (of_scene(add_part), f"add {fields.get('kind')}"),
+        "duplicate": (of_scene(duplicate_part), f"duplicate {words}"),
+        "snap": (of_scene(snap_object), f"set {words} on the desk"),
+        "remove": (lambda w: w.without_part(**fields), f"remove {words}"),
+        "show": (lambda w: w.with_part_shown(**fields), f"{'show' if on else 'hide'} {words}"),
+        "effect": (lambda w: w.with_effect(**fields), f"switch {fields.get('name')} {'on' if on else 'off'}"),
+        "method": (lambda w: w.with_method(**fields), f"choose the method of {fields.get('stage')}"),
+        "card": (of_scene(use_card), "use the printed card"),
+        "reset": (
+            lambda w: dataclasses.replace(original, quality=w.quality, cameras=w.cameras),
+            "undo all edits",
+        ),
+    }
+    edit, label = edits.get(command.type, (None, ""))
+    return None if edit is None else (edit, label.replace("_", " "))
 
 
-def _named(part: str, index: int) -> str:
-    """A part in words."""
-    names = {"object": "object", "light": "light", "proxy": "shape", "probe": "mirror ball"}
-    return f"{names[part]} {index + 1}" if part in names else f"the {part}"
+def moved(value: _T, place: Callable[[Path], Path]) -> _T:
+    """Return a scene, or a part of one, whose files are elsewhere."""
+    if isinstance(value, Path):
+        return cast(_T, place(value))
+    if isinstance(value, tuple) and list(files_of(value)):
+        return cast(_T, tuple(moved(item, place) for item in value))
+    if not dataclasses.is_dataclass(value) or isinstance(value, type):
+        return value
+    fields = {field.name: getattr(value, field.name) for field in dataclasses.fields(value) if field.init}
+    changes = {name: new for name, old in fields.items() if (new := moved(old, place)) is not old}
+    return dataclasses.replace(value, **changes)
+
+
+def beside(scene: Scene, folder: Path) -> Scene:
+    """Return the scene with files in a folder named as if they lay beside its own file."""
+    return moved(scene, lambda path: Path(path.name) if path.is_relative_to(folder) else path)
 
 
 def wanted_record(wanted: Wanted) -> dict[str, Any]:
-    """What the page needs to know of a scene, as plain data; of files only their names."""
+    """Return the record of a scene for the page, as plain data; of files only their names."""
     scene = wanted.scene
 
     def plain(item: Any) -> dict[str, Any]:
@@ -492,7 +470,7 @@ def wanted_record(wanted: Wanted) -> dict[str, Any]:
         record["animated"] = not isinstance(item, Proxy) and item.animate is not None
         if isinstance(item, Object):
             material = _shown_material(item)
-            model = next(name for name, made in _MODELS.items() if isinstance(material, made))
+            model = next(name for name, made in MATERIALS.items() if isinstance(material, made))
             record["material"] = {"model": model, **plain(material)}
             record["reach"] = _reach(item)
             record |= play_record(item)
@@ -520,12 +498,56 @@ def wanted_record(wanted: Wanted) -> dict[str, Any]:
     }
 
 
+def _box(item: Object) -> npt.NDArray[np.float64]:
+    """Return the lowest and the highest corner of the box around an object that stands unturned at the origin."""
+    if (mesh := mesh_of(item)) is not None:
+        return item.scale * mesh.bounds.astype(np.float64)
+    wide = item.radius + item.major_radius + item.minor_radius
+    tall = {"sphere": item.radius, "disk": 0.0}.get(item.shape, item.minor_radius + 0.5 * item.length)
+    half = 0.5 * np.array([*item.size, 0.0])[:3] if any(item.size) else np.array([wide, wide, tall])
+    return item.scale * np.array([-half, half])
+
+
 def _reach(item: Object) -> float:
-    """Radius in metres of a circle on the ground around an object, about its size."""
-    if item.shape == "mesh":
-        mesh = mesh_of(item)
-        assert mesh is not None
-        return item.scale * float(np.abs(mesh.bounds)[:, :2].mean())
-    if item.shape in ("box", "rect"):
-        return item.scale * 0.5 * float(np.hypot(item.size[0], item.size[1]))
-    return item.scale * (item.radius + item.major_radius + item.minor_radius + 0.5 * item.length)
+    """Return the radius of a circle on the desk around an object's place, about its size, metres."""
+    return float(np.abs(_box(item)[:, :2]).mean())
+
+
+def _spot(item: Any) -> tuple[npt.NDArray[np.float64], float]:
+    """Return the middle and the radius of the circle on the desk that an object, a light or a ball takes up."""
+    if isinstance(item, Probe):
+        return np.array(item.center[:2]), item.radius
+    if isinstance(item, Light):
+        return np.array(item.at[:2]), _LIGHT_REACH
+    low, high = _box(item)
+    middle = rotation_matrix(item.rotate) @ (0.5 * (low + high))
+    return (middle + item.at)[:2], 0.25 * float((high - low)[:2].sum())
+
+
+def _apart(scene: Scene, item: Any) -> Any:
+    """Return a new object or light moved aside, along a spiral, where something stands at its place."""
+    if isinstance(item, Proxy) or (isinstance(item, Light) and item.kind == "directional"):
+        return item  # a shape of the desk is where it was pointed out, a sun far away
+    alike = scene.lights if isinstance(item, Light) else (*scene.objects, *scene.probes)
+    taken, (place, reach) = [_spot(one) for one in alike], _spot(item)
+    for step in range(_PLACES):
+        angle = _GOLDEN * step
+        moved = _STEP * math.sqrt(step) * np.array([math.cos(angle), math.sin(angle)])
+        if all(math.dist(place + moved, other) >= reach + far for other, far in taken):
+            x, y = (round(float(value), 5) for value in moved + item.at[:2])
+            return dataclasses.replace(item, at=(x, y, item.at[2]))
+    return item
+
+
+def duplicate_part(scene: Scene, part: str, index: int) -> Scene:
+    """Return the scene with another object, light or proxy that is as one of it, beside that one."""
+    return add_item(scene, part, _items(scene, part, index)[index])
+
+
+def snap_object(scene: Scene, index: int) -> Scene:
+    """Return the scene with an object's lowest point at the height of the marker, so that it stands on the desk."""
+    item = _items(scene, "object", index)[index]
+    mesh = mesh_of(item)
+    points = np.array(list(itertools.product(*_box(item).T))) if mesh is None else item.scale * mesh.vertices
+    lowest = float((points @ rotation_matrix(item.rotate)[2]).min())
+    return set_value(scene, "object", index, "at", (*item.at[:2], round(-lowest, 5)))

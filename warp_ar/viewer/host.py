@@ -1,40 +1,94 @@
-"""The page's library half: takes what viewers ask for, runs their frames, and has what they can save."""
+"""Host of the page: takes viewers' commands, lights their frames, and makes the files that they can save."""
 
 from __future__ import annotations
 
+import collections
 import contextlib
 import dataclasses
 import tempfile
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import cv2
+import numpy as np
 
 from warp_ar.checks.pointed_shape import point_out
-from warp_ar.engine.pipeline import resolve_quality
+from warp_ar.device import exclusive
+from warp_ar.engine.pipeline import Pipeline, Result, resolve_quality
 from warp_ar.errors import SourceError, UsageError, WarpArError
-from warp_ar.output.sinks import write_environment
-from warp_ar.scene import Camera, Scene, bundled_scenes, dumps_scene, load_scene
+from warp_ar.scene import Camera, Pose, Scene, bundled_scenes, dumps_scene, load_scene
+from warp_ar.scene.object_shapes import object_shapes
+from warp_ar.sources.sources import Frame, Source
 from warp_ar.stages.quality import AUTO, DEFAULT_PRESET, PRESETS, Quality
+from warp_ar.tracking.tracking import TrackState, given_pose, tell_missing_poses
 from warp_ar.viewer import edits
-from warp_ar.viewer.budget import BudgetSetting
-from warp_ar.viewer.camera import BrowserCamera, CalibrationSession, card_pdf, written
-from warp_ar.viewer.controls import Controls, Feed, NoCamera, open_feed
+from warp_ar.viewer.budget import START, BudgetSetting
+from warp_ar.viewer.controls import (
+    CONVERGING,
+    BrowserCamera,
+    Controls,
+    Feed,
+    Image,
+    NoCamera,
+    Pushed,
+    guessed_camera,
+    open_feed,
+)
 from warp_ar.viewer.edits import Wanted
-from warp_ar.viewer.frames import FrameLoop, Helpers, Lit, Recorder
-from warp_ar.viewer.light_record import LightState
-from warp_ar.viewer.lighting import Lighting, make_target
-from warp_ar.viewer.messages import Notify, failure, notice
-from warp_ar.viewer.protocol import Command
-from warp_ar.viewer.setup import SetupChecks
+from warp_ar.viewer.light_record import LightState, encode_picture
+from warp_ar.viewer.lighting import Convergence, Lighting, make_target
+from warp_ar.viewer.protocol import Command, Notify, failure, notice
+from warp_ar.viewer.setup import CalibrationSession, SetupChecks, card_pdf, page_record
 from warp_ar.viewer.uploads import DroppedFiles, pack_scene
+
+PLAY_RATE: Final = 30.0
+"""Frames a second of clips that tell no rate."""
+_LIGHT_SECONDS: Final = 0.25
+"""Time between two looks at the environment."""
+_MEASURING_REST: Final = 0.15
+"""Seconds that the frames rest, one from the next, while methods are timed: what runs beside them spoils the times."""
+_STILL_SECONDS: Final = 0.25
+"""Time after which a held frame is looked at again, where nothing was edited."""
+_BUILDING_SECONDS: Final = 0.03
+"""Time after which it is looked at again while a pipeline is built."""
+_NOTICE_SECONDS: Final = 5.0
+"""Shortest time between two notices of frames that cannot be lit."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Lit:
+    """One frame as the viewers get it."""
+
+    id: int
+    """Number of the frame since the page was started."""
+    taken: float
+    """Time of its capture, or for a recorded frame the time at which it was due, seconds of ``time.monotonic``."""
+    stamp: float | None
+    """Time at which a browser's camera took it, milliseconds of the browser's own clock; None from other sources."""
+    image: Image
+    """Lit, uint8 RGB; the camera's own where nothing can light it yet."""
+    other: Image | None
+    """Picture that it is compared with."""
+    frame: Image
+    """As the camera gave it."""
+    pose: Pose | None
+    """``camera_from_world``."""
+    state: TrackState | None
+    camera: Camera
+    stages: tuple[tuple[str, float, bool], ...]
+    """Name, milliseconds, and True if it was skipped."""
+    light_ms: float
+    """From the frame in hand to the lit frame."""
+    plan: int
+    """Number of the plan that it was lit by; 0 where it was not."""
 
 
 class Host:
-    """Lights frames for viewers. Every method may be called from any thread."""
+    """Frames that viewers steer. Every method may be called from any thread, but for ``run``, which lights them."""
 
     def __init__(
         self,
@@ -51,80 +105,84 @@ class Host:
         """Open the source; pipelines are built while ``run`` shows its frames.
 
         Args:
-            scene: What to show first.
+            scene: The scene to begin with.
             source: Frames instead of the scene's own.
             device: ``auto``, ``cpu`` or ``cuda:N``.
             quality: A preset's name, a value, or ``auto``.
             budget_ms: Milliseconds per frame for ``auto``; None means 33.
             frames: End after so many lit frames.
             publish: Takes every frame, on the host's own thread.
-            notify: Takes what else viewers should know, on any thread.
+            notify: Takes other news for viewers, on any thread.
 
         Raises:
             WarpArError: The source cannot be opened, or no plan be made for it. A capture device that is not there is
                 waited for, unless ``frames`` are counted: a viewer may bring a camera.
         """
-        self._notify = notify
         self._given_source = source
         self._budget = BudgetSetting(notify)
         if quality == AUTO:
             self._budget.switch(budget_ms or self._budget.last_budget)
         self._preset = PRESETS[DEFAULT_PRESET] if quality == AUTO else resolve_quality(quality)
-        wanted = Wanted(scene, self._budget.start_quality() if quality == AUTO else self._preset)
+        wanted = Wanted(scene, START if quality == AUTO else self._preset)
         self._original = wanted
         feed = open_feed(scene, source)
         if isinstance(feed.source, NoCamera) and frames is not None:
             raise feed.source.error
-        self._controls = Controls(feed, wanted, notify)
         self._folder = tempfile.TemporaryDirectory(prefix="warp_ar_live_")
-        self._recorder = Recorder(Path(self._folder.name))
-        self._dropped, self._dropping = DroppedFiles(Path(self._folder.name)), threading.Lock()
+        folder, controls = Path(self._folder.name), Controls(feed, wanted, notify)
         try:
-            self._lighting = Lighting(self._controls, device, notify, lambda: self._budget.switch(None))
+            self._lighting = Lighting(controls, device, notify, lambda: self._budget.switch(None))
         except BaseException:
-            self._controls.close()
+            controls.close()
             self._folder.cleanup()
             raise
-        self._camera = BrowserCamera(self._controls, notify)
+        self._controls, self._camera = controls, BrowserCamera(controls, notify)
         self._looker = ThreadPoolExecutor(1, "warp-ar-board")
         self._calibration = CalibrationSession(self._looker, notify, self._use_calibrated)
-        self._setup = SetupChecks(self._controls, self._looker, notify, Path(self._folder.name))
-        helpers = Helpers(self._lighting, self._budget, self._camera, self._calibration, self._recorder, self._setup)
-        self._loop = FrameLoop(self._controls, helpers, frames=frames, publish=publish, notify=notify)
+        self._setup = SetupChecks(controls, self._looker, notify, folder)
+        self._frames, self._publish, self._notify = frames, publish, notify
+        self._id = self._lit = self._plan = 0
+        self._base = self._at = self._busy_ms = 0.0
+        self._light_time = self._notice_time = 0.0
+        self.seconds = 0.0
+        """Time of the newest lit frame since the first: the time of animations."""
+        self._times: collections.deque[float] = collections.deque(maxlen=60)
+        self._compared = ""
+        self._hits: tuple[Any, Scene] | None = None
+        """Shape that each pixel of the newest frame shows, and the scene of these shapes."""
+        self.convergence = Convergence()
+        """The reference of a held frame."""
+        self.latest: Lit | None = None
+        """The newest frame."""
+        self.light_state: LightState | None = None
+        """The environment as it was a moment ago, with its status; None while it is not known."""
+        self._dropped, self._dropping = DroppedFiles(folder), threading.Lock()
         self._doing: dict[str, Callable[..., None]] = {
-            "undo": self._controls.undo,
-            "redo": self._controls.redo,
+            "undo": controls.undo,
+            "redo": controls.redo,
             "outline": self._point_out,
             "quality": self._choose_quality,
             "budget": self._set_budget,
             "scene": self._open_scene,
-            "compare": self._controls.set_compare,
-            "play": self._controls.play,
-            "record": self._record,
+            "compare": controls.set_compare,
+            "play": controls.play,
             "calibrate": self._calibration.step,
             "setup": self._setup.step,
         }
-        self.run = self._loop.run
-        """Light frames until told to stop; blocks."""
-        self.stop = self._controls.stop
+        self.stop = controls.stop
         """End ``run`` after the frame in hand."""
-        self.watch = self._controls.watch
+        self.watch = controls.watch
         """Count one viewer more (1) or less (-1): without any, no frame is lit."""
         self.push, self.camera_size = self._camera.push, self._camera.size
         """Take a picture of a browser's camera; size of the pictures that a viewer may push."""
-        self.scene_message, self.plan_message = self._controls.scene_message, self._lighting.plan_message
+        self.scene_message, self.plan_message = controls.scene_message, self._lighting.plan_message
         """Messages of the scene as it is edited, and of the stages that run."""
 
     # ------------------------------------------------------------------------------------------------- what viewers ask
 
     @property
-    def latest(self) -> Lit | None:
-        """The newest frame."""
-        return self._loop.latest
-
-    @property
     def no_camera(self) -> NoCamera | None:
-        """What is said while there is no camera; None while there are frames."""
+        """The source that stands for an absent camera; None while there are frames."""
         source = self._controls.feed.source
         return source if isinstance(source, NoCamera) else None
 
@@ -134,7 +192,7 @@ class Host:
         return self._controls.feed.source.description.rsplit("/", 1)[-1]
 
     def wanted(self) -> Wanted:
-        """What viewers see now, or will once it is built."""
+        """Return the state that viewers see now, or will once it is built."""
         return self._controls.wanted
 
     def edit(self, command: Command, owner: object = None) -> None:
@@ -147,21 +205,15 @@ class Host:
         Raises:
             WarpArError: It cannot be done; nothing has changed.
         """
-        if (made := edits.make_edit(command, self._original, self._loop.seconds)) is not None:
+        if (made := edits.make_edit(command, self._original, self.seconds)) is not None:
             self._controls.change(*made)
         elif command.type in ("camera", "no_camera"):
             use = self._camera.use if command.type == "camera" else self.leave_camera
             use(**command.fields, owner=owner)
         else:
             self._doing[command.type](**command.fields)
-            if command.type in ("compare", "play", "record", "quality", "budget"):
+            if command.type in ("compare", "play", "quality", "budget"):
                 self._notify(self.state_message())
-
-    def _record(self, on: bool) -> None:
-        if on:
-            self._recorder.start(self._controls.feed.source.fps)
-        else:
-            self._recorder.stop()
 
     def _choose_quality(self, name: str) -> None:
         self._set_budget(self._budget.last_budget if name == AUTO else None, name)
@@ -173,13 +225,13 @@ class Host:
                 quality = self._preset = resolve_quality(preset or self._preset.name)
             else:
                 running = self._controls.wanted.quality
-                quality = running if self._budget.rules(running) else self._budget.start_quality()
+                quality = running if running.name == AUTO else START
             self._budget.switch(ms)
             self._controls.change(lambda w: dataclasses.replace(w, quality=quality))
 
     def _point_out(self, kind: str, points: tuple[tuple[float, float], ...]) -> None:
         """Model a part of the desk that four points of the newest frame outline."""
-        lit = self._loop.latest
+        lit = self.latest
         if lit is None or lit.pose is None:
             raise UsageError("the marker is not seen, so no point of the picture has a place: show it first")
         proxy = point_out(lit.camera, lit.pose, kind, points)
@@ -195,7 +247,7 @@ class Host:
             raise UsageError(f"no bundled scene {name!r}; expected {', '.join(bundled_scenes())}")
         scene = load_scene(name)
         running = self._controls.wanted.quality
-        quality = self._budget.start_quality() if self._budget.rules(running) else running
+        quality = START if running.name == AUTO else running
         wanted = self._original = Wanted(scene, quality, cameras=self._controls.wanted.cameras)
         self._budget.forget_costs()
         if self._controls.feed.is_browser or self._given_source is not None:
@@ -217,16 +269,10 @@ class Host:
             self._notify(failure(error))
             absent = error if isinstance(error, SourceError) else SourceError(str(error))
             feed = Feed(NoCamera((scene.camera.width, scene.camera.height), absent))
-        self._camera.leave(feed)
-
-    def _use_calibrated(self, camera: Camera) -> None:
-        known = self._controls.camera_of(self._controls.feed)
-        self._camera.stop_estimating()
-        camera = dataclasses.replace(camera, transfer=known.transfer)  # which a board does not tell
-        self._controls.change(lambda w: w.with_camera(camera), "calibrate the camera")
+        self._controls.switch(feed)
 
     def drop(self, name: str, data: bytes) -> str:
-        """Take a file that a viewer dropped onto the picture; what is to be said about it.
+        """Take a file that a viewer dropped onto the picture; return the words about it.
 
         Raises:
             WarpArError: It cannot be used; nothing has changed.
@@ -254,7 +300,6 @@ class Host:
                 "application/zip",
                 lambda: pack_scene(make_target(self._controls.wanted, self._controls.feed).scene),
             ),
-            "recording.mp4": ("video/mp4", self._recorder.video),
             "camera.yml": ("application/yaml", self._calibration.camera_file),
             "response.txt": ("text/plain", self._setup.response_file),
             "card-a4.pdf": ("application/pdf", lambda: card_pdf("a4")),
@@ -267,8 +312,7 @@ class Host:
         Raises:
             UsageError: There was none.
         """
-        latest = self._loop.latest
-        if latest is None:
+        if (latest := self.latest) is None:
             raise UsageError("no frame has been lit yet")
         return cv2.imencode(".png", latest.image[..., ::-1])[1].tobytes()
 
@@ -278,12 +322,11 @@ class Host:
         Raises:
             UsageError: It is not known.
         """
-        state = self._loop.light_state
-        if state is None:
+        if (state := self.light_state) is None:
             raise UsageError(
                 "the environment is not captured: no stage of this scene reads it, or the marker was not seen"
             )
-        return written("environment.exr", lambda path: write_environment(path, state.radiance))
+        return encode_picture(state, "exr", "z-up", "latlong", None)
 
     def scene_toml(self, *, full_paths: bool) -> str:
         """Return the scene as it is shown, as a scene file.
@@ -299,13 +342,8 @@ class Host:
 
     # ---------------------------------------------------------------------------------------------------- what is told
 
-    @property
-    def light_state(self) -> LightState | None:
-        """The environment as it was a moment ago, and what is known of it; None while it is not captured."""
-        return self._loop.light_state
-
     def greetings(self) -> list[dict[str, Any]]:
-        """All that a new viewer should know."""
+        """Return all that a new viewer should know."""
         return [
             self.plan_message(),
             self.scene_message(),
@@ -316,61 +354,324 @@ class Host:
         ]
 
     def state_message(self) -> dict[str, Any]:
-        """What changes by itself."""
+        """Return the message of all that changes by itself."""
         controls, lighting, budget = self._controls, self._lighting, self._budget
         return {
             "type": "state",
-            "fps": round(self._loop.fps, 2),
+            "fps": round(self.fps, 2),
             "source": self.description,
             "camera": controls.feed.is_browser,
-            "estimating": self._camera.estimating,
+            "estimating": self._setup.estimating,
             "lens": self._lens(),
             "missing": self._missing(),
+            "ball": self._setup.ball,
             "playing": controls.playing,
-            "recording": self._recorder.count,
             "building": lighting.doing(),
             "compare": controls.compare,
-            "compare_ready": lighting.compare_ready or self._loop.convergence.status is not None,
-            "convergence": self._loop.convergence.status,
+            "compare_ready": lighting.compare_ready or self.convergence.status is not None,
+            "convergence": self.convergence.status,
             "budget": budget.budget,
             "auto": budget.state(),
             "costs": budget.costs(),
             "watchers": controls.watchers,
-            "difference": self._loop.difference,
         }
 
     def _missing(self) -> dict[str, str] | None:
-        """Why there are no frames, why the marker is not seen in them, or why no object is."""
+        """Return why there are no frames, why the marker is not seen in them, or why no object is."""
         absent = self.no_camera  # once: another source may come meanwhile
-        missing = (self._setup.missing or self._setup.outside) if absent is None else absent.finding
-        return None if missing is None else {"name": missing.name, "text": missing.text, "remedy": missing.remedy}
+        return self._setup.guide() if absent is None else page_record(absent.finding)
 
     def _lens(self) -> str:
-        """Where the camera's numbers come from: calibrated, given by the scene, estimated, or guessed."""
+        """Return the origin of the camera's numbers: calibrated, given by the scene, estimated, or guessed."""
         controls = self._controls
         feed, wanted = controls.feed, controls.wanted
         if wanted.camera_of(feed.source.size) is not None:
             return "calibrated"
         if feed.camera is not None:
-            return "estimated" if self._camera.estimated else "guessed"
+            return "estimated" if feed.estimated else "guessed"
         return "given" if wanted.scene.camera.field_of_view is None else "guessed"
 
     def close(self, *, wait_seconds: float | None = None, frames_ended: bool = True) -> bool:
         """Let the source, the pipelines and all temporary files go.
 
         Args:
-            wait_seconds: How long to wait for pipelines that are being built; None waits until they are.
-            frames_ended: Whether ``run`` has ended; if it is at a frame still, its pipeline is left to it.
+            wait_seconds: Longest wait for pipelines that are being built; None waits until they are.
+            frames_ended: False while ``run`` is at a frame still: its pipeline is left to it.
 
         Returns:
-            Whether all threads have ended; those that have not end with what they are at.
+            True if all threads have ended; others end after their work in hand.
         """
-        self._budget.stop()
-        with contextlib.suppress(WarpArError):  # a recording that cannot be finished goes with its folder
-            self._recorder.stop()
+        self._budget.stopped = True
         self._controls.close()
         ended = frames_ended and self._lighting.close(wait_seconds)
         self._looker.shutdown(wait=ended)
         with contextlib.suppress(OSError):  # a thread that has not ended may still write into it
             self._folder.cleanup()
         return ended
+
+    # ---------------------------------------------------------------------------------------------------------- frames
+
+    def _use_calibrated(self, camera: Camera) -> None:
+        transfer = self._controls.camera_of(self._controls.feed).transfer  # which a board does not tell
+        camera = dataclasses.replace(camera, transfer=transfer)
+        self._controls.change(lambda w: w.with_camera(camera), "calibrate the camera")
+
+    @property
+    def fps(self) -> float:
+        """Frames a second over the last ones."""
+        times = list(self._times)
+        return (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 and times[-1] > times[0] else 0.0
+
+    def pick(self, x: float, y: float, reach: float) -> int | None:
+        """Return the number of the object that the newest frame shows at a pixel, or nearest to it; from any thread.
+
+        Args:
+            x: Column of the pixel; centres lie at integers.
+            y: Row of the pixel.
+            reach: Largest distance of a pixel that shows the object, pixels.
+        """
+        if self._hits is None:
+            return None
+        hits, scene = self._hits
+        with exclusive(hits.device):
+            seen = hits.numpy()
+        left, top = (max(int(value - reach) - 1, 0) for value in (x, y))
+        near = seen[top : max(int(y + reach) + 2, 0), left : max(int(x + reach) + 2, 0)]
+        rows, columns = np.nonzero(near >= 0)
+        distances = np.hypot(columns + left - x, rows + top - y)
+        if not len(distances) or distances.min() > max(reach, 0.75):  # half of a pixel's diagonal, and rounding
+            return None
+        nearest = distances.argmin()
+        wanted = self._controls.wanted
+        shown = [index for index in range(len(wanted.scene.objects)) if ("object", index) not in wanted.hidden]
+        # Pixels know shapes: an object that its file moves in parts has several.
+        number = object_shapes(scene)[near[rows[nearest], columns[nearest]]].index
+        return shown[number] if number < len(shown) else None
+
+    def run(self) -> None:
+        """Light frames until told to stop. A failure of a source is told to the viewers; another source may follow."""
+        controls = self._controls
+        while not controls.stopped:
+            try:
+                with controls.feed.source as source:
+                    self._run_source(source)
+            except Exception as error:
+                self._notify(failure(error, "no more frames come from this source"))
+            controls.wait()
+            controls.adopt()
+
+    def _run_source(self, source: Source) -> None:
+        due, previous = time.monotonic(), 0.0
+        start: float | None = None
+        still: Frame | None = None
+        if words := tell_missing_poses(self._controls.wanted.scene.pose, source):
+            self._notify(notice(words))
+        for frame in source:
+            if still is None or frame.exposure_time in (None, *source.exposures[:1]):
+                still = frame  # a held picture is one of those that are shown
+            if start is None:
+                start = self._base - frame.time  # the pipeline's clock never runs back
+            if not source.live:
+                # A recorded frame waits until it is due; one that is late moves all that follow.
+                due = max(due + max(frame.time - previous, 0.0), time.monotonic())
+                previous = frame.time
+                self._controls.wait(max(due - time.monotonic(), 0.0))
+            if not (self._light_frame(frame, frame.time + start) and self._hold(still, frame.time + start)):
+                return
+            if self._frames is not None and self._lit >= self._frames:
+                self._controls.stop()
+                return
+
+    def _hold(self, frame: Frame, now: float) -> bool:
+        """Rest while nobody watches; while held, light the same frame again after edits. False to leave the source."""
+        controls = self._controls
+        while True:
+            with controls.changed:
+                idle = controls.watchers == 0 and self._frames is None
+                if controls.leaving:
+                    return False
+                if controls.playing and not idle:
+                    return True
+                seen = controls.edits
+                controls.changed.wait_for(
+                    lambda seen=seen, idle=idle: (  # type: ignore[misc]
+                        controls.leaving or controls.edits != seen or (controls.playing and not idle)
+                    ),
+                    timeout=self._rest(idle),
+                )
+            if controls.watchers == 0:
+                self._lighting.follow()  # the wanted pipeline is to be there when somebody comes
+            elif not controls.playing and not (self._converge() or self._light_frame(frame, now)):
+                return False
+
+    def _rest(self, idle: bool) -> float | None:
+        """Return seconds until a held frame is looked at again; None waits for somebody to come."""
+        if idle and not self._lighting.busy:
+            return None
+        if not idle and self._progress() == "running":
+            return 0.0
+        return _BUILDING_SECONDS if self._lighting.busy else _STILL_SECONDS
+
+    def _held(self) -> tuple[Wanted, int, float]:
+        """Return the identity of a held picture, the frame's own time included; the reference of another is dropped."""
+        return self._controls.wanted, self._plan, self._at
+
+    def _progress(self) -> str:
+        """Return the reference's progress for the held frame; empty where none is asked for, or lighting changes."""
+        controls, latest = self._controls, self.latest
+        asked = controls.compare in CONVERGING and not controls.playing and latest is not None and latest.plan != 0
+        return self.convergence.progress(self._held()) if asked and not self._lighting.changing else ""
+
+    def _converge(self) -> bool:
+        """Add a slice of samples, and hand out the picture; False where the frame is to be lit instead.
+
+        At rest the picture stays that of the reference: lit again, it would have light that came in meanwhile.
+        """
+        progress, compare, latest = self._progress(), self._controls.compare, self.latest
+        if latest is None or not progress:
+            return False
+        shows = compare != self._compared
+        if progress == "running":
+            try:
+                shows = self.convergence.step()
+            except Exception as error:
+                self._notify(failure(error, "the picture goes on without a reference"))
+                return True
+        if shows:
+            self._id += 1
+            other, self._compared = self.convergence.other(self._held(), compare), compare
+            self.latest = dataclasses.replace(latest, id=self._id, taken=time.monotonic(), stamp=None, other=other)
+            self._publish(self.latest)
+        return True
+
+    def _compare_with(self, pipeline: Pipeline, frame: Frame, result: Result, now: float) -> Image | None:
+        """Return the picture that the lit one is compared with."""
+        controls, lighting = self._controls, self._lighting
+        converges = controls.compare in CONVERGING
+        if not converges or controls.playing or lighting.changing:
+            self.convergence.drop()
+        elif result.pose is not None:
+            self.convergence.begin(self._held(), pipeline, frame.image, result, now, lighting.builder)
+        self._compared = controls.compare
+        if converges:
+            return self.convergence.other(self._held(), controls.compare)
+        start, other = time.perf_counter(), lighting.other(frame, now)
+        if other is not None and controls.playing and controls.compare in PRESETS:
+            self._budget.note(controls.compare, (time.perf_counter() - start) * 1e3)
+        return other
+
+    def _light_frame(self, frame: Frame, now: float) -> bool:
+        """Light one frame and hand it out; False to leave the source."""
+        if self._controls.leaving:
+            return False
+        begin = time.perf_counter()
+        self._at = now  # seconds on the pipeline's clock, which never runs back: another frame has another
+        pushed = self._camera.begin(frame.image, self._busy_ms)
+        plain = self._plain(frame, pushed)
+        self._calibration.look(frame.image)
+        pipeline = self._lighting.follow()
+        if self._lighting.swaps != self._plan:
+            self._plan = self._lighting.swaps
+            self._budget.restart()
+        lit = plain
+        try:
+            if pipeline is not None and pipeline.size == (frame.image.shape[1], frame.image.shape[0]):
+                lit = self._lit_by(pipeline, frame, now, plain)
+        except Exception as error:
+            self._tell_failure(error)
+        self.latest, self._hits = lit, None
+        if lit.plan and pipeline is not None and "hit_object" in pipeline.arrays:
+            self._hits = pipeline.arrays["hit_object"], pipeline.scene
+        self._times.append(time.monotonic())
+        if lit.plan:
+            self._lighting.note_lit()
+            self._setup.note(frame.image, lit.state, lit.pose, self._times[-1], rests=self._calibration.on)
+        self._publish(lit)
+        self._busy_ms = (time.perf_counter() - begin) * 1e3
+        if self._budget.measuring:
+            self._controls.wait(_MEASURING_REST)
+        return True
+
+    def _tell_failure(self, error: Exception) -> None:
+        """Tell why a frame is not lit. After a fault, the edit since the last lit frame is taken back.
+
+        An error of the program's own, such as of an exposure that was not announced, says nothing of the edit.
+        """
+        taken_back = not isinstance(error, WarpArError) and self._lighting.take_back()
+        if taken_back or time.monotonic() - self._notice_time > _NOTICE_SECONDS:
+            self._notice_time = time.monotonic()
+            then = "the edit is taken back and the frames go on" if taken_back else "the frames go on"
+            self._notify(failure(error, then))
+
+    def _lit_by(self, pipeline: Pipeline, frame: Frame, now: float, plain: Lit) -> Lit:
+        """Return the lit frame."""
+        start = time.perf_counter()
+        pose = given_pose(pipeline.scene.pose, frame)
+        result = pipeline(frame.image, time_seconds=now, pose=pose, exposure_time=frame.exposure_time)
+        image = result.image
+        light_ms = (time.perf_counter() - start) * 1e3
+        self.seconds = float(pipeline.arrays["seconds"]())
+        self._base = now + 1.0 / PLAY_RATE
+        self._lit += 1
+        other = self._compare_with(pipeline, frame, result, now)
+        self._look_at_light(pipeline)
+        self._watch_cost(pipeline, frame, result, light_ms)
+        return dataclasses.replace(
+            plain,
+            image=image,
+            other=other,
+            pose=result.pose,
+            state=result.state,
+            camera=pipeline.camera,
+            stages=tuple((name, round(t.milliseconds, 3), t.skipped) for name, t in result.stages.items()),
+            light_ms=light_ms,
+            plan=self._plan,
+        )
+
+    def _plain(self, frame: Frame, pushed: Pushed | None) -> Lit:
+        """Return a frame as the camera gave it, for viewers to see meanwhile; it is stamped here, before lighting."""
+        self._id += 1
+        taken, stamp = time.monotonic(), None
+        if pushed is not None:
+            taken, stamp = pushed.taken, pushed.stamp
+        elif self._controls.feed.source.live and self._controls.playing:
+            taken = self._controls.feed.source.start + frame.time  # a frame that waited for the one before is older
+        camera = self._controls.camera_of(self._controls.feed)
+        size = frame.image.shape[1], frame.image.shape[0]
+        if (camera.width, camera.height) != size:
+            camera = guessed_camera(*size)
+        return Lit(self._id, taken, stamp, frame.image, None, frame.image, None, None, camera, (), 0.0, 0)
+
+    def _look_at_light(self, pipeline: Pipeline) -> None:
+        now = time.monotonic()
+        if now - self._light_time < _LIGHT_SECONDS:
+            return
+        self._light_time = now
+        arrays = pipeline.arrays
+        if (light := arrays.get("environment")) is None:
+            self.light_state = None
+            return
+        with exclusive(pipeline.device):
+            values = np.array(light.numpy())
+            others = arrays.get("others_environment")
+            others = () if others is None else tuple(np.array(others.numpy()))
+            scale = arrays.get("expose_scale")
+            exposure = 1.0 if scale is None else float(scale.numpy()[0])
+        known = arrays.get("recover_status", dict)()
+        places = tuple(probe.center for probe in pipeline.scene.probes[: len(others) + 1])
+        seen = values.any()  # black until the ball has been seen once
+        self.light_state = LightState(values, exposure, known, others, places) if seen else None
+
+    def _watch_cost(self, pipeline: Pipeline, frame: Frame, result: Result, light_ms: float) -> None:
+        """Learn what the preset costs; under a budget, choose the methods that it asks for."""
+        if not result.shown or (result.pose is None and pipeline.plan.needs("pose")):
+            return
+        controls, budget = self._controls, self._budget
+        wanted = controls.wanted
+        # A held frame changes nothing, a pipeline on its way out says nothing about the next one.
+        steady = not self._lighting.changing and controls.playing and pipeline.quality == wanted.shown_quality()
+        budget.look(pipeline, frame.image, result.pose, self._lighting.builder)
+        chosen = budget.observe(wanted.quality.name, light_ms if steady else None)
+        if chosen is not None and chosen != wanted.quality:
+            budget.forget_costs(chosen.name)
+            controls.change(lambda w: dataclasses.replace(w, quality=chosen) if w.quality.name == AUTO else w)

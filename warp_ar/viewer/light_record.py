@@ -1,30 +1,34 @@
-"""What ``/light.json`` says: harmonics of the environment, its key light, what is known of both. Loads Warp."""
+"""Content of ``/light.json``: harmonics of the environment, its key light, what is known of both. Loads Warp."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
-from typing import Any, Final
+import tempfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from warp_ar.errors import UsageError
-from warp_ar.kernels.environment.irradiance import cosine_lobe
 from warp_ar.light.captured import find_emitters, latlong_directions, texel_solid_angles
-from warp_ar.output.environment_axes import CUBES, FACES, check_axes, to_cube, world_from_marker
-from warp_ar.output.environment_file import write_environment
-from warp_ar.output.environment_harmonics import BASIS, project_radiance
-from warp_ar.output.radiance_hdr import encode_hdr
+from warp_ar.output.environment_axes import (
+    BASIS,
+    CUBES,
+    FACES,
+    LOBE,
+    check_axes,
+    project_radiance,
+    to_cube,
+    world_from_marker,
+)
+from warp_ar.output.environment_file import encode_hdr, write_environment
 from warp_ar.scene import Pose
 from warp_ar.signature import PROGRAM
-from warp_ar.viewer.camera import written
-
-_DEGREES: Final = (0, 1, 1, 1, 2, 2, 2, 2, 2)
-_LOBE: Final = np.array([cosine_lobe(degree) for degree in _DEGREES])
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class LightState:
     """The light of a moment."""
 
@@ -33,15 +37,15 @@ class LightState:
     exposure: float
     """Factor on the picture's radiance."""
     recovery: Mapping[str, Any]
-    """What recovered light rests on, of ``recover``; empty where it does not run."""
+    """Status of ``recover``; empty where it does not run."""
     others: tuple[npt.NDArray[np.float32], ...] = ()
     """The same light at each mirror ball after the first, where it is interpolated."""
     places: tuple[tuple[float, float, float], ...] = ()
-    """Where all those balls stand, the first one too, metres in the marker's frame."""
+    """Centres of all those balls, the first one too, metres in the marker's frame."""
 
 
 def describe(state: LightState, pose: Pose | None, axes: str) -> dict[str, Any]:
-    """What ``/light.json`` says.
+    """Return the content of ``/light.json``.
 
     Args:
         state: The light.
@@ -53,17 +57,16 @@ def describe(state: LightState, pose: Pose | None, axes: str) -> dict[str, Any]:
     """
     check_axes(axes)
     turn = world_from_marker(axes)
-    coefficients = project_radiance(state.radiance, axes)
-    several = {"balls": _balls(state, turn, axes)} if state.others else {}
+    lights = [_describe_ball(radiance, turn, axes) for radiance in (state.radiance, *state.others)]
+    places = [(turn @ np.array(place)).tolist() for place in state.places]
+    several = {"balls": [{"at": at, **light} for at, light in zip(places, lights, strict=True)]} if state.others else {}
     return {
         "program": PROGRAM,
         "type": "light",
         "axes": axes,
         "world_from_marker": turn.ravel().tolist(),
         "basis": list(BASIS),
-        "radiance": coefficients.tolist(),
-        "irradiance": (coefficients * _LOBE[:, None]).tolist(),
-        "key": key_light(state.radiance, turn),
+        **lights[0],
         **several,
         "interval": _interval(state.recovery),
         "exposure": state.exposure,
@@ -72,24 +75,14 @@ def describe(state: LightState, pose: Pose | None, axes: str) -> dict[str, Any]:
     }
 
 
-def _balls(state: LightState, turn: npt.NDArray[np.float64], axes: str) -> list[dict[str, Any]]:
-    """The light at every mirror ball, the first one's too, and where it stands."""
-    told = []
-    for place, radiance in zip(state.places, (state.radiance, *state.others), strict=True):
-        coefficients = project_radiance(radiance, axes)
-        told.append(
-            {
-                "at": (turn @ np.array(place)).tolist(),
-                "radiance": coefficients.tolist(),
-                "irradiance": (coefficients * _LOBE[:, None]).tolist(),
-                "key": key_light(radiance, turn),
-            }
-        )
-    return told
+def _describe_ball(radiance: npt.NDArray[np.float32], turn: npt.NDArray[np.float64], axes: str) -> dict[str, Any]:
+    coefficients = project_radiance(radiance, axes)
+    irradiance = (coefficients * LOBE[:, None]).tolist()
+    return {"radiance": coefficients.tolist(), "irradiance": irradiance, "key": key_light(radiance, turn)}
 
 
 def key_light(radiance: npt.NDArray[np.float32], turn: npt.NDArray[np.float64]) -> dict[str, Any] | None:
-    """The emitter that brings most: where it is, what it brings, how far the light goes its way; None of no emitter.
+    """Return the strongest emitter: direction, irradiance, extent and directionality; None if there is none.
 
     ``directionality`` is clamp(2 V . s / phi, 0, 1) with the flow V = integral of L d and phi = integral of L: 0 where
     light comes from everywhere, 1 for a sun in the dark.
@@ -112,7 +105,7 @@ def key_light(radiance: npt.NDArray[np.float32], turn: npt.NDArray[np.float64]) 
 
 
 def _interval(recovery: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Irradiance along the marker's axes and the interval that it lies in; None where light is not recovered."""
+    """Return irradiance along the marker's axes and its interval; None where light is not recovered."""
     if "irradiance_value" not in recovery:
         return None
     values = {name: recovery[f"irradiance_{name}"] for name in ("low", "value", "high")}
@@ -120,7 +113,7 @@ def _interval(recovery: Mapping[str, Any]) -> dict[str, Any] | None:
 
 
 def encode_picture(state: LightState, kind: str, axes: str, layout: str, size: int | None, ball: int = 0) -> bytes:
-    """The environment at a ball as an ``exr`` or ``hdr``; arguments and errors as those of `write_environment`."""
+    """Return the environment at a ball as ``exr`` or ``hdr``; arguments and errors as those of `write_environment`."""
     radiance = _at_ball(state, ball)
     return written(f"light.{kind}", lambda path: write_environment(path, radiance, axes=axes, layout=layout, size=size))
 
@@ -133,9 +126,17 @@ def _at_ball(state: LightState, ball: int) -> npt.NDArray[np.float32]:
 
 
 def encode_face(state: LightState, axes: str, size: int | None, face: str, ball: int = 0) -> bytes:
-    """One face of the cube, of ``FACES``, as HDR; arguments and errors as those of `to_cube`."""
+    """Return one face of the cube, of ``FACES``, as HDR; arguments and errors as those of `to_cube`."""
     check_axes(axes, "cube")
     column = to_cube(_at_ball(state, ball), axes, size)
     edge, number = column.shape[1], FACES.index(face)
     picture = np.ascontiguousarray(column[number * edge : (number + 1) * edge])
     return encode_hdr(picture, CUBES[axes])
+
+
+def written(name: str, write: Callable[[Path], object]) -> bytes:
+    """Return what ``write`` writes into a file of that name, which is gone afterwards."""
+    with tempfile.TemporaryDirectory(prefix="warp_ar_live_") as folder:
+        path = Path(folder) / name
+        write(path)
+        return path.read_bytes()

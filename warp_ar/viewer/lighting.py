@@ -1,17 +1,28 @@
-"""The page's pipelines: one lights the frames, one more what they are compared with; both follow what is wanted."""
+"""The page's pipelines: one lights the frames, one more what they are compared with; both follow what is wanted.
+
+The reference of a held frame is path-traced a slice of samples at a time, in the light, pose and scene of the frame as
+it was lit last. Whatever moves on (frames that flow, an edit, another plan) drops it, and the next held frame begins
+anew.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
 import threading
+import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, Final
 
-from warp_ar.device import resolve_device
+import cv2
+import numpy as np
+
+from warp_ar.accuracy.known_frame import KnownFrame, exposed_scene, light_of
+from warp_ar.accuracy.path_tracer import PathTracer, TracedPicture
+from warp_ar.device import exclusive, resolve_device
 from warp_ar.engine.graph import Plan, make_plan
-from warp_ar.engine.pipeline import Pipeline
+from warp_ar.engine.pipeline import Pipeline, Result
 from warp_ar.engine.switcher import PipelineSwitcher, Target
 from warp_ar.errors import WarpArError
 from warp_ar.output.report import left_out, stage_names
@@ -20,21 +31,21 @@ from warp_ar.sources.sources import Frame
 from warp_ar.stages import STAGES
 from warp_ar.stages.quality import PRESETS
 from warp_ar.stages.request import Request
-from warp_ar.viewer.camera import Image
-from warp_ar.viewer.controls import CAMERA, Controls, Feed
+from warp_ar.tracking.tracking import given_pose
+from warp_ar.viewer.controls import CAMERA, TRACED, Controls, Feed, Image
 from warp_ar.viewer.edits import Wanted
-from warp_ar.viewer.messages import Notify, failure, notice
+from warp_ar.viewer.protocol import Notify, failure, notice
 
 FIRST: Final = dataclasses.replace(
     PRESETS["low"].with_methods(recover="white_card", environment_shadow="none"), name="the first picture"
 )
-"""What lights a scene until the wanted plan is built: ``low`` without what takes long to compile."""
+"""Quality until the wanted plan is built: ``low`` without what takes long to compile."""
 _AS_QUICK: Final = ("low", "paper")
 """Presets that are not worth waiting for in two steps."""
 
 
 def make_target(wanted: Wanted, feed: Feed) -> Target:
-    """What a pipeline is built for."""
+    """Return the target that a pipeline is built for."""
     camera = wanted.camera_of(feed.source.size) or feed.camera or wanted.scene.camera
     scene = dataclasses.replace(wanted.shown_scene(), camera=camera)
     # The page draws handles where parts are: that takes the pose, even where no stage does.
@@ -49,9 +60,9 @@ class Lighting:
         """Start without a pipeline.
 
         Args:
-            controls: What is wanted.
+            controls: State that viewers want to see.
             device: ``auto``, ``cpu`` or ``cuda:N``.
-            notify: Takes what viewers should know.
+            notify: Takes news for viewers.
             give_up: Called when what is wanted cannot be built, before what was good is wanted again.
 
         Raises:
@@ -81,7 +92,7 @@ class Lighting:
         self._bracket_notes: tuple[str, ...] = ()
         self._progress: tuple[str, int, int] | None = None
         self.plan: Plan | None = None
-        """What lights the frames."""
+        """Plan by which the frames are lit."""
 
     @property
     def swaps(self) -> int:
@@ -90,22 +101,22 @@ class Lighting:
 
     @property
     def busy(self) -> bool:
-        """Whether a pipeline is being built."""
+        """True while a pipeline is being built."""
         return self.changing or self._second.busy
 
     @property
     def changing(self) -> bool:
-        """Whether the frames are about to be lit by another pipeline."""
+        """True while the frames are about to be lit by another pipeline."""
         followed = self._followed
         return not self._settled or followed is None or followed[0] is not self._controls.wanted
 
     @property
     def compare_ready(self) -> bool:
-        """Whether what the picture is compared with is there."""
+        """True if the picture to compare with is there."""
         return self._controls.compare in ("", CAMERA) or self._second.pipeline is not None
 
     def doing(self) -> dict[str, Any] | None:
-        """What is being built, for a line on the page; None while nothing is."""
+        """Return the pipeline that is being built, for a line on the page; None while none is."""
         if not self.busy:
             return None
         then = self._then  # once: the thread of the frames sets it
@@ -122,9 +133,9 @@ class Lighting:
         self._first = dataclasses.replace(now, quality=FIRST) if elsewhere else None
 
     def follow(self) -> Pipeline | None:
-        """The pipeline for the next frame; None where none is built that shows this scene.
+        """Return the pipeline for the next frame; None where none is built that shows this scene.
 
-        What cannot be built is undone and told.
+        An edit that cannot be built is undone and told.
         """
         controls = self._controls
         with controls.changed:
@@ -205,14 +216,15 @@ class Lighting:
             self._progress = None
 
     def other(self, frame: Frame, now: float) -> Image | None:
-        """What the picture is compared with; None without a comparison, or until it is built."""
+        """Return the picture to compare with; None without a comparison, or until it is built."""
         if self._controls.compare == CAMERA:
             return frame.image
         pipeline = self._second.pipeline
         if pipeline is None or pipeline.size != (frame.image.shape[1], frame.image.shape[0]):
             return None
         with contextlib.suppress(WarpArError):
-            return pipeline(frame.image, time_seconds=now, exposure_time=frame.exposure_time).image
+            pose = given_pose(pipeline.scene.pose, frame)
+            return pipeline(frame.image, time_seconds=now, pose=pose, exposure_time=frame.exposure_time).image
         return None
 
     def plan_message(self) -> dict[str, Any]:
@@ -223,22 +235,16 @@ class Lighting:
         quality = self.plan.request.quality
         summaries = {kind.name: kind.summary for kind in STAGES} | {"track": "finds the marker and the camera's pose"}
         methods = {kind.name: list(kind.methods) for kind in STAGES if len(kind.methods) > 1}
-        run = [
-            {
-                "stage": name,
-                "method": quality.method(name),
-                "methods": methods.get(name, []),
-                "summary": summaries[name],
-            }
-            for name in stage_names(self.plan)
-        ]
-        out = [
-            {"stage": name, "reason": reason, "methods": methods.get(name, [])} for name, reason in left_out(self.plan)
-        ]
+
+        def record(name: str, **more: str) -> dict[str, Any]:
+            return {"stage": name, "methods": methods.get(name, []), **more}
+
+        run = [record(name, method=quality.method(name), summary=summaries[name]) for name in stage_names(self.plan)]
+        out = [record(name, reason=reason) for name, reason in left_out(self.plan)]
         return {**told, "quality": quality.name, "run": run, "left_out": out}
 
     def close(self, wait_seconds: float | None = None) -> bool:
-        """Let the pipelines go; what is being built is waited for, at most so many seconds. Whether it has ended."""
+        """Let the pipelines go; wait so long at most for what is being built, and return True if that has ended."""
         self._main.close(wait=False)
         self._second.close(wait=False)
         done = threading.Event()
@@ -249,6 +255,149 @@ class Lighting:
 
 
 def _place(target: Target) -> Any:
-    """What a picture is of, whatever its quality: a pipeline of another place would show nonsense."""
+    """Return the place of a picture, whatever its quality: a pipeline of another one would show nonsense."""
     scene = target.scene
     return scene.name, scene.path, scene.marker, target.size
+
+
+FULL_SCALE: Final = 0.2
+"""Difference, of full scale, that has the last colour."""
+SLICE_SECONDS: Final = 0.04
+"""Of samples, between two looks at what viewers ask for."""
+SHOWN_SECONDS: Final = 0.3
+"""Between two pictures at least."""
+LIGHT_SAMPLES: Final = 8
+"""Per pixel, by which the reflectance of proxies is found; fewer than offline, for somebody waits."""
+LEAST_SAMPLES: Final = 16
+"""Per pixel, before which an error is not believed."""
+GOAL: Final = 0.002
+"""Relative standard error at which a picture rests."""
+MOST_SAMPLES: Final = 4096
+"""Per pixel, after which it does, too."""
+
+
+def false_colors(image: Image, reference: Image) -> Image:
+    """The largest channel's difference as a colour, black at none and light yellow from FULL_SCALE on."""
+    off = np.abs(image.astype(np.int16) - reference.astype(np.int16)).max(axis=2)
+    share = np.clip(off / (255.0 * FULL_SCALE), 0.0, 1.0)
+    colors = cv2.applyColorMap(np.round(255.0 * share).astype(np.uint8), cv2.COLORMAP_INFERNO)
+    return np.ascontiguousarray(colors[..., ::-1])
+
+
+def _is_done(picture: TracedPicture) -> bool:
+    """Return True if no more samples are added."""
+    if picture.samples < LEAST_SAMPLES:
+        return False
+    return picture.samples >= MOST_SAMPLES or picture.relative_error <= GOAL
+
+
+class Convergence:
+    """Follows paths of one held frame. The thread of the frames calls it; ``status`` may be read by any."""
+
+    def __init__(self) -> None:
+        self._key: Any = None
+        self._made: Future[PathTracer] | None = None
+        self._picture: TracedPicture | None = None
+        self._lit: Image | None = None
+        self._shown = 0.0
+        self.status: dict[str, float] | None = None
+        """Record for viewers; None while there is no picture."""
+
+    def begin(
+        self,
+        key: Any,
+        pipeline: Pipeline,
+        frame: Image,
+        result: Result,
+        seconds: float,
+        builder: ThreadPoolExecutor,
+    ) -> None:
+        """Trace a frame that was just lit, unless it is the one in hand.
+
+        Args:
+            key: Identity of the picture; another one begins anew.
+            pipeline: That lit it.
+            frame: As the camera gave it.
+            result: The pipeline's result of it.
+            seconds: On the pipeline's clock: where what is animated stands.
+            builder: Compiles, uploads and takes the first sample beside the frames.
+        """
+        if key == self._key:
+            return
+        assert result.pose is not None
+        self.drop()
+        with exclusive(pipeline.device):
+            light, scene = light_of(pipeline), exposed_scene(pipeline)
+        known = KnownFrame(
+            scene, frame.copy(), result.image, result.pose, light, seconds, 0.0, pipeline.plan.features.others + 1
+        )
+        self._key, self._lit = key, result.image
+
+        def make() -> PathTracer:
+            tracer = known.tracer(device=str(pipeline.device), light_samples=LIGHT_SAMPLES)
+            # All kernels are compiled here, so that no slice waits for that; what is dropped meanwhile ends.
+            while self._key is key and not tracer.sample_for(SLICE_SECONDS):
+                pass
+            if tracer.samples > 0:
+                tracer.picture()
+            return tracer
+
+        self._made = builder.submit(make)
+
+    def drop(self) -> None:
+        """Forget the picture: something moves on."""
+        if self._made is not None:
+            self._made.cancel()
+        self._key = self._made = self._picture = self._lit = self.status = None
+
+    def progress(self, key: Any) -> str:
+        """Return "running" or "done" for the picture of ``key``; empty where there is none."""
+        if key != self._key or (self._made is None and self._picture is None):
+            return ""
+        if self._picture is not None and _is_done(self._picture):
+            return "done"
+        return "running" if self._made is not None else ""
+
+    def step(self) -> bool:
+        """Add a slice of samples; return True if there is a new picture to show.
+
+        Raises:
+            Exception: The frame cannot be traced, such as on a device whose memory is full; it is not tried again.
+        """
+        made = self._made
+        if made is None or not made.done():
+            time.sleep(0.5 * SLICE_SECONDS)
+            return False
+        try:
+            tracer = made.result()
+            tracer.sample_for(SLICE_SECONDS)
+        except Exception:
+            self._made = None  # the picture goes on without a reference
+            raise
+        now = time.monotonic()
+        if tracer.samples < 1 or now - self._shown < SHOWN_SECONDS:
+            return False
+        picture, lit = tracer.picture(), self._lit
+        if lit is None:
+            return False
+        self._shown, self._picture, self.status = now, picture, self._told(picture, lit)
+        return True
+
+    def other(self, key: Any, compare: str) -> Image | None:
+        """Return the picture to compare with; None until there is one."""
+        picture, lit = self._picture, self._lit
+        if key != self._key or picture is None or lit is None:
+            return None
+        return picture.image if compare == TRACED else false_colors(lit, picture.image)
+
+    def _told(self, picture: TracedPicture, lit: Image) -> dict[str, float]:
+        """Samples, relative standard error and mean difference of the picture; all but the first in per cent."""
+        off = float(cv2.norm(lit, picture.image, cv2.NORM_L1)) / lit.size
+        return {
+            "samples": picture.samples,
+            "error": round(100.0 * picture.relative_error, 2),
+            "goal": 100.0 * GOAL,
+            "done": _is_done(picture),
+            "difference": round(100.0 * off / 255.0, 3),
+            "scale": 100.0 * FULL_SCALE,
+        }

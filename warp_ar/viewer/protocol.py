@@ -1,4 +1,4 @@
-"""Messages between the page and the server.
+"""Messages between the page and the server, with notices and failures for viewers.
 
 From the page come text messages, JSON objects with a ``type``, and binary messages, pictures of the browser's camera.
 Nothing that comes in is trusted: a message that is not exactly one of ``_MESSAGES`` raises ``ProtocolError``, whose
@@ -10,15 +10,20 @@ header, then the pictures that it names, one after another.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import math
+import re
 import struct
+import sys
+import traceback
 from collections.abc import Callable, Mapping
+from concurrent.futures import Executor, Future
 from typing import Any, Final
 
-from warp_ar.errors import WarpArError
-from warp_ar.pictures import jpeg_segments
+from warp_ar.errors import WarpArError, reason
+from warp_ar.pictures import picture_size
 
 SCHEMA: Final = 3
 """Version of the messages, told in ``hello``; it grows when keys change."""
@@ -26,6 +31,8 @@ MAX_TEXT: Final = 4096
 """Longest text message from a page in bytes: an edit takes under 200."""
 MAX_PICTURE: Final = 1 << 20
 """Largest binary message from a page in bytes: a JPEG of 1920x1080 at quality 0.85 takes half of that."""
+MOST_BYTES: Final = 1 << 26
+"""Of one file that is dropped onto the picture: 64 MB."""
 SMALLEST_CAMERA: Final = (64, 48)
 LARGEST_CAMERA: Final = (1920, 1080)
 
@@ -71,67 +78,67 @@ class Picture:
     jpeg: bytes
 
 
-def _number(low: float, high: float) -> Callable[[Any], float]:
-    def check(value: Any) -> float:
-        if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
-            raise ProtocolError(f"expected a number from {low:g} to {high:g}")
-        return float(value)
+Check = Callable[[Any], Any]
+"""Function that returns a value of a message as the program takes it, or raises a ProtocolError."""
+
+
+def _expect(fits: bool, words: str) -> None:
+    if not fits:
+        raise ProtocolError(f"expected {words}")
+
+
+def _number(low: float, high: float, kind: type = float) -> Check:
+    words = f"a {'whole ' if kind is int else ''}number from {low:g} to {high:g}"
+
+    def check(value: Any) -> Any:
+        known = isinstance(value, kind | int) and not isinstance(value, bool)
+        _expect(known and low <= value <= high, words)
+        return kind(value)
 
     return check
 
 
-def _integer(low: int, high: int) -> Callable[[Any], int]:
-    def check(value: Any) -> int:
-        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-            raise ProtocolError(f"expected a whole number from {low} to {high}")
-        return value
-
-    return check
+def _integer(low: int, high: int) -> Check:
+    return _number(low, high, int)
 
 
-def _choice(*options: str) -> Callable[[Any], str]:
+def _choice(*options: str) -> Check:
     def check(value: Any) -> str:
-        if not isinstance(value, str) or value not in options:
-            raise ProtocolError(f"expected one of {', '.join(options)}")
-        return value
+        _expect(isinstance(value, str) and value in options, f"one of {', '.join(options)}")
+        return str(value)
 
     return check
 
 
 def _name(value: Any) -> str:
-    if not isinstance(value, str) or len(value) > 64:
-        raise ProtocolError("expected a short name")
-    return value
+    _expect(isinstance(value, str) and len(value) <= 64, "a short name")
+    return str(value)
 
 
 def _flag(value: Any) -> bool:
-    if not isinstance(value, bool):
-        raise ProtocolError("expected true or false")
-    return value
+    _expect(isinstance(value, bool), "true or false")
+    return bool(value)
 
 
 def _value(value: Any) -> Any:
     """Return a scene key's value: a finite number, two or three of them, or a short word."""
     if isinstance(value, str):
         return _name(value)
-    numbers = value if isinstance(value, list) and 2 <= len(value) <= 3 else [value]
-    for number in numbers:
-        if isinstance(number, bool) or not isinstance(number, int | float) or not abs(number) <= 1e9:
-            raise ProtocolError("expected a number, two or three of them, or a word")
+    for number in value if isinstance(value, list) and 2 <= len(value) <= 3 else [value]:
+        known = isinstance(number, int | float) and not isinstance(number, bool)
+        _expect(known and abs(number) <= 1e9, "a number, two or three of them, or a word")
     return tuple(map(float, value)) if isinstance(value, list) else value
 
 
-def _optional(check: Callable[[Any], float]) -> Callable[[Any], float | None]:
+def _optional(check: Check) -> Check:
     return lambda value: None if value is None else check(value)
 
 
 def _points(value: Any) -> tuple[tuple[float, float], ...]:
     """Return four points of a picture, pixels."""
-    if not isinstance(value, list) or len(value) != 4:
-        raise ProtocolError("expected four points")
+    _expect(isinstance(value, list) and len(value) == 4, "four points")
+    _expect(all(isinstance(point, list) and len(point) == 2 for point in value), "points of two numbers")
     check = _number(-1e5, 1e5)
-    if not all(isinstance(point, list) and len(point) == 2 for point in value):
-        raise ProtocolError("expected points of two numbers")
     return tuple((check(x), check(y)) for x, y in value)
 
 
@@ -139,16 +146,22 @@ _INDEX = _integer(0, 63)
 _NAME = {"name": _name}
 _ON = {"on": _flag}
 
-_MESSAGES: Final[Mapping[str, Mapping[str, Callable[[Any], Any]]]] = {
+_MESSAGES: Final[Mapping[str, Mapping[str, Check]]] = {
     # The frame of this number is on the screen.
     "ack": {"id": _integer(0, 1 << 53)},
     # Asks for the server's clock; ``sent`` comes back.
     "ping": {"sent": _number(0.0, 1e15)},
+    # Asks for the object that is seen at a pixel, or nearest to it within a reach, pixels; all comes back.
+    "pick": {"x": _number(-1e5, 1e5), "y": _number(-1e5, 1e5), "reach": _number(0.0, 64.0)},
     # Gives a key of a scene's part a value, as the scene file would.
     "set": {"part": _choice(*PARTS), "index": _INDEX, "key": _name, "value": _value},
     # Changes how an object plays an animation of its file; a flag is 0 or 1.
     "animate": {"index": _INDEX, "key": _choice(*ANIMATED), "value": _number(-1.0, 1e3)},
     "add": {"part": _choice(*KINDS), "kind": _name},
+    # Adds another object, light or proxy that is as one of the scene's, beside it.
+    "duplicate": {"part": _choice(*KINDS), "index": _INDEX},
+    # Puts an object's lowest point on the desk.
+    "snap": {"index": _INDEX},
     "remove": {"part": _choice(*KINDS), "index": _INDEX},
     "show": {"part": _choice(*KINDS), "index": _INDEX, **_ON},
     "effect": {"name": _choice(*EFFECTS), **_ON},
@@ -178,7 +191,6 @@ _MESSAGES: Final[Mapping[str, Mapping[str, Callable[[Any], Any]]]] = {
     "no_camera": {},
     # Looks out for the printed board, leaves it at that, or uses what was seen.
     "calibrate": {"step": _choice("start", "stop", "finish")},
-    "record": _ON,
 }
 
 
@@ -234,24 +246,10 @@ def parse_picture(data: bytes, size: tuple[int, int]) -> Picture:
     if not (math.isfinite(taken) and 0.0 <= taken <= 1e15):
         raise ProtocolError("picture has no sensible time")
     jpeg = data[_PICTURE_HEADER.size :]
-    if (found := jpeg_size(jpeg)) != size:
+    if (found := picture_size(jpeg) if jpeg.startswith(b"\xff\xd8") else None) != size:
         got = "no JPEG" if found is None else f"{found[0]}x{found[1]}"
         raise ProtocolError(f"picture is {got}, not the {size[0]}x{size[1]} that was announced")
     return Picture(number, taken, jpeg)
-
-
-def jpeg_size(data: bytes) -> tuple[int, int] | None:
-    """Return width and height in the header of a JPEG of three 8-bit components; None if it is none."""
-    if data[:2] != b"\xff\xd8":
-        return None
-    for marker, at in jpeg_segments(data):
-        # Start of frame: baseline, extended and progressive Huffman; the other kinds no browser writes.
-        if marker in (0xC0, 0xC1, 0xC2):
-            if at + 10 > len(data) or data[at + 4] != 8 or data[at + 9] != 3:
-                return None
-            height, width = struct.unpack_from(">HH", data, at + 5)
-            return (width, height) if width and height else None
-    return None
 
 
 def pack(header: Mapping[str, Any], *pictures: bytes) -> bytes:
@@ -274,3 +272,54 @@ class Bucket:
             return False
         self._left -= amount
         return True
+
+
+Notify = Callable[[dict[str, Any]], None]
+"""Receiver of a message for all viewers, called on any thread."""
+
+_LONGEST: Final = 400
+"""Characters of a notice about a fault: an exception's text may be a whole file."""
+_FOLDERS: Final = re.compile(r"(?<![\w:/.])(?:[A-Za-z]:\\|/)(?:[^\s/\\:;,'\"()]+[/\\])+")
+"""Folders of an absolute path: those of this machine are not for viewers; the file's name stays."""
+
+
+def notice(text: str, *, bad: bool = False) -> dict[str, Any]:
+    """Return a notice; ``bad`` marks a refusal or a failure."""
+    return {"type": "notice", "text": text, "bad": bad}
+
+
+def failure(error: BaseException, then: str = "the frames go on") -> dict[str, Any]:
+    """Return the notice for an exception; every exception of a frame or of work beside the frames comes here.
+
+    An error of the program's own says what is wrong as it stands. Any other is a fault of the program: its traceback
+    goes to the terminal, and viewers are told its type, its text and what happens next.
+
+    Args:
+        error: The exception.
+        then: Words for the next step, where the error is a fault.
+    """
+    if isinstance(error, WarpArError):
+        return notice(_FOLDERS.sub("", str(error)), bad=True)
+    with contextlib.suppress(OSError, ValueError):  # nobody may read it any more
+        traceback.print_exception(error, file=sys.stderr)
+    words = _FOLDERS.sub("", reason(error)[:_LONGEST])
+    return notice(f"this failed: {type(error).__name__}: {words}; {then}", bad=True)
+
+
+def begin(helper: Executor, notify: Notify, work: Callable[..., None], *arguments: Any) -> Future[None]:
+    """Run work beside the frames; an error that it does not catch itself becomes a notice.
+
+    Args:
+        helper: Executor that runs it.
+        notify: Receiver of the notice, called on the helper's thread.
+        work: Function to run.
+        *arguments: Arguments of ``work``.
+    """
+
+    def tell(future: Future[None]) -> None:
+        if not future.cancelled() and (error := future.exception()) is not None:
+            notify(failure(error))
+
+    future = helper.submit(work, *arguments)
+    future.add_done_callback(tell)
+    return future

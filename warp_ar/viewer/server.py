@@ -1,8 +1,17 @@
-"""Serves the page, over HTTP and one WebSocket per viewer.
+"""Server of the page, over HTTP and one WebSocket per viewer.
 
 A viewer is sent a frame only after it has shown an earlier one: two are under way at most, and the newest wins.
 Pictures are encoded once for all viewers, and only if one is ready for them. Nothing that a viewer sends is trusted;
-one that breaks the rules is dropped with a reason, and no other notices.
+one that breaks the rules is dropped with a reason, and no other notices. Other programs ask for the light:
+
+    GET /light.json                 harmonics, key light, interval, exposure, pose
+    GET /light.exr, /light.hdr      the environment: ``?axes=``, ``?layout=cube``, ``?size=``, ``?ball=``
+    GET /light/px.hdr ... nz.hdr    one face of the cube
+    WS  /light                      the same JSON, when it has changed; text, no answer expected
+
+All take ``?axes=`` (z-up, blender, opengl, and the default, y-up) and the token as the page does. Who asks counts as a
+viewer for some seconds, so that frames are lit though nobody looks at the page. ``light_record``, which makes the
+answers, loads Warp, for which the page does not wait.
 """
 
 from __future__ import annotations
@@ -12,78 +21,130 @@ import contextlib
 import dataclasses
 import functools
 import hmac
+import html
+import importlib.resources
+import io
 import json
-import socket
-import threading
+import secrets
 import time
 from collections.abc import Awaitable, Callable
-from typing import TYPE_CHECKING, Any, Final
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import cv2
 import numpy as np
 import numpy.typing as npt
+import segno
 from aiohttp import WSCloseCode, WSMsgType, web
 
-from warp_ar.errors import UsageError
+from warp_ar.errors import SinkError, UsageError, WarpArError
+from warp_ar.output.environment_axes import AXES, FACES, LAYOUTS
 from warp_ar.scene import bundled_scenes
 from warp_ar.srgb import encode_srgb
 from warp_ar.stages.quality import PRESETS
 from warp_ar.viewer import protocol
 from warp_ar.viewer.address import LOOPBACK, Address, listen
-from warp_ar.viewer.backend import MOST_VIEWERS, Backend
 from warp_ar.viewer.gate import HEADER_SECONDS, Gate
-from warp_ar.viewer.messages import failure
-from warp_ar.viewer.routes import PageFiles, SharedLight
+from warp_ar.viewer.protocol import MOST_BYTES, failure
 
 if TYPE_CHECKING:
-    from warp_ar.viewer.frames import Lit
-    from warp_ar.viewer.host import Host
+    from warp_ar.scene import Pose
+    from warp_ar.viewer.host import (
+        Host,  # loads Warp, for which the page does not wait
+        Lit,
+    )
     from warp_ar.viewer.light_record import LightState
 
+_T = TypeVar("_T")
 
 JPEG_QUALITY: Final = 85
 """At 640x480 a desk takes 60 KB; at 95 it takes twice that."""
-
-
-def encode_jpeg(image: npt.NDArray[np.uint8]) -> bytes:
-    """JPEG of an RGB picture."""
-    bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-    return bytes(cv2.imencode(".jpg", bgr, (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY))[1])
-
-
-def encode_light(light: npt.NDArray[np.float32]) -> bytes:
-    """PNG of an environment: x / (1 + x), so that what clips in the camera still shows, encoded as sRGB."""
-    value = np.maximum(light, 0.0)
-    value = value / (1.0 + value)
-    return bytes(cv2.imencode(".png", np.uint8(np.round(encode_srgb(value)[..., ::-1] * 255.0)))[1])
-
-
 IN_FLIGHT: Final = 2
 """Frames that a viewer may have unshown: one on the way while another is decoded."""
 SEND_SECONDS: Final = 20.0
-"""A viewer that takes nothing for so long is dropped."""
+"""Time after which a viewer that takes nothing is dropped."""
 STATE_SECONDS: Final = 0.5
+STOP_SECONDS: Final = 0.7
+"""Longest wait at the end for a frame in hand, and as long for pipelines that are being built."""
+MOST_VIEWERS: Final = 8
 MESSAGES_PER_SECOND: Final = 240.0
 BYTES_PER_SECOND: Final = 8e6
 """Thirty pictures a second of a camera at 1920x1080."""
-LARGEST_MESSAGE: Final = protocol.MAX_PICTURE + 64
+
+DROP_SECONDS: Final = 60.0
+"""Longest time for a dropped file to come."""
+DROPS: Final = 4
+"""Files that may be on their way at once: a slow one does not hold up the others."""
+_TYPES: Final = {
+    "html": "text/html; charset=utf-8",
+    "css": "text/css; charset=utf-8",
+    "js": "text/javascript; charset=utf-8",
+    "svg": "image/svg+xml",
+    "jpg": "image/jpeg",
+    "exr": "image/x-exr",
+    "hdr": "image/vnd.radiance",
+}
+
+
+WATCH_SECONDS: Final = 5.0
+"""Time that a request keeps frames going."""
+PUSH_SECONDS: Final = 0.1
+"""Time between two looks of the channel for changes; the light itself is looked at four times a second."""
+MOST_LISTENERS: Final = 8
+LARGEST_FACE: Final = 1024
 
 _POLICY: Final = (
     "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' blob: data:; "
     "media-src 'self' blob:; connect-src 'self' ws: wss:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
-_HEADERS: Final = {
+_RUN: Final = secrets.token_hex(4)
+"""Name of this run: a page that comes back to another one has lost its edits."""
+HEADERS: Final = {
     "Content-Security-Policy": _POLICY,
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",  # the address holds the token
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cache-Control": "no-store",
 }
+"""Headers of every answer, refusals too."""
 
 
-def own_headers() -> dict[str, str]:
-    """Headers of every answer, refusals too."""
-    return dict(_HEADERS)
+def encode_jpeg(image: npt.NDArray[np.uint8]) -> bytes:
+    """Return the JPEG of an RGB picture."""
+    bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    return bytes(cv2.imencode(".jpg", bgr, (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY))[1])
+
+
+@functools.lru_cache(maxsize=2)
+def pack_light(light: LightState | None) -> bytes:
+    """Return the message of an environment, a PNG: x / (1 + x), which shows clipped light too, encoded as sRGB."""
+    if light is None:
+        return protocol.pack({"type": "light", "known": False}, b"")
+    value = np.maximum(light.radiance, 0.0)
+    codes = np.uint8(np.round(encode_srgb(value / (1.0 + value))[..., ::-1] * 255.0))
+    return protocol.pack({"type": "light", "known": True}, bytes(cv2.imencode(".png", codes)[1]))
+
+
+@functools.lru_cache(maxsize=4)
+def pack_frame(lit: Lit) -> bytes:
+    """Return the message of a frame, its pictures encoded once for all viewers."""
+    start = time.perf_counter()
+    pictures = [encode_jpeg(image) for image in (lit.image, lit.other) if image is not None]
+    camera, pose = lit.camera, lit.pose
+    header = {
+        "type": "frame",
+        "id": lit.id,
+        "taken": lit.taken * 1e3,
+        "stamp": lit.stamp,
+        "state": None if lit.state is None else lit.state.value,
+        "pose": None if pose is None else [*pose.rotation.ravel().tolist(), *pose.translation.tolist()],
+        "camera": [camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion],
+        "stages": lit.stages,
+        "light_ms": round(lit.light_ms, 3),
+        "encode_ms": round((time.perf_counter() - start) * 1e3, 3),
+        "plan": lit.plan,
+    }
+    return protocol.pack(header, *pictures)
 
 
 class _Viewer:
@@ -96,22 +157,33 @@ class _Viewer:
         self.sent = 0
         """Number of the newest frame sent."""
         self.unshown: set[int] = set()
-        self.compare = ""
         self.messages = protocol.Bucket(MESSAGES_PER_SECOND, 2 * MESSAGES_PER_SECOND)
         self.bytes = protocol.Bucket(BYTES_PER_SECOND, 2 * BYTES_PER_SECOND)
         self.picture: asyncio.Task[None] | None = None
-        self.early: list[str | bytes] | None = []
-        """What all were told while its greetings were made, which may be older; None once it has those."""
 
-    def tell(self, message: str | bytes) -> None:
+    def tell(self, message: str | bytes | dict[str, Any]) -> None:
         """Send a message when there is room for it; a viewer that lets 64 pile up misses some."""
         with contextlib.suppress(asyncio.QueueFull):
-            self.queue.put_nowait(message)
+            self.queue.put_nowait(json.dumps(message) if isinstance(message, dict) else message)
         self.wake.set()
+
+    async def send(self, message: str | bytes) -> None:
+        """Send a message now.
+
+        Raises:
+            TimeoutError: The viewer takes nothing.
+        """
+        send = self.socket.send_str if isinstance(message, str) else self.socket.send_bytes
+        await asyncio.wait_for(send(message), SEND_SECONDS)  # type: ignore[arg-type]
+
+    async def drop(self, code: int, reason: str, seconds: float = 5.0) -> None:
+        """Close the connection with a reason."""
+        with contextlib.suppress(ConnectionError, TimeoutError):
+            await asyncio.wait_for(self.socket.close(code=code, message=reason.encode()[:120]), seconds)
 
 
 class Server:
-    """The page of one host."""
+    """The page of one host, which is made beside the loop, and the threads that work for its requests."""
 
     def __init__(
         self, make_host: Callable[..., Host], address: Address, *, header_seconds: float = HEADER_SECONDS
@@ -120,30 +192,43 @@ class Server:
 
         Args:
             make_host: Called with ``publish`` and ``notify`` once the page is served; gives the host.
-            address: Where to serve.
-            header_seconds: How long a connection may take for a request's header.
+            address: Address to serve at.
+            header_seconds: Longest time for a request's header.
         """
+        self.address = address
+        """Address of the page; with the port that was taken, once it is served."""
+        self._make_host = make_host
+        self._host: Host | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
+        self._encoder = ThreadPoolExecutor(1, "warp-ar-encode")
+        self._hands = ThreadPoolExecutor(2, "warp-ar-page")
+        self._frames = ThreadPoolExecutor(1, "warp-ar-frames")
+        self._ending = False
         self._viewers: set[_Viewer] = set()
         self._latest: Lit | None = None
-        self._jpegs: dict[tuple[int, str], asyncio.Future[bytes]] = {}
-        self._packed_light: tuple[LightState, asyncio.Future[bytes]] | None = None
-        self._encode_ms = 0.0
-        self._make_host = make_host
         self.ended = True
-        """Whether all threads of the frames have ended; False when ``serve`` was not to wait for them."""
-        self.gate = Gate(own_headers(), header_seconds=header_seconds)
-        self.backend = Backend(address, self.gate)
+        """False if ``serve`` left a thread of the frames behind that took too long to end."""
+        self.gate = Gate(HEADERS, header_seconds=header_seconds)
         self.app = web.Application(client_max_size=1024, middlewares=[self._guard])
-        PageFiles(self.app, self.backend)
-        SharedLight(self.app, self.backend)
         self.app.on_response_prepare.append(self._add_headers)
-        self.app.add_routes([web.get("/live", self._live)])
-
-    @property
-    def address(self) -> Address:
-        """Where the page is served; with the port that was taken, once it is."""
-        return self.backend.address
+        # Read once: no request's path ever becomes a file's.
+        folder = importlib.resources.files("warp_ar.viewer") / "static"
+        self._static = {item.name: item.read_bytes() for item in folder.iterdir() if item.name.split(".")[-1] in _TYPES}
+        self._coming = self._listeners = 0
+        self._watching: asyncio.TimerHandle | None = None
+        lights = [*(f"/light.{kind}" for kind in ("json", "exr", "hdr")), *(f"/light/{name}.hdr" for name in FACES)]
+        self.app.add_routes(
+            [
+                web.get("/", self._page),
+                web.get("/static/{name}", self._page),
+                web.get("/address.svg", self._code),
+                web.get("/download/{name}", self._download),
+                web.post("/drop/{name}", self._drop),
+                web.get("/live", self._live),
+                web.get("/light", self._channel),
+                *(web.get(path, self._light) for path in lights),
+            ]
+        )
 
     # ------------------------------------------------------------------------------------------------------- admission
 
@@ -151,260 +236,339 @@ class Server:
     async def _guard(
         self, request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
     ) -> web.StreamResponse:
-        """Refuse what comes from other sites, and beyond this machine whoever does not know the token."""
-        name = (
-            request.host.rsplit(":", 1)[0].strip("[]") if not request.host.endswith("]") else request.host.strip("[]")
-        )
+        """Refuse requests from other sites, and beyond this machine those without the token."""
+        name = (request.host if request.host.endswith("]") else request.host.rsplit(":", 1)[0]).strip("[]")
+        token, public = self.address.token, request.path.startswith("/static/")
         # A foreign site that has its name resolve to this machine would pass every other check.
-        if self.address.loopback and self.address.token is None and name not in LOOPBACK:
-            return self._refuse(f"this page is at {self.address.url}")
+        if self.address.loopback and token is None and name not in LOOPBACK:
+            return self._refuse(request, f"this page is at {self.address.url}")
         origin = request.headers.get("Origin")
-        welcome = origin in self.address.origins and request.path.startswith("/light")
-        if not welcome and origin is not None and origin != f"{request.scheme}://{request.host}":
-            return self._refuse("requests from other sites are refused")
-        if (
-            not welcome
-            and request.headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin")
-            and request.path != "/"
-        ):
-            return self._refuse("requests from other sites are refused")
-        given = request.query.get("token", "")
-        public = request.path.startswith("/static/")
-        if self.address.token is not None and not public and not _same(given, self.address.token):
-            return self._refuse("a token is needed: open the whole address that the program printed")
-        if not public or self.address.token is None:
-            self.gate.admit(request)
-        with self.gate.answering(request):
+        if not self._is_welcome(request):
+            foreign = origin is not None and origin != f"{request.scheme}://{request.host}"
+            embedded = request.headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin")
+            if foreign or (embedded and request.path != "/"):
+                return self._refuse(request, "requests from other sites are refused")
+        given = request.query.get("token", "").encode("utf-8", "surrogateescape")
+        if token is not None and not public and not hmac.compare_digest(given, token.encode()):
+            return self._refuse(request, "a token is needed: open the whole address that the program printed")
+        with self.gate.answering(request, admitted=not public or token is None):
             return await handler(request)
 
-    @staticmethod
-    def _refuse(reason: str) -> web.Response:
+    def _is_welcome(self, request: web.Request) -> bool:
+        """Return True for a request for the light from a site that may have it."""
+        return request.headers.get("Origin") in self.address.origins and request.path.startswith("/light")
+
+    def _refuse(self, request: web.Request, reason: str) -> web.Response:
+        """Return a refusal: a page for who opens one, else a line."""
         response = web.Response(status=403, text=f"warp_ar: {reason}\n")
+        if "text/html" in request.headers.get("Accept", ""):
+            page = self._static["refused.html"].decode()
+            response = web.Response(
+                status=403, text=page.replace("{reason}", html.escape(reason)), content_type="text/html"
+            )
         response.force_close()
         return response
 
     async def _add_headers(self, request: web.Request, response: web.StreamResponse) -> None:
-        response.headers.update(_HEADERS)
-        origin = request.headers.get("Origin")
-        if origin in self.address.origins and request.path.startswith("/light"):
-            allowed = {"Access-Control-Allow-Origin": str(origin), "Vary": "Origin"}
+        response.headers.update(HEADERS)
+        if self._is_welcome(request):
+            allowed = {"Access-Control-Allow-Origin": request.headers["Origin"], "Vary": "Origin"}
             response.headers.update({**allowed, "Cross-Origin-Resource-Policy": "cross-origin"})
+
+    # ------------------------------------------------------------------------------------------------ the host, threads
+
+    async def started(self) -> Host:
+        """Return the host, once it is there."""
+        while self._host is None:
+            await asyncio.sleep(0.05)
+        return self._host
+
+    def aside(
+        self, function: Callable[..., _T], *arguments: Any, pool: ThreadPoolExecutor | None = None
+    ) -> asyncio.Future[_T]:
+        """Begin work that may take long beside the loop.
+
+        Raises:
+            asyncio.CancelledError: The server is ending, and its threads take nothing more.
+        """
+        if self._ending:
+            raise asyncio.CancelledError
+        loop = asyncio.get_running_loop()
+        return loop.run_in_executor(pool or self._hands, functools.partial(function, *arguments))
+
+    async def websocket(self, request: web.Request, largest: int) -> web.WebSocketResponse:
+        """Make a WebSocket of a request, whose messages have so many bytes at most."""
+        socket = web.WebSocketResponse(max_msg_size=largest, heartbeat=30.0, compress=False)
+        await socket.prepare(request)
+        self.gate.connection_of(request).deadline = float("inf")  # its heartbeat looks after it
+        return socket
 
     # ---------------------------------------------------------------------------------------------------------- frames
 
     def _publish(self, lit: Lit) -> None:
-        """On the host's thread."""
-        loop = self._loop
-        if loop is not None:
-            loop.call_soon_threadsafe(self._arrived, lit)
+        """Take a frame, on the host's thread."""
+        if self._loop is not None:
+            self._loop.call_soon_threadsafe(self._arrived, lit)
 
     def _arrived(self, lit: Lit) -> None:
         self._latest = lit
-        for key in [key for key in self._jpegs if key[0] < lit.id - 1]:
-            del self._jpegs[key]
         for viewer in self._viewers:
             viewer.wake.set()
 
     def _notify(self, message: dict[str, Any]) -> None:
-        """On any thread."""
-        loop = self._loop
-        if loop is not None:
-            loop.call_soon_threadsafe(self._tell_all, json.dumps(message))
+        """Take a message for all, on any thread."""
+        if self._loop is not None:
+            self._loop.call_soon_threadsafe(self._tell_all, json.dumps(message))
 
     def _tell_all(self, message: str | bytes) -> None:
         for viewer in self._viewers:
-            viewer.tell(message) if viewer.early is None else viewer.early.append(message)
-
-    async def _jpeg(self, lit: Lit, which: str) -> bytes:
-        """A picture of a frame, encoded when first asked for."""
-        key = (lit.id, which)
-        if key not in self._jpegs:
-            image = lit.image if which == "image" else lit.other
-
-            def encode() -> bytes:
-                start = time.perf_counter()
-                assert image is not None
-                data = encode_jpeg(image)
-                self._encode_ms = (time.perf_counter() - start) * 1e3
-                return data
-
-            self._jpegs[key] = self.backend.aside(encode, pool=self.backend.encoder)
-        return await asyncio.shield(self._jpegs[key])
-
-    async def _message(self, lit: Lit) -> bytes:
-        pictures = [await self._jpeg(lit, "image")]
-        if lit.other is not None:
-            pictures.append(await self._jpeg(lit, "other"))
-        camera, pose = lit.camera, lit.pose
-        header = {
-            "type": "frame",
-            "id": lit.id,
-            "taken": lit.taken * 1e3,
-            "stamp": lit.stamp,
-            "state": None if lit.state is None else lit.state.value,
-            "pose": None if pose is None else [*pose.rotation.ravel().tolist(), *pose.translation.tolist()],
-            "camera": [camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion],
-            "stages": lit.stages,
-            "light_ms": round(lit.light_ms, 3),
-            "encode_ms": round(self._encode_ms, 3),
-            "plan": lit.plan,
-        }
-        return protocol.pack(header, *pictures)
+            viewer.tell(message)
 
     async def _send(self, viewer: _Viewer) -> None:
-        """Send a viewer what is new, as fast as it takes it."""
-        while True:
-            await viewer.wake.wait()
-            viewer.wake.clear()
-            while not viewer.queue.empty():
-                message = viewer.queue.get_nowait()
-                send = viewer.socket.send_str if isinstance(message, str) else viewer.socket.send_bytes
-                await asyncio.wait_for(send(message), SEND_SECONDS)  # type: ignore[arg-type]
-            lit = self._latest
-            if lit is None or lit.id <= viewer.sent or len(viewer.unshown) >= IN_FLIGHT:
-                continue
-            viewer.sent = lit.id
-            viewer.unshown.add(lit.id)
-            data = await self._message(lit)
-            await asyncio.wait_for(viewer.socket.send_bytes(data), SEND_SECONDS)
-            # A newer one may have come meanwhile.
-            viewer.wake.set()
-
-    async def _send_safely(self, viewer: _Viewer) -> None:
+        """Send a viewer messages and the newest frame, as fast as it takes them."""
         try:
-            await self._send(viewer)
+            while True:
+                await viewer.wake.wait()
+                viewer.wake.clear()
+                while not viewer.queue.empty():
+                    await viewer.send(viewer.queue.get_nowait())
+                lit = self._latest
+                if lit is None or lit.id <= viewer.sent or len(viewer.unshown) >= IN_FLIGHT:
+                    continue
+                viewer.sent = lit.id
+                viewer.unshown.add(lit.id)
+                await viewer.send(await self.aside(pack_frame, lit, pool=self._encoder))
+                # A newer one may have come meanwhile.
+                viewer.wake.set()
         except (TimeoutError, ConnectionError):
-            await self._drop(viewer, WSCloseCode.POLICY_VIOLATION, "nothing was taken for too long")
+            await viewer.drop(WSCloseCode.POLICY_VIOLATION, "nothing was taken for too long")
 
-    async def _tick(self) -> None:
+    async def _tick(self, host: Host) -> None:
         """Tell viewers what changes by itself."""
         shown: LightState | None = None
         while True:
             await asyncio.sleep(STATE_SECONDS)
             if not self._viewers:
                 continue
-            self._tell_all(json.dumps(self.backend.host.state_message()))
-            light = self.backend.host.light_state
-            if light is not shown:
+            self._tell_all(json.dumps(host.state_message()))
+            if (light := host.light_state) is not shown:
                 shown = light
-                self._tell_all(await self._light_message(light))
-
-    async def _light_message(self, light: LightState | None) -> bytes:
-        """The environment as a picture, packed once for all who ask."""
-        if light is None:
-            return protocol.pack({"type": "light", "known": False}, b"")
-        if self._packed_light is None or self._packed_light[0] is not light:
-            packing = self.backend.aside(encode_light, light.radiance, pool=self.backend.encoder)
-            self._packed_light = (light, packing)
-        data = await asyncio.shield(self._packed_light[1])
-        return protocol.pack({"type": "light", "known": True}, data)
+                self._tell_all(await self.aside(pack_light, light, pool=self._encoder))
 
     # --------------------------------------------------------------------------------------------------------- viewers
 
     async def _live(self, request: web.Request) -> web.StreamResponse:
         if len(self._viewers) >= MOST_VIEWERS:
             return web.Response(status=503, text=f"{MOST_VIEWERS} viewers are here already\n")
-        if not await self.backend.may_come(request.remote or ""):
-            return web.Response(status=429, text="too many connections\n")
-        host = await self.backend.started()
-        socket = web.WebSocketResponse(max_msg_size=LARGEST_MESSAGE, heartbeat=30.0, compress=False)
-        await socket.prepare(request)
-        self.gate.upgrade(request)
-        viewer = _Viewer(socket)
-        self._viewers.add(viewer)
+        host = await self.started()
+        viewer = _Viewer(await self.websocket(request, protocol.MAX_PICTURE + 64))
+        self._viewers.add(viewer)  # from here on news wait in its queue, to be sent after its greetings
         host.watch(1)
-        sender = asyncio.create_task(self._send_safely(viewer))
+        sender: asyncio.Task[None] | None = None
         try:
-            viewer.tell(json.dumps(self._hello()))
-            # Not here: to tell how large a mesh is, its file is read.
-            for message in await self.backend.aside(host.greetings):
-                viewer.tell(json.dumps(message))
-            viewer.tell(await self._light_message(host.light_state))
-            early, viewer.early = viewer.early or [], None
-            for told in early:
-                viewer.tell(told)
-            await self._receive(viewer)
+            # Not on the loop: to tell how large a mesh is, its file is read.
+            for message in (self._hello(), *await self.aside(host.greetings)):
+                await viewer.send(json.dumps(message))
+            await viewer.send(await self.aside(pack_light, host.light_state, pool=self._encoder))
+            sender = asyncio.create_task(self._send(viewer))
+            await self._receive(host, viewer)
+        except (TimeoutError, ConnectionError):
+            await viewer.drop(WSCloseCode.POLICY_VIOLATION, "nothing was taken for too long")
         finally:
             self._viewers.discard(viewer)
             host.watch(-1)
-            sender.cancel()
-            if viewer.picture is not None:
-                viewer.picture.cancel()
-            try:
-                with contextlib.suppress(asyncio.CancelledError):
-                    await sender
-            finally:
-                if not self.backend.ending:  # else the host gives up its camera by itself
-                    await self.backend.aside(host.leave_camera, viewer)
-        return socket
+            for task in (sender, viewer.picture):
+                if task is not None:
+                    task.cancel()
+            if not self._ending:  # else the host gives up its camera by itself
+                await self.aside(host.leave_camera, viewer)
+        return viewer.socket
 
     def _hello(self) -> dict[str, Any]:
         return {
             "type": "hello",
+            "run": _RUN,
             "protocol": protocol.SCHEMA,
             "scenes": list(bundled_scenes()),
             "presets": list(PRESETS),
             "effects": list(protocol.EFFECTS),
             "largest_camera": list(protocol.LARGEST_CAMERA),
+            "outside": self.address.outside_url,
         }
 
-    async def _receive(self, viewer: _Viewer) -> None:
+    async def _receive(self, host: Host, viewer: _Viewer) -> None:
         """Take a viewer's messages until it leaves or breaks a rule."""
         async for message in viewer.socket:
             now = time.monotonic()
             size = len(message.data) if message.type in (WSMsgType.TEXT, WSMsgType.BINARY) else 0
-            if not viewer.messages.take(1.0, now) or not viewer.bytes.take(size, now):
-                limit = f"{MESSAGES_PER_SECOND:g} messages or {BYTES_PER_SECOND / 1e6:g} MB a second"
-                await self._drop(viewer, WSCloseCode.POLICY_VIOLATION, f"more than {limit}")
-                return
             try:
+                if not viewer.messages.take(1.0, now) or not viewer.bytes.take(size, now):
+                    limit = f"{MESSAGES_PER_SECOND:g} messages or {BYTES_PER_SECOND / 1e6:g} MB a second"
+                    raise protocol.ProtocolError(f"more than {limit}")
                 if message.type is WSMsgType.TEXT:
-                    await self._command(viewer, protocol.parse_text(message.data))
+                    await self._command(host, viewer, protocol.parse_text(message.data))
                 elif message.type is WSMsgType.BINARY:
-                    self._camera_picture(viewer, message.data)
+                    self._camera_picture(host, viewer, message.data)
                 else:  # aiohttp has closed it already, with the reason that the protocol has for it
                     return
             except protocol.ProtocolError as error:
-                await self._drop(viewer, WSCloseCode.POLICY_VIOLATION, str(error))
+                await viewer.drop(WSCloseCode.POLICY_VIOLATION, str(error))
                 return
 
-    async def _command(self, viewer: _Viewer, command: protocol.Command) -> None:
+    async def _command(self, host: Host, viewer: _Viewer, command: protocol.Command) -> None:
         if command.type == "ack":
             viewer.unshown = {id for id in viewer.unshown if id > command.fields["id"]}
             viewer.wake.set()
         elif command.type == "ping":
-            viewer.tell(json.dumps({"type": "pong", **command.fields, "clock": time.monotonic() * 1e3}))
+            viewer.tell({"type": "pong", **command.fields, "clock": time.monotonic() * 1e3})
+        elif command.type == "pick":
+            object_seen = await self.aside(functools.partial(host.pick, **command.fields))
+            viewer.tell({"type": "picked", **command.fields, "object": object_seen})
         else:
             try:
-                await self.backend.aside(self.backend.host.edit, command, viewer)
+                await self.aside(host.edit, command, viewer)
             except Exception as error:
-                viewer.tell(json.dumps(failure(error, "nothing was changed")))
-                viewer.tell(json.dumps(self.backend.host.scene_message()))
+                viewer.tell(failure(error, "nothing was changed"))
+                viewer.tell(host.scene_message())
 
-    def _camera_picture(self, viewer: _Viewer, data: bytes) -> None:
-        size = self.backend.host.camera_size(viewer)
+    def _camera_picture(self, host: Host, viewer: _Viewer, data: bytes) -> None:
+        size = host.camera_size(viewer)
         if size is None:
-            # What was on the way when the camera was switched off.
-            if len(data) > protocol.MAX_PICTURE:
-                raise protocol.ProtocolError("picture too large")
-            return
+            return  # a picture that was on the way when the camera was switched off
         picture = protocol.parse_picture(data, size)
-        # The page waits for "taken"; whoever does not has pictures left out.
+        # The page waits for "taken"; a viewer that does not has pictures left out.
         if viewer.picture is None or viewer.picture.done():
-            viewer.picture = asyncio.create_task(self._push(viewer, picture))
+            viewer.picture = asyncio.create_task(self._push(host, picture, viewer))
 
-    async def _push(self, viewer: _Viewer, picture: protocol.Picture) -> None:
+    async def _push(self, host: Host, picture: protocol.Picture, viewer: _Viewer) -> None:
         try:
-            await self.backend.aside(self.backend.host.push, picture, viewer)
+            await self.aside(host.push, picture, viewer)
         except protocol.ProtocolError as error:
-            await self._drop(viewer, WSCloseCode.POLICY_VIOLATION, str(error))
+            await viewer.drop(WSCloseCode.POLICY_VIOLATION, str(error))
         except Exception as error:
-            viewer.tell(json.dumps(failure(error)))
+            viewer.tell(failure(error))
 
-    @staticmethod
-    async def _drop(viewer: _Viewer, code: int, reason: str, seconds: float = 5.0) -> None:
-        with contextlib.suppress(ConnectionError, TimeoutError):
-            await asyncio.wait_for(viewer.socket.close(code=code, message=reason.encode()[:120]), seconds)
+    # -------------------------------------------------------------------------------------- files, downloads, the light
+
+    async def _page(self, request: web.Request) -> web.Response:
+        name = request.match_info.get("name", "index.html")
+        if name not in self._static:
+            raise web.HTTPNotFound(text="no such file\n")
+        return _answer(self._static[name], name)
+
+    async def _code(self, request: web.Request) -> web.Response:
+        """Return the page's address for other machines as a picture that phones read."""
+        buffer = io.BytesIO()
+        segno.make_qr(self.address.outside_url or self.address.url).save(buffer, "svg", scale=5, border=3, light="#fff")
+        return _answer(buffer.getvalue(), "code.svg")
+
+    async def _download(self, request: web.Request) -> web.Response:
+        host = await self.started()
+        name = request.match_info["name"]
+        if (found := host.downloads(full_paths=self.address.loopback).get(name)) is None:
+            raise web.HTTPNotFound(text="no such download\n")
+        kind, make = found
+        try:
+            body = await self.aside(make)
+        except WarpArError as error:
+            raise web.HTTPConflict(text=f"{error}\n") from error
+        headers = {"Content-Type": kind, "Content-Disposition": f'attachment; filename="{name}"'}
+        return web.Response(body=body, headers=headers)
+
+    async def _drop(self, request: web.Request) -> web.Response:
+        """Take a file that was dropped onto the picture; the answer says in words what became of it."""
+        host = await self.started()
+        if self._coming >= DROPS:
+            return web.Response(status=429, text=f"{DROPS} files are on their way already: wait until one is there\n")
+        self._coming += 1
+        try:
+            # A bound of its own, for all other requests have none worth the name; and not for ever.
+            async with asyncio.timeout(DROP_SECONDS):
+                data = await request.clone(client_max_size=MOST_BYTES).read()
+            words = await self.aside(host.drop, request.match_info["name"], data)
+        except web.HTTPRequestEntityTooLarge:
+            refused = web.Response(status=413, text=f"more than {MOST_BYTES >> 20} MB; no more are taken\n")
+            refused.force_close()
+            return refused
+        except TimeoutError:
+            return web.Response(status=408, text="the file took too long\n")
+        except ConnectionError:  # nobody hears it: the sender has gone
+            return web.Response(status=400, text="the file did not come whole\n")
+        except SinkError as error:
+            return web.Response(status=507, text=f"{error}\n")
+        except Exception as error:
+            return web.Response(status=422, text=failure(error, "nothing was changed")["text"] + "\n")
+        finally:
+            self._coming -= 1
+        return web.Response(text=f"{words}\n")
+
+    def _rest(self, host: Host) -> None:
+        self._watching = None
+        host.watch(-1)
+
+    async def _light(self, request: web.Request) -> web.Response:
+        """Return the light's record, its picture, or a face of its cube; what refuses it is the request's fault."""
+        stem, _, kind = request.path.rpartition("/")[2].partition(".")
+        layout, options = request.query.get("layout", "latlong"), {"axes": _axes(request)}
+        if layout not in LAYOUTS:
+            raise web.HTTPBadRequest(text=f"layout = {layout!r}: expected {' or '.join(LAYOUTS)}\n")
+        if kind != "json":
+            options |= _numbers(request)
+        host = await self.started()
+        if self._watching is None:
+            host.watch(1)
+        else:
+            self._watching.cancel()
+        self._watching = asyncio.get_running_loop().call_later(WATCH_SECONDS, self._rest, host)
+        if host.light_state is None:
+            words = "the environment is not captured: no stage of this scene reads it, or the marker was not seen\n"
+            raise web.HTTPConflict(text=words)
+        from warp_ar.viewer.light_record import describe, encode_face, encode_picture
+
+        make: Any = functools.partial(encode_picture, kind=kind, layout=layout)
+        if stem in FACES:
+            make = functools.partial(encode_face, face=stem)
+        elif kind == "json":
+            make = functools.partial(describe, pose=_pose(host))
+        try:
+            made = await self.aside(functools.partial(make, host.light_state, **options))
+        except WarpArError as error:
+            raise web.HTTPBadRequest(text=f"{error}\n") from error
+        return web.json_response(made) if kind == "json" else _answer(made, f"{stem}.{kind}")
+
+    async def _channel(self, request: web.Request) -> web.StreamResponse:
+        axes = _axes(request)
+        if self._listeners >= MOST_LISTENERS:
+            return web.Response(status=503, text=f"{MOST_LISTENERS} programs listen already\n")
+        host = await self.started()
+        socket = await self.websocket(request, 1024)
+        self._listeners += 1
+        host.watch(1)
+        pusher = asyncio.create_task(self._push_light(host, socket, axes))
+        try:
+            async for message in socket:
+                if message.type in (WSMsgType.TEXT, WSMsgType.BINARY):
+                    await socket.close(code=1008, message=b"this channel takes no messages")
+        finally:
+            self._listeners -= 1
+            host.watch(-1)
+            pusher.cancel()
+            with contextlib.suppress(asyncio.CancelledError, ConnectionError):
+                await pusher
+        return socket
+
+    async def _push_light(self, host: Host, socket: web.WebSocketResponse, axes: str) -> None:
+        """Send the light when it has changed; a listener that takes nothing is closed by the heartbeat."""
+        from warp_ar.viewer.light_record import describe
+
+        sent: tuple[LightState | None, Any] = (None, None)
+        while not socket.closed:
+            state, pose = host.light_state, _pose(host)
+            now = (state, None if pose is None else (*pose.rotation.ravel(), *pose.translation))
+            if state is not None and (now[0] is not sent[0] or now[1] != sent[1]):
+                sent = now
+                await socket.send_str(json.dumps(await self.aside(describe, state, pose, axes)))
+            await asyncio.sleep(PUSH_SECONDS)
 
     # --------------------------------------------------------------------------------------------------------- running
 
@@ -420,68 +584,89 @@ class Server:
         """
         self._loop = asyncio.get_running_loop()
         runner = web.AppRunner(self.app, access_log=None, handle_signals=False, shutdown_timeout=0.5)
+        starting: asyncio.Future[Host] | None = None
         running: asyncio.Future[None] | None = None
         ticker: asyncio.Task[None] | None = None
         try:
             await runner.setup()
             assert runner.server is not None
-            self.gate.start(runner.server, await self._listen(tries), self.address.tls)
+            listener = await self.aside(listen, self.address.host, self.address.port, tries)
+            self.address = dataclasses.replace(self.address, port=listener.getsockname()[1])
+            self.gate.start(runner.server, listener, self.address.tls)
             ready(self.address)
             # The page is there before kernels, and even their libraries, are loaded.
-            make_host = functools.partial(self._make_host, publish=self._publish, notify=self._notify)
-            host = await self.backend.start(make_host)
-            ticker = asyncio.create_task(self._tick())
-            running = self._run_frames(host)
+            starting = self.aside(functools.partial(self._make_host, publish=self._publish, notify=self._notify))
+            self._host = host = await asyncio.shield(starting)
+            ticker = asyncio.create_task(self._tick(host))
+            running = self.aside(host.run, pool=self._frames)
             await asyncio.shield(running)
         finally:
-            self.backend.stop()
+            self._ending = True
+            if self._host is not None:
+                self._host.stop()
             if ticker is not None:
                 ticker.cancel()
             reason = "the program has ended"
-            drops = [self._drop(viewer, WSCloseCode.GOING_AWAY, reason, 0.5) for viewer in tuple(self._viewers)]
+            drops = [viewer.drop(WSCloseCode.GOING_AWAY, reason, 0.5) for viewer in tuple(self._viewers)]
             await asyncio.gather(*drops)
             await self.gate.close()
             await runner.cleanup()
-            self.ended = await self.backend.end(running)
+            self.ended = await self._end(starting, running)
             self._loop = None
 
-    def _run_frames(self, host: Host) -> asyncio.Future[None]:
-        """Start the thread of the frames."""
-        loop = asyncio.get_running_loop()
-        done: asyncio.Future[None] = loop.create_future()
-
-        def finish(error: BaseException | None) -> None:
-            if not done.done():
-                done.set_result(None) if error is None else done.set_exception(error)
-
-        def run() -> None:
-            error: BaseException | None = None
-            try:
-                host.run()
-            except BaseException as raised:
-                error = raised
-            with contextlib.suppress(RuntimeError):  # the loop has closed: nobody waits for this any more
-                loop.call_soon_threadsafe(finish, error)
-
-        # A frame of many seconds must not keep the program: the thread is left behind if need be.
-        threading.Thread(target=run, name="warp-ar-frames", daemon=True).start()
-        return done
-
-    async def _listen(self, tries: int) -> list[socket.socket]:
-        first = self.address.port
-        for port in range(first, first + max(tries, 1)):
-            try:
-                listeners = await listen(self.address.host, port)
-            except OSError as error:
-                if port + 1 < first + tries:
-                    continue
-                raise UsageError(
-                    f"cannot serve at {self.address.host} port {port}: {error.strerror or error}; choose another --port"
-                ) from error
-            self.backend.address = dataclasses.replace(self.address, port=listeners[0].getsockname()[1])
-            return listeners
-        raise AssertionError("a port was tried at least")
+    async def _end(self, starting: asyncio.Future[Host] | None, running: asyncio.Future[None] | None) -> bool:
+        """End the host and all threads; return False if one that takes too long is left behind."""
+        ended, waited = True, running or starting
+        if waited is not None:
+            done, _ = await asyncio.wait({waited}, timeout=STOP_SECONDS)
+            ended = bool(done)
+        host = self._host
+        if host is None and starting is not None and starting.done() and starting.exception() is None:
+            host = starting.result()
+        for pool in (self._encoder, self._hands, self._frames):
+            pool.shutdown(wait=ended, cancel_futures=True)
+        if host is not None:
+            ended = host.close(wait_seconds=STOP_SECONDS, frames_ended=ended)
+        return ended
 
 
-def _same(given: str, expected: str) -> bool:
-    return hmac.compare_digest(given.encode("utf-8", "surrogateescape"), expected.encode())
+def _answer(body: bytes, name: str) -> web.Response:
+    return web.Response(body=body, headers={"Content-Type": _TYPES[name.split(".")[-1]]})
+
+
+def _pose(host: Host) -> Pose | None:
+    return None if host.latest is None else host.latest.pose
+
+
+def _axes(request: web.Request) -> str:
+    axes = request.query.get("axes", "y-up")
+    if axes not in AXES:
+        raise web.HTTPBadRequest(text=f"axes = {axes[:40]!r}: expected {', '.join(AXES)}\n")
+    return axes
+
+
+def _numbers(request: web.Request) -> dict[str, Any]:
+    """Return the size of a picture, texels, and the number of its mirror ball."""
+    expected = {
+        "size": (1, LARGEST_FACE, f"1 to {LARGEST_FACE} texels"),
+        "ball": (0, 999, "the number of a mirror ball, counted from 0"),
+    }
+    numbers: dict[str, Any] = {"size": None, "ball": 0}
+    for name, (least, most, words) in expected.items():
+        if (text := request.query.get(name)) is not None:
+            if not (text.isascii() and text.isdigit() and len(text) < 6 and least <= int(text) <= most):
+                raise web.HTTPBadRequest(text=f"{name} = {text[:40]!r}: expected {words}\n")
+            numbers[name] = int(text)
+    return numbers
+
+
+def check_origin(origin: str) -> str:
+    """Return an origin that may ask for the light, as browsers name it.
+
+    Raises:
+        UsageError: It is none.
+    """
+    scheme, _, rest = origin.partition("://")
+    if scheme not in ("http", "https") or not rest or any(c in rest for c in "/?#*@ "):
+        raise UsageError(f"--allow-origin {origin}: expected an origin such as http://localhost:5173, without a path")
+    return origin

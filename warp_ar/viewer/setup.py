@@ -1,52 +1,85 @@
-"""What is wrong with the set-up whose frames are shown, said in words while they are lit; and the ball, measured."""
+"""Faults of the set-up whose frames are shown, in words while they are lit; ball, response and camera, measured."""
 
 from __future__ import annotations
 
 import collections
+import contextlib
 import dataclasses
 import math
+import re
+import time
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-import numpy.typing as npt
-
 from warp_ar.ball.ball_measure import measure_ball
-from warp_ar.calibration.grey_response import MOST_DEVIATION, measure_grey_response
-from warp_ar.calibration.response import write_response
+from warp_ar.calibration.camera_calibration import GOOD_VIEWS, BoardViews, CameraReport, write_camera
+from warp_ar.calibration.card import write_card
+from warp_ar.calibration.response import MOST_DEVIATION, measure_grey_response, write_response
+from warp_ar.checks.check_ball import is_in_view
 from warp_ar.checks.check_objects import check_objects, find_outside
-from warp_ar.checks.check_pictures import Look, board_instead, look_at, why_unseen
-from warp_ar.checks.checkup import check_look
+from warp_ar.checks.check_pictures import Look, board_instead, look_at, measure_focal, why_unseen
+from warp_ar.checks.checkup import ball_is_seen, check_look
 from warp_ar.checks.finding import Finding
 from warp_ar.errors import UsageError, WarpArError
-from warp_ar.scene import Camera, Pose, Probe, Scene
+from warp_ar.scene import Camera, Pose, Scene
+from warp_ar.tracking.card_layout import SHEET
 from warp_ar.tracking.tracking import TrackState
-from warp_ar.viewer.controls import Controls
-from warp_ar.viewer.messages import Notify, begin
-
-Image = npt.NDArray[np.uint8]
+from warp_ar.viewer.controls import Controls, Feed, Image
+from warp_ar.viewer.edits import Wanted
+from warp_ar.viewer.light_record import written
+from warp_ar.viewer.protocol import Notify, begin, failure
 
 KEPT: Final = 24
 """Frames that are looked at: the newest, ``STEP_SECONDS`` from each other."""
 STEP_SECONDS: Final = 0.4
 LOST_SECONDS: Final = 1.5
-"""How long the marker must not have been seen before it is looked at why."""
+"""Time without the marker after which the reason is looked for."""
 AGAIN_SECONDS: Final = 3.0
-"""How often that is looked at."""
+"""Time between two such looks, and between two for a ball that is missing."""
+BALL_SECONDS: Final = 10.0
+"""Time between two looks for a ball that is seen: each takes a third of a second."""
 PLACES_SECONDS: Final = 1.0
-"""How often it is looked at whether the picture shows an object."""
+"""Time between two looks for objects in the picture."""
+FOCAL_FRAMES: Final = 4
+"""Frames after which a guessed camera's focal length is first looked for."""
+FOCAL_SPREAD: Final = 0.04
+"""Largest relative standard error of a focal length that is used."""
+FOCAL_STEP: Final = 0.01
+"""Share by which a better estimate must differ to be worth another pipeline."""
 RESPONSE: Final = "response.txt"
 """Name of a measured response's file."""
+NO_BALL: Final = Finding(
+    "ball.unfound",
+    "no mirror ball is seen where the scene has it, so the light is not that of this desk",
+    "put the ball on the card’s cross, all of it in the picture, or press “Measure the ball”",
+)
 FEWEST: Final = 3
 """Frames without which nothing is measured."""
 PAGE_WORDS: Final = (
-    ("and run python -m warp_ar.calibrate camera PICTURES", "and press “Calibrate”"),
-    ("python -m warp_ar.calibrate camera PICTURES", "press “Calibrate”"),
-    ("python -m warp_ar.calibrate ball SCENE --write", "press “Measure the ball”"),
+    (r"and run python -m warp_ar\.calibrate camera PICTURES", "and press “Calibrate”"),
+    (r"python -m warp_ar\.calibrate camera PICTURES", "press “Calibrate”"),
+    (r"python -m warp_ar\.calibrate ball SCENE --write", "press “Measure the ball”"),
+    (r"DICT_(\w+?) (?:id )?(\d+)", r"marker \2 of the family \1"),
+    (r"the \[marker\]|\[marker\]", "the scene’s marker"),
+    (r"\[(probe|camera|object|light|proxy)\]", r"the scene’s \1"),
 )
-"""What a finding's command is on the page."""
+"""Words on the page for commands, sections of scene files and names of dictionaries."""
+
+
+@dataclasses.dataclass
+class _Step:
+    """One thing that the page can ask for."""
+
+    work: Callable[[Scene, Look], str]
+    """Function that returns its result in words."""
+    made: object = None
+    """Part of the set-up that the result is about."""
+    words: str = ""
+    """The result."""
+    failed: str = ""
+    """Reason of a failure."""
 
 
 class SetupChecks:
@@ -56,73 +89,85 @@ class SetupChecks:
         """Start without frames.
 
         Args:
-            controls: What is shown, and where measurements go.
+            controls: State that is shown, and taker of measurements.
             helper: Looks at the frames, beside them.
             notify: Takes ``message`` whenever it has changed.
-            folder: Where a measured response is kept.
+            folder: Folder of a measured response.
         """
-        self._folder = folder
-        self._controls, self._helper, self._notify = controls, helper, notify
+        self._controls, self._helper, self._notify, self._path = controls, helper, notify, folder / RESPONSE
+        self._steps = {"check": _Step(self._check), "ball": _Step(self._ball), "response": _Step(self._response)}
+        self._findings: list[Finding] = []
         self._frames: collections.deque[tuple[Image, float]] = collections.deque(maxlen=KEPT)
         self._of: object = None
         self._busy: Future[None] | None = None
         self._step: str | None = None
         self._doing = ""
         self._waits = False
-        self._work: dict[str, Callable[[Scene, Look], None]] = {
-            "check": self._check,
-            "ball": self._ball,
-            "response": self._response,
-        }
-        self._seen = self._looked = 0.0
-        self._findings: list[Finding] | None = None
-        self._measured: dict[str, str] = {}
-        self._made: dict[str, object] = {}
         self._told: frozenset[str] = frozenset()
-        self._failed: dict[str, str] = {}
-        self.missing: Finding | None = None
-        """Why the marker is not seen, or that it is one of a board's, in words; None while all is right."""
-        self.outside: Finding | None = None
-        """That all virtual objects lie outside the picture, and where; None while it shows one."""
-        self._placed = -math.inf
+        self._start(0.0)
 
-    def note(self, image: Image, state: TrackState | None, pose: Pose | None, now: float) -> None:
+    def _start(self, now: float) -> None:
+        """Forget the frames: they are of another source or marker."""
+        self._frames.clear()
+        self._count, self._focal_due = 0, FOCAL_FRAMES
+        self._seen, self._looked, self._placed, self._ball_looked = now, -math.inf, -math.inf, -math.inf
+        self.missing: Finding | None = None
+        """Finding of a marker that is not seen, or is one of a board's; None while all is right."""
+        self.outside: Finding | None = None
+        """Finding that all virtual objects lie outside the picture; None while it shows one."""
+        self.ball = ""
+        """``seen``, ``missing`` or ``outside`` the picture; empty where the scene reads no mirror ball."""
+
+    def note(
+        self, image: Image, state: TrackState | None, pose: Pose | None, now: float, *, rests: bool = False
+    ) -> None:
         """Take notice of a frame.
 
         Args:
             image: As the camera gave it, RGB.
-            state: Whether the marker was seen; None where nothing looked for it.
+            state: State of the marker; None where nothing looked for it.
             pose: ``camera_from_world``; None where it is not known.
             now: Seconds on a clock that does not jump.
+            rests: Begin no look that nobody asked for: the helper looks for the board.
         """
+        of = (self._controls.feed.source, self._controls.wanted.scene.marker)
+        if self._of is None or of != self._of:
+            self._of = of
+            self._start(now)
         if now - self._placed > PLACES_SECONDS:
             self._placed = now
             self.outside = None if pose is None else self._find_outside(pose)
-        feed = self._controls.feed
-        of = (feed.source, self._controls.wanted.scene.marker)
-        if self._of is None or of != self._of:
-            self._of = of
-            self._frames.clear()
-            self._seen, self._looked, self.missing = now, -math.inf, None
         if not self._frames or now - self._frames[-1][1] >= STEP_SECONDS:
             self._frames.append((image, now))
-        self._begin()
-        if self._step is None and self._made and self._valid() != self._told:
+            self._count += 1
+        if self._waits and self._step is not None and len(self._frames) >= FEWEST:
+            self._waits = False
+            self._busy = begin(self._helper, self._notify, self._run, self._step)
+        if self._step is None and self._valid() != self._told:
             self._notify(self.message())
-        if state in (None, TrackState.TRACKED):
+        tracked = state is TrackState.TRACKED
+        if tracked or state is None:
             self._seen = now
             # A single marker that is seen may be one of a board's, which is looked at below.
             if self.missing is not None and self.missing.name != "marker.board":
                 self.missing = None
-        doubtful = state is TrackState.TRACKED and self._controls.wanted.scene.marker.board is None
-        due = doubtful or now - self._seen > LOST_SECONDS
-        if due and now - self._looked > AGAIN_SECONDS and not self._is_busy:
-            self._looked = now
-            self._busy = begin(self._helper, self._notify, self._say_why, doubtful)
+        if not rests:
+            self._begin_looks(image, now, tracked=tracked)
 
-    @property
-    def _is_busy(self) -> bool:
-        return self._busy is not None and not self._busy.done()
+    def _begin_looks(self, image: Image, now: float, *, tracked: bool) -> None:
+        """Begin the look that is due, one at a time: for the focal length, or for the marker and the ball."""
+        if self._busy is not None and not self._busy.done():
+            return
+        if self._guesses and self._count >= self._focal_due:
+            # When twice as many frames have come, and later whenever all that are kept are new.
+            self._focal_due = self._count + min(self._count, KEPT)
+            self._busy = begin(self._helper, self._notify, self._estimate_focal, self._controls.feed)
+        elif (tracked or now - self._seen > LOST_SECONDS) and now - self._looked > AGAIN_SECONDS:
+            self._looked = now
+            patience = BALL_SECONDS if self.ball == "seen" else AGAIN_SECONDS
+            if for_ball := tracked and now - self._ball_looked > patience:
+                self._ball_looked = now
+            self._busy = begin(self._helper, self._notify, self._look, image, tracked, for_ball)
 
     def _shown(self) -> tuple[Scene, Camera]:
         wanted, feed = self._controls.wanted, self._controls.feed
@@ -131,7 +176,7 @@ class SetupChecks:
         return dataclasses.replace(wanted.scene, camera=camera), camera
 
     def _find_outside(self, pose: Pose) -> Finding | None:
-        """Say where the objects are, if the picture shows none of them."""
+        """Return the finding that the picture shows none of the objects, if so."""
         try:
             scene, camera = self._shown()
         except WarpArError:
@@ -140,19 +185,56 @@ class SetupChecks:
             return None
         return next(iter(check_objects(scene, camera, [pose])), None)
 
-    def _say_why(self, seen: bool) -> None:
-        """Say why the marker is not seen; of one that is seen, whether it belongs to a board."""
-        try:
+    def _look(self, image: Image, tracked: bool, for_ball: bool) -> None:
+        """Find why the marker is not seen; of one that is, whether it belongs to a board, and whether a ball is too."""
+        of, missing, ball = self._of, None, self.ball
+        with contextlib.suppress(WarpArError, IndexError):  # the source has changed meanwhile
             scene, camera = self._shown()
-            of, newest = self._of, list(self._frames)[-4:]
-            missing = board_instead(scene.marker, [image for image, _ in newest[::-1]])
-            if missing is None and not seen:
+            newest = list(self._frames)[-4:]
+            if not tracked or scene.marker.board is None:
+                missing = board_instead(scene.marker, [image for image, _ in newest[::-1]])
+            if missing is None and not tracked:
                 look = look_at(scene.marker, camera, newest)
                 missing = None if look.views else why_unseen(scene.marker, look)
-            if of is self._of:  # else the marker or the source has changed meanwhile
-                self.missing = missing
-        except (WarpArError, IndexError):
-            self.missing = None  # the source has changed meanwhile
+            if for_ball:
+                ball = self._ball_in(look_at(scene.marker, camera, [(image, 0.0)]), scene)
+        if of is self._of:  # else the marker or the source has changed meanwhile
+            self.missing, self.ball = missing, ball
+
+    def _ball_in(self, look: Look, scene: Scene) -> str:
+        """Return ``ball`` as one frame shows it."""
+        if not self._controls.wanted.shown_scene().probes or scene.captured is not None:
+            return ""
+        if not any(is_in_view(look, pose, probe) for _, pose in look.views for probe in scene.probes):
+            return "outside" if look.views else self.ball
+        return "seen" if ball_is_seen(scene, look.camera, look.views) else "missing"
+
+    @property
+    def _guesses(self) -> bool:
+        """True while frames come from a browser's camera that nobody calibrated."""
+        feed = self._controls.feed
+        return feed.is_browser and self._controls.wanted.camera_of(feed.source.size) is None
+
+    @property
+    def estimating(self) -> bool:
+        """True until the frames of a guessed camera have told its focal length."""
+        return self._guesses and not self._controls.feed.estimated
+
+    def _estimate_focal(self, feed: Feed) -> None:
+        with contextlib.suppress(WarpArError):  # the source has changed meanwhile
+            scene, camera = self._shown()
+            self._take_focal(scene, look_at(scene.marker, camera, list(self._frames)), feed)
+
+    def _take_focal(self, scene: Scene, look: Look, feed: Feed) -> None:
+        """Use the focal length that frames tell, where they tell it well enough."""
+        fit, camera = measure_focal(scene.marker, look), look.camera
+        if fit is None or fit.deviation > FOCAL_SPREAD or abs(fit.ratio - 1.0) < FOCAL_STEP * feed.estimated:
+            return
+        focal = fit.ratio * camera.fx
+        if self._controls.use_estimate(dataclasses.replace(camera, fx=focal, fy=focal), feed):
+            self._notify({"type": "intrinsics", "focal": focal, "spread": fit.deviation, "views": fit.views})
+
+    # ----------------------------------------------------------------------------------------------------------- steps
 
     def step(self, step: str) -> None:
         """Begin to look at the frames, or to measure by them, as soon as there are enough.
@@ -162,24 +244,19 @@ class SetupChecks:
         """
         if self._step is not None:
             raise UsageError("the frames are being looked at already: wait until that is done")
-        if step not in self._work:
-            raise UsageError(f"no step {step!r}; expected {', '.join(self._work)}")
         self._step, self._waits = step, True
-        self._failed.pop(step, None)
+        self._steps[step].failed = ""
         self._notify(self.message())
 
-    def _begin(self) -> None:
-        """Do what was asked for, if there are enough frames."""
-        if self._waits and self._step is not None and len(self._frames) >= FEWEST:
-            self._waits = False
-            self._busy = begin(self._helper, self._notify, self._run, self._step)
-
-    def _run(self, step: str) -> None:
+    def _run(self, name: str) -> None:
+        step = self._steps[name]
         try:
             scene, camera = self._shown()
-            self._work[step](scene, look_at(scene.marker, camera, list(self._frames)))
+            step.words = step.work(scene, look_at(scene.marker, camera, list(self._frames)))
+            # Where the check has changed the camera, or a step what it measured, the result is about what is now.
+            step.made = _state_of(scene if name == "check" and not self._guesses else self._shown()[0])[name]
         except WarpArError as error:
-            self._failed[step] = str(error)
+            step.failed = _page_words(str(error))
         finally:
             self._step, self._doing = None, ""
             self._notify(self.message())
@@ -189,20 +266,24 @@ class SetupChecks:
         self._doing = words
         self._notify(self.message())
 
-    def _check(self, scene: Scene, look: Look) -> None:
+    def _check(self, scene: Scene, look: Look) -> str:
+        if self._guesses:
+            self._take_focal(scene, look, self._controls.feed)
+            scene, camera = self._shown()
+            look = look_at(scene.marker, camera, list(self._frames))
         self._findings = check_look(scene, look, views=2)
-        self._made["check"] = _state_of(scene)["check"]
+        return ""
 
     def _valid(self) -> frozenset[str]:
-        """Steps whose result is that of the set-up as it is: undo takes it back, redo brings it again."""
+        """Return the steps whose result is that of the set-up as it is: undo takes it back, redo brings it again."""
+        made = {name: step.made for name, step in self._steps.items() if step.made is not None}
         try:
-            now = _state_of(self._shown()[0])
+            now = _state_of(self._shown()[0]) if made else {}
         except WarpArError:
             return frozenset()  # the source has changed meanwhile
-        # A copy: the helper adds to it.
-        return frozenset(step for step, made in list(self._made.items()) if now[step] == made)
+        return frozenset(name for name, state in made.items() if now[name] == state)
 
-    def _ball(self, scene: Scene, look: Look) -> None:
+    def _ball(self, scene: Scene, look: Look) -> str:
         """Measure the first mirror ball and put it where it stands."""
         if not scene.probes:
             raise UsageError("the scene has no mirror ball: use the printed card, or add one to its file")
@@ -217,76 +298,73 @@ class SetupChecks:
             )
         x, y, z = (round(value, 5) for value in found.center)
         ball = dataclasses.replace(probe, center=(x, y, z), radius=round(found.radius, 5))
-        self._controls.change(lambda w: dataclasses.replace(w, scene=_with_ball(w.scene, ball)), "measure the ball")
-        self._made["ball"] = (ball.center, ball.radius)
+
+        def change(wanted: Wanted) -> Wanted:
+            balls = (ball, *wanted.scene.probes[1:])
+            return dataclasses.replace(wanted, scene=dataclasses.replace(wanted.scene, probes=balls))
+
+        self._controls.change(change, "measure the ball")
         moved = 1e3 * math.dist(found.center, probe.center)
-        radius = f"{1e3 * found.radius:.1f} mm"
-        radius += (
-            " as typed (the views are too alike to tell it: move the camera around)"
-            if found.radius_deviation is None
-            else f" ± {2e3 * found.radius_deviation:.1f} mm"
-        )
-        self._measured["ball"] = (
+        unsure = " as typed (the views are too alike to tell it: move the camera around)"
+        radius = unsure if found.radius_deviation is None else f" ± {2e3 * found.radius_deviation:.1f} mm"
+        return (
             f"The ball's centre was {moved:.1f} mm off; it is known to ± {2e3 * found.deviation:.1f} mm now. "
-            f"Its radius: {radius}."
+            f"Its radius: {1e3 * found.radius:.1f} mm{radius}."
         )
 
-    def _response(self, scene: Scene, look: Look) -> None:
+    def _response(self, scene: Scene, look: Look) -> str:
         """Measure how the camera encodes light, by the card's greys."""
         found = measure_grey_response(look.images)
-        if (interval := 2 * found.deviation[128].max()) > MOST_DEVIATION:
+        interval = 2 * found.deviation[128].max()
+        if interval > MOST_DEVIATION:
             raise UsageError(
                 f"the curve is known to {interval:.0%} only, by {found.views} pictures, and sRGB is as likely: nothing "
                 "is changed. Show the card under exposures, or lamps, that differ more"
             )
-        path = self._folder / RESPONSE
-        write_response(found.curve, path)
-        camera = dataclasses.replace(scene.camera, transfer=path)
+        write_response(found.curve, self._path)
+        camera = dataclasses.replace(scene.camera, transfer=self._path)
         self._controls.change(lambda w: w.with_camera(camera), "measure the response")
-        self._made["response"] = path
-        middle = found.curve[128].mean()
-        self._measured["response"] = (
-            f"Code 128 is {middle:.3f} of clipping ± {2 * found.deviation[128].max():.0%} (sRGB: 0.216), by "
+        return (
+            f"Code 128 is {found.curve[128].mean():.3f} of clipping ± {interval:.0%} (sRGB: 0.216), by "
             f"{found.views} pictures. Several exposures, or lamps on and off, tell it better."
         )
 
     def response_file(self) -> bytes:
-        """The measured response.
+        """Return the measured response.
 
         Raises:
             UsageError: None was measured.
         """
-        if "response" not in self._measured:
+        if not self._steps["response"].words:
             raise UsageError("no response was measured here")
-        return (self._folder / RESPONSE).read_bytes()
+        return self._path.read_bytes()
 
     def message(self) -> dict[str, Any]:
-        """What was found and measured."""
+        """Return the findings and measurements."""
         self._told = valid = self._valid()
         findings = None
-        if self._findings is not None and "check" in valid:
-            findings = [
-                {"name": f.name, "text": f.text, "cost": f.cost, "remedy": _page_words(f.remedy), "error": f.error}
-                for f in self._findings
-            ]
+        if "check" in valid:
+            findings = [page_record(one) | {"cost": one.cost, "error": one.error} for one in self._findings]
+        steps = self._steps.items()
         return {
             "type": "setup",
             "busy": self._step,
             "doing": self._doing,
             "findings": findings,
-            "outdated": self._findings is not None and findings is None,
+            "outdated": self._steps["check"].made is not None and findings is None,
             "frames": len(self._frames),
-            "measured": {step: words for step, words in list(self._measured.items()) if step in valid},
-            "failed": dict(self._failed),
+            "measured": {name: step.words for name, step in steps if step.words and name in valid},
+            "failed": {name: step.failed for name, step in steps if step.failed},
         }
 
-
-def _with_ball(scene: Scene, ball: Probe) -> Scene:
-    return dataclasses.replace(scene, probes=(ball, *scene.probes[1:]))
+    def guide(self) -> dict[str, str] | None:
+        """Return what is missing in the picture, and what to do; None while all is right."""
+        found = self.missing or self.outside or (NO_BALL if self.ball == "missing" else None)
+        return None if found is None else page_record(found)
 
 
 def _state_of(scene: Scene) -> dict[str, object]:
-    """What each step's result is about, as a scene has it."""
+    """Return the part of a scene that each step's result is about."""
     ball = scene.probes[0] if scene.probes else None
     return {
         "ball": ball and (ball.center, ball.radius),
@@ -295,8 +373,118 @@ def _state_of(scene: Scene) -> dict[str, object]:
     }
 
 
-def _page_words(remedy: str) -> str:
-    """A finding's remedy with the page's buttons instead of commands."""
+def page_record(finding: Finding) -> dict[str, str]:
+    """Return a finding for the page."""
+    return {"name": finding.name, "text": _page_words(finding.text), "remedy": _page_words(finding.remedy)}
+
+
+def _page_words(text: str) -> str:
+    """Return a finding's words with the page's own for those of commands and files."""
     for command, words in PAGE_WORDS:
-        remedy = remedy.replace(command, words)
-    return remedy
+        text = re.sub(command, words, text)
+    return text
+
+
+_BOARD_SECONDS: Final = 0.4
+"""Time between two looks for the board."""
+
+
+class CalibrationSession:
+    """Collects views of the board. ``look`` is called by the thread of the frames, all else by any."""
+
+    def __init__(self, helper: Executor, notify: Notify, use: Callable[[Camera], None]) -> None:
+        """Start without a calibration.
+
+        Args:
+            helper: Looks for the board, beside the frames.
+            notify: Takes ``message`` whenever it has changed.
+            use: Takes the calibrated camera, whose transfer is still that of a board's pictures.
+        """
+        self._helper, self._notify, self._use = helper, notify, use
+        self._views: BoardViews | None = None
+        self._report: CameraReport | None = None
+        self._looking: Future[None] | None = None
+        self._looked = 0.0
+
+    @property
+    def on(self) -> bool:
+        """True while views are collected."""
+        return self._views is not None
+
+    def step(self, step: str) -> None:
+        """Start, stop or finish.
+
+        Raises:
+            WarpArError: There is nothing to finish, or what was seen tells too little: looking goes on.
+        """
+        if step == "finish":
+            seen = self._views  # once: another viewer may finish or stop it meanwhile
+            if seen is None:
+                raise UsageError("nothing was looked at yet: start the calibration first")
+            report = seen.solve()
+            if report.doubt:
+                # The views stay, for more of them to be added.
+                views = len(report.view_errors)
+                raise UsageError(f"{report.doubt}, in {views} views: nothing is used. Show the card from other sides")
+            self._report = report
+            self._use(report.camera)
+        self._views = BoardViews() if step == "start" else None
+        self._notify(self.message())
+
+    def look(self, image: Image) -> None:
+        """Have a frame looked at; newer ones are left aside meanwhile."""
+        views, now = self._views, time.monotonic()
+        if views is None or now - self._looked < _BOARD_SECONDS:
+            return
+        if self._looking is not None and not self._looking.done():
+            return
+        self._looked = now
+        self._looking = begin(self._helper, self._notify, self._add, views, image)
+
+    def _add(self, views: BoardViews, image: Image) -> None:
+        try:
+            new = views.add(image)
+        except UsageError as error:  # the source has changed
+            new = True
+            if self._views is views:
+                self._views = None
+            self._notify(failure(error))
+        if new:
+            self._notify(self.message())
+
+    def message(self) -> dict[str, Any]:
+        """Return how far the calibration has come."""
+        views, report = self._views, self._report
+        told = None
+        if report is not None:
+            told = {
+                "focal": report.camera.fx,
+                "error": report.error,
+                "deviation": report.focal_deviation,
+                "coverage": report.coverage,
+                "warnings": list(report.warnings),
+            }
+        return {
+            "type": "calibration",
+            "on": views is not None,
+            "views": 0 if views is None else len(views.views),
+            "wanted": GOOD_VIEWS,
+            "covered": [] if views is None else views.covered().tolist(),
+            "report": told,
+        }
+
+    def camera_file(self) -> bytes:
+        """Return the calibrated camera as OpenCV's YAML.
+
+        Raises:
+            UsageError: None was calibrated.
+        """
+        report = self._report
+        if report is None:
+            raise UsageError("no camera was calibrated here")
+        return written("camera.yml", lambda path: write_camera(report, path))
+
+
+def card_pdf(paper: str) -> bytes:
+    """Return the card to print, a PDF."""
+    return written("card.pdf", lambda path: write_card(SHEET, path, paper))

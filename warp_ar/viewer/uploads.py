@@ -15,7 +15,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterable
 from pathlib import Path, PurePosixPath
-from typing import Any, Final, TypeVar
+from typing import Final, TypeVar
 
 import numpy as np
 
@@ -23,10 +23,11 @@ from warp_ar.errors import SceneError, SinkError, UsageError, WarpArError, reaso
 from warp_ar.files import read_bytes
 from warp_ar.light.captured import Light
 from warp_ar.scene import CapturedLight, Object, Scene, dumps_scene, load_scene, loads_scene
-from warp_ar.scene.mesh_assets import confine
 from warp_ar.scene.mesh_files import MESH_SUFFIXES, files_beside, load_mesh
+from warp_ar.scene.mesh_source import confine
 from warp_ar.scene.scene_files import SceneFiles, files_of
-from warp_ar.viewer.edits import Wanted, add_item
+from warp_ar.viewer.edits import Wanted, add_item, moved
+from warp_ar.viewer.protocol import MOST_BYTES
 
 SCENE: Final = "scene.toml"
 MOST_MEMBERS: Final = 256
@@ -34,7 +35,7 @@ MOST_MEMBERS: Final = 256
 _KINDS: Final = {*MESH_SUFFIXES, ".mtl", ".bin", ".exr", ".hdr", ".txt", ".json", ".usda", ".usdc", ".usd"} | {
     *(".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".gif", ".ppm", ".ktx2")
 }
-"""Endings of what a scene names."""
+"""Endings of files that a scene names."""
 LONGEST_NAME: Final = 200
 """Characters of a member's name with its folders."""
 MOST_LEVELS: Final = 8
@@ -43,7 +44,7 @@ _T = TypeVar("_T")
 
 
 def pack_scene(scene: Scene) -> bytes:
-    """The scene as ``scene.toml``, and beside it its meshes with their materials, its light, response and poses.
+    """Return the scene as ``scene.toml``, and beside it its meshes with their materials, its light, response and poses.
 
     A video or a folder of frames is not packed, nor named: it may be gigabytes.
 
@@ -62,7 +63,7 @@ def pack_scene(scene: Scene) -> bytes:
         members[str(inside)] = read_bytes(path, "mesh_bytes", SceneError)
         if path.suffix.lower() in MESH_SUFFIXES:
             members |= {str(folder / _beside(name)): data for name, data in files_beside(path).items()}
-    text = dumps_scene(dataclasses.replace(_moved(scene, places), path=None))
+    text = dumps_scene(dataclasses.replace(moved(scene, lambda path: places.get(path, path)), path=None))
     head = "# With all that it names but its frames: python -m warp_ar.live FOLDER --source PATH|INDEX\n"
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as file:
@@ -72,8 +73,12 @@ def pack_scene(scene: Scene) -> bytes:
     return packed.getvalue()
 
 
+_HIDDEN: Final = re.compile(r"(^|/)(__MACOSX/|\.(?!\.?/))")
+"""Files that macOS puts beside those that are packed: ``__MACOSX``, ``._NAME``, ``.DS_Store``."""
+
+
 def unpack_scene(name: str, data: bytes, folder: Path, most: int) -> Path:
-    """Unpack such a ZIP; the path of its scene file.
+    """Unpack such a ZIP; return the path of its scene file.
 
     Args:
         name: To show.
@@ -86,21 +91,12 @@ def unpack_scene(name: str, data: bytes, folder: Path, most: int) -> Path:
     """
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as file:
-            members = [member for member in file.infolist() if not member.is_dir()]
+            found = (member for member in file.infolist() if not member.is_dir())
+            members = [member for member in found if not _HIDDEN.search(member.filename)]
             _check_members(name, members, most)
-            # A bomb's header may lie: no more is read than it says.
-            contents = {}
-            for member in members:
-                with file.open(member) as opened:
-                    contents[member.filename] = opened.read(member.file_size + 1)
-                if len(contents[member.filename]) != member.file_size:
-                    raise UsageError(f"{name}: {_shown(member.filename)} is not as large as its header says")
+            file.extractall(folder, members)  # which reads no more than the headers say
     except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, OSError) as error:
         raise UsageError(f"{name}: no ZIP that can be unpacked: {str(error)[:120]}") from error
-    for inside, content in contents.items():
-        path = folder / inside
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(content)
     return folder / SCENE
 
 
@@ -111,7 +107,7 @@ def _check_members(name: str, members: list[zipfile.ZipInfo], most: int) -> None
     if len(set(names)) < len(names) or len(names) > MOST_MEMBERS:
         raise UsageError(f"{name}: {len(names)} files; expected at most {MOST_MEMBERS}, each once")
     if (size := sum(member.file_size for member in members)) > most:
-        raise UsageError(f"{name} unpacks to {size:,} bytes; at most {most:,} are taken")
+        raise UsageError(f"{name} unpacks to {_megabytes(size)}; at most {_megabytes(most)} are taken")
     for inside in names:
         parts = PurePosixPath(inside)
         if len(inside) > LONGEST_NAME or len(parts.parts) > MOST_LEVELS + 1:
@@ -125,24 +121,8 @@ def _check_members(name: str, members: list[zipfile.ZipInfo], most: int) -> None
         raise UsageError(f"{name}: {_shown(min(both))} is a file and a folder")
 
 
-def _moved(value: _T, places: dict[Path, Path]) -> _T:
-    """A scene, or a part of one, with its files elsewhere."""
-
-    def moved(item: Any) -> Any:
-        if isinstance(item, Path):
-            return places.get(item, item)
-        if isinstance(item, tuple):
-            return tuple(moved(entry) for entry in item) if list(files_of(item)) else item
-        return _moved(item, places)
-
-    if not dataclasses.is_dataclass(value) or isinstance(value, type):
-        return value
-    changes = {field.name: moved(getattr(value, field.name)) for field in dataclasses.fields(value) if field.init}
-    return dataclasses.replace(value, **{key: new for key, new in changes.items() if new is not getattr(value, key)})
-
-
 def _beside(name: str) -> str:
-    """The place beside a mesh under which it finds what it names: its own name where that stays inside."""
+    """Return the place of a file beside the mesh that names it: its own name where that stays inside."""
     plain = name.strip().replace("\\", "/")
     inside = re.fullmatch(r"[\w .()-]+(/[\w .()-]+)*", plain) and ".." not in PurePosixPath(plain).parts
     return plain if inside else plain.rsplit("/", 1)[-1]
@@ -152,8 +132,6 @@ def _plain(stem: str) -> str:
     return re.sub(r"[^A-Za-z0-9_-]+", "_", stem)[:40] or "file"
 
 
-MOST_BYTES: Final = 1 << 26
-"""Of one file: 64 MB."""
 MOST_FILES: Final = 32
 """Files that one run of the page keeps: edits that are undone still need theirs."""
 MOST_KEPT_BYTES: Final = 1 << 29
@@ -161,16 +139,16 @@ MOST_KEPT_BYTES: Final = 1 << 29
 MOST_TRIANGLES: Final = 1_000_000
 """Of a mesh: beyond that a page waits too long."""
 SIZES: Final = (0.02, 0.4)
-"""Metres: the longest side of what stands on a desk."""
+"""Metres: least and largest longest side of an object on a desk."""
 USUAL: Final = 0.12
 """Metres: the longest side of a mesh whose units cannot be told."""
 PLACE: Final = (0.12, -0.08)
-"""Where it lands, metres."""
+"""Place of a dropped mesh, metres."""
 LIGHTS: Final = (".exr", ".hdr")
 SUFFIXES: Final = (*MESH_SUFFIXES, *LIGHTS, ".toml", ".zip")
 
 Edit = tuple[Callable[[Wanted], Wanted], str, str]
-"""What it makes of what is wanted, its name as an edit, and what is said about it."""
+"""Function from the wanted state to the next, its name as an edit, and the words about it."""
 
 
 class DroppedFiles:
@@ -181,28 +159,30 @@ class DroppedFiles:
         self._folder, self._count = folder, 0
 
     def take(self, name: str, data: bytes, wanted: Wanted) -> Edit:
-        """Keep a file and say what to make of it.
+        """Keep a file and return the edit that it makes.
 
         Args:
             name: The file's own name.
-            data: What it holds.
-            wanted: What is shown now.
+            data: Its content.
+            wanted: The state that is shown now.
 
         Raises:
             UsageError: It is none that can be used.
             SinkError: The disk is full, or the file cannot be written for another reason.
-                Whatever is raised, nothing of the file is kept.
+                In no case of an error is anything of the file kept.
         """
         suffix = Path(name).suffix.lower()
         if suffix not in SUFFIXES:
             raise UsageError(f"{_shown(name)}: expected a file that ends in {', '.join(SUFFIXES)}")
         if len(data) > MOST_BYTES:
-            raise UsageError(f"{_shown(name)} has {len(data):,} bytes; at most {MOST_BYTES:,} are taken")
+            raise UsageError(f"{_shown(name)} has {_megabytes(len(data))}; at most {_megabytes(MOST_BYTES)} are taken")
         if suffix == ".toml":
-            return _scene_edit(_shown(name), data, wanted)
+            return self._scene_edit(_shown(name), data, wanted)
         if self._count >= MOST_FILES:
             raise UsageError(f"{MOST_FILES} files were dropped already; start the program anew for more")
-        stem = re.sub(r"[^A-Za-z0-9_-]+", "_", Path(name).stem)[:40] or "file"
+        stem = _plain(Path(name).stem)
+        if any(self._folder.glob(f"*/{stem}{suffix}")):
+            stem += f"-{self._count + 1}"  # a saved scene names it by its name alone
         # Each in a folder of its own, with all that is made of it: nothing else is to be removed where it is refused.
         place = self._folder / f"{self._count:02d}"
         path = place / f"{stem}{suffix}"
@@ -227,15 +207,35 @@ class DroppedFiles:
         self._count += 1
         return edit
 
+    def _scene_edit(self, name: str, data: bytes, wanted: Wanted) -> Edit:
+        try:
+            text = data.decode()
+        except ValueError as error:
+            raise UsageError(f"{name}: not valid TOML: {str(error)[:160]}") from error
+        folder = Path() if wanted.scene.path is None else wanted.scene.path.parent
+        files = _files(folder, (), wanted)
+        # As a file that was saved here names what was dropped or measured before.
+        shown = [path for path in files_of(wanted.scene) if path.is_relative_to(self._folder)]
+        dropped = {path.name: path for path in (*self._folder.glob("[0-9][0-9]/*"), *shown) if path.is_file()}
+        files = dataclasses.replace(files, names=dropped)
+        scene = dataclasses.replace(loads_scene(text, name, files), path=wanted.scene.path)
+        return lambda w: Wanted(scene, w.quality, cameras=w.cameras), f"open {name}", f"{name}: the scene is shown."
+
     def _check_room(self, more: int) -> None:
         """Refuse a file with which more would be kept than may be."""
         kept = more + sum(file.stat().st_size for file in self._folder.glob("[0-9][0-9]/**/*") if file.is_file())
         if kept > MOST_KEPT_BYTES:
-            raise UsageError(f"{kept:,} bytes would be kept; at most {MOST_KEPT_BYTES:,} are: start the program anew")
+            raise UsageError(
+                f"{_megabytes(kept)} would be kept; at most {_megabytes(MOST_KEPT_BYTES)} are: start the program anew"
+            )
+
+
+def _megabytes(count: int) -> str:
+    return f"{count / (1 << 20):.3g} MB"
 
 
 def _shown(name: str) -> str:
-    """A file's name as it may be shown: short, and of one line."""
+    """Return a file's name as it may be shown: short, and on one line."""
     return re.sub(r"[^\w .()-]+", "_", Path(name).name)[:60]
 
 
@@ -287,16 +287,6 @@ def _bundle_edit(name: str, data: bytes, folder: Path, wanted: Wanted) -> Edit:
         if item.file is not None and (count := len(load_mesh(item.file).faces)) > MOST_TRIANGLES:
             raise UsageError(f"{name}: a mesh has {count:,} triangles; at most {MOST_TRIANGLES:,} are taken")
     scene = dataclasses.replace(scene, path=wanted.scene.path)
-    return lambda w: Wanted(scene, w.quality, cameras=w.cameras), f"open {name}", f"{name}: the scene is shown."
-
-
-def _scene_edit(name: str, data: bytes, wanted: Wanted) -> Edit:
-    try:
-        text = data.decode()
-    except ValueError as error:
-        raise UsageError(f"{name}: not valid TOML: {str(error)[:160]}") from error
-    folder = Path() if wanted.scene.path is None else wanted.scene.path.parent
-    scene = dataclasses.replace(loads_scene(text, name, _files(folder, (), wanted)), path=wanted.scene.path)
     return lambda w: Wanted(scene, w.quality, cameras=w.cameras), f"open {name}", f"{name}: the scene is shown."
 
 

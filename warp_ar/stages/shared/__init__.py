@@ -1,1 +1,1 @@
-"""What several stages use and none of them owns: how they hand their arrays to kernels. No file here is a stage."""
+"""Functions that several stages use to hand their arrays to kernels. No file here is a stage."""

@@ -18,7 +18,7 @@ LISTED_LEAST = 1 << 12
 
 
 def edge_arrays(request: Request, stage: str) -> Mapping[str, ArraySpec]:
-    """What ``make_edge_lists`` needs; none where a pixel has one sample."""
+    """Arrays of ``make_edge_lists``; none where a pixel has one sample."""
     samples = request.quality.edge_samples
     if samples == 1:
         return {}

@@ -29,8 +29,7 @@ class Method:
 
 
 METHODS: Mapping[str, Method] = {
-    "coarse6": Method(32, 4, 6, "estimated"),
-    "coarse": Method(32, 4, 5, "estimated"),
+    "coarse": Method(32, 4, 6, "estimated"),
     "bounce": Method(64, 4, 2, "traced", 0.5),
     "brute_force": Method(REFERENCE_SIZE[0] * REFERENCE_SIZE[1], 1, 1, "traced"),
 }
@@ -42,7 +41,7 @@ SAMPLES = 1024
 
 
 def lists_texels(features: Features) -> bool:
-    """Whether the reference asks for every texel of the environment, beside the samples that follow its light."""
+    """Return whether the reference asks for every texel of the environment, beside samples that follow its light."""
     return features.request.quality.method("environment_shadow") == "brute_force"
 
 

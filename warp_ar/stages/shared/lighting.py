@@ -3,65 +3,53 @@
 from __future__ import annotations
 
 import dataclasses
-import os
-from collections.abc import Iterable, Mapping
-from typing import Any, Final
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 import warp as wp
 
-from warp_ar.errors import UsageError
 from warp_ar.kernels.environment.interpolated_irradiance import OtherBalls
 from warp_ar.kernels.objects.reflect import DiffuseForm, DistantLight, DistantLightConfig
 from warp_ar.kernels.objects.shade import ShadeConfig
 from warp_ar.kernels.rays.trace import TraceConfig
-from warp_ar.kernels.receiver.receiver import RelightConfig
+from warp_ar.kernels.receiver.receiver import Receiver, ReceiverCells, RelightConfig, make_receiver
 from warp_ar.kernels.split_sum import integrate_dfg
-from warp_ar.kernels.structs import METALLIC_ROUGHNESS
+from warp_ar.kernels.structs import METALLIC_ROUGHNESS, filled
 from warp_ar.scene.kinds import light_kind, trace_config
-from warp_ar.stages.base import Arrays, ArraySpec
+from warp_ar.stages.base import Arrays
 from warp_ar.stages.features import LOCAL, MEASURED, Features
-from warp_ar.stages.shared.picture import frame_reads
-
-VARIABLE: Final = "WARP_AR_KERNELS"
-"""Environment variable that decides for all devices: ``shared`` or ``specialised``. It is there for measuring."""
+from warp_ar.stages.shared.picture import find_picture, frame_reads
 
 
 def shares_kernels(device: Any) -> bool:
-    """Return whether kernels on ``device`` are those of any scene.
-
-    Raises:
-        UsageError: The environment variable has another value.
-    """
-    asked = os.environ.get(VARIABLE, "")
-    if asked not in ("", "shared", "specialised"):
-        raise UsageError(f"{VARIABLE} = {asked!r}: expected shared or specialised")
-    return asked == "shared" if asked else bool(device.is_cpu)
+    """Return whether kernels on ``device`` are those of any scene: on CPU, where variants cost more than they save."""
+    return bool(device.is_cpu)
 
 
 def trace_variant(config: TraceConfig, device: Any) -> TraceConfig:
     """Kinds of shape to compile in."""
-    return config.general(by_call=device.is_cpu) if shares_kernels(device) else config
+    return config.general() if shares_kernels(device) else config
 
 
 def distant_variant(features: Features, device: Any) -> DistantLightConfig:
     """Shapes, materials and forms of light to compile in."""
     if not shares_kernels(device):
         return features.distant
-    return features.distant.general(_form(features), by_call=device.is_cpu)
+    return features.distant.general(_form(features))
 
 
 def shade_variant(config: ShadeConfig, features: Features, device: Any) -> ShadeConfig:
     """As ``distant_variant``, and kinds of virtual light."""
     if not shares_kernels(device):
         return config
-    return config.general(_form(features), soft=_asks_soft(features), by_call=device.is_cpu)
+    return config.general(_form(features), soft=_asks_soft(features))
 
 
 def relight_variant(config: RelightConfig, features: Features, device: Any) -> RelightConfig:
     """Shapes and shadows to compile in."""
     if not shares_kernels(device):
         return config
-    return config.general(soft=_asks_soft(features), by_call=device.is_cpu)
+    return config.general(soft=_asks_soft(features))
 
 
 def _form(features: Features) -> DiffuseForm:
@@ -95,36 +83,27 @@ def _other_reads(features: Features) -> tuple[str, ...]:
     return (*diffuse, *specular, *(("others_emitters",) if config.emitters else ()), "probe_places")
 
 
-def distant_light_arrays(features: Features, stage: str) -> Mapping[str, ArraySpec]:
-    """What a stage owns for ``make_distant_light``: for metallic-roughness, the table of its reflectance."""
-    return (
-        {f"{stage}_dfg": ArraySpec((DFG_SIZE, DFG_SIZE), wp.vec2)}
-        if METALLIC_ROUGHNESS in features.distant.models
-        else {}
+def _make_dfg() -> Any:
+    """The table of what metallic-roughness reflects, on the current device."""
+    table = wp.empty((DFG_SIZE, DFG_SIZE), dtype=wp.vec2)
+    integrate_dfg(table)
+    return table
+
+
+def make_distant_light(features: Features, arrays: Arrays) -> DistantLight:
+    """The environment as kernels of a stage read it."""
+    config, names = features.distant, _other_reads(features)
+    form = f"irradiance_{config.diffuse}"
+    return filled(
+        DistantLight(),
+        levels=arrays["prefilter_levels"] if config.specular else None,
+        level_height=features.request.quality.environment_height,
+        dfg=arrays.constant("dfg", _make_dfg) if METALLIC_ROUGHNESS in config.models else None,
+        probes=arrays["probes"],
+        emitters=arrays["emitters"] if config.emitters else None,
+        others=make_other_balls(features, arrays, names) if names else None,
+        **({} if config.diffuse == "none" else {form: arrays[form]}),
     )
-
-
-def make_distant_light(features: Features, arrays: Arrays, stage: str) -> DistantLight:
-    """The environment as kernels of a stage with ``distant_light_arrays`` read it; the table is made here, once."""
-    config = features.distant
-    distant = DistantLight()
-    if config.diffuse == "sh":
-        distant.irradiance_sh = arrays["irradiance_sh"]
-    if config.diffuse == "map":
-        distant.irradiance_map = arrays["irradiance_map"]
-    if config.specular:
-        distant.levels = arrays["prefilter_levels"]
-    distant.level_height = features.request.quality.environment_height
-    if METALLIC_ROUGHNESS in config.models:
-        table = arrays[f"{stage}_dfg"]
-        integrate_dfg(table)
-        distant.dfg = table
-    distant.probes = arrays["probes"]
-    if config.emitters:
-        distant.emitters = arrays["emitters"]
-    if names := _other_reads(features):
-        distant.others = make_other_balls(features, arrays, names)
-    return distant
 
 
 def make_other_balls(features: Features, arrays: Arrays, names: Iterable[str]) -> OtherBalls:
@@ -136,15 +115,21 @@ def make_other_balls(features: Features, arrays: Arrays, names: Iterable[str]) -
         "others_environment": "environment",
         "others_emitters": "emitters",
     }
-    others = OtherBalls()
-    for name in names:
-        if name in fields:
-            setattr(others, fields[name], arrays[name])
-    return others
+    return filled(OtherBalls(), **{fields[name]: arrays[name] for name in names if name in fields})
+
+
+def find_receiver(
+    config: RelightConfig, features: Features, arrays: Arrays, reads: Sequence[str], cells: ReceiverCells | None = None
+) -> Receiver:
+    """The receiver as kernels read it, for a stage that reads these resources."""
+    names = {"key_lights": "key_lights", "irradiance": features.irradiance, "emitters": "emitters"}
+    known = {word: arrays[name] for word, name in names.items() if name in reads}
+    others = make_other_balls(features, arrays, reads)
+    return make_receiver(config, find_picture(arrays), probes=arrays["probes"], others=others, cells=cells, **known)
 
 
 def shade_config(features: Features) -> ShadeConfig:
-    """What the shading of a request's objects calls for."""
+    """Return the configuration that shading a request's objects calls for."""
     return ShadeConfig(
         distant=features.distant,
         lights=tuple(sorted({light_kind(light) for light in features.request.scene.lights})),
@@ -161,7 +146,7 @@ def mirrored_shading(features: Features) -> ShadeConfig:
 
 
 def relight_reads(features: Features) -> tuple[str, ...]:
-    """What the method of ``relight`` needs to know of the environment and the receiver."""
+    """Return the resources that the method of ``relight`` reads of the environment and the receiver."""
     method = features.relight_method
     reads = ["pose", "lights", "objects"]
     measured = method in MEASURED
@@ -178,7 +163,7 @@ def relight_reads(features: Features) -> tuple[str, ...]:
 
 
 def relight_config(features: Features) -> RelightConfig:
-    """What the relighting of a request's receiver calls for."""
+    """Return the configuration that relighting a request's receiver calls for."""
     method = features.relight_method
     return RelightConfig(
         "reflectance" if method in LOCAL else method,

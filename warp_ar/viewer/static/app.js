@@ -1,7 +1,7 @@
 // The page: wires the connection, the picture, the handles and the panels together.
 
 import { Capture } from "./capture.js";
-import { cameraOf, poseOf } from "./geometry.js";
+import { cameraOf, poseOf, project } from "./geometry.js";
 import { Handles } from "./handles.js";
 import { Light } from "./light.js";
 import { Connection, downloadUrl, dropFile } from "./net.js";
@@ -25,10 +25,14 @@ let state = {};
 let scene = null;
 let camera = null;
 let pose = null;
+let carded = 0;
 
 // ------------------------------------------------------------------------------------------------------------- messages
 
+let run = null;
 connection.addEventListener("hello", ({ detail }) => {
+  if (run !== null && run !== detail.run && !$("undo").disabled) notice("The program was started anew: edits that were made before are gone.", true);
+  run = detail.run;
   $("scene-name").replaceChildren(...detail.scenes.map((name) => new Option(name, name)));
   const group = document.createElement("optgroup");
   group.label = "another preset";
@@ -36,6 +40,7 @@ connection.addEventListener("hello", ({ detail }) => {
   const traced = [new Option("Split: path tracing", "traced"), new Option("Split: difference to it", "difference")];
   $("compare").replaceChildren(new Option("Split: off", ""), new Option("Split: camera", "camera"), ...traced, group);
   quality.presets = detail.presets;
+  setup.outside = detail.outside;
 });
 
 const adopt = (next) => {
@@ -48,6 +53,9 @@ const adopt = (next) => {
   scenePanel.scene = scene;
   quality.scene = scene;
   setup.scene = scene;
+  const first = scene.objects.find((one) => one.visible);
+  $("hint").hidden = !first || !!localStorage.getItem("warp_ar.dragged");
+  if (first) $("hint").textContent = `The ${(first.file ?? first.shape).replace(/\.\w+$/, "").replaceAll("_", " ")} is not real. Drag it.`;
   $("captured-note").hidden = !scene.captured;
   $("captured-note").textContent = scene.captured ? `Light of ${scene.captured} stands for what the mirror ball shows.` : "";
 };
@@ -67,6 +75,10 @@ connection.addEventListener("scene", ({ detail }) => {
 });
 connection.addEventListener("settled", adoptWaiting);
 handles.addEventListener("released", adoptWaiting);
+handles.addEventListener("edited", () => {
+  $("hint").hidden = true;
+  localStorage.setItem("warp_ar.dragged", "1");
+});
 
 function showEdit(id, label, verb, keys) {
   // A button that is switched off loses the focus, and the keyboard its place.
@@ -89,13 +101,6 @@ connection.addEventListener("state", ({ detail }) => {
   if (before.lens !== state.lens) withdrawOffers(state.lens);
   $("play").setAttribute("aria-pressed", String(state.playing));
   $("play").lastElementChild.textContent = state.playing ? "Hold" : "Go on";
-  $("record").setAttribute("aria-pressed", String(state.recording !== null));
-  $("recording-badge").hidden = state.recording === null;
-  $("recording-badge").lastElementChild.textContent = `${state.recording ?? 0} frames`;
-  if (before.recording !== null && before.recording !== undefined && state.recording === null) {
-    $("recording-link").hidden = false;
-    download("recording.mp4");
-  }
   $("compare").value = state.compare;
   showSplit();
   showBuilding();
@@ -103,19 +108,26 @@ connection.addEventListener("state", ({ detail }) => {
   $("use-camera").setAttribute("aria-pressed", String(state.camera));
   $("fps").title = `Shown per second here; the program lights ${state.fps.toFixed(1)} a second for ${state.watchers} viewer${state.watchers === 1 ? "" : "s"}`;
   showCamera();
+  showBall(state.ball);
 });
+
+/** The ball's light in the bar; its word is short, so that the bar does not move the picture. */
+function showBall(found) {
+  const [look, words] = { seen: ["tracked", "found"], missing: ["lost", "not seen where the scene has it"], outside: ["held", "out of the picture"] }[found] ?? ["", "none is looked for"];
+  $("ball-state").className = `chip ${look}`;
+  $("ball-state").title = `The mirror ball: ${words}`;
+}
 
 connection.addEventListener("light", ({ detail }) => light.take(detail));
 connection.addEventListener("notice", ({ detail }) => notice(detail.text, detail.bad));
 connection.addEventListener("intrinsics", ({ detail }) => {
-  if (detail.focal) {
-    const spread = Math.max(1, Math.round(100 * detail.spread));
-    offer(`Your camera's focal length was estimated from the marker: ${detail.focal.toFixed(0)} pixels, within about ${spread} %. For exact light, calibrate it.`);
-  } else offer("The marker was not seen well enough to tell your camera's focal length: 60 degrees are assumed. Calibrate it, or move it around the marker.");
+  const spread = Math.max(1, Math.round(100 * detail.spread));
+  offer(`Your camera's focal length was estimated from the marker: ${detail.focal.toFixed(0)} pixels, within about ${spread} %. For exact light, calibrate it.`);
 });
 
 connection.addEventListener("calibration", ({ detail }) => {
   const { on, views, wanted, covered, report } = detail;
+  if (on) withdrawOffers("calibrating");
   $("calibrate").setAttribute("aria-pressed", String(on));
   $("calibrate").textContent = on ? "Stop" : report ? "Calibrate again" : "Calibrate";
   $("calibrate-finish").hidden = !on || views < 4;
@@ -134,13 +146,23 @@ connection.addEventListener("calibration", ({ detail }) => {
   $("calibration-note").textContent = lines.join(" ");
 });
 
+// The program loads its libraries before it has anything to say; what is compiled is counted by itself, below the picture.
+const starting = setInterval(() => {
+  $("veil-words").textContent = `Starting, ${Math.round(performance.now() / 1000)} s: the program loads, then the camera's picture comes, then the lit one.`;
+}, 500);
 connection.addEventListener("open", () => ($("veil").hidden = view.stats.shown > 0));
 connection.addEventListener("lost", ({ detail }) => {
   $("veil").hidden = false;
-  $("veil").textContent = detail.reason ? `Disconnected: ${detail.reason}` : "The program is not reachable; trying again …";
+  showBall("");
+  $("track-state").className = "chip";
+  $("track-state").lastElementChild.textContent = "not connected";
+  clearInterval(starting);
+  $("stored").hidden = true;
+  $("veil-words").textContent = detail.reason ? `Disconnected: ${detail.reason}` : "The program is not reachable; trying again …";
 });
 
 view.addEventListener("shown", ({ detail: frame }) => {
+  clearInterval(starting);
   $("veil").hidden = true;
   camera = cameraOf(frame.camera);
   pose = poseOf(frame.pose);
@@ -149,10 +171,21 @@ view.addEventListener("shown", ({ detail: frame }) => {
   light.draw();
   time.frame(frame);
   setup.frame(frame);
+  showOnCards(frame);
   $("track-state").className = `chip ${frame.state ?? ""}`;
   $("track-state").lastElementChild.textContent = frame.state === null ? (frame.plan ? "no marker needed" : "not lit yet") : { tracked: "marker found", held: "marker hidden", lost: "marker not seen" }[frame.state];
 });
-view.addEventListener("resize", () => $("figure").style.setProperty("--aspect", $("canvas").width / $("canvas").height));
+/** Small pictures of the presets that are lit now: around the first object, every two seconds. */
+function showOnCards(frame) {
+  const first = scene?.objects.find((one) => one.visible);
+  const at = first && pose && project(camera, pose, first.at);
+  if (!at || !frame.plan || state.building || performance.now() - carded < 2000) return;
+  carded = performance.now();
+  const around = [at[0], at[1], Math.max((3.2 * first.reach * camera.fx) / at[2], 48)];
+  quality.show(scene.quality, view.pictures[0], around);
+  if (view.pictures[1] && state.compare_ready) quality.show(state.compare, view.pictures[1], around);
+}
+view.addEventListener("resize", () => document.documentElement.style.setProperty("--aspect", $("canvas").width / $("canvas").height));
 
 setInterval(() => {
   const { fps, latency } = view.stats;
@@ -206,11 +239,8 @@ function notice(text, bad = false) {
   return box;
 }
 
-function download(name) {
-  const link = document.createElement("a");
-  link.href = downloadUrl(name);
-  link.download = name;
-  link.click();
+function save(href, name) {
+  Object.assign(document.createElement("a"), { href, download: name }).click();
 }
 
 /** What is right of the divider; of path tracing, how far it is. */
@@ -221,7 +251,8 @@ function rightTag() {
   if (state.playing) return `${name}: hold the frame`;
   if (!convergence) return `${name} …`;
   const { samples, error, goal, done, difference } = convergence;
-  return `${name}: ${samples} samples, error ${error.toFixed(1)} % (${done ? "done" : `until ${goal.toFixed(1)} %`}), differs by ${difference.toFixed(2)} %`;
+  const noise = samples < 16 ? "too noisy yet to be told apart" : `itself known to ${error.toFixed(1)} %${done ? "" : `, until ${goal.toFixed(1)} %`}`;
+  return `${name}: the picture is ${difference.toFixed(2)} % off on average; the reference, ${samples} samples a pixel, is ${noise}`;
 }
 
 function showSplit() {
@@ -266,7 +297,7 @@ document.addEventListener("pointerdown", (event) => {
 for (const button of document.querySelectorAll("[data-add]")) {
   button.addEventListener("click", () => {
     const [part, kind] = button.dataset.add.split(" ");
-    scenePanel.select(`${part} ${scene[`${part}s`].length}`);
+    scenePanel.expect(part);
     connection.send("add", { part, kind });
   });
 }
@@ -283,6 +314,7 @@ const openTab = (tab) => {
     one.tabIndex = one === tab ? 0 : -1;
     $(one.getAttribute("aria-controls")).hidden = one !== tab;
   }
+  document.querySelector("aside").scrollTop = 0;
 };
 tabs.forEach((tab, index) => {
   tab.addEventListener("click", () => openTab(tab));
@@ -305,12 +337,36 @@ $("split").addEventListener("input", (event) => {
   showSplit();
 });
 $("play").addEventListener("click", () => connection.send("play", { on: !state.playing }));
-$("record").addEventListener("click", () => connection.send("record", { on: state.recording === null }));
+let recorder = null;
+/** Record the picture as it is shown, comparison and all, and save the video when that ends. */
+$("record").addEventListener("click", () => {
+  if (recorder) return recorder.stop();
+  const type = ["video/mp4", "video/webm"].find((one) => window.MediaRecorder?.isTypeSupported(one));
+  if (!type) return notice("This browser records no video.", true);
+  const parts = [];
+  recorder = new MediaRecorder($("canvas").captureStream(), { mimeType: type, videoBitsPerSecond: 1.6e7 });
+  recorder.ondataavailable = ({ data }) => parts.push(data);
+  recorder.onstop = () => {
+    recorder = null;
+    showRecording();
+    save(URL.createObjectURL(new Blob(parts, { type })), `recording.${type.slice(6)}`);
+  };
+  recorder.start();
+  showRecording();
+});
+function showRecording() {
+  $("record").setAttribute("aria-pressed", String(recorder !== null));
+  $("recording-badge").hidden = recorder === null;
+}
+// A video has one size: it ends where that changes.
+view.addEventListener("resize", () => recorder?.stop());
 /** Files one after another; what became of each is said in words. */
 async function take(files) {
   for (const file of files) {
     const box = notice(`${file.name} is on its way …`);
+    if (/\.(glb|gltf|obj|ply|stl|off)$/i.test(file.name)) scenePanel.expect("object");
     const { ok, words } = await dropFile(file);
+    if (!ok) scenePanel.expect(null);
     box.remove();
     notice(words, !ok);
   }
@@ -366,7 +422,7 @@ document.addEventListener("keydown", (event) => {
   const keys = { " ": "play", h: "show-handles", r: "record", f: "fullscreen" };
   if (event.key === " " && event.target.closest("button, [tabindex]:not(g)")) return;
   if (keys[event.key]) $(keys[event.key]).click();
-  else if (event.key === "s") download("frame.png");
+  else if (event.key === "s") save(downloadUrl("frame.png"), "frame.png");
   else if (event.key === "c") connection.send("compare", { other: state.compare ? "" : "camera" });
   else return;
   event.preventDefault();

@@ -13,7 +13,7 @@ const css = (color) => {
   const top = Math.max(...color, 1e-6);
   return `rgb(${color.map((c) => Math.round(255 * Math.pow(Math.min(c / top, 1), 1 / 2.2))).join(" ")})`;
 };
-const rounded = (values) => values.map((v) => Math.round(v * 1e5) / 1e5);
+const rounded = (value) => (Array.isArray(value) ? value.map(rounded) : Math.round(value * 1e5) / 1e5);
 const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
 const SUN = 0.22; // metres from the marker at which a directional light's handle hangs
 
@@ -27,6 +27,10 @@ export class Handles extends EventTarget {
   #pose = null;
   #scene = null;
   #drag = null;
+  #pressed = null;
+  #grips = new WeakMap();
+  #fingers = new Map();
+  #wheeled = null;
   #selected = null;
   #visible = true;
 
@@ -35,15 +39,30 @@ export class Handles extends EventTarget {
     this.#svg = svg;
     this.#connection = connection;
     svg.addEventListener("pointermove", (event) => this.#move(event));
-    svg.addEventListener("pointerup", () => this.#release());
-    svg.addEventListener("pointercancel", () => this.#release());
+    for (const type of ["pointerup", "pointercancel"]) {
+      svg.addEventListener(type, (event) => {
+        this.#fingers.delete(event.pointerId);
+        this.#release();
+      });
+    }
     svg.addEventListener("wheel", (event) => this.#wheel(event), { passive: false });
-    svg.addEventListener("pointerdown", (event) => event.target === svg && this.#select(null));
+    svg.addEventListener("pointerdown", (event) => this.#press(event));
+    connection.addEventListener("lost", () => {
+      this.#pressed = null;
+      this.#fingers.clear();
+      this.#release();
+    });
+    connection.addEventListener("picked", ({ detail }) => this.#picked(detail));
   }
 
   /** Whether something is being dragged: the scene is the page's until it is let go. */
   get busy() {
-    return this.#drag !== null;
+    return this.#drag !== null || this.#pressed !== null;
+  }
+
+  /** Key of the part that is dragged; null while nothing is, undefined until a press is answered. */
+  get dragged() {
+    return this.#drag ? this.#drag.item.key : this.#pressed ? undefined : null;
   }
 
   set visible(on) {
@@ -61,7 +80,12 @@ export class Handles extends EventTarget {
     const shape = JSON.stringify([scene.objects.map((o) => o.shape), scene.lights.map((l) => [l.kind, !!l.target]), scene.proxies.map((p) => p.shape)]);
     const same = this.#scene && shape === this.#scene.shape;
     this.#scene = { ...scene, shape };
-    if (!same) this.#rebuild();
+    if (!same) {
+      // The keyboard's place stays: on the same part, else on the one that has taken its number, or the picture's last.
+      const key = this.#svg.contains(document.activeElement) ? document.activeElement.dataset.key : null;
+      this.#rebuild();
+      if (key) (this.#items.find((item) => item.key === key) ?? this.#items.at(-1))?.group.focus({ preventScroll: true });
+    }
     this.selected = this.#selected;
     this.#place();
   }
@@ -92,6 +116,8 @@ export class Handles extends EventTarget {
       item.ring = this.#grip(item, "at", make("path", { class: "ring" }, item.group));
       item.turn = make("circle", { class: "turn", r: 6 }, item.group);
       item.turnHit = this.#grip(item, "turn", make("circle", { class: "hit", r: 20 }, item.group));
+      item.scale = make("circle", { class: "turn scale", r: 6 }, item.group);
+      item.scaleHit = this.#grip(item, "scale", make("circle", { class: "hit", r: 20 }, item.group));
     });
     this.#scene.lights.forEach((light, index) => {
       const item = this.#group("light", index, `${light.kind} light ${index + 1}`);
@@ -118,7 +144,7 @@ export class Handles extends EventTarget {
   }
 
   #grip(item, grip, element) {
-    element.addEventListener("pointerdown", (event) => this.#grab(event, item, grip));
+    this.#grips.set(element, { item, grip });
     return element;
   }
 
@@ -166,8 +192,10 @@ export class Handles extends EventTarget {
     item.ring.setAttribute("d", path);
     item.halo.setAttribute("d", path);
     const angle = (object.rotate[2] * Math.PI) / 180;
-    const turn = project(this.#camera, this.#pose, [object.at[0] + radius * Math.cos(angle), object.at[1] + radius * Math.sin(angle), 0]);
-    for (const [element, size] of [[item.turn, 5.5], [item.turnHit, 22]]) put(element, turn, size * unit);
+    const outside = 1.15 * radius + 0.012; // clear of the object's own pixels, which move it
+    const [x, y] = [outside * Math.cos(angle), outside * Math.sin(angle)];
+    const [turn, scale] = [1, -1].map((side) => project(this.#camera, this.#pose, [object.at[0] + side * x, object.at[1] + side * y, 0]));
+    for (const [element, at, size] of [[item.turn, turn, 5.5], [item.turnHit, turn, 22], [item.scale, scale, 5.5], [item.scaleHit, scale, 22]]) put(element, at, size * unit);
   }
 
   #placeProxy(item, proxy) {
@@ -216,25 +244,77 @@ export class Handles extends EventTarget {
     return [((event.clientX - box.left) / box.width) * width - 0.5, ((event.clientY - box.top) / box.height) * height - 0.5];
   }
 
-  #grab(event, item, grip) {
-    if (event.button !== 0 || !this.#pose) return;
+  /** An object is taken by the pixels that show it, which the program knows; handles by what is left. */
+  #press(event) {
+    if (event.button !== 0 || !this.#pose || this.#svg.classList.contains("pointing")) return;
     event.preventDefault();
-    event.stopPropagation();
+    this.#svg.setPointerCapture(event.pointerId);
+    const [u, v] = this.#pointer(event);
+    this.#fingers.set(event.pointerId, [u, v]);
+    if (this.#pressed) return;
+    const grip = this.#grips.get(event.target);
+    this.#pressed = { u, v, grip, moved: event, up: false };
+    const unit = this.#camera.width / (this.#svg.clientWidth || this.#camera.width);
+    // A chosen light is taken over an object too, by what is drawn of it.
+    const chosen = grip?.item.part === "light" && grip.item.key === this.#selected;
+    const drawn = chosen && project(this.#camera, this.#pose, grip.grip === "target" ? this.#part(grip.item).target : this.#lightAt(this.#part(grip.item)));
+    if (!this.#connection.ready || (drawn && Math.hypot(drawn[0] - u, drawn[1] - v) < 9 * unit)) return this.#take(grip);
+    this.#connection.send("pick", { x: u, y: v, reach: event.pointerType === "touch" ? 8 * unit : 0 });
+  }
+
+  #picked({ x, y, object }) {
+    const [pressed, wheeled] = [this.#pressed, this.#wheeled];
+    if (wheeled?.u === x && wheeled.v === y) {
+      wheeled.key = object === null ? wheeled.drawn : `object ${object}`;
+      this.#turnWheel();
+    }
+    if (!pressed || this.#drag || x !== pressed.u || y !== pressed.v) return;
+    const item = this.#items.find((one) => one.key === `object ${object}`);
+    this.#take(item ? { item, grip: "at" } : pressed.grip);
+  }
+
+  #take(held) {
+    const { u, v, moved, up } = this.#pressed;
+    if (!held) {
+      this.#pressed = null;
+      return this.#select(null);
+    }
+    const { item, grip } = held;
     const part = this.#part(item);
     const point = item.part === "proxy" ? part.at : item.part === "object" || grip === "floor" ? [part.at[0], part.at[1], 0] : grip === "target" ? part.target : this.#lightAt(part);
     const seen = project(this.#camera, this.#pose, point) ?? [0, 0];
-    const [u, v] = this.#pointer(event);
-    this.#drag = { item, grip, point, off: [seen[0] - u, seen[1] - v], height: part.at[2], from: v };
-    this.#svg.setPointerCapture(event.pointerId);
+    this.#drag = { item, grip, point, off: [seen[0] - u, seen[1] - v], height: part.at[2], from: v, away: this.#away(part, u, v), scale: part.scale };
     item.group.focus({ preventScroll: true });
     this.#select(item.key);
+    // The hand may have gone on, or up, before the answer was there.
+    if (this.#pointer(moved).some((value, i) => Math.abs(value - [u, v][i]) > 0.5)) this.#move(moved);
+    if (up) this.#release();
+  }
+
+  /** Distance along the desk from a part to what a pixel shows of it, metres. */
+  #away(part, u, v) {
+    const at = onPlane(this.#camera, this.#pose, u, v, 0);
+    return at ? Math.max(Math.hypot(at[0] - part.at[0], at[1] - part.at[1]), 0.005) : 0.1;
+  }
+
+  /** Two fingers on an object: their distance is its size, their direction its turn. */
+  #pinch({ item }, part) {
+    const [[a, b], [c, d]] = this.#fingers.values();
+    const [distance, angle] = [Math.hypot(c - a, d - b), (Math.atan2(d - b, c - a) * 180) / Math.PI];
+    const from = (this.#drag.pinch ??= { distance, angle, scale: part.scale, turn: part.rotate[2] });
+    this.#put(item, "scale", Math.max((from.scale * distance) / Math.max(from.distance, 1), 1e-4));
+    this.#put(item, "rotate", [part.rotate[0], part.rotate[1], from.turn + from.angle - angle]);
   }
 
   #move(event) {
+    if (this.#pressed && !(this.#fingers.size > 1)) this.#pressed.moved = event;
     if (!this.#drag || !this.#pose) return;
-    const { item, grip, point, off, from, height } = this.#drag;
+    const { item, grip, point, off, from, height, away, scale } = this.#drag;
     const part = this.#part(item);
     const [u, v] = this.#pointer(event);
+    if (this.#fingers.has(event.pointerId)) this.#fingers.set(event.pointerId, [u, v]);
+    if (this.#fingers.size > 1 && item.part === "object") return this.#pinch(this.#drag, part);
+    if (grip === "scale") return this.#put(item, "scale", Math.max((scale * this.#away(part, u, v)) / away, 1e-4));
     if (grip === "turn") {
       const at = onPlane(this.#camera, this.#pose, u, v, 0);
       if (at) this.#put(item, "rotate", [part.rotate[0], part.rotate[1], (Math.atan2(at[1] - part.at[1], at[0] - part.at[0]) * 180) / Math.PI]);
@@ -253,19 +333,35 @@ export class Handles extends EventTarget {
   }
 
   #release() {
+    if (this.#pressed && !this.#drag) return void (this.#pressed.up = true);
+    this.#pressed = null;
     if (!this.#drag) return;
     this.#drag = null;
     this.dispatchEvent(new Event("released"));
   }
 
+  /** The wheel turns the object, or sets the height of the light, that is under it. */
   #wheel(event) {
-    const key = event.target.closest?.(".part")?.dataset.key ?? this.#selected;
-    const item = this.#items.find((one) => one.key === key);
-    if (!item || !this.#pose) return;
+    if (!this.#pose) return;
     event.preventDefault();
     const step = clamp(event.deltaY * (event.deltaMode === 1 ? 30 : 1), -240, 240);
+    const [u, v] = this.#pointer(event);
+    if (this.#wheeled && Math.hypot(this.#wheeled.u - u, this.#wheeled.v - v) < 1) {
+      this.#wheeled.step += step;
+      return this.#turnWheel();
+    }
+    const drawn = event.target.closest?.(".part")?.dataset.key;
+    this.#wheeled = { u, v, step, drawn, raises: event.shiftKey };
+    this.#connection.send("pick", { x: u, y: v, reach: 0 });
+  }
+
+  #turnWheel() {
+    const { key, step, raises } = this.#wheeled;
+    const item = this.#items.find((one) => one.key === key);
+    if (!item) return;
+    this.#wheeled.step = 0;
     if (item.part === "light") this.#raise(item, -step * 0.0002);
-    else if (event.shiftKey) this.#raise(item, -step * 0.0001);
+    else if (raises) this.#raise(item, -step * 0.0001);
     else this.#turn(item, step * 0.06);
     this.#select(item.key);
   }
@@ -297,6 +393,9 @@ export class Handles extends EventTarget {
       } else this.#put(item, "at", [part.at[0] + x * step, part.at[1] + y * step, part.at[2]]);
     } else if (event.key === "PageUp" || event.key === "PageDown") this.#raise(item, event.key === "PageUp" ? step : -step);
     else if (event.key === "[" || event.key === "]") this.#turn(item, event.key === "]" ? 5 : -5);
+    else if (["+", "=", "-"].includes(event.key) && item.part === "object") this.#put(item, "scale", part.scale * (event.key === "-" ? 1 / 1.05 : 1.05));
+    else if (event.key === "g" && item.part === "object") this.#connection.send("snap", { index: item.index });
+    else if (event.key === "d") this.dispatchEvent(new CustomEvent("duplicate", { detail: item.key }));
     else if (event.key === "v") this.#connection.send("show", { part: item.part, index: item.index, on: false });
     else if (event.key === "Delete") this.#connection.send("remove", { part: item.part, index: item.index });
     else return;
@@ -307,7 +406,8 @@ export class Handles extends EventTarget {
   /** Change a value here at once, and on the server. */
   #put(item, key, value) {
     const part = this.#part(item);
-    part[key] = rounded(value);
+    if (key === "scale") part.reach *= value / part.scale;
+    part[key] = key === "scale" ? Number(value.toPrecision(6)) : rounded(value);
     this.#connection.set(item.part, item.index, key, part[key]);
     this.#place();
     this.dispatchEvent(new CustomEvent("edited", { detail: item.key }));

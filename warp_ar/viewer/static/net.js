@@ -6,6 +6,7 @@ const query = token ? `?token=${encodeURIComponent(token)}` : "";
 // How far clocks go apart, milliseconds a millisecond: quartz does a tenth of it.
 const DRIFT = 1e-3;
 
+export const codeUrl = `address.svg${query}`;
 export const downloadUrl = (name) => `download/${name}${query}`;
 
 /** Hand the program a file; whether it took it, and what it says. */

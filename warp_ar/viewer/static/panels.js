@@ -68,6 +68,7 @@ function color(label, value, change) {
 
 const shapeName = (proxy) => (proxy.shape === "plane" && proxy.rotate[0] ? "wall" : proxy.shape === "plane" ? "plane" : proxy.file?.replace(/\.\w+$/, "") ?? proxy.shape);
 
+const LISTS = { object: "objects", light: "lights", proxy: "proxies" };
 const MODELS = { metallic_roughness: "Metallic-roughness", phong: "Phong", lambert: "Chalk", mirror: "Mirror", emissive: "Emits", file: "The file's own" };
 const EFFECTS = {
   objects: ["Virtual objects", ""],
@@ -85,6 +86,7 @@ export class ScenePanel {
   #scene = null;
   #selected = null;
   #shape = "";
+  #expected = null;
 
   constructor(connection, handles) {
     this.#connection = connection;
@@ -94,7 +96,19 @@ export class ScenePanel {
     this.proxies = document.getElementById("proxies");
     this.proxyInspector = document.getElementById("proxy-inspector");
     handles.addEventListener("select", ({ detail }) => this.select(detail, false));
-    handles.addEventListener("edited", ({ detail }) => detail === this.#selected && this.#fill());
+    handles.addEventListener("edited", ({ detail }) => detail === this.#selected && this.#inspect());
+    handles.addEventListener("duplicate", ({ detail }) => this.#duplicate(detail));
+  }
+
+  /** Choose the part of a kind that comes next; null: none any more. */
+  expect(part) {
+    this.#expected = part && { part, count: this.#scene[LISTS[part]].length };
+  }
+
+  #duplicate(key) {
+    const [part, index] = key.split(" ");
+    this.expect(part);
+    this.#connection.send("duplicate", { part, index: Number(index) });
   }
 
   select(key, tellHandles = true) {
@@ -119,6 +133,12 @@ export class ScenePanel {
     this.parts.replaceChildren(...entries.map(([part, index, item]) => this.#entry(part, index, item)));
     if (!entries.length) this.parts.append(el("li", { class: "note" }, "Nothing yet: add an object or a light."));
     this.proxies.replaceChildren(...scene.proxies.map((proxy, index) => this.#entry("proxy", index, proxy)));
+    const { part, count } = this.#expected ?? {};
+    if (part && scene[LISTS[part]].length > count) {
+      this.#expected = null;
+      this.#selected = `${part} ${scene[LISTS[part]].length - 1}`;
+      this.#handles.selected = this.#selected;
+    }
     const known = (key) => document.querySelector(`:is(#parts, #proxies) [data-key="${key}"]`);
     if (!this.#selected || !known(this.#selected)) {
       this.#selected = entries.length ? `${entries[0][0]} ${entries[0][1]}` : null;
@@ -156,19 +176,16 @@ export class ScenePanel {
   #item() {
     if (!this.#selected || !this.#scene) return null;
     const [part, index] = this.#selected.split(" ");
-    return this.#scene[{ object: "objects", light: "lights", proxy: "proxies" }[part]][index] ?? null;
-  }
-
-  /** Bring the numbers of the inspector up to date with a drag. */
-  #fill() {
-    this.#inspect();
+    return this.#scene[LISTS[part]][index] ?? null;
   }
 
   #inspect() {
     const item = this.#item();
+    // What was chosen before stays, out of use: the panel keeps its place.
+    this.inspector.inert = this.proxyInspector.inert = !item;
+    if (!item) return;
     this.inspector.replaceChildren();
     this.proxyInspector.replaceChildren();
-    if (!item) return;
     const [part, number] = this.#selected.split(" ");
     const index = Number(number);
     const set = (key, value, holder = item) => {
@@ -188,7 +205,9 @@ export class ScenePanel {
     }
     if (part === "object") rows.push(...this.#object(item, set, along));
     else rows.push(...this.#light(item, set));
-    this.inspector.replaceChildren(...rows);
+    const actions = [el("button", { title: "d", onclick: () => this.#duplicate(this.#selected) }, "Duplicate")];
+    if (part === "object") actions.push(el("button", { title: "g", onclick: () => this.#connection.send("snap", { index }) }, "Set on the desk"));
+    this.inspector.replaceChildren(...rows, el("div", { class: "actions" }, ...actions));
   }
 
   /** Sizes and place of a shape of the desk. */
@@ -282,6 +301,7 @@ export class ScenePanel {
   }
 }
 
+const spoken = (name) => name.replaceAll("_", " ");
 const hue = (index) => `hsl(${(28 + index * 47) % 360} ${58 + (index % 3) * 9}% ${56 + (index % 2) * 8}%)`;
 const HISTORY = 120;
 
@@ -311,21 +331,24 @@ export class TimePanel {
     const runs = all.map((entry, index) => this.#row(entry, hue(index)));
     const outs = plan.left_out.map((entry) => this.#row(entry, "var(--line)"));
     this.list.replaceChildren(...runs, ...outs);
+    const several = plan.run.filter((entry) => entry.methods.length > 1).concat(plan.left_out.filter((entry) => entry.methods.length > 1));
+    document.getElementById("methods").replaceChildren(...several.map((entry) => this.#methodsOf(entry)));
+  }
+
+  #methodsOf({ stage, method, methods }) {
+    const pick = el("select", { "aria-label": `Method of ${spoken(stage)}`, onchange: () => this.#connection.send("method", { stage, method: pick.value }) },
+      ...(methods.includes(method) ? [] : [el("option", { value: "", selected: true }, "default")]),
+      ...methods.map((one) => el("option", { value: one, selected: one === method }, spoken(one))));
+    return el("div", { class: "row typed" }, el("span", {}, spoken(stage)), pick);
   }
 
   #row(entry, tint) {
     const out = "reason" in entry;
     const why = el("div", { class: "why" }, out ? `Left out: ${entry.reason}.` : `${entry.summary[0].toUpperCase()}${entry.summary.slice(1)}.`);
-    if (entry.methods.length > 1) {
-      const pick = el("select", { "aria-label": `Method of ${entry.stage}`, onchange: () => this.#connection.send("method", { stage: entry.stage, method: pick.value }) },
-        ...(entry.methods.includes(entry.method) ? [] : [el("option", { value: "", selected: true }, "default")]),
-        ...entry.methods.map((method) => el("option", { value: method, selected: method === entry.method }, method)));
-      why.append(pick);
-    }
     const bar = el("b");
     const time = el("span", { class: "ms" }, out ? "–" : "");
     const row = el("li", { class: out ? "out" : "", tabindex: "0", title: why.firstChild.textContent },
-      el("span", { class: "name" }, el("i"), entry.stage.replaceAll("_", " ")), out ? el("span", { class: "ms" }, "left out") : el("span", { class: "bar" }, bar), time, why);
+      el("span", { class: "name" }, el("i"), spoken(entry.stage)), out ? el("span", { class: "ms" }, "left out") : el("span", { class: "bar" }, bar), time, why);
     row.style.setProperty("--c", tint);
     row.dataset.stage = entry.stage;
     this.#rows.set(entry.stage, { row, bar, time, tint, why, out, summary: entry.summary });
@@ -416,6 +439,7 @@ export class QualityPanel {
   #time;
   #state = null;
   #budget = null;
+  #cards = new Map();
   #later = 0;
 
   constructor(connection, time) {
@@ -454,8 +478,9 @@ export class QualityPanel {
   }
 
   set presets(names) {
-    const buttons = names.map((name) => el("button", { role: "radio", "data-preset": name, "aria-checked": "false", onclick: () => this.#connection.send("quality", { name }) }, name, el("small", {}, "–")));
-    this.holder.replaceChildren(...buttons);
+    this.#cards = new Map(names.map((name) => [name, this.#card(name)]));
+    this.holder.replaceChildren(...[...this.#cards.values()].map(({ card }) => card));
+    const buttons = [...this.#cards.values()].map(({ button }) => button);
     this.holder.onkeydown = (event) => {
       const step = { ArrowRight: 1, ArrowDown: 1, ArrowLeft: -1, ArrowUp: -1 }[event.key];
       const place = buttons.indexOf(document.activeElement);
@@ -465,8 +490,30 @@ export class QualityPanel {
     };
   }
 
+  #card(name) {
+    const picture = el("canvas", { width: 96, height: 72, "aria-hidden": "true" });
+    // Of the bundled desk, until this machine has a picture of its own.
+    const image = new Image();
+    image.onload = () => picture.dataset.own || picture.getContext("2d").drawImage(image, 0, 0, picture.width, picture.height);
+    image.src = `static/preset-${name}.jpg`;
+    const [cost, off] = [el("small"), el("small")];
+    const button = el("button", { role: "radio", "data-preset": name, "aria-checked": "false", onclick: () => this.#connection.send("quality", { name }) },
+      picture, el("b", {}, name), cost, off);
+    const compare = el("button", { class: "beside", "aria-pressed": "false", title: `Show ${name} beside what is shown now`, "aria-label": `Compare with ${name}`,
+      onclick: () => this.#connection.send("compare", { other: this.#state?.compare === name ? "" : name }) }, "Compare");
+    return { card: el("div", { class: "card" }, button, compare), button, compare, picture, cost, off };
+  }
+
+  /** Take a preset's small picture from one that it has lit: the surroundings of a pixel. */
+  show(name, picture, [x, y, size]) {
+    const own = this.#cards.get(name)?.picture;
+    if (!own?.offsetParent) return;
+    own.dataset.own = "1";
+    own.getContext("2d").drawImage(picture, x - (size * 2) / 3, y - size / 2, (size * 4) / 3, size, 0, 0, own.width, own.height);
+  }
+
   set scene(scene) {
-    for (const button of this.holder.children) button.setAttribute("aria-checked", String(button.dataset.preset === scene.quality));
+    for (const [name, { button }] of this.#cards) button.setAttribute("aria-checked", String(name === scene.quality));
   }
 
   set budget(budget) {
@@ -480,18 +527,26 @@ export class QualityPanel {
       this.flip.setAttribute("aria-checked", String(state.budget !== null));
       if (state.budget !== null && document.activeElement !== this.range) this.range.value = 1000 * share(state.budget);
     }
-    for (const button of this.holder.children) {
-      const cost = state.costs[button.dataset.preset];
-      button.lastChild.textContent = cost === undefined ? "–" : `${brief(cost)} ms`;
+    for (const [name, { compare, cost, off }] of this.#cards) {
+      const [known, error] = [state.costs[name], this.#budget?.errors[name]];
+      cost.textContent = known ? `${known.frames ? "" : "about "}${brief(known.ms)} ms · ${(1000 / known.ms).toFixed(known.ms > 100 ? 1 : 0)} fps` : "takes seconds a frame";
+      off.textContent = error === undefined ? "the most exact" : `${inWords(error)} · ${error.toFixed(3)}`;
+      compare.setAttribute("aria-pressed", String(state.compare === name));
     }
     this.#draw();
+  }
+
+  /** Times here over those that methods were measured to take, from the base, which is medium. */
+  get #load() {
+    const { costs = {}, auto } = this.#state ?? {};
+    return auto?.factor ?? (costs.medium ? costs.medium.ms / this.#budget.base : 1);
   }
 
   /** What the slider's budget buys, as the program chooses; null while costs are unknown. */
   #bought() {
     const { known, base, choices } = this.#budget ?? {};
     if (!known) return null;
-    const factor = this.#state?.auto?.factor ?? 1;
+    const factor = this.#load;
     const took = (choice) => factor * (base + choice.ms);
     const fitting = choices.filter((choice) => took(choice) <= AIM * this.#ms);
     const choice = fitting.at(-1) ?? choices[0];
@@ -506,8 +561,7 @@ export class QualityPanel {
     if (!this.plot.parentElement.offsetParent) return;
     const bought = this.#bought();
     this.plot.parentElement.classList.toggle("off", !on);
-    this.plot.style.display = bought ? "" : "none";
-    if (bought) this.#plot(bought);
+    this.#plot(bought);
     document.getElementById("buys").replaceChildren(...(bought && on ? this.#methods(bought.choice) : []));
     document.getElementById("budget-note").textContent = this.#note(bought);
   }
@@ -521,52 +575,56 @@ export class QualityPanel {
     if (!bought) return "The program then chooses the methods that err least within this time. What each costs on this device is measured once; how long that takes is told as soon as it is known.";
     const { choice, took, fits } = bought;
     if (this.#budget.choices.every((one) => one.error === 0)) return "What these methods err is not in the cost table, so the cheapest are taken: python -m warp_ar.tradeoff makes one.";
-    const parts = [`${this.#on ? "This buys" : "This would buy"} about ${brief(took(choice))} ms a frame, ${error(choice.error)} off the best that can be had.`];
+    const parts = [`${this.#on ? "This buys" : "This would buy"} about ${brief(took(choice))} ms a frame, with an error of ${error(choice.error)} against the truth.`];
     if (!fits) parts.push("Nothing cheaper is left.");
-    const { difference, compare } = this.#state ?? {};
-    if (difference !== null && difference !== undefined) parts.push(`Against ${compare}, the picture differs by ${difference.toFixed(2)} % of full scale on average.`);
     return parts.join(" ");
   }
 
-  /** Error over time of all that can be bought, over the slider's own scale. */
-  #plot({ choice, took }) {
-    const { choices, presets, base } = this.#budget;
+  /** Error over time, over the slider's own scale: presets, hollow until they ran here, and all that can be bought. */
+  #plot(bought) {
+    const { choices = [], errors = {} } = this.#budget ?? {};
+    const { costs = {} } = this.#state ?? {};
+    const presets = Object.entries(errors).filter(([name]) => costs[name]).map(([name, error]) => ({ name, error, ...costs[name] }));
     const [width, height] = [this.plot.clientWidth, this.plot.clientHeight];
-    const [left, top] = [8, 14];
-    const x = (ms) => left + share(ms) * (width - 2 * left);
-    const most = Math.max(...choices.map((c) => c.error), ...Object.values(presets).map((p) => p.error), 1e-6);
-    const y = (e) => top + (1 - e / most) * (height - top - 6);
+    const [left, right, top, bottom] = [34, 8, 16, 4];
+    const x = (ms) => left + share(ms) * (width - left - right);
+    const most = Math.max(...choices.map((c) => c.error), ...presets.map((p) => p.error), 0.1);
+    const y = (e) => top + (1 - e / most) * (height - top - bottom);
     const placed = [];
     const label = (name, px, py) => {
-      const at = [Math.min(px + 6, width - 44), Math.max(py - 4, 10)];
-      if (placed.some(([ox, oy]) => Math.abs(at[0] - ox) < 42 && Math.abs(at[1] - oy) < 11)) return [];
+      const at = [Math.min(px + 6, width - 44), Math.max(py - 5, 10)];
+      while (placed.some(([ox, oy]) => Math.abs(at[0] - ox) < 44 && Math.abs(at[1] - oy) < 11)) at[1] += 11;
       placed.push(at);
-      return [shape("text", { x: at[0], y: at[1] }, name)];
+      return shape("text", { x: at[0], y: at[1] }, name);
     };
-    let path = "";
-    for (const c of choices) path += path ? `H${x(took(c)).toFixed(1)}V${y(c.error).toFixed(1)}` : `M${x(took(c)).toFixed(1)} ${top}V${y(c.error).toFixed(1)}`;
-    const at = x(this.#ms);
-    const parts = [
-      shape("path", { class: "area", d: `${path}H${width - left}V${height}H${x(took(choices[0])).toFixed(1)}Z` }),
-      shape("path", { class: "line", d: `${path}H${width - left}` }),
-      shape("line", { class: "budget", x1: at, x2: at, y1: 4, y2: height }),
-      ...Object.entries(presets).flatMap(([name, cost]) => {
-        const [px, py] = [x(took({ ms: cost.ms })), y(cost.error)];
-        return [shape("circle", { class: "preset", cx: px, cy: py, r: 3 }), ...label(name, px, py)];
-      }),
-      shape("circle", { class: "choice", cx: x(took(choice)), cy: y(choice.error), r: 5 }),
-    ];
+    const parts = [shape("text", { x: 0, y: 9 }, "error, FLIP")];
+    for (let e = 0; e <= most; e += 0.1) {
+      parts.push(shape("line", { class: "grid", x1: left, x2: width - right, y1: y(e), y2: y(e) }), shape("text", { class: "tick", x: left - 6, y: y(e) + (e ? 4 : 0) }, e ? e.toFixed(1) : "0"));
+    }
+    for (const ms of [1, 10, 100, 1000]) parts.push(shape("line", { class: "grid", x1: x(ms), x2: x(ms), y1: top, y2: height }));
+    if (bought) {
+      const { choice, took } = bought;
+      let path = "";
+      for (const c of choices) path += path ? `H${x(took(c)).toFixed(1)}V${y(c.error).toFixed(1)}` : `M${x(took(c)).toFixed(1)} ${top}V${y(c.error).toFixed(1)}`;
+      parts.push(shape("path", { class: "area", d: `${path}H${width - right}V${height}H${x(took(choices[0])).toFixed(1)}Z` }), shape("path", { class: "line", d: `${path}H${width - right}` }));
+      parts.push(shape("circle", { class: "choice", cx: x(took(choice)), cy: y(choice.error), r: 5 }));
+    }
+    if (this.#on) parts.push(shape("line", { class: "budget", x1: x(this.#ms), x2: x(this.#ms), y1: 4, y2: height }));
+    for (const { name, error, ms, frames } of presets) {
+      parts.push(shape("circle", { class: `preset${frames ? "" : " about"}`, cx: x(ms), cy: y(error), r: 3.5 }), label(name, x(ms), y(error)));
+    }
     this.plot.replaceChildren(...parts);
-    this.plot.setAttribute("aria-label", `Error over time: ${brief(took(choice))} milliseconds, error ${error(choice.error)}, base ${brief(base)} milliseconds`);
+    this.plot.setAttribute("aria-label", `Error over time. ${presets.map(({ name, error, ms }) => `${name}: ${brief(ms)} milliseconds, error ${error.toFixed(3)}`).join("; ")}`);
   }
 
   #methods(choice) {
     return Object.entries(this.#budget.settings).map(([name, methods], index) => {
       const place = choice.methods[index];
       const pips = el("span", { class: "pips", "aria-hidden": "true" }, ...methods.map((_, i) => el("i", { class: i <= place ? "on" : "" })));
-      return el("li", {}, el("span", { class: "name" }, name.replaceAll("_", " ")), pips, el("span", {}, methods[place].replaceAll("_", " ")));
+      return el("li", {}, el("span", { class: "name" }, spoken(name)), pips, el("span", {}, spoken(methods[place])));
     });
   }
 }
 
 const error = (value) => `${value.toFixed(3)} FLIP`;
+const inWords = (value) => (value < 0.05 ? "hardly to be told from the truth" : value < 0.13 ? "close to the truth" : value < 0.2 ? "visibly off" : "plainly off");

@@ -1,9 +1,11 @@
 // Setting up one's own desk: the card, its sizes, what is missing, the measurements, and what is wrong.
 
+import { codeUrl } from "./net.js";
 import { el } from "./panels.js";
 
 const $ = (id) => document.getElementById(id);
 const DICTIONARIES = ["DICT_4X4_50", "DICT_4X4_100", "DICT_4X4_250", "DICT_5X5_50", "DICT_5X5_100", "DICT_5X5_250", "DICT_6X6_50", "DICT_6X6_250", "DICT_7X7_50", "DICT_ARUCO_ORIGINAL", "DICT_APRILTAG_36h11"];
+const family = (name) => name.replace(/^DICT_/, "");
 const millimetres = (metres) => Number((1000 * metres).toFixed(2));
 
 export class SetupPanel {
@@ -29,7 +31,7 @@ export class SetupPanel {
     $("measure-ball").addEventListener("click", () => connection.send("setup", { step: "ball" }));
     $("measure-response").addEventListener("click", () => connection.send("setup", { step: "response" }));
     $("check").addEventListener("click", () => connection.send("setup", { step: "check" }));
-    $("marker-dictionary").replaceChildren(...DICTIONARIES.map((name) => el("option", { value: name }, name)));
+    $("marker-dictionary").replaceChildren(...DICTIONARIES.map((name) => el("option", { value: name }, family(name))));
   }
 
   set scene(scene) {
@@ -41,17 +43,24 @@ export class SetupPanel {
     $("marker-note").textContent = marker.ruler !== null
       ? `The scene uses the printed card${Math.abs(marker.ruler - 0.1) > 1e-6 ? `, whose rulers are ${size(marker.ruler)}` : ""}${probes.length ? `; the ball's radius is ${size(probes[0].radius)}` : ""}.`
       : own
-        ? `The scene expects another marker: number ${marker.id} of ${marker.dictionary}, ${size(marker.size)} wide.`
+        ? `The scene expects another marker: number ${marker.id} of the family ${family(marker.dictionary)}, ${size(marker.size)} wide.`
         : `The scene expects a board of its own: ${marker.board}.`;
     // What is typed stays until the scene says otherwise.
     if (before === JSON.stringify([marker, probes])) return;
     if (probes.length) $("ball-radius").value = millimetres(probes[0].radius);
     $("ruler").value = millimetres(marker.ruler ?? 0.1);
-    if (!DICTIONARIES.includes(marker.dictionary)) $("marker-dictionary").append(el("option", { value: marker.dictionary }, marker.dictionary));
+    if (!DICTIONARIES.includes(marker.dictionary)) $("marker-dictionary").append(el("option", { value: marker.dictionary }, family(marker.dictionary)));
     $("marker-dictionary").value = marker.dictionary;
     $("marker-id").value = marker.id;
     $("marker-size").value = millimetres(marker.size);
     this.#say();
+  }
+
+  /** Address for other machines, with its code for a phone's camera; null where they do not reach this page. */
+  set outside(address) {
+    $("phone").hidden = !address;
+    $("phone-note").textContent = address ? `Point a phone's camera at the code, or open ${address} there.` : "To open this page on a phone, start the program with --host 0.0.0.0 --tls.";
+    if (address) $("phone").src = codeUrl;
   }
 
   set state(state) {

@@ -19,7 +19,10 @@ export class View extends EventTarget {
     this.#context = canvas.getContext("2d", { alpha: false });
     this.#connection = connection;
     connection.addEventListener("frame", ({ detail }) => this.#take(detail));
-    connection.addEventListener("lost", () => (this.#times = []));
+    connection.addEventListener("lost", () => {
+      [this.#times, this.#delays] = [[], []];
+      Object.assign(this.stats, { fps: 0, latency: null });
+    });
   }
 
   async #take(frame) {
@@ -38,6 +41,11 @@ export class View extends EventTarget {
     this.draw();
     this.#measure(frame);
     this.dispatchEvent(new CustomEvent("shown", { detail: frame }));
+  }
+
+  /** Pictures of the newest frame: lit, and what it is compared with. */
+  get pictures() {
+    return this.#last?.pictures ?? [];
   }
 
   draw() {

@@ -1,0 +1,75 @@
+"""Error of the irradiance that card, planes and boxes tell of, with the mirror ball painted out of rendered desks.
+
+Beside it that of a constant light of the card's brightness: both over all directions, relative to the true light at the
+ball, as ``truth_score`` has it. The ball is painted over by the median of the desk around it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from warp_ar.kernels.color import decode_table
+from warp_ar.light.card_light import light_by_card
+from warp_ar.light.config import Kind
+from warp_ar.light.surfaces import find_surfaces
+from warp_ar.scene import Pose, Scene, load_scene
+from warp_ar.scene.pixel_rays import project
+
+FRAMES = (0, 5, 11)
+
+
+def painted(image: npt.NDArray[np.uint8], scene: Scene, pose: Pose) -> npt.NDArray[np.uint8]:
+    """The frame without its first ball."""
+    ball, camera = scene.probes[0], scene.camera
+    center = pose.apply(np.array(ball.center))
+    u, v = project(camera, center[None])[0]
+    radius = 1.06 * camera.fx * ball.radius / float(np.sqrt(center[2] ** 2 - ball.radius**2)) + 2.0
+    mask = np.zeros(image.shape[:2], np.uint8)
+    cv2.circle(mask, (round(u), round(v)), int(np.ceil(radius)), 255, -1)
+    ring = (cv2.dilate(mask, np.ones((15, 15), np.uint8)) > 0) & (mask == 0)
+    out = image.copy()
+    out[mask > 0] = np.median(image[ring], axis=0)
+    return out
+
+
+def card_irradiance(image: npt.NDArray[np.uint8], scene: Scene, pose: Pose) -> npt.NDArray[np.float64]:
+    """By the median of the card's white alone, RGB."""
+    surfaces = find_surfaces(scene)
+    points = surfaces.points["position"][surfaces.kinds[surfaces.surface] == Kind.CARD].astype(np.float64)
+    columns, rows = project(scene.camera, pose.apply(points)).round().astype(int).T
+    codes, decode = np.median(image[rows, columns], axis=0).astype(int), decode_table(scene.camera.transfer)
+    return np.pi / scene.marker.white * decode[codes, range(3)]
+
+
+def main(device: str) -> None:
+    """Print the two errors of each desk."""
+    theta, phi = (np.arange(64) + 0.5) / 64 * np.pi, ((np.arange(128) + 0.5) / 64 - 1.0) * np.pi
+    rows, columns = np.meshgrid(theta, phi, indexing="ij")
+    sine = np.sin(rows)
+    directions = np.stack([sine * np.cos(columns), sine * np.sin(columns), np.cos(rows)], -1).reshape(-1, 3)
+    normals = directions[::7]
+    weights = np.maximum(normals @ directions.T, 0.0) * (sine.ravel() * (np.pi / 64) ** 2)
+    for case in sorted(path.parent for path in Path(os.environ["WARP_AR_SHARED"], "truth").glob("*/case.json")):
+        scene, told = load_scene(case / "scene_object.toml"), json.loads((case / "case.json").read_text())
+        errors = []
+        for frame in FRAMES:
+            if not (file := case / "env" / f"{frame:04d}.npy").exists():
+                continue
+            env = cv2.resize(np.load(file).astype(np.float32), (128, 64), interpolation=cv2.INTER_AREA)
+            true = weights @ env.reshape(-1, 3)
+            pose = Pose(*(np.array(told["poses"][frame][key]) for key in ("R", "t")))
+            image = cv2.imread(str(case / "camera" / f"{frame:04d}.png"))[..., ::-1]
+            light = light_by_card(painted(image, scene, pose), dataclasses.replace(scene, probes=()), pose)
+            found, half = light.irradiance(normals)
+            constant = np.broadcast_to(card_irradiance(image, scene, pose), true.shape)
+            misses = (np.linalg.norm(guess - true) / np.linalg.norm(true) for guess in (found, constant))
+            errors.append([*misses, (np.abs(found - true) <= half).mean()])
+        ours, constant_error, within = np.mean(errors, axis=0)
+        print(f"{case.name:26s} card {ours:.1%}  constant {constant_error:.1%}  within the interval {within:.0%}")

@@ -1,0 +1,55 @@
+"""Time until the next frame can begin after an object is moved, painted, added or removed, beside that of a frame."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import time
+from collections.abc import Callable
+
+import numpy as np
+import warp as wp
+
+from warp_ar.engine.pipeline import Pipeline
+from warp_ar.scene import MetallicRoughnessMaterial, load_scene
+from warp_ar.sources.sources import open_scene_source
+
+ROUNDS = 12
+
+
+def milliseconds(pipeline: Pipeline, work: Callable[[], object]) -> float:
+    start = time.perf_counter()
+    work()
+    pipeline.warm_up()
+    wp.synchronize_device(pipeline.device)
+    return (time.perf_counter() - start) * 1e3
+
+
+def main(device: str) -> None:
+    """Print the median of each; every round is one of all, so that they meet the same load."""
+    scene = load_scene("desk")
+    with open_scene_source(scene, None, loop=False) as source, Pipeline(scene, device=device) as pipeline:
+        frames = itertools.cycle([frame.image for frame in itertools.islice(source, 4)])
+        model = scene.objects[0]
+        compiled: list[int] = []
+        place = np.eye(4)
+        place[:3, :3] *= model.scale
+        blue = MetallicRoughnessMaterial((0.2, 0.3, 0.9), 1.0, 0.4)
+        works: dict[str, Callable[[], object]] = {
+            "frame": lambda: pipeline(next(frames)).image,
+            "add": lambda: pipeline.objects.add(dataclasses.replace(model, name="other", at=(0.1, -0.05, 0.0))),
+            "frame with it": lambda: pipeline(next(frames)).image,
+            "move": lambda: setattr(pipeline.objects["other"], "world_from_object", place),
+            "paint": lambda: setattr(pipeline.objects["other"], "material", blue),
+            "remove": lambda: pipeline.objects.remove("other"),
+        }
+        times: dict[str, list[float]] = {name: [] for name in works}
+        for turn in range(ROUNDS + 2):
+            for name, work in works.items():
+                taken = milliseconds(pipeline, work)
+                if turn > 1:
+                    times[name].append(taken)
+            if turn > 1:
+                pipeline.warm_up(lambda done, count: compiled.append(count))
+    told = ", ".join(f"{name} {np.median(values):.1f} ms (least {min(values):.1f})" for name, values in times.items())
+    print(f"{told}; modules compiled: {len(compiled)}")

@@ -1,0 +1,388 @@
+"""A case at one quality, every method of a setting, the whole, and the tables made of it."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+import re
+import time
+import xml.etree.ElementTree as ElementTree
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from tests.accuracy_rig import case, frames, report, setting  # noqa: F401  (fixtures)
+from warp_ar.accuracy import cases, charts, measure, metrics, pictures
+from warp_ar.accuracy import report as report_module
+from warp_ar.accuracy.charts import Point
+from warp_ar.accuracy.cost_table import (
+    SETTINGS,
+    MethodCost,
+    choose,
+    chosen,
+    pareto_front,
+    read_errors,
+    relevant_settings,
+    turn,
+)
+from warp_ar.accuracy.costs import Costs
+from warp_ar.accuracy.metrics import changed_region, clipped_region, flip_map
+from warp_ar.engine.pipeline import Pipeline
+from warp_ar.errors import UsageError
+from warp_ar.kernels.color import decode_table
+from warp_ar.scene import load_scene
+from warp_ar.stages.quality import PRESETS
+
+pytest.importorskip("flip_evaluator")
+
+
+def even(name: str) -> Costs:
+    return Costs(1.0, {name: {method: float(place) for place, method in enumerate(setting(name).methods)}})
+
+
+def test_frames_that_are_not_shown_keep_the_light(case, device):
+    """They run at another quality, without a trace in the picture that counts."""
+    with Pipeline(case.scene, device=device, quality="low") as pipeline:
+        for frame, pose in zip(case.frames, case.poses, strict=True):
+            full = pipeline(frame.image, time_seconds=frame.time, pose=pose).image
+    sparse = measure.run(case, PRESETS["low"], device)
+    assert list(sparse) == [3]
+    assert np.abs(sparse[3].astype(int) - full).max() <= 1
+
+
+def test_in_turn_is_alone(case, device):
+    """Qualities that run in turn do not touch each other."""
+    qualities = {"a": PRESETS["low"], "b": PRESETS["low"].with_methods(irradiance="sh2")}
+    times, images = measure.run_in_turn(case, qualities, device, time.perf_counter)
+    for label, quality in qualities.items():
+        _, alone = measure.run_in_turn(case, {label: quality}, device, time.perf_counter)
+        np.testing.assert_array_equal(images[label][3], alone[label][3])
+        assert len(times[label]) == len(case.frames) - measure.WARM_UP
+
+
+def test_the_last_method_is_its_own_reference(case, device):
+    rows, pictures = measure.sweep(case, setting("mirror_ball"), device, even("mirror_ball"), base=PRESETS["low"])
+    assert [row.method for row in rows] == ["none", "single", "smooth", "brute_force"] == list(pictures)
+    assert [row.milliseconds for row in rows] == [0.0, 1.0, 2.0, 3.0]
+    errors = [row.error for row in rows]
+    assert errors[0] > max(errors[1:])
+    assert errors[3] == rows[3].flip == 0.0
+
+
+def test_truth_is_what_pictures_are_compared_with(case, device):
+    truth = dataclasses.replace(case, truth={3: np.full_like(case.frames[3].image, 250)})
+    rows, _ = measure.sweep(truth, setting("expose"), device, even("expose"), base=PRESETS["low"])
+    assert {row.against for row in rows} == {"truth"}
+    assert all(row.flip > 0.1 for row in rows)
+    assert min(row.error for row in rows) == 0.0
+
+
+def test_dominated_means_in_cost_and_error():
+    def row(method, ms, flip):
+        return measure.Row("c", "k", method, ms, flip, "truth", flip)
+
+    rows = [row("a", 1.0, 0.3), row("b", 2.0, 0.4), row("c", 3.0, 0.3), row("d", 4.0, 0.1)]
+    assert [measure.is_dominated(one, rows) for one in rows] == [False, True, True, False]
+    # What cannot be told apart counts as equal, and of equals the first stays.
+    equal = [row("a", 1.0, 0.3), row("b", 1.01, 0.3001), row("c", 1.0, 0.3)]
+    assert [measure.is_dominated(one, equal) for one in equal] == [False, True, True]
+
+
+def test_a_whole_case_has_the_choices_of_the_committed_table(case, device, monkeypatch):
+    """The best within what the paper's methods take, and the cheapest that errs no more, by the committed errors."""
+    own = (dataclasses.replace(setting("irradiance"), methods=("sphere_mip", "sh2", "clusters")),)
+    errors = {"irradiance": {"sphere_mip": 0.3, "sh2": 0.2, "clusters": 0.1}}
+    costs = Costs(10.0, {"irradiance": {"sphere_mip": 1.0, "sh2": 0.5, "clusters": 2.0}})
+    monkeypatch.setattr(measure, "load_errors", lambda: errors)
+    monkeypatch.setattr(measure, "measure_costs", lambda *_, **__: costs)
+    monkeypatch.setattr(measure, "settings_of", lambda _: own)
+    truth = dataclasses.replace(case, truth={3: case.frames[3].image})
+    told: list[str] = []
+    found = measure.measure_case(truth, device, own, told.append, presets=("paper", "low"))
+    wholes = {whole.label: whole for whole in found.wholes}
+    assert list(wholes) == ["paper", "low", measure.SAME_TIME, measure.SAME_ERROR]
+    for label in (measure.SAME_TIME, measure.SAME_ERROR):
+        assert wholes[label].settings == {"irradiance": "sh2"}
+    assert len(told) == len(own) + 2
+
+
+def test_records_and_tables_hold_every_method(report):
+    lines = [json.loads(json.dumps(record)) for record in report_module.records(report, "cpu")]
+    assert [line["kind"] for line in lines] == ["method", "method", "whole", "whole"]
+    console = Console(width=120, record=True, quiet=False, file=open("/dev/null", "w"))  # noqa: SIM115
+    with console.file:
+        report_module.print_report(report, console)
+    text = console.export_text()
+    assert all(word in text for word in ("sphere_mip", "sh2", "0.1000", "ours near the"))
+
+
+def test_cost_table_is_what_choices_read(report):
+    made = json.loads(json.dumps(report_module.make_cost_table([report, report], "cpu")))
+    errors = read_errors(made)
+    assert errors["irradiance"]["sphere_mip"] == pytest.approx(0.1)
+    assert errors["irradiance"]["sh2"] == 0.0
+    assert made["milliseconds"]["irradiance"] == {"sphere_mip": 0.5, "sh2": 1.0}
+
+
+# --- Settings turn what they say; choices are the best there are, against trying all ----------------------------------
+
+
+# Sums of a handful of float64.
+EXACT = 1e-12
+
+
+@pytest.mark.parametrize("setting", SETTINGS, ids=lambda setting: setting.name)
+def test_what_is_turned_is_set(setting):
+    for method in setting.methods:
+        assert chosen(turn(PRESETS["medium"], {setting.name: method}), setting) == method
+
+
+def test_turning_changes_nothing_else():
+    turned = turn(PRESETS["medium"], {"irradiance": "sh2", "edge_samples": "16"})
+    for one in SETTINGS:
+        if one.name not in ("irradiance", "edge_samples"):
+            assert chosen(turned, one) == chosen(PRESETS["medium"], one)
+
+
+def test_bad_turns_are_refused():
+    with pytest.raises(UsageError, match="irradiance has no method 'sh9'; expected sphere_mip"):
+        turn(PRESETS["medium"], {"irradiance": "sh9"})
+    with pytest.raises(UsageError, match="nothing called 'colour'"):
+        turn(PRESETS["medium"], {"colour": "red"})
+
+
+def test_scenes_have_the_settings_that_they_call_for():
+    def names(scene):
+        return {setting.name for setting in relevant_settings(load_scene(scene), (640, 480))}
+
+    assert "expose" in names("darken")
+    assert names("darken").isdisjoint({"irradiance", "prefilter", "relight", "shade", "edge_samples"})
+    assert {"irradiance", "prefilter", "relight", "environment_shadow", "environment_height", "mirror_ball"} <= names(
+        "desk"
+    )
+    assert "expose" not in names("desk")
+    assert "relight" not in names("torus")
+
+
+def test_scenes_without_a_ball_or_anything_virtual_have_nothing_to_mirror():
+    desk = load_scene("desk")
+    for changes in ({"probes": ()}, {"objects": (), "lights": ()}):
+        bare = dataclasses.replace(desk, **changes)
+        assert "mirror_ball" not in {setting.name for setting in relevant_settings(bare, (640, 480))}
+
+
+def random_method_costs(seed, settings=4, methods=4):
+    rng = np.random.default_rng(seed)
+    return [
+        MethodCost(f"setting{k}", f"method{r}", float(rng.integers(1, 20)), float(rng.integers(0, 9)))
+        for k in range(settings)
+        for r in range(methods)
+    ]
+
+
+def check_choices(front, every, budgets):
+    """Of all (cost, error), the least error within each budget; where nothing fits, the cheapest."""
+    for budget in budgets:
+        choice = choose(front, budget)
+        fitting = [error for cost, error in every if cost <= budget]
+        if fitting:
+            assert choice.milliseconds <= budget
+            assert choice.error == pytest.approx(min(fitting), abs=EXACT)
+        else:
+            assert choice.milliseconds == pytest.approx(min(cost for cost, _ in every), abs=EXACT)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_choice_is_the_best_of_all(seed):
+    method_costs = random_method_costs(seed)
+    groups = [list(own) for _, own in itertools.groupby(method_costs, lambda method_cost: method_cost.setting)]
+    every = [(sum(p.milliseconds for p in pick), sum(p.error for p in pick)) for pick in itertools.product(*groups)]
+    front = pareto_front(method_costs)
+    check_choices(front, every, (5.0, 12.0, 25.0, 40.0, 1e9))
+
+
+def test_choice_adds_up_and_covers_every_setting():
+    method_costs = random_method_costs(3)
+    by_name = {(method_cost.setting, method_cost.method): method_cost for method_cost in method_costs}
+    for choice in pareto_front(method_costs):
+        assert [setting for setting, _ in choice.settings] == ["setting0", "setting1", "setting2", "setting3"]
+        own = [by_name[pair] for pair in choice.settings]
+        assert choice.milliseconds == pytest.approx(sum(method_cost.milliseconds for method_cost in own), abs=EXACT)
+        assert choice.error == pytest.approx(sum(method_cost.error for method_cost in own), abs=EXACT)
+
+
+def test_price_list_is_checked():
+    with pytest.raises(UsageError, match="table 'errors'"):
+        read_errors({})
+    with pytest.raises(UsageError, match=r"errors\.irradiance\.sh2 is -1"):
+        read_errors({"errors": {"irradiance": {"sh2": -1}}})
+    errors = read_errors({"errors": {"irradiance": {"sphere_mip": 0.5, "clusters": 0.1}}})
+    assert errors["irradiance"] == {
+        "sphere_mip": 0.5,
+        "sh2": 0.5,
+        "clusters": 0.1,
+        "brute_force": 0.1,
+    }
+
+
+# --- Cases with their truth -------------------------------------------------------------------------------------------
+
+
+def test_bundled_scenes_end_with_their_truth():
+    case = cases.open_scene("desk", 2, 4)
+    assert len(case.frames) == 2
+    assert list(case.truth) == [1]
+    region = case.regions[1]
+    camera, truth = case.frames[1].image, case.truth[1]
+    assert 0.05 < region.mean() < 0.5
+    # Nothing virtual, nothing changed.
+    np.testing.assert_array_equal(truth[~region], camera[~region])
+    assert np.abs(truth[region].astype(int) - camera[region]).mean() > 5.0
+
+
+def test_where_nothing_clips_the_truth_of_a_shorter_exposure_is_known():
+    case = cases.open_scene("darken", 1, 1)
+    camera, truth, region = case.frames[0].image, case.truth[0], case.regions[0]
+    decode = decode_table("srgb")[:, 0]
+    scaled = 0.5 * decode[camera[~region]]
+    # Rounding to a code: half of the step between codes there.
+    assert np.abs(decode[truth[~region]] - scaled).max() <= 0.51 * np.diff(decode).max()
+    assert region[(camera >= 255).any(-1)].mean() > 0.95
+
+
+@pytest.mark.parametrize("scale", [0.0, 0.3, 1.0])
+def test_scaling_codes_is_scaling_radiance(scale):
+    image = np.arange(256, dtype=np.uint8)[None, :, None].repeat(3, -1)
+    scaled = cases.scale_codes(image, scale, "linear")
+    np.testing.assert_array_equal(scaled[0, :, 0], np.floor(np.arange(256) * scale + 0.5))
+
+
+# --- FLIP at its two ends; regions of pictures that count -------------------------------------------------------------
+
+
+def test_flip_ends():
+    pytest.importorskip("flip_evaluator")
+    black, white = np.zeros((16, 24, 3), np.uint8), np.full((16, 24, 3), 255, np.uint8)
+    assert flip_map(black, black).max() == 0.0
+    assert flip_map(black, black).shape == (16, 24)
+    assert flip_map(black, white).mean() > 0.9
+
+
+def test_changed_region_takes_what_changed_and_no_noise():
+    camera = np.random.default_rng(0).integers(100, 104, (60, 80, 3)).astype(np.uint8)
+    truth = camera.copy()
+    truth[20:40, 30:50] += 60
+    region = changed_region(camera, truth)
+    assert region[20:40, 30:50].all()
+    assert not region[:5].any()
+    assert not changed_region(camera, camera ^ 1).any()
+
+
+def test_clipped_region_is_any_channel():
+    camera = np.full((2, 3, 3), 253, np.uint8)
+    camera[0, 1, 2] = 254
+    assert clipped_region(camera).sum() == 1
+
+
+@pytest.mark.parametrize("box", [np.s_[0:5, 0:5], np.s_[40:60, 70:100], np.s_[115:120, :]])
+def test_flip_looks_only_where_pictures_differ(box):
+    """Elsewhere it is 0; the same bits as of whole pictures."""
+    rng = np.random.default_rng(5)
+    reference = rng.integers(0, 256, (120, 160, 3)).astype(np.uint8)
+    test = reference.copy()
+    test[box] = rng.integers(0, 256, test[box].shape)
+    errors = flip_map(reference, test)
+    np.testing.assert_array_equal(errors, metrics._evaluate_flip(reference, test))
+    assert not flip_map(test, test).any()
+
+
+# --- Crops, and sheets of them ----------------------------------------------------------------------------------------
+
+
+def test_crops_lie_around_what_is_to_be_seen():
+    region = np.zeros((480, 640), bool)
+    region[400:470, 600:630] = True
+    region[0, 0] = True  # one stray pixel
+    rows, columns = pictures.bounding_box(region, region.shape)
+    assert rows.start <= 400 <= 470 <= rows.stop <= 480
+    assert columns.start <= 600 <= 630 <= columns.stop <= 640
+    assert rows.stop - rows.start < 200
+    assert pictures.bounding_box(np.zeros((48, 64), bool), (48, 64)) == (slice(0, 48), slice(0, 64))
+
+
+def test_a_sheet_holds_every_column_and_its_error():
+    pytest.importorskip("flip_evaluator")
+    box = slice(0, 60), slice(0, 360)
+    black, white = np.zeros((60, 360, 3), np.uint8), np.full((60, 360, 3), 255, np.uint8)
+    plain = pictures.sheet([black, white], None, box)
+    assert plain.shape == (60, 2 * 360 + pictures.GAP, 3)
+    assert (plain[:, :360] == 0).all()
+    assert (plain[:, 360:] == 255).all()
+    with_errors = pictures.sheet([black, white], black, box)
+    assert with_errors.shape == (2 * 60 + pictures.GAP, 2 * 360 + pictures.GAP, 3)
+    below = with_errors[60 + pictures.GAP :]
+    assert below[30, 100].max() < 10  # no error
+    assert below[30, 360 + pictures.GAP + 100].max() > 200
+
+
+def test_halves_are_of_the_box():
+    box = slice(10, 30), slice(20, 60)
+    first, second = np.zeros((40, 80, 3), np.uint8), np.full((40, 80, 3), 9, np.uint8)
+    above = pictures.halves(first, second, box, above=True)
+    assert (above[:20] == 0).all()
+    assert (above[20:] == 9).all()
+    left = pictures.halves(first, second, box, above=False)
+    assert (left[:, :40] == 0).all()
+    assert (left[:, 40:] == 9).all()
+
+
+# --- Charts: all points inside, all named, in the page's colours ------------------------------------------------------
+
+
+pytest.importorskip("matplotlib")
+SVG = "{http://www.w3.org/2000/svg}"
+
+
+def parse(chart: str) -> ElementTree.Element:
+    return ElementTree.fromstring(chart)
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        [Point("one", 1.0, 0.0, False)],
+        [Point("a", 0.0, 0.1, False), Point("b", 900.0, 1e-7, True)],
+        [Point(f"method {k}", 1.0 + 0.01 * k, 0.1 - 0.01 * k, k > 2) for k in range(6)],
+    ],
+    ids=["one", "far apart", "close together"],
+)
+def test_scatter_holds_every_point_and_name(points: list[Point]) -> None:
+    root = parse(charts.scatter(points, "ms", "error", 33.3))
+    _, _, width, height = map(float, root.attrib["viewBox"].split())
+    # Markers, and the marks of the axes, which stand inside as well.
+    spots = {(float(node.attrib["x"]), float(node.attrib["y"])) for node in root.iter(f"{SVG}use")}
+    assert len(spots) >= len({(point.milliseconds, point.error) for point in points})
+    assert all(0.0 <= x <= width and 0.0 <= y <= height for x, y in spots)
+    names = {node.text for node in root.iter(f"{SVG}text")}
+    assert names >= {point.label for point in points}
+    assert root.attrib["role"] == "img"
+    assert all(point.label in root.attrib["aria-label"] for point in points)
+
+
+def test_colours_are_the_pages_and_ids_differ() -> None:
+    first, second = (charts.scatter([Point("a", ms, 0.1, False)], "ms", "error") for ms in (1.0, 2.0))
+    for chart in (first, second):
+        assert "var(--mark)" in chart
+        assert "#2f6f" not in chart
+        ids = set(re.findall(r'id="([^"]+)"', chart))
+        used = set(re.findall(r'(?:href="#|url\(#)([^")]+)', chart))
+        assert used <= ids
+    assert not set(re.findall(r'id="([^"]+)"', first)) & set(re.findall(r'id="([^"]+)"', second))
+    assert first == charts.scatter([Point("a", 1.0, 0.1, False)], "ms", "error")
+
+
+def test_lines_are_named() -> None:
+    chart = charts.lines([("truth", [0, 1], [0, 1]), ("paper", [0, 1], [1, 0])], "column", "brightness")
+    assert {"truth", "paper"} <= {node.text for node in parse(chart).iter(f"{SVG}text")}

@@ -1,0 +1,332 @@
+"""Measurement of cases: every method of every setting, whole presets, our choice in the paper's time and at its error.
+
+**A method's error.** Where the methods approximate one quantity that the last of them gives (``converges``), it is the
+distance from the last: nearer to the truth than the exact light would be is luck, for something else is wrong then.
+Where methods are models of their own, it is the distance from the truth, less that of the best. Distances are FLIP,
+summed over the picture and divided by the pixels that anything virtual changes, so that errors of different settings
+are on one scale.
+
+**A method's cost** is what its stages take more than those of the setting's cheapest method, as ``--quality auto``
+measures it. Presets, and the choices that the cost table offers for the paper's time and for its error, are timed as
+whole frames, one frame of each in turn. Choices are made from the committed errors, not from those of the case that
+they are scored on.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import math
+import statistics
+import time
+from collections.abc import Callable, Mapping, Sequence
+
+from warp_ar.accuracy.cases import SIZED, Case, Image, Mask
+from warp_ar.accuracy.cost_table import (
+    Setting,
+    choose,
+    chosen,
+    light_only,
+    load_errors,
+    pareto_front,
+    relevant_settings,
+    turn,
+)
+from warp_ar.accuracy.costs import BASE as COST_BASE
+from warp_ar.accuracy.costs import Costs, make_method_costs, measure_costs
+from warp_ar.accuracy.metrics import changed_region, flip_map
+from warp_ar.engine.pipeline import Pipeline
+from warp_ar.stages.quality import PRESETS, Quality
+
+Clock = Callable[[], float]
+Tell = Callable[[str], object]
+"""Told of all that has been done, in words."""
+BASE = PRESETS["high"]
+"""Preset of all settings but the one that is turned."""
+WARM_UP = 3
+"""Frames of a run that are not timed: modules load, caches fill."""
+RUNS = ("paper", "low", "medium", "high")
+"""Presets that are run as a whole."""
+SAME_TIME, SAME_ERROR = "ours near the paper's time", "ours near the paper's error"
+"""Labels of choices that the cost table offers; their time and their error are measured beside the presets'."""
+COST_NOISE, FLIP_NOISE = 0.03, 2e-4
+"""Share by which costs, and FLIP by which pictures, must differ to be told apart."""
+_FAIR: Mapping[str, Mapping[str, str]] = {
+    "unwrap": {"environment_height": "32"},
+    "environment_height": {"environment_shadow": "none", "recover": "white_card"},
+}
+"""Other methods at which a setting is turned: footprints on the ball matter where texels are coarse; what few rays of
+another map happen to meet, and how its energy is shared among emitters, would hide what the map's own size does."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One method of one setting in one case."""
+
+    case: str
+    setting: str
+    method: str
+    milliseconds: float
+    """More than the setting's cheapest method takes, per frame."""
+    flip: float
+    """Mean FLIP of the picture per changed pixel."""
+    against: str
+    """``truth`` or ``last method``."""
+    error: float = 0.0
+    """Error that counts, as the module's text defines it."""
+    dominated: bool = False
+    """Another method costs no more and errs no more."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Whole:
+    """A preset or a choice, run as a whole."""
+
+    label: str
+    milliseconds: float
+    """Median per frame, tracking left out."""
+    flip: float
+    settings: Mapping[str, str]
+    images: Mapping[int, Image]
+    over_paper: float = math.nan
+    """Median ratio of its frames' times to the paper preset's, paired."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CaseReport:
+    """All that is known of a case."""
+
+    case: Case
+    reference: Mapping[int, Image]
+    """Pictures that others are compared with: the truth, or the best there is."""
+    rows: tuple[Row, ...]
+    pictures: Mapping[tuple[str, str], Image]
+    """The last picture of every method."""
+    wholes: tuple[Whole, ...]
+    region: Mask
+    """Pixels of the last picture that anything virtual changes."""
+
+
+def settings_of(case: Case) -> tuple[Setting, ...]:
+    """Return the settings that change what a case shows or costs."""
+    return relevant_settings(case.scene, (case.scene.camera.width, case.scene.camera.height))
+
+
+def measure_case(
+    case: Case,
+    device: str,
+    settings: Sequence[Setting],
+    tell: Tell = lambda text: None,
+    *,
+    quick: bool = False,
+    clock: Clock | None = None,
+    presets: Sequence[str] = RUNS,
+) -> CaseReport:
+    """Turn every setting, then run presets and the best choices.
+
+    Args:
+        case: Frames, and their truth if it is known.
+        device: ``cpu`` or ``cuda:N``.
+        settings: Settings to turn.
+        tell: Told of what is done.
+        quick: True to leave brute force out.
+        clock: Seconds of whole frames; None is the time that passes.
+        presets: Presets to run as a whole.
+    """
+    rows: list[Row] = []
+    pictures: dict[tuple[str, str], Image] = {}
+    costs = Costs(0.0, {})
+    if settings:
+        size = case.scene.camera.width, case.scene.camera.height
+        at = case.frames[-1].image, case.poses[-1]
+        costs = measure_costs(case.scene, *at, device, size, settings, all_methods=not quick)
+        tell(f"{case.name}: costs")
+    for setting in settings:
+        own, shown = sweep(case, setting, device, costs, methods=setting.measured if quick else setting.methods)
+        rows += own
+        pictures.update({(setting.name, method): image for method, image in shown.items()})
+        tell(f"{case.name}: {setting.name}")
+    index = case.shown[-1]
+    if case.name.endswith(SIZED):
+        last = pictures[settings[-1].name, rows[-1].method]
+        return CaseReport(case, {index: last}, tuple(rows), pictures, (), region_of(case, index, last))
+    reference = case.truth
+    if not reference:
+        best = turn(PRESETS["reference"], {"environment_shadow": "bounce"}) if quick else PRESETS["reference"]
+        reference = run(case, best, device)
+        tell(f"{case.name}: reference")
+    qualities = {name: PRESETS[name] for name in presets}
+    if "paper" in qualities and {setting.name for setting in settings} == {one.name for one in settings_of(case)}:
+        qualities |= _equals(costs, settings)
+    wholes = _run_wholes(case, qualities, reference, device, clock or time.perf_counter)
+    tell(f"{case.name}: presets")
+    return CaseReport(case, reference, tuple(rows), pictures, wholes, region_of(case, index, reference[index]))
+
+
+def run(
+    case: Case, quality: Quality, device: str, keep: Callable[[Pipeline], object] | None = None
+) -> dict[int, Image]:
+    """Run a case's frames and return the pictures that are compared; the frames before only bring the light, cheaply.
+
+    Args:
+        case: Frames, and which pictures are wanted.
+        quality: Quality of the wanted pictures.
+        device: ``cpu`` or ``cuda:N``.
+        keep: Called with the pipeline that made the last picture.
+    """
+    images: dict[int, Image] = {}
+    with (
+        Pipeline(case.scene, device=device, quality=quality) as pipeline,
+        Pipeline(case.scene, device=device, quality=light_only(quality)) as cheap,
+    ):
+        last: Pipeline | None = None
+        for index, (frame, pose) in enumerate(zip(case.frames, case.poses, strict=True)):
+            now = pipeline if index in case.shown else cheap
+            if last not in (None, now):
+                now.continue_from(last)
+            last = now
+            result = now(frame.image, time_seconds=frame.time, pose=pose)
+            if index in case.shown:
+                images[index] = result.image
+        if keep is not None:
+            keep(pipeline)
+    return images
+
+
+def run_in_turn(
+    case: Case, qualities: Mapping[str, Quality], device: str, clock: Clock
+) -> tuple[dict[str, list[float]], dict[str, dict[int, Image]]]:
+    """Run several qualities frame by frame in turn, so that whatever else goes on disturbs all alike.
+
+    Returns:
+        Milliseconds of every whole frame after the first ``WARM_UP``, until its picture is on the host, tracking left
+        out, and the wanted pictures; by label.
+    """
+    times: dict[str, list[float]] = {label: [] for label in qualities}
+    images: dict[str, dict[int, Image]] = {label: {} for label in qualities}
+    with contextlib.ExitStack() as stack:
+        pipelines = {
+            label: stack.enter_context(Pipeline(case.scene, device=device, quality=quality))
+            for label, quality in qualities.items()
+        }
+        for index, (frame, pose) in enumerate(zip(case.frames, case.poses, strict=True)):
+            for label, pipeline in pipelines.items():
+                begun = clock()
+                image = pipeline(frame.image, time_seconds=frame.time, pose=pose).image
+                if index >= min(WARM_UP, len(case.frames) - 1):
+                    times[label].append((clock() - begun) * 1e3)
+                if index in case.shown:
+                    images[label][index] = image
+    return times, images
+
+
+def _run_wholes(
+    case: Case, qualities: Mapping[str, Quality], reference: Mapping[int, Image], device: str, clock: Clock
+) -> tuple[Whole, ...]:
+    """Return cost and error of whole pictures by several qualities."""
+    times, images = run_in_turn(case, qualities, device, clock)
+    return tuple(
+        Whole(
+            label,
+            statistics.median(times[label]),
+            picture_error(case, reference, images[label]),
+            {setting.name: chosen(quality, setting) for setting in settings_of(case)},
+            images[label],
+            statistics.median(a / b for a, b in zip(times[label], times["paper"], strict=True))
+            if "paper" in times
+            else math.nan,
+        )
+        for label, quality in qualities.items()
+    )
+
+
+def _equals(costs: Costs, settings: Sequence[Setting]) -> dict[str, Quality]:
+    """Return our choices in the paper's time and at its error, as ``--quality auto`` would make them."""
+    errors = load_errors()
+    front = pareto_front(make_method_costs(costs, errors))
+    paper = {setting.name: chosen(PRESETS["paper"], setting) for setting in settings}
+    most = sum(errors[name][method] for name, method in paper.items())
+    same_error = next((choice for choice in front if choice.error <= most), front[-1])
+    found = {SAME_TIME: choose(front, costs.excess(paper)), SAME_ERROR: same_error}
+    return {label: turn(COST_BASE, dict(choice.settings)) for label, choice in found.items()}
+
+
+def sweep(
+    case: Case, setting: Setting, device: str, costs: Costs, *, base: Quality = BASE, methods: Sequence[str] = ()
+) -> tuple[list[Row], dict[str, Image]]:
+    """Return a row for every method of one setting, and its last picture.
+
+    Args:
+        case: Frames, and their truth if it is known.
+        setting: Setting to turn.
+        device: ``cpu`` or ``cuda:N``.
+        costs: Measured costs of the methods.
+        base: Quality that all other settings stay on.
+        methods: Some of the setting's, in its order; none means all.
+    """
+    qualities = {
+        method: turn(base, {**_FAIR.get(setting.name, {}), setting.name: method})
+        for method in methods or setting.methods
+    }
+    images = {method: run(case, quality, device) for method, quality in qualities.items()}
+    last = list(images.values())[-1]
+    reference = case.truth or last
+    times = costs.methods[setting.name]
+    errors = {method: picture_error(case, reference, own) for method, own in images.items()}
+    counted = {method: error - min(errors.values()) for method, error in errors.items()}
+    if setting.converges or not case.truth:
+        counted = {method: picture_error(case, reference, own, last) for method, own in images.items()}
+    against = "truth" if case.truth else "last method"
+    rows = [
+        Row(case.name, setting.name, method, times[method] - min(times.values()), errors[method], against, error)
+        for method, error in counted.items()
+    ]
+    rows = [dataclasses.replace(row, dominated=is_dominated(row, rows)) for row in rows]
+    return rows, {method: own[case.shown[-1]] for method, own in images.items()}
+
+
+def is_dominated(row: Row, rows: Sequence[Row]) -> bool:
+    """Return whether another method costs no more and errs no more.
+
+    Measurements that cannot be told apart count as equal; of equals the first method stays.
+    """
+
+    def better(a: Row, b: Row) -> bool:
+        cheaper = a.milliseconds < (1.0 - COST_NOISE) * b.milliseconds
+        return cheaper or a.error < b.error - FLIP_NOISE
+
+    place = list(rows).index(row)
+    return any(
+        not better(row, other) and (better(other, row) or index < place)
+        for index, other in enumerate(rows)
+        if index != place
+    )
+
+
+def picture_error(
+    case: Case,
+    reference: Mapping[int, Image],
+    images: Mapping[int, Image],
+    last: Mapping[int, Image] | None = None,
+) -> float:
+    """Return the error of a picture: FLIP summed over it, divided by the pixels that anything virtual changes.
+
+    It is the mean over the compared frames.
+
+    Args:
+        case: Frames.
+        reference: Pictures that tell which pixels are changed.
+        images: Pictures to judge.
+        last: Pictures to compare them with; None: ``reference``.
+    """
+    errors = []
+    for index, picture in reference.items():
+        region = region_of(case, index, picture)
+        flip = flip_map((last or reference)[index], images[index])
+        errors.append(float((flip * region if case.darker else flip).sum()) / max(int(region.sum()), 1))
+    return statistics.fmean(errors)
+
+
+def region_of(case: Case, index: int, reference: Image) -> Mask:
+    """Return the pixels of a frame that anything virtual, or the exposure, changes."""
+    return case.regions[index] if index in case.regions else changed_region(case.frames[index].image, reference)

@@ -1,0 +1,159 @@
+"""Virtual objects of a running pipeline by their names: placed, painted, added and removed between two frames."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from warp_ar.errors import SceneError, UsageError
+from warp_ar.scene import Material, Object, object_at
+from warp_ar.scene.messages import nearest
+from warp_ar.scene.node_animation import NodeTrack
+
+Edit: TypeAlias = Callable[[tuple[Object, ...]], Sequence[Object]]
+"""Function from the objects of a scene to those that are shown next."""
+
+
+class SceneObjects:
+    """The objects of a pipeline's scene; each edit holds from the next frame on, and is done as ``Pipeline.change``."""
+
+    def __init__(self, objects: Callable[[], tuple[Object, ...]], edit: Callable[[Edit], None]) -> None:
+        """Take how to read the objects, and how to have them edited."""
+        self._objects, self._edit = objects, edit
+
+    def __len__(self) -> int:
+        """Return the number of objects."""
+        return len(self._objects())
+
+    def __iter__(self) -> Iterator[SceneObject]:
+        """Yield every object."""
+        return (self[item.name or index] for index, item in enumerate(self._objects()))
+
+    def __contains__(self, name: object) -> bool:
+        """Return whether an object has that name."""
+        return name is not None and any(item.name == name for item in self._objects())
+
+    def __getitem__(self, key: str | int) -> SceneObject:
+        """Return the object of a name, or of a number in the scene, from 0 on.
+
+        Raises:
+            UsageError: There is none, or several have the name.
+        """
+        find(self._objects(), key)
+        return SceneObject(self._objects, self._edit, key)
+
+    def add(self, item: Object) -> SceneObject:
+        """Add an object, as the last one.
+
+        Raises:
+            UsageError: ``item`` is no object, or there is one of its name.
+            SceneError: A number is not finite, or its file cannot be used; nothing has changed then.
+        """
+        if not isinstance(item, Object):
+            raise UsageError(f"add: {type(item).__name__} given; expected an Object, or AreaLight(...).as_object()")
+        if item.name in self:
+            raise UsageError(f"add: there is an object {item.name!r}; give it another name, or remove that one")
+        self._edit(lambda items: (*items, item))
+        return self[item.name or len(self) - 1]
+
+    def remove(self, key: str | int) -> None:
+        """Remove an object by its name or number; those after it move up.
+
+        Raises:
+            UsageError: There is none, or several have the name.
+        """
+
+        def without(items: tuple[Object, ...]) -> Sequence[Object]:
+            index = find(items, key)
+            return items[:index] + items[index + 1 :]
+
+        self._edit(without)
+
+
+class SceneObject:
+    """One object, found by its name or number whenever it is asked for something."""
+
+    def __init__(self, objects: Callable[[], tuple[Object, ...]], edit: Callable[[Edit], None], key: str | int) -> None:
+        """Take how to read and edit the objects, and which is meant."""
+        self._objects, self._edit, self._key = objects, edit, key
+
+    @property
+    def value(self) -> Object:
+        """The object as it is in the scene; may be set to another, of any fields."""
+        items = self._objects()
+        return items[find(items, self._key)]
+
+    @value.setter
+    def value(self, value: Object) -> None:
+        self._replace(lambda _: value)
+
+    def _replace(self, made: Callable[[Object], Object]) -> None:
+        def edited(items: tuple[Object, ...]) -> Sequence[Object]:
+            index = find(items, self._key)
+            return *items[:index], made(items[index]), *items[index + 1 :]
+
+        self._edit(edited)
+
+    @property
+    def world_from_object(self) -> npt.NDArray[np.float64]:
+        """Place, turn and one scale, (4, 4), metres, before any animation; in its marker's frame where it has one.
+
+        Raises:
+            SceneError: What it is set to is no such matrix (``object_at``).
+        """
+        item, matrix = self.value, np.eye(4)
+        rotation, matrix[:3, 3] = dataclasses.replace(item, animate=None).pose_at(0.0)
+        matrix[:3, :3] = item.scale * rotation
+        return matrix
+
+    @world_from_object.setter
+    def world_from_object(self, matrix: Any) -> None:
+        self._replace(lambda item: object_at(item, matrix))
+
+    def place(self, translation: Any, quaternion: Any = (0.0, 0.0, 0.0, 1.0), scale: float = 1.0) -> None:
+        """Put it somewhere, as glTF's nodes are.
+
+        Args:
+            translation: Metres, (3,).
+            quaternion: Its turn, x, y, z, w, of any length but 0.
+            scale: Factor on all lengths.
+
+        Raises:
+            SceneError: A number is not finite, the quaternion has no length, or the scale is not above 0.
+        """
+        given = [np.asarray(value, np.float64) for value in (translation, quaternion)]
+        length = np.linalg.norm(given[1])
+        if [value.shape for value in given] != [(3,), (4,)] or not 0.0 < length < np.inf:
+            raise SceneError("place: expected a translation of 3 numbers and a quaternion x, y, z, w with a length")
+        self.world_from_object = NodeTrack(given[0], given[1] / length, np.full(3, scale), {}).transform_at(0.0)
+
+    @property
+    def material(self) -> Material:
+        """Material of the scene; another value of the same model without other pictures changes numbers alone."""
+        return self.value.material
+
+    @material.setter
+    def material(self, material: Material) -> None:
+        self._replace(lambda item: dataclasses.replace(item, material=material))
+
+
+def find(items: Sequence[Object], key: str | int) -> int:
+    """Return the number of the object that a name or number means.
+
+    Raises:
+        UsageError: There is none, or several have the name.
+    """
+    if isinstance(key, int) and 0 <= key < len(items):
+        return key
+    found = [index for index, item in enumerate(items) if item.name == key and key is not None]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise UsageError(f"objects: {len(found)} have the name {key!r}; give each its own, or use its number")
+    names = [item.name for item in items if item.name is not None]
+    known = nearest(str(key), names) if names else "none has a name"
+    raise UsageError(f"objects: there is no {key!r}: {known}; numbers run from 0 to {len(items) - 1}")

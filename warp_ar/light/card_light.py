@@ -1,0 +1,235 @@
+"""Light where no mirror ball is: what the card, planes and boxes of a frame tell of it, and how surely.
+
+The world around is ``ROWS`` x 2 ``ROWS`` cells of constant radiance x. A point p of a surface of reflectance rho shows
+
+    r_p = rho / pi sum_c x_c max(n_p . d_c, 0) V_pc w_c,
+
+w_c the solid angle of a cell, V_pc 1 where no box hides it. The white of the card is known; other reflectances follow
+from the light, in turn with it. A direction in which the frame shows something has the radiance that it shows.
+Before anything is seen, cells are what the card says in the mean, and below the horizon as bright as the table (m),
+with a covariance P by ``SPREAD`` and ``REACH``. With rows A, values b and noise S the light is the x >= 0 that
+minimises (x - m)' P^-1 (x - m) + (A x - b)' S^-1 (A x - b); (P^-1 + A' S^-1 A)^-1 is its covariance.
+
+A card that lies flat says nothing of what shines across it. ``SIDES`` is how much of the light is taken to come from
+near the horizon: where no face of a box is seen, as much as lets an upright face have a flat one's irradiance, as under
+a constant light.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Final
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from warp_ar.errors import UsageError
+from warp_ar.kernels.color import decode_table
+from warp_ar.light.config import Kind
+from warp_ar.light.fit import one_blas_thread, solve_nonnegative
+from warp_ar.light.surfaces import find_surfaces
+from warp_ar.scene import Pose, Proxy, Scene
+from warp_ar.scene.geometry import rotation_matrix
+from warp_ar.scene.pixel_rays import project, undistorted
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+ROWS: Final = 8
+SIDES: Final = (0.9, 0.3)
+"""Share of the card's light from near the horizon, before anything is seen: without a face of a box, and with one."""
+NEAR_HORIZON: Final = 0.25
+"""Height above the horizon, as a sine, by which that light has fallen to 1 / e."""
+SPREAD: Final = (0.7, 0.4)
+"""Relative standard deviation of a cell above and below the horizon, before anything is seen."""
+REACH: Final = 0.8
+"""Radians by which the resemblance of cells falls to 1 / e."""
+NOISE: Final = {Kind.CARD: 0.02, Kind.PLANE: 0.1, Kind.FACE: 0.05}
+"""Relative standard deviation of what a surface shows, by its kind; that of a texture is no less with more points."""
+INDEPENDENT: Final = 4
+"""Points of a plane or box that are taken to have noise of their own."""
+SEEN: Final = 0.2
+"""Relative standard deviation of a cell that the frame shows in part."""
+CLIPPED: Final = 250
+"""Code from which a channel says nothing."""
+EXCESS: Final = 1.3
+"""Factor on the light of a card that clips."""
+STEP: Final = 12
+"""Pixels between directions that are looked at."""
+CENTER: Final = (0.0, 0.0, 0.05)
+"""Place of the light, metres: above the card, where objects stand."""
+TURNS: Final = 6
+"""Times that reflectances and light are found in turn."""
+WITHIN: Final = 7.5
+"""Standard deviations that hold nine tenths of the errors on desks of known light: most of an error is not noise, but
+light from where no surface looks."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class CardLight:
+    """Light of one frame, good for irradiance: of second order, with one main direction."""
+
+    radiance: npt.NDArray[np.float32]
+    """Latlong, z up, (``ROWS``, 2 ``ROWS``, 3), camera values."""
+    covariance: Array
+    """Covariance of the cells, by channel, (3, cells, cells)."""
+
+    def irradiance(self, normals: npt.ArrayLike) -> tuple[Array, Array]:
+        """Return the irradiance on surfaces that face ``normals``, and half its interval of 90 %, (n, 3)."""
+        directions, angles = _cells()
+        weights = np.maximum(np.asarray(normals, np.float64) @ directions.T, 0.0) * angles
+        variance = np.einsum("nc,kcd,nd->nk", weights, self.covariance, weights)
+        return weights @ self.radiance.reshape(-1, 3), WITHIN * np.sqrt(np.maximum(variance, 0.0))
+
+    @property
+    def main_direction(self) -> Array:
+        """Unit direction that most of the light comes from, (3,)."""
+        directions, angles = _cells()
+        sum_: Array = (self.radiance.reshape(-1, 3).mean(axis=1) * angles) @ directions
+        return sum_ / max(float(np.linalg.norm(sum_)), 1e-12)
+
+
+def light_by_card(image: npt.NDArray[np.uint8], scene: Scene, pose: Pose) -> CardLight:
+    """Return the light that the surfaces of a frame tell of.
+
+    Args:
+        image: RGB codes, (height, width, 3).
+        scene: Its marker, planes and boxes; its camera at the size of the frame.
+        pose: ``camera_from_world``.
+
+    Raises:
+        UsageError: The frame shows nothing of the marker's white paper.
+    """
+    shown = _look(image, scene, pose)
+    if not (shown.group == 0).any():
+        raise UsageError("light by the card: the frame shows nothing of its white paper; expected the marker in sight")
+    with one_blas_thread():
+        found = [_solve(shown, scene.marker.white, channel) for channel in range(3)]
+    radiance = np.stack([values for values, _ in found], -1).reshape(ROWS, 2 * ROWS, 3)
+    return CardLight(radiance.astype(np.float32), np.stack([covariance for _, covariance in found]))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Shown:
+    """Values that a frame shows of surfaces, and in directions."""
+
+    values: Array
+    """Linear values at points, (n, 3)."""
+    exact: Mask
+    """True where they do not clip, (n, 3)."""
+    kind: npt.NDArray[np.int64]
+    group: npt.NDArray[np.int64]
+    """Number of the surface: 0 is the card."""
+    transfer: Array
+    """Irradiance at points by the radiance of cells, (n, cells)."""
+    cells: npt.NDArray[np.int64]
+    """Cells that the frame shows."""
+    radiance: Array
+    """Mean linear values that it shows there, (m, 3)."""
+
+
+def _look(image: npt.NDArray[np.uint8], scene: Scene, pose: Pose) -> _Shown:
+    surfaces, camera = find_surfaces(dataclasses.replace(scene, probes=())), scene.camera
+    kind, group = surfaces.kinds[surfaces.surface], surfaces.groups[surfaces.surface]
+    points, normals = (surfaces.points[name].astype(np.float64) for name in ("position", "normal"))
+    eye, blurred, exact = pose.inverse().translation, *_blur(image, decode_table(camera.transfer))
+    places = np.nan_to_num(project(camera, pose.apply(points)), nan=-1.0).round()
+    inside = ((places >= 3.0) & (places < np.array([camera.width, camera.height]) - 3.0)).all(axis=1)
+    toward = eye - points
+    facing = (toward * normals).sum(axis=1) > 0.1 * np.linalg.norm(toward, axis=1)
+    hidden = _hidden(points + 1e-3 * normals, toward[:, None], scene.proxies)[:, 0]
+    own = inside & facing & ~hidden & (kind != Kind.INK)
+    columns, rows = places[own].astype(int).T
+    directions, angles = _cells()
+    sight = ~_hidden((points + 1e-3 * normals)[own], directions[None], scene.proxies)
+    transfer = np.maximum(normals[own] @ directions.T, 0.0) * sight * angles
+
+    u, v = (part.ravel() for part in np.meshgrid(*(np.arange(4, size, STEP) for size in (camera.width, camera.height))))
+    rays = np.column_stack([undistorted(camera, np.column_stack([u, v])), np.ones(len(u))]) @ pose.rotation
+    on_table = rays[:, 2] * np.sign(eye[2]) < -0.02
+    reached = eye - rays * (eye[2] / np.where(on_table, rays[:, 2], 1.0))[:, None]
+    seen = _cell_of(np.where(on_table[:, None], reached - CENTER, rays))
+    count = np.bincount(seen, minlength=len(directions))
+    sums = np.stack([np.bincount(seen, blurred[v, u, c], minlength=len(count)) for c in range(3)], -1)
+    cells = np.flatnonzero(count >= 2)
+    observed = blurred[rows, columns], exact[rows, columns], kind[own], group[own], transfer
+    return _Shown(*observed, cells, sums[cells] / count[cells, None])
+
+
+def _solve(shown: _Shown, white: float, channel: int) -> tuple[Array, Array]:
+    """Return the radiance of the cells in one channel, and its covariance."""
+    directions, angles = _cells()
+    exact, values = shown.exact[:, channel].copy(), shown.values[:, channel]
+    card = shown.group == 0
+    clips = exact[card].mean() < 0.7
+    level = float(np.median(values[card if clips else card & exact])) / white * (EXCESS if clips else 1.0)
+    exact &= ~(card & clips)
+    up = directions[:, 2] > 0.0
+    ring = np.where(up, np.exp(-directions[:, 2] / NEAR_HORIZON), 0.0)
+    ring *= np.pi / (ring * np.maximum(directions[:, 2], 0.0) * angles).sum()
+    share = SIDES[int((shown.kind == Kind.FACE).any())]
+    below = shown.radiance[~up[shown.cells], channel]
+    prior = np.where(up, level * (1.0 - share + share * ring), np.median(below) if len(below) else 0.3 * level)
+    spread = np.where(up, SPREAD[0] * np.maximum(prior, 0.5 * level), SPREAD[1] * prior) + 1e-6
+    angle = np.arccos(np.clip(directions @ directions.T, -1.0, 1.0))
+    inverse = np.linalg.inv(spread[:, None] * spread * np.exp(-angle / REACH))
+    seen = shown.radiance[:, channel]
+    rows, right, noise = [np.eye(len(angles))[shown.cells]], [seen], [SEEN * np.maximum(seen, 1e-4)]
+    light = prior
+    for _ in range(TURNS):
+        del rows[1:], right[1:], noise[1:]
+        for group in np.unique(shown.group[exact]):
+            own = exact & (shown.group == group)
+            received, kind = shown.transfer[own] @ light, Kind(shown.kind[own][0])
+            told = np.pi * float(values[own] @ received) / max(float(received @ received), 1e-12)
+            reflectance = white if group == 0 else float(np.clip(told, 0.02, 0.95))
+            count = int(own.sum())
+            alike = np.sqrt(count if kind == Kind.CARD else max(count / INDEPENDENT, 1.0))
+            rows.append(shown.transfer[own] * reflectance / np.pi)
+            right.append(values[own])
+            noise.append(np.full(count, NOISE[kind] * max(float(values[own].mean()), 1e-4) * alike))
+        weighted = (matrix := np.concatenate(rows)) / np.concatenate(noise)[:, None] ** 2
+        precision = inverse + matrix.T @ weighted
+        light = solve_nonnegative(precision, inverse @ prior + weighted.T @ np.concatenate(right))
+    covariance = np.asarray(np.linalg.inv(precision), np.float64)
+    return light, covariance
+
+
+def _cells() -> tuple[Array, Array]:
+    """Return directions (cells, 3) and solid angles (cells,) of the cells, rows from +z down, columns from -x by y."""
+    theta = (np.arange(ROWS) + 0.5) / ROWS * np.pi
+    phi = ((np.arange(2 * ROWS) + 0.5) / ROWS - 1.0) * np.pi
+    theta, phi = (part.ravel() for part in np.meshgrid(theta, phi, indexing="ij"))
+    directions: Array = np.column_stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
+    bands = -np.diff(np.cos(np.linspace(0.0, np.pi, ROWS + 1)))
+    angles: Array = np.repeat(bands * np.pi / ROWS, 2 * ROWS)
+    return directions, angles
+
+
+def _cell_of(directions: Array) -> npt.NDArray[np.int64]:
+    x, y, z = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).T
+    row = np.clip(np.arccos(np.clip(z, -1.0, 1.0)) / np.pi * ROWS, 0, ROWS - 1).astype(np.int64)
+    column = np.clip((np.arctan2(y, x) / np.pi + 1.0) * ROWS, 0, 2 * ROWS - 1).astype(np.int64)
+    cells: npt.NDArray[np.int64] = row * 2 * ROWS + column
+    return cells
+
+
+def _blur(image: npt.NDArray[np.uint8], decode: Array) -> tuple[Array, Mask]:
+    """Return linear values in means of 5 x 5 pixels, and where none of these clips."""
+    linear = np.stack([decode[image[..., c], c] for c in range(3)], -1)
+    return cv2.blur(linear, (5, 5)), cv2.blur((image >= CLIPPED).astype(np.float32), (5, 5)) == 0.0
+
+
+def _hidden(points: Array, directions: Array, proxies: tuple[Proxy, ...]) -> Mask:
+    """Return True where boxes hide what lies in directions (1 or n, m, 3) of points (n, 3), (n, m)."""
+    found = np.zeros((len(points), directions.shape[1]), bool)
+    for box in proxies:
+        if box.shape == "box" and box.marker is None:
+            turn, half = rotation_matrix(box.rotate), 0.5 * np.array(box.size)
+            start, way = ((points - np.array(box.at)) @ turn)[:, None], directions @ turn
+            with np.errstate(divide="ignore", invalid="ignore"):
+                ends = (-half - start) / way, (half - start) / way
+            near, far = np.minimum(*ends).max(axis=-1), np.maximum(*ends).min(axis=-1)
+            found |= far > np.maximum(near, 0.0)
+    return found

@@ -1,0 +1,216 @@
+"""Priors on light that clips, from the captured map alone: its regions, and how far they exceed clipping.
+
+**By colour.** What is far brighter than clipping clips in all channels alike. What clips in one channel and not in
+another is hardly brighter than clipping: its hue would be odd otherwise. So the radiance that a component is expected
+to lack is in proportion to the square of the share of its clipped solid angle in which all channels clip (``alike``).
+
+**By depth.** A sky that brightens toward the sun clips where it reaches the limit: what it lacks is nothing at that
+boundary and grows inward. A window or a lamp ends at a wall: what it lacks is the same up to its boundary. Cells that
+do not clip, beside those that do, tell which it is: they are nearly at clipping, or far below it. So within a component
+light is shared in proportion to the angle from the nearest boundary at which it fades (``depth_profile``), up to
+``PriorConfig.depth``: without such a boundary it is shared evenly.
+
+**At least** (``least_missing``). Where no surface tells, what clips is raised by what nearly every place lacks. Let X
+be the irradiance that an estimate adds and D that which is missing. It is no worse than nothing as long as X is at most
+2 D. So twice a radiance that is missing nearly everywhere may be added without knowing more about the place. What
+nearly always is missing depends on what the map shows:
+
+- **How much clips.** The more of all directions clips, W steradians, the longer the exposure and the further what clips
+  lies above clipping: as W^(1/4), up to a steradian. A sky that clips in whole may be hardly above it.
+- **Whether channels clip alike** (``alike``). What clips in one channel alone is hardly brighter than clipping.
+- **Whether it fades.** Beside a lamp or a window it is far darker. Where cells beside what clips are nearly at it,
+  so may be what clips (``PriorConfig.fades``).
+
+A component of what clips is raised, in units of the level of clipping, by
+
+    x = least * alike * sharp * W^(1/4).
+
+``bench clipping_prior`` has in how many exposures of a folder of environments that became worse.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from warp_ar.kernels.recovery.recover_cells import LOST
+from warp_ar.light.config import CONFIG
+
+Array = NDArray[np.float64]
+
+
+def connected_regions(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Connected part that each cell of a latlong mask belongs to, across the seam and the poles; -1 for none."""
+    height = len(mask)
+    count, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
+    parent = list(range(count))
+
+    def root(label: int) -> int:
+        while parent[label] != label:
+            label = parent[label]
+        return label
+
+    for row in range(height):
+        for other in range(max(row - 1, 0), min(row + 2, height)):
+            if labels[row, -1] and labels[other, 0]:
+                parent[root(int(labels[row, -1]))] = root(int(labels[other, 0]))
+    for row in (0, height - 1):
+        at_pole = [int(label) for label in np.unique(labels[row]) if label]
+        for label in at_pole[1:]:
+            parent[root(label)] = root(at_pole[0])
+    roots = np.array([root(label) for label in range(count)])
+    number = np.full(count, -1)
+    number[np.unique(roots[1:])] = np.arange(len(np.unique(roots[1:])))
+    return np.asarray(number[roots][labels], np.int64)
+
+
+def split_regions(
+    labels: NDArray[np.int64], directions: Array, solid_angles: Array, size: float = CONFIG.priors.region
+) -> tuple[NDArray[np.int64], int]:
+    """Split regions that are wider than ``size`` steradians into compact parts of about that size.
+
+    Args:
+        labels: Region of each cell, -1 for none, (m,).
+        directions: Unit, (m, 3).
+        solid_angles: (m,).
+        size: Steradians.
+
+    Returns:
+        Part of each cell, -1 for none, and the number of parts.
+    """
+    parts = np.full(len(labels), -1)
+    count = 0
+    for region in range(int(labels.max(initial=-1)) + 1):
+        index = np.flatnonzero(labels == region)
+        d, weights = directions[index], solid_angles[index]
+        pieces = max(1, int(np.ceil(weights.sum() / size)))
+        centres = [d[np.argmax(d @ d.mean(axis=0))]]
+        while len(centres) < pieces:
+            centres.append(d[np.argmin((d @ np.array(centres).T).max(axis=1))])
+        middle = np.array(centres)
+        nearest = np.zeros(len(d), np.int64)
+        for _ in range(8 if pieces > 1 else 1):
+            nearest = np.argmax(d @ middle.T, axis=1)
+            sums = np.stack([np.bincount(nearest, weights * d[:, axis], minlength=pieces) for axis in range(3)], -1)
+            lengths = np.linalg.norm(sums, axis=1, keepdims=True)
+            middle = np.where(lengths > 0, sums / np.maximum(lengths, 1e-12), middle)
+        for piece in np.unique(nearest):
+            parts[index[nearest == piece]] = count
+            count += 1
+    return parts, count
+
+
+WHOLE = 0.9
+"""Share from which a cell clips in whole and shows the level of clipping."""
+
+
+def alike(clipped: Array, solid_angle: Array, component: NDArray[np.int64], count: int) -> Array:
+    """Return what each component is expected to lack over one in which all channels clip throughout, (count,).
+
+    The share of its clipped solid angle in which all channels clip, squared, and at least ``least_alike``.
+
+    Args:
+        clipped: Share of cells at clipping, per channel, (m, 3).
+        solid_angle: Steradians, (m,).
+        component: Of each cell, -1 for none, (m,).
+        count: Of components.
+    """
+    inside = component >= 0
+    every, some = (
+        np.bincount(component[inside], (solid_angle * share)[inside], minlength=count)
+        for share in (clipped.min(axis=1), clipped.max(axis=1))
+    )
+    return np.asarray(np.maximum((every / np.maximum(some, 1e-9)) ** 2, CONFIG.priors.least_alike), np.float64)
+
+
+def depth_profile(cells: NDArray[Any], component: NDArray[np.int64]) -> Array:
+    """Return what cells lack over the mean of their component, by their depth inside it, per channel, (m, 3).
+
+    Args:
+        cells: Records of ``kernels.recover_cells.Cell``, (rows, columns).
+        component: Of each cell, -1 for none, (m,).
+    """
+    flat, profile = cells.ravel(), np.ones((cells.size, 3))
+    beyond, seen = flat["modelled"] <= 0.5, flat["hidden"] <= 0.5
+    for c in range(3):
+        clipped = flat["clipped"][:, c] - flat["hidden"]
+        inside = np.flatnonzero((clipped > LOST) & (component >= 0) & beyond)
+        whole = inside[clipped[inside] > WHOLE]
+        if not len(whole):
+            continue
+        level = np.median(flat["radiance"][whole, c])
+        around = grown((clipped > LOST).reshape(cells.shape)).ravel() & (clipped <= LOST) & beyond & seen
+        below, nearly = CONFIG.priors.fades
+        outside = np.flatnonzero(around & (flat["radiance"][:, c] > below * level))
+        if not len(outside):
+            continue
+        sharp = np.clip((nearly - flat["radiance"][outside, c] / level) / (nearly - below), 0.0, 1.0)
+        cosine = flat["middle"][inside].astype(float) @ flat["middle"][outside].astype(float).T
+        depth = np.arccos(np.clip(cosine, -1.0, 1.0)) + CONFIG.priors.depth * sharp
+        deep = np.minimum(depth.min(axis=1), CONFIG.priors.depth)
+        weight = (flat["missing"][inside, c] * flat["solid_angle"][inside]).astype(float)
+        own, count = component[inside], int(component.max()) + 1
+        total, sums = np.bincount(own, weight, count), np.bincount(own, weight * deep, count)
+        known = total[own] > 0.0
+        profile[inside[known], c] = deep[known] * total[own[known]] / sums[own[known]]
+    return profile
+
+
+def grown(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """A latlong mask and its neighbours, across the seam."""
+    wide = np.pad(mask, ((0, 0), (1, 1)), mode="wrap").astype(np.uint8)
+    return np.asarray(cv2.dilate(wide, np.ones((3, 3), np.uint8))[:, 1:-1] > 0)
+
+
+def least_missing(
+    radiance: NDArray[Any], clipped: NDArray[Any], solid_angle: NDArray[Any], is_light: NDArray[np.bool_]
+) -> Array:
+    """Radiance by which what clips is raised where nothing else tells, (rows, columns, 3): of a wholly clipped texel.
+
+    Args:
+        radiance: Mean of cells of a latlong map, as captured, (rows, columns, 3).
+        clipped: Share of them at clipping, per channel, (rows, columns, 3).
+        solid_angle: Steradians, (rows, columns).
+        is_light: Cells that were seen and show no modelled surface, (rows, columns): what clips elsewhere is lit or
+            unknown.
+    """
+    own = np.where(is_light[..., None], clipped, 0.0)
+    some = own.max(axis=-1)
+    component = connected_regions(some > LOST)
+    count = int(component.max(initial=-1)) + 1
+    inside = component >= 0
+    found = np.zeros(np.shape(radiance), np.float64)
+    if count == 0:
+        return found
+    # No cell is brighter than clipping, and the brightest ones clip throughout where something wide enough does.
+    level = np.asarray(radiance, np.float64)[inside].max(axis=0)
+    area = np.asarray(solid_angle, np.float64)
+    wide = min(float((area * some)[inside].sum()), CONFIG.least.most)
+    shares = alike(own.reshape(-1, 3).astype(np.float64), area.ravel(), component.ravel(), count)
+    shares *= _sharp(np.asarray(radiance, np.float64) / max(float(level.max()), 1e-9), area, component, is_light)
+    found[inside] = CONFIG.least.least * wide**CONFIG.least.exponent * shares[component[inside], None] * level
+    return found
+
+
+def _sharp(radiance: Array, area: Array, component: NDArray[np.int64], is_light: NDArray[np.bool_]) -> Array:
+    """Return how far components end at something darker, 0 to 1, (components,); half where nothing beside one was seen.
+
+    Args:
+        radiance: Of cells over the level of clipping, (rows, columns, 3).
+        area: Steradians, (rows, columns).
+        component: Of each cell, -1 for none, (rows, columns).
+        is_light: Cells that tell, (rows, columns).
+    """
+    below, nearly = CONFIG.priors.fades
+    brightness = np.clip(radiance, 0.0, 1.0).mean(axis=-1)
+    beside = (component < 0) & is_light
+    sharp = np.full(int(component.max()) + 1, 0.5)
+    for one in range(len(sharp)):
+        around = grown(component == one) & beside
+        if around.any():
+            rim = float((area * brightness)[around].sum() / area[around].sum())
+            sharp[one] = np.clip((nearly - rim) / (nearly - below), 0.0, 1.0)
+    return sharp

@@ -1,0 +1,90 @@
+"""The table around a photographed mirror ball: what it tells of the ball's reflectance and of the light's level.
+
+The ball mirrors the table, which the photograph shows beside it as well: the ratio of both is the ball's reflectance
+(``ball/ball_reflectance.py``). And no table sends more light than it gets. With radiance L of the table in the
+photograph and irradiance E on it by the captured light, its reflectance is
+
+    rho = pi L / E,
+
+and a light under which rho is above ``WHITEST`` is too low: the ball reflects less than was taken, or lamps clip.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from warp_ar.ball.ball_finder import BallOutline
+from warp_ar.ball.ball_reflectance import Reflected, are_seen, measure_reflectance
+from warp_ar.photographs.support import Support
+from warp_ar.scene import Camera, Probe, Proxy, Scene
+from warp_ar.scene.pixel_rays import project
+
+Array = NDArray[np.float64]
+
+WHITEST: Final = 0.9
+"""Reflectance that no table exceeds: white paper has 0.85."""
+REACH: Final = (2.0, 6.0)
+"""Radii of the ball from its foot between which the table is looked at: nearer the ball shades it."""
+SHARE: Final = 90.0
+"""Percentile of the table that is its brightest part, free of shadows: what is above may shine."""
+FEWEST: Final = 40
+"""Points of the table that must be seen."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Table:
+    """A ball on a table in a photograph, with the table's plane."""
+
+    image: NDArray[np.uint8]
+    """uint8 RGB, upright."""
+    camera: Camera
+    """Of the photograph."""
+    support: Support
+    """The table's plane."""
+    probe: Probe
+    """The ball, as large as one that stands on the plane."""
+    table: NDArray[np.float32]
+    """Linear value of each code, (256, 3)."""
+
+    @classmethod
+    def under(
+        cls,
+        outline: BallOutline,
+        image: NDArray[np.uint8],
+        camera: Camera,
+        support: Support,
+        table: NDArray[np.float32],
+    ) -> Table:
+        """Return the table under a ball that is seen at an outline."""
+        radius = support.radius_of(outline.sphere)
+        x, y, z = map(float, support.pose.inverse().apply(radius * np.array(outline.sphere)))
+        return cls(image, camera, support, Probe((x, y, z), radius), table)
+
+    def _scene(self) -> Scene:
+        (x, y, _), side = self.probe.center, 80.0 * self.probe.radius
+        proxies = (Proxy("plane", at=(x, y, 0.0), size=(side, side)),)
+        return Scene(camera=self.camera, probes=(self.probe,), proxies=proxies, has_marker=False, name="table")
+
+    def reflectance_of_ball(self) -> Reflected | None:
+        """Return the ball's reflectance; None where it mirrors too little of what the photograph shows beside it."""
+        view = self.image, self.support.pose
+        return measure_reflectance(self._scene(), self.camera, self.probe, view, self.table)
+
+    def reflectance_under(self, irradiance: Array) -> float:
+        """Return the reflectance of the table's brightest part under irradiance (3,); 0 where too little is seen."""
+        angle, away = np.meshgrid(np.arange(48) * np.pi / 24, np.linspace(*REACH, 16))
+        x, y, _ = self.probe.center
+        away = self.probe.radius * away.ravel()
+        points = np.column_stack([x + away * np.cos(angle.ravel()), y + away * np.sin(angle.ravel()), 0.0 * away])
+        points = points[are_seen(self._scene(), self.camera, self.probe, self.support.pose, points)]
+        if len(points) < FEWEST:
+            return 0.0
+        at = project(self.camera, self.support.pose.apply(points)).astype(np.float32)
+        linear = cv2.GaussianBlur(cv2.LUT(self.image, self.table[None]), (0, 0), 1.5)
+        seen = cv2.remap(linear, at[:, None, 0], at[:, None, 1], cv2.INTER_LINEAR).mean((1, 2))
+        return float(np.pi * np.percentile(seen, SHARE) / irradiance.mean())

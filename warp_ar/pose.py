@@ -1,0 +1,131 @@
+"""``python -m warp_ar.pose PLATE``: where the camera of a photograph stood, and a scene of it under captured light."""
+
+from __future__ import annotations
+
+if __name__ == "__main__":
+    from warp_ar.begin import begin
+
+    begin("warp_ar.pose")
+
+import argparse
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from warp_ar.command_line import EXIT_DONE, Parser, run_command
+from warp_ar.errors import SinkError, UsageError, say
+from warp_ar.files import store
+from warp_ar.light.captured import Light
+from warp_ar.output.places import check_places, check_replaceable
+from warp_ar.photographs.photographs import Photograph, read_photograph
+from warp_ar.photographs.support import Support, focal_range, plane_from_points, plane_from_rectangle, scene_on
+from warp_ar.scene import Camera, CapturedLight, dumps_scene
+from warp_ar.scene.exif import FULL_FRAME_DIAGONAL
+
+HARDLY_KNOWN = 1.2
+"""Ratio of the focal lengths that fit, from which on the best one is doubted."""
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The command's options."""
+    parser = Parser(
+        prog="python -m warp_ar.pose",
+        description="Find where a photograph's camera stood, by a rectangle or known points; write a scene with two "
+        "balls, lit by what capture wrote.",
+    )
+    add = parser.add_argument
+    add("plate", type=Path, metavar="PLATE", help="photograph to put objects into")
+    add("--light", type=Path, required=True, metavar="FILE", help="captured light, such as light.exr")
+    add(
+        "--scene",
+        type=Path,
+        default=Path("plate.toml"),
+        metavar="FILE.toml",
+        help="default: plate.toml",
+    )
+    parser.add_common("--overwrite")
+    text = "corners of a rectangle, as for capture; the same one turns the light to the plate"
+    add("--rectangle", type=float, nargs=8, metavar="N", help=text)
+    parser.add_common("--rectangle-size")
+    text = "a known point, metres, z up, and its pixel; four or more"
+    add("--point", type=float, nargs=5, action="append", metavar=("X", "Y", "Z", "COLUMN", "ROW"), help=text)
+    parser.add_common("--focal-35mm")
+    text = "radius of the two balls, metres (default: 0.04)"
+    add("--object-radius", type=float, default=0.04, metavar="M", help=text)
+    return parser
+
+
+def _check(options: argparse.Namespace) -> None:
+    if (options.rectangle is None) == (options.point is None):
+        raise UsageError("give --rectangle with --rectangle-size, or four or more --point")
+    if (options.rectangle is None) != (options.rectangle_size is None):
+        raise UsageError("--rectangle and --rectangle-size belong together: pixels of the corners, metres of the sides")
+    if options.point is not None and len(options.point) < 4:
+        raise UsageError(f"{len(options.point)} points; expected four or more --point")
+    if not all(map(math.isfinite, np.ravel(options.rectangle or options.point).tolist())):
+        raise UsageError("pixels and points: expected finite numbers")
+    if options.focal_35mm is not None and not 1.0 <= options.focal_35mm <= 10_000.0:
+        raise UsageError(f"--focal-35mm {options.focal_35mm:g}: expected millimetres from 1 to 10000, such as 26")
+    if not 0.0 < options.object_radius < math.inf:
+        raise UsageError(f"--object-radius {options.object_radius:g}: expected metres above 0")
+    if options.scene.suffix.lower() != ".toml":
+        raise UsageError(f"--scene {options.scene}: expected a name that ends in .toml")
+    check_places({"the plate": [options.plate], "the light": [options.light]}, {"--scene": options.scene})
+    if words := check_replaceable(options.scene, overwrite=options.overwrite):
+        say(words)
+
+
+def find_camera(plate: Photograph, options: argparse.Namespace) -> tuple[Camera, Support]:
+    """Return the camera of a plate and the plane z = 0 before it; say how well they are known."""
+
+    def find(camera: Camera) -> Support:
+        if options.rectangle is not None:
+            corners = np.array(options.rectangle).reshape(4, 2).tolist()
+            return plane_from_rectangle(camera, corners, tuple(options.rectangle_size))
+        points = np.array(options.point)
+        return plane_from_points(camera, points[:, :3].tolist(), points[:, 3:].tolist())
+
+    height, width = plate.image.shape[:2]
+    unit = math.hypot(width, height) / FULL_FRAME_DIAGONAL
+    camera = plate.info.camera()
+    if options.focal_35mm is not None or camera is None:
+        focal = unit * (options.focal_35mm or 35.0)
+        camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+        if options.focal_35mm is None:
+            camera, least, most = focal_range(camera, find)
+            doubt = "; it is hardly known: give --focal-35mm, or points in depth" * (most > HARDLY_KNOWN * least)
+            say(
+                f"the focal length is {camera.fx / unit:.0f} mm (35 mm; {least / unit:.0f} to {most / unit:.0f}){doubt}"
+            )
+    support = find(camera)
+    x, y, z = support.pose.inverse().translation
+    say(f"the camera is at ({x:.3f}, {y:.3f}, {z:.3f}) m; what was picked misses by {support.error:.1f} pixels")
+    return camera, support
+
+
+def place(options: argparse.Namespace) -> int:
+    """Find the camera, bring the light to the plate's exposure, and write the scene."""
+    _check(options)
+    plate, light = read_photograph(options.plate), Light.load(options.light)
+    camera, support = find_camera(plate, options)
+    scale = 1.0
+    if light.exposure is None or plate.info.exposure is None:
+        whose = options.light if light.exposure is None else options.plate
+        say(f"{whose} tells no exposure: the light is taken to be of the plate's; [light] scale says otherwise")
+    else:
+        scale = plate.info.exposure / light.exposure
+        say(f"the plate has {scale:.3g} times the light's exposure")
+    captured = CapturedLight(options.light.resolve(), scale=scale)
+    middle = (0.0, 0.0) if options.point is None else tuple(np.mean(options.point, 0)[:2].tolist())
+    scene = scene_on(support, camera, options.plate, captured, middle, options.object_radius)
+    options.scene.parent.mkdir(parents=True, exist_ok=True)
+    store(options.scene, dumps_scene(scene, options.scene.parent).encode())
+    print(f"{options.scene}: python -m warp_ar.live {options.scene} --output out/")
+    return EXIT_DONE
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
+    return run_command(lambda: place(make_parser().parse_args(arguments)), SinkError)
