@@ -103,9 +103,10 @@ def do_or_note(note: Note) -> None:
 
 
 def device_of(device: wp.DeviceLike, arguments: Sequence[Any]) -> Any:
-    """Return a device, or where none is given that of the first array among a kernel's arguments."""
+    """Return a device, or where none is given that of a kernel's first array, which may lie in a struct."""
     if device is None:
-        device = next((one.device for one in arguments if isinstance(one, wp.array)), None)
+        held = [part for one in arguments for part in (one, *getattr(one, "__dict__", {}).values())]
+        device = next(part.device for part in held if isinstance(part, wp.array))
     return wp.get_device(device)
 
 

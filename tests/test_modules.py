@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import ast
+import contextlib
+import gc
 import importlib
 import inspect
 import itertools
@@ -12,6 +15,7 @@ import shutil
 import subprocess
 import sys
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -19,6 +23,7 @@ import pytest
 import warp as wp
 
 import warp_ar.kernels
+from warp_ar.device import compiling
 from warp_ar.engine import modules
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import UsageError
@@ -173,6 +178,7 @@ BESIDE = """
 import faulthandler
 import itertools
 import threading
+import time
 import numpy as np
 import warp as wp
 from warp_ar.device import start_warp
@@ -238,3 +244,36 @@ def test_a_shared_kernel_gives_the_same_picture(monkeypatch: pytest.MonkeyPatch,
             lit.append([pipeline(image, time_seconds=k / 24.0).image for k, image in enumerate(images)])
     np.testing.assert_array_equal(lit[0], lit[1])
     assert any((shown != image).any() for shown, image in zip(lit[0], images, strict=True)), "nothing was lit"
+
+
+def test_what_other_threads_parse_meanwhile_harms_no_translation() -> None:
+    """Finalizers that run inside Python 3.11's parser let another thread parse, which ended both."""
+
+    class Finalized:
+        def __init__(self) -> None:
+            self.cycle = self
+
+        def __del__(self) -> None:
+            time.sleep(0)
+
+    def parse_on() -> None:
+        for count in itertools.count():
+            if done.is_set():
+                return
+            if count % 50 == 0:
+                Finalized()
+            with contextlib.suppress(SystemError):
+                ast.parse("(3,)")
+
+    done, source = threading.Event(), pathlib.Path(modules.__file__).read_text()
+    other = threading.Thread(target=parse_on)
+    other.start()
+    try:
+        for _ in range(20):
+            with compiling(), compiling():
+                ast.parse(source)
+                assert not gc.isenabled()
+            assert gc.isenabled()
+    finally:
+        done.set()
+        other.join()

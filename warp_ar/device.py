@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import contextlib
 import ctypes
+import gc
 import os
 import shutil
 import sys
@@ -55,17 +56,26 @@ def exclusive(device: Any) -> contextlib.AbstractContextManager[Any]:
 
 @contextlib.contextmanager
 def translating(device: Any) -> Iterator[None]:
-    """Held by who declares kernels or launches them for the first time; to be entered before ``exclusive``.
-
-    Python 3.11's parser is not safe in two threads (seen: "AST constructor recursion depth mismatch").
-    """
-    with _TRANSLATION, exclusive(device):
+    """Held by who declares kernels or launches them for the first time; to be entered before ``exclusive``."""
+    with compiling(), exclusive(device):
         yield
 
 
-def compiling() -> contextlib.AbstractContextManager[Any]:
-    """Held by who has kernels compiled, in threads of its own: nobody else translates, frames go on."""
-    return _TRANSLATION
+@contextlib.contextmanager
+def compiling() -> Iterator[None]:
+    """Held by who has kernels compiled, in threads of its own: nobody else translates, frames go on.
+
+    Python 3.11 collects garbage inside its parser; a finalizer lets another thread parse, and then both parsers end in
+    "AST constructor recursion depth mismatch" (CPython's issue 106905). Until it is released nothing is collected.
+    """
+    with _TRANSLATION:
+        collects = gc.isenabled()
+        gc.disable()
+        try:
+            yield
+        finally:
+            if collects:
+                gc.enable()
 
 
 class _Captures:
