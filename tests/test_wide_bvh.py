@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import warp as wp
 
 from tests.mesh_rays_rig import (
     MESHES,
@@ -17,24 +18,41 @@ from tests.mesh_rays_rig import (
     rays_toward,
 )
 from warp_ar.kernels.rays import wide_bvh
-from warp_ar.kernels.rays.wide_bvh import BLOCK, LEAF_BLOCKS, MOST_DEPTH, NODE_BLOCKS, STACK, WIDTH, build_wide_bvh
+from warp_ar.kernels.rays.wide_bvh import (
+    BLOCK,
+    LEAF_BLOCKS,
+    MOST_DEPTH,
+    NODE_BLOCKS,
+    STACK,
+    WIDTH,
+    build_wide_bvh,
+    refit_wide_bvh,
+)
 from warp_ar.scene.ray_mesh import BOX_MARGIN
 
 MARGIN = 1e-4
+
+
+def build(corners, margin, rest=None, **building):
+    """Build a tree over triangles; if they stood at ``rest`` before, over those, and have it follow them."""
+    tree = build_wide_bvh(corners if rest is None else rest, margin, **building)
+    if rest is not None:
+        refit_wide_bvh(tree, wp.array(corners.reshape(-1, 3), dtype=wp.vec3, device="cpu"), margin)
+    return tree
 
 
 def walk(corners, origins, directions, t_max=T_MAX, **building):
     """Closest hits (t, u, v, face) and whether there is any: by Warp's tree, by ours; NumPy."""
     made = ray_mesh(corners, "cpu")
     moved = made.mesh.points.numpy().reshape(-1, 3, 3)
-    tree = build_wide_bvh(moved, BOX_MARGIN * np.linalg.norm(made.half), **building) if building else made.tree
+    tree = build(moved, BOX_MARGIN * np.linalg.norm(made.half), **building) if building else made.tree
     kernel = make_walk_kernel(wide_bvh.walk_closest, wide_bvh.walk_any)
     return launch_walk(kernel, made.mesh, tree.ptr, np.asarray(origins) - made.center, directions, "cpu", t_max)
 
 
 def parse(corners, **building):
     """Depth of a tree, and the triangles of each leaf with the box that its node gives it; checks what must hold."""
-    flat = build_wide_bvh(corners, MARGIN, **building).numpy()
+    flat = build(corners, MARGIN, **building).numpy()
     width = int(WIDTH)
     leaves, deepest, seen = [], 0, int(LEAF_BLOCKS)
     waiting = [(0, 1, np.full(3, -np.inf), np.full(3, np.inf))]
@@ -88,6 +106,19 @@ def test_parts_that_are_halved(most_depth):
     _, _, halved, halved_any = walk(corners, *rays, most_depth=most_depth)
     np.testing.assert_array_equal(halved[:, 0], wide[:, 0])
     np.testing.assert_array_equal(halved_any, wide_any)
+
+
+@pytest.mark.parametrize("name", MESHES)
+def test_a_tree_follows_triangles_that_move(name):
+    """However far they are from where it was built: it holds them as a new one does, and rays meet the same."""
+    corners = MESHES[name]
+    rest = np.random.default_rng(5).normal(size=corners.shape).astype(np.float32)
+    parse(corners, rest=rest)
+    rays = rays_toward(corners, 5000)
+    _, _, wide, wide_any = walk(corners, *rays)
+    _, _, followed, followed_any = walk(corners, *rays, rest=rest)
+    np.testing.assert_array_equal(followed[:, 0], wide[:, 0])
+    np.testing.assert_array_equal(followed_any, wide_any)
 
 
 @pytest.mark.parametrize("name", MESHES)

@@ -7,9 +7,10 @@ processor has narrower lanes, the compiler takes several steps.
 
 A tree is an array of float32, read in blocks of 16 (64 bytes). A node is four blocks: lower x of its eight children,
 lower y, lower z, upper x, upper y, upper z, and as integers where the children lie: at block c if c >= 0, a leaf at
-block ~c if not. The root is at block 0. A leaf is five blocks: x, y and z of the eight first corners, of the second
-and of the third, and as integers the triangles' numbers. Children that a node lacks are boxes that no ray meets, of
-an empty leaf, which lies after the root: rays that are no numbers end, too. Triangles that a leaf lacks are points.
+block ~c if not; then ``BEFORE`` and ``LAST``. The root is at block 0. A leaf is five blocks: x, y and z of the eight
+first corners, of the second and of the third, and as integers the triangles' numbers. Children that a node lacks are
+boxes that no ray meets, of an empty leaf, which lies after the root: rays that are no numbers end, too. Triangles that
+a leaf lacks are points.
 
 Boxes are larger than their triangles by a margin that covers the rounding of a slab's bounds;
 ``kernels/rays/shapes.py``
@@ -20,7 +21,8 @@ edge functions by Kahan's product of differences, whose sign is exact. Direction
 Building: parts of a node are split in two until there are eight or all fit a leaf, the part with the largest surface
 first; each split minimises the surface-area heuristic over ``BINS`` bins of centroids along each axis [Wal07]. Splits
 that take a single triangle off would make a deep tree; below ``MOST_DEPTH`` parts are halved, so that none is deeper
-than the walk's stack.
+than the walk's stack. Where triangles move, boxes follow them from the last made node to the root; who has which
+children stays.
 
 References:
     [DHK08] Dammertz, Hanika, Keller, "Shallow Bounding Volume Hierarchies for Fast SIMD Ray Tracing of Incoherent
@@ -50,6 +52,10 @@ BLOCK = wp.constant(16)
 """Numbers of a block."""
 NODE_BLOCKS = wp.constant(4)
 LEAF_BLOCKS = wp.constant(5)
+BEFORE = wp.constant(56)
+"""Place in a node of the node that was made before it, -1: it is the root. Children are made after their parents."""
+LAST = wp.constant(57)
+"""Place in the root of the node that was made last."""
 
 STACK = 256
 """Entries of the walk's stack."""
@@ -248,7 +254,6 @@ def find_bin(middle: wp.float32, low: wp.float32, bins_per_length: wp.float32) -
 class Building:
     """Input of the construction of a tree, and its working memory."""
 
-    corners: wp.array2d[wp.vec3]  # (triangles, 3)
     lower: wp.array[wp.vec3]  # boxes, with their margins
     upper: wp.array[wp.vec3]
     order: wp.array[wp.int32]  # triangles, those of a part one after another
@@ -335,19 +340,6 @@ def bound_part(b: Building, start: wp.int32, stop: wp.int32) -> wp.types.matrix(
     return wp.matrix_from_rows(lower, upper)
 
 
-@wp.func
-def write_leaf(b: Building, start: wp.int32, stop: wp.int32, leaf: wp.int32, tree_out: wp.array[wp.float32]):
-    """Write the triangles of a part, as many as a block has lanes at most, and -1 as the number of those that lack."""
-    for lane in range(WIDTH):
-        triangle = wp.int32(-1)
-        if start + lane < stop:
-            triangle = b.order[start + lane]
-            for corner in range(3):
-                for axis in range(3):
-                    tree_out[leaf + 24 * corner + 8 * axis + lane] = b.corners[triangle, corner][axis]
-        tree_out[leaf + 9 * WIDTH + lane] = wp.cast(triangle, wp.float32)
-
-
 @wp.kernel(enable_backward=False)
 def build_wide_bvh_kernel(
     most_depth: wp.int32,
@@ -357,13 +349,17 @@ def build_wide_bvh_kernel(
     tree_out: wp.array[wp.float32],
     blocks_out: wp.array[wp.int32],
 ):
-    """One thread: writes a tree while there is room, and how many blocks it takes, or more than there are."""
+    """One thread: writes a tree while there is room, and how many blocks it takes, or more than there are.
+
+    ``refit_wide_bvh_kernel`` writes its boxes and its triangles' corners.
+    """
     distant = tree_out.shape[0] // BLOCK
     for lane in range(WIDTH):
         tree_out[NODE_BLOCKS * BLOCK + 9 * WIDTH + lane] = wp.cast(wp.int32(-1), wp.float32)
     blocks = wp.int32(NODE_BLOCKS + LEAF_BLOCKS)
+    made_before = wp.int32(-1)
     tasks = wp.int32(1)
-    b.tasks[0] = wp.vec4i(0, b.corners.shape[0], -1, 0)
+    b.tasks[0] = wp.vec4i(0, b.order.shape[0], -1, 0)
     while tasks > 0 and blocks <= distant:
         tasks -= 1
         task = b.tasks[tasks]
@@ -405,27 +401,75 @@ def build_wide_bvh_kernel(
 
         if blocks + WIDTH * LEAF_BLOCKS <= distant:
             at = node * BLOCK
+            tree_out[at + BEFORE] = wp.cast(made_before, wp.float32)
+            made_before = node
             for k in range(WIDTH):
-                lower = wp.vec3(wp.inf, wp.inf, wp.inf)
-                upper = -lower
                 tree_out[at + 6 * WIDTH + k] = wp.cast(wp.int32(-1 - NODE_BLOCKS), wp.float32)
-                if k < parts:
-                    box = bound_part(b, starts[k], stops[k])
-                    lower = box[0]
-                    upper = box[1]
-                    if stops[k] - starts[k] > WIDTH:
-                        b.tasks[tasks] = wp.vec4i(starts[k], stops[k], at + 6 * WIDTH + k, task[3] + 1)
-                        tasks += 1
-                    else:
-                        tree_out[at + 6 * WIDTH + k] = wp.cast(-1 - blocks, wp.float32)
-                        write_leaf(b, starts[k], stops[k], blocks * BLOCK, tree_out)
-                        blocks += LEAF_BLOCKS
-                for axis in range(3):
-                    tree_out[at + WIDTH * axis + k] = lower[axis]
-                    tree_out[at + WIDTH * (3 + axis) + k] = upper[axis]
+                if k < parts and stops[k] - starts[k] > WIDTH:
+                    b.tasks[tasks] = wp.vec4i(starts[k], stops[k], at + 6 * WIDTH + k, task[3] + 1)
+                    tasks += 1
+                elif k < parts:
+                    tree_out[at + 6 * WIDTH + k] = wp.cast(-1 - blocks, wp.float32)
+                    for lane in range(WIDTH):
+                        triangle = wp.int32(-1)
+                        if starts[k] + lane < stops[k]:
+                            triangle = b.order[starts[k] + lane]
+                        tree_out[blocks * BLOCK + 9 * WIDTH + lane] = wp.cast(triangle, wp.float32)
+                    blocks += LEAF_BLOCKS
         else:
             blocks = distant + 1
+    tree_out[LAST] = wp.cast(made_before, wp.float32)
     blocks_out[0] = blocks
+
+
+@wp.kernel(enable_backward=False)
+def refit_wide_bvh_kernel(
+    margin: wp.float32,
+    # In:
+    corners: wp.array[wp.vec3],
+    # Out:
+    tree_out: wp.array[wp.float32],
+):
+    """One thread: puts a tree's triangles where their corners are and boxes around them, the last made node first."""
+    around = wp.vec3(margin, margin, margin)
+    node = wp.cast(tree_out[LAST], wp.int32)
+    while node >= 0:
+        at = node * BLOCK
+        for k in range(WIDTH):
+            lower = wp.vec3(wp.inf, wp.inf, wp.inf)
+            upper = -lower
+            child = wp.cast(tree_out[at + 6 * WIDTH + k], wp.int32)
+            for lane in range(WIDTH):
+                if child >= 0:
+                    low = child * BLOCK + lane
+                    high = low + 3 * WIDTH
+                    lower = wp.min(lower, wp.vec3(tree_out[low], tree_out[low + WIDTH], tree_out[low + 2 * WIDTH]))
+                    upper = wp.max(upper, wp.vec3(tree_out[high], tree_out[high + WIDTH], tree_out[high + 2 * WIDTH]))
+                else:
+                    leaf = (-1 - child) * BLOCK + lane
+                    triangle = wp.cast(tree_out[leaf + 9 * WIDTH], wp.int32)
+                    if triangle >= 0:
+                        for corner in range(3):
+                            place = corners[3 * triangle + corner]
+                            for axis in range(3):
+                                tree_out[leaf + 24 * corner + 8 * axis] = place[axis]
+                            lower = wp.min(lower, place - around)
+                            upper = wp.max(upper, place + around)
+            for axis in range(3):
+                tree_out[at + WIDTH * axis + k] = lower[axis]
+                tree_out[at + WIDTH * (3 + axis) + k] = upper[axis]
+        node = wp.cast(tree_out[at + BEFORE], wp.int32)
+
+
+def refit_wide_bvh(tree: wp.array, corners: wp.array, margin: float) -> None:
+    """Have a tree hold its triangles where they are now.
+
+    Args:
+        tree: Of ``build_wide_bvh``.
+        corners: Corner k of triangle f is the (3 f + k)-th.
+        margin: By how much boxes are larger than their triangles, in the same unit.
+    """
+    wp.launch(refit_wide_bvh_kernel, 1, [margin, corners], [tree], device="cpu")
 
 
 def build_wide_bvh(corners: np.ndarray, margin: float, *, most_depth: int = MOST_DEPTH) -> wp.array:
@@ -443,7 +487,6 @@ def build_wide_bvh(corners: np.ndarray, margin: float, *, most_depth: int = MOST
     scratch = {"bin_lower": wp.vec3, "bin_upper": wp.vec3, "bin_count": wp.int32, "right_area": wp.float32}
     with wp.ScopedDevice("cpu"):
         b = Building()
-        b.corners = wp.array(corners, dtype=wp.vec3)
         b.lower = wp.array(corners.min(axis=1) - np.float32(margin), dtype=wp.vec3)
         b.upper = wp.array(corners.max(axis=1) + np.float32(margin), dtype=wp.vec3)
         b.order = wp.array(np.arange(count), dtype=wp.int32)
@@ -458,5 +501,7 @@ def build_wide_bvh(corners: np.ndarray, margin: float, *, most_depth: int = MOST
             wp.launch(build_wide_bvh_kernel, 1, [most_depth, b], [tree, used])
             needed = int(used.numpy()[0])
             if needed <= blocks:
-                return wp.array(tree.numpy()[: needed * int(BLOCK)], dtype=wp.float32)
+                tree = wp.array(tree.numpy()[: needed * int(BLOCK)], dtype=wp.float32)
+                refit_wide_bvh(tree, wp.array(corners.reshape(-1, 3), dtype=wp.vec3), margin)
+                return tree
             blocks *= 2

@@ -12,7 +12,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_ar import scene as scenes
-from warp_ar.kernels.rays.wide_bvh import build_wide_bvh
+from warp_ar.kernels.rays.wide_bvh import build_wide_bvh, refit_wide_bvh
 from warp_ar.scene.geometry import Mesh
 from warp_ar.scene.object_materials import file_mesh
 from warp_ar.scene.object_shapes import ObjectShape
@@ -67,8 +67,8 @@ def make_ray_mesh(mesh: Mesh, device: Any) -> RayMesh:
     """
     low, high = (bound.astype(np.float64) for bound in mesh.bounds)
     center = 0.5 * (low + high)
-    corners, half, margin, boxes = _corners(mesh, center)
-    points = wp.array(boxes, dtype=wp.vec3, device=device)
+    corners, half, margin = _corners(mesh, center)
+    points = wp.array(_spanning(corners, margin), dtype=wp.vec3, device=device)
     indices = wp.array(np.arange(corners.shape[0] * 3, dtype=np.int32), dtype=wp.int32, device=device)
     on_cpu = points.device.is_cpu
     constructor = "median" if on_cpu else BVH_CONSTRUCTOR
@@ -80,35 +80,36 @@ def make_ray_mesh(mesh: Mesh, device: Any) -> RayMesh:
     return RayMesh(ray_mesh, center, half, normals, uvs[mesh.faces].reshape(-1, 2), tree)
 
 
-def _corners(
-    mesh: Mesh, center: FloatArray
-) -> tuple[npt.NDArray[np.float32], FloatArray, float, npt.NDArray[np.float32]]:
-    """Corners of the triangles about a centre, (m, 3, 3), half sizes, margin, and triangles that span the boxes."""
+def _corners(mesh: Mesh, center: FloatArray) -> tuple[npt.NDArray[np.float32], FloatArray, float]:
+    """Corners of the triangles about a centre, (m, 3, 3), half sizes, margin."""
     # Vertices at one position stay at one position to the last bit: every corner is computed the same way.
     corners = (mesh.vertices.astype(np.float64) - center).astype(np.float32)[mesh.faces]
     half = np.abs(corners).reshape(-1, 3).max(axis=0).astype(np.float64)
-    margin = np.float32(BOX_MARGIN * np.linalg.norm(half))
-    boxes = np.stack([corners.min(axis=1) - margin, corners.max(axis=1) + margin, corners[:, 0]], axis=1)
-    return corners, half, float(margin), boxes.reshape(-1, 3)
+    return corners, half, float(np.float32(BOX_MARGIN * np.linalg.norm(half)))
+
+
+def _spanning(corners: npt.NDArray[np.float32], margin: float) -> npt.NDArray[np.float32]:
+    """Corners of triangles that span others with their margin, (3 m, 3)."""
+    low, high = corners.min(axis=1) - np.float32(margin), corners.max(axis=1) + np.float32(margin)
+    return np.stack([low, high, corners[:, 0]], axis=1).reshape(-1, 3)
 
 
 def bend_ray_mesh(ray_mesh: RayMesh, mesh: Mesh) -> RayMesh:
-    """Have rays meet a mesh whose vertices are elsewhere now: Warp's BVH is refitted, the CPU's tree built again.
+    """Have rays meet a mesh whose vertices are elsewhere now: boxes follow them, trees stay where they are.
 
     Args:
         ray_mesh: What rays have met so far, of which no other scene has a share; its place in memory stays.
         mesh: With the same faces.
     """
-    corners, half, margin, boxes = _corners(mesh, ray_mesh.center)
-    points, tree = ray_mesh.mesh.points, None
+    corners, half, margin = _corners(mesh, ray_mesh.center)
+    points = ray_mesh.mesh.points
     if ray_mesh.tree is None:
-        points.assign(boxes)
+        points.assign(_spanning(corners, margin))
         ray_mesh.mesh.refit()
-    else:
-        tree = build_wide_bvh(corners, margin)
     points.assign(corners.reshape(-1, 3))
-    normals = mesh.normals[mesh.faces].reshape(-1, 3)
-    return dataclasses.replace(ray_mesh, half=half, normals=normals, tree=tree)
+    if ray_mesh.tree is not None:
+        refit_wide_bvh(ray_mesh.tree, points, margin)
+    return dataclasses.replace(ray_mesh, half=half, normals=mesh.normals[mesh.faces].reshape(-1, 3))
 
 
 _SHARED: weakref.WeakKeyDictionary[Mesh, weakref.WeakValueDictionary[str, RayMesh]] = weakref.WeakKeyDictionary()
