@@ -147,6 +147,7 @@ def test_colmap_binary_says_what_its_text_does(tmp_path):
         ("a.jsonl", '{"transforms": []}', r"sample 0: expected transforms"),
         ("a.jsonl", '{"transforms": [{"translation": {"x": 1, "y": 2}}]}', r"expected translation with x, y, z"),
         ("a.json", '[{"transforms": [{"translation": {"x": 1, "y": 2, "z": 3}}]}]', r"expected rotation with pan"),
+        ("a.jsonl", json.dumps({"transforms": [sample() | {"scale": dict.fromkeys("xyz", 2)}]}), "scale is"),
         ("a.jsonl", "", r"holds no pose"),
         ("a.abc", "Ogawa", r"a\.abc: Alembic is not read; turn it into USD"),
         ("a.bin", "123", r"cut off after 3 bytes"),

@@ -240,6 +240,12 @@ CASES: dict[str, list[Case]] = {
         Case("other models", "a.json", PINHOLE | {"distortion_model": "omni"}, "camera model 'omni'"),
         Case("other keys of distortion", "a.json", PINHOLE | {"distorsion_x": 0.1}, "distorsion_x: not understood"),
         Case(
+            "cameras of single frames",
+            "a.json",
+            PINHOLE | {"fl_x": 400, "frames": [{"fl_x": 401}]},
+            "fl_x of its own",
+        ),
+        Case(
             "wider fisheyes",
             "a.json",
             PINHOLE | {"image_width": 6400, "fisheye_model": 1, "distortion_coefficients": [0.0] * 4},
@@ -249,6 +255,15 @@ CASES: dict[str, list[Case]] = {
     "poses": [
         Case("damaged", "images.bin", b"\1" + bytes(7), "cut off"),
         Case("Alembic", "a.abc", b"", "Alembic is not read"),
+        *(
+            Case(
+                "NeRF's applied_transform, applied_scale (the world behind them is taken)",
+                "transforms.json",
+                {"frames": [{"file_path": "a", "transform_matrix": np.eye(4).tolist()}], key: value},
+                key,
+            )
+            for key, value in (("applied_transform", np.eye(4)[:3].tolist()), ("applied_scale", 2.0))
+        ),
     ],
 }
 

@@ -271,6 +271,8 @@ KALIBR += "  intrinsics: [400, 401, 320, 240]\n  resolution: [640, 480]\n"
 NERF = {"w": 640, "h": 480, "fl_x": 400, "fl_y": 401, "cx": 320.5, "cy": 240.5, "frames": []}
 REALSENSE = {"width": 640, "height": 480, "ppx": 320, "ppy": 240, "fx": 400, "fy": 401, "model": "Brown Conrady"}
 REALSENSE["coeffs"] = [-0.3, 0.1, 0, 0, 0]
+ZERO_INVERSE = {"model": "distortion.inverse_brown_conrady", "coeffs": [0.0] * 5}
+KALIBR_PLACE = "  T_cam_imu:\n  - [1.0, 0.0, 0.0, 0.1]\n  - [0.0, 1.0, 0.0, 0.0]\n  - [0.0, 0.0, 1.0, 0.0]\n"
 SIZED = {"image_width": 640, "image_height": 480, "camera_matrix": [[400, 0, 320], [0, 401, 240], [0, 0, 1]]}
 
 
@@ -280,9 +282,13 @@ SIZED = {"image_width": 640, "image_height": 480, "camera_matrix": [[400, 0, 320
         ("a.json", json.dumps(SIZED | {"distortion_coeffs": [-0.3, 0.1, 0, 0, 0]}), (-0.3, 0.1, 0, 0, 0)),
         ("a.json", json.dumps(SIZED | {"k1": -0.3, "p2": 0.01, "k3": 0.2}), (-0.3, 0, 0, 0.01, 0.2, 0, 0, 0)),
         ("a.json", json.dumps(SIZED | {"distortion_model": "none"}), (0, 0, 0, 0, 0)),
+        ("a.json", json.dumps(SIZED | {"Distortion": [-0.3, 0.1, 0, 0], "skew": 0}), (-0.3, 0.1, 0, 0)),
+        ("a.json", json.dumps(SIZED | {"K1": -0.3, "K2": 0.1}), (-0.3, 0.1, 0, 0, 0, 0, 0, 0)),
         ("transforms.json", json.dumps(NERF | {"k1": -0.3, "k2": 0.1}), (-0.3, 0.1, 0, 0, 0, 0, 0, 0)),
         ("realsense.json", json.dumps(REALSENSE), (-0.3, 0.1, 0, 0, 0)),
+        ("realsense.json", json.dumps(REALSENSE | ZERO_INVERSE), (0, 0, 0, 0, 0)),
         ("camchain.yaml", KALIBR.format("pinhole"), (-0.3, 0.1, 0.001, 0)),
+        ("camchain.yaml", KALIBR.format("pinhole") + KALIBR_PLACE, (-0.3, 0.1, 0.001, 0)),
         ("cameras.txt", "# list\n1 PINHOLE 640 480 400 401 320.5 240.5\n", (0, 0, 0, 0, 0)),
         ("cameras.txt", "3 OPENCV 640 480 400 401 320.5 240.5 -0.3 0.1 1e-3 0\n", (-0.3, 0.1, 0.001, 0, 0, 0, 0, 0)),
     ],
@@ -300,6 +306,21 @@ def test_calibrations_of_other_programs(tmp_path, name, text, distortion):
         ("camchain.yaml", KALIBR.format("omni"), "camera model 'omni'"),
         ("realsense.json", json.dumps(REALSENSE | {"model": "inverse_brown_conrady"}), "'inverse_brown_conrady'"),
         ("a.json", json.dumps(SIZED | {"lens_coefficients": [0.1, 0, 0, 0]}), "lens_coefficients: not understood"),
+        *(
+            ("a.json", json.dumps(SIZED | more), said)
+            for more, said in (
+                ({"skew": 3.0}, "skew: not understood"),
+                ({"s1": 0.1}, "s1: not understood"),
+                ({"radial": [0.1, 0]}, "radial: not understood"),
+                ({"dist": {"k1": 0.1}}, "distortion_coefficients"),
+                ({"dist": ["-0.3", "0.1", "0", "0"]}, "distortion_coefficients"),
+            )
+        ),
+        ("transforms.json", json.dumps(NERF | {"frames": [{"file_path": "a", "fl_x": 500}]}), "fl_x of its own"),
+        ("transforms.json", json.dumps(NERF | {"frames": [{"file_path": "a", "k1": 0.1}]}), "k1 of its own"),
+        ("cameras.txt", "1 OPENCV 640 480 400 401 320 240 -0.3\n", "expected numbers for width, height, fl_x"),
+        ("cameras.txt", "1 PINHOLE 640 480 400 401 320 240 -0.3\n", "expected numbers for width, height, fl_x"),
+        ("cameras.txt", "1 PINHOLE 640 480 400 401 320 240\n2 PINHOLE 640 480 nan 4 3 2\n", "2 cameras"),
         ("camchain.yaml", KALIBR.format("pinhole") + KALIBR.format("pinhole").replace("cam0", "cam1"), "2 cameras"),
         ("cameras.txt", "1 FOV 640 480 400 401 320 240 0.9\n", "camera model 'FOV'"),
         ("cameras.txt", "1 PINHOLE 6 4 4 4 3 2\n2 PINHOLE 6 4 4 4 3 2\n", "2 cameras"),
@@ -309,6 +330,49 @@ def test_calibrations_of_other_programs_that_are_not_followed(tmp_path, name, te
     (tmp_path / name).write_text(text)
     with pytest.raises(SceneError, match=said):
         load_calibration(tmp_path / name)
+
+
+INFO = """height: 480
+width: 640
+distortion_model: "plumb_bob"
+D: [-0.3, 0.1, 0.001, 0.0, 0.0]
+K: [400.0, 0.0, 320.0, 0.0, 401.0, 240.0, 0.0, 0.0, 1.0]
+binning_x: {}
+binning_y: {}
+roi:
+  x_offset: {}
+  y_offset: {}
+  height: {}
+  width: {}
+  do_rectify: False
+"""
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    *[st.integers(0, 4)] * 2, *[st.integers(0, 100)] * 2, st.sampled_from([0, 200, 380]), st.sampled_from([0, 300, 540])
+)
+def test_regions_and_bins_of_ros_are_followed(tmp_path_factory, bin_x, bin_y, left, top, height, width):
+    """A point is seen at the mean place of the sensor's pixels that its bin has, counted from the region's corner."""
+    path = tmp_path_factory.mktemp("c") / "camera_info.yaml"
+    path.write_text(INFO.format(bin_x, bin_y, left, top, height, width))
+    found = load_calibration(path)
+    bin_x, bin_y = max(bin_x, 1), max(bin_y, 1)
+    assert (found.width, found.height) == ((width or 640 - left) // bin_x, (height or 480 - top) // bin_y)
+    path.write_text(INFO.format(0, 0, 0, 0, 0, 0))
+    points = np.array([[0.2, -0.1, 1.0], [-0.3, 0.25, 1.0]])
+    sensor = project(load_calibration(path), points)
+    for column, row in ((0, 0), (found.width - 1, found.height - 1)):
+        middle = np.array([left + bin_x * column + (bin_x - 1) / 2, top + bin_y * row + (bin_y - 1) / 2])
+        moved = (sensor - middle) / (bin_x, bin_y)
+        assert project(found, points) == pytest.approx(moved + np.array([column, row]), abs=1e-6)
+
+
+@pytest.mark.parametrize("wrong", [(1.5, 1, 0, 0, 0, 0), (-2, 1, 0, 0, 0, 0), (1, 1, 600, 0, 100, 100)])
+def test_regions_that_the_sensor_has_not_are_refused(tmp_path, wrong):
+    (tmp_path / "camera_info.yaml").write_text(INFO.format(*wrong))
+    with pytest.raises(SceneError, match="roi and binning_x are"):
+        load_calibration(tmp_path / "camera_info.yaml")
 
 
 @pytest.mark.parametrize(

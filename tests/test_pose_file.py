@@ -79,6 +79,10 @@ def test_poses_of_a_clip(tmp_path):
     (tmp_path / "poses.json").write_text(json.dumps(entries))
     with pytest.raises(SceneError, match="pose 1: expected R, a rotation matrix"):
         load_pose_file(tmp_path / "poses.json")
+    entries = [{"R": np.eye(3).tolist(), "t": [0, 0, 1], **name} for name in ({"name": "a.png"}, {})]
+    (tmp_path / "poses.json").write_text(json.dumps(entries))
+    with pytest.raises(SceneError, match="1 of 2 poses have names"):
+        load_pose_file(tmp_path / "poses.json")
     (tmp_path / "images.txt").write_text("1 0 0 0 0 0 0 1 1 a.png\n")
     with pytest.raises(SceneError, match="QW QX QY QZ"):
         load_pose_file(tmp_path / "images.txt")
@@ -130,6 +134,7 @@ def test_poses_of_nerf(tmp_path):
         {},
         {"file_path": "a", "transform_matrix": [[1, 2], [3]]},
         {"file_path": 3, "transform_matrix": level},
+        {"file_path": "a", "transform_matrix": np.transpose(level).tolist()},  # by columns
     ):
         path.write_text(json.dumps({"frames": [wrong]}))
         with pytest.raises(SceneError, match="frame 0: expected file_path and transform_matrix"):

@@ -17,21 +17,22 @@ from warp_ar.files import bracket_depth, check_depth, indentation_depth, is_file
 from warp_ar.scene.description import Camera
 from warp_ar.scene.messages import LARGEST, MOST_PIXELS, SMALLEST, show_value
 
-# Keys as OpenCV's, ROS's, ArUco's and the usual Python scripts write them.
-_WIDTH_NAMES: Final = ("image_width", "image_Width", "width", "imageWidth", "w")
-_HEIGHT_NAMES: Final = ("image_height", "image_Height", "height", "imageHeight", "h")
-_SIZE_NAMES: Final = ("image_size", "imageSize", "image_Size", "calibImageDimensions", "resolution")
-_MATRIX_NAMES: Final = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "CameraMatrix", "K", "mtx", "intrinsics")
-_SINGLE_NAMES: Final = (("fx", "fl_x"), ("fy", "fl_y", "fl_x"), ("cx", "ppx"), ("cy", "ppy"))
-_DISTORTION_NAMES: Final = (
-    *("distortion_coefficients", "Distortion_Coefficients", "distortionCoefficients", "dist_coeffs", "distCoeffs"),
-    *("dist_coeff", "dist", "distortion", "D", "distortion_coeffs", "coeffs"),
+# Keys as OpenCV's, ROS's, ArUco's and the usual Python scripts write them, but for case and underscores.
+_WIDTH: Final = ("image_width", "width", "w")
+_HEIGHT: Final = ("image_height", "height", "h")
+_SIZE: Final = ("image_size", "calib_image_dimensions", "resolution")
+_MATRIX: Final = ("camera_matrix", "k", "mtx", "intrinsics")
+_SINGLE: Final = (("fx", "fl_x"), ("fy", "fl_y", "fl_x"), ("cx", "ppx"), ("cy", "ppy"))
+_DISTORTION: Final = (
+    *("distortion_coefficients", "dist_coeffs", "dist_coeff", "dist", "distortion", "d", "distortion_coeffs", "coeffs"),
 )
 _TERMS: Final = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-_MODEL_NAMES: Final = ("distortion_model", "camera_model", "model", "camera_type", "projection_model")
+_MODEL: Final = ("distortion_model", "camera_model", "model", "camera_type", "projection_model")
+_NOT_UNDERSTOOD: Final = "dist|coef|radial|tangential|skew|^(xi|s[1-4]|tau[xy]?|mirrorparameters)$"
+"""Keys that would change where points are seen, unless they are 0."""
 _PINHOLES: Final = (
     *("plumb_bob", "rational_polynomial", "radtan", "pinhole", "opencv", "perspective", "brown_conrady", "none", ""),
-    *("simple_pinhole", "simple_radial", "radial", "full_opencv"),
+    *("simple_pinhole", "simple_radial", "radial", "full_opencv", "radial_tangential"),
 )
 _FISHEYES: Final = (
     *("equidistant", "fisheye", "kannala_brandt", "opencv_fisheye", "kannala_brandt4", "equi"),
@@ -60,75 +61,106 @@ def load_calibration(path: str | Path, transfer: str | Path = "srgb") -> Camera:
     """Read a calibration file: OpenCV's YAML, JSON or XML, ROS's camera_info, Kalibr's camchain, COLMAP's cameras.txt.
 
     Follows:
-        size; camera matrix, or fx fy cx cy; distortion of 4, 5 or 8 terms; keys of OpenCV, ROS, Kalibr, ArUco, NeRF;
-        fisheyes to 80 degrees from the axis, as a rational model within 0.25 pixels.
+        size; camera matrix, or fx fy cx cy; distortion of 4, 5 or 8 terms; keys of OpenCV, ROS, Kalibr, ArUco, NeRF,
+        RealSense; ROS's roi and binning; fisheyes to 80 degrees from the axis, as a rational model within 0.25 pixels.
 
     Args:
         path: The file.
         transfer: Encoding of the camera's values, which such files do not hold.
 
     Raises:
-        SceneError: Damaged; missing keys; several cameras; skew; other models; other keys of distortion; wider
-            fisheyes.
+        SceneError: Damaged; missing keys; several cameras; skew; other models; other keys of distortion; cameras of
+            single frames; wider fisheyes.
     """
     path = Path(path)
     if not is_file(path):
         raise SceneError(f"{path}: no such calibration file")
-    tree = _read_tree(path)
+    said = _read_tree(path)
+    tree = {_plain_key(key): value for key, value in said.items()}
 
-    def numbers(names: Sequence[str]) -> list[float] | None:
-        return next((_flatten(tree[name]) for name in names if name in tree), None)
+    def numbers(*names: str) -> list[float] | None:
+        return next((_flatten(tree[key]) for key in map(_plain_key, names) if key in tree), None)
 
-    def fail(names: Sequence[str], value: object, right: str) -> NoReturn:
+    def fail(name: str, value: object, right: str) -> NoReturn:
         shown = " is missing" if value is None else f" = {show_value(value)}"
-        raise SceneError(f"{path}: {names[0]}{shown}: {right}")
+        raise SceneError(f"{path}: {name}{shown}: {right}")
 
-    size = numbers(_SIZE_NAMES) or [*(numbers(_WIDTH_NAMES) or []), *(numbers(_HEIGHT_NAMES) or [])]
+    size = numbers(*_SIZE) or [*(numbers(*_WIDTH) or []), *(numbers(*_HEIGHT) or [])]
     if len(size) != 2 or not all(1 <= side <= MOST_PIXELS and side == int(side) for side in size):
         right = f"expected image_width and image_height, whole numbers to {MOST_PIXELS} (pixels)"
-        fail(_WIDTH_NAMES, size or None, right)
-    known = {name.lower() for name in (*_DISTORTION_NAMES, *_MODEL_NAMES)}
-    for key in tree:
-        if key.lower() not in known and re.search("dist|coef|^xi$|^mirror_parameters$", key.lower()):
-            raise SceneError(f"{path}: {key}: not understood; expected {_DISTORTION_NAMES[0]}: k1 k2 p1 p2 [k3 ...]")
-    fisheye = any("fisheye" in key.lower() and tree[key] not in (0.0, "false", "") for key in tree)
-    for model in (str(tree[name]) for name in _MODEL_NAMES if name in tree):
-        plain = model.lower().replace("-", "_").replace(" ", "_")
+        fail(_WIDTH[0], size or None, right)
+    known = set(map(_plain_key, (*_DISTORTION, *_MODEL)))
+    for key, value in said.items():
+        plain = _plain_key(key)
+        if plain not in known and re.search(_NOT_UNDERSTOOD, plain) and any(_flatten(value)):
+            raise SceneError(f"{path}: {key}: not understood; expected {_DISTORTION[0]}: k1 k2 p1 p2 [k3 ...]")
+    of_lens = {_plain_key(key) for key in (*_WIDTH, *_HEIGHT, *_MATRIX, *_TERMS, *_MODEL, *sum(_SINGLE, ()))}
+    for frame in tree.get("frames") or ():
+        for key, value in frame.items() if isinstance(frame, dict) else ():
+            if (plain := _plain_key(key)) in of_lens and value != tree.get(plain, 0.0):
+                raise SceneError(f"{path}: a frame has {key} of its own; expected one camera for all frames")
+    fisheye = any("fisheye" in key and tree[key] not in (0.0, "false", "") for key in tree)
+    for model in (str(tree[key]) for key in map(_plain_key, _MODEL) if key in tree):
+        plain = re.sub("[- ]", "_", model.lower().removeprefix("distortion."))
         fisheye |= plain in _FISHEYES
-        if plain not in (*_FISHEYES, *_PINHOLES):
+        unbent = plain == "inverse_brown_conrady" and not any(numbers(*_DISTORTION) or ())  # as a RealSense says
+        if plain not in (*_FISHEYES, *_PINHOLES) and not unbent:
             expected = ", ".join(filter(None, (*_PINHOLES, *_FISHEYES)))
             raise SceneError(f"{path}: camera model {model!r} is not understood; expected {expected}")
-    k = numbers(_MATRIX_NAMES)
-    singles = [value for names in _SINGLE_NAMES for value in numbers(names) or []]
+    k = numbers(*_MATRIX)
+    singles = [value for names in _SINGLE for value in numbers(*names) or []]
     if k is None or len(k) == 4:
         fx, fy, cx, cy = k or (singles if len(singles) == 4 else [math.nan] * 4)
-        middle = 0.5 if k is None and "fl_x" in tree else 0.0  # COLMAP's pixel centres lie at halves, so NeRF's do
+        middle = 0.5 if k is None and "flx" in tree else 0.0  # COLMAP's pixel centres lie at halves, so NeRF's do
         k = None if math.isnan(fx) else [fx, 0.0, cx - middle, 0.0, fy, cy - middle, 0.0, 0.0, 1.0]
     if k is None or len(k) != 9 or not all(map(math.isfinite, k)):
-        fail(_MATRIX_NAMES, k, "expected a 3x3 matrix of finite numbers")
+        fail(_MATRIX[0], k, "expected a 3x3 matrix of finite numbers")
     if not (SMALLEST <= k[0] <= LARGEST and SMALLEST <= k[4] <= LARGEST):
-        fail(_MATRIX_NAMES, k, "focal lengths must be above 0 (pixels)")
+        fail(_MATRIX[0], k, "focal lengths must be above 0 (pixels)")
     if any(abs(k[i]) > 1e-9 * k[0] for i in (1, 3, 6, 7)) or abs(k[8] - 1.0) > 1e-9:
-        fail(_MATRIX_NAMES, k, "expected [fx, 0, cx, 0, fy, cy, 0, 0, 1]: a camera without skew")
+        fail(_MATRIX[0], k, "expected [fx, 0, cx, 0, fy, cy, 0, 0, 1]: a camera without skew")
     terms = ("k1", "k2", "k3", "k4") if fisheye else _TERMS
-    distortion = numbers(_DISTORTION_NAMES)
+    distortion = numbers(*_DISTORTION)
     if not distortion and any(term in tree for term in _TERMS):
-        distortion = [sum(numbers([term]) or []) for term in terms]
+        distortion = [sum(numbers(term) or []) for term in terms]
     distortion = distortion or list(Camera.distortion)
-    shape = int(size[0]), int(size[1])
+    columns, rows, (fx, _, cx, _, fy, cy, *_) = *map(int, size), k
+    columns, fx, cx = _read_out(path, tree, "x", columns, fx, cx)
+    rows, fy, cy = _read_out(path, tree, "y", rows, fy, cy)
     finite = all(map(math.isfinite, distortion))
     if fisheye:
         if len(distortion) != 4 or not finite:
-            fail(_DISTORTION_NAMES, distortion, "expected 4 finite values of a fisheye (k1 k2 k3 k4)")
+            fail(_DISTORTION[0], distortion, "expected 4 finite values of a fisheye (k1 k2 k3 k4)")
+        matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
         try:
-            distortion = list(rational_of_fisheye(*shape, np.reshape(k, (3, 3)), distortion))
+            distortion = list(rational_of_fisheye(columns, rows, matrix, distortion))
         except SceneError as error:
             raise SceneError(f"{path}: {error}") from error
     if len(distortion) > 8 and not any(distortion[8:]):
         distortion = distortion[:8]
     if len(distortion) not in (4, 5, 8) or not finite:
-        fail(_DISTORTION_NAMES, distortion, "expected 4, 5 or 8 finite values (k1 k2 p1 p2 [k3 [k4 k5 k6]])")
-    return Camera(*shape, k[0], k[4], k[2], k[5], tuple(distortion), transfer)
+        fail(_DISTORTION[0], distortion, "expected 4, 5 or 8 finite values (k1 k2 p1 p2 [k3 [k4 k5 k6]])")
+    return Camera(columns, rows, fx, fy, cx, cy, tuple(distortion), transfer)
+
+
+def _read_out(
+    path: Path, tree: dict[str, Any], axis: str, side: int, focal: float, middle: float
+) -> tuple[int, float, float]:
+    """Return side, focal length and middle along an axis of the pixels that ROS's camera_info says are read out.
+
+    A region of interest of the sensor's pixels, then bins of them: pixel u of the sensor is (u + 1/2 - offset) / bin -
+    1/2 of the picture. Zeros say neither.
+    """
+    told = tree.get("roi")
+    roi = told if isinstance(told, dict) else {}
+    names = f"{axis}_offset", "width" if axis == "x" else "height"
+    values = [*(roi.get(name, 0.0) for name in names), tree.get(f"binning{axis}", 0.0)]
+    whole = all(isinstance(value, float) and value >= 0.0 and value == int(value) for value in values)
+    offset, length, bins = map(int, values) if whole else (0, 0, 0)
+    length, bins = length or side - offset, max(bins, 1)
+    if not whole or length < bins or offset + length > side:
+        raise SceneError(f"{path}: roi and binning_{axis} are {values}; expected whole pixels of its {side}")
+    return length // bins, focal / bins, (middle + 0.5 - offset) / bins - 0.5
 
 
 def rational_of_fisheye(
@@ -190,13 +222,17 @@ def rational_of_fisheye(
 def _read_tree(path: Path) -> dict[str, Any]:
     """Return the keys of a calibration with numbers, texts, lists and maps."""
     text = read_text(path, SceneError, expected=_EXPECTED)
-    told = re.findall(r"(?m)^\s*\d+\s+([A-Z_]+)\s+(\d+)\s+(\d+)((?:\s+[-+.\deE]+)+)\s*$", text)
     cameras: dict[str, Any] = {}
-    for model, width, height, rest in told if path.suffix.lower() == ".txt" else ():
-        values = [float(word) for word in rest.split()]
-        named = dict(zip(_COLMAP.get(model, "").split(), values, strict=False))
-        size = {"width": float(width), "height": float(height)}
-        cameras[f"camera {len(cameras)}"] = {"camera_model": model, **size, **named}
+    for line in text.splitlines() if path.suffix.lower() == ".txt" else ():
+        words = line.split()
+        if len(words) < 5 or not re.fullmatch("[A-Z][A-Z_]+", words[1]):
+            continue
+        names = ["width", "height", *_COLMAP.get(words[1], "").split()]
+        try:
+            values = dict(zip(names, map(float, words[2:]), strict=words[1] in _COLMAP))
+        except ValueError as error:
+            raise SceneError(f"{path}: {line.strip()[:80]!r}: expected numbers for {', '.join(names)}") from error
+        cameras[f"camera {len(cameras)}"] = {"camera_model": words[1], **values}
     tree = cameras or _by_opencv(path, text)
     inner = [key for key, value in tree.items() if isinstance(value, dict) and "data" not in value]
     if len(inner) == len(tree) > 1:
@@ -215,6 +251,8 @@ def _by_opencv(path: Path, text: str) -> dict[str, Any]:
     wrong = f"{path}: the calibration cannot be read; expected {_EXPECTED}"
     if "\0" in text or not start:
         raise SceneError(wrong)
+    if start not in "<{[%":  # Python's YAML does not indent lists, which OpenCV asks for
+        text = re.sub(r"(?m)^( *)- (?=[-+.\d\[])", r"\1 - ", text)
     try:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         tree = _plain(storage.root()) if storage.isOpened() else None
@@ -235,10 +273,14 @@ def _plain(node: Any) -> Any:
     return node.string() if node.isString() else float(node.real()) if node.isReal() or node.isInt() else None
 
 
+def _plain_key(key: str) -> str:
+    return key.replace("_", "").lower()
+
+
 def _flatten(value: Any) -> list[float]:
-    """Numbers of a matrix, of a map with ``data`` (ROS), of nested lists, or a single one."""
+    """Numbers of a matrix, of a map with ``data`` (ROS), of nested lists, or a single one; NaN for what is none."""
     if isinstance(value, dict):
-        return _flatten(value.get("data"))
+        return _flatten(value.get("data", ""))
     if isinstance(value, list):
         return [number for entry in value for number in _flatten(entry)]
-    return [value] if isinstance(value, float) else []
+    return [] if value is None else [value if isinstance(value, float) else math.nan]

@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_ar.errors import SceneError
+from warp_ar.exr_file import say_once
 from warp_ar.files import limits, parse_json, read_bytes, read_text, too_much
 from warp_ar.scene.description import PoseSpec
 from warp_ar.scene.fields import Vec3
@@ -84,7 +85,7 @@ def load_pose_file(path: Path) -> PoseSpec:
         with names; else frames in turn: JSON, OpenTrackIO, the one camera of a USD.
 
     Names:
-        frames without a pose.
+        frames without a pose; NeRF's applied_transform, applied_scale (the world behind them is taken).
 
     Returns:
         Poses by name, in natural order of the names; else in the file's order.
@@ -110,7 +111,9 @@ def load_pose_file(path: Path) -> PoseSpec:
     if not found:
         raise SceneError(f"{path}: holds no pose; expected COLMAP's images, OpenTrackIO samples, or a list of R and t")
     found = [(name.replace("\\", "/"), pose) for name, pose in found]
-    named = all(name for name, _ in found)
+    named = sum(1 for name, _ in found if name)
+    if named not in (0, len(found)):
+        raise SceneError(f"{path}: {named} of {len(found)} poses have names of pictures; expected all, or none")
     if named:
         found.sort(key=lambda item: natural_key(item[0]))
     return PoseSpec(tuple(pose for _, pose in found), path, tuple(name for name, _ in found) if named else ())
@@ -119,6 +122,8 @@ def load_pose_file(path: Path) -> PoseSpec:
 def _read_json(path: Path, text: str) -> list[tuple[str, RawPose]]:
     entries = parse_json(text, str(path), SceneError)
     if isinstance(entries, dict) and isinstance(entries.get("frames"), list):
+        if moved := [key for key in ("applied_transform", "applied_scale") if key in entries]:
+            say_once(f"{path}: poses are taken in the world that {' and '.join(moved)} led to; nothing is undone")
         return [_nerf_pose(f"{path}: frame {index}", entry) for index, entry in enumerate(entries["frames"])]
     if isinstance(entries, dict) and "transforms" in entries:
         entries = [entries]
@@ -141,10 +146,11 @@ def _nerf_pose(label: str, entry: Any) -> tuple[str, RawPose]:
         name, matrix = entry["file_path"], np.array(entry["transform_matrix"], float)
         good = isinstance(name, str) and matrix.shape in ((3, 4), (4, 4)) and bool(np.isfinite(matrix).all())
         good = good and check_rotation(matrix[:3, :3].ravel().tolist())
+        good = good and bool((matrix[3:] == (0.0, 0.0, 0.0, 1.0)).all())  # a matrix may lie there by columns
     except (TypeError, KeyError, ValueError, OverflowError):
         good = False
     if not good:
-        raise SceneError(f"{label}: expected file_path and transform_matrix, rotation and translation in 4 rows of 4")
+        raise SceneError(f"{label}: expected file_path and transform_matrix, 4 rows of 4 of which the last is 0 0 0 1")
     return name, pose_of_placement(matrix[:3, :3] @ _OPENCV, matrix[:3, 3])
 
 
@@ -237,6 +243,9 @@ def _read_sample(label: str, sample: Any) -> RawPose:
         raise SceneError(f"{label}: expected transforms, a list of translation and rotation, as OpenTrackIO has it")
     rotation, position = np.eye(3), np.zeros(3)
     for transform in transforms:
+        scaled = isinstance(transform, Mapping) and "scale" in transform
+        if scaled and _numbers(label, transform, "scale", ("x", "y", "z")) != [1.0] * 3:
+            raise SceneError(f"{label}: transforms: scale is {transform['scale']}; expected 1 along x, y and z")
         x, y, z = _numbers(label, transform, "translation", ("x", "y", "z"))
         turn = rotation_of_track(*_numbers(label, transform, "rotation", ("pan", "tilt", "roll")))
         position = position + rotation @ np.array([x, y, z])
