@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import dataclasses
 import itertools
 import pathlib
@@ -81,6 +82,30 @@ def test_tensors_that_stay_on_the_gpu() -> None:
     assert found["lit"].device.type == found["light"].device.type == "cuda"
 
 
+def test_a_session_in_asyncio(short: None) -> None:
+    """The loop turns while frames are waited for; a task that is cancelled in a frame leaves the session closed."""
+    shown: list[np.ndarray] = []
+    turns: list[int] = []
+    light = run("asyncio.to_thread")["light"]
+
+    async def turn() -> None:
+        while True:
+            turns.append(len(shown))
+            await asyncio.sleep(0.001)
+
+    async def both() -> None:
+        other = asyncio.create_task(turn())
+        await light("desk", shown.append)
+        other.cancel()
+        task = asyncio.create_task(light("desk", lambda image: (shown.append(image), task.cancel())))
+        with pytest.raises(asyncio.CancelledError):
+            await task
+
+    asyncio.run(both())
+    assert len(shown) == 3
+    assert turns.count(0) > 2
+
+
 def test_objects_by_name() -> None:
     lamp = Object("sphere", radius=0.02, material=LambertMaterial((0.5, 0.5, 0.5)), name="lamp")
     with Pipeline(dataclasses.replace(load_scene("desk"), objects=(lamp,)), device="cpu", quality="paper") as pipeline:
@@ -92,4 +117,4 @@ def test_objects_by_name() -> None:
 
 
 def test_all_examples_are_run() -> None:
-    assert len(BLOCKS) == 5
+    assert len(BLOCKS) == 6
