@@ -117,5 +117,5 @@ def test_required_keys_are_required(key, folder):
 
 def test_page_has_a_row_for_every_key():
     page = as_markdown()
-    assert len(re.findall(r"^\| `", page, flags=re.M)) == len(KEYS)
+    assert len(re.findall(r"^- `", page, flags=re.M)) == len(KEYS)
     assert all(key.meaning and key.unit and key.default for key in KEYS)

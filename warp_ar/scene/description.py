@@ -47,24 +47,24 @@ class Camera(Checked):
     """OpenCV's pinhole camera; pixel centres lie at integers."""
 
     width: Annotated[int, Key("pixels", "640", low=1, high=MOST_PIXELS)]
-    """Width of the picture in pixels."""
+    """Width of the picture, pixels."""
     height: Annotated[int, Key("pixels", "480", low=1, high=MOST_PIXELS)]
-    """Height of the picture in pixels."""
+    """Height of the picture, pixels."""
     fx: Focal
-    """Focal length along x in pixels."""
+    """Focal length along x, pixels."""
     fy: Focal
-    """Focal length along y in pixels."""
+    """Focal length along y, pixels."""
     cx: Pixel
-    """Column of the principal point in pixels."""
+    """Column of the principal point, pixels."""
     cy: Pixel
-    """Row of the principal point in pixels."""
+    """Row of the principal point, pixels."""
     distortion: Annotated[tuple[float, ...], Key("-", "[-0.12, 0.05, 0.0, 0.0, 0.0]", sizes=(4, 5, 8))] = NO_DISTORTION
     """OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6]]: 4, 5 or 8 values."""
     transfer: Annotated[str | Path, Key("-", '"gamma:2.2"')] = "srgb"
-    """Encoding of values: "srgb", "linear", "gamma:G" (linear = value ** G), or a measured response's file."""
+    """Encoding: "srgb", "linear", "gamma:G" (linear = value ** G), or a measured response's file."""
     field_of_view: Annotated[float | None, Key("degrees", "60.0", low=5.0, high=150.0)] = None
-    """Horizontal field of view in degrees of a camera that was never calibrated, instead of its numbers: a guess, with
-    square pixels, a central principal point and no distortion, for whatever size the frames have."""
+    """Horizontal field of view, degrees, of an uncalibrated camera instead of its numbers. Assumes square pixels, a
+    central principal point and no distortion; fits any frame size."""
 
     @classmethod
     def guessed(cls, width: int, height: int, field_of_view: float, transfer: str | Path = "srgb") -> Camera:
@@ -125,26 +125,25 @@ class SourceSpec:
     """Source of frames: exactly one of ``path``, ``camera`` and ``synthetic`` is given."""
 
     path: Annotated[Path | None, Key("-", '"frames"', right="a folder of frames or a video")] = None
-    """A folder of frames in name order, or a video file."""
+    """Folder of frames in name order, or a video."""
     camera: Annotated[int | None, Key("-", "0", low=0, high=1023)] = None
     """Index of a capture device."""
     synthetic: Annotated[str | None, Key("-", '"moving_card"', right="the name of a generated source")] = None
     """Name of a generated source."""
     fps: Annotated[float | None, Key("frames per second", "24.0", low=1e-3, high=1e5, beside='path = "frames"')] = None
-    """Frames per second; the source's own if left out."""
+    """Frames per second; default: the source's own."""
     exposures: Annotated[
         tuple[float, ...] | None,
         Key("seconds", "[0.016, 0.001]", low=1e-6, high=1e3, sizes=(2, 3, 4, 5, 6, 7, 8), beside="camera = 0"),
     ] = None
-    """Exposure times in seconds that frames have in turn: recorded so, or to be asked of the device."""
+    """Exposure times, seconds, that the frames have in turn; a camera is set to them."""
     shown: Annotated[
         float | None, Key("seconds", "0.001", low=1e-6, high=1e3, beside="camera = 0\nexposures = [0.016, 0.001]")
     ] = None
-    """Exposure time in seconds of the frames that are lit and shown; the longest if left out."""
+    """Exposure time, seconds, of the frames that are shown; default: the longest."""
     metering: Annotated[Literal["fixed", "automatic"] | None, Key("-", '"automatic"', beside="camera = 0")] = None
-    """Metering: "automatic" if the camera's exposure and white balance may drift; what dims all alike is then not the
-    light; fixed if left out.
-    """
+    """Metering: "fixed" (default), or "automatic" if exposure and white balance may drift: a change of all surfaces
+    alike is then the camera's."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -230,18 +229,18 @@ class Marker(Checked):
     """The printed marker, or board of markers, that the world is fixed to."""
 
     dictionary: Annotated[str, Key("-", '"DICT_APRILTAG_36h11"')] = "DICT_4X4_50"
-    """OpenCV's name of the dictionary, ArUco or AprilTag."""
+    """OpenCV's name of the ArUco or AprilTag dictionary."""
     id: Annotated[int, Key("-", "7")] = 0
-    """Number of the marker in the dictionary; unused with a board."""
+    """Number of the marker; unused with a board."""
     size: Annotated[float, Key("metres", "0.08", low=SMALLEST, required=True)] = 0.08
-    """Side of the black square in metres; unused with a board."""
+    """Side of the black square, metres; unused with a board."""
     white: Annotated[float, Key("reflectance, 0 to 1", "0.85", low=0.01, high=1.0)] = 0.85
-    """Diffuse reflectance of the card's white paper."""
+    """Diffuse reflectance of the white paper, 0 to 1."""
     board: Annotated[Board | None, Key("metres", '"charuco 5x7 0.035 0.026"')] = None
-    """A board instead of a single marker."""
+    """Board instead of a single marker, lengths in metres."""
     turn: Annotated[int, Key("degrees", "180", low=0, high=270, beside="size = 0.08")] = 0
-    """Turn of the print against the one that OpenCV draws, counterclockwise: 0, 90, 180 or 270; 180 has the pictures
-    that AprilTag's authors publish stand upright."""
+    """Counterclockwise turn of the print from OpenCV's drawing, degrees: 0, 90, 180 or 270; 180 for the pictures that
+    AprilTag's authors publish."""
 
     def __post_init__(self) -> None:
         """Check all values."""
@@ -257,14 +256,14 @@ class Probe(Checked):
     """A mirror ball."""
 
     center: Annotated[Vec3, Key("metres", "[-0.12, 0.03, 0.0346]")]
-    """Centre in metres."""
+    """Centre, metres."""
     radius: Length
-    """Radius in metres."""
+    """Radius, metres."""
     reflectance: Annotated[RGB, Key("0 to 1 per channel", "[0.85, 0.85, 0.87]", low=0.01, high=1.0)] = SILVERED
-    """Share of light that the ball reflects; a silvered ornament if left out. A file may give one number for grey.
-    Frames that show otherwise are believed, but for the quality ``paper``."""
+    """Share of light that the ball reflects, 0 to 1, RGB or one number; default: a silvered ornament. Corrected where
+    frames show another, except in the preset ``paper``."""
     marker: OwnMarker = None
-    """A marker or board of its own, in whose frame its centre is: it may be moved; lost, its last light remains."""
+    """Own marker or board, in whose frame the centre is. While it is lost, the ball's last light remains."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -272,10 +271,9 @@ class ProxyMaterial(Checked):
     """Mirroring of a proxy's surface, beside its diffuse part; glTF's rough dielectric."""
 
     roughness: Share = 0.1
-    """Perceptual, as glTF has it: 0 is a mirror, 1 as wide as can be; a polished table has about 0.1."""
+    """glTF's roughness: 0 (mirror) to 1 (matt); a polished table has about 0.1."""
     reflectance: Annotated[RGB, Key("0 to 1 per channel", "[0.04, 0.04, 0.05]", low=0.0, high=1.0)] = (0.04, 0.04, 0.04)
-    """Specular reflectance where it is seen from ahead, glTF's F0; 0.04 is lacquer or glass. A file may give one number
-    for grey."""
+    """Specular reflectance seen from ahead, glTF's F0, RGB or one number; 0.04 is lacquer or glass."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -285,19 +283,19 @@ class Proxy(Checked):
     USES: ClassVar = {"plane": ("size",), "box": ("size",), "mesh": ("file",)}
 
     shape: Annotated[Literal["plane", "box", "mesh"], Key("-", '"plane"')]
-    """A plane lies in its own x and y and faces its own +z."""
+    """Shape: "plane" in its own x and y, facing +z; "box"; or "mesh"."""
     at: Place = ORIGIN
-    """Centre (mesh: origin) in metres."""
+    """Centre (mesh: origin), metres."""
     rotate: Turn = ORIGIN
     """Degrees about the fixed x, then y, then z axis."""
     size: Size = ()
-    """Whole lengths in metres: x and y of a plane; x, y and z of a box; empty for a mesh."""
+    """Whole lengths, metres: x and y of a plane; x, y and z of a box."""
     file: MeshFile = None
     """Mesh file, in metres."""
     marker: OwnMarker = None
-    """A marker or board of its own, in whose frame it stands; while that is lost it is not there."""
+    """Own marker or board, in whose frame it stands; absent while that is lost."""
     material: Annotated[ProxyMaterial | None, Key("-", "{ roughness = 0.1 }")] = None
-    """Mirroring of what is virtual; matt if left out."""
+    """Reflection of virtual things; default: none."""
 
     def __post_init__(self) -> None:
         """Check all values."""
@@ -316,13 +314,13 @@ class Animation:
     """
 
     turn: Annotated[Vec3, Key("degrees per second", "[0.0, 0.0, 30.0]")] = ORIGIN
-    """Degrees per second about the fixed axes."""
+    """Degrees per second about the fixed x, y and z axis."""
     pivot: Annotated[Vec3 | None, Key("metres", "[0.0, 0.0, 0.0]", beside="turn = [0.0, 0.0, 30.0]")] = None
-    """Point in metres that ``turn`` leaves in place; the body's own ``at`` if left out, so that it spins in place."""
+    """Centre of ``turn``, metres; default: the body's own ``at``."""
     sway: Annotated[Vec3, Key("metres", "[0.02, 0.0, 0.0]")] = ORIGIN
-    """Furthest excursion of a swing to and fro, in metres."""
+    """Amplitude of a swing to and fro, metres."""
     period: Annotated[float, Key("seconds", "3.0", low=1e-3, beside="sway = [0.02, 0.0, 0.0]")] = 4.0
-    """Duration of one swing in seconds."""
+    """Duration of one swing, seconds."""
 
     def rotation_at(self, seconds: float) -> FloatMatrix:
         """R(t), (3, 3)."""
@@ -344,17 +342,17 @@ class Play:
     """Playing of an animation of a glTF file's nodes."""
 
     animation: Annotated[str | int, Key("-", '"Open"')] = 0
-    """Name of the animation in the file, or its number from 0 on."""
+    """Name of the animation, or its number from 0."""
     loop: Annotated[bool, Key("-", "false")] = True
-    """True if it begins anew after its last key; else it holds that pose."""
+    """True to repeat it; else it holds the last pose."""
     start: Annotated[float, Key("seconds", "2.0")] = 0.0
-    """Time at which it begins, in seconds after the first frame; before, it holds its first pose."""
+    """Start, seconds after the first frame; before, it holds its first pose."""
     speed: Annotated[float, Key("-", "0.5", low=SMALLEST)] = 1.0
     """Seconds of the animation per second."""
     offset: Annotated[float, Key("seconds", "1.5", low=0.0)] = 0.0
-    """Time of the animation with which it begins, in seconds."""
+    """Time of the animation at the start, seconds."""
     paused: Annotated[bool, Key("-", "true")] = False
-    """True if it holds the pose that it begins with."""
+    """True to hold the pose of the start."""
 
     def time_at(self, seconds: float, duration: float) -> float:
         """Time of the animation, ``seconds`` after the first frame; ``duration`` is that of its last key."""
@@ -381,36 +379,36 @@ class Object(Checked):
     }
 
     shape: Annotated[Literal["mesh", "sphere", "box", "torus", "rect", "disk", "tube"], Key("-", '"sphere"')]
-    """All but meshes are centred at their origin; a torus and a tube lie around their z axis, a rect and a disk face
-    their own +z."""
+    """Shape: "mesh", "sphere", "box", "torus" or "tube" around its z axis, "rect" or "disk" facing its +z. All but
+    meshes are centred at their origin."""
     file: MeshFile = None
-    """Mesh file; under another material than its own its textures of the base colour multiply the first colour."""
+    """Mesh file, metres. Its base-colour textures multiply the first colour of a material given here."""
     radius: Length = 0.0
-    """Radius of a sphere, a disk or a tube in metres."""
+    """Radius of a sphere, disk or tube, metres."""
     size: Size = ORIGIN
-    """Whole lengths of a box, or of a rect along x and y, in metres."""
+    """Whole lengths of a box, or x and y of a rect, metres."""
     length: Length = 0.0
-    """Length of a tube in metres; its ends are open."""
+    """Length of a tube, metres; its ends are open."""
     major_radius: Annotated[float, Key("metres", "0.05", low=SMALLEST, required=True)] = 0.0
-    """Distance of a torus's tube from its axis in metres."""
+    """Distance of a torus's tube from its axis, metres."""
     minor_radius: Length = 0.0
-    """Radius of a torus's tube in metres, below the major radius."""
+    """Radius of a torus's tube, metres."""
     at: Place = ORIGIN
-    """Position in metres."""
+    """Position, metres."""
     rotate: Turn = ORIGIN
     """Degrees about the fixed x, then y, then z axis."""
     scale: Annotated[float, Key("-", "0.026", low=SMALLEST)] = 1.0
-    """Factor on all lengths of the shape."""
+    """Factor on all lengths."""
     material: Annotated[Material, Key("-", '{ model = "mirror" }')] = OF_THE_FILE
-    """Material: its reflection of light."""
+    """Material."""
     animate: Motion = None
     """Movement."""
     play: Annotated[Play | None, Key("-", "{ animation = 0 }", beside='shape = "mesh"\nfile = "watch.glb"')] = None
-    """An animation of its glTF file: of nodes, skins and morph targets; without, they stand as at the start."""
+    """Animation of its glTF file to play; default: its nodes stand still."""
     marker: OwnMarker = None
-    """A marker or board of its own, in whose frame it stands; while that is lost it is not there."""
+    """Own marker or board, in whose frame it stands; absent while that is lost."""
     name: ObjectName = None
-    """Name by which a program finds it, ``pipeline.objects["lamp"]``."""
+    """Name in Python: ``pipeline.objects["lamp"]``."""
     mesh: Mesh | None = dataclasses.field(default=None, repr=False)
     """A mesh in memory instead of a file, as ``object_from_trimesh`` gives; a scene file cannot say it."""
 
@@ -446,29 +444,29 @@ class Light(Checked):
     }
 
     kind: Annotated[Literal["point", "spot", "directional"], Key("-", '"point"')]
-    """Kind of light, by the directions in which it shines."""
+    """Kind: "point", "spot" or "directional"."""
     intensity: Intensity
-    """Radiant intensity (point, spot) or irradiance (directional), in camera values."""
+    """Radiant intensity (point, spot) or irradiance (directional), camera values."""
     color: Annotated[RGB, LIGHT_COLOR] = (1.0, 1.0, 1.0)
-    """Factor on the intensity per channel."""
+    """Factor per channel, linear RGB."""
     at: LightPlace = ORIGIN
-    """Position of a point or spot light in metres."""
+    """Position, metres."""
     target: Annotated[Vec3 | None, Key("metres", "[0.135, 0.04, 0.01]")] = None
-    """Point in metres that a spot light shines at; it stays when the light moves."""
+    """Point, metres, that a spot aims at, also when it moves."""
     direction: Annotated[Vec3 | None, Key("-", "[0.3, 0.0, -1.0]", beside='kind = "directional"')] = None
-    """The way the light travels, of any length; instead of a target. It turns with the light."""
+    """Direction in which the light travels, instead of a target; turns with the light."""
     inner_angle: Angle = 0.0
-    """Half angle of a spot in degrees within which it is full."""
+    """Half angle, degrees, of a spot's full intensity."""
     outer_angle: Angle = 0.0
-    """Half angle in degrees at which a spot is zero, after a linear fall from the inner angle."""
+    """Half angle, degrees, at which a spot ends, after a linear fall."""
     attenuation: Annotated[Vec3, Key("1, 1/m, 1/m²", "[0.0, 0.0, 1.0]", low=0.0)] = (0.0, 0.0, 1.0)
-    """Constant, linear and quadratic term of the fall with distance; (0, 0, 1) is the inverse square."""
+    """Constant, linear and quadratic term of the fall with distance: 1, 1/m, 1/m²."""
     radius: Annotated[float, Key("metres", "0.02", low=0.0)] = 0.0
-    """Radius in metres of the sphere that emits (point, spot), for soft shadows; 0 is a point."""
+    """Radius, metres, of a point or spot, for soft shadows."""
     animate: Motion = None
     """Movement."""
     marker: OwnMarker = None
-    """A marker or board of its own, in whose frame it stands; while that is lost it is not there."""
+    """Own marker or board, in whose frame it stands; absent while that is lost."""
 
     def __post_init__(self) -> None:
         """Check all values."""
@@ -505,31 +503,31 @@ class AreaLight(Checked):
     }
 
     kind: Annotated[Literal["rect", "disk", "sphere", "tube"], Key("-", '"rect"')]
-    """A rect and a disk shine where their own +z points; a tube lies around its z axis."""
+    """Kind: "rect" or "disk" shining along its +z, "sphere", or "tube" around its z axis."""
     intensity: Intensity
-    """Radiance in camera values: 1 is what the camera clips."""
+    """Radiance, camera values: 1 clips."""
     color: Annotated[RGB, LIGHT_COLOR] = (1.0, 1.0, 1.0)
-    """Factor on the radiance per channel."""
+    """Factor per channel, linear RGB."""
     at: LightPlace = ORIGIN
-    """Centre in metres."""
+    """Position, metres."""
     rotate: Turn = ORIGIN
-    """Degrees about the fixed x, then y, then z axis; [180, 0, 0] turns a rect or disk down."""
+    """Degrees about the fixed x, then y, then z axis."""
     size: Size = ()
-    """Whole lengths of a rect along x and y in metres."""
+    """Whole lengths of a rect along x and y, metres."""
     radius: Length = 0.0
-    """Radius of a disk, sphere or tube in metres."""
+    """Radius of a disk, sphere or tube, metres."""
     length: Length = 0.0
-    """Length of a tube in metres; its ends are open."""
+    """Length of a tube, metres; its ends are open."""
     image: Annotated[Path | None, Key("-", '"picture.png"', right="a picture")] = None
-    """Picture that multiplies the radiance of a rect: sRGB-encoded, or linear radiance (HDR, OpenEXR)."""
+    """Picture that multiplies the radiance of a rect: sRGB-encoded, or linear (HDR, OpenEXR)."""
     two_sided: Annotated[bool, Key("-", "true")] = False
-    """True if the back of a rect or disk shines too; else it is not there from behind, but throws a shadow."""
+    """True if the back shines too; else it is invisible from behind, but throws a shadow."""
     animate: Motion = None
     """Movement."""
     marker: OwnMarker = None
-    """A marker or board of its own, in whose frame it stands; while that is lost it is not there."""
+    """Own marker or board, in whose frame it stands; absent while that is lost."""
     name: ObjectName = None
-    """Name by which a program finds it among the objects."""
+    """Name in Python, among ``pipeline.objects``."""
 
     def __post_init__(self) -> None:
         """Check all values."""
@@ -561,14 +559,14 @@ class CapturedLight(Checked):
     """Light of the environment from a file instead of from a mirror ball in the frames."""
 
     file: Annotated[Path, Key("-", '"light.exr"', right="a captured light (OpenEXR or HDR)")]
-    """Latlong OpenEXR or Radiance HDR, as ``warp_ar.capture`` writes it, or of another program."""
+    """Latlong OpenEXR or Radiance HDR, by ``warp_ar.capture`` or another program."""
     scale: Annotated[float, Key("-", "0.5", low=SMALLEST)] = 1.0
-    """Factor from the file's values to those of the frames' camera."""
+    """Factor on the file's values, to match the camera's."""
     rotate: Turn = ORIGIN
-    """Degrees about the fixed x, then y, then z axis, from the file's axes to the scene's."""
+    """Degrees about the fixed x, then y, then z axis."""
     axes: Annotated[str | None, Key("-", '"y-up"', words=LATLONG_AXES)] = None
-    """Axes of the file: "z-up", "blender", "y-up" or "opengl"; if left out, as the file says, else y-up of an OpenEXR
-    and blender of an HDR."""
+    """Axes of the file: "z-up", "blender", "y-up" or "opengl"; default: the file's, else y-up of an OpenEXR and blender
+    of an HDR."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -578,21 +576,21 @@ class PoseKeys:
     R: Annotated[
         tuple[float, ...] | None, Key("-", "[1, 0, 0, 0, 0, -1, 0, 1, 0]", sizes=(9,), beside="t = [0.0, 0.1, 0.6]")
     ] = None
-    """Rotation of camera_from_world, row by row, as OpenCV has it: x right, y down, z forward."""
+    """Rotation of camera_from_world, row by row; camera axes x right, y down, z forward."""
     t: Annotated[Vec3 | None, Key("metres", "[0.0, 0.1, 0.6]", beside="R = [1, 0, 0, 0, 0, -1, 0, 1, 0]")] = None
-    """Translation of camera_from_world, beside R or quaternion."""
+    """Translation of camera_from_world, metres, with R or quaternion."""
     quaternion: Annotated[
         tuple[float, ...] | None, Key("-", "[0.7, 0.7, 0.0, 0.0]", sizes=(4,), beside="t = [0.0, 0.1, 0.6]")
     ] = None
-    """Rotation of camera_from_world as COLMAP has it: w, x, y, z."""
+    """Rotation of camera_from_world: w, x, y, z."""
     position: Annotated[Vec3 | None, Key("metres", "[0.0, -0.6, 0.1]")] = None
-    """Place of the camera, instead of camera_from_world."""
+    """Position of the camera, metres, instead of camera_from_world."""
     rotate: Annotated[Vec3 | None, Key("degrees", "[-20.0, 0.0, 0.0]", beside="position = [0.0, -0.6, 0.3]")] = None
-    """About the fixed x, then y, then z axis, from a level camera that looks along +y."""
+    """Degrees about the fixed x, then y, then z axis, from a level camera that looks along +y."""
     file: Annotated[
         Path | None, Key("-", '"images.txt"', right="poses: COLMAP's images, OpenTrackIO, USD, or JSON")
     ] = None
-    """A pose for every frame: COLMAP's or NeRF's by name, JSON of R and t, OpenTrackIO, USD."""
+    """A pose for every frame: COLMAP's or NeRF's by name, JSON, OpenTrackIO, USD."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -655,7 +653,7 @@ class Exposure:
     """A simulated shorter exposure."""
 
     scale: Annotated[float | Literal["auto"], Key("-", "0.5", low=0.0)] = 1.0
-    """Factor on the frame's light, 1 = off; "auto" keeps highlights below clipping when virtual light is added."""
+    """Factor on the frame's light; "auto" keeps highlights below clipping when virtual light is added."""
 
 
 @dataclasses.dataclass(frozen=True)

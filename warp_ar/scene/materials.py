@@ -23,15 +23,15 @@ class PhongMaterial(Checked):
     """Diffuse plus a cosine lobe about the mirror direction."""
 
     diffuse: Tint = (0.8, 0.8, 0.8)
-    """Diffuse reflectance."""
+    """Diffuse reflectance, linear RGB."""
     specular: Tint = (0.2, 0.2, 0.2)
-    """Reflectance of the lobe."""
+    """Reflectance of the lobe, linear RGB."""
     shininess: Annotated[float, Key("-", "64.0", low=0.0)] = 32.0
-    """Exponent of the lobe, from 0 (widest) on."""
+    """Exponent of the lobe, from 0 (widest)."""
 
     @property
     def base_color(self) -> Color:
-        """Diffuse reflectance, by the name that the other models have for theirs."""
+        """Diffuse reflectance, under the other models' name."""
         return self.diffuse
 
 
@@ -40,7 +40,7 @@ class MetallicRoughnessMaterial(Checked):
     """glTF's BRDF: GGX with alpha = roughness squared, F0 = 0.04 for what is no metal."""
 
     base_color: Tint = (0.8, 0.8, 0.8)
-    """Diffuse reflectance of a non-metal, F0 of a metal."""
+    """Diffuse reflectance of a non-metal or F0 of a metal, linear RGB."""
     metallic: Share = 0.0
     """0 (no metal) to 1 (metal)."""
     roughness: Share = 0.5
@@ -52,7 +52,7 @@ class LambertMaterial(Checked):
     """Perfectly diffuse."""
 
     base_color: Tint = (0.8, 0.8, 0.8)
-    """Diffuse reflectance."""
+    """Diffuse reflectance, linear RGB."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,21 +60,21 @@ class MirrorMaterial(Checked):
     """Perfect mirror."""
 
     base_color: Tint = (1.0, 1.0, 1.0)
-    """Reflectance, the same at every angle."""
+    """Reflectance at every angle, linear RGB."""
 
 
 @dataclasses.dataclass(frozen=True)
 class EmissiveMaterial(Checked):
-    """Sends out light of its own, alike in all directions, and reflects none."""
+    """Emits alike in all directions and reflects nothing."""
 
     color: Annotated[RGB, LIGHT_COLOR] = (1.0, 1.0, 1.0)
-    """Factor on the radiance per channel."""
+    """Factor per channel, linear RGB."""
     intensity: Annotated[float, Key("camera values", "4.0", low=0.0)] = 1.0
-    """Radiance in camera values: 1 is what the camera clips."""
+    """Radiance, camera values: 1 clips."""
     image: Annotated[Path | None, Key("-", '"picture.png"', right="a picture")] = None
-    """Picture that multiplies the radiance: sRGB-encoded, or linear radiance (HDR, OpenEXR)."""
+    """Picture that multiplies the radiance: sRGB-encoded, or linear (HDR, OpenEXR)."""
     two_sided: Annotated[bool, Key("-", "true")] = False
-    """True if the back of an open surface emits too; else it is not there from behind, but throws a shadow."""
+    """True if the back of an open surface emits too; else it is invisible from behind, but throws a shadow."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,7 +103,7 @@ Wrap: TypeAlias = Literal["repeat", "clamp", "mirror"]
 """Continuation of a picture beyond its border."""
 
 IDENTITY: Final = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
-"""Texture coordinates as they are."""
+"""Unchanged texture coordinates."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,9 +117,9 @@ class TextureUse:
     transform: tuple[float, ...] = IDENTITY
     """Rows (a, b, c), (d, e, f): the picture is read at (a u + b v + c, d u + e v + f), v up the picture."""
     wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")
-    """Beyond the border along u and v."""
+    """Continuation beyond the border along u and v."""
     nearest: bool = False
-    """True if the texel that is nearest is shown as a square, as a sampler's magnification filter may ask."""
+    """True for nearest-neighbour magnification."""
 
 
 _CHALK: Final = LambertMaterial()
@@ -127,53 +127,53 @@ _CHALK: Final = LambertMaterial()
 
 @dataclasses.dataclass(frozen=True)
 class MeshMaterial:
-    """Appearance of a group of triangles; a texture's value is multiplied by the constant of the same name."""
+    """Appearance of a group of triangles; each texture is multiplied by the constant of its name."""
 
     surface: Material = _CHALK
     """The reflection model and its constants; never ``FileMaterial``."""
     name: str = ""
     """The file's name for it."""
     alpha: Literal["opaque", "mask", "blend"] = "opaque"
-    """Effect of alpha: none; cut away below ``cutoff``; show as large a share of the points."""
+    """Effect of alpha: none; a cut below ``cutoff``; or the share of points that are shown."""
     opacity: float = 1.0
     """Constant factor of alpha."""
     cutoff: float = 0.5
-    """Alpha from which on a mask is there."""
+    """Least alpha that a mask shows."""
     double_sided: bool = True
-    """True if triangles are seen from behind; of a closed mesh nobody sees those."""
+    """True if triangles are seen from behind."""
     unlit: bool = False
-    """True if the base colour is shown as it is: 1 is the camera's clipping value."""
+    """True if the base colour is shown unlit; 1 clips."""
     emission: RGB = (0.0, 0.0, 0.0)
-    """Radiance that it sends out itself, in camera values."""
+    """Emitted radiance, camera values."""
     base: TextureUse | None = None
-    """RGB, sRGB-encoded, times the surface's first colour; A times ``opacity``."""
+    """RGB, sRGB-encoded, multiplies the first colour; A multiplies ``opacity``."""
     specular: TextureUse | None = None
-    """RGB, sRGB-encoded, times the specular colour of Phong's model."""
+    """RGB, sRGB-encoded, multiplies Phong's specular colour."""
     metallic_roughness: TextureUse | None = None
-    """G times roughness, B times metallic, linear."""
+    """Linear: G multiplies roughness, B metallic."""
     normal: TextureUse | None = None
     """Normal in the tangent frame, 0.5 + 0.5 n, linear."""
     normal_scale: float = 1.0
     """Factor of the normal's first two components."""
     occlusion: TextureUse | None = None
-    """R, linear: the share of the environment that reaches a point."""
+    """Linear R: share of the environment's light that reaches a point."""
     occlusion_strength: float = 1.0
-    """Share of the occlusion that counts."""
+    """Strength of the occlusion, 0 to 1."""
     emissive: TextureUse | None = None
-    """RGB, sRGB-encoded, times ``emission``."""
+    """RGB, sRGB-encoded, multiplies ``emission``."""
     roughness_span: tuple[float, float] = (1.0, 1.0)
-    """Least and largest factor that the texture gives the roughness."""
+    """Least and largest factor of the texture on roughness."""
     metallic_span: tuple[float, float] = (1.0, 1.0)
-    """Least and largest factor that the texture gives metallic."""
+    """Least and largest factor of the texture on metallic."""
 
     @property
     def textures(self) -> tuple[TextureUse, ...]:
-        """All that it has."""
+        """All its textures."""
         found = (self.base, self.specular, self.metallic_roughness, self.normal, self.occlusion, self.emissive)
         return tuple(use for use in found if use is not None)
 
     @property
     def plain(self) -> bool:
-        """Return whether its surface's constants say everything."""
+        """Return whether the surface's constants alone describe it."""
         dark = not any(self.emission)
         return not self.textures and self.alpha == "opaque" and self.double_sided and not self.unlit and dark

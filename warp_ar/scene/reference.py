@@ -53,11 +53,17 @@ class Key:
     unit: str
     """Unit of its value; a dash where it has none."""
     default: str
-    """Value in a file that leaves the key out, as TOML; "required", or "none" where nothing is assumed."""
+    """Value if the key is left out, as TOML; or "required", or "none"."""
     example: str
     """A value as TOML."""
     beside: str = ""
-    """Other keys of the section, as lines of TOML, without which the example is not complete."""
+    """Other keys of the section that the example needs, as lines of TOML."""
+
+    @property
+    def description(self) -> str:
+        """Meaning with its unit."""
+        said = self.unit == "-" or self.unit.split()[0].lower().rstrip(",") in self.meaning.lower()
+        return self.meaning if said else f"{self.meaning} ({self.unit})"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,28 +81,30 @@ class Section:
 
 
 SECTIONS: Final[tuple[Section, ...]] = (
-    Section("camera", False, "The camera that the frames come from. Intrinsics, or a file with them.", (Camera,)),
-    Section("source", False, "Where frames come from: exactly one of path, camera and synthetic.", (SourceSpec,)),
-    Section("marker", False, "The printed marker or board that the world is fixed to.", (Marker,)),
-    Section("probe", True, "A mirror ball; a single one may be written [probe].", (Probe,)),
-    Section("proxy", True, "Simplified physical geometry that receives virtual light and shadow.", (Proxy,)),
-    Section("proxy.material", False, "How a proxy mirrors what is virtual.", (ProxyMaterial,)),
+    Section(
+        "camera", False, "Camera of the frames: its numbers, a calibration file, or a guessed field of view.", (Camera,)
+    ),
+    Section("source", False, "Source of frames: exactly one of path, camera and synthetic.", (SourceSpec,)),
+    Section("marker", False, "Printed marker or board that fixes the world.", (Marker,)),
+    Section("probe", True, "A mirror ball.", (Probe,)),
+    Section("proxy", True, "Simplified real geometry that receives virtual light and shadow.", (Proxy,)),
+    Section("proxy.material", False, "Reflection of virtual things in a proxy.", (ProxyMaterial,)),
     Section("object", True, "A virtual object.", (Object,)),
     Section(
         "object.material",
         False,
-        "How a virtual object reflects light, or sends it out.",
+        "Reflection or emission of a virtual object.",
         tuple(kind for kind in MATERIALS.values() if kind is not FileMaterial),
     ),
-    Section("object.play", False, "How an animation of the object's glTF file is played.", (Play,)),
+    Section("object.play", False, "Playing of an animation of the object's glTF file.", (Play,)),
     Section("object.animate", False, "Motion of an object; a light's `animate` has the same keys.", (Animation,)),
     Section(
         "light",
         True,
-        "A virtual light or, with `file`, the environment's light as `warp_ar.capture` wrote it; one may be [light].",
+        "A virtual light or, with `file`, the environment's light by `warp_ar.capture`.",
         (Light, CapturedLight, AreaLight),
     ),
-    Section("pose", False, "Where the camera stands, where no marker tells.", (PoseKeys,)),
+    Section("pose", False, "Pose of the camera, instead of a marker.", (PoseKeys,)),
     Section("exposure", False, "A simulated shorter exposure.", (Exposure,)),
 )
 
@@ -106,13 +114,13 @@ _OTHERS: Final[dict[tuple[str, str], tuple[str, str, str, str]]] = {
         '"camera.yml"',
         "",
         "-",
-        "A calibration file, OpenCV's YAML, JSON or XML, instead of the numbers; `exif`: EXIF of [source]'s first.",
+        'Calibration file instead of the numbers; "exif": EXIF of the source\'s first picture.',
     ),
     ("object.material", "model"): (
         '"metallic_roughness"',
         "",
         "-",
-        "The reflection model; each has keys of its own.",
+        "Reflection model, one of " + ", ".join(MATERIALS) + "; each has keys of its own.",
     ),
 }
 
@@ -185,11 +193,11 @@ def _toml(field: Field) -> str:
         return "required"
     if value is None:
         return "none"
-    return type(value).__name__ if dataclasses.is_dataclass(value) else tomlkit.item(value).as_string()
+    return "that of its file" if isinstance(value, FileMaterial) else tomlkit.item(value).as_string()
 
 
 def as_markdown() -> str:
-    """The page of keys: a table for every section."""
+    """Return the page of keys: for every section a list of keys with an example each."""
     own = list(keys())
     parts: list[str] = []
     for name in ["", *(section.name for section in SECTIONS)]:
@@ -197,10 +205,9 @@ def as_markdown() -> str:
         title = "Top of the file" if section is None else f"[[{name}]]" if section.several else f"[{name}]"
         parts += [f"## {title}" if section is None else f"## `{title}`", ""]
         parts += [section.meaning, ""] if section is not None else []
-        parts += ["| key | meaning | unit | default | example |", "| --- | --- | --- | --- | --- |"]
         for key in own:
             if key.section == name:
-                cells = [f"`{key.name}`", key.meaning, key.unit, f"`{key.default}`", f"`{key.example}`"]
-                parts.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+                usual = {"required": " Required.", "none": ""}.get(key.default, f" Default `{key.default}`.")
+                parts.append(f"- `{key.name} = {key.example}`: {key.description}{usual}")
         parts.append("")
-    return "\n".join(parts)
+    return "\n".join(parts).replace("``", "`")

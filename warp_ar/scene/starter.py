@@ -98,8 +98,7 @@ roughness = 0.25
 def key_comment(section: str, name: str) -> list[str]:
     """Lines of a comment that says what a key is."""
     (key,) = (one for one in keys() if (one.section, one.name) == (section, name))
-    said = key.unit == "-" or key.unit.split()[0] in key.meaning.lower()
-    return [f"# {line}" for line in textwrap.wrap(key.meaning if said else f"{key.meaning} ({key.unit})", _WIDTH)]
+    return [f"# {line}" for line in textwrap.wrap(key.description, _WIDTH)]
 
 
 def guesses(scene: Scene) -> list[str]:
