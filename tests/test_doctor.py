@@ -22,7 +22,7 @@ from warp_ar.checks.check_print import check_print
 from warp_ar.checks.check_proxies import check_proxies
 from warp_ar.checks.check_scene import check_scene
 from warp_ar.checks.checkup import check_look, check_up
-from warp_ar.checks.finding import Finding, fault_errors, worst_first
+from warp_ar.checks.finding import Finding
 from warp_ar.errors import SceneError
 from warp_ar.scene import Camera, CharucoBoard, Marker, Pose, Scene, SourceSpec, load_scene, loads_scene
 from warp_ar.scene.starter import amend_scene
@@ -331,17 +331,6 @@ def test_unreadable_source_is_a_finding(tmp_path):
     assert [finding.name for finding in found] == ["source.unreadable"]
 
 
-def test_costs_are_measured_and_order_the_findings():
-    errors = fault_errors()
-    assert errors["units.ball"]["error"] > errors["ball.place"]["error"] > errors["camera.focal"]["error"]
-    findings = [Finding("ball.place", "", ""), Finding("marker.unseen", "", "")]
-    assert [finding.name for finding in worst_first(findings)] == ["marker.unseen", "ball.place"]
-    assert "FLIP" in findings[0].cost
-    assert errors["camera.response"]["error"] > errors["camera.focal"]["error"]
-    remedy = Finding("camera.response", "", "python -m warp_ar.calibrate response PICTURES").remedy_for("my_desk")
-    assert remedy.endswith("PICTURES --write my_desk")
-
-
 @pytest.fixture(autouse=True)
 def own_cache(tmp_path_factory, monkeypatch):
     """What a test finds is not what an earlier one has kept."""
@@ -456,12 +445,6 @@ def test_lives_line_names_a_print_that_is_not_true(monkeypatch):
     said, names = lives_words(scene, frames, monkeypatch)
     assert "card.print" in names
     assert len(said) == 1
-
-
-@pytest.mark.parametrize(("clip", "change"), BRIEF)
-def test_live_says_nothing_of_a_right_set_up(clip, change, monkeypatch, looks):
-    frames = [RIGHT[change](image, k) for k, image in enumerate(looks[clip].images)]
-    assert lives_words(load_scene(clip), frames, monkeypatch) == ([], [])
 
 
 @pytest.fixture(scope="module")

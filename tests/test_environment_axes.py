@@ -193,33 +193,12 @@ def test_a_cube_that_no_memory_holds_is_refused():
 # --- Spherical harmonics: closed forms, and another way to the same sums ----------------------------------------------
 
 
-ROUNDING = 1e-6  # float32 of the map; sums are in double precision
 # 200,000 directions of a bilinear sample: five standard errors of a mean of values about 0.3.
 MONTE_CARLO = 5 * 0.5 * 4 * math.pi / math.sqrt(200_000)
 
 
 def noise() -> np.ndarray:
     return np.random.default_rng(3).random((8, 16, 3)).astype(np.float32)
-
-
-def test_a_constant_has_the_first_coefficient_alone() -> None:
-    coefficients = project_radiance(np.full((5, 10, 3), 0.5, np.float32))
-    expected = np.zeros((9, 3))
-    expected[0] = 0.5 * math.sqrt(4 * math.pi)
-    np.testing.assert_allclose(coefficients, expected, atol=ROUNDING)
-    content = json.loads(encode_harmonics(np.full((5, 10, 3), 0.5, np.float32), "z-up", 1.0))
-    received = basis(np.array([[0.6, 0.0, 0.8]])) @ np.array(content["irradiance"])
-    np.testing.assert_allclose(received, math.pi * 0.5, rtol=ROUNDING)  # white furnace
-
-
-def test_half_a_sky_lights_what_faces_it() -> None:
-    """L = 1 above: E(up) of order 2 is pi/2 + 2 pi/3 . 3/4 (the exact pi less orders above 2, which are odd)."""
-    sky = np.zeros((16, 32, 3), np.float32)
-    sky[:8] = 1.0
-    content = json.loads(encode_harmonics(sky, "y-up", 1.0))
-    up = np.array([[0.0, 1.0, 0.0]])
-    np.testing.assert_allclose(basis(up) @ np.array(content["irradiance"]), math.pi, rtol=ROUNDING)
-    np.testing.assert_allclose(basis(-up) @ np.array(content["irradiance"]), 0.0, atol=ROUNDING * 10)
 
 
 @pytest.mark.parametrize("axes", AXES)
@@ -249,15 +228,6 @@ def test_the_frames_own_harmonics_agree(device: str) -> None:
     np.testing.assert_allclose(out.numpy(), content["irradiance"], atol=1e-4)
 
 
-def test_a_turned_ramp_points_the_same_way() -> None:
-    """l = 1 is a vector: it turns with the world."""
-    z_up = project_radiance(noise())[[3, 1, 2]]
-    for axes in AXES:
-        np.testing.assert_allclose(
-            project_radiance(noise(), axes)[[3, 1, 2]], world_from_marker(axes) @ z_up, atol=ROUNDING
-        )
-
-
 # --- The command that writes an environment for another program -------------------------------------------------------
 
 
@@ -282,13 +252,6 @@ def test_axes_time_and_place_are_written(captured: pathlib.Path) -> None:
     info = read_environment_info(output)
     assert (info.exposure, info.place[2]) == (0.5, 34.0)
     assert info.taken.isoformat() == "2026-05-01T10:00:00+00:00"
-
-
-@pytest.mark.parametrize("name", ["out.hdr", "out.json", "out.exr"])
-def test_every_ending_is_written(captured: pathlib.Path, name: str) -> None:
-    output = captured.parent / name
-    assert environment.main([str(captured), "--output", str(output), "--axes", "blender"]) == 0
-    assert output.stat().st_size > 100
 
 
 def test_a_cube_has_the_size_asked_for(captured: pathlib.Path) -> None:
@@ -328,7 +291,6 @@ def test_a_missing_environment_is_one_line(tmp_path: pathlib.Path, capsys: pytes
 # --- The environment within a glTF: its faces, its roughness, its harmonics, against sums that are written out here ---
 
 
-CONSTANT = 1e-5  # of weighted means in float64, kept in float32
 RGBD = 0.02  # a step of 8 bits in the brightest channel's 2.2th power, and of D's whole steps
 MONTE_CARLO_GLTF_ENVIRONMENT = 5.0  # standard errors
 # Directions that faces of a cube look along, as glTF's picture of the extension has them.
@@ -345,11 +307,6 @@ def glowing(toward: np.ndarray, height: int = 64) -> np.ndarray:
     """A smooth light around a direction."""
     cos_theta = latlong_directions(height) @ (toward / np.linalg.norm(toward))
     return (0.2 + 5.0 * np.exp(8.0 * (cos_theta - 1.0)))[..., None].astype(np.float32) * np.float32([1.0, 0.5, 0.25])
-
-
-def test_a_constant_stays_constant() -> None:
-    for cube in specular_cubes(np.full((32, 64, 3), 0.7, np.float32)):
-        np.testing.assert_allclose(cube, 0.7, rtol=CONSTANT)
 
 
 @pytest.mark.parametrize("face", range(6))

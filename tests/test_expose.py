@@ -70,13 +70,6 @@ def disc(size=96, radius=20):
     return np.repeat(np.where(x * x + y * y <= radius * radius, 255, 40).astype(np.uint8)[..., None], 3, axis=2)
 
 
-@pytest.mark.parametrize("transfer", ["srgb", "linear", "gamma:2.2"])
-@pytest.mark.parametrize("method", expose.METHODS)
-def test_scale_one_is_the_identity(device, method, transfer):
-    frame = make_layers()[0]
-    np.testing.assert_array_equal(run(frame, 1.0, method, transfer=transfer), frame)
-
-
 @pytest.mark.parametrize("level", [238, 255])
 def test_what_is_drawn_ends_where_the_camera_does(device, level):
     """A white object over a frame whose lamps end at ``level``; what the frame shows above it stays."""
@@ -181,19 +174,6 @@ def test_pixel_with_a_hue_is_not_lifted(device):
     """Orange that clips in red alone fades with its surroundings, however large it is."""
     frame = np.full((64, 64, 3), (255, 230, 120), np.uint8)
     np.testing.assert_array_equal(run(frame, 0.5), run(frame, 0.5, "plain"))
-
-
-@pytest.mark.parametrize("method", expose.BOXES)
-@pytest.mark.parametrize("frame", [disc(96, 30), np.full((30, 30, 3), 255, np.uint8)], ids=["disc", "saturated"])
-def test_brightness_never_falls_as_the_scale_rises(device, frame, method):
-    """No pixel may flash while the exposure is turned down; also continuous at 1."""
-    before = run(frame, 0.0, method).astype(int)
-    for scale in np.linspace(0.05, 1.0, 20):
-        now = run(frame, scale, method).astype(int)
-        assert (now >= before).all()
-        before = now
-    almost = run(frame, np.nextafter(np.float32(1), np.float32(0)), method).astype(int)
-    assert np.abs(almost - frame).max() <= 0
 
 
 @pytest.mark.parametrize(("other", "factor"), [(255, 1.0), (191, 0.806), (128, 0.615)])

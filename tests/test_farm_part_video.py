@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import fractions
 import itertools
 
@@ -12,15 +11,10 @@ import pytest
 
 from tests.farm_rig import TICK, desk_frames, write_recording
 from warp_ar.errors import SourceError
-from warp_ar.farm import video as part_video
 from warp_ar.farm.video import join_parts, open_part_sink
 
 pytestmark = pytest.mark.slow
 
-MOST_ERROR = 0.15
-"""Codes in the mean by which a quicker encoding may err more; at 1080p it was 0.1 at most."""
-MOST_BYTES = 1.2
-"""Times as many as the slower one's; 1.1 at this size, 1.7 without x264's look ahead."""
 UNEVEN = [7, 30, 41, 100, 101, 150, 203, 260, 261, 300, 390, 391]
 
 
@@ -61,23 +55,6 @@ def test_packets_are_those_of_the_parts_at_the_times_of_the_recording(tmp_path):
     whole = [image for part in parts for image in decoded(part)]
     for a, b in zip(whole, decoded(tmp_path / "out.mp4"), strict=True):
         np.testing.assert_array_equal(a, b)
-
-
-def test_the_quick_encoding_is_hardly_larger_or_worse_than_the_slow_one(tmp_path, monkeypatch):
-    ticks, own = [25 * n for n in range(48)], part_video.part_encoding()
-    slow = {name: value for name, value in own.options.items() if name != "x264-params"} | {"preset": "veryfast"}
-    found = []
-    for name, options in (("quick", own.options), ("slow", slow)):
-        monkeypatch.setattr(
-            part_video, "part_encoding", lambda _, options=options: dataclasses.replace(own, options=options)
-        )
-        (tmp_path / name).mkdir()
-        (part,), _ = write_parts(tmp_path / name, ticks, [0, 48])
-        pairs = zip(desk_frames(48), decoded(part), strict=True)
-        found.append((np.mean([np.abs(a.astype(int) - b).mean() for a, b in pairs]), part.stat().st_size))
-    (quick_error, quick_bytes), (slow_error, slow_bytes) = found
-    assert quick_error < slow_error + MOST_ERROR
-    assert quick_bytes < MOST_BYTES * slow_bytes
 
 
 def test_sound_and_metadata_are_the_recordings(tmp_path):

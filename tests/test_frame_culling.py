@@ -55,10 +55,6 @@ STEPS = (
 DARK, EMPTY, NOTHING = Reach(light=False), Reach(objects=False), Reach(objects=False, light=False)
 
 
-def test_a_frame_that_reaches_everything_leaves_nothing_out() -> None:
-    assert Demand(STEPS, ("image",)).look(Reach()) == ({}, set())  # type: ignore[arg-type]
-
-
 def test_an_idle_stage_clears_once_and_rests_with_what_only_it_reads() -> None:
     demand = Demand(STEPS, ("image",))  # type: ignore[arg-type]
     assert demand.look(EMPTY) == ({}, {"shade"}), "what it wrote before must go"
@@ -66,47 +62,6 @@ def test_an_idle_stage_clears_once_and_rests_with_what_only_it_reads() -> None:
     assert demand.look(EMPTY) == ({"shade": "no objects", "filter": nobody}, set())
     assert demand.look(Reach()) == ({}, set())
     assert demand.look(EMPTY)[1] == {"shade"}, "it has written since"
-
-
-def test_frames_of_one_reach_have_one_answer() -> None:
-    """The same object, so that nothing need be made of it anew; until arrays are taken to hold something again."""
-    demand = Demand(STEPS, ("image",))  # type: ignore[arg-type]
-    cleared = demand.look(EMPTY)[0]
-    resting = demand.look(EMPTY)[0]
-    assert cleared == {}
-    assert demand.look(Reach(objects=False))[0] is resting
-    assert demand.look(NOTHING)[1] == {"relight"}
-    assert demand.look(EMPTY)[0] == resting
-    demand.forget()
-    assert demand.look(EMPTY) == ({}, {"shade"})
-
-
-def test_what_accumulates_over_frames_runs_though_nothing_reads_it() -> None:
-    demand = Demand(STEPS, ("image",))  # type: ignore[arg-type]
-    demand.look(NOTHING)
-    resting, clearing = demand.look(NOTHING)
-    assert set(resting) == {"keep", "filter", "shade", "relight"}
-    assert not clearing
-
-
-def test_an_output_is_needed_in_every_frame() -> None:
-    demand = Demand(STEPS, ("image", "environment"))  # type: ignore[arg-type]
-    demand.look(NOTHING)
-    assert set(demand.look(NOTHING)[0]) == {"filter", "shade", "relight"}
-
-
-def test_what_a_stage_does_not_depend_on_in_a_frame_is_not_needed_for_it() -> None:
-    steps = (Step("respond", "frame", "response"), Step("mirror", "frame response", "image"))
-    demand = Demand(steps, ("image",))  # type: ignore[arg-type]
-    assert not demand.look(Reach())[0]
-    assert set(demand.look(Reach(falls=False))[0]) == {"respond"}
-
-
-def test_after_a_launch_of_everything_nothing_is_clear() -> None:
-    demand = Demand(STEPS, ("image",))  # type: ignore[arg-type]
-    demand.look(NOTHING)
-    demand.forget()
-    assert demand.look(NOTHING)[1] == {"shade", "relight"}
 
 
 # --- Pictures ---------------------------------------------------------------------------------------------------------

@@ -39,19 +39,6 @@ def test_no_stage_imports_another() -> None:
     assert {path.name: found for path in files if (found := stages_imported(path))} == {}
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
-        "from warp_ar.stages.unwrap import Unwrap",
-        "from warp_ar.stages import unwrap",
-        "import warp_ar.stages.unwrap",
-        "def f():\n    from warp_ar.stages.unwrap import Unwrap",
-    ],
-)
-def test_an_import_of_a_stage_is_found(line: str) -> None:
-    assert imported(line) & MODULES == {"warp_ar.stages.unwrap"}
-
-
 @pytest.mark.parametrize("folder", ["bench", "scenes", "tests"])
 def test_no_two_files_beside_the_package_import_each_other(folder: str) -> None:
     """``lint-imports`` looks after the package alone."""

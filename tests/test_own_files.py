@@ -11,14 +11,12 @@ import stat
 import numpy as np
 import pytest
 
-from bench.common import KeptLines
 from warp_ar import calibrate
 from warp_ar.calibration.camera_calibration import CameraReport, write_camera
 from warp_ar.calibration.response import write_response
 from warp_ar.command_line import Terminated
 from warp_ar.errors import SinkError, UsageError
 from warp_ar.files import create_new, name_aside, write_whole
-from warp_ar.kernels.color import decode_table
 from warp_ar.output.places import OwnFiles
 from warp_ar.output.sinks import open_sink, write_environment
 from warp_ar.output.video_sink import VideoSink, WholeFragments
@@ -191,28 +189,6 @@ def test_one_place_sets_files_aside_and_renames() -> None:
 # --- Lines of a long run that are kept, so that it goes on where it was ended -----------------------------------------
 
 
-def test_a_run_that_was_ended_goes_on(tmp_path, capsys):
-    path = tmp_path / "lines.jsonl"
-    first = KeptLines(path)
-    first.add({"scene": "desk", "mode": "whole", "samples": 16, "z_rms": 1.0})
-    with path.open("a") as file:
-        file.write('{"scene": "desk", "mode": "kno')  # ended while it wrote
-    later = KeptLines(path)
-    assert later.has(scene="desk", mode="whole", samples=16)
-    assert not later.has(scene="desk", mode="whole", samples=64)
-    assert not later.has(scene="desk", mode="known")
-    later.add({"scene": "desk", "mode": "known", "samples": 16})
-    assert [json.loads(line)["mode"] for line in path.read_text().splitlines()] == ["whole", "known"]
-    assert len(capsys.readouterr().out.splitlines()) == 2
-
-
-def test_without_a_file_lines_are_printed_alone(capsys):
-    lines = KeptLines(None)
-    lines.add({"scene": "desk"})
-    assert lines.has(scene="desk")
-    assert json.loads(capsys.readouterr().out) == {"scene": "desk"}
-
-
 # --- Files that this program writes are known as its own; others are not, whatever they hold --------------------------
 
 
@@ -253,11 +229,6 @@ def test_what_is_written_here_is_known(tmp_path: pathlib.Path, name: str) -> Non
 def test_a_signed_calibration_is_read(tmp_path: pathlib.Path, suffix: str) -> None:
     write_camera(REPORT, tmp_path / f"a.{suffix}")
     assert load_calibration(tmp_path / f"a.{suffix}").matrix() == pytest.approx(REPORT.camera.matrix())
-
-
-def test_a_signed_response_is_read(tmp_path: pathlib.Path) -> None:
-    write_response(CURVE, tmp_path / "a.txt")
-    assert np.allclose(decode_table(tmp_path / "a.txt"), CURVE, atol=1e-7)
 
 
 def test_others_are_not(tmp_path: pathlib.Path) -> None:

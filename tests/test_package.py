@@ -134,21 +134,3 @@ def test_docstrings_list_what_is_raised(folder: str) -> None:
     texts = {str(path.relative_to(ROOT)): path.read_text(encoding="utf-8") for path in files}
     trees = {name: ast.parse(text) for name, text in texts.items() if "raise " in text}
     assert {name: found for name, tree in trees.items() if (found := silent(tree))} == {}
-
-
-@pytest.mark.parametrize(
-    ("body", "missing"),
-    [
-        ('    """Do."""\n    raise UsageError("no")', {"f": {"UsageError"}}),
-        ('    """Do.\n\n    Raises:\n        OSError: No.\n    """\n    raise UsageError("no")', {"f": {"UsageError"}}),
-        ('    """Do.\n\n    Raises:\n        UsageError: No.\n    """\n    raise UsageError("no")', {}),
-        ('    """Do.\n\n    Raises:\n        WarpArError: No.\n    """\n    raise UsageError("no")', {}),
-        ('    """Do."""\n    def g():\n        raise UsageError("no")', {}),
-        ('    """Do."""\n    try:\n        g()\n    except OSError:\n        raise', {}),
-        ('    """Do."""\n    try:\n        raise OSError\n    except OSError:\n        pass', {}),
-        ('    """Do."""\n    try:\n        g()\n    except OSError:\n        raise ValueError', {"f": {"ValueError"}}),
-        ('    """Do."""\n    raise error("no")', {"f": {"error"}}),
-    ],
-)
-def test_what_is_left_out_is_found(body: str, missing: dict[str, set[str]]) -> None:
-    assert silent(ast.parse(f"def f():\n{body}")) == missing

@@ -559,22 +559,6 @@ def test_a_still_picture_runs_only_what_time_moves(frames: Frames) -> None:
     assert "accumulate" not in skipped[-1], "accumulation follows the clock"
 
 
-@pytest.mark.parametrize(
-    ("image", "expected"),
-    [
-        (np.zeros((240, 320, 4), np.uint8), r"frame is uint8 \(240, 320, 4\); expected uint8 RGB \(240, 320, 3\)"),
-        (np.zeros((240, 320, 3), np.float32), r"frame is float32"),
-        (np.zeros((120, 160, 3), np.uint8), r"frame is uint8 \(120, 160, 3\)"),
-        ("frame.png", r"frame is str"),
-    ],
-)
-def test_wrong_frames_are_refused_and_the_next_one_works(image: object, expected: str, frames: Frames) -> None:
-    with Pipeline(make_scene(), device="cpu", quality="low") as pipeline:
-        with pytest.raises(UsageError, match=expected):
-            pipeline(image)
-        assert pipeline(frames[0]).pose is not None
-
-
 def test_warmed_up_equals_fresh(frames: Frames, device: str) -> None:
     with contextlib.ExitStack() as stack:
         warm, fresh = (stack.enter_context(Pipeline(make_scene(), device=device, quality="medium")) for _ in range(2))

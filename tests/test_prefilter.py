@@ -30,8 +30,6 @@ from warp_ar.stages.prefilter import Prefilter, scene_lobe
 from warp_ar.stages.quality import PRESETS
 from warp_ar.stages.request import Request
 
-# The best public prefilter keeps a white furnace within this.
-FURNACE = 5e-4
 # Float32 sums over a map, relative.
 ROUNDING = 2e-5
 # Split-sum table: 1024 Hammersley directions against quadrature.
@@ -278,35 +276,13 @@ def test_the_split_sum_of_a_mirror_is_fresnel(device):
     np.testing.assert_allclose(table.numpy()[0, 1:].sum(1), 1, atol=1e-4)
 
 
-def test_a_white_metal_keeps_a_white_furnace_white(device):
-    table = wp.zeros((32, 32), dtype=wp.vec2)
-    integrate_dfg(table)
-    at = np.array([[a, b] for a in (-0.1, 0.0, 0.3, 1.0, 1.1) for b in (-1.0, 0.0, 0.37, 1.0, 2.0)], np.float32)
-    out, factor = wp.zeros(25, dtype=wp.vec2), wp.zeros(25, dtype=wp.vec3)
-    wp.launch(dfg_kernel, 25, [table, wp.array(at, dtype=wp.vec2)], [out, factor])
-    once = out.numpy().sum(1)
-    assert ((once > 0.3) & (once < 1.0001)).all()
-    np.testing.assert_allclose(once * factor.numpy()[:, 0], 1, atol=FURNACE)
-    assert (factor.numpy()[:, 1] <= factor.numpy()[:, 0] + 1e-6).all()
-    np.testing.assert_array_equal(factor.numpy()[:, 2], 1)
-
-
 # --- Wiring -----------------------------------------------------------------------------------------------------------
-
-
-SCALED_ENERGY = 1e-5
 
 
 REFERENCE_ENERGY = 0.02
 
 
 ERRORS = {"energy_mip": 0.6, "fis128": 0.2}
-
-
-def sun(height, row, sky=1e-4, value=1e6):
-    radiance = np.full((height, 2 * height, 3), sky)
-    radiance[row, height // 3] = value
-    return radiance
 
 
 @pytest.mark.parametrize("lobe", LOBES)
@@ -327,22 +303,6 @@ def test_the_reference_agrees_with_monte_carlo(device, lobe):
         estimate = (weight * seen).sum(0) / weight.sum()
         error = np.sqrt((weight**2 * (seen - estimate) ** 2).sum(0)) / weight.sum()
         assert (np.abs(estimate - ours[at]) < 5 * error + 1e-3).all()
-
-
-@pytest.mark.parametrize("lobe", LOBES)
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("row", [2, 12])
-def test_every_level_keeps_the_energy_of_a_lamp(device, method, lobe, row):
-    # Atlas rows 6 and 18: one texel of 1e6 over 1e-4.
-    height = 16
-    radiance = sun(height, row)
-    whole = reference_pyramid.energy(radiance)
-    for level in unpack(run(radiance, method, lobe), height):
-        assert np.isfinite(level).all()
-        assert (level >= 0).all()
-        energy = reference_pyramid.energy(level) / whole
-        # Methods that scale are exact; the reference is as good as its sampling of one texel.
-        np.testing.assert_allclose(energy, 1, rtol=0.03 if method == "brute_force" else SCALED_ENERGY)
 
 
 @pytest.mark.parametrize(("name", "lobe"), [("forest", "ggx"), ("night", "phong"), ("studio", "ggx")])

@@ -58,11 +58,3 @@ def test_a_stage_on_a_method_that_has_no_row_does_not_run() -> None:
         for method in set(stage.methods) - set(METHODS[stage.name]):
             plan = make_plan(Request(make_scene(), make_quality(**{stage.name: method}), SIZE))
             assert dict(plan.left_out)[stage.name], f"{stage.name} on {method}"
-
-
-def test_tests_that_stand_elsewhere_exist() -> None:
-    for name in atlas.ELSEWHERE:
-        file, function = name.split("::")
-        assert f"def {function}(" in (ROOT / "tests" / file).read_text(), (
-            f"{name} is named in the atlas and does not exist"
-        )

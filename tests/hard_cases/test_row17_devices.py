@@ -105,15 +105,6 @@ def test_cuda_agrees_with_cpu(stage, method):
     compare(stage, method, CUDA[0])
 
 
-@pytest.mark.parametrize("stage", ["fill", "visibility", "summed_area"])
-def test_the_comparison_itself(stage):
-    """Equal where devices are; sees a difference of more than the bound."""
-    compare(stage, "default", "cpu")
-    values = np.linspace(0.0, 1.0, 101, dtype=np.float32)
-    assert differences(values, values * np.float32(1 + 1e-3), 1e-4) > 0.5
-    assert differences(np.arange(5), np.arange(5) + (np.arange(5) == 3), 0.0) == pytest.approx(0.2)
-
-
 @pytest.mark.atlas(row=17, stage="pipeline")
 @pytest.mark.skipif(not CUDA, reason="needs a CUDA device")
 def test_pictures_of_cpu_and_cuda():

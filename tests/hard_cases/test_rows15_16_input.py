@@ -76,19 +76,3 @@ def test_what_is_no_frame_is_refused_and_the_next_one_works(rig_for, shape, kind
     with pytest.raises(UsageError, match=r"expected uint8 RGB \(36, 48, 3\)"):
         rig.pipeline(image)
     assert rig.frame(FRAMES["ramp"]).shape == (36, 48, 3)
-
-
-@pytest.mark.atlas(row=16, stage="pipeline")
-@pytest.mark.parametrize("kind", [np.uint16, np.float32])
-def test_the_right_shape_of_the_wrong_type_is_refused(rig_for, kind):
-    with pytest.raises(UsageError, match="expected uint8 RGB"):
-        rig_for("fill", "default").pipeline(np.full((SIZE[1], SIZE[0], 3), np.nan if kind == np.float32 else 7, kind))
-
-
-@pytest.mark.atlas(row=16, stage="pipeline")
-def test_frames_that_are_not_contiguous_are_frames(device):
-    """Views of a larger or mirrored picture give what their copies give."""
-    large = np.random.default_rng(0).integers(0, 256, (2 * SIZE[1], 2 * SIZE[0], 3), dtype=np.uint8)
-    with Rig(device) as one, Rig(device) as other:
-        for view in (large[::2, ::2], large[::-2, ::-2], large[: SIZE[1], : SIZE[0], ::-1]):
-            np.testing.assert_array_equal(one.pipeline(view).image, other.pipeline(view.copy()).image)

@@ -31,7 +31,7 @@ from warp_ar.reference import write_picture
 from warp_ar.scene import Pose, loads_scene
 from warp_ar.sources.sources import open_source
 
-DAMAGES = 28
+DAMAGES = 40
 """Damaged copies of each file."""
 
 
