@@ -48,8 +48,7 @@ def scene_keys() -> str:
 def command_line() -> str:
     """Every command with its options; what several have alike stands first, and is named after the others' own."""
     parsers = dict(all_parsers())
-    rows = {(row, name.split()[0]) for name, parser in parsers.items() for row in _options(parser).items()}
-    count = collections.Counter(row for row, _ in rows)
+    count = collections.Counter(row for parser in parsers.values() for row in _options(parser).items())
     common = {argument: text for (argument, text), times in sorted(count.items()) if times > 1}
     parts = ["## Common arguments", "", *_listed(common)]
     for name, parser in parsers.items():

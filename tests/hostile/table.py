@@ -43,7 +43,7 @@ def attack() -> list[Outcome]:
 def make_table(outcomes: list[Outcome]) -> str:
     """One line for all that was tried."""
     counts = collections.Counter(outcome if outcome in HELD else "broke" for _, _, outcome, _ in outcomes)
-    head = "| what takes it in | tried | accepted | refused in one line | broke |\n| --- | --: | --: | --: | --: |\n"
+    head = "| input | tried | accepted | refused in one line | broke |\n| --- | --: | --: | --: | --: |\n"
     return head + f"| {MADE} | {counts.total()} | {counts['read']} | {counts['refused']} | {counts['broke']} |"
 
 

@@ -59,15 +59,15 @@ def _shared(name: str, *methods: str) -> Setting:
 
 
 _SHARED: Mapping[str, tuple[str, Mapping[str, str]]] = {
-    "environment_height": ("rows of the map that holds the environment", {}),
-    "edge_samples": ("samples per pixel along the outlines of virtual objects, and of shadows of virtual light", {}),
+    "environment_height": ("rows of the environment map", {}),
+    "edge_samples": ("samples per pixel at outlines of virtual objects and shadows", {}),
     "area_light": (
         "light of objects that emit",
         {
-            "point": "as if each were all at its middle (the paper)",
-            "coarse": "8 places on them per point",
-            "fine": "32 places",
-            "brute_force": "256 places",
+            "point": "as a point in its middle (the paper)",
+            "coarse": "8 samples per point",
+            "fine": "32 samples",
+            "brute_force": "256 samples",
         },
     ),
     "light_shadow": (

@@ -18,7 +18,7 @@ class Bracket(Stage):
     """The latest frame of every exposure, merged; frames of shorter exposures come in through ``ShortFrames``."""
 
     name: ClassVar[str] = "bracket"
-    summary: ClassVar[str] = "merges alternating exposures: what clips in the long one comes from the short one"
+    summary: ClassVar[str] = "merges alternating exposures: clipped pixels come from the shorter one"
     unread: ClassVar[str] = "nothing asks for the environment"
     follows: ClassVar[bool] = True
     numerics: ClassVar[Numerics] = Numerics(

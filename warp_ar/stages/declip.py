@@ -20,7 +20,7 @@ class Declip(Stage):
     """Estimates radiance above clipping, which another exposure shows; its methods are those of ``expose``."""
 
     name: ClassVar[str] = "declip"
-    summary: ClassVar[str] = "estimates how bright clipped pixels were, by hue, depth and the ball"
+    summary: ClassVar[str] = "estimates the radiance of clipped pixels by hue, depth and the ball"
     unread: ClassVar[str] = "nothing asks how bright clipped pixels were"
     numerics: ClassVar[Numerics] = Numerics(
         precision="float32; sums of sums over a pyramid",

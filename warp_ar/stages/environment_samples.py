@@ -25,7 +25,7 @@ class EnvironmentSamples(Stage):
     """Draws directions by the light that comes from them, anew whenever the environment changes."""
 
     name: ClassVar[str] = "environment_samples"
-    summary: ClassVar[str] = "the environment as directions, drawn by what they send to the receiver"
+    summary: ClassVar[str] = "directions sampled by the environment's light on the receiver"
     unread: ClassVar[str] = "nothing traces rays to the environment"
     settings: ClassVar[tuple[str, ...]] = ("environment_height",)
     numerics: ClassVar[Numerics] = Numerics(

@@ -67,12 +67,12 @@ class EnvironmentShadow(Stage):
     name: ClassVar[str] = "environment_shadow"
     methods: ClassVar[Mapping[str, str]] = {
         "none": "none (the paper)",
-        "coarse": "32 rays, every sixth pixel, and an estimate of reflected light",
-        "bounce": "64 rays, every second pixel, and reflected light by a ray for half of them",
+        "coarse": "32 rays at every sixth pixel; reflected light estimated",
+        "bounce": "64 rays at every second pixel; half of them trace reflected light",
         "brute_force": "every texel of the environment at every pixel",
     }
     summary: ClassVar[str] = "shadows of virtual objects on the receiver under the environment"
-    subject: ClassVar[str] = "shadows of virtual objects in the environment, and light reflected onto the receiver"
+    subject: ClassVar[str] = "shadows and reflected light of virtual objects on the receiver"
     converges: ClassVar[bool] = True
     unseen_method: ClassVar[str | None] = "none"
     numerics: ClassVar[Numerics] = Numerics(

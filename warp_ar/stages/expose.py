@@ -22,10 +22,10 @@ class Expose(Stage):
         "plain": "scaled",
         "paper": "scaled less where surroundings clip too (the paper)",
         "box": "the same, by one stop at most",
-        "ball": "from the glow around them and the ball's view of the same emitter",
+        "ball": "from their glow and the ball's view of the emitter",
     }
     remembers: ClassVar[tuple[str, ...]] = ("expose_scale",)
-    summary: ClassVar[str] = "another exposure: over-exposed regions keep what they can be guessed to have had"
+    summary: ClassVar[str] = "simulates another exposure, with estimated radiance where the frame clips"
     subject: ClassVar[str] = "clipped pixels at a shorter exposure"
     numerics: ClassVar[Numerics] = Numerics(
         precision="float32 to 8-bit codes by exact thresholds",

@@ -30,7 +30,7 @@ class Gloss(Stage):
     """Virtual objects and lights, mirrored in receivers that have a material."""
 
     name: ClassVar[str] = "gloss"
-    summary: ClassVar[str] = "what polished receivers mirror of virtual objects and lights, and what those hide there"
+    summary: ClassVar[str] = "reflections of virtual objects and lights in polished receivers"
     numerics: ClassVar[Numerics] = Numerics(
         precision="float32; GGX by half vectors, no cancellation near the peak",
         bound=2e-3,

@@ -22,9 +22,9 @@ class Irradiance(Stage):
 
     name: ClassVar[str] = "irradiance"
     methods: ClassVar[Mapping[str, str]] = {
-        "sphere_mip": "a 4x4 level of the sphere map, background included (the paper)",
+        "sphere_mip": "a 4x4 level of the sphere map with background (the paper)",
         "sh2": "spherical harmonics of order 2",
-        "clusters": "200 clusters of the environment, summed for every direction",
+        "clusters": "200 clusters of the environment for every direction",
         "brute_force": "every texel for every direction",
     }
     summary: ClassVar[str] = "irradiance of the environment for every orientation"

@@ -18,7 +18,7 @@ class KeyLights(Stage):
     """Dominant direction, and how far it dominates."""
 
     name: ClassVar[str] = "key_lights"
-    summary: ClassVar[str] = "finds the environment's dominant direction and how far it dominates"
+    summary: ClassVar[str] = "finds the environment's dominant direction and its directionality"
     unread: ClassVar[str] = "relighting does not ask where the environment's light comes from"
     settings: ClassVar[tuple[str, ...]] = ("environment_height",)
     numerics: ClassVar[Numerics] = Numerics(

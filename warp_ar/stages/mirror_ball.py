@@ -86,8 +86,8 @@ class MirrorBall(Stage):
         "smooth": "4 rays per pixel",
         "brute_force": "64 rays per pixel",
     }
-    summary: ClassVar[str] = "what the mirror ball in the picture shows of virtual objects, light and shadows"
-    subject: ClassVar[str] = "what the mirror ball in the picture shows of virtual objects"
+    summary: ClassVar[str] = "reflections of virtual objects, light and shadows in the mirror ball"
+    subject: ClassVar[str] = "reflections of virtual objects in the mirror ball"
     converges: ClassVar[bool] = True
     unseen_method: ClassVar[str | None] = "none"
     numerics: ClassVar[Numerics] = Numerics(

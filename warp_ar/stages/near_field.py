@@ -88,7 +88,7 @@ class NearField(Stage):
     """Light that reaches objects past each other, and what they mirror of the receiver and of each other."""
 
     name: ClassVar[str] = "near_field"
-    summary: ClassVar[str] = "what of the receiver and of other objects virtual objects show"
+    summary: ClassVar[str] = "receiver and other objects as virtual objects reflect them"
     unread: ClassVar[str] = "virtual objects show the distant environment only"
     numerics: ClassVar[Numerics] = Numerics(
         precision="float32",

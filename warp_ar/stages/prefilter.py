@@ -43,8 +43,8 @@ class Prefilter(Stage):
 
     name: ClassVar[str] = "prefilter"
     methods: ClassVar[Mapping[str, str]] = {
-        "sphere_mip": "mip levels of the sphere map, background included (the paper)",
-        "energy_mip": "a pyramid that keeps energy, mixed to fit the lobe",
+        "sphere_mip": "mip levels of the sphere map with background (the paper)",
+        "energy_mip": "an energy-conserving pyramid, mixed to fit the lobe",
         "fis128": "128 importance samples per texel",
         "brute_force": "every texel for every direction and width",
     }

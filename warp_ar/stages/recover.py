@@ -97,10 +97,10 @@ class Recover(Stage):
     name: ClassVar[str] = "recover"
     methods: ClassVar[Mapping[str, str]] = {
         "clipped": "as the camera saw it (the paper)",
-        "white_card": "scaled until it lights the white card as brightly as the frame shows",
-        "shading": "shared among emitters as shading and shadows in the frame tell",
+        "white_card": "scaled to light the white card as the frame shows",
+        "shading": "shared among emitters by shading and shadows in the frame",
     }
-    summary: ClassVar[str] = "puts back the light that clipping lost in the ball, by what it falls on"
+    summary: ClassVar[str] = "restores clipped light of the ball from the surfaces that it lights"
     subject: ClassVar[str] = "light that clips in the ball"
     unread: ClassVar[str] = "nothing asks for the environment"
     settings: ClassVar[tuple[str, ...]] = ("environment_height",)

@@ -49,9 +49,9 @@ class Relight(Stage):
     methods: ClassVar[Mapping[str, str]] = {
         "flat": "on a grey receiver",
         "paper": "blended by the frame's brightness (the paper)",
-        "reflectance": "on the reflectance that frame and environment light give",
-        "bounce": "the same, knowing the environment's own shadows, and what lit surfaces send each other",
-        "brute_force": "the same at every pixel, with 1,024 rays and patches of 4 pixels",
+        "reflectance": "times reflectance from frame and environment",
+        "bounce": "the same with the environment's shadows and light between lit surfaces",
+        "brute_force": "the same at every pixel, 1,024 rays, patches of 4 pixels",
     }
     summary: ClassVar[str] = "virtual light and its shadows on the receiver"
     subject: ClassVar[str] = "virtual light on the receiver"

@@ -28,7 +28,7 @@ class Separate(Stage):
     """Writes the layers that are asked for, neutral where they do not reach."""
 
     name: ClassVar[str] = "separate"
-    summary: ClassVar[str] = "layers of the picture that were asked for, and the frame as linear radiance"
+    summary: ClassVar[str] = "requested layers of the picture, and the frame as linear radiance"
     numerics: ClassVar[Numerics] = Numerics(
         precision="float32, as the picture is made of",
         bound=2e-6,

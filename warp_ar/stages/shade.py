@@ -29,11 +29,11 @@ class Shade(Stage):
     name: ClassVar[str] = "shade"
     methods: ClassVar[Mapping[str, str]] = {
         "environment": "the environment (the paper)",
-        "few_rays": "the environment, the receiver, themselves and each other, by few rays",
-        "one_bounce": "the environment, the receiver and each other",
+        "few_rays": "environment, receiver and objects, by few rays",
+        "one_bounce": "environment, receiver and other objects",
     }
     summary: ClassVar[str] = "shades virtual objects by the environment and virtual lights, shadowed and anti-aliased"
-    subject: ClassVar[str] = "what virtual objects reflect"
+    subject: ClassVar[str] = "surroundings that virtual objects reflect"
     settings: ClassVar[tuple[str, ...]] = ("edge_samples", "light_shadow", "area_light")
     unseen_method: ClassVar[str | None] = "environment"
     numerics: ClassVar[Numerics] = Numerics(

@@ -20,7 +20,7 @@ class Surfaces(Stage):
     """Finds number, depth, normal and place of the surface at every pixel's centre."""
 
     name: ClassVar[str] = "surfaces"
-    summary: ClassVar[str] = "depth, normal and place of the object, proxy or ball that each pixel shows"
+    summary: ClassVar[str] = "depth, normal and position of each pixel's object, proxy or ball"
     unread: ClassVar[str] = NOT_ASKED
     numerics: ClassVar[Numerics] = Numerics(
         precision="float32; points put back onto their surfaces",

@@ -24,10 +24,10 @@ class Unwrap(Stage):
 
     name: ClassVar[str] = "unwrap"
     methods: ClassVar[Mapping[str, str]] = {
-        "sphere_map": "OpenGL's sphere mapping, as if ball and light were far away (the paper)",
-        "area": "the mean over what a texel covers",
+        "sphere_map": "OpenGL's sphere mapping, ball and light far away (the paper)",
+        "area": "the mean over a texel's footprint",
     }
-    summary: ClassVar[str] = "reads the light off the mirror ball, exactly for a camera nearby"
+    summary: ClassVar[str] = "reads the light off the mirror ball, exact for a near camera"
     subject: ClassVar[str] = "reading the light off the mirror ball, judged with a map of 32 rows"
     unread: ClassVar[str] = "nothing asks for the environment"
     converges: ClassVar[bool] = True

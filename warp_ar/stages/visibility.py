@@ -21,7 +21,7 @@ class Visibility(Stage):
     """Traces primary rays, only where virtual objects can be on screen."""
 
     name: ClassVar[str] = "visibility"
-    summary: ClassVar[str] = "traces which virtual object each pixel sees, hidden by proxies in front"
+    summary: ClassVar[str] = "traces the virtual object that each pixel sees, behind proxies"
     numerics: ClassVar[Numerics] = Numerics(
         precision="float32; error bound carried with every hit",
         bound=3e-5,
