@@ -5,8 +5,11 @@ Lengths are metres in the world (marker) frame, angles radians, colours linear R
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 import warp as wp
 
 vec8 = wp.types.vector(length=8, dtype=wp.float32)
@@ -253,3 +256,21 @@ class Emitter:
     direction: wp.vec3  # unit, from there, as in the environment; zero where there is no emitter
     distance: wp.float32  # metres from there, infinite for a distant one
     power: wp.vec3  # radiance times solid angle from there, beyond what was captured; * distance^2: radiant intensity
+
+
+@functools.cache
+def struct_dtype(struct: Any) -> np.dtype[Any]:
+    """Return NumPy's type of a struct's records.
+
+    NumPy parses text to make one, which Python 3.11 cannot do in two threads at once (CPython's issue 106905): frames
+    take the type that was made when the pipeline was built.
+    """
+    return np.dtype(struct.numpy_dtype())
+
+
+def struct_values(array: wp.array) -> npt.NDArray[Any]:
+    """Return a copy of an array of structs, as records of ``struct_dtype``; ``wp.array.numpy`` would make the type."""
+    dtype = struct_dtype(array.dtype)
+    size = array.size * dtype.itemsize
+    values = wp.array(ptr=array.ptr, dtype=wp.uint8, shape=(size,), device=array.device).numpy()
+    return np.array(values).view(dtype).reshape(array.shape)

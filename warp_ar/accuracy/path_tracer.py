@@ -245,8 +245,8 @@ class PathTracer:
         """The scene as paths meet it."""
         local = LocalScene()
         device, shape = self.device, (self.camera.height, self.camera.width)
-        objects = np.zeros(self._host.shape_count, np.dtype(structs.Shape.numpy_dtype()))
-        lights = np.zeros(len(self.scene.lights), np.dtype(structs.Light.numpy_dtype()))
+        objects = np.zeros(self._host.shape_count, structs.struct_dtype(structs.Shape))
+        lights = np.zeros(len(self.scene.lights), structs.struct_dtype(structs.Light))
         self._host.write_objects(objects, seconds)
         self._host.write_lights(lights, seconds)
         # Without a frame the first surface's reflectance is a factor of its paths, not of what they sum to.
@@ -256,7 +256,7 @@ class PathTracer:
         local.rays.objects = wp.array(objects, dtype=structs.Shape, device=device)
         local.lights = wp.array(lights, dtype=structs.Light, device=device)
         local.lights_followed = self._follows_lights
-        balls = np.zeros(len(self.scene.probes), np.dtype(structs.Probe.numpy_dtype()))
+        balls = np.zeros(len(self.scene.probes), structs.struct_dtype(structs.Probe))
         for ball, probe in zip(balls, self.scene.probes, strict=True):
             ball["center"], ball["radius"], ball["reflectance"] = probe.center, probe.radius, probe.reflectance
         local.probes = wp.array(balls, dtype=structs.Probe, device=device)
@@ -283,7 +283,7 @@ class PathTracer:
         return local
 
     def _camera_values(self, pose: Pose) -> npt.NDArray[Any]:
-        params = np.zeros(1, np.dtype(structs.FrameParams.numpy_dtype()))
+        params = np.zeros(1, structs.struct_dtype(structs.FrameParams))
         inverse = pose.inverse()
         params["camera_position"], params["world_from_camera"] = inverse.translation, inverse.rotation
         params["focal"] = self.camera.fx, self.camera.fy
@@ -543,7 +543,7 @@ def _environment(light: Light | FloatImage) -> FloatImage:
 def _near_emitters(light: Light | FloatImage) -> npt.NDArray[Any]:
     """Records of the emitters whose distances are known."""
     near = [e for e in light.emitters if e.distance is not None] if isinstance(light, Light) else []
-    records = np.zeros(len(near), np.dtype(structs.Emitter.numpy_dtype()))
+    records = np.zeros(len(near), structs.struct_dtype(structs.Emitter))
     for record, emitter in zip(records, near, strict=True):
         record["origin"], record["direction"] = emitter.origin, emitter.direction
         record["distance"], record["power"] = emitter.distance, emitter.power

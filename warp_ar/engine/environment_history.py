@@ -10,7 +10,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_ar.kernels.environment.change import scale_radiance
-from warp_ar.kernels.structs import Emitter
+from warp_ar.kernels.structs import struct_values
 from warp_ar.stages.base import Arrays
 
 KEPT_ARRAYS = ("others_kept_radiance", "others_filled")
@@ -57,7 +57,7 @@ class CarriedLight:
         name = "recover_found" if "recover_found" in arrays else "emitters"
         if name in arrays and isinstance(arrays[name], wp.array):
             emitters = arrays[name]
-            records = np.array(emitters.numpy()).view(np.dtype(Emitter.numpy_dtype()))
+            records = struct_values(emitters)
             records["power"] *= ratio
             emitters.assign(records)
 

@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 
 from warp_ar.device import wait_for
-from warp_ar.kernels.structs import FrameParams, Light, Shape
+from warp_ar.kernels.structs import FrameParams, Light, Shape, struct_dtype
 
 _ALIGNMENT = 16
 _SLOTS = 4  # uploads that may be under way
@@ -40,7 +40,7 @@ class FrameBlock:
         size = 0
         for _, struct, count in layout:
             offsets.append(size)
-            bytes_needed = np.dtype(struct.numpy_dtype()).itemsize * max(count, 1)
+            bytes_needed = struct_dtype(struct).itemsize * max(count, 1)
             size += -(-bytes_needed // _ALIGNMENT) * _ALIGNMENT
         self._device_buffer = wp.zeros(size, dtype=wp.uint8, device=device)
         self._pinned: list[tuple[Any, Any, Any]] = []
@@ -53,7 +53,7 @@ class FrameBlock:
         self._host: dict[str, Any] = {}
         self._device: dict[str, Any] = {}
         for (name, struct, count), offset in zip(layout, offsets, strict=True):
-            dtype = np.dtype(struct.numpy_dtype())
+            dtype = struct_dtype(struct)
             self._host[name] = self._bytes[offset : offset + dtype.itemsize * count].view(dtype)
             pointer = self._device_buffer.ptr + offset if count else None
             self._device[name] = wp.array(ptr=pointer, dtype=struct, shape=(count,), device=device)

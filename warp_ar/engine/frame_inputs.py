@@ -27,7 +27,7 @@ from warp_ar.engine.transfer import Slot, Transfers
 from warp_ar.kernels.color import camera_table, decode_table, encode_table
 from warp_ar.kernels.launch import Note, noting
 from warp_ar.kernels.rays.wide_bvh import build_wide_bvh_kernel
-from warp_ar.kernels.structs import MESH, Probe
+from warp_ar.kernels.structs import MESH, Probe, struct_dtype
 from warp_ar.scene import Camera, Pose, Scene
 from warp_ar.scene.kinds import shape_kind
 from warp_ar.scene.pixel_rays import pixel_rays
@@ -440,7 +440,7 @@ class FrameInputs:
 
 def _probe_values(probes: Sequence[scenes.Probe], reflectances: Sequence[scenes.RGB] | None = None) -> npt.NDArray[Any]:
     """Records of balls; None: they reflect what the scene says."""
-    values = np.zeros(len(probes), dtype=np.dtype(Probe.numpy_dtype()))
+    values = np.zeros(len(probes), struct_dtype(Probe))
     told = [probe.reflectance for probe in probes] if reflectances is None else reflectances
     for value, probe, reflectance in zip(values, probes, told, strict=True):
         value["center"], value["radius"], value["reflectance"] = probe.center, probe.radius, reflectance

@@ -18,6 +18,7 @@ from warp_ar.engine.layers import LayerArrays, compose_layers
 from warp_ar.engine.scheduler import StageTiming
 from warp_ar.engine.transfer import Image, Picture
 from warp_ar.errors import UsageError
+from warp_ar.kernels.structs import struct_values
 from warp_ar.scene import Pose
 from warp_ar.stages.request import PICTURE_LAYERS
 from warp_ar.tracking.tracking import TrackState
@@ -52,10 +53,10 @@ class Rendered:
 
     def with_light_kept(self) -> Rendered:
         """The same with arrays of its own for all that is known of the light."""
-        light, others, emitters = (
-            None if one is None else np.array(one.numpy())
-            for one in (self.environment_array, self.others_array, self.emitters_array)
+        light, others = (
+            None if one is None else np.array(one.numpy()) for one in (self.environment_array, self.others_array)
         )
+        emitters = None if self.emitters_array is None else struct_values(self.emitters_array)
         return dataclasses.replace(self, environment=light, others=others, emitters=emitters)
 
     def at_once(self) -> Future[Rendered]:
@@ -159,7 +160,8 @@ class Result:
         if rendered.emitters is not None or rendered.emitters_array is None:
             return rendered.emitters
         with exclusive(rendered.emitters_array.device):
-            return np.array(rendered.emitters_array.numpy())
+            values: npt.NDArray[Any] = struct_values(rendered.emitters_array)
+            return values
 
     @property
     def layer_arrays(self) -> Mapping[str, Any]:

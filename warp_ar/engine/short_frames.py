@@ -15,7 +15,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_ar.kernels.environment.bracket import BracketExposure
-from warp_ar.kernels.structs import FrameParams
+from warp_ar.kernels.structs import FrameParams, struct_dtype
 from warp_ar.scene import Pose
 from warp_ar.stages.base import Arrays, Wiring
 from warp_ar.stages.features import Features
@@ -94,7 +94,7 @@ class ShortFrames:
             return False
         self._told = told
         before, self._merged = self._merged, sum(told)
-        values = np.zeros(len(told), np.dtype(BracketExposure.numpy_dtype()))
+        values = np.zeros(len(told), struct_dtype(BracketExposure))
         values["ratio"], values["trust"] = self._ratios, told
         self._arrays["bracket_exposures"].assign(values)
         self._arrays.touch("short_frames")

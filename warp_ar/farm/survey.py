@@ -27,7 +27,7 @@ import collections
 import contextlib
 import dataclasses
 import fractions
-import io
+import math
 import zipfile
 import zlib
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -44,6 +44,7 @@ from warp_ar.farm.frames import FrameIndex, index_frames, open_part
 from warp_ar.farm.jobs import JobFile, inputs_of, jobs_of_clip, lit_range, scene_of, source_of
 from warp_ar.farm.manifest import describe_inputs
 from warp_ar.kernels.environment.change import CHANGE_FLOOR, CHANGE_SHARE
+from warp_ar.kernels.structs import Emitter, struct_dtype
 from warp_ar.light.captured import Light, find_emitters
 from warp_ar.scene import CapturedLight, Pose, Scene
 from warp_ar.sources.deep_frame import check_linear
@@ -89,6 +90,7 @@ class Survey:
                 width, height = (int(v) for v in values["size"])
                 self.size = width, height
                 self.coding = str(values["coding"])
+                self._shape = tuple(int(v) for v in values["shape"])
         except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
             raise SourceError(f"{self._path} cannot be read: {reason(error)}; remove its folder and resume") from error
 
@@ -111,9 +113,11 @@ class Survey:
         try:
             with open(self._maps, "rb") as stream:
                 stream.seek(begin)
-                stored = io.BytesIO(zlib.decompress(stream.read(end - begin)))
-            radiance = np.asarray(np.load(stored), np.float32)
-            return radiance, np.load(stored) if stored.tell() < len(stored.getbuffer()) else None
+                stored = zlib.decompress(stream.read(end - begin))
+            count = math.prod(self._shape)
+            radiance = np.frombuffer(stored, np.float32, count).reshape(self._shape)
+            emitters = np.frombuffer(stored, struct_dtype(Emitter), offset=radiance.nbytes)
+            return radiance, emitters if emitters.size else None
         except (OSError, ValueError, zlib.error) as error:
             raise SourceError(f"{self._maps} cannot be read: {reason(error)}; remove its folder and resume") from error
 
@@ -169,6 +173,7 @@ def survey_clip(jobs: JobFile, clip: int, folder: Path, device: str) -> dict[str
         saturation=look.saturation,
         keys=look.keys,
         places=look.places,
+        shape=look.shape,
     )
     found = int(np.isfinite(look.poses[first:end, 0]).sum())
     if not alone and not found:
@@ -195,6 +200,8 @@ class _Look:
     """Environment and emitters of the last frame whose marker was found."""
     kept: tuple[Map, npt.NDArray[Any] | None] | None = None
     """Those of the last key."""
+    shape: tuple[int, ...] = (0, 0, 3)
+    """Of every map."""
 
     def take(self, frame: int, result: Result) -> None:
         """Wait for the pose and the light of a frame; where all of its light is wanted, ``keep`` it."""
@@ -214,11 +221,9 @@ class _Look:
             if same and not (np.abs(environment - last) > CHANGE_FLOOR + CHANGE_SHARE * np.abs(last)).any():
                 return
         self.kept = _rounded(environment), emitters
-        buffer = io.BytesIO()
-        for array in self.kept:
-            if array is not None:
-                np.save(buffer, array, allow_pickle=False)
-        self.places.append(self.places[-1] + self.maps.write(zlib.compress(buffer.getbuffer(), 1)))
+        stored = b"".join(array.tobytes() for array in self.kept if array is not None)
+        self.shape = environment.shape
+        self.places.append(self.places[-1] + self.maps.write(zlib.compress(stored, 1)))
         self.keys.append(frame)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warp_ar.kernels.recovery.recover import SurfacePoint
+from warp_ar.kernels.structs import struct_dtype
 from warp_ar.light.config import CONFIG, Kind
 from warp_ar.scene import Proxy, Scene
 from warp_ar.scene.geometry import rotation_matrix
@@ -51,7 +52,7 @@ class _Collector:
         self.groups.append(group)
 
     def result(self) -> Surfaces:
-        points = np.zeros(len(self.rows), np.dtype(SurfacePoint.numpy_dtype()))
+        points = np.zeros(len(self.rows), struct_dtype(SurfacePoint))
         for column, name in enumerate(("position", "normal", "tangent", "half")):
             points[name] = [row[column] for row in self.rows]
         surface, kinds = np.array(self.surface), np.array(self.kinds)

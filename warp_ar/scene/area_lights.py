@@ -63,7 +63,7 @@ def make_area_table(objects: Sequence[Object], meshes: Sequence[Mesh | None]) ->
         objects: All of the scene.
         meshes: What rays meet of each, None for a sphere.
     """
-    dtype = np.dtype(structs.AreaLight.numpy_dtype())
+    dtype = structs.struct_dtype(structs.AreaLight)
     lights: list[Any] = []
     faces: list[npt.NDArray[Any]] = []
     weights: list[FloatArray] = []

@@ -70,7 +70,7 @@ class HostScene:
         self._textures = textures
         materials = self._material_records()
         self._place_objects()
-        self._lights = np.zeros(len(scene.lights), _dtype(structs.Light))
+        self._lights = np.zeros(len(scene.lights), structs.struct_dtype(structs.Light))
         self._lit: Outline | None = None
         self._mirrors: tuple[Outline, Outline] | None = None
         self._bounced: tuple[Outline, Outline] | None = None
@@ -88,7 +88,7 @@ class HostScene:
         self.write_proxies(np.zeros_like(self._proxies))
         self.write_lights(np.zeros_like(self._lights), 0.0)
 
-        records = np.zeros(len(textures.records), _dtype(structs.Texture))
+        records = np.zeros(len(textures.records), structs.struct_dtype(structs.Texture))
         for record, values in zip(records, textures.records, strict=True):
             for name, value in values.items():
                 record[name] = value
@@ -189,14 +189,14 @@ class HostScene:
 
     def _material_records(self) -> npt.NDArray[Any]:
         materials = [(item, material) for item in self.scene.objects for material in materials_of(item).materials]
-        records = np.zeros(len(materials), _dtype(structs.Material))
+        records = np.zeros(len(materials), structs.struct_dtype(structs.Material))
         for record, (item, material) in zip(records, materials, strict=True):
             self._fill_material(record, item, material)
         return records
 
     def _shape_records(self, shapes: Sequence[ObjectShape | scenes.Proxy], device: Any) -> npt.NDArray[Any]:
         """Records of ``structs.Shape`` with all that does not move."""
-        records = np.zeros(len(shapes), _dtype(structs.Shape))
+        records = np.zeros(len(shapes), structs.struct_dtype(structs.Shape))
         for record, shape in zip(records, shapes, strict=True):
             item = shape.item if isinstance(shape, ObjectShape) else shape
             scale = getattr(item, "scale", 1.0)
@@ -429,10 +429,6 @@ class HostScene:
                 ]
             )
         return self._shaded
-
-
-def _dtype(struct: Any) -> Any:
-    return np.dtype(struct.numpy_dtype())
 
 
 def _present(records: npt.NDArray[Any]) -> npt.NDArray[Any]:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_ar.errors import UsageError
-from warp_ar.kernels.structs import Emitter
+from warp_ar.kernels.structs import Emitter, struct_dtype
 from warp_ar.light.captured import Light, placed_emitters
 from warp_ar.light.config import CONFIG
 from warp_ar.scene.geometry import rotation_matrix
@@ -57,7 +57,7 @@ class Captured(Stage):
         turn = rotation_matrix(spec.rotate)
         self._radiance = spec.scale * light.resampled(self.request.quality.environment_height, turn)
 
-        self._emitters = np.zeros(CONFIG.search.most, np.dtype(Emitter.numpy_dtype()))
+        self._emitters = np.zeros(CONFIG.search.most, struct_dtype(Emitter))
         placed = placed_emitters(light, spec.scale, turn, CONFIG.search.most)
         for record, fields in zip(self._emitters, placed, strict=False):
             for name, value in fields.items():

@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 
 from warp_ar.kernels.receiver import gloss
+from warp_ar.kernels.structs import struct_dtype
 from warp_ar.scene.kinds import light_kind, proxies_face, trace_config
 from warp_ar.stages import base
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Stage, Wiring, over_rows
@@ -102,7 +103,7 @@ class Gloss(Stage):
     def _surfaces(self) -> Any:
         """Records of ``Gloss``, one for each proxy."""
         proxies = self.request.scene.proxies
-        records = np.zeros(len(proxies), np.dtype(gloss.Gloss.numpy_dtype()))
+        records = np.zeros(len(proxies), struct_dtype(gloss.Gloss))
         for record, proxy in zip(records, proxies, strict=True):
             if proxy.material is not None:
                 record["reflectance"], record["roughness"] = proxy.material.reflectance, proxy.material.roughness

@@ -20,7 +20,7 @@ from warp_ar.kernels.recovery import relocate
 from warp_ar.kernels.recovery.light_level import apply_level, follow_level, sum_upward
 from warp_ar.kernels.recovery.recover_cells import Cell, add_recovered, cell_shape, condense_cells, leave_out_edges
 from warp_ar.kernels.recovery.saturation_boundaries import weigh_boundaries
-from warp_ar.kernels.structs import Emitter
+from warp_ar.kernels.structs import Emitter, struct_dtype
 from warp_ar.light import recovery, solving
 from warp_ar.light.config import CONFIG, Kind
 from warp_ar.light.estimate import Estimate
@@ -458,7 +458,7 @@ class Recover(Stage):
         now.estimate = estimate
         # In camera values of the frame that it was begun in; the camera's gain may have changed since.
         ratio = (self._arrays["gain"]() / now.gain).astype(np.float32)
-        records = np.zeros(CONFIG.search.most, np.dtype(Emitter.numpy_dtype()))
+        records = np.zeros(CONFIG.search.most, struct_dtype(Emitter))
         for record, emitter in zip(records, estimate.emitters, strict=False):
             record["origin"], record["direction"] = emitter.origin, emitter.direction
             record["distance"], record["power"] = emitter.distance, emitter.power * ratio
