@@ -64,7 +64,7 @@ _SHARED: Mapping[str, tuple[str, Mapping[str, str]]] = {
     "area_light": (
         "light of objects that emit",
         {
-            "point": "as a point in its middle (the paper)",
+            "point": "as a point in its middle",
             "coarse": "8 samples per point",
             "fine": "32 samples",
             "brute_force": "256 samples",
@@ -72,7 +72,7 @@ _SHARED: Mapping[str, tuple[str, Mapping[str, str]]] = {
     ),
     "light_shadow": (
         "shadows of virtual lights",
-        {"hard": "as if every light were a point (the paper)", "soft": "as wide as the light"},
+        {"hard": "as if every light were a point", "soft": "as wide as the light"},
     ),
 }
 _CHOICES = tuple(stage for stage in STAGES if len(stage.methods) > 1)

@@ -66,7 +66,7 @@ class EnvironmentShadow(Stage):
 
     name: ClassVar[str] = "environment_shadow"
     methods: ClassVar[Mapping[str, str]] = {
-        "none": "none (the paper)",
+        "none": "none",
         "coarse": "32 rays at every sixth pixel; reflected light estimated",
         "bounce": "64 rays at every second pixel; half of them trace reflected light",
         "brute_force": "every texel of the environment at every pixel",

@@ -20,7 +20,7 @@ class Expose(Stage):
     name: ClassVar[str] = "expose"
     methods: ClassVar[Mapping[str, str]] = {
         "plain": "scaled",
-        "paper": "scaled less where surroundings clip too (the paper)",
+        "paper": "scaled less where surroundings clip too",
         "box": "the same, by one stop at most",
         "ball": "from their glow and the ball's view of the emitter",
     }

@@ -22,7 +22,7 @@ class Irradiance(Stage):
 
     name: ClassVar[str] = "irradiance"
     methods: ClassVar[Mapping[str, str]] = {
-        "sphere_mip": "a 4x4 level of the sphere map with background (the paper)",
+        "sphere_mip": "a 4x4 level of the sphere map with background",
         "sh2": "spherical harmonics of order 2",
         "clusters": "200 clusters of the environment for every direction",
         "brute_force": "every texel for every direction",

@@ -81,7 +81,7 @@ class MirrorBall(Stage):
 
     name: ClassVar[str] = "mirror_ball"
     methods: ClassVar[Mapping[str, str]] = {
-        "none": "nothing (the paper)",
+        "none": "nothing",
         "single": "one ray per pixel",
         "smooth": "4 rays per pixel",
         "brute_force": "64 rays per pixel",

@@ -43,7 +43,7 @@ class Prefilter(Stage):
 
     name: ClassVar[str] = "prefilter"
     methods: ClassVar[Mapping[str, str]] = {
-        "sphere_mip": "mip levels of the sphere map with background (the paper)",
+        "sphere_mip": "mip levels of the sphere map with background",
         "energy_mip": "an energy-conserving pyramid, mixed to fit the lobe",
         "fis128": "128 importance samples per texel",
         "brute_force": "every texel for every direction and width",

@@ -96,7 +96,7 @@ class Recover(Stage):
 
     name: ClassVar[str] = "recover"
     methods: ClassVar[Mapping[str, str]] = {
-        "clipped": "as the camera saw it (the paper)",
+        "clipped": "as the camera saw it",
         "white_card": "scaled to light the white card as the frame shows",
         "shading": "shared among emitters by shading and shadows in the frame",
     }

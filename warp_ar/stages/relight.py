@@ -48,7 +48,7 @@ class Relight(Stage):
     name: ClassVar[str] = "relight"
     methods: ClassVar[Mapping[str, str]] = {
         "flat": "on a grey receiver",
-        "paper": "blended by the frame's brightness (the paper)",
+        "paper": "blended by the frame's brightness",
         "reflectance": "times reflectance from frame and environment",
         "bounce": "the same with the environment's shadows and light between lit surfaces",
         "brute_force": "the same at every pixel, 1,024 rays, patches of 4 pixels",

@@ -28,7 +28,7 @@ class Shade(Stage):
 
     name: ClassVar[str] = "shade"
     methods: ClassVar[Mapping[str, str]] = {
-        "environment": "the environment (the paper)",
+        "environment": "the environment",
         "few_rays": "environment, receiver and objects, by few rays",
         "one_bounce": "environment, receiver and other objects",
     }

@@ -24,7 +24,7 @@ class Unwrap(Stage):
 
     name: ClassVar[str] = "unwrap"
     methods: ClassVar[Mapping[str, str]] = {
-        "sphere_map": "OpenGL's sphere mapping, ball and light far away (the paper)",
+        "sphere_map": "OpenGL's sphere mapping, ball and light far away",
         "area": "the mean over a texel's footprint",
     }
     summary: ClassVar[str] = "reads the light off the mirror ball, exact for a near camera"
