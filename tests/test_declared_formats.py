@@ -231,6 +231,14 @@ CASES: dict[str, list[Case]] = {
         hdr("VIEW, PIXASPECT", "VIEW= -vtv", "not followed"),
         hdr("VIEW, PIXASPECT", "PIXASPECT=2", "not followed"),
         Case("values not finite (NaN: 0, infinity: 65,504)", "a.exr", {"Y": np.nan}, "are not finite"),
+        *(
+            Case("pixelAspectRatio, adoptedNeutral, another colorInteropID", "a.exr", {"Y": 0.5, key: value}, said)
+            for key, value, said in (
+                ("pixelAspectRatio", 2.0, "pixelAspectRatio"),
+                ("adoptedNeutral", (0.3457, 0.3585), "adoptedNeutral"),
+                ("colorInteropID", "srgb_rec709_scene", "srgb_rec709_scene is not followed"),
+            )
+        ),
     ],
     "calibrations": [
         Case("damaged", "a.json", "{", "cannot be read"),
@@ -295,8 +303,9 @@ def write(path: pathlib.Path, data: Any) -> None:
     elif isinstance(data, bytes):
         path.write_bytes(data)
     elif path.suffix == ".exr":
-        planes = {channel: np.full((4, 8), value, np.float32) for channel, value in data.items()}
-        OpenEXR.File({"type": OpenEXR.scanlineimage}, planes).write(str(path))
+        planes = {name: np.full((4, 8), value, np.float32) for name, value in data.items() if len(name) == 1}
+        told = {name: value for name, value in data.items() if len(name) > 1}
+        OpenEXR.File({"type": OpenEXR.scanlineimage, **told}, planes).write(str(path))
     else:
         path.write_text(data if isinstance(data, str) else json.dumps(data), encoding="utf-8")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import pathlib
+import struct
 import subprocess
 import sys
 
@@ -15,7 +16,7 @@ import OpenEXR
 import pytest
 from hypothesis import strategies as st
 
-from warp_ar import environment
+from warp_ar import environment, signals
 from warp_ar.errors import SceneError
 from warp_ar.exr_file import read_linear_picture
 from warp_ar.light.captured import Light
@@ -159,9 +160,76 @@ def test_pictures_whose_colours_are_not_rgb_are_refused(tmp_path: pathlib.Path) 
     OpenEXR.File(kind, {name: flat.copy() for name in ("Y", "RY", "BY")}).write(str(tmp_path / "a.exr"))
     with pytest.raises(SceneError, match="has channels BY, RY, Y"):
         read_linear_picture(tmp_path / "a.exr", SceneError, "a")
+    OpenEXR.File(kind, {name: flat.copy() for name in "XYZ"}).write(str(tmp_path / "a.exr"))
+    with pytest.raises(SceneError, match="has channels X, Y, Z"):
+        read_linear_picture(tmp_path / "a.exr", SceneError, "a")
+    OpenEXR.File(kind, {name: flat.copy() for name in "YZ"}).write(str(tmp_path / "a.exr"))  # with depth
+    assert read_linear_picture(tmp_path / "a.exr", SceneError, "a").color.shape == (2, 4, 3)
     (tmp_path / "a.hdr").write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_xyze\n\n-Y 1 +X 8\n" + bytes(32))
     with pytest.raises(SceneError, match="holds CIE XYZ"):
         read_linear_picture(tmp_path / "a.hdr", SceneError, "a")
+
+
+def subsampled(path: pathlib.Path, channels: dict[str, int]) -> pathlib.Path:
+    """Write an OpenEXR of 8x4 pixels by its bytes: of a channel every n-th pixel of every n-th row is kept."""
+
+    def attribute(name: str, kind: str, value: bytes) -> bytes:
+        return f"{name}\0{kind}\0".encode() + struct.pack("<i", len(value)) + value
+
+    listed = sorted(channels.items())
+    kinds = b"".join(name.encode() + b"\0" + struct.pack("<iB3xii", 2, 0, step, step) for name, step in listed)
+    window = struct.pack("<4i", 0, 0, 7, 3)
+    head = b"\x76\x2f\x31\x01\2\0\0\0" + attribute("channels", "chlist", kinds + b"\0")
+    head += attribute("compression", "compression", b"\0") + attribute("lineOrder", "lineOrder", b"\0")
+    head += attribute("dataWindow", "box2i", window) + attribute("displayWindow", "box2i", window)
+    head += attribute("pixelAspectRatio", "float", struct.pack("<f", 1.0))
+    head += attribute("screenWindowCenter", "v2f", bytes(8))
+    head += attribute("screenWindowWidth", "float", struct.pack("<f", 1.0)) + b"\0"
+    table, body = b"", b""
+    for row in range(4):
+        values = b"".join(np.full(8 // step, 0.5, "<f4").tobytes() for _, step in listed if row % step == 0)
+        table += struct.pack("<Q", len(head) + 4 * 8 + len(body))
+        body += struct.pack("<ii", row, len(values)) + values
+    path.write_bytes(head + table + body)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("channels", "said"),
+    [
+        ({"Y": 1, "RY": 2, "BY": 2}, "has channels BY, RY, Y"),
+        ({"Y": 2}, "channels of several sizes"),
+        ({"R": 1, "G": 1, "B": 2}, "channels of several sizes"),
+        ({"R": 1, "G": 1, "B": 1, "A": 2}, ""),
+    ],
+)
+def test_subsampled_colours_are_refused(tmp_path: pathlib.Path, channels: dict[str, int], said: str) -> None:
+    path = subsampled(tmp_path / "a.exr", channels)
+    if said:
+        with pytest.raises(SceneError, match=said):
+            read_linear_picture(path, SceneError, "a")
+    else:
+        np.testing.assert_array_equal(read_linear_picture(path, SceneError, "a").color, np.full((4, 8, 3), 0.5))
+
+
+@pytest.mark.parametrize(
+    ("told", "primaries"),
+    [
+        ({"acesImageContainerFlag": 1}, signals.AP0),
+        ({"acesImageContainerFlag": 1, "chromaticities": signals.REC_2020}, signals.REC_2020),
+        ({"colorInteropID": "lin_ap1_scene"}, signals.AP1),
+        ({"colorInteropID": "lin_p3d65_scene"}, signals.P3_D65),
+        ({"colorInteropID": "lin_rec709_scene"}, signals.REC_709),
+    ],
+)
+def test_colour_spaces_that_other_attributes_tell_are_followed(
+    tmp_path: pathlib.Path, told: dict, primaries: tuple
+) -> None:
+    color = np.array([0.2, 0.5, 0.1])
+    planes = {name: np.full((4, 8), value, np.float32) for name, value in zip("RGB", color, strict=True)}
+    OpenEXR.File({"type": OpenEXR.scanlineimage, **told}, planes).write(str(tmp_path / "a.exr"))
+    found = read_linear_picture(tmp_path / "a.exr", SceneError, "a").color[1, 2]
+    np.testing.assert_allclose(found, signals.rgb_from_rgb(primaries, signals.REC_709) @ color, rtol=FLOAT32, atol=1e-7)
 
 
 def radiance(path: pathlib.Path, picture: np.ndarray, line: str, head: str = "") -> pathlib.Path:

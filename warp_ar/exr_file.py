@@ -23,7 +23,7 @@ import OpenEXR
 
 from warp_ar.errors import WarpArError, reason, say
 from warp_ar.files import check_size, is_file, read_bytes, store
-from warp_ar.signals import REC_709, are_primaries, converted
+from warp_ar.signals import AP0, AP1, P3_D65, REC_709, REC_2020, are_primaries, converted
 from warp_ar.signature import PROGRAM
 
 _LINES = (1, 1, 1, 16, 32, 16, 32, 32, 32, 256)
@@ -33,6 +33,14 @@ LARGEST = 65504.0
 _HDR_HEAD = 1 << 16
 """Bytes within which a Radiance picture has its size; its header tells all programs that it went through."""
 _MAGIC = b"\x76\x2f\x31\x01"
+_SPACES = {
+    "lin_rec709_scene": REC_709,
+    "lin_rec2020_scene": REC_2020,
+    "lin_p3d65_scene": P3_D65,
+    "lin_ap0_scene": AP0,
+    "lin_ap1_scene": AP1,
+}
+"""Primaries by the attribute ``colorInteropID`` (ASWF, Color Interop Forum)."""
 _SEVERAL_PARTS = 0x10
 """Bit of the second byte of the version's four."""
 
@@ -66,10 +74,11 @@ def read_linear_picture(path: pathlib.Path, error: type[WarpArError], label: str
 
     Follows:
         OpenEXR: first part with R G B or Y, half or float, display window (black without data), chromaticities,
-        envmap; HDR: PRIMARIES, EXPOSURE, COLORCORR, rows and columns in any order.
+        colorInteropID, ACES containers, envmap; HDR: PRIMARIES, EXPOSURE, COLORCORR, rows and columns in any order.
 
     Names:
-        axes taken; parts not taken; EXPOSURE, COLORCORR; VIEW, PIXASPECT; values not finite (NaN: 0, infinity: 65,504).
+        axes taken; parts not taken; EXPOSURE, COLORCORR; VIEW, PIXASPECT; pixelAspectRatio,
+        adoptedNeutral, another colorInteropID; values not finite (NaN: 0, infinity: 65,504).
 
     Args:
         path: The file.
@@ -135,15 +144,25 @@ def _read_exr(path: pathlib.Path, error: type[WarpArError], label: str) -> Linea
     _picture_part(path, error, label, header_only=True)  # looks at sizes before pixels are read
     header, channels = _picture_part(path, error, label, separate_channels=True)
     names = "RGB" if {"R", "G", "B"} <= channels.keys() else "YYY"
-    if names[0] not in channels or (names == "YYY" and {"RY", "BY"} & channels.keys()):
+    others = {"RY", "BY"} & channels.keys() or {"X", "Z"} <= channels.keys()  # chroma, CIE XYZ
+    if names[0] not in channels or (names == "YYY" and others):
         raise error(f"{label} has channels {', '.join(channels)}; R, G and B, or Y, are needed")
-    shape = channels[names[0]].shape
-    if any(channels[name].shape != shape for name in names):
-        raise error(f"{label} has channels of several sizes; R, G and B of one size are needed")
     windows = header["dataWindow"], header["displayWindow"]
+    shape = _size_of(windows[0])[::-1]
+    if any(channels[name].shape != shape for name in names):
+        raise error(f"{label} has channels of several sizes; R, G and B of its window's size are needed")
+    said, space = header.get("chromaticities"), str(header.get("colorInteropID", ""))
+    if said is None:
+        said = AP0 if header.get("acesImageContainerFlag") == 1 else _SPACES.get(space)
+        if said is None and space not in ("", "data", "unknown"):
+            say_once(f"{label}: its colorInteropID {space} is not followed; expected one of {', '.join(_SPACES)}")
+    white = np.asarray(REC_709 if said is None else said)[6:]
+    neutral = np.asarray(header.get("adoptedNeutral", white))
+    if header.get("pixelAspectRatio", 1.0) != 1.0 or not np.allclose(neutral, white, atol=1e-3):
+        say_once(f"{label}: pixelAspectRatio and adoptedNeutral of its header are not followed; it is taken as it lies")
     with np.errstate(over="ignore"):
         color = np.stack([channels[name].astype(np.float32) for name in names], -1)
-    color = _in_rec_709(color, header.get("chromaticities"), error, label)
+    color = _in_rec_709(color, said, error, label)
     others = {
         name: _in_window(values.astype(np.float32), *windows)
         for name, values in channels.items()

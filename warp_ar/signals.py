@@ -6,7 +6,7 @@ by the inverse of the camera's curve; of PQ, which says what a display shows, it
 
 References:
     ITU-R BT.2100-2, tables 4 (PQ) and 5 (HLG). ITU-R BT.2408-7, table 1 (reference white). ITU-R BT.709-6, BT.2020-2,
-    SMPTE EG 432-1 (primaries); SMPTE RP 177 (matrices of primaries).
+    SMPTE EG 432-1, ST 2065-1, ACES S-2014-004 (primaries); SMPTE RP 177 (matrices of primaries).
 """
 
 from __future__ import annotations
@@ -23,6 +23,8 @@ REC_709: Final[Chromaticities] = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.
 """x and y of red, green, blue and white."""
 REC_2020: Final[Chromaticities] = (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.3290)
 ADOBE_RGB: Final[Chromaticities] = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, 0.3127, 0.3290)
+AP0: Final[Chromaticities] = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.0770, 0.32168, 0.33767)
+AP1: Final[Chromaticities] = (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767)
 P3_D65: Final[Chromaticities] = (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.3127, 0.3290)
 
 PQ_PEAK: Final = 10000.0

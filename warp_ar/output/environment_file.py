@@ -37,16 +37,16 @@ from warp_ar.output.environment_axes import (
     to_cube,
 )
 from warp_ar.output.places import check_replaceable
-from warp_ar.signals import REC_709, Chromaticities, converted
+from warp_ar.signals import AP1, REC_709, Chromaticities, converted
 from warp_ar.signature import PROGRAM
 
 Radiance = npt.NDArray[np.float32]
 
 COLOR_SPACES: Final[dict[str, Chromaticities]] = {
     "rec709": REC_709,
-    "acescg": (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767),
+    "acescg": AP1,
 }
-"""Chromaticities of red, green, blue and white, x and y each; ACEScg's are AP1 (ACES S-2014-004)."""
+"""Chromaticities of red, green, blue and white, x and y each."""
 _REC_709_WORDS = " ".join(f"{value:.4f}" for value in REC_709)
 ENVIRONMENT_SUFFIXES = (".exr", ".hdr", ".json")
 
