@@ -144,8 +144,8 @@ def _read_exr(path: pathlib.Path, error: type[WarpArError], label: str) -> Linea
     _picture_part(path, error, label, header_only=True)  # looks at sizes before pixels are read
     header, channels = _picture_part(path, error, label, separate_channels=True)
     names = "RGB" if {"R", "G", "B"} <= channels.keys() else "YYY"
-    others = {"RY", "BY"} & channels.keys() or {"X", "Z"} <= channels.keys()  # chroma, CIE XYZ
-    if names[0] not in channels or (names == "YYY" and others):
+    mixed = bool({"RY", "BY"} & channels.keys()) or {"X", "Z"} <= channels.keys()  # chroma, CIE XYZ
+    if names[0] not in channels or (names == "YYY" and mixed):
         raise error(f"{label} has channels {', '.join(channels)}; R, G and B, or Y, are needed")
     windows = header["dataWindow"], header["displayWindow"]
     shape = _size_of(windows[0])[::-1]
