@@ -55,7 +55,7 @@ def live() -> NoReturn:
 
 @contextlib.contextmanager
 def importing() -> Iterator[None]:
-    """Around imports that may take seconds, while nothing is open: a signal ends the process, and slowness is told.
+    """Context of slow imports while nothing is open: a signal ends the process, and a slow import prints a line.
 
     An exception would not do: native code, as it is loaded, turns it into another error, or drops it.
     """

@@ -36,7 +36,7 @@ SUFFIXES = {"--output": ".exr", "--outline": ".png", "--scene": ".toml"}
 OUTLINE, PREVIEW, RESPONSE = ".outline.png", ".preview.png", ".response.txt"
 """Endings of files beside the light."""
 LARGEST_BALL = 1.0
-"""Metres of the radius: beyond that another unit was meant."""
+"""Largest plausible radius, metres; a larger number is probably in another unit."""
 
 
 def _seconds(text: str) -> float:

@@ -42,10 +42,10 @@ STEP = 0.5
 
 @dataclasses.dataclass(frozen=True)
 class TablePolish:
-    """Polish of the scene's table, by its frames."""
+    """Reflection of the scene's table, estimated from frames."""
 
     values: dict[str, float]
-    """Of ``[proxy.material]``, rounded."""
+    """Rounded values for ``[proxy.material]``."""
     proxy: int
     """Number of the ``[[proxy]]``."""
     lines: tuple[str, ...]

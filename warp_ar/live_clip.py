@@ -49,7 +49,7 @@ def _check_places(options: argparse.Namespace, scene: Scene) -> None:
 
 
 def reflectances_told(probes: Sequence[Probe], status: Callable[[], Mapping[str, Any]] | None) -> list[str]:
-    """Return a line for each ball whose reflectance frames have told otherwise than the scene.
+    """Return a line for each ball whose reflectance in the frames differs from the scene's.
 
     Args:
         probes: The scene's.

@@ -256,7 +256,7 @@ class Session(Closing):
             yield frame
 
     def _known_of(self, frame: Frame) -> dict[str, Any]:
-        """Return what a pipeline is told of a frame besides its picture."""
+        """Return the arguments of a pipeline's call besides the picture."""
         pose = given_pose(self.pipeline.scene.pose, frame)
         return {"time_seconds": frame.time, "exposure_time": frame.exposure_time, "pose": pose}
 

@@ -31,15 +31,15 @@ wp.set_module_options({"enable_backward": False})
 SIDE = wp.constant(3)
 """Directions along the side of a texel."""
 FRAME_TRUST = wp.constant(wp.float32(0.8))
-"""Of what the picture shows, beside 1 of what a ball shows."""
+"""Trust in a texel from the picture; one from a ball has 1."""
 BALL_MARGIN = wp.constant(wp.float32(1.08))
-"""Factor on a ball's radius where it hides what is behind it: its outline is blurred."""
+"""Factor on a ball's radius for hiding surfaces, because its outline is blurred."""
 OWN_SHADOW = wp.constant(wp.float32(6.0))
-"""Radii around a ball within which it shades surfaces: as far reaches its shadow of light 10 degrees above them."""
+"""Distance in radii within which a ball shades surfaces: its shadow in light 10 degrees above them."""
 CLOSE = wp.constant(wp.float32(1.0e-3))
-"""Relative distance within which what a camera ray meets is the surface itself."""
+"""Relative distance within which a camera ray's hit is the surface itself."""
 ENOUGH = wp.constant(wp.float32(0.999))
-"""Trust from which a ball tells all."""
+"""Trust from which a ball needs no help of the picture."""
 
 
 @wp.func

@@ -32,11 +32,11 @@ from warp_ar.kernels.structs import FrameParams, Probe
 wp.set_module_options({"enable_backward": False})
 
 TRUST_TIME = wp.constant(wp.float32(0.4))
-"""Time constant in seconds with which trust follows what is seen of a ball."""
+"""Time constant, seconds, with which trust follows a ball's visibility."""
 ENOUGH = wp.constant(wp.float32(0.5))
-"""Share of a map's texels whose light a ball tells from which on it is trusted fully."""
+"""Share of measured texels in a ball's map from which the ball is trusted fully."""
 SEEN_AT_ALL = wp.constant(wp.float32(0.02))
-"""Share from which on a ball's place is believed."""
+"""Least visible share at which a ball's place is updated."""
 
 
 @wp.func

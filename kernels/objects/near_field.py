@@ -89,10 +89,10 @@ SHARP = wp.constant(wp.float32(SHARP_ALPHA))
 RAY_WIDTH = 2.0
 """Width of one ray of many, over the width that its share of the lobe has."""
 LOBE_ANGLE = 1.0
-"""Side of what such a ray covers in the frame, as an angle, over its width. A ray's share is a square of 1.77;
-what is less is left to the rays beside it, for a wide square also reaches over the edges of what it lies on."""
+"""Side of such a ray's footprint in the frame, as an angle, over its width. A ray's share would be a square of 1.77;
+a smaller one crosses fewer edges of the surface."""
 SAME_SURFACE = wp.constant(wp.float32(0.5))
-"""Cosine between the normals of neighbours up to which they say how a mirror bends."""
+"""Least cosine between the normals of neighbours that estimate a mirror's curvature."""
 MIN_LIGHT = wp.constant(wp.float32(1.0e-6))
 """Brightness, in camera values, below which a lobe's share is 0 over 0."""
 NO_RAY = wp.constant(wp.float32(-1.0))
@@ -124,8 +124,8 @@ class NearFieldConfig:
     added: bool
     """True if virtual lights light the receiver."""
     known: bool = False
-    """True if irradiance is that of the environment, as it is known, and what the samples that meet something change;
-    else the sum of all samples."""
+    """True if irradiance is the environment's known one plus the change by samples that hit something; else the sum
+    of all samples."""
 
 
 @wp.func

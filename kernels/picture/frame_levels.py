@@ -32,9 +32,9 @@ LAST_LEVEL = 6
 """Coarsest level; its texels are as wide as 64 pixels."""
 LAST = wp.constant(wp.int32(LAST_LEVEL))
 MOST_TAPS = wp.constant(wp.int32(4))
-"""Places that are read along the longer axis of what a ray covers."""
+"""Largest number of reads along the longer axis of a ray's footprint."""
 LEAST_COSINE = wp.constant(wp.float32(0.02))
-"""Between a ray and a surface that it grazes: what it covers there has no end."""
+"""Least cosine between ray and normal, to bound the footprint of a grazing ray."""
 
 
 @wp.struct

@@ -184,7 +184,7 @@ def make_visible_share(config: TraceConfig) -> wp.Function:
 
 @wp.func
 def tile_turn(row: wp.int32, column: wp.int32) -> wp.float32:
-    """Rotation of a pixel's pattern, in turns: all sixteenths in every tile of 4 x 4, neighbours far apart (Bayer)."""
+    """Return a pixel's rotation of samples in turns, by a Bayer matrix of 4 x 4: neighbours differ most."""
     mixed = row ^ column
     rank = ((mixed & 1) << 3) | ((row & 1) << 2) | (mixed & 2) | ((row & 2) >> 1)
     return wp.float32(rank) / 16.0

@@ -84,7 +84,7 @@ def tiled_cell(i: wp.int32, thread: wp.int32, side: wp.int32, columns: wp.int32)
 
 
 def tiled_shape(rows: int, columns: int, side: int) -> tuple[int, int]:
-    """Rows and columns of threads with which ``tiled_cell`` reaches all cells, and some beyond."""
+    """Return the launch's rows and columns of threads: the cells' rounded up to whole tiles of ``tiled_cell``."""
     down, across = side * int(TILE_ROWS), side * int(TILE_COLUMNS)
     return -(-rows // down) * down, -(-columns // across) * across
 

@@ -63,15 +63,15 @@ wp.set_module_options({"enable_backward": False})
 LOBE_REACH = wp.constant(wp.float32(14.0))
 """Tangents of a half vector, over alpha, that are looked at: 0.5 % of GGX's energy lies beyond."""
 MIRROR_ALPHA = wp.constant(wp.float32(1.0e-3))
-"""Width below which a receiver is a mirror: all rays of a pixel leave it alike."""
+"""Lobe width alpha below which a receiver is a mirror, with one direction per pixel."""
 EDGE_SAMPLES = 4
-"""Rays per pixel of a mirror, for the edges of what it shows."""
+"""Rays per pixel of a mirror, to anti-alias edges of its image."""
 MOST_RADIANCE = wp.constant(wp.float32(8.0))
-"""Radiance that one ray of a rough receiver brings at most: a highlight of a highlight would be a speckle."""
+"""Largest radiance of one ray of a rough receiver; it suppresses speckles of mirrored highlights."""
 LEAST = wp.constant(wp.float32(2.0e-4))
-"""Radiance of a highlight that is looked for: a code of 8 bits is at least 3e-4."""
+"""Least radiance of a highlight that is computed; a step of 8-bit codes is at least 3e-4."""
 LEAST_SHADOW = wp.constant(wp.float32(0.01))
-"""Share of the frame that a shadow must take before what is mirrored is given back."""
+"""Least darkening by a shadow, as a share of the frame, at which mirrored light is restored."""
 SMOOTHED = wp.constant(2)
 """Pixels to each side over which a rough receiver is averaged."""
 

@@ -56,7 +56,7 @@ wp.set_module_options({"enable_backward": False})
 
 _INV_PI = wp.constant(wp.float32(1.0 / math.pi))
 _MASKED = 8
-"""Lights whose shadows are told apart: one bit each, of what ``relight`` writes for ``smooth_edges``."""
+"""Largest number of lights with separate shadow bits in the mask that ``relight`` writes for ``smooth_edges``."""
 _LIT = wp.constant(1 << _MASKED)
 """The bit that tells whether any light arrives; the number of the surface stands above it."""
 _SURFACE = wp.constant(_MASKED + 1)

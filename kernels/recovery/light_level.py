@@ -28,17 +28,17 @@ wp.set_module_options({"enable_backward": False})
 STILL = wp.constant(wp.float32(0.01))
 """Relative change of the card's light up to which the level stays."""
 FOLLOWED = wp.constant(wp.float32(0.03))
-"""The same from which on it is followed in full."""
+"""Relative change from which the level follows the card in full."""
 LEAST_SHARE = wp.constant(wp.float32(0.1))
-"""Of the card's light that the map must not show: less of it is not told from what the map errs by."""
+"""Least share of the card's light that is missing in the map; a smaller one is within the map's error."""
 LEAST_POINTS = wp.constant(wp.int32(8))
-"""Of the card that must be seen, then and now."""
+"""Least number of the card's points seen in both frames."""
 AGREEING = wp.constant(wp.float32(0.7))
 """Share of them whose light must have changed alike,"""
 SPREAD = wp.constant(wp.float32(0.1))
 """within this, relatively."""
 MOST = wp.constant(wp.float32(1.5))
-"""Highest level: what makes a card brighter by more is rather a lamp that was switched on, somewhere else."""
+"""Highest level; a larger rise of the card is probably another lamp."""
 DARK = wp.constant(wp.float32(0.0016))
 """Radiance below which a point says nothing: quantisation."""
 
@@ -138,7 +138,7 @@ def follow_level_kernel(
 def follow_level(
     now: wp.array, then: wp.array, upward: tuple[wp.array, wp.array], share: wp.array, level_out: wp.array
 ) -> None:
-    """Level of recovered light by what the card shows; it stays as it was where the card does not tell.
+    """Update the level of recovered light from the card; without a verdict it stays.
 
     Args:
         now: What the card's points show, ``Observation`` (n).

@@ -33,13 +33,14 @@ wp.set_module_options({"enable_backward": False})
 PATCH = wp.constant(5)
 """Points along the side of the patch over which a surface point is averaged."""
 BALL_MARGIN = wp.constant(wp.float32(1.08))
-"""Factor on a ball's radius where it hides surfaces from the camera: its outline is blurred."""
+"""Factor on a ball's radius for hiding surfaces, because its outline is blurred."""
 FAR_FROM_BALL = wp.constant(wp.float32(10.0))
-"""Radii from which what a ball throws is left out: (R / 2 s)^2, less than a four-hundredth of the light itself."""
+"""Distance in radii beyond which light reflected by a ball is ignored: (R / 2 s)^2, less than 1/400 of the light
+itself."""
 GRAZING = wp.constant(wp.float32(1.0e-3))
-"""Cosine below which a ball mirrors nothing: the light passes along its outline, and is seen straight."""
+"""Cosine below which a ball mirrors nothing: light at grazing angles is seen directly past the outline."""
 CLOSE = wp.constant(wp.float32(1.0e-3))
-"""Relative distance within which what a camera ray meets is the surface itself."""
+"""Relative distance within which a camera ray's hit is the surface itself."""
 
 
 @wp.struct
@@ -221,7 +222,7 @@ def observe_surfaces(
     proxies: tuple[int, ...],
     rows: Rows | None = None,
 ) -> None:
-    """Measure what the frame shows of surface points.
+    """Measure the frame's radiance at surface points.
 
     Args:
         frame: ``wp.vec3ub`` (frame rows, columns), RGB codes; or ``wp.vec3``, linear radiance.

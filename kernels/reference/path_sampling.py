@@ -61,13 +61,13 @@ PI = wp.constant(wp.float32(math.pi))
 ALL_MODELS = tuple(sorted(map(int, (LAMBERT, PHONG, METALLIC_ROUGHNESS, MIRROR))))
 """Of materials."""
 NO_DENSITY = wp.constant(wp.float32(-1.0))
-"""Instead of the density of a direction that was not drawn from one: a mirror's, or the camera's."""
+"""Marker in place of a density for directions without one: of a mirror or the camera."""
 LEAST_CHANCE = wp.constant(wp.float32(0.1))
-"""Of either lobe of a surface that has two: what one of them hardly reflects may still be all that is to be seen."""
+"""Least probability of sampling either lobe of a surface with two; a weak lobe can carry all visible light."""
 EVEN_SHARE = 0.01
-"""Of the mean density, what every direction of the environment gets at least."""
+"""Least density of any direction of the environment, relative to the mean density."""
 STREAMS = wp.constant(16)
-"""Triples of random numbers that a vertex of a path may ask for."""
+"""Largest number of random triples per vertex of a path."""
 SEED_STEP = wp.constant(wp.uint32(0x9E3779B9))
 
 LEAST_COSINE = wp.constant(wp.float32(0.1))

@@ -50,7 +50,7 @@ RUNS = ("paper", "low", "medium", "high")
 SAME_TIME, SAME_ERROR = "ours near the paper's time", "ours near the paper's error"
 """Labels of choices that the cost table offers; their time and their error are measured beside the presets'."""
 COST_NOISE, FLIP_NOISE = 0.03, 2e-4
-"""Share by which costs, and FLIP by which pictures, must differ to be told apart."""
+"""Measurement noise: relative for costs, in FLIP for pictures."""
 _FAIR: Mapping[str, Mapping[str, str]] = {
     "unwrap": {"environment_height": "32"},
     "environment_height": {"environment_shadow": "none", "recover": "white_card"},

@@ -99,13 +99,15 @@ UNMODELLED = 0.02
 SPAN = 0.14
 """Share of the given radius by which it may be off."""
 RADIUS_STEP = 0.02
-"""Share of it between radii that are tried."""
+"""Step between tried radii, relative to the given radius."""
 ASIDE = 3
-"""Steps from the best radius at which its cost is compared with others'."""
+"""Distance from the best radius, in steps, of the radii whose costs are compared with the best."""
 DISTINCT = 0.9
-"""The least cost over those ``ASIDE``, below which the radius is told: 0.6 to 0.87 on rendered desks."""
+"""Largest ratio of the least cost to the costs ``ASIDE`` at which the radius counts as determined: 0.6 to 0.87 on
+rendered desks."""
 EXPLAINED = 0.42
-"""Mean cost up to which a ball explains what is mirrored: 0.2 to 0.39 on rendered desks, else 0.5 and more."""
+"""Largest mean cost at which a ball explains its mirror image: 0.2 to 0.39 on rendered desks, 0.5 and more
+otherwise."""
 HOPELESS = 0.6
 """Mean cost of a few radii beyond which no other explains the frames: 0.25 to 0.45 on rendered desks up to six steps
 beside the right one, 0.7 and more without a ball."""

@@ -210,12 +210,12 @@ _SAMPLES = _samples_in_disc()
 
 
 def _has_changed(change: Array) -> bool:
-    """Return whether a ball's disc shows something else, (cells, 3); a cell that is not seen in both is as it was."""
+    """Return whether enough cells of a ball's disc changed, (cells, 3); cells hidden in either frame did not."""
     return bool((np.abs(change) > CHANGED).any(axis=1).mean() >= DISC_SHARE)
 
 
 def _follow(before: Array, now: Array, seconds: float) -> Array:
-    """Return what is remembered, drawn toward what is seen now, where that is seen, after so long."""
+    """Return the memory ``before``, moved toward the seen cells of ``now`` by the time constant ``MEMORY``."""
     followed = before + (1.0 - np.exp(-abs(seconds) / MEMORY)) * (now - before)
     followed = np.where(np.isnan(before), now, followed)
     return np.asarray(np.where(np.isnan(followed), before, followed))

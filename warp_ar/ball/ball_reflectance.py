@@ -1,4 +1,4 @@
-"""Share of light that a mirror ball reflects, told by what is seen twice: directly, and mirrored in the ball.
+"""Reflectance of a mirror ball, from surfaces that the frame shows both directly and mirrored in the ball.
 
 A matt surface has one radiance wherever it is seen from. So where the ball mirrors a point of a modelled plane that the
 camera sees beside the ball as well, the ball's pixel over that point's own is the ball's reflectance:

@@ -36,7 +36,7 @@ STEP = 0.5
 SHIFT_STEP = 0.1
 """Pixels between shifts that are tried; costs between them are interpolated."""
 MOST_COST = 4.5
-"""Most that a profile may cost above its best: that of three standard deviations."""
+"""Bound on a profile's cost above its best: 4.5, three standard deviations."""
 STEP_WINDOW = (3.0, 5.0)
 """Pixels inside and outside the rim in which a step is looked for."""
 FINE_WINDOW = (2.0, 3.0)

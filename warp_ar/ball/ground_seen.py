@@ -33,7 +33,7 @@ PAIRS: Final = 6
 LEAST_POINTS: Final = 200
 """Points that the ball would hide from both eyes."""
 TEXTURE: Final = 0.01
-"""Standard deviation over mean of codes below which nothing is told; the card's thin rings have 0.02 to 0.03."""
+"""Least contrast (standard deviation over mean of codes) for a verdict; the card's thin rings have 0.02 to 0.03."""
 ALIKE: Final = 0.8
 """Median correlation of the pairs from which the receiver is seen: bare cards have 0.91 to 0.97, balls -0.4 to 0."""
 

@@ -22,11 +22,11 @@ ENOUGH: Final = 8
 MOST: Final = 24
 """Frames that are asked where few tell."""
 EVERY: Final = 5
-"""Frames of which one is asked, after the first three."""
+"""Interval, in frames, between measurements after the first three."""
 FIRST: Final = 3
-"""Frames that are each asked: photographs and clips of a few frames are told by these."""
+"""Number of first frames that are all measured, for photographs and short clips."""
 STEADY: Final = 0.03
-"""Logarithm by which the median must move for another value to be taken: all light changes with it."""
+"""Change of the median's logarithm that replaces the value in use; each replacement changes all light."""
 
 
 class ReflectanceWatch:
@@ -85,7 +85,7 @@ class ReflectanceWatch:
         used: tuple[float, float, float],
         told: Sequence[tuple[float, float, float]],
     ) -> tuple[float, float, float]:
-        """Return what to take for one ball, by what the scene says, what was taken before and what frames told."""
+        """Return the reflectance to use for one ball, from the scene's, the one in use and the frames' estimates."""
         median = np.minimum(np.median(told, axis=0), 1.0)
         logarithms = np.log(median)
         if abs(float((logarithms - np.log(said)).mean())) < REFLECTANCE:

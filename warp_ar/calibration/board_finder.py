@@ -29,7 +29,7 @@ DICTIONARIES: Final = (
 )
 """Dictionaries that are tried; OpenCV's smaller ones are the first entries of these."""
 _FEWEST: Final = 5
-"""Markers without which a layout is not told from another."""
+"""Least number of markers that identify a layout."""
 _LAYOUTS: Final = range(3, 15)
 """Columns that are tried."""
 STRAIGHT: Final = 0.04

@@ -42,7 +42,7 @@ GOOD_VIEWS = 12
 _GROUPS = 15
 """Groups of views that are left out in turn: more cost time and tell the same."""
 LEAST_TILT = 15.0
-"""Degrees by which the board's tilt must differ: else focal length and distance cannot be told apart."""
+"""Least range of the board's tilt, degrees; below it focal length and distance are ambiguous."""
 MOST_FOCAL = 0.03
 """Share of the focal length that its interval of two standard deviations may have."""
 _COVERAGE_CELLS = (4, 6)
@@ -74,7 +74,7 @@ class CameraReport:
 
     @property
     def doubt(self) -> str:
-        """Why the focal length is not to be believed, in words; empty where it is."""
+        """Reason to reject the focal length; empty if it is good."""
         if self.tilts[1] - self.tilts[0] < LEAST_TILT:
             return f"the card was tilted by {self.tilts[0]:.0f} to {self.tilts[1]:.0f} degrees only"
         if (share := 2 * self.focal_deviation / self.camera.fx) > MOST_FOCAL:

@@ -47,7 +47,7 @@ Image = NDArray[np.uint8]
 MOST: Final = 24
 """Pictures that are used at most."""
 FEWEST: Final = 2
-"""Pictures without which a slope of the light cannot be told from the curve."""
+"""Least number of pictures that separate a gradient of the light from the curve."""
 CORNERS: Final = 8
 """Corners of the board without which no patch is placed exactly."""
 RANGE: Final = (8.0, 248.0)

@@ -1,4 +1,4 @@
-"""At which code a camera's channels saturate, told from the pictures themselves.
+"""Codes at which a camera's channels saturate, estimated from pictures.
 
 A sensor that saturates need not give 255: limited range, a shoulder or tone mapping may end at 235 or 238. What lies
 above that light is lost all the same, and code 238 taken for a radiance of 0.85 hides that a lamp clips.
@@ -76,11 +76,11 @@ PERIOD = 12
 WIDTH = 1
 """Codes to either side of a plateau's own that belong to it."""
 WIDE = 2
-"""The same of luma after hard compression."""
+"""The same for luma after strong compression."""
 NEUTRAL_WIDE = 6.0
-"""Codes by which the median pixel of such a plateau may be off it: chroma is compressed harder than luma."""
+"""Largest distance, in codes, of the median pixel of such a plateau; chroma is compressed more strongly than luma."""
 LOPSIDED = 0.7
-"""Most that a wide plateau may have above it, of what as many codes below it have: a lit surface has as much."""
+"""Largest ratio of pixels above a wide plateau to pixels in as many codes below it; a lit surface has a ratio of 1."""
 TOP = 3
 """Codes to either side of a blurred plateau's own that belong to it."""
 TOP_SHARE = 0.02
@@ -172,7 +172,7 @@ class SaturationLevels:
         return bool(self._guess)
 
     def _unmoved(self, top: int | None, gain: float) -> int | None:
-        """The code at which luma ends whatever the gain, or None where that is not told yet."""
+        """Return the code at which luma saturates at any gain; None if still unknown."""
         if top is None:
             return None
         self._tops = [*self._tops, (top, float(np.log(max(gain, 1e-6))))][-WATCHED:]

@@ -51,7 +51,7 @@ class SeenFrame:
     """A frame that has been looked at, not rendered."""
 
     image: Any
-    """As it was given, or a copy of one's own."""
+    """The given image, or a private copy."""
     slot: Slot | None
     """Memory that it is sent to the device from, if copying it there has begun."""
     pose: Pose | None
@@ -113,7 +113,7 @@ class FrameInputs:
         self.decode = decode_table(camera.transfer)
         """Linear value of each code, (256, 3)."""
         self.saturation = SaturationLevels()
-        """Codes at which channels saturate, as frames have told so far."""
+        """Saturation codes of the channels, estimated from the frames so far."""
         self._drift = ExposureDrift(scene, camera) if follows_gain and scene.has_marker else None
         watches_ball = watches_ball and scene.has_marker and bool(scene.probes)
         self._cover = BallCover(scene, camera) if watches_ball else None
@@ -167,7 +167,7 @@ class FrameInputs:
 
     @property
     def told_reflectance(self) -> tuple[scenes.RGB, ...] | None:
-        """Reflectance of the balls by what frames have told; None while it is what the scene says."""
+        """Reflectance of the balls estimated from frames; None while the scene's is in use."""
         told = self._reflectance
         return None if told is None or not told.is_told else told.values
 
@@ -203,7 +203,7 @@ class FrameInputs:
         return np.asarray(self._drift.gain / gain), is_bent
 
     def continue_from(self, other: FrameInputs) -> None:
-        """Go on with what another pipeline's frames have told of the same camera: its white, gain and tone curve."""
+        """Take over another pipeline's estimates of saturation, gain, tone curve, covered balls and reflectance."""
         if self._camera == other._camera and not self._saturation_is_known:
             self.saturation = copy.deepcopy(other.saturation)
             self._saturation_is_known = other._saturation_is_known
@@ -232,7 +232,7 @@ class FrameInputs:
             self._write_decode()
 
     def _write_decode(self) -> None:
-        """Decode by what frames have told of the camera so far."""
+        """Update the decoding table from the camera's estimates so far."""
         contrast, levels = 0.0 if self._drift is None else self._drift.contrast, self.saturation.levels
         self._arrays["decode"].assign(camera_table(self._camera.transfer, levels, contrast))
         if contrast != self._encoded[0] or (contrast != 0.0 and (levels != self._encoded[1]).any()):
@@ -321,7 +321,7 @@ class FrameInputs:
         return True
 
     def _write_probes(self) -> None:
-        """Write the places of balls, and their reflectance by what frames have told so far."""
+        """Write the balls' places and estimated reflectance."""
         told = None if self._reflectance is None else self._reflectance.values
         self._arrays["probes"].assign(_probe_values(self._probes, told))
 
@@ -399,7 +399,7 @@ class FrameInputs:
         return Reach(objects=objects, shines=self._shines, falls=falls, light=light, shadows=shadows, balls=balls)
 
     def radiance(self, plate: Plate) -> npt.NDArray[np.float32]:
-        """A plate as linear radiance, by what frames have told of the camera's tone curve; an array of its own."""
+        """Return a plate as linear radiance by the estimated tone curve, in a new array."""
         contrast = 0.0 if self._drift is None else self._drift.contrast
         if contrast == 0.0 or plate.picture.dtype != np.uint16:
             return plate.radiance(str(self._camera.transfer))

@@ -63,7 +63,7 @@ class LayerArrays:
         return dataclasses.replace(self, arrays={**self.arrays, "plate": deep})
 
     def to_host(self) -> LayerArrays:
-        """Copies of one's own: float32 (height, width[, components]), ``ids`` int32."""
+        """Return copies on the host: float32 (height, width[, components]), ``ids`` int32."""
         scale = None if self.scale is None else _copied(self.scale)
         return LayerArrays({name: _copied(array) for name, array in self.arrays.items()}, scale)
 

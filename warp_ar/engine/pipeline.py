@@ -368,7 +368,7 @@ class Pipeline(Closing):
         self.change(dataclasses.replace(self.scene, objects=tuple(edit(self.scene.objects))))
 
     def _go_on(self, other: Pipeline) -> None:
-        """Go on with another's track, where it fits, and with what its frames have told."""
+        """Take over another pipeline's track, if it fits, and its estimates from frames."""
         if (self.scene.marker, self.camera) == (other.scene.marker, other.camera) and other._tracker and self._tracker:
             self._tracker = other._tracker
         if self.camera == other.camera and own_markers(self.scene) == own_markers(other.scene):

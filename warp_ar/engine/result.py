@@ -86,7 +86,8 @@ class Result:
     """Tracked, held or lost; None when nothing needed the pose."""
     _rendered: Future[Rendered]
     shown: bool = True
-    """False: the frame has another exposure than the shown ones; it only told of the light, the picture is the last."""
+    """False for a frame of another exposure than the shown ones: it only measured light, and the picture is the
+    previous one."""
 
     @property
     def image_array(self) -> Any:

@@ -91,9 +91,9 @@ _LIGHT_DEFAULTS: Mapping[str, Mapping[str, Any]] = {
 RESTS = ("upright", "any")
 """Ways in which an object stands: turned about the vertical alone, or any way up; its lowest point touches the desk."""
 MOST = 64
-"""Objects, or lights, of a picture."""
+"""Largest number of objects, and of lights, in a picture."""
 Share = Callable[[tuple[int, ...]], Any]
-"""Shares, from 0 to 1, of the way from lowest to highest, in an array of a shape."""
+"""Function from an array's shape to an array of random numbers from 0 (lowest) to 1 (highest)."""
 
 
 def draw(value: Any, share: Share) -> Any:
@@ -437,7 +437,7 @@ def _try(
 
 
 def local_points(item: Object | Proxy) -> Points:
-    """Points whose hull is that of an object before scale, turn and place, (n, 3) in metres."""
+    """Return points with the same convex hull as an object before scale, turn and place, (n, 3) in metres."""
     return np.asarray(mesh_of(item).vertices, np.float64)
 
 

@@ -160,7 +160,7 @@ class Lighter(Closing):
         return open_part(path, self.survey(job.clip).index, first, job.end, fps, gpu)
 
     def _options(self) -> dict[str, Any]:
-        """Return what all pipelines are told."""
+        """Return the arguments shared by all pipelines."""
         return {"device": self._device, "quality": self._jobs.settings.quality, "estimates": "synchronous"}
 
     def _pipeline_for(

@@ -345,7 +345,7 @@ def describe_inputs(paths: Iterable[Path]) -> dict[str, list[Any]]:
 
 
 def changed_input(inputs: Mapping[str, Sequence[Any]]) -> str | None:
-    """Say which of the files that ``describe_inputs`` told of is another one now; None where all are the same.
+    """Return a message that names a changed file of ``describe_inputs``; None if all are unchanged.
 
     A file is read only where its time of change is another.
     """
@@ -370,7 +370,7 @@ def _digest(path: Path) -> str:
 
 
 PACE = 50
-"""Latest jobs by whose pace the time that is left is told."""
+"""Number of latest jobs that estimate the remaining time."""
 
 
 def read_status(folder: Path) -> dict[str, Any]:

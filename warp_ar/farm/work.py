@@ -70,7 +70,7 @@ class Work(Closing):
         return program_version()
 
     def do(self, job: Job, arguments: Any = None) -> Outcome:
-        """Do a job as a whole; what goes wrong is told, not raised.
+        """Do a whole job; failures are returned, not raised.
 
         Args:
             job: The job.

@@ -80,9 +80,9 @@ class PriorConfig:
     inside: float = 0.7
     """Relative standard deviation of regions about their component's mean."""
     hue: float = 0.5
-    """Relative standard deviation of one channel's distribution about that of all."""
+    """Relative standard deviation of a channel's distribution from that of all channels."""
     least: float = 0.3
-    """Radiance below which relative deviations are no longer relative."""
+    """Radiance below which deviations count as absolute, not relative."""
     surface_recovered: float = 0.5
     """Radiance above clipping (standard deviation) of modelled surfaces."""
 

@@ -108,7 +108,7 @@ WHOLE = 0.9
 
 
 def alike(clipped: Array, solid_angle: Array, component: NDArray[np.int64], count: int) -> Array:
-    """Return what each component is expected to lack over one in which all channels clip throughout, (count,).
+    """Return the expected missing light of each component relative to one with all channels clipped, (count,).
 
     The share of its clipped solid angle in which all channels clip, squared, and at least ``least_alike``.
 
@@ -168,7 +168,7 @@ def grown(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def least_missing(
     radiance: NDArray[Any], clipped: NDArray[Any], solid_angle: NDArray[Any], is_light: NDArray[np.bool_]
 ) -> Array:
-    """Radiance by which what clips is raised where nothing else tells, (rows, columns, 3): of a wholly clipped texel.
+    """Return the prior's addition to the radiance of a wholly clipped texel, (rows, columns, 3).
 
     Args:
         radiance: Mean of cells of a latlong map, as captured, (rows, columns, 3).

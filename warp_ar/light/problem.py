@@ -192,7 +192,7 @@ class Problem:
         return through_balls
 
     def _sum_light(self, through_balls: NDArray[Any]) -> None:
-        """Irradiance as captured, the share of it that comes by way of balls, and that of each part per radiance."""
+        """Compute captured irradiance, its share by way of balls, and irradiance of each part per unit radiance."""
         # With what clips taken to be some ten times as bright: only the order of magnitude matters.
         bright = (self.radiance + 10.0 * self.missing * self.radiance).mean(axis=1)
         sums = self.transfer @ np.column_stack([self.radiance, bright]).astype(np.float32)
@@ -247,7 +247,7 @@ class Problem:
         return means, (bounds[0], bounds[1], bounds[2])
 
     def card_factor(self, bounds: tuple[bool, bool, bool], doubt: float) -> float:
-        """Share of what makes the card right that is believed, 0 to 1.
+        """Return the share, 0 to 1, of the correction by the card that is applied.
 
         The card's irradiance errs by its white, the response and the ball. What is missing of it is at least the
         measured less that error, and up to twice the missing is no worse than nothing.

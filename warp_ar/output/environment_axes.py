@@ -88,7 +88,7 @@ _SPANS = {
 
 
 def check_axes(axes: str, layout: str = "latlong") -> None:
-    """Check that these axes are known, and told for this layout.
+    """Check that the axes are known and defined for the layout.
 
     Raises:
         UsageError: They are not, or there is no such layout.

@@ -49,7 +49,7 @@ Codes = npt.NDArray[np.uint8]
 Matrix = npt.NDArray[np.float64]
 
 FILM_WIDTH = 0.036
-"""Metres of film that lenses are told for: 36 mm. Only its ratio to the focal length matters to a picture."""
+"""Film width, metres, that focal lengths refer to: 36 mm. Only their ratio matters to a picture."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

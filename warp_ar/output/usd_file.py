@@ -30,7 +30,7 @@ SUN_DEGREES = 0.53
 _COORDINATES = ("st", "st1")
 """Names of both sets of texture coordinates."""
 _TENTHS = 10.0
-"""Lengths of a camera's lens are told in tenths of the stage's unit."""
+"""Factor of a USD camera's lens lengths: they are in tenths of the stage's unit."""
 
 
 def load_usd() -> Any:

@@ -56,7 +56,7 @@ class PhotoInfo:
     focal_35mm: float | None = None
     """Focal length in millimetres of a full-frame camera with the same view."""
     focal_pixels: float | None = None
-    """Focal length in pixels, where the sensor's resolution is told."""
+    """Focal length, pixels, from the sensor's resolution; None without it."""
     model: str = ""
     """Name of the camera."""
 

@@ -145,9 +145,9 @@ class MovingPart:
     mesh: Mesh
     """In the coordinates of its anchor."""
     anchor: int
-    """Number of its moving node; -1: it stands still, in the file's world."""
+    """Index of its moving node; -1 for a part that stands still in the file's world."""
     bend: Bend | None = None
-    """The mesh at other times; None: it is always the same."""
+    """Skin and morph targets of the mesh; None for a rigid part."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -38,7 +38,7 @@ MOST_MISSES = 3
 """Times in a row that it may fail to."""
 
 LEAST_RATIO = 1.8
-"""Of neighbouring exposures of a device: nearer ones cannot be told apart by what they show."""
+"""Least ratio of neighbouring exposures of a device; closer ones cannot be distinguished by their pictures."""
 
 
 class _Bracketing:

@@ -88,8 +88,8 @@ class Pass:
     reads: tuple[str, ...] | None = None
     """Resources of the stage that it reads: on CUDA it begins when these are there. None means all."""
     beforehand: bool = False
-    """On CUDA a pass on the host that is done before anything of the frame is launched: what comes before it in the
-    frame has nothing to do with what it changes, and so the graph need not be cut for it."""
+    """True for a pass on the host that CUDA frames run before all launches. Earlier passes must not depend on its
+    changes; the graph then needs no cut."""
 
 
 def over_rows(
@@ -187,29 +187,29 @@ class Stage(abc.ABC):
     """One step on the way of a frame."""
 
     name: ClassVar[str]
-    """As in reports and in ``Quality``."""
+    """Name in reports and in ``Quality``."""
     methods: ClassVar[Mapping[str, str]] = {"default": ""}
-    """Ways to do the work, cheapest first, and what tables say of each."""
+    """Methods by name, cheapest first, with a description each."""
     summary: ClassVar[str]
     """Work of the stage, in one line for ``explain``."""
     subject: ClassVar[str] = ""
     """Subject of its methods, for tables; only where there is a choice."""
     unread: ClassVar[str] = ""
-    """Why a plan can do without it where nothing reads what it writes."""
+    """Reason for ``explain`` when nothing reads its outputs."""
     converges: ClassVar[bool] = False
-    """True if its methods approximate one result, which the last of them gives; others are models of their own."""
+    """True if all methods approximate the last one's result; False if they are different models."""
     numerics: ClassVar[Numerics]
     """Precision of its results."""
     settings: ClassVar[tuple[str, ...]] = ()
     """Settings of ``Quality`` that it shares with other stages and that change its work: ``environment_height``,
     ``edge_samples``, ``light_shadow``."""
     unseen_method: ClassVar[str | None] = None
-    """Method for frames that nobody looks at, where the stage only shows the light; None: as in all frames."""
+    """Method for frames that are not shown, if the stage does not affect the light; None for no change."""
     remembers: ClassVar[tuple[str, ...]] = ()
-    """Its arrays that carry over from frame to frame, and so to the pipeline of another quality."""
+    """Arrays with state across frames, which a pipeline of another quality takes over."""
 
     follows: ClassVar[bool] = False
-    """True if it runs in every frame, read or not: what it remembers is a sum over all of them."""
+    """True if it must run in every frame because its state accumulates over all of them."""
 
     def __init__(self, features: Features, wiring: Wiring) -> None:
         self.features, self.wiring = features, wiring
@@ -247,11 +247,11 @@ class Stage(abc.ABC):
         """Called once in every frame in which the stage runs, before any of its passes."""
 
     def host_kernels(self) -> tuple[Any, ...]:
-        """Kernels that its steps on the host launch: they are compiled with the others."""
+        """Return kernels launched by its steps on the host, to compile them with the others."""
         return ()
 
     def idle(self, reach: Reach) -> str | None:
-        """Why what the stage writes is as if it did nothing in a frame; None where it may do something.
+        """Return the reason if the stage has no effect in a frame; else None.
 
         Its passes then write just that, whatever the stage reads. What it says may change only when something that it
         reads does, and is the same for the same ``reach``.
@@ -259,7 +259,7 @@ class Stage(abc.ABC):
         return None
 
     def reads_for(self, reach: Reach) -> tuple[str, ...]:
-        """Those of the resources that it reads on which what it writes may depend in a frame; as ``idle``."""
+        """Return the inputs that can affect this frame's output, like ``idle``."""
         return self.wiring.reads
 
     def rest(self) -> None:  # noqa: B027

@@ -103,7 +103,7 @@ class EnvironmentShadow(Stage):
         return Wiring(tuple(reads), ("shadow_ratio",))
 
     def idle(self, reach: Reach) -> str | None:
-        """Far from objects the environment is as it was."""
+        """Return a reason if no virtual object shades anything in the picture."""
         return None if reach.shadows else "no virtual object is near anything in the picture"
 
     def arrays(self) -> Mapping[str, ArraySpec]:

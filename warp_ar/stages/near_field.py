@@ -40,7 +40,7 @@ class RayCounts:
     mirror: int
     """Of a mirror, a square number."""
     known: bool
-    """True if samples only say what differs from the environment's irradiance, as it is known."""
+    """True if samples estimate only the difference from the known irradiance of the environment."""
 
 
 RAYS: Mapping[str, RayCounts] = MappingProxyType(
@@ -50,7 +50,7 @@ RAYS: Mapping[str, RayCounts] = MappingProxyType(
 
 
 def lobe_widths(material: MeshMaterial) -> tuple[float, float]:
-    """Least and largest width alpha of what a material mirrors, as ``kernels.near_field`` has it."""
+    """Return the least and largest lobe width alpha of a material, as ``kernels.near_field`` defines it."""
     surface = material.surface
     match surface:
         case MetallicRoughnessMaterial():

@@ -29,7 +29,7 @@ class SummedArea(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Reads the frame alone; where it is wanted deeper than 8 bits, what these cut off has a table too."""
+        """Read the frame; deeper frames also get a table of the residual below 8 bits."""
         if SUMMED_CUT in box_reads(features):
             return Wiring(frame_reads(features), (SUMMED, SUMMED_CUT))
         return Wiring(("frame",), (SUMMED,))

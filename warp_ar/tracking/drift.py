@@ -1,4 +1,4 @@
-"""A camera's exposure and white balance that drift while frames run, told from what stands still in them.
+"""Drift of a camera's exposure and white balance, estimated from still surfaces.
 
 A camera that meters for itself scales the whole picture: every surface, lit or in shadow, becomes brighter by the same
 factor per channel. Light that changes does not: what an emitter reaches follows it, what lies in its shadow does not.
@@ -45,7 +45,7 @@ GRID = 21
 LEAST_POINTS = 24
 """Points that must be seen again."""
 LEAST = 0.05
-"""Logarithm of the gain, over all channels, from which a drift is believed."""
+"""Least logarithm of the gain over all channels that counts as a drift."""
 AGREEING = 0.7
 """Share of points that must agree."""
 SPREAD = 0.3
@@ -104,7 +104,7 @@ class ExposureDrift:
         self.gain: Array = np.ones(3)
         """Factor of the camera on radiance, against its first frame, RGB."""
         self.saturation = np.full(3, 255.0)
-        """Code at which each channel saturates, as far as frames have told."""
+        """Estimated code at which each channel saturates."""
         self.contrast = 0.0
         """Of the camera's tone curve, as ``without_contrast`` takes it."""
 

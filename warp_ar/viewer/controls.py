@@ -136,7 +136,7 @@ class Feed:
     owner: object = None
     """The viewer whose camera it is."""
     estimated: bool = False
-    """True once frames have told the camera's focal length."""
+    """True once the camera's focal length has been estimated from frames."""
 
     @property
     def is_browser(self) -> bool:
@@ -322,7 +322,7 @@ class Controls:
         return True
 
     def use_estimate(self, camera: Camera, feed: Feed) -> bool:
-        """Take the camera that frames of a feed have told; False if the feed has been left."""
+        """Use the camera estimated from a feed's frames; return False if the feed has been left."""
         with self.changed:
             if self._next is not None or self.feed is not feed:
                 return False

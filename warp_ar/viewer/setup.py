@@ -217,7 +217,7 @@ class SetupChecks:
 
     @property
     def estimating(self) -> bool:
-        """True until the frames of a guessed camera have told its focal length."""
+        """True while the focal length of a guessed camera is still unknown."""
         return self._guesses and not self._controls.feed.estimated
 
     def _estimate_focal(self, feed: Feed) -> None:
@@ -275,7 +275,7 @@ class SetupChecks:
         return ""
 
     def _valid(self) -> frozenset[str]:
-        """Return the steps whose result is that of the set-up as it is: undo takes it back, redo brings it again."""
+        """Return the steps whose results the present set-up holds, so that undo and redo follow them."""
         made = {name: step.made for name, step in self._steps.items() if step.made is not None}
         try:
             now = _state_of(self._shown()[0]) if made else {}

@@ -133,15 +133,15 @@ def _plain(stem: str) -> str:
 
 
 MOST_FILES: Final = 32
-"""Files that one run of the page keeps: edits that are undone still need theirs."""
+"""Largest number of dropped files in one run; undone edits keep theirs for redo."""
 MOST_KEPT_BYTES: Final = 1 << 29
-"""Bytes of all files that one run of the page keeps: 512 MB."""
+"""Largest total of bytes of dropped files in one run: 512 MB."""
 MOST_TRIANGLES: Final = 1_000_000
-"""Of a mesh: beyond that a page waits too long."""
+"""Largest number of triangles of a dropped mesh; more take the page too long."""
 SIZES: Final = (0.02, 0.4)
 """Metres: least and largest longest side of an object on a desk."""
 USUAL: Final = 0.12
-"""Metres: the longest side of a mesh whose units cannot be told."""
+"""Longest side, metres, given to a mesh of unknown units."""
 PLACE: Final = (0.12, -0.08)
 """Place of a dropped mesh, metres."""
 LIGHTS: Final = (".exr", ".hdr")

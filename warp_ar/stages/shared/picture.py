@@ -45,7 +45,7 @@ def layers_of(arrays: Mapping[str, Any]) -> composite.Layers:
 SUMMED = "summed_area"
 """Resource: the frame's summed-area table."""
 SUMMED_CUT = "summed_area_cut"
-"""Resource: that of what 8 bits cut off, for frames of more."""
+"""Resource: summed-area table of the residual below 8 bits, for deeper frames."""
 
 
 def box_reads(features: Features) -> tuple[str, ...]:
