@@ -70,13 +70,14 @@ def _page_address(options: argparse.Namespace) -> Address:
     return Address(options.host, port, options.token if known else secrets.token_hex(16), tls, origins)
 
 
-def _make_page_host(options: argparse.Namespace, scene: Scene, **callbacks: Any) -> Any:
+def _make_page_host(options: argparse.Namespace, scene: Scene, checking: threading.Thread, **callbacks: Any) -> Any:
     """Return the host of a page that is served already, on its own thread: it loads Warp and all that uses it."""
     from warp_ar.device import bound_arenas
 
     start_device(options.device)
     from warp_ar.viewer.host import Host
 
+    checking.start()  # not beside the imports: Python 3.11's parser is not safe in two threads
     bound_arenas()
     # Imports stay: looking through them for garbage would hold up a frame for a tenth of a second.
     gc.collect()
@@ -119,7 +120,6 @@ def serve_page(options: argparse.Namespace) -> int:
     address = _page_address(options)
     # Beside the page, which does not wait for it.
     checking = threading.Thread(target=say_quick_check, args=(options, scene), daemon=True)
-    checking.start()
 
     def ready(address: Address) -> None:
         print(f"warp_ar: {printable(scene.name)} is at {address.url} (Ctrl-C ends it)", flush=True)
@@ -132,7 +132,7 @@ def serve_page(options: argparse.Namespace) -> int:
 
     # A shell that starts this in the background has it ignore the signal; here it is the only way to end.
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    server = Server(functools.partial(_make_page_host, options, scene), address)
+    server = Server(functools.partial(_make_page_host, options, scene, checking), address)
     code, before = EXIT_DONE, tempfile.tempdir
     # All temporary folders of this run, Warp's own for each thread that compiles among them.
     tempfile.tempdir = folder = tempfile.mkdtemp(prefix="warp_ar_page_")
@@ -150,7 +150,8 @@ def serve_page(options: argparse.Namespace) -> int:
         shutil.rmtree(folder, ignore_errors=True)
         gc.unfreeze()  # whoever called goes on with a collector that sees all
     interrupted = code in (EXIT_INTERRUPTED, EXIT_TERMINATED)
-    checking.join(0.0 if interrupted else CHECKING_S)
+    if checking.ident is not None:
+        checking.join(0.0 if interrupted else CHECKING_S)
     if not server.ended or interrupted or checking.is_alive():
         # A frame of the reference, a kernel that is compiled, or the check of the scene takes seconds and cannot be
         # stopped, and Python would wait for its thread, or end it within native code, which aborts. All files are

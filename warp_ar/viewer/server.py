@@ -477,7 +477,7 @@ class Server:
 
     async def _drop(self, request: web.Request) -> web.Response:
         """Take a file that was dropped onto the picture; the answer says in words what became of it."""
-        host = await self.started()
+        host, name = await self.started(), request.match_info["name"]
         if self._coming >= DROPS:
             return web.Response(status=429, text=f"{DROPS} files are on their way already: wait until one is there\n")
         self._coming += 1
@@ -485,15 +485,15 @@ class Server:
             # A bound of its own, for all other requests have none worth the name; and not for ever.
             async with asyncio.timeout(DROP_SECONDS):
                 data = await request.clone(client_max_size=MOST_BYTES).read()
-            words = await self.aside(host.drop, request.match_info["name"], data)
+            words = await self.aside(host.drop, name, data)
         except web.HTTPRequestEntityTooLarge:
-            refused = web.Response(status=413, text=f"more than {MOST_BYTES >> 20} MB; no more are taken\n")
+            refused = web.Response(status=413, text=f"{name}: more than {MOST_BYTES >> 20} MB, the most of one file\n")
             refused.force_close()
             return refused
         except TimeoutError:
-            return web.Response(status=408, text="the file took too long\n")
+            return web.Response(status=408, text=f"{name} took too long\n")
         except ConnectionError:  # nobody hears it: the sender has gone
-            return web.Response(status=400, text="the file did not come whole\n")
+            return web.Response(status=400, text=f"{name} did not come whole\n")
         except SinkError as error:
             return web.Response(status=507, text=f"{error}\n")
         except Exception as error:

@@ -1,6 +1,7 @@
 // The picture: decodes frames, draws them with the split, and measures how late and how often they are shown.
 
 const median = (values) => [...values].sort((a, b) => a - b)[values.length >> 1];
+const WINDOW = 2000; // milliseconds that rate and latency are of: longer, and they tell of what was before
 
 export class View extends EventTarget {
   split = 0.5;
@@ -72,14 +73,15 @@ export class View extends EventTarget {
       if (from !== null) {
         if (stats.stamped !== (frame.stamp !== null)) this.#delays = [];
         stats.stamped = frame.stamp !== null;
-        this.#delays.push(Math.max(performance.now(), now) - from);
-        if (this.#delays.length > 90) this.#delays.shift();
-        stats.latency = median(this.#delays);
+        const shown = Math.max(performance.now(), now);
+        this.#delays = this.#delays.filter(([at]) => at > shown - WINDOW);
+        this.#delays.push([shown, shown - from]);
+        stats.latency = median(this.#delays.map(([, delay]) => delay));
       }
     });
     const now = performance.now();
     this.#times.push(now);
-    while (this.#times.length > 2 && this.#times[0] < now - 2000) this.#times.shift();
+    while (this.#times.length > 2 && this.#times[0] < now - WINDOW) this.#times.shift();
     const span = now - this.#times[0];
     stats.fps = span > 0 ? ((this.#times.length - 1) * 1000) / span : 0;
     stats.shown += 1;
