@@ -49,7 +49,7 @@ STATE = (
 """Columns of the one row of the state."""
 
 STAGE = ("waits", "first_pass", "last_pass", "current", "ready", "first_reader", "last_reader")
-"""Of a stage: inputs that are not there, its passes and the current one, whether that may be taken, who reads it."""
+"""Fields of a stage: missing inputs, its passes and the current one, whether that may be taken, its readers."""
 
 PASS = (
     "first_call",

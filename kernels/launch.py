@@ -72,7 +72,7 @@ class Note:
     record: Callable[[], wp.Launch] | None = None
     """Loads the kernel and packs its arguments; the launch is over all rows, its first input being 0."""
     arrays: tuple[wp.array, wp.array] | None = None
-    """Of a copy: target and source."""
+    """Target and source of a copy."""
     block_dim: int = 256
     """Threads of a block, on CUDA."""
     tiles: bool = False

@@ -31,7 +31,7 @@ CARDS = tuple(
 )
 """Files of the card: name, paper, dots per inch."""
 DEFAULT_RADIUS = 0.035
-"""Of the ball, metres."""
+"""Radius of the ball, metres."""
 
 
 def make_parser() -> argparse.ArgumentParser:

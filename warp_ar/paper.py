@@ -37,9 +37,9 @@ except ImportError as error:
 
 READINGS = "readings"
 QUALITY = 88
-"""Of WebP."""
+"""WebP's quality."""
 ENDINGS = (".webp", ".svg", "a.svg", "b.svg")
-"""Of a figure's files: its picture, and one plot or two."""
+"""Endings of a figure's files: its picture, and one plot or two."""
 PAGE = "figures.md"
 
 

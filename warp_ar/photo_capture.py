@@ -69,7 +69,7 @@ class Capture:
     shown: Path
     """That photograph."""
     camera: Camera
-    """Of that photograph."""
+    """Camera of that photograph."""
     picture: Image
     """That photograph, uint8 RGB, upright."""
     support: Support | None

@@ -41,7 +41,7 @@ _LEADS = rb"""\s*\{\s*"program":\s*"|%YAML[: ][\d.]+\s*(?:---\s*)?program: "?|""
 COMMENT = f"<!-- {PROGRAM} -->"
 """Start of a chart or a text in Markdown, and behind the document type of a page."""
 _SOFTWARE_TAG = 0x0131
-"""Of EXIF."""
+"""EXIF's tag of the software."""
 
 
 def sign_png(data: bytes) -> bytes:

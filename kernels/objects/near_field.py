@@ -89,8 +89,8 @@ SHARP = wp.constant(wp.float32(SHARP_ALPHA))
 RAY_WIDTH = 2.0
 """Width of one ray of many, over the width that its share of the lobe has."""
 LOBE_ANGLE = 1.0
-"""Side of such a ray's footprint in the frame, as an angle, over its width. A ray's share would be a square of 1.77;
-a smaller one crosses fewer edges of the surface."""
+"""Side of such a ray's footprint in the frame, as an angle, over its width. The whole share of a ray has a side of
+1.77, but so wide a footprint would cross the edges of its surface."""
 SAME_SURFACE = wp.constant(wp.float32(0.5))
 """Least cosine between the normals of neighbours that estimate a mirror's curvature."""
 MIN_LIGHT = wp.constant(wp.float32(1.0e-6))

@@ -43,7 +43,7 @@ from warp_ar.kernels.structs import BOX, MESH, PLANE, SPHERE, Hit, Probe, RaySce
 wp.set_module_options({"enable_backward": False})
 
 ALL_KINDS = tuple(sorted(map(int, (SPHERE, BOX, PLANE, MESH))))
-"""Of shapes."""
+"""All kinds of shapes."""
 
 
 @wp.func

@@ -36,7 +36,7 @@ from warp_ar.kernels.structs import FrameParams, Light, Probe, RayScene
 wp.set_module_options({"enable_backward": False})
 
 MIN_REFLECTANCE = wp.constant(wp.float32(0.05))
-"""Of a ball that is a mirror at all: what a pixel shows is divided by it."""
+"""Least reflectance of a mirror ball, by which a pixel's radiance is divided."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -54,7 +54,7 @@ class Reading:
     """Choices of equation (1) that the paper's text leaves open; the defaults are the letter of the text."""
 
     values: Literal["video", "linear"] = "video"
-    """Of the multiplicative factor: codes over 255 as the shader samples them, or linear luminance."""
+    """Values of the multiplicative factor: codes over 255 as in the paper's shader, or linear luminance."""
     blend: Literal["text", "shader"] = "text"
     """The three cases of the text, or the printed shader's lerp, which differs where alpha is negative."""
     weighted: bool = False
@@ -71,7 +71,7 @@ READINGS: Mapping[str, Reading] = MappingProxyType(
 )
 """Ways to take equation (1), by name: the method, and readings that docs/paper.md compares with it."""
 DEFAULT_REFLECTANCE = wp.constant(wp.float32(0.5))
-"""Of a receiver that nothing is known about: the material of ``flat`` and ``paper``, the prior of ``reflectance``."""
+"""Reflectance of an unknown receiver: the material of ``flat`` and ``paper``, the prior of ``reflectance``."""
 PRIOR_WEIGHT = wp.constant(wp.float32(0.002 * math.pi))
 """Irradiance at which the prior counts as much as the frame: that of a white receiver at half a code of 255."""
 

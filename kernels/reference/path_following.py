@@ -76,7 +76,7 @@ GOLDEN = wp.constant(wp.float32(0.61803399))
 SILVER = wp.constant(wp.float32(0.41421356))
 """Steps between candidates, which spread them evenly."""
 MOST_RANDOM = wp.constant(wp.float32(0.99999994))
-"""Of what is drawn from [0, 1)."""
+"""Largest random number below 1."""
 
 SURFACE = wp.constant(0)
 RAY = wp.constant(1)

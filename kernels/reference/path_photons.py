@@ -86,11 +86,11 @@ START = wp.constant(2)
 ON_EMITTER = wp.constant(3)
 """Streams of random numbers by which a path starts."""
 UNIT = wp.constant(wp.float32(16777216.0))
-"""Of what is summed."""
+"""Fixed-point unit of the sums."""
 MOST = wp.constant(wp.float32(8192.0))
 """That a path adds at most: of its own pixel's radiance, were it the only one of a pass."""
 LEAST_VERSINE = wp.constant(wp.float32(1.0e-6))
-"""Of the cone toward an object: half an angle of 0.08 degrees."""
+"""Least versine of the cone toward an object: a half angle of 0.08 degrees."""
 COUNTERS = 1024
 """Sums of rays."""
 

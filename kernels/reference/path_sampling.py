@@ -59,7 +59,7 @@ wp.set_module_options({"enable_backward": False})
 
 PI = wp.constant(wp.float32(math.pi))
 ALL_MODELS = tuple(sorted(map(int, (LAMBERT, PHONG, METALLIC_ROUGHNESS, MIRROR))))
-"""Of materials."""
+"""All models of materials."""
 NO_DENSITY = wp.constant(wp.float32(-1.0))
 """Marker in place of a density for directions without one: of a mirror or the camera."""
 LEAST_CHANCE = wp.constant(wp.float32(0.1))
@@ -71,7 +71,7 @@ STREAMS = wp.constant(16)
 SEED_STEP = wp.constant(wp.uint32(0x9E3779B9))
 
 LEAST_COSINE = wp.constant(wp.float32(0.1))
-"""Between a ray and the sphere that an emitter lies on: one that is seen from the side is not thin."""
+"""Least cosine between a ray and the sphere of an emitter; an emitter seen from the side is not thin."""
 
 reflect_direct = make_reflect_direct(ALL_MODELS)
 

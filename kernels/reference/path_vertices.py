@@ -37,7 +37,7 @@ PROXY = wp.constant(2)
 BALL = wp.constant(3)
 """Kind of thing that a ray meets."""
 LEAST_WEIGHT = wp.constant(wp.float32(0.25))
-"""Of the frame's four pixels around a point, what those of its surface must have for the frame to show it."""
+"""Least bilinear weight of the four pixels around a point that show its surface, for the point to count as seen."""
 
 
 @wp.struct

@@ -26,7 +26,7 @@ Mask = npt.NDArray[np.bool_]
 LIGHT_RADIUS = 0.02
 """Metres, of ``sized_light``: a light bulb."""
 SIZED = ", sized light"
-"""At the end of such a case's name."""
+"""Suffix of the name of such a case."""
 VERSIONS = ("both", "object", "light", "dark_50", "dark_25")
 """Kinds of truth that a case may have; ``object`` and ``light`` are swept only where there is no ``both``."""
 

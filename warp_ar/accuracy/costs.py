@@ -52,7 +52,7 @@ class Costs:
     base: float
     """Milliseconds per frame of the preset that methods were measured from, tracking included."""
     methods: Mapping[str, Mapping[str, float]]
-    """By setting and method: milliseconds per frame more than the base takes."""
+    """Milliseconds per frame above the base, by setting and method."""
     track: float = 0.0
     """Milliseconds of ``base`` that tracking takes."""
 

@@ -29,7 +29,7 @@ class KnownFrame:
     """A frame, and what the pipeline knew when it lit it."""
 
     scene: Scene
-    """With its camera at the frame's size."""
+    """The scene, its camera scaled to the frame's size."""
     image: Image
     """The camera's picture."""
     lit: Image
@@ -37,7 +37,7 @@ class KnownFrame:
     pose: Pose
     """``camera_from_world``."""
     light: Light
-    """Of the environment; emitters of known distance are in ``Light.emitters``."""
+    """Light of the environment; emitters of known distance are in ``Light.emitters``."""
     seconds: float
     """Since the first frame."""
     milliseconds: float

@@ -27,15 +27,15 @@ from warp_ar.light.config import CONFIG
 from warp_ar.scene import Pose, Scene
 
 WIDTH = 160
-"""Of the pictures by which reflectance is found, in pixels."""
+"""Width, pixels, of the pictures that measure reflectance."""
 SAMPLES = 16
-"""Of each of their pixels."""
+"""Samples of each of their pixels."""
 GRAIN = 0.1
 """Deviation of a reflectance's logarithm, about that of wood or paper, beyond which it counts less and less."""
 SHOWN = (0.01, 0.95)
 """Radiance between which a pixel tells reflectance, in camera values."""
 LEAST_PIXELS = 50
-"""Of a proxy that is to say anything."""
+"""Least number of a proxy's pixels for an estimate."""
 WORTH = 0.1
 """Fall of the cost, as a share of it, that a place must be worth: grain and clutter look like shadows by chance."""
 MOST = 3
@@ -46,7 +46,7 @@ BOUND = 0.9 * FARTHEST
 """Metres beyond which nothing is placed: what does best where the search ends has no place, such as paint that is
 darker toward one side under light from afar."""
 STEPS = 6
-"""Of the search between two distances that were tried."""
+"""Steps of the search between two tried distances."""
 GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 
 

@@ -58,17 +58,17 @@ DEFAULT_SAMPLES = 256
 LIGHT_SAMPLES = 32
 """Per pixel, by which the reflectance of proxies is found before the picture."""
 FIRST_LIGHT_SAMPLES = 4
-"""Of these, those after which the mean reflectance of each proxy is known."""
+"""Number of these samples after which each proxy's mean reflectance is known."""
 UNKNOWN_REFLECTANCE = 0.5
-"""Of a proxy that no pixel shows."""
+"""Reflectance of a proxy that no pixel shows."""
 DFG_SIZE = 32
 """Rows and columns of the table of directional albedo."""
 PART = 2048
 """Samples that a thread takes at a time, on CPU."""
 MOST_SAMPLES = 1 << 21
-"""Of a round on a CPU, where a pass has no more."""
+"""Largest number of samples of a round on a CPU."""
 MOST_CUDA_SAMPLES = 1 << 25
-"""Of a round on a GPU, where a pass has no more, and memory has ``SAMPLE_BYTES`` free for each."""
+"""Largest number of samples of a round on a GPU with ``SAMPLE_BYTES`` of free memory for each."""
 SAMPLE_BYTES = 512
 """That must be free for each: several times what it takes."""
 PATHS_OF_LIGHTS = 0.25

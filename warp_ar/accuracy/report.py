@@ -25,7 +25,7 @@ from warp_ar.signature import PROGRAM
 from warp_ar.stages.quality import PRESETS
 
 MIN_COLUMNS = 110
-"""Of the tables: where output is no terminal, narrower ones would be cut."""
+"""Least width of tables without a terminal, so that none is cut."""
 
 
 def make_cost_table(reports: Sequence[CaseReport], device: str) -> dict[str, Any]:

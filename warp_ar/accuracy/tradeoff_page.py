@@ -21,7 +21,7 @@ from warp_ar.accuracy.pictures import Box, bounding_box, crop, error_colors
 from warp_ar.signature import COMMENT
 
 QUALITY = 82
-"""Of WebP, for all pictures."""
+"""WebP's quality of all pictures."""
 SHOWN = ("paper", SAME_TIME, "medium", "high")
 """Wholes whose pictures are shown."""
 REAL_TIME = 1e3 / 30.0

@@ -43,7 +43,7 @@ NEAR_SHARE = 0.15
 DISC_SHARE = 0.15
 """Share of a ball's cells that have."""
 EVERY = 3
-"""Of the points all over, one of so many is looked at."""
+"""Stride through the scene's still points."""
 LEAST_POINTS = 24
 """Points that must be seen again, all over."""
 LEAST_NEAR = 8
@@ -53,10 +53,10 @@ PATIENCE = 1.5
 MEMORY = 0.3
 """Time constant in seconds with which remembered codes follow frames."""
 DISC_SECONDS = 0.008
-"""Between two looks at the balls' discs: cameras of up to 120 frames a second have each frame looked at. What moves by
-a metre in a second goes 8 mm meanwhile."""
+"""Least seconds between two tests of the balls' discs: every frame up to 120 frames a second. An object at 1 m/s
+moves 8 mm meanwhile."""
 LOOK_SECONDS = 0.1
-"""Between two looks at the points while no ball's disc changes: they take four times as long as the discs."""
+"""Least seconds between two tests of the points while no disc changes; they take four times as long as the discs."""
 RINGS = (1.2, 1.7, 2.4, 3.4, 5.0)
 """Radii of the circles on planes around a ball on which points lie, over the ball's."""
 BESIDE = (1.1, 3.0)

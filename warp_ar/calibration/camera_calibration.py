@@ -29,7 +29,7 @@ from warp_ar.tracking.markers import make_board
 
 Image = NDArray[np.uint8]
 _Views: TypeAlias = list[tuple[NDArray[Any], NDArray[Any], NDArray[Any]]]
-"""Of each view the corners in pixels, their numbers, and where they are on the board."""
+"""Corners of each view in pixels, their numbers, and their places on the board."""
 
 _MOVED = 0.03
 """Share of the picture's diagonal that a board's corners must have moved for another view of it to be taken."""
@@ -265,7 +265,7 @@ class _Solution:
     distortion: NDArray[Any]
     """k1 k2 p1 p2 k3 of a pinhole, k1 k2 k3 k4 of a fisheye."""
     rotations: Sequence[NDArray[Any]]
-    """Of the board in each view, as vectors."""
+    """Rotation vectors of the board in each view."""
     deviation: float
     """Standard deviation of the focal length by independent corners, pixels; 0: not known."""
     view_errors: NDArray[Any]

@@ -80,7 +80,7 @@ must not outvote what is expected of the curve and the ink."""
 ZONES: Final = 3
 """The board's cells are averaged over so many zones along x and y: neighbours share what is wrong with them."""
 _LIMITS: Final = ((0.015, 0.25), (-0.1, 0.1))
-"""Of k and of the ink's spread: beyond them a flat curve would explain anything."""
+"""Bounds of k and of the ink's spread; beyond them a flat curve would fit anything."""
 _STEPS: Final = 12
 _TERMS: Final = len(BENDS)
 

@@ -62,7 +62,7 @@ ABOVE_LUMA = 0.15
 NEUTRAL = 3.0
 """Codes by which the median pixel of a plateau of luma may be off it, in each channel."""
 LUMA = np.array([0.299, 0.587, 0.114])
-"""Of JPEG and most video: ITU-R BT.601."""
+"""Weights of luma in JPEG and most video, ITU-R BT.601."""
 RINGING = 17
 """Codes by which compression exceeds a plateau."""
 LEAST_HEAP = 2e-4
@@ -72,7 +72,7 @@ INSIDE = 0.95
 WATCHED = 24
 """First frames of a camera, each of which is looked at."""
 PERIOD = 12
-"""Of later frames one of so many is."""
+"""Interval, in frames, between later measurements."""
 WIDTH = 1
 """Codes to either side of a plateau's own that belong to it."""
 WIDE = 2

@@ -122,7 +122,7 @@ def _check_ball(
 def _check_reflectance(
     scene: Scene, look: Look, views: Sequence[tuple[Image, Pose]], probe: Probe, label: str
 ) -> list[Finding]:
-    """The finding that what the ball mirrors is too bright or too dark there for its reflectance."""
+    """Return a finding if the ball's mirror image is too bright or too dark for its reflectance."""
     measured = [measure_reflectance(scene, look.camera, probe, view, look.table) for view in views]
     told = [one for one in measured if one is not None]
     if not told or 2 * len(told) < len(views):

@@ -20,7 +20,7 @@ from warp_ar.scene.screen_extents import EMPTY, ball_outline, screen_rects
 Array = npt.NDArray[np.float64]
 
 MOST_POSES: Final = 120
-"""Of a recording's poses so many are looked at."""
+"""Largest number of a recording's poses that are checked."""
 
 
 def check_objects(scene: Scene, camera: Camera, poses: Sequence[Pose]) -> list[Finding]:

@@ -80,13 +80,13 @@ class Look:
     """Frames of a scene, and where the marker is in them."""
 
     camera: Camera
-    """Of the frames' size."""
+    """Camera at the frames' size."""
     images: tuple[Image, ...]
     """All frames that were looked at, RGB."""
     views: tuple[tuple[Image, Pose], ...]
     """Those with the marker, with ``camera_from_world``."""
     errors: tuple[float, ...]
-    """Of those, root mean square distance of the print's edges from where the pose has them, pixels."""
+    """Root mean square distance, pixels, of the print's edges from their places by the pose, for each of those."""
     table: NDArray[np.float32]
     """Linear value of each code, (256, 3)."""
 

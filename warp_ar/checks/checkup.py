@@ -30,7 +30,7 @@ SPREAD: Final = 96
 _NOT_LOOKED: Final = ("source.", "units.", "marker.", "picture.", "camera.aspect", "ball.unfound", "ball.outside")
 """Beginnings of findings after which a ball was not looked for, or one of several not seen."""
 PIXELS: Final = 640 * 480
-"""Of larger pictures so many fewer frames are read that it takes as long."""
+"""Pixels of a picture above which fewer frames are read, for the same total."""
 
 
 def check_up(

@@ -39,9 +39,9 @@ from warp_ar.tracking.drift import ExposureDrift
 from warp_ar.tracking.tracking import Places
 
 _CLOCK = struct.Struct("<2f2i")
-"""Of the frame's values, one behind the other: ``time``, ``time_step``, ``frame_index``, ``environment_reset``."""
+"""Layout of the frame's values ``time``, ``time_step``, ``frame_index`` and ``environment_reset``."""
 _ALL_RECTS = ("object", "light", "direct", "shadow", "ball")
-"""As the frame's values hold them, one behind the other."""
+"""Rectangles in their order in the frame's values."""
 RECTS = ("object", "light", "shadow", "ball")
 """Parts of the screen to whose rows passes keep; the frame's values hold them whole."""
 
@@ -133,7 +133,7 @@ class FrameInputs:
         self._all_rects = values.view(np.uint8)[values.dtype.fields[f"{_ALL_RECTS[0]}_rect"][1] :].view(np.int32)
         self._clock = values.view(np.uint8)[values.dtype.fields["time"][1] :].data
         self._looked_at: tuple[Any, ...] | None = None
-        """From where at what, when rectangles were written last."""
+        """Pose and contents at the last writing of rectangles."""
         self._shines = True
         self._add(scene, device)
         self._params["focal"][0] = (camera.fx, camera.fy)

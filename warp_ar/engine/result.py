@@ -35,7 +35,7 @@ class Rendered:
     environment_array: Any
     stages: Mapping[str, StageTiming]
     render_ms: float = 0.0
-    """Of the host: running the stages on CPU, launching them on CUDA."""
+    """Milliseconds of the host: to run the stages on CPU, to launch them on CUDA."""
     layers: LayerArrays | None = None
     """The layers that were asked for, on the device or kept; None: none were."""
     image: Picture | Image | None = None
@@ -81,7 +81,7 @@ class Result:
     """Result of one frame; of a submitted one, all but the pose waits until it has been rendered."""
 
     pose: Pose | None
-    """From marker to camera; None while the marker is lost or when nothing needed it."""
+    """Pose from marker to camera; None while the marker is lost or if nothing needed it."""
     state: TrackState | None
     """Tracked, held or lost; None when nothing needed the pose."""
     _rendered: Future[Rendered]

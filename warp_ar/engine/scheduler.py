@@ -38,8 +38,8 @@ class StageTiming:
     """Work of one stage in one frame."""
 
     milliseconds: float
-    """On CPU the stage's share of the time that all took, by the time that its bands took; on CUDA, unless the pipeline
-    profiles, an equal share of the time that launching took the host."""
+    """On CPU the frame's time in proportion to that of the stage's bands. On CUDA, unless the pipeline profiles, an
+    equal share of the host's launch time."""
     skipped: bool
     """True: nothing that it reads had changed, or it was left out of this frame."""
     left_out: str | None = None

@@ -41,7 +41,8 @@ COPY_BYTES = 3_000_000
 at the interpreter. Of a frame that is smaller than two such parts the caller's thread copies all."""
 
 FRAME_BYTES = 1 << 29
-"""Of the frames that ``new_frame`` gives, together; who keeps more gets ordinary memory, which is copied when sent."""
+"""Largest total of bytes of pinned frames by ``new_frame``; more are in ordinary memory, which is copied before the
+transfer."""
 
 MARKED = 16
 """Frames whose times on the device are remembered."""
@@ -59,7 +60,7 @@ class Slot:
     """Buffers of one frame under way."""
 
     marks: Marks
-    """Of the frame that was uploaded last."""
+    """Events of the last uploaded frame."""
 
     def __init__(self, shape: tuple[int, int], device: Any) -> None:
         self.own = Pinned(shape)

@@ -169,7 +169,7 @@ class Dataset:
     """The values of ``[dataset]``."""
 
     variations: int
-    """Of each clip."""
+    """Variations of each clip."""
     seed: int
     objects: tuple[int, int]
     """Least and most objects of a picture."""
@@ -348,12 +348,12 @@ class _Chosen:
     """The first draws of a variation."""
 
     kinds: list[int]
-    """Of its objects, numbers in the catalogue; some may find no place."""
+    """Catalogue numbers of its objects; some may find no place."""
     lights: list[int]
-    """Of its lights, numbers in their list."""
+    """Numbers of its lights in their list."""
     exposure: float
     random: np.random.Generator
-    """For what is drawn next."""
+    """Generator of the following random numbers."""
 
 
 def _draw_kinds(dataset: Dataset, clip: int, variation: int) -> _Chosen:

@@ -51,7 +51,7 @@ class Settings:
     decode: str = DECODERS[0]
     """One of ``DECODERS``."""
     coding: str = AS_RECORDED
-    """Of what is written: one of ``CODINGS``, or ``AS_RECORDED``."""
+    """Coding of the output: one of ``CODINGS``, or ``AS_RECORDED``."""
     digests: bool = False
     """True if digests of recordings' pictures are kept, as they were before they were encoded."""
 
@@ -65,7 +65,7 @@ class Clip:
     """One recording."""
 
     name: str
-    """Of its files; no other clip has it."""
+    """Name of its files, unique among clips."""
     scene: str
     """A scene file or a bundled scene's name."""
     source: Path | None = None
@@ -73,7 +73,7 @@ class Clip:
     light: Path | None = None
     """Captured light instead of a mirror ball's."""
     calibration: Path | None = None
-    """Of the camera, instead of the scene's numbers."""
+    """Calibration file instead of the scene's camera."""
     first: int = 0
     """Number of the first frame that is lit."""
     end: int | None = None
@@ -98,7 +98,7 @@ class Job:
     clip: int = 0
     """Number of the clip."""
     number: int = 0
-    """Of the segment or variation in its clip."""
+    """Number of the segment or variation in its clip."""
     first: int = 0
     """Number of the first frame, for segments and variations."""
     end: int = 0
@@ -344,7 +344,7 @@ class Context:
 
     jobs: JobFile
     folder: Path
-    """Of the run."""
+    """Folder of the run."""
     device: str
     """``cpu`` or ``cuda:N``."""
     worker: int = 0
@@ -358,13 +358,13 @@ class Outcome:
     state: str
     """``done``, ``failed``, or ``full``: the disk is."""
     values: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Of the manifest's line."""
+    """Values for the manifest's line."""
     reason: str = ""
     """The error, on one line."""
 
 
 _LIBRARIES = ("warp-lang", "numpy", "opencv-contrib-python-headless", "av")
-"""Of what else pictures and their bytes depend on."""
+"""Libraries whose versions change pictures or their bytes."""
 
 
 @functools.cache

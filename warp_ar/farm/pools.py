@@ -29,9 +29,9 @@ from warp_ar.farm.jobs import Context, Job, Outcome, program_version
 from warp_ar.farm.manifest import RunError
 
 CORES = 4
-"""Of a worker on CPU: more of them leave stages of few rows waiting."""
+"""Processor cores of a worker on CPU; stages of few rows cannot use more."""
 GPU_CORES = 2
-"""Of a worker on a GPU, which keeps about so many busy with decoding and encoding."""
+"""Processor cores of a worker on a GPU, for decoding and encoding."""
 MOST_OF_GPU = 16
 """Workers that share a GPU unless more are asked for: each holds its arrays there."""
 DEATHS = 5
@@ -193,7 +193,7 @@ class ProcessPool(Pool):
 
 
 _worker: tuple[Any, Sequence[int]] | None = None
-"""Of this process, if it is a worker: it does its jobs, and the cores of all workers."""
+"""Worker that does the jobs of this process, and the cores of all workers; None in the driver."""
 
 
 def _begin(context: Context, cores: Sequence[int], every: Sequence[int]) -> None:

@@ -201,7 +201,7 @@ class _Look:
     kept: tuple[Map, npt.NDArray[Any] | None] | None = None
     """Those of the last key."""
     shape: tuple[int, ...] = (0, 0, 3)
-    """Of every map."""
+    """Shape of every map."""
 
     def take(self, frame: int, result: Result) -> None:
         """Wait for the pose and the light of a frame; where all of its light is wanted, ``keep`` it."""

@@ -24,7 +24,7 @@ from warp_ar.output.video_sink import VideoSink, tag_for_players
 from warp_ar.signature import PROGRAM
 
 ENCODER_THREADS = 2
-"""Of x264 and x265, on every machine."""
+"""Threads of x264 and x265, the same on every machine."""
 _X264 = "rc-lookahead=10:mbtree=1"
 """With these of `veryfast`, x264's preset `superfast` looks no less far ahead. What it leaves out is the search for
 motion by fractions of a pixel: three fifths of the processor time for a twentieth more bytes and 0.1 codes of error."""

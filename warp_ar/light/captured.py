@@ -36,7 +36,7 @@ BRIGHT = 6.0
 """Times the mean radiance from which on a texel is part of an emitter."""
 MOST_EMITTERS = 12
 LEAST_SHARE = 0.01
-"""Of the irradiance that all directions bring, what an emitter must have to be listed."""
+"""Least share of the irradiance of all directions for a listed emitter."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -36,15 +36,16 @@ class SurfaceConfig:
     face_steps: int = 5
     """at most this many in each of a face's two directions."""
     noise: tuple[float, ...] = (0.02, 0.04, 0.12, 0.04)
-    """Relative standard deviation of one equation, by kind, where points scatter so much or are too few to tell."""
+    """Relative standard deviation of an equation, by kind, if points scatter by as much or are too few to measure
+    it."""
     least_noise: float = 0.015
-    """The same of the most even surface: transport that the model leaves out."""
+    """Least relative standard deviation, of an even surface: transport outside the model."""
     scatter_points: int = 12
-    """Points of a surface that tell how much they scatter."""
+    """Least number of a surface's points that measure their scatter."""
     scatter_iterations: int = 5
-    """Of reweighting by which shadows and stains are left out of that."""
+    """Iterations of reweighting that exclude shadows and stains from the scatter."""
     shared: tuple[float, ...] = (4.0, 8.0, 2.0, 3.0)
-    """Equations that share one error of transport that the model leaves out, by kind, however far apart."""
+    """Number of equations, by kind, that share one error of transport outside the model."""
     texture: tuple[float, ...] = (0.0, 0.0, 0.03, 0.03)
     """Metres within which texture varies little, by kind: points that are closer share its error as well."""
     reflectance: tuple[float, ...] = (0.85, 0.045, 0.35, 0.35)
@@ -68,7 +69,7 @@ class PriorConfig:
     region: float = 0.12
     """Steradians: a region wider than this (22 degrees across) is split."""
     exponent: float = -0.5
-    """Of the solid angle, in the radiance that a component is expected to have."""
+    """Exponent of the solid angle in a component's expected radiance."""
     least_alike: float = 0.05
     """Least of what a component is expected to lack over one in which all channels clip: some light lacks in any."""
     fades: tuple[float, float] = (0.6, 0.7)
@@ -149,7 +150,7 @@ class SolverConfig:
     """When a solution is good enough, and when none is asked for."""
 
     iterations: int = 6
-    """Of reweighting, from a start that is far off."""
+    """Iterations of reweighting from a distant start."""
     warm_iterations: int = 3
     """The same from a solution of nearly the same problem."""
     halvings: int = 4
@@ -236,7 +237,7 @@ class ShadowConfig:
     level: float = 0.05
     """The same of a plane's level from place to place, beside how far its points scatter."""
     iterations: int = 8
-    """Of reweighting."""
+    """Iterations of reweighting."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -244,22 +245,22 @@ class RecoveryConfig:
     """All numbers of the recovery."""
 
     surfaces: SurfaceConfig = SurfaceConfig()
-    """Of surfaces."""
+    """Settings of surfaces."""
     priors: PriorConfig = PriorConfig()
-    """Of what clips."""
+    """Priors of clipped light."""
     least: LeastConfig = LeastConfig()
-    """Of what clips where nothing else tells."""
+    """Prior of clipped light without any other evidence."""
     search: SearchConfig = SearchConfig()
-    """Of emitters."""
+    """Settings of the search for emitters."""
     card: CardConfig = CardConfig()
-    """Of the card."""
+    """Settings of the card."""
     evidence: EvidenceConfig = EvidenceConfig()
-    """Of what estimates rest on."""
+    """Settings of the evidence for an estimate."""
     shadow: ShadowConfig = ShadowConfig()
-    """Of the ball's own shadow."""
+    """Settings of the ball's own shadow."""
     solver: SolverConfig = SolverConfig()
-    """Of the solution."""
+    """Settings of the solver."""
 
 
 CONFIG = RecoveryConfig()
-"""As the program runs."""
+"""Configuration of the program."""

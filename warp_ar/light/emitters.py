@@ -39,7 +39,7 @@ Array = NDArray[np.float64]
 STEP = 1.1
 """Ratio of neighbouring distances that are tried."""
 MOST_STEPS = 4
-"""From where a search has ended."""
+"""Largest number of steps from the end of a search."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -56,7 +56,7 @@ class Estimate:
     lower_bound: tuple[bool, bool, bool]
     """Channels in which the card clips or is not seen: there the total is a lower bound, or rests on priors."""
     emitters: tuple[FoundEmitter, ...] = ()
-    """By falling power."""
+    """Emitters, the most powerful first."""
     method: str = "clipped"
     """Method: the one that was asked for, or the one that is left. ``least``: no card is seen,
     and what clips is raised by what nearly every place lacks."""
@@ -65,9 +65,9 @@ class Estimate:
     card: CardCheck = NO_CARD
     """Evidence that the card is in the picture."""
     card_share: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Of the card's light that the map as captured does not show, by channel; 0 where the card does not tell."""
+    """Share of the card's light, by channel, that the captured map lacks; 0 without evidence of the card."""
     irradiance: Interval | None = None
-    """Of light from all directions."""
+    """Interval of the irradiance from all directions."""
 
     @property
     def is_finite(self) -> bool:

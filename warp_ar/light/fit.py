@@ -153,7 +153,7 @@ class Fit:
     target: Array
     """Right sides, (rows,)."""
     weights: Array
-    """Of the last quadratic problem, (rows,)."""
+    """Weights of the last quadratic problem, (rows,)."""
     hessian: Array
     """The same, priors included, (unknowns, unknowns)."""
 

@@ -143,7 +143,7 @@ class Problem:
         usual *= alike(self.lost, self.solid_angle, component, self.components)
         self.expected = np.where(is_surface, 0.0, usual)
         self.profile = np.ones_like(self.missing)
-        """By which ``missing`` is multiplied, (m, 3)."""
+        """Factor on ``missing``, (m, 3)."""
         self._depth = depth_profile(cells, component)
         self.is_surface = is_surface[self.component]
         self.member = np.zeros((len(component), self.parts))

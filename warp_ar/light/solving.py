@@ -165,6 +165,6 @@ def serve(descriptor: int) -> None:
 
 
 PROCESS = SolvingProcess()
-"""Of this process."""
+"""Solving process of this process."""
 atexit.register(PROCESS.close)
 os.register_at_fork(after_in_child=PROCESS._forget)

@@ -32,7 +32,7 @@ from warp_ar.scene.pixel_rays import pixel_rays
 TRACK_SUFFIX = ".jsonl"
 
 _SPACE = uuid.UUID("6f1f3c1e-8a4b-4e35-9f5e-0b8d8f0f7a11")
-"""Of the samples' identifiers, which are the same for the same shot."""
+"""Namespace of the samples' identifiers, which equal shots share."""
 
 
 def write_track(path: Path, shot: Shot) -> list[Path]:

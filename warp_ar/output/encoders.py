@@ -20,7 +20,7 @@ CODINGS: Final = ("8bit", "10bit", "pq", "hlg")
 DEFAULT_ENCODERS: Final = {"8bit": "libx264", "10bit": "libx265", "pq": "libx265", "hlg": "libx265"}
 
 CRF: Final = 18
-"""Of x264 and x265: the constant rate factor at which a loss is hardly seen."""
+"""Constant rate factor of x264 and x265 with a hardly visible loss."""
 _DEFAULTS: Final[Mapping[str, Mapping[str, str]]] = {
     "libx264": {"preset": "veryfast", "crf": str(CRF)},
     "libx265": {"preset": "veryfast", "crf": str(CRF), "x265-params": "log-level=error"},

@@ -31,7 +31,7 @@ EXTENSION: Final = "EXT_lights_image_based"
 LARGEST: Final = 64
 """Texels along an edge of the sharpest cube."""
 SMALLEST: Final = 16
-"""Of the roughest."""
+"""Edge, in texels, of the roughest level."""
 GAMMA: Final = 2.2
 
 _FILTERED_ROWS = 32

@@ -71,11 +71,11 @@ class LayerFrame:
     """One frame's layers, and what a file of them says beside."""
 
     layers: Layers
-    """By the names of ``LAYERS``."""
+    """Layers by the names of ``LAYERS``."""
     frame: npt.NDArray[np.uint8]
     """The camera's frame, RGB."""
     names: tuple[str, ...]
-    """Of the surfaces, by their numbers."""
+    """Names of the surfaces, by number."""
     exposure_scale: float = 1.0
     """Factor on the composed radiance in the picture."""
     transfer: str = "srgb"

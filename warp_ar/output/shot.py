@@ -93,7 +93,7 @@ class ExchangeMaterial:
     specular: RGB | None = None
     """Reflectance straight on where it is given; None: by ``metallic``, 0.04 for what is no metal."""
     pictures: Mapping[str, Picture] = dataclasses.field(default_factory=dict)
-    """By what they are of: "" (base colour and opacity), emission, metallic_roughness, normal, occlusion."""
+    """Pictures by use: "" (base colour and opacity), emission, metallic_roughness, normal, occlusion."""
     own: MeshMaterial = dataclasses.field(default_factory=MeshMaterial)
     """The scene's material, for all that formats tell alike: alpha, emission, factors of pictures."""
 
@@ -227,8 +227,7 @@ class Shot:
     radiance: npt.NDArray[np.float32] | None = None
     """The same, (height, 2 height, 3), z-up, for files that hold it themselves."""
     others: tuple[tuple[Path, tuple[float, float, float]], ...] = ()
-    """Of each mirror ball after the first whose light is interpolated: its environment, as ``environment``, and where
-    it stands, metres."""
+    """Environment, as ``environment``, and place, metres, of each interpolated mirror ball after the first."""
 
     @property
     def camera(self) -> Camera:

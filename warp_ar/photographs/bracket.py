@@ -79,10 +79,11 @@ class Aligned:
     patches: tuple[Image, ...]
     """The balls, all of one size and place, uint8 RGB."""
     correlation: tuple[float, ...]
-    """Of each with the one that it was laid over; 1 for the anchor, NaN where too little is well exposed in both."""
+    """Correlation of each photograph with the one that it was aligned to; 1 for the anchor, NaN if too little is
+    well exposed in both."""
     changed: tuple[float, ...]
-    """Of each against the same, the factor by which places that looked alike came to differ, as a logarithm; NaN where
-    too little is well exposed in both."""
+    """Logarithm of the factor by which formerly equal places differ in each photograph from the one it was aligned
+    to; NaN if too little is well exposed in both."""
 
     @property
     def strangers(self) -> tuple[str, ...]:
@@ -352,7 +353,7 @@ class Exposures:
     """Exposures that were agreed upon."""
 
     ratios: tuple[float, ...]
-    """Of each picture to the first."""
+    """Ratio of each picture's exposure to the first's."""
     curve: Array | None
     """Linear value of each code, (256, 3), where sRGB does not hold; else None."""
     notes: tuple[str, ...]

@@ -43,7 +43,7 @@ class Table:
     image: NDArray[np.uint8]
     """uint8 RGB, upright."""
     camera: Camera
-    """Of the photograph."""
+    """Camera of the photograph."""
     support: Support
     """The table's plane."""
     probe: Probe

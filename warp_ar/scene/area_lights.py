@@ -39,7 +39,7 @@ class AreaTable(NamedTuple):
     faces: npt.NDArray[np.int32]
     """Object, triangle (-1: a sphere), and whether only its front emits, (n, 3)."""
     shares: npt.NDArray[np.float32]
-    """Of all that is emitted, by a face and those before it, (n,); the last is 1."""
+    """Cumulative shares of the emitted power by face, (n,); the last is 1."""
 
 
 def emits(material: MeshMaterial) -> bool:

@@ -166,9 +166,9 @@ class GltfAnimation:
     """One animation of a file."""
 
     samplers: Mapping[int, Mapping[str, Sampler]]
-    """By node, then by the property that they move."""
+    """Samplers by node, then by the animated property."""
     weights: Mapping[int, Sampler]
-    """Of the morph targets, by the node that the mesh hangs on."""
+    """Samplers of morph weights, by the mesh's node."""
     duration: float
     """Time of the last key, in seconds."""
 
@@ -260,7 +260,7 @@ Array = npt.NDArray[np.float64]
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _UP: Final = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
-"""From +Y up to +Z up."""
+"""Rotation from +Y up to +Z up."""
 _MOST_IMAGES: Final = 4
 """Largest number of pixels of all pictures together, in pictures of the largest size."""
 _MOST_PLACES: Final = 20_000
@@ -285,9 +285,9 @@ class GltfContents:
     anchors: tuple[Anchor, ...] = ()
     """Nodes that the animation moves."""
     duration: float = 0.0
-    """Of the animation, in seconds."""
+    """Duration of the animation, seconds."""
     bends: list[Bending | None] = dataclasses.field(default_factory=list)
-    """Of each part; None: it keeps its shape."""
+    """Bending of each part; None for a rigid part."""
 
 
 def load_gltf(source: MeshSource, *, animation: str | int | None = None) -> GltfContents:

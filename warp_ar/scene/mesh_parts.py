@@ -34,7 +34,7 @@ class MeshPart:
     colors: Array | None = None
     """Linear RGBA, (n, 4)."""
     tangents: Array | None = None
-    """As ``Mesh.tangents``, (n, 4)."""
+    """Tangents like ``Mesh.tangents``, (n, 4)."""
     material: MeshMaterial | None = None
     """None: the file says nothing."""
     source: npt.NDArray[np.int64] | None = None

@@ -77,7 +77,7 @@ class _Map:
     picture: ByteArray
     """RGBA."""
     transform: tuple[float, ...]
-    """As ``TextureUse.transform``."""
+    """Transform like ``TextureUse.transform``."""
     clamped: bool
     """True if it does not repeat."""
     channel: int | None

@@ -113,7 +113,7 @@ class NodeTrack:
     scale: Array
     """(3,), likewise."""
     samplers: Mapping[str, Sampler]
-    """By the names of ``WIDTHS``."""
+    """Samplers by the names of ``WIDTHS``."""
 
     def transform_at(self, seconds: float) -> Array:
         """``parent_from_node``, (4, 4), at a time of the animation."""

@@ -26,11 +26,11 @@ class ObjectShape:
 
     item: Object
     index: int
-    """Of the object in its scene."""
+    """Number of the object in its scene."""
     moving: MovingMesh | None = None
     """Animation that the object plays; None: it is one shape."""
     part: int = 0
-    """Of ``moving``."""
+    """Number of the part in ``moving``."""
 
     @property
     def mesh(self) -> Mesh | None:
@@ -85,7 +85,7 @@ class Stretch:
     rotation: Array
     """The map over its scale."""
     inverse: Array
-    """Of ``rotation``."""
+    """Inverse of ``rotation``."""
     stretch: float
     """Longest over shortest image of a unit vector; 0 for a rotation, whose inverse is its transpose."""
 

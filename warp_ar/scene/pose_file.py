@@ -35,9 +35,9 @@ TURNED = 1e-3
 _LEVEL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """``world_from_camera`` of a level camera that looks along +y, z up."""
 _Z_FROM_Y_UP = _LEVEL.T
-"""From a y-up world to the z-up one of a marker: x stays."""
+"""Rotation from a y-up world to a marker's z-up one; x stays."""
 _OPENCV = np.diag([1.0, -1.0, -1.0])
-"""From OpenCV's axes of a camera to OpenGL's, or back."""
+"""Rotation between OpenCV's and OpenGL's axes of a camera."""
 
 
 def pose_of_placement(rotation: Matrix, position: Matrix) -> RawPose:

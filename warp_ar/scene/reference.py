@@ -71,7 +71,7 @@ class Section:
     """One section of a scene file."""
 
     name: str
-    """As in the file, without brackets."""
+    """Name as in the file, without brackets."""
     several: bool
     """True if it is written ``[[name]]`` and may stand there more than once."""
     meaning: str

@@ -280,7 +280,7 @@ class _Joined:
     """Several outlines one behind the other."""
 
     corners: FloatArray
-    """Of all, (n, 3)."""
+    """Corners of all, (n, 3)."""
     starts: list[int]
     """First index of each that has any."""
     places: tuple[int, ...]

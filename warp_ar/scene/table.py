@@ -14,7 +14,7 @@ from warp_ar.scene.messages import LARGEST, SMALLEST, nearest, show_key, show_va
 
 MISSING: Final = dataclasses.MISSING
 MOST: Final = 10**9
-"""Of a whole number of which nothing else is said."""
+"""Largest whole number without another bound."""
 
 
 class Table:

@@ -113,7 +113,7 @@ def load_texture(path: str | Path) -> ByteArray:
 
 
 RADIANCE_SUFFIXES: Final = (".exr", ".hdr")
-"""Of files that hold linear radiance."""
+"""Suffixes of files with linear radiance."""
 
 
 def load_emission(path: Path) -> tuple[npt.NDArray[np.uint8], float]:

@@ -24,7 +24,7 @@ from warp_ar.sources.video_file import pixel_shape, rgb_from_video, video_stream
 Image = npt.NDArray[np.uint8]
 
 SCHEMES = ("rtsp", "rtsps", "http", "https", "rtmp", "rtmps", "srt", "udp", "tcp")
-"""Of addresses that are streams."""
+"""Schemes of addresses of streams."""
 
 GRACE_SECONDS = 15.0
 """Seconds that a line may be broken."""

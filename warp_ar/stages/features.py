@@ -111,7 +111,7 @@ class Features:
 
     @property
     def _first_alone(self) -> str:
-        """Forms that are made from the first ball's light only, in words."""
+        """Names of results that only the first ball's light enters."""
         names = ["the light of a path-traced reference"]
         if self.lit and self.relight_method not in (FLAT, *MEASURED):
             names.append("the key light of receivers")

@@ -34,11 +34,11 @@ class RayCounts:
     """Rays of a pixel."""
 
     samples: int
-    """To the environment."""
+    """Rays toward the environment."""
     lobe: int
-    """Into a glossy lobe."""
+    """Rays into a glossy lobe."""
     mirror: int
-    """Of a mirror, a square number."""
+    """Rays of a mirror, a square number."""
     known: bool
     """True if samples estimate only the difference from the known irradiance of the environment."""
 
@@ -46,7 +46,7 @@ class RayCounts:
 RAYS: Mapping[str, RayCounts] = MappingProxyType(
     {"few_rays": RayCounts(4, 1, 1, known=True), "one_bounce": RayCounts(32, 4, 4, known=False)}
 )
-"""By method of ``shade``."""
+"""Ray counts by method of ``shade``."""
 
 
 def lobe_widths(material: MeshMaterial) -> tuple[float, float]:

@@ -12,7 +12,7 @@ class Quality:
     """The method of every stage and the sizes that go with it. Equal values share plans and compiled kernels."""
 
     name: str
-    """Of the preset, or ``custom``."""
+    """Name of the preset, or ``custom``."""
     methods: tuple[tuple[str, str], ...]
     """(stage, method) pairs, sorted by stage; stages that have only one method need not be named."""
     environment_height: int

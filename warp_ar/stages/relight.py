@@ -29,7 +29,7 @@ class Grain:
     """Resolution at which cells of the receiver are estimated."""
 
     samples: int
-    """Of the environment, for ambient visibility."""
+    """Samples of the environment for ambient visibility."""
     ambient: int
     """Pixels per cell of ambient visibility, in frames of ``STRIDE_ROWS`` rows; 1 is every pixel of any frame."""
     bounced: int

@@ -106,7 +106,7 @@ class ExposureDrift:
         self.saturation = np.full(3, 255.0)
         """Estimated code at which each channel saturates."""
         self.contrast = 0.0
-        """Of the camera's tone curve, as ``without_contrast`` takes it."""
+        """Contrast of the camera's tone curve, as in ``without_contrast``."""
 
     def copied(self) -> Self:
         """Return what has been seen so far, for another pipeline to go on from; what it sees changes nothing here."""

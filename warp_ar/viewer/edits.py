@@ -53,7 +53,7 @@ NONE = -1
 _LIGHT_REACH, _STEP, _GOLDEN, _PLACES = 0.03, 0.02, 2.399963, 400
 """Of places for what is new: metres around a light, metres and radians of the spiral's steps, and how many."""
 _DIGITS = 4
-"""Of seconds that the page sets, in scene files: a tenth of a millisecond."""
+"""Decimal places of seconds that the page writes into scene files."""
 
 
 def names_of(item: Object) -> tuple[str, ...]:

@@ -74,7 +74,7 @@ class Lit:
     other: Image | None
     """Picture that it is compared with."""
     frame: Image
-    """As the camera gave it."""
+    """Frame of the camera."""
     pose: Pose | None
     """``camera_from_world``."""
     state: TrackState | None
@@ -82,7 +82,7 @@ class Lit:
     stages: tuple[tuple[str, float, bool], ...]
     """Name, milliseconds, and True if it was skipped."""
     light_ms: float
-    """From the frame in hand to the lit frame."""
+    """Milliseconds from the received to the lit frame."""
     plan: int
     """Number of the plan that it was lit by; 0 where it was not."""
 

@@ -263,9 +263,9 @@ def _place(target: Target) -> Any:
 FULL_SCALE: Final = 0.2
 """Difference, of full scale, that has the last colour."""
 SLICE_SECONDS: Final = 0.04
-"""Of samples, between two looks at what viewers ask for."""
+"""Seconds of sampling between two looks at viewers' requests."""
 SHOWN_SECONDS: Final = 0.3
-"""Between two pictures at least."""
+"""Least seconds between two pictures."""
 LIGHT_SAMPLES: Final = 8
 """Per pixel, by which the reflectance of proxies is found; fewer than offline, for somebody waits."""
 LEAST_SAMPLES: Final = 16

@@ -32,7 +32,7 @@ MAX_TEXT: Final = 4096
 MAX_PICTURE: Final = 1 << 20
 """Largest binary message from a page in bytes: a JPEG of 1920x1080 at quality 0.85 takes half of that."""
 MOST_BYTES: Final = 1 << 26
-"""Of one file that is dropped onto the picture: 64 MB."""
+"""Largest dropped file, bytes: 64 MB."""
 SMALLEST_CAMERA: Final = (64, 48)
 LARGEST_CAMERA: Final = (1920, 1080)
 

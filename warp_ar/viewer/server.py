@@ -58,7 +58,7 @@ if TYPE_CHECKING:
 _T = TypeVar("_T")
 
 JPEG_QUALITY: Final = 85
-"""At 640x480 a desk takes 60 KB; at 95 it takes twice that."""
+"""Quality of JPEG: a desk at 640x480 has 60 KB, at quality 95 twice that."""
 IN_FLIGHT: Final = 2
 """Frames that a viewer may have unshown: one on the way while another is decoded."""
 SEND_SECONDS: Final = 20.0
