@@ -170,6 +170,8 @@ class Transfers:
         self._compute = wp.get_stream(device)
         self._up, self._down = wp.Stream(device), wp.Stream(device)
         self._slots = [Slot(shape, device) for _ in range(SLOTS)]
+        for stream in (self._up, self._down):
+            stream.wait_stream(self._compute)  # which clears the slots: a frame must not come before that
         self._uploads = self._downloads = 0
         self._parts = split_rows(*shape)
         self._copiers = [_Copier() for _ in self._parts] if len(self._parts) > 1 else []
