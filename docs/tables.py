@@ -228,7 +228,7 @@ READERS = {
     "poses": ("scene.pose_file.load_pose_file",),
 }
 """Readers by format; the first one's docstring tells of the format."""
-NAMED = ("_LEFT_OUT", "_NOT_SHOWN", "_NOT_FOLLOWED")
+NAMED = ("_NOT_SHOWN", "_NOT_FOLLOWED")
 """Tables of readers' modules, whose keys are the format's own names of what is noted."""
 
 

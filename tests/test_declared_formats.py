@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import base64
 import dataclasses
+import io
 import json
 import pathlib
 import struct
@@ -12,9 +14,11 @@ import cv2
 import numpy as np
 import OpenEXR
 import pytest
+from PIL import Image
 
 from docs.tables import formats
 from tests.gltf_files import SQUARE, SQUARE_FACES, SQUARE_UVS, Gltf
+from tests.test_foreign_files import adobe_profile
 from warp_ar.errors import SceneError
 from warp_ar.exr_file import read_linear_picture
 from warp_ar.scene import load_calibration
@@ -27,7 +31,6 @@ NOT_HERE = {
     "deep pixels": "test_linear_pictures",  # written by a process of OpenImageIO
     "frames without a pose": "test_pose_file",  # needs frames
     "animated …": "test_what_else_an_animation_moves_is_named",
-    "ICC profiles, as glTF says": "test_foreign_files",  # not followed on purpose, and not said
 }
 """Features that other files of tests feed, by what is declared."""
 
@@ -91,11 +94,18 @@ def gltf(declared: str, said: str, primitive: dict[str, Any] | None = None, **tr
     return Case(declared, "a.glb", made, said)
 
 
+def profiled() -> bytes:
+    """A PNG of Adobe RGB."""
+    data = io.BytesIO()
+    Image.new("RGB", (2, 2), (160, 90, 47)).save(data, "PNG", icc_profile=adobe_profile())
+    return data.getvalue()
+
+
 UV = {"attributes": {"TEXCOORD_0": SQUARE_UVS}, "material": 0}
 IMAGE = {"images": [{"uri": "none.png"}], "textures": [{"source": 0}]}
 MOVED = {"name": "a", "samplers": [], "channels": [{"target": {"node": 0, "path": "weights"}, "sampler": 0}]}
 
-MTL_KEYS = "map_bump, bump, disp, map_ns, refl, decal, map_tr, tf, pc, ps, aniso"
+MTL_KEYS = "map_bump bump disp map_ns refl decal map_tr tf pc ps aniso map_ka map_emissive map_orm"
 CASES: dict[str, list[Case]] = {
     "`.obj`": [
         Case("damaged", "a.obj", CORNERS + "f 1 2 9\n", "vertex index 8"),
@@ -104,10 +114,24 @@ CASES: dict[str, list[Case]] = {
         ),
         Case("the material library …, which is not there", "a.obj", WRAPPED, "library a.mtl, which is not there"),
         *(
-            Case("curv, curv2, surf, l, p", "a.obj", f"{CORNERS}f 1 2 3\n{key} 1 2\n", said)
-            for key, said in (("curv", "free-form"), ("curv2", "free-form"), ("surf", "free-form"), ("l", "lines"))
+            Case("curv, curv2, surf, l, p, #MRGB", "a.obj", f"{CORNERS}f 1 2 3\n{key} 1 2\n", said)
+            for key, said in (
+                *(("curv", "free-form"), ("curv2", "free-form"), ("surf", "free-form")),
+                *(("l", "lines"), ("p", "points and lines"), ("#MRGB", "ZBrush")),
+            )
         ),
-        Case("curv, curv2, surf, l, p", "a.obj", f"{CORNERS}f 1 2 3\np 1\n", "points and lines"),
+        Case(
+            "smoothing groups without normals: edges of more than … degrees are sharp",
+            "a.obj",
+            f"{CORNERS}s 1\nf 1 2 3\n",
+            "smoothing groups without normals",
+        ),
+        Case(
+            "alpha of colours, which is 0 everywhere",
+            "a.obj",
+            "v 0 0 0 1 1 1 0\nv 1 0 0 1 1 1 0\nv 0 1 0 1 1 1 0\nf 1 2 3\n",
+            "alpha of colours",
+        ),
     ],
     "MTL": [
         library("damaged", "map_Kd a.mtl", "a.mtl, which it names"),
@@ -118,19 +142,25 @@ CASES: dict[str, list[Case]] = {
         library("-boost, -cc, -mm, -t", "map_Kd -mm 0.1 2 a.png", "-mm"),
         library("-boost, -cc, -mm, -t", "map_Kd -t 1 1 1 a.png", "-t"),
         *(
-            library(MTL_KEYS, f"{key} 1 1 1", said)
-            for key, said in zip(
-                MTL_KEYS.split(", "),
-                [
-                    *("bump", "bump", "displacement", "Ns", "reflection", "decals"),
-                    *("Tr", "transmission", "clearcoat", "sheen", "anisotropy"),
-                ],
-                strict=True,
-            )
+            library("the key … of materials", f"{key} 0.5 0.5 0.5", f"the key {key} of materials")
+            for key in MTL_KEYS.split()
         ),
+        library("-halo of d", "d -halo 0.5", "-halo of d"),
+        *(
+            library("… …, which is not … numbers", line, f"{line[:2].lower()}{line[2:]}, which is not")
+            for line in ("Kd xyz 0.4 0.2 0.1", "Kd spectral a.rfl", "Ns 0,5", "Ke 1 2")
+        ),
+        library("… beyond … to …", "Kd 204 102 51", "kd beyond 0 to 1"),
+        library("… beyond … to …", "d 2", "d beyond 0 to 1"),
     ],
     "`.ply`": [
         Case("damaged", "a.ply", ply()[:-12], "is the file whole"),
+        Case(
+            "the element …",
+            "a.ply",
+            ply().replace("end_header", "element edge 1\nproperty int vertex1\nend_header") + "0\n",
+            "the element edge",
+        ),
         Case("the property … of each …", "a.ply", ply("property float gloss\n", more="1"), "gloss of each vertex"),
         Case(
             "strips of triangles beside faces",
@@ -182,7 +212,11 @@ CASES: dict[str, list[Case]] = {
     ],
     "`.stl`": [
         Case("damaged", "a.stl", bytes(80) + STL[:40], "cut off"),
+        Case(
+            "damaged", "a.stl", b"solid a\nfacet\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n", "in a facet"
+        ),
         Case("colours of triangles", "a.stl", bytes(80) + STL, "colours of triangles"),
+        Case("bytes behind the last triangle", "a.stl", bytes(80) + STL + bytes(80) + STL, "bytes behind"),
     ],
     "`.gltf` `.glb`": [
         Case("damaged", "a.glb", b"glTF", "cut off"),
@@ -192,6 +226,24 @@ CASES: dict[str, list[Case]] = {
         ),
         gltf("other extensions", "KHR_materials_sheen", extensionsUsed=["KHR_materials_sheen"]),
         gltf("animations (an object's key play names one)", "animations", animations=[MOVED]),
+        gltf("damaged", "it is of glTF 1.0", asset={"version": "1.0"}),
+        gltf("damaged", "it is of glTF 2.1", asset={"version": "2.0", "minVersion": "2.1"}),
+        gltf(
+            "factors beyond their ranges", "emissiveFactor beyond 0 to 1", UV, materials=[{"emissiveFactor": [2, 1, 0]}]
+        ),
+        gltf(
+            "colours beyond the first set",
+            "colours beyond",
+            {"attributes": {name: np.ones((4, 4), np.float32) for name in ("COLOR_0", "COLOR_1")}},
+        ),
+        gltf(
+            "colour profiles of pictures, which glTF has ignored",
+            "colour profiles",
+            UV,
+            images=[{"uri": "data:image/png;base64," + base64.b64encode(profiled()).decode()}],
+            textures=[{"source": 0}],
+            materials=[{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
+        ),
         gltf("cameras", "cameras", cameras=[{"type": "perspective"}]),
         gltf("primitives without positions", "without positions", {"other": {"attributes": {}}}),
         gltf(

@@ -284,7 +284,7 @@ def test_material_libraries(tmp_path):
     assert shiny.surface == PhongMaterial((0.5, 0.25, 0.125), (0.2, 0.2, 0.2), 40.0)
     assert (shiny.alpha, shiny.opacity) == ("blend", 0.5)
     assert (matt.surface, matt.emission) == (LambertMaterial((0.9, 0.9, 0.9)), (3.0, 2.0, 1.0))
-    assert mesh.notes == ("bump maps",)
+    assert mesh.notes == ("the key bump of materials",)
     (tmp_path / "a.mtl").write_text("newmtl shiny\nKd 1 1 1\nPr 0.2\nPm 1\nnewmtl matt\nmap_Ke none.png\n")
     with pytest.raises(SceneError, match=r"none\.png, which it names, is not there"):
         load_mesh(path)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from warp_ar.scene.geometry import Mesh, rotation_matrix
-from warp_ar.scene.materials import MeshMaterial
+from warp_ar.scene.materials import LambertMaterial, MeshMaterial
 from warp_ar.scene.mesh_files import load_mesh
 from warp_ar.scene.polygon_files import clip_ears
 
@@ -298,3 +298,49 @@ def test_colours_of_an_off(tmp_path: pathlib.Path, head: str, more: str, face: s
     rows = "".join(f"{x} {y} {z} {more} # corner\n" for x, y, z in SQUARE)
     (tmp_path / "a.off").write_text(f"{head} 4 1 0\n{rows}4 0 1 2 3 {face}\n")
     np.testing.assert_allclose(load_mesh(tmp_path / "a.off").colors[:, :3] - srgb([1.0, 0.4, 0.2]), 0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["uchar", "ushort", "short", "int"])
+@pytest.mark.parametrize("white", [255, 32767, 65535])
+def test_colours_of_a_ply_by_the_white_of_their_type(tmp_path: pathlib.Path, kind: str, white: int) -> None:
+    """Shorts of which none is above 255 are of 8 bits."""
+    most = {"uchar": 255, "ushort": 65535, "short": 32767, "int": 65535}[kind]
+    if (white > most) or (white, kind) in ((255, "ushort"), (32767, "ushort"), (32767, "int")):
+        pytest.skip("no such values")
+    colors = "".join(f"property {kind} {name}\n" for name in ("red", "green", "blue"))
+    (tmp_path / "a.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+        f"{colors}element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+        + "".join(f"{x} {y} 0 {white} 0 {white // 2}\n" for x, y in ((0, 0), (1, 0), (0, 1)))
+        + "3 0 1 2\n"
+    )
+    found = load_mesh(tmp_path / "a.ply").colors
+    np.testing.assert_allclose(found[:, :3], [(1.0, 0.0, 0.2122)] * 3, atol=2e-3)
+
+
+@pytest.mark.parametrize("corners", [[3], [4], [3, 4, 5], [4, 3]])
+def test_facets_of_an_stl_may_have_more_corners(tmp_path: pathlib.Path, corners: list[int]) -> None:
+    """Each is a polygon of its own, wherever the one before ends; a byte-order mark may precede."""
+    text = "solid a\n"
+    for number, count in enumerate(corners):
+        angles = 2 * np.pi * np.arange(count) / count
+        lines = [f"vertex {np.cos(a):.9f} {np.sin(a):.9f} {number}" for a in angles]
+        text += "facet normal 0 0 1\nouter loop\n" + "\n".join(lines) + "\nendloop\nendfacet\n"
+    (tmp_path / "a.stl").write_text(text + "endsolid a\n", encoding="utf-8-sig")
+    mesh = load_mesh(tmp_path / "a.stl")
+    a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(float) for k in range(3))
+    areas = np.cross(b - a, c - a)[:, 2] / 2
+    assert (areas > 0).all()
+    assert areas.sum() == pytest.approx(sum(n / 2 * np.sin(2 * np.pi / n) for n in corners), rel=1e-5)
+
+
+def test_alpha_of_an_obj_and_a_lobe_without_width(tmp_path: pathlib.Path) -> None:
+    """MeshLab writes Ks 1 and Ns 0 for all materials; that is no lobe which takes light from the diffuse colour."""
+    (tmp_path / "a.mtl").write_text("newmtl a\nKd 0.75 0.5 0.25\nKs 1 1 1\nillum 2\nNs 0\nTf 1 1 1\nPc 0.0\n")
+    corners = "v 0 0 0 1 0 0 0.5\nv 1 0 0 1 0 0 0.25\nv 0 1 0 1 0 0 1\n"
+    (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{corners}usemtl a\nf 1 2 3\n")
+    mesh = load_mesh(tmp_path / "a.obj")
+    assert mesh.materials[0].surface == LambertMaterial((0.75, 0.5, 0.25))
+    assert mesh.colors[:, 3].tolist() == [0.5, 0.25, 1.0]
+    assert mesh.materials[0].alpha == "blend"
+    assert mesh.notes == ()

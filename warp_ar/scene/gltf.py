@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from warp_ar.errors import SceneError
 from warp_ar.files import limits, too_much
-from warp_ar.pictures import picture_size
+from warp_ar.pictures import in_srgb, picture_size
 from warp_ar.scene.geometry import creased_normals
 from warp_ar.scene.gltf_file import GltfFile
 from warp_ar.scene.materials import IDENTITY, MeshMaterial, MetallicRoughnessMaterial, TextureUse, Wrap
@@ -261,6 +261,8 @@ Array = npt.NDArray[np.float64]
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _UP: Final = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 """Rotation from +Y up to +Z up."""
+_SAME_COLOR: Final = 2
+"""Codes by which profiles of sRGB itself change a picture."""
 _MOST_IMAGES: Final = 4
 """Largest number of pixels of all pictures together, in pictures of the largest size."""
 _MOST_PLACES: Final = 20_000
@@ -299,7 +301,7 @@ def load_gltf(source: MeshSource, *, animation: str | int | None = None) -> Gltf
         KHR_materials_emissive_strength, KHR_mesh_quantization, EXT_texture_webp.
 
     Names:
-        other extensions; ICC profiles, as glTF says.
+        other extensions; factors beyond their ranges.
 
     Args:
         source: The file.
@@ -486,6 +488,8 @@ class _Reader:
         colors = attribute("COLOR_0", 3, 4)
         if colors is not None and colors.shape[1] == 3:
             colors = np.concatenate([colors, np.ones((count, 1))], axis=1)
+        if "COLOR_1" in attributes:
+            self._source.note("colours beyond the first set")
         faces = self._faces(primitive, count)
         if len(faces) > limits().mesh_elements:
             raise SceneError(too_much(f"{self._source.path}", len(faces), "faces", "mesh_elements"))
@@ -620,7 +624,11 @@ class _Reader:
                     too_much(f"{self._source.path}: its pictures", self._pixels, "pixels", "picture_pixels")
                 )
             self._images[index] = len(self._source.images)
-            self._source.images.append(decode_rgba(data, f"{self._source.path}: its image {index}"))
+            picture = decode_rgba(data, f"{self._source.path}: its image {index}")
+            shown = in_srgb(np.ascontiguousarray(picture[..., :3]), data)
+            if np.abs(shown.astype(np.int16) - picture[..., :3]).max(initial=0) > _SAME_COLOR:
+                self._source.note("colour profiles of pictures, which glTF has ignored")
+            self._source.images.append(picture)
         return self._images[index]
 
 

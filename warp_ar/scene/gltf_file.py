@@ -53,6 +53,10 @@ class GltfFile:
         if not isinstance(header, dict):
             self.fail("its header is no JSON object")
         self.header: dict[str, Any] = header
+        asset = self.table(header, "asset", "its header")
+        version = str(asset.get("minVersion", asset.get("version", "2.0")))
+        if not re.match(r"2\.0?$", version) and not ("minVersion" not in asset and version.startswith("2.")):
+            self.fail(f"it is of glTF {version[:20]}; 2.0 is read")
         self._accessors = self.objects("accessors")
         for item in self._accessors:
             source.check_count(self.whole(item, "count", "an accessor"))
@@ -109,6 +113,8 @@ class GltfFile:
         value = item.get(key, default)
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
             self.fail(f"{label} has {key} {str(value)[:30]!r}, which is no finite number")
+        if not low <= value <= high:
+            self.source.note(f"{key} beyond {low:g} to {high:g}")
         return min(max(float(value), low), high)
 
     def numbers(

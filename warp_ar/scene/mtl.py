@@ -35,20 +35,8 @@ from warp_ar.scene.mesh_source import MeshSource
 
 ByteArray = npt.NDArray[np.uint8]
 
-_LEFT_OUT: Final = {
-    "map_bump": "bump maps",
-    "bump": "bump maps",
-    "disp": "displacement maps",
-    "map_ns": "maps of Ns",
-    "refl": "reflection maps",
-    "decal": "decals",
-    "map_tr": "maps of Tr",
-    "tf": "transmission (Tf)",
-    "pc": "clearcoat (Pc)",
-    "ps": "sheen (Ps)",
-    "aniso": "anisotropy",
-}
-"""Keys of a library that are not shown, in words."""
+_KNOWN: Final = "name|k[adse]|n[si]|d|tr|illum|p[rm]|map_(k[dsen]|d|p[rm])|norm|pcr|anisor|sharpness"
+"""Keys that are shown, and those that say nothing of how a surface looks in this light."""
 
 CHALK: Final[RGB] = (0.8, 0.8, 0.8)
 """Diffuse colour of a material that says none."""
@@ -160,9 +148,15 @@ class _Library:
 
     def read(self, base: TextureUse | None) -> MeshMaterial:
         """The material, with the picture of its colour if it has one."""
-        for key, words in _LEFT_OUT.items():
-            if key in self._values:
-                self._source.note(words)
+        for key, words in self._values.items():
+            nothing = {1.0} if key == "tf" else {0.0}  # lets all light through; no sheen, no clearcoat
+            shown = (
+                re.fullmatch(_KNOWN, key)
+                or (key == "map_ka" and "map_kd" in self._values)
+                or not isinstance(words, list)
+            )
+            if not shown and not (all(map(_is_number, words)) and set(map(float, words)) == nothing):
+                self._source.note(f"the key {key[:40]} of materials")
         color = self._map("map_kd", color=True) if base is None else None
         white = (1.0, 1.0, 1.0)
         diffuse = self._color("kd", CHALK if base is None and color is None else white)
@@ -174,7 +168,8 @@ class _Library:
         maps = self._map("map_pr"), self._map("map_pm")
         specular_map = self._map("map_ks", color=True)
         # A lobe without an exponent is none: some programs use Ks for numbers of their own.
-        shiny = (any(specular) and "ns" in self._values) or specular_map is not None
+        exponent = self._number("ns", 0.0, 0.0, 1e4)
+        shiny = (any(specular) and exponent > 0.0) or specular_map is not None
         surface: Material
         if maps != (None, None) or "pr" in self._values or "pm" in self._values:
             metallic = self._number("pm", 1.0 if maps[1] is not None else 0.0, 0.0, 1.0)
@@ -188,7 +183,7 @@ class _Library:
             diffuse, specular = (
                 cast(RGB, tuple(value / max(most, 1.0) for value in color)) for color in (diffuse, specular)
             )
-            surface = PhongMaterial(diffuse, specular, self._number("ns", 32.0, 0.0, 1e4))
+            surface = PhongMaterial(diffuse, specular, exponent or 32.0)
         else:
             surface, specular_map = LambertMaterial(diffuse), None
         glow = self._map("map_ke", color=True)
@@ -284,17 +279,25 @@ class _Library:
         )
 
     def _color(self, key: str, default: RGB, most: float = 1.0) -> RGB:
-        value = self._values.get(key, default)
-        items = value if isinstance(value, list | tuple) else [value]
-        if not all(_is_number(item) for item in items) or len(items) not in (1, 3):
-            return default
-        numbers = [min(max(float(item), 0.0), most) for item in items]
-        return cast(RGB, tuple(numbers if len(numbers) == 3 else numbers * 3))
+        numbers = self._numbers(key, (1, 3), 0.0, most)
+        return cast(RGB, tuple((3 * numbers)[:3])) if numbers else default
 
     def _number(self, key: str, default: float, low: float, high: float) -> float:
-        value = self._values.get(key, default)
-        first = value[0] if isinstance(value, list) and value else value
-        return min(max(float(first), low), high) if _is_number(first) else default
+        return next(iter(self._numbers(key, (1,), low, high)), default)
+
+    def _numbers(self, key: str, counts: tuple[int, ...], low: float, high: float) -> list[float]:
+        """Numbers of a key within their range, as many as it may have; empty where it says none."""
+        value = self._values.get(key, [])
+        words = list(value) if isinstance(value, list | tuple) else [value]
+        if words[:1] == ["-halo"]:
+            self._source.note("-halo of d")
+            words = words[1:]
+        if words and (len(words) not in counts or not all(map(_is_number, words))):
+            self._source.note(f"{key} {' '.join(map(str, words))[:40]}, which is not {counts[-1]} numbers")
+            return []
+        if any(not low <= float(word) <= high for word in words):
+            self._source.note(f"{key} beyond {low:g} to {high:g}")
+        return [min(max(float(word), low), high) for word in words]
 
 
 def _is_number(value: object) -> bool:

@@ -254,6 +254,7 @@ def decode_text(data: bytes) -> str:
 _NOT_SHOWN: Final = {
     **dict.fromkeys(("curv", "curv2", "surf"), "free-form curves and surfaces"),
     **dict.fromkeys(("l", "p"), "points and lines"),
+    "#MRGB": "colours in ZBrush's comments",
 }
 """Statements of an OBJ that are named, in words."""
 
@@ -268,6 +269,7 @@ class _Obj:
         self._faces: list[tuple[int, int, int, int, int]] = []  # corners, material, and v, vt, vn before it
         self._materials: dict[str, int] = {}
         self._libraries: list[str] = []
+        self._smooth = False
         self._material = self._number("")
         for line in re.sub(r"\\[ \t]*\r?\n", " ", decode_text(source.data)).splitlines():
             self._read(line)
@@ -291,8 +293,10 @@ class _Obj:
                 self._material = self._number(name)
             elif name:
                 self._libraries.append(name)
-        elif key in _NOT_SHOWN:
-            self._source.note(_NOT_SHOWN[key])
+        elif key == "s":
+            self._smooth |= rest.strip() not in ("", "0", "off")
+        elif (key or line[:5]) in _NOT_SHOWN:
+            self._source.note(_NOT_SHOWN[key or line[:5]])
 
     def parts(self) -> list[MeshPart]:
         """Return a part for each material."""
@@ -301,6 +305,8 @@ class _Obj:
         corners.vertex_color = colors
         corners.check(self._source, len(vertices))
         library = self._library()
+        if self._smooth and corners.normal is None:
+            self._source.note(f"smoothing groups without normals: edges of more than {CREASE:g} degrees are sharp")
         triangles, owners = triangles_of(vertices, corners)
         found = []
         for name, number in self._materials.items():
@@ -322,13 +328,12 @@ class _Obj:
         if any(len(row) < 3 for row in rows):
             raise SceneError(f"{self._source.path}: a vertex has fewer than 3 numbers")
         vertices = np.array([row[:3] for row in rows], dtype=np.float64).reshape(-1, 3)
-        colored = [len(row) >= 6 for row in rows]
-        if not any(colored):
+        if all(len(row) < 6 for row in rows):
             return vertices, None
-        values = np.array([row[3:6] if has else (1, 1, 1) for row, has in zip(rows, colored, strict=True)], np.float64)
-        largest = 255.0 if values[np.array(colored)].max(initial=0.0) > 1.0 else 1.0
-        values[~np.array(colored)] = largest
-        return vertices, linear_rgba(values, largest)
+        told = (row[3:7] if len(row) == 7 else [*row[3:6], "nan"] if len(row) >= 6 else ["nan"] * 4 for row in rows)
+        values = np.array(list(told), np.float64)
+        largest = _white(values[:, :3], False)
+        return vertices, _shown_colors(self._source, np.where(np.isnan(values), largest, values), largest)
 
     def _corners(self) -> tuple[Corners, Indices]:
         faces = np.array(self._faces, np.int64).reshape(-1, 5)
@@ -447,22 +452,28 @@ def read_stl(source: MeshSource) -> list[MeshPart]:
     Raises:
         ValueError: Damaged.
     """
-    data = source.data
+    data = source.data.removeprefix(b"\xef\xbb\xbf")
     count = int.from_bytes(data[80:84], "little")
     is_text = data.lstrip()[:5].lower() == b"solid" and b"facet" in data[:_STL_TEXT].lower()
     if is_text and len(data) != 84 + 50 * count:
-        words = re.findall(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)", data, re.IGNORECASE)
-        vertices = np.array([list(map(float, row)) for row in words], np.float64).reshape(-1, 3)
-        vertices = vertices[: len(vertices) // 3 * 3]
+        loops = re.split(rb"outer\s+loop", data.lower())[1:]
+        words = [re.findall(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)", loop) for loop in loops]
+        if loops and b"endloop" not in loops[-1]:
+            raise ValueError("cut off in a facet")
+        vertices = np.array([list(map(float, row)) for loop in words for row in loop], np.float64).reshape(-1, 3)
+        lengths = np.array(list(map(len, words)), np.int64)
     else:
         source.check_count(count, 1)
         if len(data) < 84 + 50 * count:
             raise ValueError(f"cut off: {count} triangles are promised")
         rows = np.frombuffer(data, [("normal", "<3f4"), ("corners", "<9f4"), ("more", "<u2")], count, 84)
         vertices = rows["corners"].reshape(-1, 3).astype(np.float64)
+        lengths = np.full(count, 3)
         if (rows["more"] & 0x8000).any() or b"COLOR=" in data[:80]:
             source.note("colours of triangles")
-    return parts_of(source, vertices, Corners(np.arange(len(vertices)), np.full(len(vertices) // 3, 3)))
+        if len(data) > 84 + 50 * count:
+            source.note("bytes behind the last triangle")
+    return parts_of(source, vertices, Corners(np.arange(len(vertices)), lengths))
 
 
 def _white(values: Array, whole: bool) -> float:
@@ -582,8 +593,11 @@ class _Ply:
         values = self.values.get(element, {})
         for names in choices:
             if all(name in values and not isinstance(values[name], tuple) for name in names):
-                largest = {"u1": 255.0, "u2": 65535.0, "i2": 32767.0}.get(self.kinds[element][names[0]], 1.0)
-                return np.stack([values[name] for name in names], 1), largest
+                taken = np.stack([values[name] for name in names], 1)
+                kind = self.kinds[element][names[0]]
+                if kind == "i2" and taken.max(initial=0.0) <= 255.0:
+                    kind = "u1"  # no 16 bits are meant where none is used
+                return taken, {"u1": 255.0, "u2": 65535.0, "i2": 32767.0}.get(kind, 1.0)
         return None, 1.0
 
     def colors(self, element: str) -> Array | None:
@@ -637,6 +651,9 @@ def read_ply(source: MeshSource) -> list[MeshPart]:
             source.note("texture coordinates of faces that do not fit their corners")
     for element, key in ply.unseen():
         source.note(f"the property {key[:40]} of each {element}")
+    for element in ply.values:
+        if element not in ("vertex", "face", "tristrips"):
+            source.note(f"the element {element[:40]}")
     corners.check(source, len(vertices))
     triangles, owners = triangles_of(vertices, corners)
     textures = ply.textures if corners.uv is not None else []
