@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import threading
 import time
 from pathlib import Path
@@ -267,6 +268,19 @@ def test_a_ball_that_is_not_there_is_told_with_what_to_do() -> None:
         assert "Measure the ball" in told["remedy"]
         running.edit(type="effect", name="environment", on=False)
         running.until(lambda: running.host.state_message()["ball"] == "")
+
+
+def test_without_a_ball_the_card_tells_of_the_light() -> None:
+    """As the page is started or when it is asked; said with the interval, and taken back by undo."""
+    with Running(page_scene(), by_card=True) as running:
+        words = running.until(
+            lambda: next((m["measured"]["light"] for m in running.messages if m.get("measured", {}).get("light")), None)
+        )
+        assert re.fullmatch(r"light by the card, of second order: irradiance from above \S+ \+- \S+ camera .*", words)
+        running.until(lambda: running.host.state_message()["ball"] == "")
+        running.until(lambda: any(name == "captured" for name, *_ in running.next().stages))
+        running.edit(type="undo")
+        running.until(lambda: running.host.state_message()["ball"] == "missing")
 
 
 def test_comparisons() -> None:

@@ -64,6 +64,7 @@ GOOD = [
     {"type": "outline", "kind": "wall", "points": [[1, 2], [3, 4], [5, 6.5], [7, 8]]},
     {"type": "card", "radius": 0.03, "ruler": 0.097},
     {"type": "setup", "step": "check"},
+    {"type": "setup", "step": "light"},
     {"type": "camera", "width": 640, "height": 480},
     {"type": "no_camera"},
     {"type": "calibrate", "step": "start"},

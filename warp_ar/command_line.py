@@ -57,7 +57,7 @@ _COMMON: Final[dict[str, dict[str, Any]]] = {
     "--calibration": {"metavar": "FILE|exif", "help": "OpenCV's calibration file; exif: by the first picture"},
     "--light": {
         "metavar": "FILE|card",
-        "help": "captured .exr or .hdr instead of the ball's light; card: live --output only",
+        "help": "captured .exr or .hdr instead of the ball's light; card: live only",
     },
     "--light-axes": {
         "choices": LATLONG_AXES,

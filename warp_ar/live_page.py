@@ -47,11 +47,12 @@ def _page_scene(options: argparse.Namespace) -> Scene:
         raise UsageError(f"--port {options.port}: expected a port, 0 to 65535; 0 takes a free one")
     if options.token is not None and not (options.token.isascii() and options.token.isalnum()):
         raise UsageError("--token: expected letters and digits, for it stands in an address")
-    if options.calibration is None and options.light is None:
+    light = None if options.light == "card" else options.light
+    if options.calibration is None and light is None:
         return load_scene(options.scene)
     from warp_ar.session import chosen_scene  # loads Warp, for which the page does not wait elsewhere
 
-    return chosen_scene(options.scene, options.source, options.calibration, options.light, options.light_axes)
+    return chosen_scene(options.scene, options.source, options.calibration, light, options.light_axes)
 
 
 def _page_address(options: argparse.Namespace) -> Address:
@@ -89,6 +90,7 @@ def _make_page_host(options: argparse.Namespace, scene: Scene, checking: threadi
         quality=options.quality,
         budget_ms=options.budget_ms,
         frames=options.frames,
+        by_card=options.light == "card",
         **callbacks,
     )
     if host.no_camera is not None:

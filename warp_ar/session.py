@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -86,14 +85,11 @@ def lit_by_card(scene: Scene, source: Source) -> tuple[Scene, str]:
     if not views:
         raise UsageError(f"light {BY_CARD!r}: the first {CARD_FRAMES} frames do not show the marker well")
     found = light_by_card(views[0][0], scene, views[0][1])
-    data = found.radiance.tobytes()
-    path = cache_folder() / "card_light" / f"{hashlib.sha256(data).hexdigest()[:16]}.exr"
+    name = hashlib.sha256(found.radiance.tobytes()).hexdigest()[:16]
+    path = cache_folder() / "card_light" / f"{name}.exr"
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_environment(path, cv2.resize(found.radiance, (64, 32), interpolation=cv2.INTER_NEAREST))
-    value, half = (float(part.mean()) for part in found.irradiance(np.array([[0.0, 0.0, 1.0]])))
-    x, y, z = found.main_direction
-    told = f"from above {value:.2f} +- {half:.2f} camera values, mainly from ({x:.2f}, {y:.2f}, {z:.2f})"
-    return with_light(scene, path), f"light by the card, of second order: irradiance {told}"
+    write_environment(path, found.latlong)
+    return with_light(scene, path), found.words
 
 
 def chosen_scene(

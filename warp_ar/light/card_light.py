@@ -89,6 +89,19 @@ class CardLight:
         sum_: Array = (self.radiance.reshape(-1, 3).mean(axis=1) * angles) @ directions
         return sum_ / max(float(np.linalg.norm(sum_)), 1e-12)
 
+    @property
+    def latlong(self) -> npt.NDArray[np.float32]:
+        """The radiance as an environment's file holds it, (32, 64, 3)."""
+        return np.repeat(np.repeat(self.radiance, 32 // ROWS, axis=0), 32 // ROWS, axis=1)
+
+    @property
+    def words(self) -> str:
+        """The irradiance from above with its interval, and the main direction, in one line."""
+        value, half = (float(part.mean()) for part in self.irradiance(np.array([[0.0, 0.0, 1.0]])))
+        x, y, z = self.main_direction
+        told = f"from above {value:.2f} +- {half:.2f} camera values, mainly from ({x:.2f}, {y:.2f}, {z:.2f})"
+        return f"light by the card, of second order: irradiance {told}"
+
 
 def light_by_card(image: npt.NDArray[np.uint8], scene: Scene, pose: Pose) -> CardLight:
     """Return the light that the surfaces of a frame tell of.

@@ -99,6 +99,7 @@ class Host:
         quality: str | Quality = DEFAULT_PRESET,
         budget_ms: float | None = None,
         frames: int | None = None,
+        by_card: bool = False,
         publish: Callable[[Lit], None] = lambda lit: None,
         notify: Notify = lambda message: None,
     ) -> None:
@@ -111,6 +112,7 @@ class Host:
             quality: A preset's name, a value, or ``auto``.
             budget_ms: Milliseconds per frame for ``auto``; None means 33.
             frames: End after so many lit frames.
+            by_card: Light the scene by the card as soon as frames show it.
             publish: Takes every frame, on the host's own thread.
             notify: Takes other news for viewers, on any thread.
 
@@ -156,6 +158,8 @@ class Host:
         """The newest frame."""
         self.light_state: LightState | None = None
         """The environment as it was a moment ago, with its status; None while it is not known."""
+        if by_card:
+            self._setup.step("light")
         self._dropped, self._dropping = DroppedFiles(folder), threading.Lock()
         self._doing: dict[str, Callable[..., None]] = {
             "undo": controls.undo,

@@ -50,8 +50,9 @@ KINDS: Final = {
 """Kinds of each part that the page can add. Meshes are files, and the page names no file."""
 OUTLINES: Final = ("plane", "wall", "box")
 """Shapes of the desk that can be pointed out by four points of the picture."""
-SETUP_STEPS: Final = ("check", "ball", "response")
-"""Steps of a set-up: ``check`` all of it, measure the ``ball`` or the camera's ``response``."""
+SETUP_STEPS: Final = ("check", "ball", "light", "response")
+"""Steps of a set-up: ``check`` all of it, measure the ``ball`` or the camera's ``response``, or take
+the ``light`` from the card."""
 
 
 class ProtocolError(WarpArError, ValueError):

@@ -23,7 +23,9 @@ from warp_ar.checks.check_pictures import Look, board_instead, look_at, measure_
 from warp_ar.checks.checkup import ball_is_seen, check_look
 from warp_ar.checks.finding import Finding
 from warp_ar.errors import UsageError, WarpArError
-from warp_ar.scene import Camera, Pose, Scene
+from warp_ar.light.card_light import light_by_card
+from warp_ar.output.sinks import write_environment
+from warp_ar.scene import Camera, CapturedLight, Pose, Scene
 from warp_ar.tracking.card_layout import SHEET
 from warp_ar.tracking.tracking import TrackState
 from warp_ar.viewer.controls import Controls, Feed, Image
@@ -53,7 +55,8 @@ RESPONSE: Final = "response.txt"
 NO_BALL: Final = Finding(
     "ball.unfound",
     "no mirror ball is seen where the scene has it, so the light is not that of this desk",
-    "put the ball on the card’s cross, all of it in the picture, or press “Measure the ball”",
+    "put the ball on the card’s cross, all of it in the picture, or press “Measure the ball”; without a ball, press "
+    "“Light by the card”",
 )
 FEWEST: Final = 3
 """Frames without which nothing is measured."""
@@ -95,7 +98,8 @@ class SetupChecks:
             folder: Folder of a measured response.
         """
         self._controls, self._helper, self._notify, self._path = controls, helper, notify, folder / RESPONSE
-        self._steps = {"check": _Step(self._check), "ball": _Step(self._ball), "response": _Step(self._response)}
+        works = {"check": self._check, "ball": self._ball, "light": self._light, "response": self._response}
+        self._steps = {name: _Step(work) for name, work in works.items()}
         self._findings: list[Finding] = []
         self._frames: collections.deque[tuple[Image, float]] = collections.deque(maxlen=KEPT)
         self._of: object = None
@@ -312,6 +316,20 @@ class SetupChecks:
             f"Its radius: {1e3 * found.radius:.1f} mm{radius}."
         )
 
+    def _light(self, scene: Scene, look: Look) -> str:
+        """Light the scene by what the newest frame's card and other surfaces show."""
+        if not look.views:
+            raise UsageError("the marker was not seen: have all of the card in the picture")
+        found = light_by_card(look.views[-1][0], scene, look.views[-1][1])
+        path = self._path.with_name(f"card_light_{self._count}.exr")
+        write_environment(path, found.latlong)
+        captured = CapturedLight(path)
+        self._controls.change(
+            lambda w: dataclasses.replace(w, scene=dataclasses.replace(w.scene, captured=captured)),
+            "light by the card",
+        )
+        return found.words
+
     def _response(self, scene: Scene, look: Look) -> str:
         """Measure how the camera encodes light, by the card's greys."""
         found = measure_grey_response(look.images)
@@ -368,6 +386,7 @@ def _state_of(scene: Scene) -> dict[str, object]:
     ball = scene.probes[0] if scene.probes else None
     return {
         "ball": ball and (ball.center, ball.radius),
+        "light": scene.captured,
         "response": scene.camera.transfer,
         "check": (scene.camera, scene.marker, scene.probes, scene.proxies),
     }

@@ -113,7 +113,7 @@ connection.addEventListener("state", ({ detail }) => {
 
 /** The ball's light in the bar; its word is short, so that the bar does not move the picture. */
 function showBall(found) {
-  const [look, words] = { seen: ["tracked", "found"], missing: ["lost", "not seen where the scene has it"], outside: ["held", "out of the picture"] }[found] ?? ["", "none is looked for"];
+  const [look, words] = { seen: ["tracked", "found"], missing: ["lost", "not seen where the scene has it"], outside: ["held", "out of the picture: its last light stays, as bright as the card"] }[found] ?? ["", "none is looked for"];
   $("ball-state").className = `chip ${look}`;
   $("ball-state").title = `The mirror ball: ${words}`;
 }

@@ -29,6 +29,7 @@ export class SetupPanel {
       if (Number.isFinite($("marker-size").valueAsNumber)) connection.set("marker", 0, "size", $("marker-size").valueAsNumber / 1000);
     });
     $("measure-ball").addEventListener("click", () => connection.send("setup", { step: "ball" }));
+    $("card-light").addEventListener("click", () => connection.send("setup", { step: "light" }));
     $("measure-response").addEventListener("click", () => connection.send("setup", { step: "response" }));
     $("check").addEventListener("click", () => connection.send("setup", { step: "check" }));
     $("marker-dictionary").replaceChildren(...DICTIONARIES.map((name) => el("option", { value: name }, family(name))));
@@ -97,13 +98,14 @@ export class SetupPanel {
   }
 
   set message({ busy, doing, findings, outdated, measured, failed }) {
-    for (const id of ["measure-ball", "measure-response", "check"]) $(id).disabled = busy !== null;
+    for (const id of ["measure-ball", "card-light", "measure-response", "check"]) $(id).disabled = busy !== null;
     clearInterval(this.#clock);
     // What was asked for stands beside its own button: how long it has taken, what came out, or why nothing did.
     const put_step = (step, id, idle) =>
       put(id, busy === step ? (doing ? `Looking at the frames: ${doing} …` : LOOKING) : failed[step] ? sentence(failed[step]) : measured[step] ?? idle);
     const count = findings?.length ?? 0;
     put_step("ball", "ball-note", "Centre and radius are solved for together, from the frames of the last seconds: move the camera around the ball, then press.");
+    put_step("light", "light-by-card", "Without a ball: what the card, planes and boxes of the newest frame show of the light; later changes are not followed.");
     put_step("response", "response-note", "How the camera encodes light, told by the card's grey patches under different exposures or light.");
     put_step("check", "check-note", findings ? (count ? `${count} finding${count === 1 ? "" : "s"}, the worst first:` : "Nothing wrong was found.") : outdated ? "The set-up has changed since it was looked at: check it again." : "Units, card, camera, ball and light are looked at in the frames of the last seconds.");
     $("response-file").hidden = !measured.response;
@@ -114,7 +116,7 @@ export class SetupPanel {
     this.#busy = busy;
     const began = this.#began;
     const seconds = el("span", { "aria-hidden": "true" });
-    $({ ball: "ball-note", response: "response-note", check: "check-note" }[busy]).append(seconds);
+    $({ ball: "ball-note", light: "light-by-card", response: "response-note", check: "check-note" }[busy]).append(seconds);
     this.#clock = setInterval(() => (seconds.textContent = ` ${Math.round((performance.now() - began) / 1000)} s`), 1000);
   }
 }
