@@ -94,7 +94,7 @@ def error_mm(fit):
     return 1e3 * np.linalg.norm(fit.center - CENTER)
 
 
-@pytest.mark.parametrize("offset", [(0.0, 0.0, 0.0), (3.0, -3.0, 0.5), (-4.0, 4.0, 0.0)])
+@pytest.mark.parametrize("offset", [(3.0, -3.0, 0.5)])
 def test_found_from_some_millimetres_off(clip, offset):
     fit = fit_ball(clip, make_camera(), rough(offset), search=0.006)
     assert fit.is_good

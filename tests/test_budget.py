@@ -128,7 +128,7 @@ def best_error(budget: float) -> float:
     return min(sum(ERRORS[setting][method] for setting, method in own.items()) for own in fitting)
 
 
-@pytest.mark.parametrize("budget", [12.0, 20.0, 33.0, 60.0, 100.0, 400.0])
+@pytest.mark.parametrize("budget", [12.0, 33.0, 400.0])
 def test_chooses_once_what_fits_and_keeps_it(budget):
     machine = Machine(budget)
     times = machine.run(20.0)
@@ -171,7 +171,7 @@ def test_load_is_answered_and_taken_back_when_it_goes():
     assert machine.controller.expected_error <= best_error(0.95 * LEAST * 33.0)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_no_setting_moves_twice_in_half_a_second(seed):
     machine = Machine(33.0, seed)
     loads = np.random.default_rng(seed)

@@ -17,7 +17,7 @@ from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, EXIT_USAGE
 from warp_ar.light.captured import Light, irradiance_above, latlong_directions, texel_solid_angles
 from warp_ar.live import main as live
 from warp_ar.live_start import say_quick_check
-from warp_ar.photo_capture import _rows_of, capture_light
+from warp_ar.photo_capture import capture_light
 from warp_ar.photographs.support import plane_from_contact
 from warp_ar.scene import load_scene
 
@@ -181,11 +181,6 @@ def test_a_response_that_was_found_is_written_into_the_scene(tmp_path, capsys):
     assert "the response is not srgb" in capsys.readouterr().err
     scene = load_scene(tmp_path / "photo.toml")
     assert scene.camera.transfer == tmp_path / "light.response.txt"
-
-
-@pytest.mark.parametrize(("radius", "rows"), [(20.0, 128), (250.0, 256), (1500.0, 2048), (5000.0, 2048)])
-def test_a_light_has_as_many_rows_as_its_ball_tells(radius, rows):
-    assert _rows_of(radius) == rows
 
 
 def test_a_photograph_too_dark_for_a_rim_is_shown_by_another(bracket):

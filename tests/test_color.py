@@ -127,13 +127,6 @@ def test_plateau_of_a_response_keeps_its_radiance(device, tmp_path):
     np.testing.assert_array_equal(decode(path, encode(path, linear)), linear)
 
 
-@pytest.mark.parametrize("transfer", ["srgb", "linear", "gamma:2.2"])
-def test_one_comparison_finds_the_code(transfer):
-    """What makes encoding fast: no cell holds two thresholds."""
-    counts = color.encode_table(transfer)[: color.ENCODE_KEYS]
-    assert (counts == np.floor(counts)).all()
-
-
 @pytest.mark.parametrize(
     ("content", "words"),
     [

@@ -142,6 +142,7 @@ def test_at_rest_the_picture_stays_that_of_its_reference(monkeypatch: pytest.Mon
         running.edit(type="compare", other="traced")
         running.edit(type="play", on=False)
         running.until(lambda: done(running))
+        time.sleep(4.0 * host._STILL_SECONDS)  # the last picture comes a moment after what is told of it
         rest, count = running.frames[-1], len(running.frames)
         time.sleep(4.0 * host._STILL_SECONDS)
         assert len(running.frames) == count, "lit anew at rest"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 from tests.test_pipeline import Frames, frames, make_scene  # noqa: F401  (a fixture)
-from warp_ar.accuracy import costs as costs_module
 from warp_ar.accuracy.cost_table import SETTINGS, chosen, relevant_settings
 from warp_ar.accuracy.costs import BASE, Costs, measure_costs, read_costs, show_again, write_costs
 from warp_ar.engine.pipeline import Pipeline
@@ -50,18 +49,6 @@ def test_a_cache_that_cannot_be_written_is_no_failure(tmp_path, capsys):
     (tmp_path / "file").write_text("")
     write_costs(tmp_path / "file", "a", KEPT)
     assert "cannot keep measured costs" in capsys.readouterr().err
-
-
-def test_key_follows_device_version_scene_and_size(monkeypatch):
-    def key(size=(320, 240), **changes):
-        with Pipeline(make_scene(**changes), device="cpu", quality="low", size=size) as pipeline:
-            return costs_module.cost_key(pipeline.plan, pipeline.device, [SETTING])
-
-    keys = [key(), key((160, 120)), key(lights=()), key(objects=())]
-    assert key() == keys[0]
-    monkeypatch.setattr(costs_module, "package_version", lambda: "another")
-    keys.append(key())
-    assert len(set(keys)) == len(keys)
 
 
 def test_measured_costs_cover_every_method_but_brute_force(frames: Frames, device: str) -> None:

@@ -18,13 +18,12 @@ from tests.layer_rig import POSES, make_scene
 from tests.test_live import message, write_scene
 from warp_ar import export
 from warp_ar.errors import SinkError
-from warp_ar.output.gltf_file import quaternions, write_glb
+from warp_ar.output.gltf_file import write_glb
 from warp_ar.output.shot import Shot, exchange_materials_of, mesh_of, placement, texture_files
 from warp_ar.output.sinks import read_environment
 from warp_ar.output.usd_file import write_usd
 from warp_ar.scene import Camera, Light, Object
 from warp_ar.scene.description import Animation
-from warp_ar.scene.geometry import rotation_matrix
 from warp_ar.scene.materials import EmissiveMaterial, PhongMaterial
 from warp_ar.scene.mesh_files import load_mesh
 from warp_ar.scene.pose_file import load_pose_file
@@ -398,48 +397,12 @@ def test_gltf_moves_camera_and_objects(shot, tmp_path):
         assert view["byteOffset"] + view["byteLength"] <= len(binary)
 
 
-def test_quaternions_turn_as_their_matrices():
-    rng = np.random.default_rng(0)
-    matrices = np.stack(
-        [rotation_matrix(rng.uniform(-180, 180, 3)) for _ in range(200)]
-        + [np.diag([1.0, -1.0, -1.0]), np.diag([-1.0, 1.0, -1.0]), np.diag([-1.0, -1.0, 1.0])]
-    )
-    found = quaternions(matrices)
-    for (x, y, z, w), matrix in zip(found, matrices, strict=True):
-        back = np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-            ]
-        )
-        np.testing.assert_allclose(back, matrix, atol=1e-12)
-    assert (np.sum(found[1:] * found[:-1], -1) >= 0.0).all(), "each on the side of the one before"
-
-
 def test_a_phong_lobe_becomes_as_wide_a_one():
     item = Object("sphere", radius=0.1, material=PhongMaterial((0.1, 0.2, 0.3), (0.4, 0.5, 0.6), 30.0))
     (material,) = exchange_materials_of(item, mesh_of(item))
     assert (material.base_color, material.metallic, material.specular) == ((0.1, 0.2, 0.3), 0.0, (0.4, 0.5, 0.6))
     assert material.roughness == pytest.approx((2 / 32) ** 0.25)
     assert not material.pictures
-
-
-def test_a_texture_is_taken_along(shot, tmp_path):
-    """A texture of a file and one that a mesh brings: as a PNG beside USD, within glTF."""
-    pytest.importorskip("pxr.Usd", reason="needs usd-core, of the extra exchange")
-    picture = np.random.default_rng(0).integers(0, 256, (4, 8, 3)).astype(np.uint8)
-    cv2.imwrite(str(tmp_path / "wood.png"), picture[..., ::-1])
-    item = dataclasses.replace(shot.scene.objects[0], material=PhongMaterial(diffuse=tmp_path / "wood.png"))
-    textured = dataclasses.replace(shot, scene=dataclasses.replace(shot.scene, objects=(item,)))
-    written = write_usd(tmp_path / "shot.usda", textured)
-    assert [path.name for path in written] == ["shot.usda", "shot_object_0_sphere.png"]
-    np.testing.assert_array_equal(cv2.imread(str(written[1]))[..., ::-1], picture)
-    write_glb(tmp_path / "shot.glb", textured)
-    tree, binary = glb(tmp_path / "shot.glb")
-    view = tree["bufferViews"][tree["images"][0]["bufferView"]]
-    data = np.frombuffer(binary, np.uint8, view["byteLength"], view["byteOffset"])
-    np.testing.assert_array_equal(cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1], picture)
 
 
 def test_what_cannot_be_written_is_said(shot, tmp_path):

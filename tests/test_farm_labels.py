@@ -13,7 +13,7 @@ import warp as wp
 from tests.farm_rig import SIZE, make_jobs, write_recording
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.farm.jobs import Context, Job
-from warp_ar.farm.labels import DEPTH_SCALE, run_lengths
+from warp_ar.farm.labels import DEPTH_SCALE
 from warp_ar.farm.work import Work
 from warp_ar.kernels.picture.object_masks import trace_object_masks
 from warp_ar.scene import load_scene
@@ -147,13 +147,6 @@ def test_coco_counts_and_runs_are_those_of_the_masks(made):
         assert mask.sum() == label["area"]
         y, x = np.nonzero(mask)
         assert label["bbox"] == [x.min(), y.min(), np.ptp(x) + 1, np.ptp(y) + 1]
-
-
-@pytest.mark.parametrize("mask", [[[0, 1], [1, 0]], [[1, 0], [1, 0]], [[0, 0], [0, 0]], [[1, 1], [1, 1]]])
-def test_run_lengths_are_cocos(mask):
-    mask = np.array(mask, bool)
-    counts = run_lengths(mask)
-    np.testing.assert_array_equal(np.repeat(np.arange(len(counts)) % 2, counts).reshape(2, 2).T.astype(bool), mask)
 
 
 def test_light_is_told_for_every_frame(made):

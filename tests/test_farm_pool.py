@@ -12,41 +12,12 @@ from tests.farm_rig import make_jobs
 from warp_ar.errors import UsageError
 from warp_ar.farm import pools
 from warp_ar.farm.jobs import Context, Job
-from warp_ar.farm.pools import ProcessPool, _connect, cores_of, devices_of, keeping_to, share_of_gpu
+from warp_ar.farm.pools import ProcessPool, _connect, keeping_to, share_of_gpu
 
 pytestmark = pytest.mark.slow
 
 PATIENCE = 120.0
 """Seconds within which a worker starts."""
-
-
-@pytest.mark.parametrize(
-    ("cores", "workers", "expected"),
-    [
-        ({0, 1, 2, 3}, 1, [[0, 1, 2, 3]]),
-        ({0, 1, 2, 3}, 2, [[0, 1], [2, 3]]),
-        ({2, 3, 5, 7, 9}, 2, [[2, 3], [5, 7, 9]]),
-        ({0, 1}, 2, [[0], [1]]),
-        ({0, 1}, 5, [[0], [1], [0], [1], [0]]),
-    ],
-)
-def test_cores_are_shared_out_evenly(monkeypatch, cores, workers, expected):
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: cores, raising=False)
-    assert cores_of(["cpu"] * workers) == expected
-
-
-@pytest.mark.parametrize(
-    ("cores", "devices", "expected"),
-    [
-        ({0, 1, 2, 3}, "000", [[0, 1, 2, 3]] * 3),
-        ({0, 1, 2, 3}, "01010", [[0, 1], [2, 3], [0, 1], [2, 3], [0, 1]]),
-        ({2, 3, 5, 7, 9}, "1212", [[2, 3], [5, 7, 9], [2, 3], [5, 7, 9]]),
-        ({0, 1}, "01230", [[0], [1], [0], [1], [0]]),
-    ],
-)
-def test_workers_of_a_gpu_share_its_part_of_the_cores(monkeypatch, cores, devices, expected):
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: cores, raising=False)
-    assert cores_of([f"cuda:{gpu}" for gpu in devices]) == expected
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="needs cores to keep to")
@@ -57,13 +28,6 @@ def test_cores_are_kept_to_for_a_while():
     assert os.sched_getaffinity(0) == before
     with keeping_to([]):
         assert os.sched_getaffinity(0) == before
-
-
-def test_workers_on_cpu_are_as_many_as_asked_or_one_per_four_cores(monkeypatch):
-    assert devices_of("cpu", 3) == ["cpu"] * 3
-    for cores, workers in ((2, 1), (8, 2), (64, 16)):
-        monkeypatch.setattr("warp_ar.farm.pools.usable_cores", lambda cores=cores: cores)
-        assert devices_of("cpu", None) == ["cpu"] * workers
 
 
 @pytest.mark.parametrize(

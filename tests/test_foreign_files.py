@@ -223,13 +223,6 @@ def test_a_fisheye_projects_as_it_says(tmp_path_factory, terms, said):
     assert np.abs(undistorted(camera, pixels) - flat).max() < PIXELS / 400 * 4  # a pixel is 4 times wider at the rim
 
 
-def test_the_fisheye_of_a_case(tmp_path):
-    camera = load_calibration(
-        calibration(tmp_path / "c.json", fisheye_model=1, distortion_coefficients=[-0.1, 0.01, 0.02, -0.01])
-    )
-    assert project(camera, np.array([[0.5, 0.3, 1.0]]))[0] == pytest.approx([496.2, 345.7], abs=0.06)
-
-
 @pytest.mark.parametrize(
     ("more", "said"),
     [

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import pathlib
-import shutil
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
 
 import cv2
@@ -43,34 +41,6 @@ def disk(tmp_path: pathlib.Path) -> Iterator[pathlib.Path]:
         pytest.skip("no small disk can be mounted here")
     yield place
     subprocess.run(["umount", str(place)], check=True)
-
-
-# What is on the disk beside: every fragment, and the end of the file, is cut off somewhere.
-@pytest.mark.parametrize("taken", [0, 130, 330])
-@pytest.mark.parametrize("name", [*VIDEOS, "frames", "light"])
-def test_full_disk_leaves_whole_files_and_true_counts(disk: pathlib.Path, name: str, taken: int) -> None:
-    (disk / "other").write_bytes(bytes(1000 * taken))
-    before = threading.active_count()
-    rng = np.random.default_rng(0)
-    sink = EnvironmentSink(disk / name) if name == "light" else open_sink(disk / name, fps=24)
-
-    def fill() -> None:
-        with sink:
-            for _ in range(260):
-                image = rng.integers(0, 256, (48, 64, 3), dtype=np.uint8)
-                sink.write(image.astype(np.float32) if name == "light" else image)
-
-    with pytest.raises(SinkError, match="No space left"):
-        fill()
-    if name == "light":
-        assert [read_environment(path).shape for path in (disk / name).iterdir()] == [(48, 64, 3)] * sink.written
-    elif name == "frames":
-        assert len(list((disk / name).iterdir())) == sink.written
-        assert sink.written == 0 or len(levels(disk / name)) == sink.written
-    elif (disk / name).exists():
-        assert len(levels(disk / name)) == sink.written
-    assert not list(disk.rglob(".*"))
-    assert threading.active_count() <= before
 
 
 @contextlib.contextmanager
@@ -186,23 +156,3 @@ def test_an_end_that_does_not_fit_leaves_the_fragments(disk: pathlib.Path, name:
         outcomes.add(sink.written)
     assert 60 in outcomes
     assert len(outcomes) > 1
-
-
-@pytest.mark.parametrize("name", VIDEOS)
-def test_full_disk_at_the_start_leaves_what_stood_there(disk: pathlib.Path, name: str) -> None:
-    with open_sink(disk / name, fps=24) as sink:
-        for level in range(20):
-            sink.write(flat(level))
-    before = (disk / name).read_bytes()
-    free = shutil.disk_usage(disk).free
-    (disk / "other").write_bytes(bytes(max(free - 8192, 0)))
-    rng = np.random.default_rng(0)
-
-    def fill() -> None:
-        with open_sink(disk / name, fps=24) as sink:
-            for _ in range(60):
-                sink.write(rng.integers(0, 256, (480, 640, 3), dtype=np.uint8))
-
-    with pytest.raises(SinkError, match="No space left"):
-        fill()
-    assert (disk / name).read_bytes() == before

@@ -74,17 +74,6 @@ def test_what_tells_nothing_says_nothing(bare):
     assert not ground_is_seen(bare, CAMERA, outside, 0.0)
 
 
-def test_nothing_is_searched_where_the_card_is_seen(bare, monkeypatch):
-    def searched(*arguments, **options):
-        raise AssertionError("an outline was looked for")
-
-    monkeypatch.setattr(ball_measure, "agreeing_outlines", searched)
-    with pytest.raises(UsageError, match="no mirror ball is seen"):
-        measure_ball(bare, CAMERA, PROBE, (TABLE,))
-    with pytest.raises(AssertionError, match="looked for"):
-        measure_ball(with_ball(bare), CAMERA, PROBE, (TABLE,))
-
-
 @pytest.mark.parametrize(("share", "is_kept"), [(0.6, False), (0.75, True), (1.25, True), (1.4, False)])
 def test_a_ball_of_quite_another_size_is_not_believed(bare, share, is_kept, monkeypatch):
     """From one side alone the card's rings made one of 18 mm where 30 were typed."""

@@ -14,7 +14,7 @@ import pytest
 from tests.layer_rig import POSES, SIZE, make_frame, make_scene, run
 from tests.reference import color as reference_color
 from warp_ar.engine.pipeline import Pipeline
-from warp_ar.errors import SinkError, UsageError
+from warp_ar.errors import SinkError
 from warp_ar.output.layer_file import (
     DEPTH_STEP,
     PICTURES,
@@ -23,7 +23,6 @@ from warp_ar.output.layer_file import (
     SideFiles,
     compose_layers,
     layer_frame,
-    parse_layers,
     write_layers,
 )
 from warp_ar.scene import Exposure
@@ -261,12 +260,3 @@ def test_side_files_ask_for_what_they_write(tmp_path):
     with SideFiles(environment=tmp_path / "e", layers=tmp_path / "l", names=("depth",)) as side:
         assert side.outputs == ("environment", "depth")
         assert side.written == ", and 0 environments, and layers of 0"
-
-
-def test_names_of_layers():
-    assert parse_layers(None) == parse_layers("all") == tuple(LAYERS)
-    assert parse_layers("depth, objects,depth") == ("depth", "objects")
-    with pytest.raises(UsageError, match=r"--layers: 'dept' is no layer; did you mean 'depth'\? expected all, or some"):
-        parse_layers("objects,dept")
-    with pytest.raises(UsageError, match=r"--layers: ' ' is no layer"):
-        parse_layers(" ")

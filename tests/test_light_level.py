@@ -20,7 +20,7 @@ from warp_ar.kernels.structs import Emitter
 from warp_ar.light.captured import texel_solid_angles
 from warp_ar.light.config import CONFIG
 from warp_ar.light.estimate import Estimate, FoundEmitter, Seen, Steadiness
-from warp_ar.light.priors import alike, connected_regions, depth_profile, least_missing
+from warp_ar.light.priors import connected_regions, depth_profile, least_missing
 from warp_ar.light.recovery import choose_channel
 
 COUNT = 40
@@ -307,13 +307,6 @@ def patch(around, radius=0.5, center=CENTER, level=1.0):
     return values, component, inside, angle, area
 
 
-def test_a_component_counts_by_the_share_that_clips_in_all_channels():
-    clipped = np.array([[1, 1, 1], [1, 1, 1], [1, 1, 1], [1, 0, 0], [1, 0, 0], [0.5, 0.2, 1]], float)
-    area = np.array([1.0, 2.0, 1.0, 3.0, 5.0, 1.0])
-    component = np.array([0, 0, 1, 1, 2, -1])
-    assert alike(clipped, area, component, 3) == pytest.approx([1.0, 0.25**2, CONFIG.priors.least_alike])
-
-
 @pytest.mark.parametrize("level", [1.0, 0.6, 1.18])
 def test_what_is_missing_grows_inward_from_where_light_fades(level):
     """At any level of clipping: a ball reflects but a part."""
@@ -331,12 +324,6 @@ def test_what_is_missing_grows_inward_from_where_light_fades(level):
 def test_a_window_lacks_as_much_at_its_frame(around):
     values, component, *_ = patch(around)
     assert (depth_profile(values, component) == 1.0).all()
-
-
-def test_nothing_clips_nothing_is_shared():
-    values, _ = cells_of("cpu", radiance=0.5)
-    assert (depth_profile(values, np.full(values.size, -1)) == 1.0).all()
-    assert alike(np.zeros((4, 3)), np.ones(4), np.full(4, -1), 0).shape == (0,)
 
 
 def test_a_sky_around_the_sun_comes_out_bright_in_its_middle(device, scene):

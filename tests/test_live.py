@@ -243,10 +243,7 @@ def test_no_marker_is_said_and_the_frames_are_kept(tmp_path: Path, capsys: pytes
 
 def test_a_source_that_breaks_leaves_a_valid_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     frames = tmp_path / "frames"
-    frames.mkdir()
-    with Synthetic("card", length=3) as card:
-        for frame in card:
-            cv2.imwrite(str(frames / f"{frame.index:04d}.png"), frame.image[..., ::-1])
+    card_frames(frames, 3)
     (frames / "0003.png").write_bytes((frames / "0002.png").read_bytes()[:2000])
     video = tmp_path / "out.mp4"
     assert run(write_scene(tmp_path, source='path = "frames"'), "--headless", "--output", video) == 1
@@ -272,7 +269,7 @@ def test_a_signal_finishes_all_files(tmp_path: Path, kind: str, code: int, momen
             time.sleep(0.05)
         time.sleep(moment)
         process.send_signal(signal.Signals[kind])
-        _, errors = process.communicate(timeout=60)
+        _, errors = process.communicate(timeout=120)
     assert process.returncode == code, errors
     assert errors == ""
     frames = json.loads(report.read_text())["frames"]
@@ -280,15 +277,6 @@ def test_a_signal_finishes_all_files(tmp_path: Path, kind: str, code: int, momen
         assert container.streams.video[0].frames == len(frames)  # an ordinary MP4 says how many it has
     assert len(list(light.iterdir())) == len(frames)
     assert not list(tmp_path.rglob(".*"))
-
-
-def write_frames(folder: Path) -> Path:
-    """A folder of frames that this program did not write."""
-    folder.mkdir()
-    with Synthetic("card", length=3) as card:
-        for frame in card:
-            cv2.imwrite(str(folder / f"{frame.index:04d}.png"), frame.image[..., ::-1])
-    return folder
 
 
 def snapshot(folder: Path) -> dict[str, bytes]:
@@ -326,7 +314,7 @@ def test_nothing_is_written_over_what_is_read_or_twice(
     monkeypatch.chdir(tmp_path)
     mesh = '[[object]]\nshape = "mesh"\nfile = "ball.ply"\n'
     scene = write_scene(tmp_path, body=PROBE + mesh, source='path = "here.mp4"')
-    write_frames(tmp_path / "frames")
+    card_frames(tmp_path / "frames", 3)
     for name in ("clip.mp4", "here.mp4", "camera.yml", "ball.ply"):
         (tmp_path / name).write_bytes(b"mine")
     (tmp_path / "link").symlink_to("frames")

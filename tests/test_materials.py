@@ -157,17 +157,6 @@ def upper(rng, count):
 # --- Closed form ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("exponent", [0.0, 1.0, 32.0, 1e3, 1e5])
-def test_phong_lobe_is_normalised(device, exponent):
-    """Its integral over the hemisphere about the mirror direction is 1 at every exponent."""
-    mirror = np.array([0.6, 0.0, 0.8])
-    wi, solid = hemisphere(400, 64, about=mirror, width=min(1.0, (exponent + 1) ** -0.5))
-    lobe, _ = lobes(wi, np.broadcast_to(mirror, wi.shape), exponent, device)
-    # At exponent 0 the lobe ends in a step, which the quadrature sees to half a node.
-    assert (lobe * solid).sum() == pytest.approx(1.0, abs=6e-3 if exponent == 0.0 else 1e-3)
-    assert np.isfinite(lobe).all()
-
-
 @pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize("roughness", [0.0, 0.3, 1.0])
 @pytest.mark.parametrize("metallic", [0.0, 0.3, 1.0])

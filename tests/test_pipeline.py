@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-import warp as wp
 
 from warp_ar.engine.pipeline import Pipeline, Result
 from warp_ar.errors import SceneError, UpdateError, UsageError
@@ -83,29 +82,6 @@ def run(pipeline: Pipeline, images: Frames) -> list[Result]:
         _ = result.image, result.environment  # taken now: arrays are valid until the next call
         results.append(result)
     return results
-
-
-def test_numpy_and_warp_frames_give_the_same(frames: Frames, device: str) -> None:
-    scene = make_scene()
-    with (
-        Pipeline(scene, device=device, quality="low") as first,
-        Pipeline(scene, device=device, quality="low") as second,
-    ):
-        for image in frames:
-            array = wp.array(image, dtype=wp.vec3ub, device=device)
-            np.testing.assert_array_equal(first(image).image, second(array).image)
-
-
-def test_frames_sent_ahead_are_the_same(frames: Frames, device: str) -> None:
-    many = frames * 3  # more than are under way at once
-    with (
-        Pipeline(make_scene(), device=device, quality="low") as first,
-        Pipeline(make_scene(), device=device, quality="low") as second,
-    ):
-        expected = [result.image for result in run(first, many)]
-        ahead = [second.submit(image, time_seconds=index / 30) for index, image in enumerate(many)]
-        for result, image in zip(ahead, expected, strict=True):
-            np.testing.assert_array_equal(result.image, image)
 
 
 def test_a_track_of_the_callers_is_that_of_the_pipelines_own(frames: Frames, device: str) -> None:
@@ -207,64 +183,6 @@ def test_profiling_changes_times_only(frames: Frames, device: str) -> None:
         for one, other in zip(run(plain, frames), run(profiled, frames), strict=True):
             np.testing.assert_array_equal(one.image, other.image)
             assert one.stages.keys() == other.stages.keys()
-
-
-def test_result_stays_on_the_device(frames: Frames, device: str) -> None:
-    with Pipeline(make_scene(), device=device, quality="low", outputs=("image", "environment", "pose")) as pipeline:
-        result = pipeline(frames[0])
-        assert result.image_array.device == wp.get_device(device)
-        assert result.environment_array.shape == (64, 128)
-        assert result.pose is not None
-        kept = result.image
-        before = kept.copy()
-        pipeline(np.zeros_like(frames[0]))
-        np.testing.assert_array_equal(kept, before)
-
-
-@pytest.mark.parametrize("bands", [1, 2, 3, 16])
-def test_bands_give_the_same_bits(frames: Frames, bands: int) -> None:
-    outputs = ("image", "environment")
-    with (
-        Pipeline(make_scene(), device="cpu", quality="low", outputs=outputs, bands=5) as expected,
-        Pipeline(make_scene(), device="cpu", quality="low", outputs=outputs, bands=bands) as pipeline,
-    ):
-        for one, other in zip(run(expected, frames), run(pipeline, frames), strict=True):
-            np.testing.assert_array_equal(one.image, other.image)
-            np.testing.assert_array_equal(one.environment, other.environment)
-
-
-def test_lost_marker_passes_the_frame_and_keeps_the_light(frames: Frames) -> None:
-    outputs = ("image", "environment", "pose")
-    grey = np.full_like(frames[0], 90)
-    with Pipeline(make_scene(), device="cpu", quality="low", outputs=outputs) as pipeline:
-        never = pipeline(grey, time_seconds=0.0)
-        assert never.state is TrackState.LOST
-        assert never.environment is None
-        np.testing.assert_array_equal(never.image, grey)
-        seen = pipeline(frames[0], time_seconds=1.0)
-        light = seen.environment
-        assert seen.pose is not None
-        assert light is not None
-        lost = pipeline(grey, time_seconds=9.0)
-        assert lost.pose is None
-        np.testing.assert_array_equal(lost.image, grey)
-        np.testing.assert_array_equal(lost.environment, light)
-        assert pipeline(frames[1], time_seconds=9.1).pose is not None
-
-
-def test_only_what_the_scene_calls_for_is_planned() -> None:
-    def stages(**changes: object) -> set[str]:
-        quality = PRESETS["low"].with_methods(expose="plain", relight="paper")
-        with Pipeline(make_scene(**changes), device="cpu", quality=quality) as pipeline:
-            return {stage.name for stage, _ in pipeline.plan.stages}
-
-    surroundings = {"unwrap", "accumulate", "fill"}
-    off = Exposure(1.0)
-    assert stages(objects=(), lights=(), exposure=off) == set()
-    assert stages(objects=(), lights=()) == {"expose"}, "plain scaling asks for nothing else"
-    assert {"relight", "summed_area", "expose"}.isdisjoint(stages(lights=(), exposure=off))
-    assert {"shade", "visibility", "irradiance", "prefilter"}.isdisjoint(stages(objects=(), exposure=off))
-    assert surroundings.isdisjoint(stages(probes=())), "without a ball there is no environment light to capture"
 
 
 def test_a_closed_pipeline_says_so(frames: Frames) -> None:

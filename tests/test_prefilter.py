@@ -18,7 +18,6 @@ from warp_ar.kernels.environment.lobes import (
     lobe_offset,
     lobe_size,
     lobe_texels,
-    mip_weights,
     sample_levels,
 )
 from warp_ar.kernels.latlong import direction_from_latlong
@@ -182,20 +181,6 @@ def test_the_reference_is_the_twin_s(device, lobe, height):
         twin = reference.integrate_lobe(radiance, directions, lobe_alpha(height, index), lobe)
         np.testing.assert_allclose(level.reshape(-1, 3), twin, rtol=1e-4, atol=ROUNDING)
         check_error("prefilter", level.reshape(-1, 3), twin)
-
-
-def test_mip_weights_are_a_blend_and_match_a_gaussian(device):
-    for lobe in LOBES:
-        weights = mip_weights(64, lobe)
-        assert (weights >= 0).all()
-        np.testing.assert_allclose(weights.sum(1), 1, atol=1e-9)
-    # A narrow Phong lobe is a Gaussian of variance alpha^2 per axis: so is the blend.
-    weights = mip_weights(256, "phong")
-    texel = np.pi / 256 * 2.0 ** np.arange(weights.shape[1])
-    variance = (texel**2 - texel[0] ** 2) / 12 + texel**2 / 4
-    variance[0] = 0
-    for level in range(2, 6):
-        assert (weights[level] * variance).sum() == pytest.approx(lobe_alpha(256, level) ** 2, rel=0.2)
 
 
 @pytest.mark.parametrize(("roughness", "bound"), [(0.5, 0.005), (0.7, 0.01), (1.0, 0.04)])

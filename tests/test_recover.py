@@ -251,7 +251,7 @@ def test_boundaries_count_less_and_the_inside_in_full(device):
     assert not got[away > 2.0].any()
 
 
-@pytest.mark.parametrize("height", [16, 32, 48, 128])
+@pytest.mark.parametrize("height", [16, 48])
 def test_cells_keep_energy_and_recovered_returns_it(device, height, scene):
     rng = np.random.default_rng(1)
     shape = (height, 2 * height)
@@ -381,7 +381,7 @@ def test_shading_shares_energy_between_lights_where_the_card_cannot(device, scen
     assert 6.0 < ratios["shading"] < 16.0
 
 
-@pytest.mark.parametrize("distance", [0.3, 0.35, 0.41, 0.55, 0.62, 0.7])
+@pytest.mark.parametrize("distance", [0.3, 0.41, 0.7])
 def test_shading_finds_how_far_an_emitter_is(device, scene, distance):
     center = np.array([-0.12, 0.03, 0.035])
     direction = np.array([-0.45, 0.35, 0.82]) / np.linalg.norm([-0.45, 0.35, 0.82])
@@ -526,36 +526,6 @@ def test_wide_regions_are_split_into_compact_parts():
     assert (parts >= 0).tolist() == (labels >= 0).tolist()
     assert sizes.max() < 3 * CONFIG.priors.region
     assert len(np.unique(parts[labels == 1])) == 1
-
-
-@pytest.mark.parametrize(("start", "least"), [(0.35, 0.29), (0.45, 0.3), (0.35, 0.38), (0.35, 0.36), (0.3, 0.2)])
-def test_an_emitter_stands_where_its_cost_is_least(start, least):
-    """Between the distances that are tried, from a start some steps off; never nearer than any is looked for."""
-    tried = []
-
-    class Search(EmitterSearch):
-        def __init__(self):
-            self.problem = SimpleNamespace(trace=True)
-
-        def tried(self, candidate, z, iterations):
-            tried.append(candidate.distance)
-            return SimpleNamespace(cost=50.0 * np.log(candidate.distance / least) ** 2)
-
-    def place_from(distance, worth):
-        place = Candidate(7, distance)
-        return Search()._at_its_distance(place, Search().cost_at(place, None), SimpleNamespace(z=None), worth)
-
-    place = place_from(start, 1e-6)
-    assert place.cell == 7
-    assert min(tried) > CONFIG.search.nearest
-    # 50 log(d / least)^2 - 6 log d: there is more room farther off.
-    if least > CONFIG.search.nearest:
-        assert place.distance == pytest.approx(least * np.exp(6.0 / 100.0), rel=1e-3)
-    assert len(tried) < 12
-    distant = Candidate(7, np.inf)
-    assert Search()._at_its_distance(distant, 0.0, SimpleNamespace(z=None), 0.01) is distant
-    # What gains no more than is asked for stays where it is.
-    assert place_from(start, 1e3) == Candidate(7, start)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import pytest
 
 from warp_ar import PRESETS, Pipeline
 from warp_ar.ball import reflectance_watch
-from warp_ar.ball.ball_reflectance import Reflected, difference_of_halves, measure_reflectance
+from warp_ar.ball.ball_reflectance import Reflected, measure_reflectance
 from warp_ar.ball.reflectance_watch import ENOUGH, FIRST, MOST, ReflectanceWatch
 from warp_ar.calibration.saturation import ball_discs
 from warp_ar.checks.check_pictures import take_look
@@ -86,17 +86,6 @@ def test_what_shines_beside_the_ball_tells_nothing():
     even, less = beside(np.ones(width)), beside(np.full(width, 1.2))
     assert np.array(less.reflectance) * 1.2 == pytest.approx(np.array(even.reflectance), rel=ROUNDED)
     assert beside(np.linspace(0.4, 2.0, width)) is None
-
-
-def test_halves_that_differ():
-    """By columns, by rows, not at all."""
-    pixels = np.stack(np.meshgrid(np.arange(10), np.arange(6)), -1).reshape(-1, 2)
-    ratio = np.repeat(np.where(pixels[:, :1] < 5, 0.3, 0.1), 3, axis=1)
-    assert difference_of_halves(ratio, pixels) == pytest.approx(0.2)
-    ratio = np.where(pixels[:, 1:] < 3, [0.0, 0.0, 0.0], [0.0, 0.4, -0.1])
-    assert difference_of_halves(ratio, pixels) == pytest.approx(0.4)
-    assert difference_of_halves(np.full((60, 3), 0.7), pixels) == 0.0
-    assert difference_of_halves(np.full((1, 3), 0.7), pixels[:1]) == 0.0
 
 
 def telling(monkeypatch, answers):

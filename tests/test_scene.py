@@ -203,18 +203,7 @@ def test_bundled_scenes_are_found_by_name(tmp_path: pathlib.Path, monkeypatch: p
         load_scene("desc")
 
 
-def test_bundled_scenes_lie_in_the_package() -> None:
-    for name, path in bundled_scenes().items():
-        assert path.is_file()
-        assert path.stem == name
-
-
 # --- The camera -------------------------------------------------------------------------------------------------------
-
-
-def test_camera_matrix() -> None:
-    expected = [[600.0, 0.0, 319.5], [0.0, 601.0, 239.5], [0.0, 0.0, 1.0]]
-    np.testing.assert_array_equal(loads_scene(CAMERA).camera.matrix(), expected)
 
 
 @pytest.mark.parametrize("size", [(640, 480), (320, 240), (1280, 960), (4, 3), (960, 720)])

@@ -272,7 +272,7 @@ for _ in range(2):
 
 def test_stages_without_a_common_input_run_side_by_side(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each waits for the other; one thread after another would never end."""
-    meeting = threading.Barrier(2, timeout=10.0)
+    meeting = threading.Barrier(2, timeout=60.0)
 
     def build(self: AddOne, arrays: Arrays, device: Any) -> list[Pass]:
         return [Pass(lambda rows: meeting.wait(), on_host=True)]  # type: ignore[arg-type,return-value]

@@ -253,7 +253,7 @@ async def test_the_token_is_asked_for() -> None:
 
 @run
 async def test_who_has_asked_counts_as_a_viewer_for_a_while(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(server, "WATCH_SECONDS", 0.3)
+    monkeypatch.setattr(server, "WATCH_SECONDS", 3.0)
     async with served() as site:
         await known_light(site)
         await known_light(site)

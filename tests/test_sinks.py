@@ -6,10 +6,6 @@ import contextlib
 import fractions
 import pathlib
 import shutil
-import subprocess
-import sys
-import threading
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -18,6 +14,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.test_sources import no_thread_left, patches  # noqa: F401  (a fixture)
 from warp_ar.command_line import Terminated, ended_by_signals
 from warp_ar.errors import SinkError, UsageError
 from warp_ar.output.sink import FRAMES_WAITING, ThreadedSink
@@ -40,21 +37,8 @@ RAMP_MEAN = 0.4
 VIDEOS = ("clip.mp4", "clip.mkv", "clip.mov")
 
 
-@pytest.fixture(autouse=True)
-def no_thread_left() -> Iterator[None]:
-    before = set(threading.enumerate())
-    yield
-    assert set(threading.enumerate()) <= before
-
-
 def flat(level: int, size: tuple[int, int] = (64, 48)) -> np.ndarray:
     return np.full((size[1], size[0], 3), level, np.uint8)
-
-
-def patches() -> np.ndarray:
-    colors = [(255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 0), (0, 255, 255), (255, 0, 255)]
-    colors += [(0, 0, 0), (255, 255, 255), (128, 128, 128), (200, 120, 60), (20, 40, 90), (90, 160, 70)]
-    return np.concatenate([np.full((32, 32, 3), color, np.uint8) for color in colors], axis=1)
 
 
 def radiance() -> np.ndarray:
@@ -356,23 +340,6 @@ def test_other_images_are_refused(tmp_path: pathlib.Path, name: str) -> None:
         sink.write(flat(0))
 
 
-def test_encoder_failure_is_told_at_the_next_write(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    sink = open_sink(tmp_path / "clip.mp4", fps=24)
-
-    def fail(*_: object) -> None:
-        raise av.FFmpegError(28, "no more")
-
-    monkeypatch.setattr(sink, "_start", fail)
-
-    def write_many() -> None:
-        for _ in range(FRAMES_WAITING + 2):
-            sink.write(flat(0))
-
-    with pytest.raises(SinkError, match="frame 0 cannot be written: no more"):
-        write_many()
-    sink.close()
-
-
 # -------------------------------------------------------------------------------------------------------------- signals
 
 
@@ -423,33 +390,3 @@ def test_last_png_that_cannot_be_written_is_told_by_close(tmp_path: pathlib.Path
     with pytest.raises(SinkError, match=r"0000\.png"):
         sink.close()
     sink.close()
-
-
-def test_killed_process_leaves_a_video(tmp_path: pathlib.Path) -> None:
-    script = (
-        "import os, sys, numpy as np\n"
-        "from warp_ar.output.sinks import open_sink\n"
-        "sink = open_sink(sys.argv[1], fps=24)\n"
-        "for index in range(120):\n"
-        "    sink.write(np.full((48, 64, 3), index, np.uint8))\n"
-        "os.kill(os.getpid(), 9)\n"
-    )
-    path = tmp_path / "clip.mp4"
-    root = pathlib.Path(__file__).resolve().parents[1]
-    done = subprocess.run([sys.executable, "-c", script, str(path)], cwd=root, check=False, capture_output=True)
-    assert done.returncode == -9, done.stderr
-    frames = levels(path)
-    assert len(frames) >= 120 - 40
-    assert frames == pytest.approx(list(range(len(frames))), abs=VIDEO_LEVELS)
-
-
-def test_interrupted_block_finishes_the_file(tmp_path: pathlib.Path) -> None:
-    def interrupted() -> None:
-        with open_sink(tmp_path / "clip.mp4", fps=24) as sink:
-            for index in range(7):
-                sink.write(flat(index))
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        interrupted()
-    assert len(levels(tmp_path / "clip.mp4")) == 7

@@ -195,40 +195,6 @@ def test_an_estimate_that_fails_leaves_the_light_and_the_next_one_is_made(monkey
     assert solvers[2] is not solvers[1]
 
 
-def test_frames_in_real_time_begin_alike_and_take_what_is_there(monkeypatch):
-    """The first frames wait in both ways; then none waits for a solution that never comes, and none is lost."""
-    scene = load_scene("desk")
-    with open_source(scene.source.path) as source:
-        frames = list(itertools.islice(source, 12))
-    held = threading.Event()
-
-    def slow(solver, sides, trace):
-        assert held.wait(60.0)
-        return solver, solve(solver, sides, trace)
-
-    monkeypatch.setattr(solving.SolvingProcess, "starting", False)
-    monkeypatch.setattr(solving.SolvingProcess, "prepare", lambda process: None)
-    monkeypatch.setattr(solving.PROCESS, "update", slow)
-    monkeypatch.setattr(recover, "REST", -1.0)  # however long the first ones took
-    with (
-        Pipeline(scene, device="cpu") as usual,
-        Pipeline(scene, device="cpu", estimates="real_time") as live,
-    ):
-        for frame in frames[: recover.EVERY_FRAME]:
-            expected = usual(frame.image, time_seconds=frame.time).image
-            np.testing.assert_array_equal(live(frame.image, time_seconds=frame.time).image, expected)
-        stage = live.scheduler.stage("recover")
-        for frame in frames[recover.EVERY_FRAME :]:
-            live(frame.image, time_seconds=frame.time)  # the estimate is held: this returns all the same
-        assert stage._progress.pending is not None
-        pending = stage._progress.pending
-        held.set()
-        pending.result(60.0)
-        live(frames[-1].image, time_seconds=frames[-1].time + 0.05)
-        assert stage._progress.pending is None or stage._progress.pending is not pending
-        assert stage._progress.took > 0.0
-
-
 def test_a_fork_solves_for_itself(process):
     """Of a process whose solver is there and whose BLAS is held: neither waits for threads that the fork lacks."""
     with one_blas_thread():

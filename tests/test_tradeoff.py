@@ -141,22 +141,6 @@ def whole(label, flip, over):
     return measure.Whole(label, 10.0 * over, flip, {"irradiance": "sh2"}, {}, over)
 
 
-@pytest.mark.parametrize(
-    ("over", "flip", "expected"),
-    [
-        (0.9, 0.2, "Chosen for the paper's time: 33% less error in 0.90x the time."),
-        (1.2, 0.4, "33% more error in 1.20x"),
-    ],
-)
-def test_words_say_what_was_measured(over, flip, expected):
-    """What was chosen for the paper's time is said to take what it took."""
-    words = tradeoff_page.whole_words(
-        [whole("paper", 0.3, 1.0), whole("high", 0.1, 9.5), whole(measure.SAME_TIME, flip, over)]
-    )
-    assert expected in words
-    assert "High: 67% less error in 9.50x the time." in words
-
-
 # --- The command that makes the paper's figures -----------------------------------------------------------------------
 
 
@@ -184,15 +168,6 @@ def test_a_figure_is_a_picture_numbers_and_a_plot(tmp_path, monkeypatch, capsys,
     assert paper.main(arguments) == EXIT_FAILED
     assert "figure7.webp is there, and this program did not write it" in capsys.readouterr().err
     assert (out / "figure7.webp").read_bytes() == kept
-
-
-def test_readings_are_a_table(monkeypatch, capsys, device):
-    monkeypatch.setattr(paper, "READING_SCENES", ("darken",))
-    monkeypatch.setattr(paper_figures, "READING_SCENES", ("darken",))
-    assert paper.main(["readings", "--frames", "2", "--shrink", "4", "--device", device]) == EXIT_DONE
-    printed = capsys.readouterr().out
-    assert "Readings of the open text" in printed
-    assert "clamp" in printed
 
 
 @pytest.mark.parametrize(

@@ -85,17 +85,6 @@ def test_frames_that_are_kept_come_in_ordinary_memory_in_the_end(hosts_side, mon
     transfers.close()
 
 
-def test_what_is_on_its_way_arrives_before_its_memory_goes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A pipeline may be let go while its last pictures are copied from slots that go with it."""
-    waited: list[str] = []
-    monkeypatch.setattr(transfer, "wait_for", waited.append)
-    transfers = Transfers.__new__(Transfers)
-    transfers._copiers = []
-    transfers._slots = [SimpleNamespace(downloaded=event) for event in ("first", "second", None)]
-    transfers.close()
-    assert waited == ["first", "second"]
-
-
 class _Stream:
     """What is put on a stream, in order."""
 

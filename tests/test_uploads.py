@@ -5,8 +5,6 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
-import pathlib
-import typing
 import zipfile
 
 import cv2
@@ -17,9 +15,9 @@ from PIL import Image
 
 from tests.gltf_files import Gltf
 from tests.test_pipeline import make_scene
-from warp_ar.errors import SceneError, SinkError, UsageError, WarpArError
+from warp_ar.errors import SinkError, UsageError, WarpArError
 from warp_ar.light.captured import Light
-from warp_ar.scene import Scene, SourceSpec, dumps_scene, load_scene
+from warp_ar.scene import SourceSpec, dumps_scene, load_scene
 from warp_ar.scene.mesh_files import load_mesh
 from warp_ar.scene.scene_files import files_of
 from warp_ar.stages.quality import PRESETS
@@ -127,85 +125,6 @@ def test_a_scene_is_shown_and_names_no_file_of_this_machine(files, wanted):
             files.take("desk.toml", spoiled.encode(), shown)
     with pytest.raises(WarpArError, match="no file of this name came with the scene"):
         files.take("desk.toml", own.encode(), wanted)
-
-
-def test_what_was_saved_here_is_taken_back(files, wanted, tmp_path):
-    """Also with a mesh that was dropped."""
-    made = files.take("my box.ply", box(0.1, 0.06, 0.2), wanted)[0](wanted)
-    saved = dumps_scene(dataclasses.replace(made.scene, path=None))
-    assert files.take("saved.toml", saved.encode(), made)[0](made).scene.objects == made.scene.objects
-
-
-MATERIAL = '[[object]]\nshape = "sphere"\nradius = 0.03\n[object.material]\nmodel = "{0}"\n{1} = "PATH"'
-# Fields of a scene that hold a path, and what names one in a file: at the end of [camera], or of the file.
-NAMED = {
-    "Camera.transfer": ('transfer = "PATH"', ""),
-    "SourceSpec.path": ("", '[source]\npath = "PATH"'),
-    "Object.file": ("", '[[object]]\nshape = "mesh"\nfile = "PATH"'),
-    "Proxy.file": ("", '[[proxy]]\nshape = "mesh"\nfile = "PATH"'),
-    "CapturedLight.file": ("", '[light]\nfile = "PATH"'),
-    "PoseSpec.file": ("", '[pose]\nfile = "PATH"'),
-    "LambertMaterial.base_color": ("", MATERIAL.format("lambert", "base_color")),
-    "MetallicRoughnessMaterial.base_color": ("", MATERIAL.format("metallic_roughness", "base_color")),
-    "MirrorMaterial.base_color": ("", MATERIAL.format("mirror", "base_color")),
-    "PhongMaterial.diffuse": ("", MATERIAL.format("phong", "diffuse")),
-    "PhongMaterial.specular": ("", MATERIAL.format("phong", "specular")),
-    "EmissiveMaterial.image": (
-        "",
-        '[[light]]\nkind = "rect"\nsize = [0.1, 0.1]\nintensity = 1.0\nat = [0.0, 0.0, 0.3]\nimage = "PATH"',
-    ),
-    "calibration": ("BY", 'calibration = "PATH"'),
-    "exif": ("BY", 'calibration = "exif"\n[source]\npath = "PATH"'),
-}
-NUMBERS = "width = 64\nheight = 48\nfx = 64.0\nfy = 64.0\ncx = 31.5\ncy = 23.5"
-
-
-def paths_of(kind, seen):
-    """Fields of dataclasses that may hold a path, in all that a scene is made of."""
-    if kind in seen:
-        return
-    seen.add(kind)
-    for name, hint in typing.get_type_hints(kind).items():
-        parts, found = [hint], False
-        while parts:
-            part = parts.pop()
-            parts += typing.get_args(part)
-            found |= part is pathlib.Path
-            if dataclasses.is_dataclass(part):
-                yield from paths_of(part, seen)
-        if found:
-            yield f"{kind.__name__}.{name}"
-
-
-def test_every_field_that_may_hold_a_path_is_tried():
-    """A scene's own path is where it was read from, not a key."""
-    assert {*NAMED, "Scene.path"} == {*paths_of(Scene, set()), "calibration", "exif"}
-
-
-@pytest.mark.parametrize("place", ["{0}/id_rsa", "id_rsa", "..", ".", "../id_rsa", "a/../../id_rsa"])
-@pytest.mark.parametrize("field", NAMED)
-def test_a_scene_from_outside_names_no_file_of_this_machine(files, wanted, tmp_path, monkeypatch, field, place):
-    """Whatever it is called, wherever the program runs, alone or in a ZIP; nothing is told of what is there."""
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "id_rsa").write_text("secret")
-    in_camera, after = NAMED[field]
-    camera = f"{NUMBERS}\n{in_camera}" if in_camera != "BY" else ""
-    text = f"schema = 1\n[camera]\n{camera}\n{after}\n[marker]\nsize = 0.08\n"
-    text = text.replace("PATH", place.format(tmp_path))
-    zipped = packed(**{"scene.toml": text, "a__b.bin": b"x"})
-    for name, data in (("desk.toml", text.encode()), ("desk.zip", zipped)):
-        with pytest.raises(WarpArError, match="no file of this name came with the scene") as caught:
-            files.take(name, data, wanted)
-        assert "secret" not in str(caught.value)
-    assert [path.name for path in tmp_path.iterdir()] == ["id_rsa"]
-
-
-def test_a_scene_from_outside_opens_no_camera_of_this_machine(files, wanted):
-    text = dumps_scene(dataclasses.replace(make_scene(), source=SourceSpec(camera=0)))
-    with pytest.raises(SceneError, match="opens no capture device"):
-        files.take("desk.toml", text.encode(), wanted)
-    own = dataclasses.replace(wanted, scene=dataclasses.replace(wanted.scene, source=SourceSpec(camera=0)))
-    assert files.take("desk.toml", text.encode(), own)[0](own).scene.source == SourceSpec(camera=0)
 
 
 @pytest.mark.parametrize(
