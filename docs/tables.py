@@ -98,25 +98,10 @@ def values_of(action: argparse.Action) -> str:
 
 
 def stages() -> str:
-    """Every stage and what it does."""
+    """Return every stage with its work."""
     from warp_ar.stages import STAGES
 
-    rows = [f"| `{stage.name}` | {stage.summary} |" for stage in STAGES]
-    return "\n".join(["| stage | what it does |", "| --- | --- |", *rows])
-
-
-def presets() -> str:
-    """What each preset chooses."""
-    from warp_ar.stages.quality import PRESETS
-
-    rows = ["| | " + " | ".join(f"`{name}`" for name in PRESETS) + " |", "| --- |" + " --- |" * len(PRESETS)]
-    for size in ("environment_height", "edge_samples"):
-        cells = [str(getattr(quality, size)) for quality in PRESETS.values()]
-        rows.append(f"| {size.replace('_', ' ')} | " + " | ".join(cells) + " |")
-    for stage in dict.fromkeys(stage for quality in PRESETS.values() for stage, _ in quality.methods):
-        cells = [chosen(stage, quality) for quality in PRESETS.values()]
-        rows.append(f"| {stage.replace('_', ' ')} | " + " | ".join(f"`{cell}`" for cell in cells) + " |")
-    return "\n".join(rows)
+    return "\n".join(f"- `{stage.name}`: {stage.summary}" for stage in STAGES)
 
 
 def figures() -> list[dict[str, Any]]:
@@ -163,20 +148,22 @@ def desk_ladder() -> str:
 
 
 def methods() -> str:
-    """Every method: its error and, where measured, the milliseconds it takes more than the cheapest of its stage."""
-    from warp_ar.accuracy.cost_table import SETTINGS, WORDS
+    """Return every method: its presets, error and, where measured, milliseconds above the cheapest of its stage."""
+    from warp_ar.accuracy.cost_table import SETTINGS, WORDS, chosen
+    from warp_ar.stages.quality import PRESETS
 
     known = figures()[0]["errors"]
     devices = [one for one in figures() if "milliseconds" in one]
-    rows = [["method", "what it does", "error", *(f"ms more, {one['made']['device']}" for one in devices)]]
-    rows.append(["---", "---", *["--:"] * (len(rows[0]) - 2)])
+    rows = [["method", "meaning", "presets", "error", *(f"ms more, {one['made']['device']}" for one in devices)]]
+    rows.append(["---", "---", "---", *["--:"] * (len(rows[0]) - 3)])
     for setting in SETTINGS:
         errors = known.get(setting.name, {})
         what, words = WORDS.get(setting.name, ("", {}))
         rows.append([f"**{setting.name.replace('_', ' ')}**", what, *[""] * (len(rows[0]) - 2)])
         for method in [method for method in setting.methods if method in errors]:
             times = [one["milliseconds"].get(setting.name, {}).get(method) for one in devices]
-            rows.append([f"`{method}`", words.get(method, ""), f"{errors[method]:.4f}", *map(milliseconds, times)])
+            own = ", ".join(name for name, quality in PRESETS.items() if chosen(quality, setting) == method)
+            rows.append([f"`{method}`", words.get(method, ""), own, f"{errors[method]:.4f}", *map(milliseconds, times)])
     return "\n".join("| " + " | ".join(cells) + " |" for cells in rows)
 
 
@@ -202,15 +189,6 @@ def plot(path: pathlib.Path | None = None) -> str:
         chart = scatter(points, "milliseconds per frame", "error: FLIP to the truth, per changed pixel", 1e3 / 30.0)
         path.write_text(stand_alone(chart), encoding="utf-8")
     return "![Error over milliseconds of the presets on the bundled desk](accuracy.svg)"
-
-
-def chosen(stage: str, quality: Any) -> str:
-    """The method of a quality for a stage; the last one where the quality names none."""
-    from warp_ar.stages import STAGES
-
-    method = str(quality.method(stage))
-    methods = next((list(one.methods) for one in STAGES if one.name == stage), [method])
-    return methods[-1] if method == "default" else method
 
 
 READERS = {
@@ -249,6 +227,7 @@ def formats() -> str:
         last = "; ".join(
             [*told.get("Names", "").strip().rstrip(".").split("; "), *dict.fromkeys(filter(None, named))]
         ).strip("; ")
+        refused = re.sub(r"^damaged(; |\b)", "", refused)  # as the page says of all
         cells = [" ".join(text.split()).rstrip(".").replace("``", "`") for text in (told["Follows"], refused, last)]
         rows.append("| " + " | ".join([name, *cells]) + " |")
     return "\n".join(rows)
@@ -281,7 +260,6 @@ PARTS = {
     "scene-keys": scene_keys,
     "command-line": command_line,
     "stages": stages,
-    "presets": presets,
     "plot": plot,
     "ladder": ladder,
     "ladder-desk": desk_ladder,

@@ -43,7 +43,7 @@ def make_parser() -> Parser:
     rare("--loop", action="store_true", help="start the clip again at its end; the page always does")
     text = "with files: first find the ball by what it mirrors"
     rare("--refine-ball", action="store_true", help=text)
-    text = "with files: path-trace with N samples a pixel, in the light of --quality"
+    text = "with files: path-trace with N samples a pixel"
     rare("--samples", type=int, metavar="N", help=text)
     text = "with --samples: relative standard error to stop at, such as 0.05"
     rare("--error", type=float, metavar="E", help=text)
@@ -54,7 +54,7 @@ def make_parser() -> Parser:
     parser.add_common("--overwrite", add=add)
     add("--report", type=Path, metavar="FILE.json", help="write poses and timings of every frame")
     add("--verbose", action="store_true", help="print a table of all stages at the end")
-    text = "of --output: 10bit, pq, hlg for video; 16bit, exr for folders (default: 8bit)"
+    text = "10bit, pq, hlg for video; 16bit, exr for folders (default: 8bit)"
     rare("--coding", choices=tuple(dict.fromkeys((*CODINGS, *FOLDER_CODINGS))), default="8bit", help=text)
     text = "FFmpeg's encoder of the video; list: show this machine's"
     rare("--encoder", metavar="NAME|list", help=text)
@@ -70,15 +70,15 @@ def make_parser() -> Parser:
     rare("--layers", metavar="NAMES|all", help=text)
     rare("--layer-pictures", action="store_true", help="with --save-layers: also PNG where it can hold them")
     add, rare = page.add_argument, functools.partial(parser.add_rare, group=page)
-    text = "address to serve at; one that others reach, such as 0.0.0.0, needs a token"
+    text = "address to serve at; 0.0.0.0 lets others in, by a token"
     add("--host", default="127.0.0.1", metavar="ADDRESS", help=text)
-    text = "serve over TLS, as cameras elsewhere need; without FILE makes a certificate"
+    text = "serve over TLS, as phones need; without FILE makes a certificate"
     add("--tls", nargs="?", const=True, metavar="FILE.pem", help=text)
     add("--no-browser", action="store_true", help="only print the page's address")
     rare("--port", type=int, metavar="N", help=f"port (default: {DEFAULT_PORT}, or the next free one)")
     text = "ask for this token (default: a new one if others reach the page)"
     rare("--token", metavar="SECRET", help=text)
-    text = "let this site, such as http://localhost:5173, ask for the light; repeatable"
+    text = "let this site, such as http://localhost:5173, ask for light; repeatable"
     rare("--allow-origin", action="append", default=[], metavar="ORIGIN", help=text)
     return parser
 

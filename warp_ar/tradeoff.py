@@ -46,7 +46,7 @@ def make_parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     text = "scenes, or all: the bundled ones (default: desk, or --truth)"
     add("scenes", nargs="*", metavar="SCENE", help=text)
-    add("--stage", metavar="NAME", help=f"change only this: {', '.join(setting.name for setting in SETTINGS)}")
+    add("--stage", metavar="NAME", help="change only this setting, such as recover")
     add("--presets", action="store_true", help="run whole presets only, into presets.json")
     add("--only", type=_words, metavar="A,B", help=f"with --presets: these instead of {','.join(RUNS)}")
     add("--truth", type=Path, metavar="DIR", help="a case with true pictures, or a folder of cases")
