@@ -375,6 +375,15 @@ def test_meshes_in_memory(device, tmp_path):
     seen = look([item], [(0, -3, 0)], FORWARD, device)
     assert seen["t"][0] == pytest.approx(3.5, abs=0.01)
     np.testing.assert_allclose(seen["diffuse"][0], [0, 1, 0], atol=1e-6)
+    block = trimesh.creation.box()
+    block.visual = trimesh.visual.TextureVisuals(material=trimesh.visual.material.SimpleMaterial(diffuse=[255, 0, 0]))
+    posts = mesh_from_trimesh(trimesh.Scene([block, trimesh.creation.cylinder(0.1, 3.0)]))
+    assert np.ptp(posts.vertices, axis=0) == pytest.approx([1.0, 1.0, 3.0])
+    assert [part.surface.base_color for part in posts.materials] == [(1.0, 0.0, 0.0), (0.8, 0.8, 0.8)]
+    assert posts.materials[0].surface.metallic == 0.0
+    painted = trimesh.creation.box()
+    painted.visual.face_colors = [[20 * face, 0, 0, 255] for face in range(12)]
+    assert len(np.unique(mesh_from_trimesh(painted).colors, axis=0)) == 12
     with pytest.raises(SceneError, match="a mesh in memory cannot be written"):
         dumps_scene(Scene(CAMERA, objects=(item,)))
     with pytest.raises(SceneError, match=r"a mesh is str; a trimesh\.Trimesh"):

@@ -28,6 +28,7 @@ from warp_ar.scene.materials import IDENTITY, MeshMaterial, MetallicRoughnessMat
 from warp_ar.scene.mesh_parts import LARGEST, MeshPart, strip_triangles, unit_or
 from warp_ar.scene.mesh_source import MeshSource
 from warp_ar.scene.node_animation import INTERPOLATIONS, WIDTHS, Anchor, NodeTrack, Sampler, part_transforms
+from warp_ar.scene.polygon_files import CREASE, linear_rgba
 from warp_ar.scene.textures import decode_rgba
 
 SUPPORTED: Final = (
@@ -292,7 +293,7 @@ class GltfContents:
     """Bending of each part; None for a rigid part."""
 
 
-def load_gltf(source: MeshSource, *, animation: str | int | None = None) -> GltfContents:
+def load_gltf(source: MeshSource, *, animation: str | int | None = None, memory: bool = False) -> GltfContents:
     """Read the triangles of a file's scene, with materials.
 
     Follows:
@@ -306,11 +307,13 @@ def load_gltf(source: MeshSource, *, animation: str | int | None = None) -> Gltf
     Args:
         source: The file.
         animation: Name or number of the animation that is to move it; None: all stands as at the start.
+        memory: Whether it is what trimesh made of a mesh in memory: axes stay, colours of vertices are sRGB-encoded,
+            and where it has no normals, edges of ``CREASE`` degrees are sharp.
 
     Raises:
         SceneError: Damaged; meshes compressed by Draco or meshopt.
     """
-    return _Reader(source).contents(animation)
+    return _Reader(source, memory=memory).contents(animation)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -319,17 +322,18 @@ class _Place:
 
     world: Array
     """In the file's world as it starts, (4, 4)."""
+    below: Array
+    """Below its anchor, or in the world turned to +Z up, (4, 4)."""
     carrier: int = -1
     """Number of the anchor that it hangs on; -1: none."""
-    below: Array = dataclasses.field(default_factory=lambda: _UP)
-    """Below its anchor, or in the world turned to +Z up, (4, 4)."""
 
 
 class _Reader:
     """Walks one file."""
 
-    def __init__(self, source: MeshSource) -> None:
-        self._source, self._file = source, GltfFile(source)
+    def __init__(self, source: MeshSource, *, memory: bool) -> None:
+        self._source, self._file, self._memory = source, GltfFile(source), memory
+        self._up = np.eye(4) if memory else _UP
         self._materials = GltfMaterials(self._file, self._take_image)
         self._nodes, self._meshes, self._skins = (self._file.objects(key) for key in ("nodes", "meshes", "skins"))
         self._primitives: dict[tuple[int, int], MeshPart | None] = {}
@@ -363,7 +367,7 @@ class _Reader:
         for node, (index, place) in zip(shown, self._places.items(), strict=True):
             if "mesh" in node:
                 # A skinned mesh stands where its joints are, whatever its own node says.
-                place = place if "skin" not in node else _Place(place.world, below=_UP @ place.world)
+                place = place if "skin" not in node else _Place(place.world, self._up @ place.world)
                 for part, bend in self._mesh(node, place.below, moves.weights.get(index)):
                     parts.append(part)
                     bends.append(bend)
@@ -400,7 +404,7 @@ class _Reader:
             roots = sorted(set(range(count)) - {child for children in below for child in children})
             if self._nodes and not roots:
                 self._file.fail("its nodes stand below each other in a circle")
-        waiting = [(node, _Place(np.eye(4))) for node in reversed(roots)]
+        waiting = [(node, _Place(np.eye(4), self._up)) for node in reversed(roots)]
         while waiting:
             index, above = waiting.pop()
             if index in self._places:
@@ -411,13 +415,13 @@ class _Reader:
             if not (np.abs(world) < LARGEST).all():
                 self._file.fail(f"node {index} has a transform that is not finite, or above {LARGEST:g}")
             if (samplers := moves.samplers.get(index)) is None:
-                place = _Place(world, above.carrier, above.below @ local)
+                place = _Place(world, above.below @ local, above.carrier)
             else:
                 if "matrix" in self._nodes[index]:
                     right = "translation, rotation and scale are right"
                     self._file.fail(f"an animation moves node {index}, which has a matrix; {right}")
                 track = dataclasses.replace(self._track(self._nodes[index], index), samplers=samplers)
-                place = _Place(world, len(self._anchors), np.eye(4))
+                place = _Place(world, np.eye(4), len(self._anchors))
                 self._anchors.append(Anchor(above.carrier, above.below, track))
             self._places[index] = place
             waiting += [(child, place) for child in reversed(below[index])]
@@ -490,11 +494,15 @@ class _Reader:
             colors = np.concatenate([colors, np.ones((count, 1))], axis=1)
         if "COLOR_1" in attributes:
             self._source.note("colours beyond the first set")
+        if colors is not None and self._memory:
+            colors = linear_rgba(colors, 1.0)
         faces = self._faces(primitive, count)
         if len(faces) > limits().mesh_elements:
             raise SceneError(too_much(f"{self._source.path}", len(faces), "faces", "mesh_elements"))
         if not len(faces):
             return None
+        number = primitive.get("material")
+        material = None if self._memory and number is None else self._materials.read(number)
         return MeshPart.checked(
             f"{self._source.path}",
             vertices,
@@ -503,8 +511,10 @@ class _Reader:
             uvs=(_upward(attribute("TEXCOORD_0", 2)), _upward(attribute("TEXCOORD_1", 2))),
             colors=None if colors is None else np.clip(colors, 0.0, 1.0),
             tangents=attribute("TANGENT", 4),
-            material=self._materials.read(primitive.get("material")),
-            crease=0.0,  # "When normals are not specified, client implementations MUST calculate flat normals"
+            material=material,
+            crease=CREASE
+            if self._memory
+            else 0.0,  # "When normals are not specified, client implementations MUST calculate flat normals"
         )
 
     def _faces(self, primitive: dict[str, Any], count: int) -> npt.NDArray[np.int64]:
@@ -598,7 +608,7 @@ class _Reader:
             self._file.fail(f"JOINTS_0 and WEIGHTS_0 are not of {count} vertices")
         if count and int(places.max()) >= len(joints):
             self._file.fail(f"JOINTS_0 holds {int(places.max())}; the skin has {len(joints)} joints, from 0 on")
-        standing = [self._places.get(joint, _Place(np.eye(4))) for joint in joints]
+        standing = [self._places.get(joint, _Place(np.eye(4), self._up)) for joint in joints]
         bones = np.stack([place.below for place in standing]) @ inverse
         total = weights.sum(axis=1, keepdims=True)
         if not (np.isfinite(bones).all() and np.isfinite(total).all() and (total > 0.0).all()):

@@ -40,8 +40,9 @@ class GltfFile:
         """
         self.source = source
         path, data = source.path, source.data
-        tree, binary = self._split_glb(data) if path.suffix.lower() == ".glb" else (data, b"")
-        if len(tree) > limits().text_bytes and path.suffix.lower() == ".glb":
+        is_binary = path.suffix.lower() != ".gltf"
+        tree, binary = self._split_glb(data) if is_binary else (data, b"")
+        if len(tree) > limits().text_bytes and is_binary:
             raise SceneError(too_much(f"{path}: its header", len(tree), "bytes", "text_bytes"))
         try:
             text = tree.decode("utf-8-sig")

@@ -18,12 +18,10 @@ from warp_ar.files import is_file, read_bytes
 from warp_ar.scene.geometry import Mesh
 from warp_ar.scene.gltf import Bending, GltfContents, animation_names, load_gltf
 from warp_ar.scene.gltf_file import GltfFile
-from warp_ar.scene.materials import MeshMaterial
 from warp_ar.scene.mesh_parts import LARGEST, MeshPart, filled, join_parts
 from warp_ar.scene.mesh_source import MeshSource
-from warp_ar.scene.mtl import read_library_material
 from warp_ar.scene.node_animation import Anchor, MovingMesh, MovingPart, part_transforms
-from warp_ar.scene.polygon_files import READERS, Corners, linear_rgba, parts_of
+from warp_ar.scene.polygon_files import READERS
 
 MESH_SUFFIXES: Final = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
 """Mesh files that :func:`load_mesh` reads."""
@@ -132,7 +130,7 @@ def _read_file(path: Path, animation: str | int | None = None) -> tuple[GltfCont
 
 
 def mesh_from_trimesh(source: Any) -> Mesh:
-    """The mesh of a ``trimesh.Trimesh`` or ``trimesh.Scene`` in memory, with its colours or materials.
+    """The mesh of a ``trimesh.Trimesh`` or ``trimesh.Scene`` in memory, with its colours or materials, as GLB has them.
 
     Args:
         source: The object; its axes and units stay as they are.
@@ -144,49 +142,25 @@ def mesh_from_trimesh(source: Any) -> Mesh:
 
     if not isinstance(source, trimesh.Trimesh | trimesh.Scene):
         raise SceneError(f"a mesh is {type(source).__name__}; a trimesh.Trimesh or trimesh.Scene is needed")
-    taken = MeshSource(Path("a mesh in memory"))
     scene = source if isinstance(source, trimesh.Scene) else trimesh.Scene(source)
-    with _said_in_words(taken.path):
-        parts = _scene_parts(taken, scene)
-    if not parts:
-        raise SceneError(f"{taken.path} holds no triangle")
-    return join_parts(taken, parts)
-
-
-def _scene_parts(source: MeshSource, scene: Any) -> list[MeshPart]:
-    """Parts of a scene of trimesh, in its world."""
-    known: dict[int, MeshMaterial | None] = {}
-    parts: list[MeshPart | None] = []
-    for node in scene.graph.nodes_geometry:
-        transform, name = scene.graph[node]
-        geometry = scene.geometry[name]
-        if not (np.abs(transform) < LARGEST).all():
-            raise SceneError(f"{source.path}: node {node!r} has a transform that is not finite")
-        if np.asarray(getattr(geometry, "faces", ()), dtype=np.int64).size == 0:
-            continue
-        material = getattr(geometry.visual, "material", None)
-        if id(material) not in known:
-            known[id(material)] = read_library_material(source, material)
-        own = _read_part(source, geometry, known[id(material)])
-        parts += [part.moved(np.asarray(transform, dtype=np.float64)) for part in own]
-    return [part for part in parts if part is not None]
-
-
-def _read_part(source: MeshSource, geometry: Any, material: MeshMaterial | None) -> list[MeshPart]:
-    """Triangles of a mesh of trimesh, with its normals, texture coordinates and colours."""
-    faces, visual = np.asarray(geometry.faces, dtype=np.int64), geometry.visual
-    corners = Corners(faces.ravel(), np.full(len(faces), 3))
-    # trimesh computes normals when asked; only its cache tells whether the mesh has them.
-    if "vertex_normals" in geometry._cache:
-        corners.vertex_normal = np.asarray(geometry.vertex_normals, dtype=np.float64)
-    if (uvs := getattr(visual, "uv", None)) is not None:
-        corners.vertex_uv = np.asarray(uvs, dtype=np.float64)[:, :2]
-    kind = getattr(visual, "kind", None) if getattr(visual, "defined", False) else None
-    if kind == "vertex":
-        corners.vertex_color = linear_rgba(np.asarray(visual.vertex_colors, dtype=np.float64), 255.0)
-    elif kind == "face":
-        corners.color = linear_rgba(np.asarray(visual.face_colors, dtype=np.float64), 255.0)
-    return parts_of(source, np.asarray(geometry.vertices, dtype=np.float64), corners, material=material)
+    path = Path("a mesh in memory")
+    made = trimesh.Scene()
+    with _said_in_words(path):
+        for node in scene.graph.nodes_geometry:
+            transform, name = scene.graph[node]
+            if not len(getattr(scene.geometry[name], "faces", ())):
+                continue
+            mesh = scene.geometry[name].copy(include_cache=True)
+            if mesh.visual.kind == "face":
+                mesh.unmerge_vertices()  # GLB has colours of vertices alone
+            if isinstance(getattr(mesh.visual, "material", None), trimesh.visual.material.SimpleMaterial):
+                mesh.visual.material = mesh.visual.material.to_pbr()
+                mesh.visual.material.metallicFactor = 0.0
+            made.add_geometry(mesh, transform=transform)
+        if not made.geometry:
+            raise SceneError(f"{path} holds no triangle")
+        taken = MeshSource(path, made.export(file_type="glb"))
+        return join_parts(taken, load_gltf(taken, memory=True).parts)
 
 
 def moving_mesh(source: MeshSource, contents: GltfContents) -> MovingMesh:

@@ -1,4 +1,4 @@
-"""Materials as trimesh has them: OBJ's material libraries with their PBR extension, and glTF's in memory.
+"""OBJ's material libraries with their PBR extension.
 
 MTL's illumination models are Phong's: Kd is the diffuse colour, Ks and Ns the lobe, which is left out where ``illum``
 is 0 or 1. A library that says Pr or Pm means a metallic-roughness material.
@@ -20,7 +20,6 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from warp_ar.errors import SceneError
 from warp_ar.scene.materials import (
     RGB,
     LambertMaterial,
@@ -40,8 +39,6 @@ _KNOWN: Final = "name|k[adse]|n[si]|d|tr|illum|p[rm]|map_(k[dsen]|d|p[rm])|norm|
 
 CHALK: Final[RGB] = (0.8, 0.8, 0.8)
 """Diffuse colour of a material that says none."""
-_MADE_UP: Final = (2, 2)
-"""Size of the picture that trimesh makes up where there is none."""
 
 _OPTIONS: Final = {
     **dict.fromkeys(("-blendu", "-blendv", "-boost", "-bm", "-cc", "-clamp", "-imfchan", "-texres", "-type"), 1),
@@ -93,7 +90,7 @@ def parse_library(text: str) -> dict[str, dict[str, Any]]:
     return found
 
 
-def read_library(source: MeshSource, values: dict[str, Any], base: TextureUse | None = None) -> MeshMaterial:
+def read_library(source: MeshSource, values: dict[str, Any]) -> MeshMaterial:
     """Return a material of `parse_library`.
 
     Follows:
@@ -103,41 +100,11 @@ def read_library(source: MeshSource, values: dict[str, Any], base: TextureUse | 
     Args:
         source: The mesh's file; takes the material's pictures, and what is not shown of it.
         values: Words of the material by key.
-        base: Picture of its colour, where it is known.
 
     Raises:
         SceneError: Damaged.
     """
-    return _Library(source, values).read(base)
-
-
-def read_library_material(source: MeshSource, material: Any) -> MeshMaterial | None:
-    """Return a material of trimesh, or None; None if it says nothing.
-
-    Raises:
-        SceneError: A picture is missing or damaged.
-    """
-    if material is None:
-        return None
-    if type(material).__name__ == "PBRMaterial":
-        return _PbrInMemory(source, material).read()
-    values = getattr(material, "kwargs", None) or {}
-    image = getattr(material, "image", None)
-    # Where a file has coordinates but no texture, trimesh makes a grey one up; only pictures from files have a format.
-    made_up = getattr(image, "format", None) is None and getattr(image, "size", None) == _MADE_UP
-    base = None if image is None or made_up else _add_picture(source, image)
-    if not values and base is None:
-        return None
-    return read_library(source, {"name": getattr(material, "name", ""), **values}, base)
-
-
-def _add_picture(source: MeshSource, image: Any) -> TextureUse:
-    try:
-        source.images.append(np.asarray(image.convert("RGBA"), dtype=np.uint8).copy())
-    except (OSError, ValueError, SyntaxError, MemoryError, EOFError) as error:
-        reason = " ".join(str(error).split())
-        raise SceneError(f"{source.path}: a texture of the mesh cannot be read ({reason})") from error
-    return TextureUse(len(source.images) - 1)
+    return _Library(source, values).read()
 
 
 class _Library:
@@ -146,7 +113,7 @@ class _Library:
     def __init__(self, source: MeshSource, values: dict[str, Any]) -> None:
         self._source, self._values = source, values
 
-    def read(self, base: TextureUse | None) -> MeshMaterial:
+    def read(self) -> MeshMaterial:
         """The material, with the picture of its colour if it has one."""
         for key, words in self._values.items():
             nothing = {1.0} if key == "tf" else {0.0}  # lets all light through; no sheen, no clearcoat
@@ -157,14 +124,14 @@ class _Library:
             )
             if not shown and not (all(map(_is_number, words)) and set(map(float, words)) == nothing):
                 self._source.note(f"the key {key[:40]} of materials")
-        color = self._map("map_kd", color=True) if base is None else None
+        color = self._map("map_kd", color=True)
         white = (1.0, 1.0, 1.0)
-        diffuse = self._color("kd", CHALK if base is None and color is None else white)
+        diffuse = self._color("kd", CHALK if color is None else white)
         specular = self._color("ks", (0.0, 0.0, 0.0))
         opacity = self._number("d", 1.0 - self._number("tr", 0.0, 0.0, 1.0), 0.0, 1.0)
         mask = self._map("map_d")
         alpha = "mask" if mask is not None else "blend" if opacity < 1.0 else "opaque"
-        base = base or self._use(color if mask is None else self._masked(color, mask))
+        base = self._use(color if mask is None else self._masked(color, mask))
         maps = self._map("map_pr"), self._map("map_pm")
         specular_map = self._map("map_ks", color=True)
         # A lobe without an exponent is none: some programs use Ks for numbers of their own.
@@ -305,45 +272,3 @@ def _is_number(value: object) -> bool:
         return math.isfinite(float(cast(Any, value)))
     except (TypeError, ValueError):
         return False
-
-
-class _PbrInMemory:
-    """A material of glTF that trimesh holds."""
-
-    def __init__(self, file: MeshSource, source: Any) -> None:
-        self._file, self._source = file, source
-
-    def read(self) -> MeshMaterial:
-        """The material; alpha, factors and pictures as trimesh has them."""
-        source = self._source
-        color = self._factor("baseColorFactor", (1.0, 1.0, 1.0, 1.0))
-        return MeshMaterial(
-            surface=MetallicRoughnessMaterial(
-                cast(RGB, color[:3]),
-                self._factor("metallicFactor", (1.0,))[0],
-                self._factor("roughnessFactor", (1.0,))[0],
-            ),
-            name=str(source.name or "")[:80],
-            alpha=cast(Any, {"MASK": "mask", "BLEND": "blend"}.get(source.alphaMode, "opaque")),
-            opacity=color[3],
-            cutoff=self._factor("alphaCutoff", (0.5,))[0],
-            double_sided=bool(source.doubleSided),
-            emission=cast(RGB, self._factor("emissiveFactor", (0.0, 0.0, 0.0))),
-            base=self._picture("baseColorTexture"),
-            metallic_roughness=self._picture("metallicRoughnessTexture"),
-            normal=self._picture("normalTexture"),
-            occlusion=self._picture("occlusionTexture"),
-            emissive=self._picture("emissiveTexture"),
-        )
-
-    def _factor(self, name: str, default: tuple[float, ...]) -> tuple[float, ...]:
-        value = getattr(self._source, name, None)
-        if value is None:
-            return default
-        array = np.atleast_1d(np.asarray(value))
-        numbers = (array / 255.0 if array.dtype == np.uint8 else array).astype(float).tolist()
-        return tuple(min(max(number, 0.0), 1.0) for number in [*numbers, *default[len(numbers) :]])[: len(default)]
-
-    def _picture(self, name: str) -> TextureUse | None:
-        image = getattr(self._source, name, None)
-        return None if image is None else _add_picture(self._file, image)

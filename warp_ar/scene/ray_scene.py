@@ -37,7 +37,7 @@ from warp_ar.scene.ray_mesh import (
     shared_ray_mesh,
     texture_density,
 )
-from warp_ar.scene.screen_extents import Outline, ball_outline, bounced_faces, box_faces, lit_faces, shaded_faces
+from warp_ar.scene.screen_extents import NOTHING, Outline, ball_outline, box_faces, lit_faces
 from warp_ar.scene.texture_pack import TexturePack, mask_cutoff
 from warp_ar.scene.textures import DECODE
 
@@ -73,10 +73,9 @@ class HostScene:
         self._lights = np.zeros(len(scene.lights), structs.struct_dtype(structs.Light))
         self._lit: Outline | None = None
         self._mirrors: tuple[Outline, Outline] | None = None
-        self._bounced: tuple[Outline, Outline] | None = None
         self._placed = b""  # the objects that the polygons below are of
-        self._outline = Outline(())
-        self._shaded: Outline | None = None
+        self._outline = NOTHING
+        self._receivers: Outline | None = None
         self.probes = scene.probes
         self._balls = ball_outline(scene.probes)
         self._glossy = np.array([proxy.material is not None for proxy in scene.proxies], bool)
@@ -322,7 +321,7 @@ class HostScene:
                 _place(record, item, fixed["rotation"], fixed["position"], places)
         changed = _update(records_out, self._proxies)
         if changed:
-            self._lit = self._shaded = self._mirrors = None
+            self._lit = self._receivers = self._mirrors = None
         return changed
 
     def place_probes(self, pose: Pose, places: Mapping[scenes.Marker, Pose | None] = _NOWHERE) -> bool:
@@ -371,40 +370,27 @@ class HostScene:
 
     def object_outline(self) -> Outline:
         """Return the outline of virtual objects."""
-        self._follow_objects()
-        return self._outline
-
-    def _follow_objects(self) -> None:
-        """Forget what was found out about moved objects; clipping polygons takes longer than a kernel."""
         placed = self._objects.tobytes()
         if placed != self._placed:
             self._placed = placed
             self._outline = Outline([face for record in _present(self._objects) for face in box_faces(record)])
-            self._shaded = None
+        return self._outline
+
+    def _receiver_outline(self) -> Outline:
+        """Return the outline of proxies."""
+        if self._receivers is None:
+            self._receivers = Outline([face for record in _present(self._proxies) for face in box_faces(record)])
+        return self._receivers
 
     def light_outline(self, *, bounced: bool = False) -> Outline:
         """Return the outline of virtual light and its shadows on proxies; if ``bounced``, with its reflections."""
         if self._lit is None:
+            lights = self._lights[self._lights["intensity"].any(axis=1)]  # no other falls anywhere
             faces = [box_faces(record) for record in _present(self._proxies)]
-            shining = self._shining()
-            parts = [part for light in shining for own in faces for part in lit_faces(light, own)]
+            self._lit = Outline([part for light in lights for own in faces for part in lit_faces(light, own)])
             if self.has_area_lights:
-                parts = [part for own in faces for part in own]  # what emits may be large: all is taken for lit
-            self._lit = Outline(parts)
-            self._bounced = None
-        if not bounced:
-            return self._lit
-        around = self.shadow_outline()  # where what objects send on counts, too
-        if self._bounced is None or self._bounced[0] is not around:
-            reached = list(self._lit.polygons)
-            if reached:
-                reached += [*bounced_faces(self._shining(), _present(self._proxies)), *around.polygons]
-            self._bounced = around, Outline(reached)
-        return self._bounced[1]
-
-    def _shining(self) -> npt.NDArray[Any]:
-        """Records of the lights that have power: no other falls anywhere."""
-        return self._lights[self._lights["intensity"].any(axis=1)]
+                self._lit = self._receiver_outline()  # what emits may be large: all is taken for lit
+        return self._receiver_outline() if bounced and self._lit.polygons else self._lit
 
     def mirror_outline(self, *, receivers: bool = False) -> Outline:
         """Return the outline of mirror balls, and of ``receivers`` that mirror."""
@@ -417,18 +403,7 @@ class HostScene:
 
     def shadow_outline(self) -> Outline:
         """Return the outline within which virtual objects can change the environment on proxies."""
-        self._follow_objects()
-        if self._shaded is None:
-            proxies = [box_faces(record) for record in _present(self._proxies)]
-            self._shaded = Outline(
-                [
-                    part
-                    for record in _present(self._objects)
-                    for faces in proxies
-                    for part in shaded_faces(record, faces)
-                ]
-            )
-        return self._shaded
+        return self._receiver_outline() if self.object_outline().polygons else NOTHING
 
 
 def _present(records: npt.NDArray[Any]) -> npt.NDArray[Any]:

@@ -1,7 +1,8 @@
 """Parts of the screen that objects, lights and shadows can touch.
 
-Boxes around shapes are clipped by what reaches them; what is left is a set of convex polygons, an `Outline`, of which
-each frame asks the smallest rectangle of pixels whose rays can meet it.
+Boxes around shapes are clipped by the cones of lights; what is left is a set of convex polygons, an `Outline`, of which
+each frame asks the smallest rectangle of pixels whose rays can meet it. Shadows and light that proxies send on may
+reach all of the proxies: clipped by what reaches them, no bundled scene's rectangle was smaller.
 """
 
 from __future__ import annotations
@@ -26,21 +27,12 @@ Rect = tuple[int, int, int, int]
 """Part of the screen: row_start, row_stop, column_start, column_stop; all zero where nothing of it is needed."""
 EMPTY: Final[Rect] = (0, 0, 0, 0)
 
-SHADOW_REACH: Final = 12.0
-"""Distance over which an object's shadow of the environment is followed, in radii of the sphere around it.
-
-A sphere that rests on a desk hides (r / d)^3 of an even sky's light from a point at distance d: under 1/512 from 8
-radii on. A lamp's shadow ends within 12 radii if the lamp stands 10 degrees high or more.
-"""
-
 # Sides of the pyramid around a spot's cone: 8 sides reach 8 % farther out than the cone at their edges.
 _CONE_SIDES: Final = 8
 
 # From this half angle on a pyramid would be nearly flat; the cone is then taken to reach everything.
 _WIDE_CONE: Final = math.radians(75.0)
 
-# A face that more lit faces reach than this is taken to be reached all over: each part costs a clipped polygon.
-_MOST_PARTS: Final = 8
 # Faces of a box as (2, 2, 2) corner indices; the first is that of a plane, whose box has no height.
 _FACES: Final = (
     (0, 2, 6, 4),
@@ -118,86 +110,6 @@ def lit_faces(light: Any, faces: list[FloatArray]) -> list[FloatArray]:
     return parts
 
 
-def _outward(face: FloatArray, center: FloatArray, kind: int, rotation: FloatArray) -> FloatArray:
-    """Unit normal of a face of a shape: a plane's own, a box's away from its middle."""
-    if kind == structs.PLANE:
-        return rotation[:, 2]
-    away = face.mean(axis=0) - center
-    normal = np.cross(face[1] - face[0], face[2] - face[1])
-    length = float(np.linalg.norm(normal))
-    return normal * (math.copysign(1.0, float(normal @ away)) / length) if length > 0.0 else np.zeros(3)
-
-
-def bounced_faces(lights: npt.NDArray[Any], proxies: npt.NDArray[Any]) -> list[FloatArray]:
-    """Parts of the proxies' faces before which some lit face stands, and behind which it does not.
-
-    The surface of a mesh lies in its box and looks every way: it sends from all of its box to all sides.
-    """
-    sources: list[tuple[FloatArray, FloatArray | None]] = []  # lit parts, and the normal if there is one
-    for record in proxies:
-        faces, rotation = box_faces(record), np.array(record["rotation"], np.float64)
-        center = np.mean([face.mean(axis=0) for face in faces], axis=0)
-        for light in lights:
-            if record["kind"] == structs.MESH:
-                if lit_faces(light, faces):
-                    sources += [(face, None) for face in faces]
-                continue
-            for face in faces:
-                facing = _outward(face, center, int(record["kind"]), rotation)
-                at, direction = (np.array(light[name], np.float64) for name in ("position", "direction"))
-                directional = light["kind"] == structs.DIRECTIONAL
-                if (float(-direction @ facing) if directional else float((at - face[0]) @ facing)) > 0.0:
-                    sources += [(part, facing) for part in lit_faces(light, [face])]
-    if not sources:
-        return []
-    # Of all sources at once: a scene of a hundred boxes has as many sources as faces.
-    most = max(len(part) for part, _ in sources)
-    corners = np.stack([part[np.minimum(np.arange(most), len(part) - 1)] for part, _ in sources])
-    normals = np.stack([np.zeros(3) if normal is None else normal for _, normal in sources])
-    offsets = np.einsum("ij,ij->i", normals, corners[:, 0]) - 1e-9
-    reached: list[FloatArray] = []
-    for record in proxies:
-        faces, rotation = box_faces(record), np.array(record["rotation"], np.float64)
-        center = np.mean([face.mean(axis=0) for face in faces], axis=0)
-        for face in faces:
-            before = normals @ face.T >= offsets[:, None]
-            reaching = before.any(axis=1)
-            if record["kind"] != structs.MESH:
-                inward = -_outward(face, center, int(record["kind"]), rotation)
-                reaching &= (corners @ inward < float(face[0] @ inward) - 1e-9).any(axis=1)
-            if (reaching & before.all(axis=1)).any() or np.count_nonzero(reaching) > _MOST_PARTS:
-                reached.append(face)
-            else:
-                reached += [_clip(face, normals[k], float(offsets[k])) for k in np.flatnonzero(reaching)]
-    return reached
-
-
-def shaded_faces(record: Any, faces: list[FloatArray]) -> list[FloatArray]:
-    """Parts of a box's faces inside the cube of ``SHADOW_REACH`` around an object, and of the cube's inside the box."""
-    radius = float(record["scale"]) * float(np.linalg.norm(record["extent"]))
-    center = np.array(record["position"], np.float64)
-    cube = [center + SHADOW_REACH * radius * _CORNERS[list(face)] for face in _FACES]
-    near = [_clip_to_cube(face, center, SHADOW_REACH * radius) for face in faces]
-    if len(faces) > 1:  # a mesh lies inside its box, where the cube may end
-        middle = np.mean([face.mean(axis=0) for face in faces], axis=0)
-        for part in cube:
-            for face in faces:
-                inward = middle - face.mean(axis=0)
-                if len(part):
-                    part = _clip(part, inward, float(inward @ face[0]))
-            near.append(part)
-    return [part for part in near if len(part)]
-
-
-def _clip_to_cube(polygon: FloatArray, center: FloatArray, reach: float) -> FloatArray:
-    """The part of a convex polygon within ``reach`` of a point along every axis."""
-    for axis in np.eye(3):
-        for normal in (axis, -axis):
-            if len(polygon):
-                polygon = _clip(polygon, normal, float(normal @ center) - reach)
-    return polygon
-
-
 @functools.lru_cache(maxsize=8)
 def _ray_bounds(camera: scenes.Camera) -> tuple[npt.NDArray[Any], ...]:
     """Smallest and largest x / z of each column's rays and y / z of each row's, a pixel's own width included.
@@ -232,6 +144,10 @@ class Outline:
     def corners(self) -> FloatArray:
         """Those of all polygons, (n, 3)."""
         return np.concatenate(self.polygons)
+
+
+NOTHING: Final = Outline(())
+"""That of no shape."""
 
 
 def screen_rects(outlines: Sequence[Outline], pose: Pose, camera: scenes.Camera) -> list[Rect]:
