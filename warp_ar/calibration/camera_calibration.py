@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warp_ar.calibration.board_finder import BENT, STRAIGHT, find_markers, recognise_board, smallest_dictionary
-from warp_ar.errors import SceneError, SinkError, UsageError, reason
-from warp_ar.files import write_whole
+from warp_ar.errors import SceneError, UsageError, reason
+from warp_ar.files import store
 from warp_ar.scene import Camera, CharucoBoard, Marker
 from warp_ar.scene.calibration_file import rational_of_fisheye
 from warp_ar.signature import PROGRAM
@@ -349,8 +349,6 @@ def write_camera(report: CameraReport, path: Path) -> None:
     """
     if path.suffix.lower() not in (".yml", ".yaml", ".json", ".xml"):
         raise UsageError(f"--output {path}: expected a name that ends in .yml, .json or .xml")
-    if not path.parent.is_dir():
-        raise SinkError(f"{path}: cannot be written: no folder {path.parent}")
     camera = report.camera
     storage = cv2.FileStorage(path.suffix.lower(), cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     storage.write("program", PROGRAM)
@@ -361,7 +359,4 @@ def write_camera(report: CameraReport, path: Path) -> None:
         storage.write("fisheye_model", 1)
     storage.write("distortion_coefficients", np.array(report.fisheye or camera.distortion)[None])
     storage.write("avg_reprojection_error", report.error)
-    try:
-        write_whole(path, storage.releaseAndGetString().encode())
-    except OSError as error:
-        raise SinkError(f"{path}: cannot be written: {reason(error)}") from error
+    store(path, storage.releaseAndGetString().encode())

@@ -12,8 +12,8 @@ import numpy as np
 import PIL.Image
 from numpy.typing import NDArray
 
-from warp_ar.errors import SinkError, UsageError, reason
-from warp_ar.files import write_whole
+from warp_ar.errors import UsageError
+from warp_ar.files import store
 from warp_ar.scene import CharucoBoard, Marker
 from warp_ar.signature import PROGRAM, sign_png
 from warp_ar.tracking.card_layout import SHEET, draw_sheet
@@ -99,10 +99,7 @@ def write_card(marker: Marker, path: Path, paper: str = "a4", dpi: float = 600.0
         page = draw_sheet((width / 1e3, height / 1e3), per_metre, draw_card(marker, per_metre))
     else:
         page = _draw_page(marker, paper, per_metre)
-    try:
-        write_whole(path, _pdf(page, per_metre) if path.suffix.lower() == ".pdf" else _png(page, per_metre))
-    except OSError as error:
-        raise SinkError(f"{path}: cannot be written: {reason(error)}") from error
+    store(path, _pdf(page, per_metre) if path.suffix.lower() == ".pdf" else _png(page, per_metre))
 
 
 def _draw_page(marker: Marker, paper: str, per_metre: int) -> Image:

@@ -34,8 +34,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from warp_ar.errors import SinkError, UsageError, reason
-from warp_ar.files import write_whole
+from warp_ar.errors import UsageError
+from warp_ar.files import store
 from warp_ar.signature import PROGRAM
 from warp_ar.srgb import decode_srgb
 from warp_ar.tracking.card_layout import GREY_SIZE, GREYS, SHEET, grey_centers
@@ -129,11 +129,8 @@ def write_response(curve: Array, path: Path) -> None:
     Raises:
         SinkError: if the file cannot be written.
     """
-    try:
-        text = f"# {PROGRAM}\n" + "".join(f"{r:.9g} {g:.9g} {b:.9g}\n" for r, g, b in curve)
-        write_whole(path, text.encode())
-    except OSError as error:
-        raise SinkError(f"{path}: cannot be written: {reason(error)}") from error
+    text = f"# {PROGRAM}\n" + "".join(f"{r:.9g} {g:.9g} {b:.9g}\n" for r, g, b in curve)
+    store(path, text.encode())
 
 
 @dataclasses.dataclass(frozen=True)

@@ -108,7 +108,7 @@ def draw(value: Any, share: Share) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class Entry:
-    """Table of an object or a light, with spans in it."""
+    """One kind of object or light: its table, with spans in it."""
 
     label: str
     folder: Path
@@ -118,30 +118,20 @@ class Entry:
     weight: float
     """Weight with which it is chosen, against the others."""
 
-    def _table(self, share: Share, kind: type) -> SceneTable:
+    def table(self, share: Share, kind: type) -> SceneTable:
+        """Return a draw as a table of a scene."""
         data = draw(dict(self.data), share)
         if "outer_angle" in data:  # beyond the inner one
             data["outer_angle"] = round(data["outer_angle"] + data.get("inner_angle", 0.0), 6)
         return SceneTable(self.label, SceneFiles(self.folder), self.section, data, list(fields_of(kind)))
 
     def draw(self, share: Share) -> Any:
-        """Return what the scene's reader makes of a draw.
+        """Draw one light.
 
         Raises:
             SceneError: It is none of a scene.
-            NotImplementedError: The kind of entry has no reader.
         """
-        raise NotImplementedError
-
-
-class LightSpec(Entry):
-    """One kind of virtual light."""
-
-    def draw(self, share: Share) -> Light:
-        """Draw one light."""
-        made = read_light(self._table(share, Light))
-        assert isinstance(made, Light)
-        return made
+        return read_light(self.table(share, Light))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -156,7 +146,7 @@ class ObjectSpec(Entry):
 
     def draw(self, share: Share) -> Object:
         """Draw one object; it stands as ``rotate`` says before it is turned."""
-        return read_object(self._table(share, Object))
+        return read_object(self.table(share, Object))
 
     @functools.cached_property
     def item(self) -> Object:
@@ -184,7 +174,7 @@ class Dataset:
     exposure: tuple[float, float]
     """Lowest and highest scale of the exposure."""
     catalogue: tuple[ObjectSpec, ...]
-    kinds_of_light: tuple[LightSpec, ...]
+    kinds_of_light: tuple[Entry, ...]
 
 
 def read_dataset(label: str, folder: Path, data: object) -> Dataset:
@@ -258,12 +248,12 @@ def _read_object(table: JobTable) -> ObjectSpec:
     )
 
 
-def _read_light(table: JobTable) -> LightSpec:
+def _read_light(table: JobTable) -> Entry:
     kind = table.choice("kind", _LIGHT_DEFAULTS, "spot")
     if "at" not in table:
         table.fail("at", "expected 3 numbers in metres, or [lowest, highest] of them")
     given = {key: value for key, value in table.data.items() if key != "weight"}
-    return LightSpec(**_entry(table, {**_LIGHT_DEFAULTS[kind], **given, "kind": kind}))
+    return Entry(**_entry(table, {**_LIGHT_DEFAULTS[kind], **given, "kind": kind}))
 
 
 def _entry(table: JobTable, data: Mapping[str, Any]) -> dict[str, Any]:
@@ -327,43 +317,29 @@ def draw_variation(base: Scene, dataset: Dataset, clip: int, variation: int, pos
     Raises:
         NoPlace: Fewer objects than the least number fit.
     """
-    chosen = _draw_kinds(dataset, clip, variation)
-    random = chosen.random
-    drawn = [dataset.kinds_of_light[kind].draw(random.random) for kind in chosen.lights]
+    kinds, lights, exposure, random = _draw_kinds(dataset, clip, variation)
+    drawn = [dataset.kinds_of_light[kind].draw(random.random) for kind in lights]
     # In the catalogue's order: scenes of the same kinds then share their kernels and their arrays.
-    placed = _place(base, dataset, sorted(chosen.kinds), poses, random)
+    placed = _place(base, dataset, sorted(kinds), poses, random)
     if len(placed) < dataset.objects[0]:
         raise NoPlace(
             f"only {len(placed)} of {dataset.objects[0]} objects find a place in {TRIES} tries each: enlarge "
             "dataset.region, or lower dataset.objects or dataset.margin"
         )
     scene = dataclasses.replace(
-        base, objects=tuple(item for _, item in placed), lights=tuple(drawn), exposure=Exposure(chosen.exposure)
+        base, objects=tuple(item for _, item in placed), lights=tuple(drawn), exposure=Exposure(exposure)
     )
     return Drawn(scene, tuple(kind for kind, _ in placed))
 
 
-@dataclasses.dataclass(frozen=True)
-class _Chosen:
-    """The first draws of a variation."""
-
-    kinds: list[int]
-    """Catalogue numbers of its objects; some may find no place."""
-    lights: list[int]
-    """Numbers of its lights in their list."""
-    exposure: float
-    random: np.random.Generator
-    """Generator of the following random numbers."""
-
-
-def _draw_kinds(dataset: Dataset, clip: int, variation: int) -> _Chosen:
+def _draw_kinds(dataset: Dataset, clip: int, variation: int) -> tuple[list[int], list[int], float, np.random.Generator]:
+    """First draws of a variation: its objects and lights, by their numbers; exposure; a generator for what is next."""
     random = np.random.Generator(np.random.PCG64(np.random.SeedSequence([dataset.seed, clip, variation])))
     count = int(random.integers(dataset.objects[0], dataset.objects[1] + 1))
     light_count = int(random.integers(dataset.lights[0], dataset.lights[1] + 1))
     exposure = round(random.uniform(*dataset.exposure), 6)
     kinds = _choose(random, [spec.weight for spec in dataset.catalogue], count)
-    lights = _choose(random, [spec.weight for spec in dataset.kinds_of_light], light_count)
-    return _Chosen(kinds, lights, exposure, random)
+    return kinds, _choose(random, [spec.weight for spec in dataset.kinds_of_light], light_count), exposure, random
 
 
 def in_kindred_order(dataset: Dataset, clip: int, count: int) -> Iterator[int]:
@@ -379,8 +355,8 @@ def in_kindred_order(dataset: Dataset, clip: int, count: int) -> Iterator[int]:
     """
 
     def kinds(variation: int) -> tuple[list[int], list[str]]:
-        chosen = _draw_kinds(dataset, clip, variation)
-        return sorted(chosen.kinds), sorted(dataset.kinds_of_light[light].data["kind"] for light in chosen.lights)
+        found, lights, _, _ = _draw_kinds(dataset, clip, variation)
+        return sorted(found), sorted(dataset.kinds_of_light[light].data["kind"] for light in lights)
 
     for first in range(0, count, CHUNK):
         yield from sorted(range(first, min(first + CHUNK, count)), key=kinds)

@@ -251,10 +251,7 @@ def _info(whole: Mask, seen: Mask, measured: Mask) -> dict[str, Any]:
 
 def _box(mask: Mask) -> list[int]:
     """x, y, width, height of what is set, in pixels; -1 where nothing is."""
-    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-    if not len(rows):
-        return [-1, -1, -1, -1]
-    return [int(columns[0]), int(rows[0]), int(columns[-1] - columns[0] + 1), int(rows[-1] - rows[0] + 1)]
+    return list(map(int, cv2.boundingRect(mask.view(np.uint8)))) if mask.any() else [-1] * 4
 
 
 def _numbers(values: Any) -> list[float]:

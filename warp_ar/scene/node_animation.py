@@ -19,7 +19,6 @@ References:
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable, Mapping
 from typing import Final, TypeAlias
 
@@ -35,8 +34,6 @@ Bend: TypeAlias = Callable[[float], Mesh]
 WIDTHS: Final[Mapping[str, int]] = {"translation": 3, "rotation": 4, "scale": 3}
 """Numbers of what a channel moves."""
 INTERPOLATIONS: Final = ("LINEAR", "STEP", "CUBICSPLINE")
-_SMALL_SINE: Final = 1e-6
-"""Below this an arc is its chord to the last bit of what is asked."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -66,7 +63,9 @@ class Sampler:
             if cubic:
                 found = self._cubic(k, s, length)
             elif self.turns:
-                return slerp(_unit(keys[k]), _unit(keys[k + 1]), s)
+                from trimesh.transformations import quaternion_slerp  # here, for scenes without animations do without
+
+                return np.array(quaternion_slerp(_unit(keys[k]), _unit(keys[k + 1]), s))
             else:
                 found = (1.0 - s) * keys[k] + s * keys[k + 1]
         return _unit(found) if self.turns else np.array(found)
@@ -82,18 +81,6 @@ class Sampler:
             + length * (s3 - s2) * arriving
         )
         return found
-
-
-def slerp(first: Array, second: Array, s: float) -> Array:
-    """Unit quaternion that is ``s`` of the way along the shorter arc between two."""
-    cosine = float(first @ second)
-    if cosine < 0.0:
-        cosine, second = -cosine, -second
-    angle = math.acos(min(cosine, 1.0))
-    sine = math.sin(angle)
-    if sine < _SMALL_SINE:
-        return _unit((1.0 - s) * first + s * second)
-    return _unit((math.sin((1.0 - s) * angle) * first + math.sin(s * angle) * second) / sine)
 
 
 def _unit(quaternion: Array) -> Array:

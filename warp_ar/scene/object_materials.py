@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import logging
+import math
 from pathlib import Path
 from typing import Any
 
@@ -37,8 +38,6 @@ _NO_FILE = (MeshMaterial(),)
 
 _NOT_SIMILAR = 1e-4
 """Largest relative error of a similarity in single precision or a few digits."""
-_UPRIGHT = 1e-7
-"""Cosine of the turn about y below which those about x and z are one."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,6 +77,8 @@ def object_at(item: Object, world_from_object: Any) -> Object:
     Raises:
         SceneError: The matrix is no 4x4 of finite numbers, or no rotation, one positive scale and translation.
     """
+    from trimesh.transformations import euler_from_matrix  # here, for scenes from files do without
+
     try:
         matrix = np.asarray(world_from_object, np.float64)
     except (TypeError, ValueError):
@@ -100,13 +101,7 @@ def object_at(item: Object, world_from_object: Any) -> Object:
         )
     if np.linalg.det(turned) < 0.0:
         raise SceneError("world_from_object: it mirrors; expected a rotation; mirror the mesh's vertices instead")
-    cosine = float(np.hypot(turned[0, 0], turned[1, 0]))
-    about_y = np.arctan2(-turned[2, 0], cosine)
-    if cosine > _UPRIGHT:
-        about_x, about_z = np.arctan2(turned[2, 1], turned[2, 2]), np.arctan2(turned[1, 0], turned[0, 0])
-    else:  # x and z turn about the same axis: z stays
-        about_x, about_z = np.arctan2(-turned[1, 2], turned[1, 1]), 0.0
-    x, y, z = (float(np.degrees(angle)) for angle in (about_x, about_y, about_z))
+    x, y, z = map(math.degrees, euler_from_matrix(turned, "sxyz"))
     at = (float(matrix[0, 3]), float(matrix[1, 3]), float(matrix[2, 3]))
     return dataclasses.replace(item, at=at, rotate=(x, y, z), scale=scale)
 

@@ -4,30 +4,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
 from warp_ar.scene.geometry import Mesh, make_mesh
 
+NEAREST: Final = 0.4
+"""Metres from which things on a desk are seen; larger ones from at least their extent, else they do not fit."""
+UNSEEN: Final = 0.1 / 1000.0
+"""Error of a silhouette in pixels that is allowed, over a focal length in pixels."""
 
-def silhouette_tolerance(extent: float, *, distance: float = 0.4, focal: float = 1000.0, pixels: float = 0.1) -> float:
-    """Largest gap between a curved surface and its triangles that a camera cannot see.
 
-    A gap g at distance d moves a silhouette by focal g / d pixels. Things on a desk are seen from 0.4 m or more, and
-    objects larger than that from at least their own extent, else they do not fit into the picture.
+def silhouette_tolerance(extent: float) -> float:
+    """Largest gap in metres between a curved surface of a radius and its triangles that a camera cannot see.
 
-    Args:
-        extent: Radius of the object in metres.
-        distance: Nearest distance of the camera in metres.
-        focal: Focal length in pixels.
-        pixels: Silhouette error that is allowed, in pixels.
-
-    Returns:
-        The gap in metres.
+    A gap g at distance d moves a silhouette by focal g / d pixels.
     """
-    return pixels / focal * max(distance, extent)
+    return UNSEEN * max(NEAREST, extent)
 
 
 def _segments(radius: float, gap: float) -> int:
