@@ -27,7 +27,7 @@ import warp as wp
 
 from warp_ar.kernels.color import brightness
 from warp_ar.kernels.latlong import texel_solid_angle
-from warp_ar.kernels.launch import row_launcher
+from warp_ar.kernels.launch import launch_tiles, row_launcher, tile_kernel
 from warp_ar.kernels.safe_math import is_finite, light_confidence, smooth_ramp, usable_confidence
 from warp_ar.kernels.structs import EnvironmentView, FrameParams
 
@@ -65,27 +65,24 @@ def known_beyond_clipping(x: wp.vec3, m: wp.vec3, clipped: wp.vec3) -> wp.vec3:
     return beyond
 
 
-@wp.kernel(enable_backward=False)
+@tile_kernel
 def measure_change_kernel(
     # In:
-    row_start: wp.int32,
     view: EnvironmentView,
     environment: EnvironmentView,
     # Out:
     change_out: wp.array2d[wp.vec2],  # this frame's signed relative change, and the one before
 ):
-    """Mean signed change of one sector a thread."""
-    band_row, sector_column = wp.tid()
-    sector_row = row_start + band_row
+    """Mean signed change of one sector, by one block."""
+    sector_row, sector_column, lane = wp.tid()
     height = view.radiance.shape[0]
     width = view.radiance.shape[1]
     first_row = sector_row * height // change_out.shape[0]
     first_column = sector_column * width // change_out.shape[1]
     rows = (sector_row + 1) * height // change_out.shape[0] - first_row
     columns = (sector_column + 1) * width // change_out.shape[1] - first_column
-    difference = wp.float32(0.0)
-    level = wp.float32(0.0)
-    for item in range(rows * columns):
+    total = wp.vec2(0.0, 0.0)  # difference and level
+    for item in range(lane, rows * columns, wp.block_dim()):
         i = first_row + item // columns
         j = first_column + item % columns
         m = environment.radiance[i, j]
@@ -97,14 +94,15 @@ def measure_change_kernel(
             weight *= texel_solid_angle(i, height, width)
             new = brightness(x)
             old = brightness(m)
-            difference += weight * (new - old)
-            level += weight * (wp.max(new, old) + DARK)
-    change = wp.float32(0.0)
-    if level > 0.0:
-        change = difference / level
-    if not wp.isfinite(change):
-        change = 0.0
-    change_out[sector_row, sector_column] = wp.vec2(change, change_out[sector_row, sector_column][0])
+            total += weight * wp.vec2(new - old, wp.max(new, old) + DARK)
+    sums = wp.tile_sum(wp.tile(total, preserve_type=True))
+    if lane == 0:
+        change = wp.float32(0.0)
+        if sums[0][1] > 0.0:
+            change = sums[0][0] / sums[0][1]
+        if not wp.isfinite(change):
+            change = 0.0
+        change_out[sector_row, sector_column] = wp.vec2(change, change_out[sector_row, sector_column][0])
 
 
 @wp.func
@@ -176,14 +174,15 @@ def change_shape(height: int, width: int) -> tuple[int, int]:
     return max(1, height // SECTOR_SIZE), max(1, width // SECTOR_SIZE)
 
 
-measure_change = row_launcher(measure_change_kernel)
-"""Signed relative change of each sector between the accumulated light and a frame's.
+def measure_change(view: EnvironmentView, environment: EnvironmentView, change_out: wp.array) -> None:
+    """Measure the signed relative change of each sector between the accumulated light and a frame's.
 
-Args:
-    view: (h, w) this frame's light.
-    environment: (h, w) accumulated light.
-    change_out: ``wp.vec2`` of ``change_shape(h, w)``: the change in -1..1, and what stood there before.
-"""
+    Args:
+        view: (h, w) this frame's light.
+        environment: (h, w) accumulated light.
+        change_out: ``wp.vec2`` of ``change_shape(h, w)``: the change in -1..1, and what stood there before.
+    """
+    launch_tiles(measure_change_kernel, change_out.shape, [view, environment], [change_out], block_dim=SECTOR_SIZE**2)
 
 
 accumulate_environment = row_launcher(accumulate_environment_kernel, like=lambda *given: given[-1].radiance)

@@ -34,7 +34,7 @@ import math
 import warp as wp
 
 from warp_ar.kernels.color import brightness
-from warp_ar.kernels.launch import Rows, launch, launch_rows
+from warp_ar.kernels.launch import Rows, launch, launch_rows, launch_tiles, tile_kernel
 from warp_ar.kernels.safe_math import safe_radiance
 from warp_ar.kernels.sampling import BELOW_ONE, radical_inverse, uniform_from_bits
 from warp_ar.kernels.structs import Emitter
@@ -175,21 +175,23 @@ def sum_along_rows_kernel(
         cumulative_out[i, j] = total
 
 
-@wp.kernel(enable_backward=False)
+@tile_kernel
 def sum_rows_kernel(
     # In:
     cumulative: wp.array2d[wp.float32],
     # Out:
     rows_out: wp.array[wp.vec2],
 ):
-    """Sum of (weighted brightness, weight) over the rows up to one; each thread adds up its own."""
-    i = wp.tid()
+    """Sum of (weighted brightness, weight) over the rows up to one, by one block."""
+    i, lane = wp.tid()
     height = cumulative.shape[0]
     width = cumulative.shape[1]
     total = wp.vec2(0.0, 0.0)
-    for row in range(i + 1):
+    for row in range(lane, i + 1, wp.block_dim()):
         total += row_weight(row, height, width) * wp.vec2(cumulative[row, width - 1], wp.float32(width))
-    rows_out[i] = total
+    sums = wp.tile_sum(wp.tile(total, preserve_type=True))
+    if lane == 0:
+        rows_out[i] = sums[0]
 
 
 @wp.kernel(enable_backward=False)
@@ -369,7 +371,7 @@ def sum_environment(
     """
     height = environment.shape[0]
     launch(sum_along_rows_kernel, height, [environment], [cumulative_out])
-    launch(sum_rows_kernel, height, [cumulative_out], [rows_out])
+    launch_tiles(sum_rows_kernel, [height], [cumulative_out], [rows_out], block_dim=32)
 
 
 def draw_samples(

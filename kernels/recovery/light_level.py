@@ -19,7 +19,7 @@ from __future__ import annotations
 import warp as wp
 
 from warp_ar.kernels.latlong import PI, texel_solid_angle
-from warp_ar.kernels.launch import launch
+from warp_ar.kernels.launch import launch, launch_tiles, tile_kernel
 from warp_ar.kernels.recovery.recover import Observation
 from warp_ar.kernels.structs import Emitter
 
@@ -43,7 +43,7 @@ DARK = wp.constant(wp.float32(0.0016))
 """Radiance below which a point says nothing: quantisation."""
 
 
-@wp.kernel(enable_backward=False)
+@tile_kernel
 def sum_upward_kernel(
     # In:
     radiance: wp.array2d[wp.vec3],
@@ -51,14 +51,16 @@ def sum_upward_kernel(
     upward_out: wp.array[wp.vec3],
 ):
     """Sum the irradiance that each row of the upper half gives a surface facing upward."""
-    i = wp.tid()
+    i, lane = wp.tid()
     height = radiance.shape[0]
     width = radiance.shape[1]
-    cosine = wp.cos(PI * (wp.float32(i) + 0.5) / wp.float32(height))
     total = wp.vec3(0.0, 0.0, 0.0)
-    for j in range(width):
+    for j in range(lane, width, wp.block_dim()):
         total += radiance[i, j]
-    upward_out[i] = texel_solid_angle(i, height, width) * cosine * total
+    sums = wp.tile_sum(wp.tile(total, preserve_type=True))
+    if lane == 0:
+        cosine = wp.cos(PI * (wp.float32(i) + 0.5) / wp.float32(height))
+        upward_out[i] = texel_solid_angle(i, height, width) * cosine * sums[0]
 
 
 @wp.kernel(enable_backward=False)
@@ -84,7 +86,7 @@ def sum_upward(radiance: wp.array, rows: wp.array, upward_out: wp.array) -> None
         rows: Scratch, ``wp.vec3`` (h / 2).
         upward_out: Irradiance, float32 (3).
     """
-    launch(sum_upward_kernel, rows.shape, [radiance], [rows])
+    launch_tiles(sum_upward_kernel, rows.shape, [radiance], [rows], block_dim=64)
     launch(add_rows_kernel, 3, [rows], [upward_out])
 
 

@@ -74,7 +74,7 @@ class Accumulate(Stage):
         environment, change, params = find_view(arrays, "environment"), arrays["accumulate_change"], arrays["params"]
 
         def measure(rows: Rows | None) -> None:
-            accumulate.measure_change(view, environment, change, rows=rows)
+            accumulate.measure_change(view, environment, change)
 
         def follow(rows: Rows | None) -> None:
             accumulate.accumulate_environment(view, change, params, environment, rows=rows)
@@ -99,7 +99,7 @@ class Accumulate(Stage):
             measure = functools.partial(accumulate.measure_change, view, environment, change)
             follow = functools.partial(accumulate.accumulate_environment, *known)
             passes += [
-                Pass(lambda rows, measure=measure: measure(rows=rows), enabled=tells),  # type: ignore[misc]
+                Pass(lambda rows, measure=measure: measure(), enabled=tells),  # type: ignore[misc]
                 Pass(lambda rows, follow=follow: follow(rows=rows), rows=height, enabled=tells),  # type: ignore[misc]
             ]
         return passes
