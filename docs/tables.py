@@ -227,7 +227,7 @@ def formats() -> str:
         last = "; ".join(
             [*told.get("Names", "").strip().rstrip(".").split("; "), *dict.fromkeys(filter(None, named))]
         ).strip("; ")
-        refused = re.sub(r"^damaged(; |\b)", "", refused)  # as the page says of all
+        refused = re.sub(r"^damaged(; |$)", "", refused)  # as the page says of all
         cells = [" ".join(text.split()).rstrip(".").replace("``", "`") for text in (told["Follows"], refused, last)]
         rows.append("| " + " | ".join([name, *cells]) + " |")
     return "\n".join(rows)
@@ -251,7 +251,8 @@ def notes_of(module: Any, name: str) -> list[str]:
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "note":
                 parts = node.args[0].values if isinstance(node.args[0], ast.JoinedStr) else node.args[:1]
                 told = ["…" if isinstance(part, ast.FormattedValue) else getattr(part, "value", "") for part in parts]
-                words += ["".join(told)] if all(isinstance(text, str) for text in told) else []
+                if all(isinstance(text, str) for text in told) and told[0] != "…":  # else it says nothing here
+                    words.append("".join(told))
     return words
 
 

@@ -34,9 +34,9 @@ LEAST_SHARE = wp.constant(wp.float32(0.1))
 LEAST_POINTS = wp.constant(wp.int32(8))
 """Least number of the card's points seen in both frames."""
 AGREEING = wp.constant(wp.float32(0.7))
-"""Share of them whose light must have changed alike,"""
+"""Least share of these points whose light changed alike."""
 SPREAD = wp.constant(wp.float32(0.1))
-"""within this, relatively."""
+"""Largest relative difference between changes that count as alike."""
 MOST = wp.constant(wp.float32(1.5))
 """Highest level; a larger rise of the card is probably another lamp."""
 DARK = wp.constant(wp.float32(0.0016))

@@ -26,15 +26,15 @@ class SurfaceConfig:
     grid: float = 0.06
     """Metres between points on planes."""
     planes: int = 8
-    """Planes that are read: costs grow no further with the scene's number of proxies. Those share"""
+    """Largest number of planes in use, which bounds the cost for scenes of many proxies."""
     plane_points: int = 2000
-    """points,"""
+    """Largest number of points on all planes."""
     boxes: int = 16
-    """and so many boxes share"""
+    """Largest number of boxes in use."""
     box_points: int = 1536
-    """points,"""
+    """Largest number of points on all boxes."""
     face_steps: int = 5
-    """at most this many in each of a face's two directions."""
+    """Largest number of points along either side of a box's face."""
     noise: tuple[float, ...] = (0.02, 0.04, 0.12, 0.04)
     """Relative standard deviation of an equation, by kind, if points scatter by as much or are too few to measure
     it."""
@@ -93,11 +93,11 @@ class LeastConfig:
     """Least radiance that is missing where the map alone is known (``priors.least_missing``)."""
 
     least: float = 1.25
-    """Radiance by which what clips in all channels is raised, over the level of clipping, where a steradian clips."""
+    """Raise of light clipped in all channels, over the level of clipping, if one steradian clips."""
     exponent: float = 0.25
-    """Of the solid angle that clips, in that,"""
+    """Exponent of the clipped solid angle in the raised radiance."""
     most: float = 1.0
-    """and steradians from which it rises no further: a sky that clips in whole may be even, just above clipping."""
+    """Steradians from which it rises no further: a wholly clipped sky may be even, just above clipping."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,94 +105,91 @@ class SearchConfig:
     """Search for emitters."""
 
     evidence: float = 7.0
-    """Fall of the cost (twice a log likelihood) that a candidate must be worth."""
+    """Least fall of the cost (twice a log likelihood) by an added candidate."""
     even: float = 1.6
-    """Ratio of how far surfaces scatter to what is expected of them above which they are textured."""
+    """Ratio of surfaces' scatter to the expected one above which they count as textured."""
     textured: float = 4.0
-    """Exponent of what exceeds it, in the fall that is asked for there."""
+    """Exponent of the ratio above ``even`` in the least fall for textured surfaces."""
     better: float = 0.1
-    """Fall of the cost for which a candidate that is being added goes to a neighbouring place."""
+    """Least fall of the cost for moving a new candidate to a neighbouring place."""
     worth_moving: float = 1.0
-    """The same for a candidate that was known before: emitters stand still, and what differs from view to view is
-    noise.
+    """The same for a known candidate: emitters stand still, and differences between views are noise.
 
     With ``better``, an emitter of ``torus`` wanders to where another comes on, a quarter of a metre from the ball.
     """
     most: int = 4
-    """Most candidates at a time."""
+    """Largest number of candidates at a time."""
     every: int = 2
     """Estimates between searches for one more candidate; the first searches for all."""
     later_every: int = 6
-    """The same once as many estimates as ``settled`` were made."""
+    """The same after ``settled`` estimates."""
     first: int = 5
-    """Estimates in which searches try as many directions as they ever do."""
+    """Number of first estimates whose searches try all directions."""
     candidates: int = 160
-    """Directions that are tried for a candidate at first."""
+    """Directions tried for a candidate in the first estimates."""
     later_candidates: int = 40
-    """Directions that are tried in a later search, others each time."""
+    """Directions tried in a later search, different ones each time."""
     distances: tuple[float, ...] = (2.0, 1.2, 0.8, 0.6, 0.45, 0.35)
-    """Metres from the ball that are tried for an emitter, beside infinity."""
+    """Distances of an emitter from the ball that are tried, metres, besides infinity."""
     nearest: float = 0.25
-    """Metres from the ball within which no emitter is looked for: it would stand in the picture, in front of the
-    desk."""
+    """Least distance of an emitter from the ball, metres; a closer one would be in the picture, before the desk."""
     farthest: float = 3.0
-    """Metres beyond which an emitter is taken for a distant one, in how much room there is for it."""
+    """Distance, metres, beyond which an emitter counts as distant."""
     angle: float = 0.12
     """Radians around a candidate's direction that share its light."""
     stray: float = 0.05
-    """Share of the light of a lamp's spot that may clip around it: glare, and cells that the spot just touches."""
+    """Largest share of a spot's light that may clip around it: glare, and cells that it just touches."""
     radius_share: float = 0.06
-    """Radius of an emitter as a share of its distance: of a disc as wide as a cell."""
+    """Radius of an emitter over its distance: a disc as wide as a cell."""
 
 
 @dataclasses.dataclass(frozen=True)
 class SolverConfig:
-    """When a solution is good enough, and when none is asked for."""
+    """Limits of iteration, and conditions of a new solution."""
 
     iterations: int = 6
     """Iterations of reweighting from a distant start."""
     warm_iterations: int = 3
     """The same from a solution of nearly the same problem."""
     halvings: int = 4
-    """Most of one step, while it leads to a higher cost."""
+    """Largest number of halvings of a step that raises the cost."""
     converged: float = 1.0e-3
-    """Relative change of the largest unknown, in one reweighting, from which on nothing more is gained."""
+    """Relative change of the largest unknown at which reweighting has converged."""
     settled: int = 10
-    """Estimates, from several views, after which emitters are taken for found, and light that stays as it is for
-    known."""
+    """Number of estimates, from several views, after which emitters and steady light count as known."""
     still: float = 0.02
-    """Relative change, of surfaces or of the environment, below which the light is the same."""
+    """Relative change of surfaces or environment below which the light counts as unchanged."""
     remembered: int = 12
-    """Estimates that count in a mean while the light is the same."""
+    """Largest number of estimates in a mean while the light is unchanged."""
     sudden: float = 0.25
-    """Relative change that is solved for at once; what changes less may wait for one more estimate."""
+    """Relative change that starts a new solution at once; smaller ones wait for one more estimate."""
 
 
 @dataclasses.dataclass(frozen=True)
 class CardConfig:
-    """Tests that a card must pass before its white is believed."""
+    """Tests that a card must pass before its white is used."""
 
     least_cells: int = 4
-    """White cells, and ink cells, that must be seen."""
+    """Least number of visible white cells, and of ink cells."""
     least_contrast: float = 2.5
     """Median ratio of paper to ink: print has 10 to 30, blur and veiling glare lower it."""
     darker: float = 1.6
     """Ratio from which an ink cell is darker than the paper beside it."""
     least_share: float = 0.75
-    """Share of ink cells that must be."""
+    """Least share of such ink cells."""
     held: int = 15
-    """Estimates, of some five a second, for which light that was found holds while a hand or an object hides it."""
+    """Number of estimates, about five a second, for which found light is kept while something hides the card."""
 
 
 @dataclasses.dataclass(frozen=True)
 class EvidenceConfig:
-    """Errors of what an estimate rests on, and the share of it that they leave."""
+    """Errors of an estimate's evidence, and the share of the estimate that is kept under them."""
 
     directions: int = 32
-    """In which irradiance counts."""
+    """Number of directions of irradiance."""
     lever: float = 2.0
-    """Most light that may be missing from all directions, over that which is missing at the card, as shares: light
-    that hardly reaches the card is hardly known by it."""
+    """Largest share of light missing from all directions, over the share missing at the card, which measures light
+    at grazing angles poorly."""
     response: float = 0.016
     """Standard deviation of the logarithm of the response's exponent."""
     white: float = 0.016
@@ -200,18 +197,18 @@ class EvidenceConfig:
     ball: float = 0.016
     """The same of the ball's."""
     usual_contrast: float = 30.0
-    """Ratio of paper to ink above which no print is known: the response is steeper than it is taken to be."""
+    """Largest ratio of paper to ink of known prints; a larger one shows that the response is steeper than assumed."""
     doubt: float = 2.0
     """Standard deviation of the card's logarithm per logarithm of contrast beyond that."""
     found: float = 0.75
-    """Relative error of the light that was found, either way."""
+    """Relative error of the recovered light, in both directions."""
     capture: float = 0.35
     """Relative error of the irradiance as captured, downward: the ball's reflectance, the unseen cone, the
     response. This, the next and ``clipped`` hold in 19 of 20 of the tables of ``bench_never_worse``."""
     overlooked: float = 2.0
     """The same upward: emitters that are too small for the ball's pixels, or saturate unnoticed."""
     clipped: float = 250.0
-    """Radiance that what clips may have on average where nothing tells: 19 of 20 rooms have less."""
+    """Bound of the mean radiance of clipped light without other evidence; 19 of 20 rooms have less."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -219,23 +216,23 @@ class ShadowConfig:
     """Test that recovered light reaches the ball (``ball_shadow.py``)."""
 
     beside: float = 2.0
-    """Radii within which light passes the ball whose absence beside the shadow is the ball's own,"""
+    """Distance in radii within which light that passes the ball tests for the ball's own shadow."""
     beside_share: float = 0.5
-    """and least share of what is added at a point that does."""
+    """Least share of such light in the light added at a tested point."""
     across: float = 3.5
-    """The same of points that show the shadow's contrast."""
+    """Distance in radii of light for points that measure the shadow's contrast."""
     elsewhere: float = 0.1
-    """Greatest share at points that say how bright the plane is elsewhere."""
+    """Largest share of such light at points that measure the plane's brightness outside the shadow."""
     points: int = 8
     """Least number of points, here and elsewhere."""
     believed: float = 0.1
-    """Share of the likelihood that lies below the share of light that is taken."""
+    """Quantile of the likelihood at which the share of light is taken."""
     scatter: float = 0.05
-    """Least standard deviation of a point's logarithm: transport that the model leaves out.
+    """Least standard deviation of a point's logarithm: transport outside the model.
 
     With 0.03 to 0.08 the same of the tables of ``bench_never_worse`` that are worse without this are not with it."""
     level: float = 0.05
-    """The same of a plane's level from place to place, beside how far its points scatter."""
+    """The same for a plane's level from place to place, in addition to its points' scatter."""
     iterations: int = 8
     """Iterations of reweighting."""
 

@@ -94,11 +94,11 @@ class Interval:
     normals: Array
     """+x, -x, +y, -y, +z, -z, (6, 3)."""
     low: Array
-    """19 of 20 times the true irradiance is between this, (6, 3: channels),"""
+    """Lower end of the 95 % interval, (6, 3: channels)."""
     value: Array
-    """this is the estimate,"""
+    """Estimate, (6, 3)."""
     high: Array
-    """and this."""
+    """Upper end of the 95 % interval, (6, 3)."""
 
 
 def doubt_of(contrast: float) -> float:

@@ -64,7 +64,7 @@ class Prefilter(Stage):
 
     @classmethod
     def method_for(cls, features: Features) -> str:
-        """``energy_mip`` in the place of the paper's, where light from a file leaves no ball to look up."""
+        """Return the quality's method, but ``energy_mip`` instead of the paper's for light from a file."""
         method = super().method_for(features)
         return "energy_mip" if method == "sphere_mip" and not features.observed else method
 

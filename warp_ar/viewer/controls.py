@@ -112,7 +112,7 @@ class NoCamera(Source):
                 return
 
     def close(self) -> None:
-        """End the pictures."""
+        """Stop the source."""
         self._closed.set()
 
 
