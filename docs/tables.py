@@ -162,7 +162,8 @@ def methods() -> str:
         rows.append([f"**{setting.name.replace('_', ' ')}**", what, *[""] * (len(rows[0]) - 2)])
         for method in [method for method in setting.methods if method in errors]:
             times = [one["milliseconds"].get(setting.name, {}).get(method) for one in devices]
-            own = ", ".join(name for name, quality in PRESETS.items() if chosen(quality, setting) == method)
+            names = [name for name, quality in PRESETS.items() if chosen(quality, setting) == method]
+            own = f"from {names[0]}" if len(names) > 2 and names == list(PRESETS)[-len(names) :] else ", ".join(names)
             rows.append([f"`{method}`", words.get(method, ""), own, f"{errors[method]:.4f}", *map(milliseconds, times)])
     return "\n".join("| " + " | ".join(cells) + " |" for cells in rows)
 

@@ -247,7 +247,7 @@ def _drop_output() -> None:
 _GRACE: Final = 20.0
 """Seconds after SIGTERM or SIGHUP at which a process ends that has not unwound by itself."""
 _SOON: Final = 0.001
-"""Seconds after which a signal that was dropped is sent again."""
+"""Seconds after which a signal that a callback swallowed is sent again."""
 
 
 @contextlib.contextmanager

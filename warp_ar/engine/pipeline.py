@@ -581,7 +581,7 @@ class Pipeline(Closing):
         return Result(frame.pose, state, (self._keep(rendered) if ahead else rendered).at_once())
 
     def _send(self, frame: SeenFrame) -> SeenFrame:
-        """Begin a frame's way to the device, where that is another and the frame is not there."""
+        """Begin the copy of a frame to the device, unless it is already there."""
         if self.inputs.transfers is None or frame.lost or isinstance(frame.image, wp.array):
             return frame
         frame.slot = self.inputs.transfers.begin(frame.image)

@@ -134,7 +134,7 @@ class SearchConfig:
     nearest: float = 0.25
     """Least distance of an emitter from the ball, metres; a closer one would be in the picture, before the desk."""
     farthest: float = 3.0
-    """Distance, metres, beyond which an emitter counts as distant."""
+    """Distance, metres, at which the prior on an emitter's distance stops growing."""
     angle: float = 0.12
     """Radians around a candidate's direction that share its light."""
     stray: float = 0.05
