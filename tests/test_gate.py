@@ -192,8 +192,9 @@ def test_a_polite_viewer_keeps_its_frames_beside_silent_connections(
 
     test()
     told = capfd.readouterr().err
-    assert told.count("\n") <= 1, "an attack fills the log"
-    assert not told or "too many connections" in told
+    # Said again after a while, however many are cut.
+    assert all("too many connections" in line for line in told.splitlines())
+    assert told.count("\n") < ATTACKERS / 10, "an attack fills the log"
 
 
 @run

@@ -242,6 +242,10 @@ async def served(
         async with aiohttp.ClientSession() as session:
             yield Site(server, f"http://127.0.0.1:{server.address.port}", session)
     finally:
+        # A host that is made after its server has stopped waiting for it is closed by nobody.
+        made = asyncio.create_task(server.started())
+        await asyncio.wait({task, made}, timeout=PATIENCE, return_when=asyncio.FIRST_COMPLETED)
+        made.cancel()
         task.cancel()
         with contextlib.suppress(asyncio.CancelledError):
             await task
