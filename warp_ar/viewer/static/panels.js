@@ -592,10 +592,11 @@ export class QualityPanel {
     const y = (e) => top + (1 - e / most) * (height - top - bottom);
     const placed = [];
     const label = (name, px, py) => {
-      const at = [Math.min(px + 6, width - 44), Math.max(py - 5, 10)];
+      const before = px > width - 50; // no room behind it
+      const at = [before ? px - 52 : px + 6, Math.max(py - 5, 10)];
       while (placed.some(([ox, oy]) => Math.abs(at[0] - ox) < 44 && Math.abs(at[1] - oy) < 11)) at[1] += 11;
       placed.push(at);
-      return shape("text", { x: at[0], y: at[1] }, name);
+      return shape("text", { x: before ? px - 8 : at[0], y: at[1], class: before ? "tick" : "" }, name);
     };
     const parts = [shape("text", { x: 0, y: 9 }, "error, FLIP")];
     for (let e = 0; e <= most; e += 0.1) {
