@@ -616,6 +616,10 @@ def test_a_users_own_scene_names_any_file(tmp_path: pathlib.Path) -> None:
         (sc.Light, {"kind": "point", "intensity": True}, "intensity = True: expected a number"),
         (sc.Light, {"kind": "directional", "intensity": 1, "direction": (0, 0, 0)}, "the way the light travels"),
         (sc.CapturedLight, {"file": pathlib.Path("a.exr"), "axes": "up"}, "axes = 'up': unknown"),
+        (sc.Object, {"shape": "sphere", "radius": 1, "material": "red"}, "material = 'red': expected .*Material or"),
+        (sc.Object, {"shape": "sphere", "radius": 1, "name": 3}, "name = 3: expected str"),
+        (sc.Object, {"shape": "sphere", "radius": 1, "marker": 7}, "marker = 7: expected Marker"),
+        (sc.CapturedLight, {"file": 3}, "file = 3: expected Path"),
         (sc.Object, {"shape": "box"}, "expected 3 lengths above 0"),
         (sc.AreaLight, {"kind": "rect", "intensity": 1, "at": (0, 0, 1)}, "expected 2 lengths above 0"),
         (sc.Marker, {"size": -0.08}, "size = -0.08: expected a number above 0"),
@@ -641,6 +645,18 @@ def test_a_pose_has_a_rotation(rotation: np.ndarray) -> None:
 def test_numbers_of_numpy_are_numbers() -> None:
     item = sc.Object("sphere", radius=np.float32(0.1), at=np.array([0.0, 1.0, 2.0], np.float32))
     assert item.radius == np.float32(0.1)
+    assert item == dataclasses.replace(item, at=[0.0, 1.0, 2.0])
+    assert hash(item) == hash(dataclasses.replace(item, radius=float(np.float32(0.1))))
+    assert sc.CapturedLight("a.exr").file == pathlib.Path("a.exr")
+
+
+def test_poses_of_lists_are_poses() -> None:
+    pose = sc.Pose(np.eye(3, dtype=np.float32), [0, 0, 1])
+    assert pose == sc.Pose(np.eye(3).tolist(), np.array([0.0, 0.0, 1.0]))
+    assert pose != sc.Pose(np.eye(3), np.zeros(3))
+    for rotation, translation in ((1j * np.eye(3), np.zeros(3)), (np.eye(3), ["a", "b", "c"]), (None, None)):
+        with pytest.raises(UsageError, match=r"Pose: (rotation|translation) .*expected an array"):
+            sc.Pose(rotation, translation)
 
 
 # --- ``python -m warp_ar.keys`` ---------------------------------------------------------------------------------------

@@ -105,6 +105,14 @@ def test_poses_come_back() -> None:
         (lambda all_: all_.add(dataclasses.replace(BALL, at=(np.nan, 0.0, 0.0))), SceneError, "finite"),
         (lambda all_: all_["lamp"].place((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)), SceneError, "with a length"),
         (lambda all_: all_["lamp"].place((0.0, 0.0, 0.0), scale=-1.0), SceneError, "world_from_object"),
+        (lambda all_: all_["lamp"].place("abc"), SceneError, "expected 3 numbers"),
+        (lambda all_: all_["lamp"].place((0.0, 0.0, 0.0), scale=None), SceneError, "finite numbers"),
+        (lambda all_: all_.add(dataclasses.replace(BALL, at=np.full(3, np.nan))), SceneError, "finite"),
+        (lambda all_: setattr(all_[1], "value", named().objects[0]), UsageError, "another object 'lamp'"),
+        (lambda all_: setattr(all_[1], "value", None), UsageError, "value is NoneType; expected an Object"),
+        (lambda all_: setattr(all_[1], "material", None), SceneError, "material = None: expected"),
+        (lambda all_: setattr(all_[1], "world_form_object", UPRIGHT), AttributeError, "world_form_object"),
+        (lambda all_: all_[True], UsageError, "there is no True"),
     ],
 )
 def test_an_edit_that_cannot_be_changes_nothing(edit, error, told, frames: Frames) -> None:
@@ -114,6 +122,32 @@ def test_an_edit_that_cannot_be_changes_nothing(edit, error, told, frames: Frame
             edit(pipeline.objects)
         assert pipeline.scene.objects == named().objects
         np.testing.assert_array_equal(pipeline(frames[0], time_seconds=0.0).image, before)
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"quality": ["low"]}, "is no preset"),
+        ({"outputs": None}, "outputs = None: expected a tuple"),
+        ({"exposures": 0.1}, "exposures = 0.1: expected a tuple"),
+        ({"size": "640x480"}, "size = '640x480': expected 2 whole numbers above 0"),
+        ({"size": (320.0, 240.0)}, "expected 2 whole numbers"),
+        ({"bands": -1}, "bands = -1: expected a whole number above 0"),
+        ({"shown": "x"}, "shown = 'x': expected a finite number of seconds"),
+        ({"scene": make_scene(objects=(3,))}, "scene.objects holds int; expected Object"),
+        ({"scene": make_scene(objects=BALL)}, "scene.objects is Object; expected a tuple of Object"),
+        ({"scene": dataclasses.replace(make_scene(), camera=None)}, "scene.camera holds NoneType; expected Camera"),
+        ({"scene": dataclasses.replace(make_scene(), proxies=(BALL,))}, "scene.proxies holds Object; expected Proxy"),
+    ],
+)
+def test_a_pipeline_names_what_it_cannot_take(given, told) -> None:
+    with pytest.raises(UsageError, match=told):
+        Pipeline(**{"scene": make_scene(), "device": "cpu", **given})
+
+
+def test_numbers_of_numpy_find_objects() -> None:
+    with Pipeline(named(), device="cpu", quality="paper") as pipeline:
+        assert pipeline.objects[np.int64(1)].value == named().objects[1]
 
 
 def test_names_are_kept_in_files() -> None:

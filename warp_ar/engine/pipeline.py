@@ -22,7 +22,7 @@ import warp as wp
 
 from warp_ar.closing import Closing
 from warp_ar.device import exclusive, resolve_device, translating
-from warp_ar.engine.arguments import check_estimates, check_exposure, check_frames, check_number, read_scene
+from warp_ar.engine.arguments import check_counts, check_estimates, check_frames, check_number, check_scene, read_scene
 from warp_ar.engine.environment_history import CarriedLight
 from warp_ar.engine.frame_exchange import Borrowed, adopt_frame
 from warp_ar.engine.frame_inputs import FrameInputs, SeenFrame
@@ -38,7 +38,6 @@ from warp_ar.errors import UpdateError, UsageError, WarpArError
 from warp_ar.kernels.picture.marker_edge_fit import fit_edges_kernel
 from warp_ar.light.captured import has_places
 from warp_ar.scene import Pose, Scene
-from warp_ar.scene.fields import check_finite
 from warp_ar.scene.kinds import difference
 from warp_ar.sources.deep_frame import Plate, as_plate, check_plate, codes8
 from warp_ar.sources.exposures import BracketPlan, brightened, find_exposure, plan_bracket
@@ -68,7 +67,7 @@ def resolve_quality(quality: str | Quality) -> Quality:
     """
     if isinstance(quality, Quality):
         return quality
-    if quality not in PRESETS:
+    if not isinstance(quality, str) or quality not in PRESETS:
         close = difflib.get_close_matches(str(quality), PRESETS, 1)
         hint = f"did you mean {close[0]}? " if close else ""
         raise UsageError(f"quality {quality!r} is no preset; {hint}expected {', '.join(PRESETS)}")
@@ -158,6 +157,10 @@ class Pipeline(Closing):
         scene = read_scene(scene)
         check_estimates(estimates)
         outputs = check_frames(exposures, outputs, linear)
+        if shown is not None:
+            check_number("shown", shown, above=0.0)
+        check_counts("size", size, 2)
+        check_counts("bands", bands, 1)
         self._closed, self._process = False, os.getpid()
         self._turn = threading.RLock()
         self.device, self.quality = resolve_device(device), resolve_quality(quality)
@@ -291,10 +294,7 @@ class Pipeline(Closing):
     def _check_next(self, scene: Scene) -> Scene:
         """Return a scene that is to be shown next, at the size of the frames, with all that was submitted rendered."""
         self._check_usable()
-        if not isinstance(scene, Scene):
-            raise UsageError(f"scene is {type(scene).__name__}; expected a Scene, such as load_scene returns")
-        check_exposure(scene)
-        check_finite(scene, leave=("pose",))  # whose numbers the file's reader has checked
+        check_scene(scene, leave=("pose",))  # whose numbers the file's reader has checked
         self._finish()
         return dataclasses.replace(scene, camera=scene.camera.scaled_to(*self.size))
 

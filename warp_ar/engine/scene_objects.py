@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import numbers
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeAlias
 
@@ -77,13 +78,19 @@ class SceneObjects:
 class SceneObject:
     """One object, found by its name or number whenever it is asked for something."""
 
+    __slots__ = ("_edit", "_key", "_objects")  # so that a name that is mistyped is no new attribute
+
     def __init__(self, objects: Callable[[], tuple[Object, ...]], edit: Callable[[Edit], None], key: str | int) -> None:
         """Take how to read and edit the objects, and which is meant."""
         self._objects, self._edit, self._key = objects, edit, key
 
     @property
     def value(self) -> Object:
-        """The object as it is in the scene; may be set to another, of any fields."""
+        """The object as it is in the scene; may be set to another, of any fields.
+
+        Raises:
+            UsageError: What it is set to is no object, or another one has its name.
+        """
         items = self._objects()
         return items[find(items, self._key)]
 
@@ -94,7 +101,12 @@ class SceneObject:
     def _replace(self, made: Callable[[Object], Object]) -> None:
         def edited(items: tuple[Object, ...]) -> Sequence[Object]:
             index = find(items, self._key)
-            return *items[:index], made(items[index]), *items[index + 1 :]
+            item, others = made(items[index]), (*items[:index], *items[index + 1 :])
+            if not isinstance(item, Object):
+                raise UsageError(f"value is {type(item).__name__}; expected an Object")
+            if item.name is not None and any(item.name == other.name for other in others):
+                raise UsageError(f"value: there is another object {item.name!r}; give each its own name")
+            return *others[:index], item, *others[index:]
 
         self._edit(edited)
 
@@ -125,11 +137,14 @@ class SceneObject:
         Raises:
             SceneError: A number is not finite, the quaternion has no length, or the scale is not above 0.
         """
-        given = [np.asarray(value, np.float64) for value in (translation, quaternion)]
-        length = np.linalg.norm(given[1])
-        if [value.shape for value in given] != [(3,), (4,)] or not 0.0 < length < np.inf:
-            raise SceneError("place: expected a translation of 3 numbers and a quaternion x, y, z, w with a length")
-        self.world_from_object = NodeTrack(given[0], given[1] / length, np.full(3, scale), {}).transform_at(0.0)
+        try:
+            given = [np.asarray(value, np.float64) for value in (translation, quaternion, scale)]
+        except (TypeError, ValueError):
+            given = []
+        length = np.linalg.norm(given[1]) if given else 0.0
+        if [value.shape for value in given] != [(3,), (4,), ()] or not 0.0 < length < np.inf:
+            raise SceneError("place: expected 3 numbers, a quaternion x, y, z, w with a length, and one scale")
+        self.world_from_object = NodeTrack(given[0], given[1] / length, np.full(3, given[2]), {}).transform_at(0.0)
 
     @property
     def material(self) -> Material:
@@ -147,8 +162,8 @@ def find(items: Sequence[Object], key: str | int) -> int:
     Raises:
         UsageError: There is none, or several have the name.
     """
-    if isinstance(key, int) and 0 <= key < len(items):
-        return key
+    if isinstance(key, numbers.Integral) and not isinstance(key, bool) and 0 <= key < len(items):
+        return int(key)
     found = [index for index, item in enumerate(items) if item.name == key and key is not None]
     if len(found) == 1:
         return found[0]

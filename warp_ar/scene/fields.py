@@ -62,10 +62,12 @@ class Field:
     """Dataclass of a table."""
     optional: bool = False
     """True if the value may be None."""
+    kinds: tuple[Any, ...] = ()
+    """Types of which a value may be, where it is no number, list or word."""
 
 
-_UNCHECKED: Final = ("table", "path", "flag", "text")
-"""Forms of which constructors check nothing."""
+_KINDS: Final = ("table", "path", "flag", "text")
+"""Forms of which constructors check the type alone."""
 _KNOWN: Final[dict[Any, dict[str, Field]]] = {}
 
 
@@ -89,7 +91,7 @@ def _field(name: str, default: Any, hint: Any, key: Key) -> Field:
     if typing.get_origin(first) is tuple:
         return Field(name, key, "color" if Path in own else "vector", default, optional=optional)
     forms = {bool: "flag", int: "integer", float: "number", str: "text", Path: "path"}
-    return Field(name, key, forms.get(first, "table"), default, kind=first, optional=optional)
+    return Field(name, key, forms.get(first, "table"), default, kind=first, optional=optional, kinds=tuple(own))
 
 
 class Checked:
@@ -112,17 +114,26 @@ class Checked:
             unused = not_used(self.USES, getattr(self, selector))
         for field in every.values():
             value = getattr(self, field.name)
-            if field.name in unused or field.form in _UNCHECKED or (value is None and field.optional):
+            if field.name in unused or (value is None and field.optional):
                 continue
-            if field.form == "word":
+            if field.form in _KINDS:
+                _check_kind(self, field, value)
+            elif field.form == "word":
                 _check_word(self, field, value, field.words)
             elif field.form in ("number", "integer"):
                 _check_numbers(self, field, (value,), "a number ")
+                object.__setattr__(self, field.name, _plain(value))
             elif field.key.sizes and not (field.form == "color" and isinstance(value, Path)):
                 count = " or ".join(map(str, field.key.sizes))
                 if not isinstance(value, Collection) or isinstance(value, str) or len(value) not in field.key.sizes:
                     fail(self, field.name, f"expected {count} numbers")
                 _check_numbers(self, field, tuple(value), f"{count} numbers, each ")
+                object.__setattr__(self, field.name, tuple(map(_plain, value)))
+
+
+def _plain(value: Any) -> Any:
+    """Return a number as Python's own: scenes are compared and hashed."""
+    return value.item() if isinstance(value, np.generic) else value
 
 
 def not_used(uses: dict[str, tuple[str, ...]], kind: str) -> set[str]:
@@ -139,6 +150,13 @@ def fail(item: object, key: str, right: str) -> NoReturn:
     value = repr(getattr(item, key))
     shown = value if len(value) <= 80 else f"{value[:60]}..."
     raise SceneError(f"{type(item).__name__}: {key} = {shown}: {right}")
+
+
+def _check_kind(item: object, field: Field, value: object) -> None:
+    if field.form == "path" and isinstance(value, str):
+        object.__setattr__(item, field.name, Path(value))
+    elif not isinstance(value, field.kinds):
+        fail(item, field.name, f"expected {' or '.join(kind.__name__ for kind in field.kinds)}")
 
 
 def _check_word(item: object, field: Field, value: object, words: tuple[str, ...]) -> None:
