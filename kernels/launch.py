@@ -192,7 +192,7 @@ def row_launcher(
     *,
     configs: int = 1,
     outputs: int = 1,
-    like: Callable[..., wp.array] | None = None,
+    like: Callable[..., Any] | None = None,
     **options: bool,
 ) -> Callable[..., None]:
     """Return ``launcher(*configs, *inputs, *outputs, rows=None, **options)`` of a kernel that takes ``row_start``.
@@ -201,7 +201,7 @@ def row_launcher(
         kernel: Kernel, or the factory that makes it of configurations, the launcher's first arguments.
         configs: Number of these.
         outputs: Number of the kernel's outputs, the launcher's last arguments.
-        like: Picks of the kernel's arguments the array of the launch's extent; None: the first output.
+        like: Extent of the launch, or the array that has it, of the kernel's arguments; None: the first output.
         **options: As for ``launch_rows``, of all launches.
     """
 
@@ -209,9 +209,9 @@ def row_launcher(
         made, arguments = kernel, given
         if not isinstance(kernel, wp.Kernel):
             made, arguments = kernel(*given[:configs]), given[configs:]
-        array = arguments[-outputs] if like is None else like(*arguments)
+        extent = arguments[-outputs] if like is None else like(*arguments)
         inputs, written = arguments[:-outputs], arguments[-outputs:]
-        launch_rows(made, array.shape, inputs, written, rows=rows, device=array.device, **options, **more)
+        launch_rows(made, getattr(extent, "shape", extent), inputs, written, rows=rows, **options, **more)
 
     return launcher
 

@@ -26,6 +26,8 @@ from warp_ar.kernels.structs import (
 from warp_ar.scene.ray_scene import HostScene
 
 COUNT, SIDE = 64, 4
+# Turn of the only ball.
+ONE_BALL = 0, 1
 ORIGIN = (0.0, 0.0, 0.035)
 # Sums of float32 over up to 2048 terms of like size.
 SUM_ERROR = 2e-5
@@ -49,17 +51,16 @@ def draw(environment, count=COUNT * SIDE * SIDE):
     samples = wp.zeros(count, EnvironmentSample)
     source = wp.array(environment, dtype=wp.vec3)
     environment_samples.sum_environment(source, cumulative, sums)
-    environment_samples.draw_samples(source, cumulative, sums, wp.vec3(*ORIGIN), directions, flux, samples)
+    environment_samples.draw_samples(source, cumulative, sums, wp.vec3(*ORIGIN), ONE_BALL, directions, flux, samples)
     return directions, flux, samples
 
 
 def list_texels(environment):
     environment = np.asarray(environment, np.float32)
     count = environment.shape[0] * environment.shape[1]
-    directions, flux = wp.zeros(count, wp.vec3), wp.zeros(count, wp.vec3)
-    samples = wp.zeros(count, EnvironmentSample)
-    environment_samples.list_texels(wp.array(environment, dtype=wp.vec3), wp.vec3(*ORIGIN), directions, flux, samples)
-    return directions, flux, samples
+    out = wp.zeros(count, wp.vec3), wp.zeros(count, wp.vec3), wp.zeros(count, EnvironmentSample)
+    environment_samples.list_texels(wp.array(environment, dtype=wp.vec3), wp.vec3(*ORIGIN), ONE_BALL, *out)
+    return out
 
 
 def sky(radiance=1.0, size=(32, 64)):

@@ -60,13 +60,14 @@ def merge(ratios, radiance, confidence, clipped, *, trust=None, rows=None, reach
     radiance, clipped = (wp.array(np.float32(x), dtype=wp.vec3) for x in (radiance, clipped))
     confidence = wp.array(np.float32(confidence), dtype=wp.float32)
     spread = wp.zeros(clipped.shape, dtype=wp.vec3)
-    stack = bracket.make_exposure_stack(radiance, confidence, clipped, spread)
+    stack = bracket.ExposureStack()
+    stack.radiance, stack.confidence, stack.clipped, stack.spread = radiance, confidence, clipped, spread
     light, share = (wp.full((height, width), wp.vec3(-1.0), dtype=wp.vec3) for _ in range(2))
     out = make_environment_view(light, wp.full((height, width), -1.0, dtype=wp.float32), share)
     for band in rows or [None]:
-        bracket.spread_clipping(stack, reach=reach, rows=band)
+        bracket.spread_clipping(reach, stack, rows=band)
     for band in rows or [None]:
-        bracket.merge_exposures(exposures, stack, out, reach=reach, rows=band)
+        bracket.merge_exposures(exposures, stack, reach, out, rows=band)
     return out.radiance.numpy(), out.confidence.numpy(), out.clipped.numpy()
 
 

@@ -4,7 +4,17 @@ import numpy as np
 import pytest
 import warp as wp
 
-from tests.environment_shadow_rig import ORIGIN, STRATIFIED, SUM_ERROR, draw, lamp_at, list_texels, sky, with_sun
+from tests.environment_shadow_rig import (
+    ONE_BALL,
+    ORIGIN,
+    STRATIFIED,
+    SUM_ERROR,
+    draw,
+    lamp_at,
+    list_texels,
+    sky,
+    with_sun,
+)
 from tests.error_model import check_error
 from tests.reference import environment_shadow as reference
 from warp_ar.kernels.environment import environment_samples
@@ -88,7 +98,7 @@ def test_lamps_give_their_samples_a_place(device):
     environment[wi @ direction > np.cos(0.1)] = 40.0
     environment[wi[..., 2] > np.cos(0.1)] = 40.0
     _, _, samples = list_texels(environment)
-    environment_samples.place_emitters(lamp_at(at, None), samples)
+    environment_samples.place_emitters(lamp_at(at, None), ONE_BALL, samples)
     found = samples.numpy()
     near = found["distance"] < 1e29
     np.testing.assert_array_equal(near, (wi @ direction > np.cos(0.1)).ravel())
@@ -102,7 +112,7 @@ def test_lamps_are_placed_from_where_the_ball_mirrors_them(device):
     environment = sky(0.5, (256, 512))
     environment[reference.texel_directions(256, 512)[0] @ direction > np.cos(0.1)] = 40.0
     _, _, samples = list_texels(environment)
-    environment_samples.place_emitters(lamp_at(at, origin=mirrors), samples)
+    environment_samples.place_emitters(lamp_at(at, origin=mirrors), ONE_BALL, samples)
     found = samples.numpy()
     near = found["distance"] < 1e29
     places = found["origin"][near] + found["distance"][near, None] * found["direction"][near]

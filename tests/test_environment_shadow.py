@@ -7,6 +7,7 @@ import pytest
 
 from tests.environment_shadow_rig import (
     MEAN_ERROR,
+    ONE_BALL,
     RIM,
     SET_ERROR,
     STRATIFIED,
@@ -172,7 +173,7 @@ def test_near_lamps_cast_their_own_shadow(device):
     directions, flux, samples = draw(environment)
     item = [sphere((0.1, 0, 0.1), 0.03)]
     distant = run((directions, flux, samples), item)[..., 0]
-    environment_samples.place_emitters(lamp_at(lamp), samples)
+    environment_samples.place_emitters(lamp_at(lamp), ONE_BALL, samples)
     near = run((directions, flux, samples), item, emitters=True)[..., 0]
     # Centre of the shadow: where the line through lamp and object meets the desk.
     expected = lamp + (np.array([0.1, 0, 0.1]) - lamp) * lamp[2] / (lamp[2] - 0.1)

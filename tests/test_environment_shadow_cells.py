@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from tests.environment_shadow_rig import SUM_ERROR, draw, lamp_at, run, shadow_cells, sphere, with_sun
+from tests.environment_shadow_rig import ONE_BALL, SUM_ERROR, draw, lamp_at, run, shadow_cells, sphere, with_sun
 from tests.gltf_files import Gltf
 from tests.kernel_rig import records, shape
 from tests.relight_rig import CAMERA, DESK, LOOK_DOWN, POINTS, RAYS, H, W
@@ -28,7 +28,7 @@ pytestmark = pytest.mark.slow
 def test_a_wavefront_finds_the_same(device, bounce, secondary):
     """By one kernel or by four: with a box, a ball and a lamp at a place, all of which may be before the objects."""
     drawn = draw(with_sun(6, 20, 100.0))
-    environment_samples.place_emitters(lamp_at((0.1, 0.05, 0.4)), drawn[2])
+    environment_samples.place_emitters(lamp_at((0.1, 0.05, 0.4)), ONE_BALL, drawn[2])
     scene = {
         "objects": [sphere((0, 0, 0.05), 0.05), shape(BOX, (-0.1, -0.1, 0.03), (0.03, 0.02, 0.03))],
         "proxies": (DESK, shape(BOX, (-0.12, 0.08, 0.04), (0.03, 0.04, 0.04))),

@@ -172,7 +172,7 @@ def filled_fill_frame(device, frame, text, seed, *, balls=((0.0, 0.0, 0.1),), ba
     """Level 0 of the pyramid, (h, w, 4), after the frame was put into ``seed``."""
     _host, arguments, proxies = given(device, frame, text, balls)
     levels = wp.array(seed.reshape(-1, 4), dtype=wp.vec4, device=device)
-    fill_frame(*arguments, levels, (HEIGHT, WIDTH), proxies=proxies, ball=ball)
+    fill_frame(proxies, *arguments, (HEIGHT, WIDTH), ball, levels)
     return levels.numpy().reshape(HEIGHT, WIDTH, 4)
 
 

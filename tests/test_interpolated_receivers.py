@@ -51,11 +51,11 @@ def sample_all(environments, *, texels, count=1024):
     for ball, one in enumerate(environments):
         source, turn = wp.array(one, dtype=wp.vec3), (ball, len(environments))
         if texels:
-            environment_samples.list_texels(source, wp.vec3(), *out, turn=turn)
+            environment_samples.list_texels(source, wp.vec3(), turn, *out)
         else:
             cumulative, sums = wp.zeros(source.shape, wp.float32), wp.zeros(source.shape[0], wp.vec2)
             environment_samples.sum_environment(source, cumulative, sums)
-            environment_samples.draw_samples(source, cumulative, sums, wp.vec3(), *out, turn=turn)
+            environment_samples.draw_samples(source, cumulative, sums, wp.vec3(), turn, *out)
     return out
 
 

@@ -438,7 +438,7 @@ def shared(*, clips, lamps, hidden=(), emitters=None, excess=None):
     maps = wp.array(first, wp.vec3), wp.zeros(shape, wp.vec3)
     given = wp.array(cells, dtype=Cell)
     send_recovered(*own, given, wp.array(recovered, wp.vec3), sent)
-    share_recovered((wp.zeros(shape, wp.vec3), *own), *maps, emitters, given, sent, out)
+    share_recovered(wp.zeros(shape, wp.vec3), *own, *maps, emitters, given, sent, out)
     return out.numpy()
 
 

@@ -193,5 +193,5 @@ def test_share_of_a_ball_that_the_frame_shows(device):
     corners[4, :, 1] = 40.0, 2.0, 9.0  # beside the picture
     corners[4, :4, 1] = (-1.0, 2.0, 9.0), (3.0, 30.0, 9.0), (3.0, -0.5, 9.0), (39.0, 29.0, 9.0)
     seen = wp.zeros((2, 5), wp.float32)
-    probe_weights.measure_seen(wp.array(corners, wp.vec3), (40, 30), seen, rim_start=2.5)
+    probe_weights.measure_seen(wp.array(corners, wp.vec3), (40, 30), seen)
     np.testing.assert_allclose(seen.numpy(), [[0] * 5, [1, 1, 3 / 9, 0, 1 / 9]], rtol=1e-6)

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 import warp as wp
 
-from tests.environment_shadow_rig import draw, lamp_at, list_texels, sky, with_sun
+from tests.environment_shadow_rig import ONE_BALL, draw, lamp_at, list_texels, sky, with_sun
 from tests.error_model import check_error
 from tests.kernel_rig import records, shape, tables
 from tests.receiver_cells_rig import (
@@ -187,7 +187,7 @@ def test_share_matches_twin(device):
     """A sun, a lamp at a place, a box and a ball; the twin asks every sample at every cell."""
     environment = with_sun(9, 40, 300.0, np.float32(np.random.default_rng(1).uniform(0.2, 1, (32, 64, 3))))
     samples = draw(environment, 256)[2]
-    environment_samples.place_emitters(lamp_at((0.2, 0.1, 0.4)), samples)
+    environment_samples.place_emitters(lamp_at((0.2, 0.1, 0.4)), ONE_BALL, samples)
     corners, (center, radius) = ((0.1, -0.1, 0), (0.22, 0.14, 0.08)), ((-0.1, 0.03, 0.05), 0.04)
     facing = np.array([0.6, 0.5, 0.4])
     share, surface = View((DESK, box(*corners)), [ball(center, radius)], surroundings=facing).share(samples)

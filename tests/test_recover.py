@@ -162,7 +162,7 @@ def test_observation_reads_surfaces_and_nothing_else(device, scene):
     points = points_of(device, positions, [(0, 0, 1)] * 5 + [(0, 0, -1)])
     out = wp.zeros(6, dtype=kernels.Observation, device=device)
     frame, table, params = look_down(device, scene, image)
-    kernels.observe_surfaces(frame, table, params, probes_of(device), host.ray_scene, points, out, proxies=proxies)
+    kernels.observe_surfaces(proxies, False, frame, table, params, probes_of(device), host.ray_scene, points, out)
     got = out.numpy()
     assert got["visible"] == pytest.approx([1, 1, 0, 0, 0, 0])
     assert got["radiance"][0] == pytest.approx(np.full(3, 0.2), abs=1e-6)
@@ -182,11 +182,11 @@ def test_observation_of_a_linear_frame_reads_light_as_it_is(device, scene):
     seen = params, probes_of(device), host.ray_scene, points, out
     clip = wp.array(np.float32([[5.0] * 3, [3.0] * 3]), dtype=wp.vec3, device=device)
     frame = wp.array(light, dtype=wp.vec3, device=device)
-    kernels.observe_surfaces(frame, clip, *seen, proxies=trace_config(scene).proxies)
+    kernels.observe_surfaces(trace_config(scene).proxies, True, frame, clip, *seen)
     np.testing.assert_allclose(out.numpy()["radiance"], [[0.0021] * 3, [6.0, 3.5, 3.5]], rtol=1e-6)
     # Red is at clipping by itself, the others beside it.
     np.testing.assert_array_equal(out.numpy()["clipped"], [[0.0] * 3, [1.0] * 3])
-    kernels.observe_surfaces(codes, table, *seen, proxies=trace_config(scene).proxies)
+    kernels.observe_surfaces(trace_config(scene).proxies, False, codes, table, *seen)
     assert abs(out.numpy()["radiance"][0, 0] / 0.0021 - 1.0) > 0.005
     assert out.numpy()["radiance"][1].max() == 1.0
 
@@ -312,7 +312,7 @@ def test_what_clips_on_a_proxy_beside_light_behind_its_edge_is_left_out(device, 
     missing = wp.array(clipped.astype(np.float32), dtype=wp.vec3, device=device)
     host, proxies = HostScene(plane, device), trace_config(plane).proxies
     source = wp.array(clipped.astype(np.float32), dtype=wp.vec3, device=device)
-    leave_out_edges(source, probes_of(device), host.ray_scene, missing, proxies=proxies)
+    leave_out_edges(proxies, source, probes_of(device), host.ray_scene, missing)
     assert (missing.numpy() == np.where(left[..., None], 0.0, clipped)).all()
     # A cell's light is what is left: it lies beyond the plane, and the cell is no part of that.
     seen = wp.full(shape, 1.0, dtype=wp.float32, device=device)

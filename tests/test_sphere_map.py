@@ -56,11 +56,11 @@ def run(frame, eye=EYE, rotation=None, level=0, scale=1.0, distortion=(0.0,) * 8
     clipped = wp.zeros(shape, dtype=wp.vec3)
     for band in rows:
         whole = None if band is None else (band[0] * sphere_map.SIZE // shape[0], band[1] * sphere_map.SIZE // shape[0])
-        sphere_map.copy_ball(params, probes, frame, decode, texture, linear=linear, rows=whole)
+        sphere_map.copy_ball(params, probes, frame, decode, linear, texture, rows=whole)
     sphere_map.halve_levels(texture)
     for band in rows:
         sphere_map.look_up_level(params, texture, level, shape, out, scale=scale, rows=band)
-        sphere_map.trust_ball(params, probes, frame, confidence, clipped, linear=linear, linear_clip=clip, rows=band)
+        sphere_map.trust_ball(params, probes, frame, linear, clip, confidence, clipped, rows=band)
     return texture.numpy(), out.numpy().reshape(*shape, 3), confidence.numpy(), clipped.numpy()
 
 

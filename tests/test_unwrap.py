@@ -68,8 +68,7 @@ def project(view, balls=(BALL,), shapes=(), kinds=None, height=HEIGHT):
     kinds = tuple(sorted({shape["kind"] for shape in shapes})) if kinds is None else kinds
     corners = wp.zeros((height + 1, 2 * height + 1, len(balls)), dtype=wp.vec3)
     rays = wp.array(view.rays().astype(np.float32), dtype=wp.vec2)
-    config = unwrap.ProjectConfig(kinds)
-    unwrap.project_corners(make_params(view), make_probes(balls), rays, make_scene(shapes), corners, config=config)
+    unwrap.project_corners(kinds, make_params(view), make_probes(balls), rays, make_scene(shapes), corners)
     return corners
 
 
@@ -93,7 +92,7 @@ def unwrapped(
     frame = wp.array(np.ascontiguousarray(frame), dtype=wp.vec3ub)
     for band in rows or [None]:
         view = make_environment_view(radiance, confidence, clipped)
-        unwrap.gather_probe(frame, table, make_probes(balls), corners, view, own=own, rows=band)
+        unwrap.gather_probe(False, frame, table, make_probes(balls), corners, own, view, rows=band)
     return radiance.numpy(), confidence.numpy(), clipped.numpy()
 
 

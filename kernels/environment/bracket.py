@@ -31,7 +31,7 @@ import math
 import warp as wp
 
 from warp_ar.kernels.latlong import PI
-from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.launch import row_launcher
 from warp_ar.kernels.safe_math import is_finite, light_confidence
 from warp_ar.kernels.structs import EnvironmentView
 
@@ -64,13 +64,6 @@ class ExposureStack:
     spread: wp.array3d[wp.vec3]  # of ``spread_clipping``
 
 
-def make_exposure_stack(radiance: wp.array, confidence: wp.array, clipped: wp.array, spread: wp.array) -> ExposureStack:
-    """The arrays of the exposures together."""
-    stack = ExposureStack()
-    stack.radiance, stack.confidence, stack.clipped, stack.spread = radiance, confidence, clipped, spread
-    return stack
-
-
 @wp.kernel(enable_backward=False)
 def spread_clipping_kernel(
     # In:
@@ -98,16 +91,15 @@ def spread_clipping_kernel(
     stack_out.spread[k, i, j] = largest
 
 
-def spread_clipping(stack_out: ExposureStack, *, reach: float = REACH, rows: Rows | None = None) -> None:
-    """Find what clips near every texel: first half, along the rows; ``merge_exposures`` does the columns.
+spread_clipping = row_launcher(
+    spread_clipping_kernel, like=lambda reach, stack: (*stack.clipped.shape[1:], len(stack.clipped))
+)
+"""Find what clips near every texel: first half, along the rows; ``merge_exposures`` does the columns.
 
-    Args:
-        stack_out: (K, h, w); its ``spread`` is written.
-        reach: Radians.
-        rows: Band of rows, None for all.
-    """
-    count, height, width = stack_out.clipped.shape
-    launch_rows(spread_clipping_kernel, (height, width, count), [reach], [stack_out], rows=rows)
+Args:
+    reach: Radians.
+    stack_out: (K, h, w); its ``spread`` is written.
+"""
 
 
 @wp.kernel(enable_backward=False)
@@ -167,22 +159,13 @@ def merge_exposures_kernel(
     view_out.clipped[i, j] = share
 
 
-def merge_exposures(
-    exposures: wp.array,
-    stack: ExposureStack,
-    view_out: EnvironmentView,
-    *,
-    reach: float = REACH,
-    rows: Rows | None = None,
-) -> None:
-    """Merge the latest unwrapped frame of every exposure.
+merge_exposures = row_launcher(merge_exposures_kernel, like=lambda *given: given[-1].radiance)
+"""Merge the latest unwrapped frame of every exposure.
 
-    Args:
-        exposures: ``BracketExposure`` (K), longest first; the reference, whose ratio is 1, is one of them.
-        stack: (K, h, w); its ``spread`` from ``spread_clipping``, with the same ``reach``.
-        view_out: (h, w): radiance in camera values of the reference, confidence of the view that saw the texel best,
-            the share that clips in all exposures.
-        reach: Radians.
-        rows: Band of rows, None for all.
-    """
-    launch_rows(merge_exposures_kernel, view_out.radiance.shape, [exposures, stack, reach], [view_out], rows=rows)
+Args:
+    exposures: ``BracketExposure`` (K), longest first; the reference, whose ratio is 1, is one of them.
+    stack: (K, h, w); its ``spread`` from ``spread_clipping``, with the same ``reach``.
+    reach: Radians.
+    view_out: (h, w): radiance in camera values of the reference, confidence of the view that saw the texel best,
+        the share that clips in all exposures.
+"""

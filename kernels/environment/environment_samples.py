@@ -34,7 +34,7 @@ import math
 import warp as wp
 
 from warp_ar.kernels.color import brightness
-from warp_ar.kernels.launch import Rows, launch, launch_rows, launch_tiles, tile_kernel
+from warp_ar.kernels.launch import launch, launch_tiles, row_launcher, tile_kernel
 from warp_ar.kernels.safe_math import safe_radiance
 from warp_ar.kernels.sampling import BELOW_ONE, radical_inverse, uniform_from_bits
 from warp_ar.kernels.structs import Emitter
@@ -50,8 +50,6 @@ EMITTER_COSINE = wp.constant(wp.float32(math.cos(math.radians(12.0))))
 """Cosine of the largest angle between an emitter's direction and light that belongs to it."""
 MIN_EMITTER_DISTANCE = wp.constant(wp.float32(0.05))
 """Metres from the ball within which no emitter is taken to be."""
-ONE_BALL = 0, 1
-"""Turn of the only ball: all samples are of its environment."""
 # Typed: literals above 2^31 in a kernel make the compiler warn.
 TOP_BIT = wp.constant(wp.uint32(0x80000000))
 
@@ -338,25 +336,16 @@ def place_emitters_kernel(
             samples_out[index].distance = wp.clamp(emitter.distance, MIN_EMITTER_DISTANCE, FAR_AWAY)
 
 
-def place_emitters(
-    emitters: wp.array[Emitter],
-    samples_out: wp.array[EnvironmentSample],
-    *,
-    turn: tuple[int, int] = ONE_BALL,
-    rows: Rows | None = None,
-) -> None:
-    """Turn the samples of near emitters from directions into places.
+place_emitters = row_launcher(place_emitters_kernel)
+"""Turn the samples of near emitters from directions into places.
 
-    A sample shows an emitter if it is as bright as clipping and within ``EMITTER_COSINE`` of its direction.
+A sample shows an emitter if it is as bright as clipping and within ``EMITTER_COSINE`` of its direction.
 
-    Args:
-        emitters: (k,) emitters; those without direction are none, those at infinity stay directions.
-        samples_out: (n,) samples, drawn from an environment captured where the emitters' distances are from.
-        turn: As for ``draw_samples``.
-        rows: Range of samples; None means all.
-    """
-    given = [emitters, wp.vec2i(*turn)]
-    launch_rows(place_emitters_kernel, samples_out.shape, given, [samples_out], rows=rows)
+Args:
+    emitters: (k,) emitters; those without direction are none, those at infinity stay directions.
+    turn: As for ``draw_samples``.
+    samples_out: (n,) samples, drawn from an environment captured where the emitters' distances are from.
+"""
 
 
 def sum_environment(
@@ -374,65 +363,29 @@ def sum_environment(
     launch_tiles(sum_rows_kernel, [height], [cumulative_out], [rows_out], block_dim=32)
 
 
-def draw_samples(
-    environment: wp.array2d[wp.vec3],
-    cumulative: wp.array2d[wp.float32],
-    rows_sums: wp.array[wp.vec2],
-    origin: wp.vec3,
-    directions_out: wp.array[wp.vec3],
-    flux_out: wp.array[wp.vec3],
-    samples_out: wp.array[EnvironmentSample],
-    *,
-    turn: tuple[int, int] = ONE_BALL,
-    rows: Rows | None = None,
-) -> None:
-    """Draw as many samples as ``samples_out`` holds, the same for the same environment.
+draw_samples = row_launcher(draw_samples_kernel, outputs=3)
+"""Draw as many samples as ``samples_out`` holds, the same for the same environment.
 
-    Args:
-        environment: (h, w) radiance.
-        cumulative: From ``sum_environment``.
-        rows_sums: From ``sum_environment``.
-        origin: Where the environment was captured, world.
-        directions_out: (n,) unit directions of the samples, by themselves for culling.
-        flux_out: (n,) their radiance times solid angle, likewise.
-        samples_out: (n,), n a power of two.
-        turn: Number of the ball that the environment is of, and how many balls share the samples.
-        rows: Range of samples; None means all.
-    """
-    launch_rows(
-        draw_samples_kernel,
-        samples_out.shape,
-        [environment, cumulative, rows_sums, origin, wp.vec2i(*turn)],
-        [directions_out, flux_out, samples_out],
-        rows=rows,
-    )
+Args:
+    environment: (h, w) radiance.
+    cumulative: From ``sum_environment``.
+    rows_sums: From ``sum_environment``.
+    origin: Where the environment was captured, world.
+    turn: Number of the ball that the environment is of, and how many balls share the samples.
+    directions_out: (n,) unit directions of the samples, by themselves for culling.
+    flux_out: (n,) their radiance times solid angle, likewise.
+    samples_out: (n,), n a power of two.
+"""
 
 
-def list_texels(
-    environment: wp.array2d[wp.vec3],
-    origin: wp.vec3,
-    directions_out: wp.array[wp.vec3],
-    flux_out: wp.array[wp.vec3],
-    samples_out: wp.array[EnvironmentSample],
-    *,
-    turn: tuple[int, int] = ONE_BALL,
-    rows: Rows | None = None,
-) -> None:
-    """Write every texel of a map as a sample: the reference.
+list_texels = row_launcher(list_texels_kernel, outputs=3, like=lambda environment, *_: environment)
+"""Write every texel of a map as a sample: the reference.
 
-    Args:
-        environment: (h, w) radiance.
-        origin: Where the environment was captured, world.
-        directions_out: (h * w * slots,) directions of the samples.
-        flux_out: As many, their radiance times solid angle.
-        samples_out: As many.
-        turn: As for ``draw_samples``.
-        rows: Band of the map's rows; None means all.
-    """
-    launch_rows(
-        list_texels_kernel,
-        environment.shape,
-        [environment, origin, wp.vec2i(*turn)],
-        [directions_out, flux_out, samples_out],
-        rows=rows,
-    )
+Args:
+    environment: (h, w) radiance.
+    origin: Where the environment was captured, world.
+    turn: As for ``draw_samples``.
+    directions_out: (h * w * slots,) directions of the samples.
+    flux_out: As many, their radiance times solid angle.
+    samples_out: As many.
+"""

@@ -20,7 +20,7 @@ import warp as wp
 
 from warp_ar.kernels.camera import project
 from warp_ar.kernels.latlong import direction_from_latlong
-from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.launch import row_launcher
 from warp_ar.kernels.pixels import pixel_radiance
 from warp_ar.kernels.rays.shapes import FAR
 from warp_ar.kernels.rays.trace import TraceConfig, make_trace
@@ -157,35 +157,16 @@ def make_fill_frame_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
     return fill_frame_kernel
 
 
-def fill_frame(
-    picture: Picture,
-    params: wp.array,
-    probes: wp.array,
-    scene: RayScene,
-    levels_out: wp.array,
-    shape: tuple[int, int],
-    *,
-    proxies: tuple[int, ...],
-    ball: int = 0,
-    rows: Rows | None = None,
-) -> None:
-    """Put what the frame shows into a seeded fill pyramid, where balls left trust open.
+fill_frame = row_launcher(make_fill_frame_kernel, like=lambda *given: given[4])
+"""Put what the frame shows into a seeded fill pyramid, where balls left trust open.
 
-    Args:
-        picture: (frame rows, columns) the camera's; its rays are not read.
-        params: ``FrameParams`` (1): the camera.
-        probes: ``Probe`` (P), at least one; all hide what is behind them.
-        scene: Its proxies are seen where they are.
-        levels_out: From ``fill.seed_fill``; its level 0 changes.
-        shape: Rows and columns of the map.
-        proxies: Kinds of proxy in the scene.
-        ball: The one whose light the map is.
-        rows: Band of rows, None for all.
-    """
-    launch_rows(
-        make_fill_frame_kernel(proxies),
-        shape,
-        [picture, params, probes, scene, wp.vec2i(*shape), ball],
-        [levels_out],
-        rows=rows,
-    )
+Args:
+    proxies: Kinds of proxy in the scene.
+    picture: (frame rows, columns) the camera's; its rays are not read.
+    params: ``FrameParams`` (1): the camera.
+    probes: ``Probe`` (P), at least one; all hide what is behind them.
+    scene: Its proxies are seen where they are.
+    shape: Rows and columns of the map.
+    ball: The one whose light the map is.
+    levels_out: From ``fill.seed_fill``; its level 0 changes.
+"""

@@ -63,7 +63,7 @@ import math
 import numpy as np
 import warp as wp
 
-from warp_ar.kernels.launch import Rows, launch, launch_rows, launch_tiles, tile_kernel
+from warp_ar.kernels.launch import Rows, launch, launch_tiles, row_launcher, tile_kernel
 from warp_ar.kernels.safe_math import safe_radiance
 
 wp.set_module_options({"enable_backward": False})
@@ -314,8 +314,7 @@ def gather_clusters_kernel(
     row_start: wp.int32,
     # In:
     environment: wp.array2d[wp.vec3],
-    blocks_high: wp.int32,
-    blocks_wide: wp.int32,
+    blocks: wp.vec2i,
     # Out:
     clusters_out: wp.array[Cluster],
 ):
@@ -341,7 +340,7 @@ def gather_clusters_kernel(
     # Means of cos phi and cos 2 phi over a column, relative to their centre's.
     single = wp.sin(half_column) / half_column
     double = wp.sin(2.0 * half_column) / (2.0 * half_column)
-    for i in range(bi * height / blocks_high, (bi + 1) * height / blocks_high):
+    for i in range(bi * height / blocks[0], (bi + 1) * height / blocks[0]):
         theta = (2.0 * wp.float32(i) + 1.0) * half_step
         sin_theta = wp.sin(theta)
         cos_theta = wp.cos(theta)
@@ -356,7 +355,7 @@ def gather_clusters_kernel(
         mean_zz = (c0 * c0 + c0 * c1 + c1 * c1) / 3.0
         mean_rz = cos_theta / sin_theta * (s0 * s0 + s0 * s1 + s1 * s1) / 3.0
         mean_rr = 0.5 * (1.0 - mean_zz)
-        for j in range(bj * width / blocks_wide, (bj + 1) * width / blocks_wide):
+        for j in range(bj * width / blocks[1], (bj + 1) * width / blocks[1]):
             phi = (2.0 * wp.float32(j) + 1.0) * half_column - PI
             cos_phi = wp.cos(phi)
             sin_phi = wp.sin(phi)
@@ -378,7 +377,7 @@ def gather_clusters_kernel(
     cluster.direction = mean
     cluster.variance = squares * inverse - wp.cw_mul(mean, mean)
     cluster.covariance = products * inverse - wp.vec3(mean[1] * mean[2], mean[0] * mean[2], mean[0] * mean[1])
-    clusters_out[bi * blocks_wide + bj] = cluster
+    clusters_out[bi * blocks[1] + bj] = cluster
 
 
 # n'C n is at most C's trace, so that h is at most sqrt(3 trace): where |c| is more, no product with C is needed.
@@ -456,23 +455,14 @@ def window_sh(irradiance_sh_out: wp.array[wp.vec3]) -> None:
     launch(window_sh_kernel, dim=1, outputs=[irradiance_sh_out])
 
 
-def gather_clusters(
-    environment: wp.array2d[wp.vec3],
-    blocks: tuple[int, int],
-    clusters_out: wp.array[Cluster],
-    *,
-    rows: Rows | None = None,
-) -> None:
-    """Distant lights that stand for blocks of texels; blocks of one texel make the reference.
+gather_clusters = row_launcher(gather_clusters_kernel, like=lambda environment, blocks, clusters: blocks)
+"""Distant lights that stand for blocks of texels; blocks of one texel make the reference.
 
-    Args:
-        environment: (H, W) radiance.
-        blocks: Blocks along rows and columns, at most (H, W).
-        clusters_out: (blocks[0] blocks[1],).
-        rows: Band of block rows; None means all.
-    """
-    inputs = [environment, *blocks]
-    launch_rows(gather_clusters_kernel, blocks, inputs, [clusters_out], rows=rows)
+Args:
+    environment: (H, W) radiance.
+    blocks: Blocks along rows and columns, at most (H, W).
+    clusters_out: (blocks[0] blocks[1],).
+"""
 
 
 def sum_clusters(

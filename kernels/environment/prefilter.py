@@ -25,10 +25,10 @@ import math
 
 import warp as wp
 
-from warp_ar.kernels.environment.lobes import Lobe, last_lobe, locate_texel
+from warp_ar.kernels.environment.lobes import last_lobe, locate_texel
 from warp_ar.kernels.environment.pyramid import last_mip, sample_mips, sample_packed, sample_packed_smooth
 from warp_ar.kernels.latlong import texel_solid_angle
-from warp_ar.kernels.launch import Rows, launch_rows, launch_tiles, row_launcher, tile_kernel
+from warp_ar.kernels.launch import launch_tiles, row_launcher, tile_kernel
 from warp_ar.kernels.safe_math import safe_radiance
 
 wp.set_module_options({"enable_backward": False})
@@ -124,7 +124,7 @@ def integrate_lobes_kernel(
     row_start: wp.int32,
     # In:
     environment: wp.array2d[wp.vec3],
-    phong: wp.int32,
+    phong: wp.bool,
     # Out:
     levels_out: wp.array[wp.vec3],
 ):
@@ -159,7 +159,7 @@ def integrate_lobes_kernel(
             cosine = 1.0 - versine
             if cosine > 0.0:
                 weight = wp.float32(0.0)
-                if phong != 0:
+                if phong:
                     weight = wp.pow(cosine, exponent)
                 else:
                     t = 0.5 * versine + 0.5 * alpha * alpha * (1.0 + cosine)
@@ -271,19 +271,14 @@ Args:
 """
 
 
-def integrate_lobes(
-    environment: wp.array2d[wp.vec3], lobe: Lobe, levels_out: wp.array[wp.vec3], *, rows: Rows | None = None
-) -> None:
-    """Fill all levels by summing over the whole environment: the reference.
+integrate_lobes = row_launcher(integrate_lobes_kernel)
+"""Fill all levels by summing over the whole environment: the reference.
 
-    Args:
-        environment: (H, 2 H) radiance.
-        lobe: ``ggx`` or ``phong``.
-        levels_out: (lobe_texels(H),).
-        rows: Band of packed texels; None means all.
-    """
-    inputs = [environment, int(lobe == "phong")]
-    launch_rows(integrate_lobes_kernel, levels_out.shape, inputs, [levels_out], rows=rows)
+Args:
+    environment: (H, 2 H) radiance.
+    phong: Whether lobes are those of ``phong``, else of ``ggx``.
+    levels_out: (lobe_texels(H),).
+"""
 
 
 def measure_energy(

@@ -26,6 +26,7 @@ from __future__ import annotations
 
 import warp as wp
 
+from warp_ar.kernels.environment.unwrap import RIM_START
 from warp_ar.kernels.launch import launch
 from warp_ar.kernels.structs import FrameParams, Probe
 
@@ -76,9 +77,7 @@ def probe_share(places: wp.array[wp.vec4], ball: wp.int32, point: wp.vec3) -> wp
 def measure_seen_kernel(
     # In:
     corners: wp.array3d[wp.vec3],
-    frame_height: wp.int32,
-    frame_width: wp.int32,
-    rim_start: wp.float32,
+    size: wp.vec2i,
     # Out:
     seen_out: wp.array2d[wp.float32],
 ):
@@ -87,8 +86,8 @@ def measure_seen_kernel(
     count = wp.float32(0.0)
     for column in range(corners.shape[1]):
         corner = corners[row, column, ball]
-        inside = corner[0] >= 0.0 and corner[0] <= wp.float32(frame_width - 1)
-        if inside and corner[1] >= 0.0 and corner[1] <= wp.float32(frame_height - 1) and corner[2] > rim_start:
+        inside = corner[0] >= 0.0 and corner[0] <= wp.float32(size[0] - 1)
+        if inside and corner[1] >= 0.0 and corner[1] <= wp.float32(size[1] - 1) and corner[2] > RIM_START:
             count += 1.0
     seen_out[ball, row] = count / wp.float32(corners.shape[1])
 
@@ -128,17 +127,15 @@ def update_places_kernel(
             places_out[ball] = wp.vec4(place[0], place[1], place[2], place[3] / most)
 
 
-def measure_seen(corners: wp.array, size: tuple[int, int], seen_out: wp.array, *, rim_start: float) -> None:
+def measure_seen(corners: wp.array, size: tuple[int, int], seen_out: wp.array) -> None:
     """Share of every ball's map that the frame shows, row by row.
 
     Args:
         corners: From ``unwrap.project_corners``, (h + 1, w + 1, P).
         size: Width and height of the frame in pixels.
         seen_out: (P, h + 1) shares, 0..1.
-        rim_start: Pixels from the silhouette from which on a ball is read.
     """
-    inputs = [corners, size[1], size[0], rim_start]
-    launch(measure_seen_kernel, seen_out.shape, inputs, [seen_out])
+    launch(measure_seen_kernel, seen_out.shape, [corners, size], [seen_out])
 
 
 def update_places(seen: wp.array, probes: wp.array, params: wp.array, places_out: wp.array) -> None:

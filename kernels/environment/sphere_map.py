@@ -23,7 +23,7 @@ from warp_ar.kernels.camera import project
 from warp_ar.kernels.color import is_clipped
 from warp_ar.kernels.environment.unwrap import mix
 from warp_ar.kernels.latlong import direction_from_latlong
-from warp_ar.kernels.launch import Rows, launch, launch_rows
+from warp_ar.kernels.launch import Rows, launch, launch_rows, row_launcher
 from warp_ar.kernels.pixels import clip_levels, is_at_clipping, pixel_radiance
 from warp_ar.kernels.structs import FrameParams, Probe
 
@@ -31,6 +31,7 @@ wp.set_module_options({"enable_backward": False})
 
 SIZE = 64
 """Side of the texture, a power of two: the ball of the bundled clips is about as large in the frame."""
+_SIZE = wp.constant(SIZE)
 DIFFUSE_SIZE = 4
 """Side of the level that stands for diffuse light: the last one that tells directions apart everywhere."""
 
@@ -105,7 +106,6 @@ def copy_ball_kernel(
     frame: wp.array2d[wp.vec3ub],
     decode_table: wp.array[wp.vec3],
     linear: wp.array2d[wp.vec3],
-    size: wp.int32,
     # Out:
     sphere_map_out: wp.array[wp.vec3],
 ):
@@ -115,8 +115,8 @@ def copy_ball_kernel(
     disc = find_disc(params[0], probes[0])
     value = wp.vec3(0.0, 0.0, 0.0)
     if disc.radius[0] > 0.0:
-        u = (2.0 * wp.float32(column) + 1.0) / wp.float32(size) - 1.0
-        v = (2.0 * wp.float32(row) + 1.0) / wp.float32(size) - 1.0
+        u = (2.0 * wp.float32(column) + 1.0) / wp.float32(_SIZE) - 1.0
+        v = (2.0 * wp.float32(row) + 1.0) / wp.float32(_SIZE) - 1.0
         x = wp.clamp(disc.center[0] + u * disc.radius[0], 0.0, wp.float32(frame.shape[1] - 1))
         y = wp.clamp(disc.center[1] + v * disc.radius[1], 0.0, wp.float32(frame.shape[0] - 1))
         i = wp.int32(y)
@@ -129,7 +129,7 @@ def copy_ball_kernel(
         left = pixel_radiance(frame, decode_table, linear, i1, j)
         bottom = mix(left, pixel_radiance(frame, decode_table, linear, i1, j1), fx)
         value = mix(top, bottom, y - wp.float32(i))
-    sphere_map_out[row * size + column] = value
+    sphere_map_out[row * _SIZE + column] = value
 
 
 @wp.kernel(enable_backward=False)
@@ -226,30 +226,18 @@ def trust_ball_kernel(
     clipped_out[row, column] = clipped
 
 
-def copy_ball(
-    params: wp.array,
-    probes: wp.array,
-    frame: wp.array,
-    decode_table: wp.array,
-    sphere_map_out: wp.array,
-    *,
-    linear: wp.array | None = None,
-    rows: Rows | None = None,
-) -> None:
-    """Copy the first ball's square of the frame into level 0 of a sphere map.
+copy_ball = row_launcher(copy_ball_kernel, like=lambda *_: (SIZE, SIZE))
+"""Copy the first ball's square of the frame into level 0 of a sphere map.
 
-    Args:
-        params: (1,) FrameParams: the camera.
-        probes: (P,) Probe; only the first is looked at.
-        frame: (H, W) vec3ub, RGB codes.
-        decode_table: (256,) vec3, linear value of each code.
-        sphere_map_out: (map_texels(),) vec3; ``SIZE`` squared texels are written. Zero where the ball is not before
-            the camera.
-        linear: (H, W) vec3, radiance of a frame of more than 8 bits, read in the place of its codes.
-        rows: Band of texel rows; None means all.
-    """
-    inputs = [params, probes, frame, decode_table, linear, SIZE]
-    launch_rows(copy_ball_kernel, (SIZE, SIZE), inputs, [sphere_map_out], rows=rows)
+Args:
+    params: (1,) FrameParams: the camera.
+    probes: (P,) Probe; only the first is looked at.
+    frame: (H, W) vec3ub, RGB codes.
+    decode_table: (256,) vec3, linear value of each code.
+    linear: (H, W) vec3, radiance of a frame of more than 8 bits, read in the place of its codes.
+    sphere_map_out: (map_texels(),) vec3; ``SIZE`` squared texels are written. Zero where the ball is not before
+        the camera.
+"""
 
 
 def halve_levels(sphere_map: wp.array) -> None:
@@ -292,28 +280,15 @@ def look_up_level(
     launch_rows(look_up_level_kernel, shape, inputs, [latlong_out], rows=rows)
 
 
-def trust_ball(
-    params: wp.array,
-    probes: wp.array,
-    frame: wp.array,
-    confidence_out: wp.array,
-    clipped_out: wp.array,
-    *,
-    linear: wp.array | None = None,
-    linear_clip: wp.array | None = None,
-    rows: Rows | None = None,
-) -> None:
-    """Write how far a sphere map is trusted, and where its ball clips.
+trust_ball = row_launcher(trust_ball_kernel, outputs=2)
+"""Write how far a sphere map is trusted, and where its ball clips.
 
-    Args:
-        params: (1,) FrameParams: the camera.
-        probes: (P,) Probe; only the first is looked at.
-        frame: (H, W) vec3ub, RGB codes.
-        confidence_out: (h, 2 h) float32: 1, or 0 where the ball is not before the camera.
-        clipped_out: (h, 2 h) vec3: 1 in the channels that clip in the nearest pixel.
-        linear: (H, W) vec3, radiance of a frame of more than 8 bits, read in the place of its codes.
-        linear_clip: (2,) vec3, where that clips: alone, and beside another channel that does; needed with ``linear``.
-        rows: Band of rows; None means all.
-    """
-    inputs, outputs = [params, probes, frame, linear, linear_clip], [confidence_out, clipped_out]
-    launch_rows(trust_ball_kernel, confidence_out.shape, inputs, outputs, rows=rows)
+Args:
+    params: (1,) FrameParams: the camera.
+    probes: (P,) Probe; only the first is looked at.
+    frame: (H, W) vec3ub, RGB codes.
+    linear: (H, W) vec3, radiance of a frame of more than 8 bits, read in the place of its codes.
+    linear_clip: (2,) vec3, where that clips: alone, and beside another channel that does; needed with ``linear``.
+    confidence_out: (h, 2 h) float32: 1, or 0 where the ball is not before the camera.
+    clipped_out: (h, 2 h) vec3: 1 in the channels that clip in the nearest pixel.
+"""

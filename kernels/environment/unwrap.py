@@ -18,31 +18,29 @@ texel, samples are placed by bilinear interpolation between its corners, as many
 that each pixel of the ball counts.
 
 Confidence is 0 where the ball says nothing (blind, outside the frame, hidden by a proxy or by another ball) and where
-what lies behind the ball could leak in: pixels nearer than ``rim_start`` to the silhouette. It rises over the next
-``rim_width`` pixels, and is scaled by density / (density + ``HALF_DENSITY``), the share that a ball of that many pixels
+what lies behind the ball could leak in: pixels nearer than ``RIM_START`` to the silhouette. It rises over the next
+``RIM_WIDTH`` pixels, and is scaled by density / (density + ``HALF_DENSITY``), the share that a ball of that many pixels
 per steradian is worth.
 """
 
-import dataclasses
 import functools
-from typing import Self
 
 import warp as wp
 
 from warp_ar.kernels.camera import project
 from warp_ar.kernels.color import decode, is_saturated, saturation_codes
 from warp_ar.kernels.latlong import PI, direction_from_latlong, texel_solid_angle
-from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.launch import row_launcher
 from warp_ar.kernels.pixels import clip_levels, is_at_clipping, keep_linear
 from warp_ar.kernels.rays.shapes import FAR, intersect_box, intersect_plane, meets_mesh, to_rigid_point, to_rigid_vector
 from warp_ar.kernels.structs import BOX, MESH, PLANE, EnvironmentView, FrameParams, Probe, RayScene
 
 wp.set_module_options({"enable_backward": False})
 
-RIM_START = 2.5
+RIM_START = wp.constant(2.5)
 """Pixels from the silhouette at which confidence starts. Along a diagonal a bilinear sample reaches 1.4 pixels and the
 pixel it finds there spreads over another 0.7; the rest is for the tracked outline, which errs by about half a pixel."""
-RIM_WIDTH = 1.5
+RIM_WIDTH = wp.constant(1.5)
 """Pixels over which confidence then rises to its full value."""
 
 ALL_ALIKE = -1
@@ -100,18 +98,6 @@ def any_perpendicular(axis: wp.vec3) -> wp.vec3:
     if wp.abs(axis[0]) > 0.6:
         other = wp.vec3(0.0, 1.0, 0.0)
     return wp.normalize(wp.cross(axis, other))
-
-
-@dataclasses.dataclass(frozen=True)
-class ProjectConfig:
-    """Kinds of shape that can hide a ball."""
-
-    occluders: tuple[int, ...] = ()
-    """Kinds of proxy in the scene: any of PLANE, BOX, MESH."""
-
-    def general(self) -> Self:
-        """For any scene."""
-        return type(self)(tuple(sorted(map(int, (PLANE, BOX, MESH)))))
 
 
 @functools.cache
@@ -193,9 +179,8 @@ def hidden_by_balls(
 
 
 @functools.cache
-def make_project_corners_kernel(config: ProjectConfig) -> wp.Kernel:
-    """Kernel specialised to ``config``; equal configs share one kernel."""
-    kinds = config.occluders
+def make_project_corners_kernel(kinds: tuple[int, ...]) -> wp.Kernel:
+    """Kernel for scenes with proxies of these kinds, which can hide a ball: any of PLANE, BOX, MESH."""
     hidden_by_proxies = make_hidden_by_proxies(kinds)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -206,7 +191,6 @@ def make_project_corners_kernel(config: ProjectConfig) -> wp.Kernel:
         probes: wp.array[Probe],
         rays: wp.array2d[wp.vec2],
         scene: RayScene,
-        rim_start: wp.float32,
         # Out:
         corners_out: wp.array3d[wp.vec3],
     ):
@@ -250,7 +234,7 @@ def make_project_corners_kernel(config: ProjectConfig) -> wp.Kernel:
             return
 
         reach = wp.length(point)
-        pad = rim_start * reach / wp.min(camera.focal[0], camera.focal[1])
+        pad = RIM_START * reach / wp.min(camera.focal[0], camera.focal[1])
         t_max = 1.0 - CONTACT * probe.radius / reach
         if hidden_by_balls(probes, index, camera.camera_position, point, t_max, pad):
             return
@@ -262,37 +246,18 @@ def make_project_corners_kernel(config: ProjectConfig) -> wp.Kernel:
     return project_corners_kernel
 
 
-def project_corners(
-    params: wp.array,
-    probes: wp.array,
-    rays: wp.array,
-    scene: RayScene,
-    corners_out: wp.array,
-    *,
-    config: ProjectConfig,
-    rim_start: float = RIM_START,
-    rows: Rows | None = None,
-) -> None:
-    """Find where the frame shows the reflected light of every texel corner's direction.
+project_corners = row_launcher(make_project_corners_kernel)
+"""Find where the frame shows the reflected light of every texel corner's direction.
 
-    Args:
-        params: ``FrameParams`` (1): the camera.
-        probes: ``Probe`` (P).
-        rays: Undistorted normalised coordinates of the frame's pixel centres, ``wp.vec2`` (frame rows, columns).
-        scene: What can hide the balls: its proxies.
-        corners_out: ``wp.vec3`` (h + 1, w + 1, P): pixel column, pixel row, and pixels from there to the ball's
-            silhouette; the last is -1 where the direction is not seen.
-        config: Kinds of proxy.
-        rim_start: Pixels around a proxy's outline that count as hidden as well.
-        rows: Band of corner rows, None for all h + 1.
-    """
-    launch_rows(
-        make_project_corners_kernel(config),
-        corners_out.shape,
-        [params, probes, rays, scene, rim_start],
-        [corners_out],
-        rows=rows,
-    )
+Args:
+    kinds: Of proxies in the scene.
+    params: ``FrameParams`` (1): the camera.
+    probes: ``Probe`` (P).
+    rays: Undistorted normalised coordinates of the frame's pixel centres, ``wp.vec2`` (frame rows, columns).
+    scene: What can hide the balls: its proxies.
+    corners_out: ``wp.vec3`` (h + 1, w + 1, P): pixel column, pixel row, and pixels from there to the ball's
+        silhouette; the last is -1 where the direction is not seen.
+"""
 
 
 @wp.func
@@ -337,17 +302,14 @@ def footprint_samples(a0: wp.vec3, a1: wp.vec3, b0: wp.vec3, b1: wp.vec3) -> wp.
 
 @functools.cache
 def make_average_footprint(linear: bool) -> wp.Function:
-    """``average_footprint(frame, table, texel, rim) -> Footprint``.
-
-    ``rim``: pixels from the silhouette at which confidence starts, and over which it rises.
-    """
+    """``average_footprint(frame, table, texel) -> Footprint``."""
     pixel = wp.vec3 if linear else wp.vec3ub
     to_light = keep_linear if linear else decode
     find_levels = clip_levels if linear else saturation_codes
     clips = is_at_clipping if linear else is_saturated
 
     @wp.func(module="unique")
-    def average_footprint(frame: wp.array2d[pixel], table: wp.array[wp.vec3], texel: Texel, rim: wp.vec2) -> Footprint:
+    def average_footprint(frame: wp.array2d[pixel], table: wp.array[wp.vec3], texel: Texel) -> Footprint:
         out = Footprint()
         last_row = wp.float32(frame.shape[0] - 1)
         last_column = wp.float32(frame.shape[1] - 1)
@@ -372,7 +334,7 @@ def make_average_footprint(linear: bool) -> wp.Function:
             out.possible += area
             # At the frame's border the same ramp as at the rim.
             inside = wp.min(wp.min(at[0], last_column - at[0]), wp.min(at[1], last_row - at[1]))
-            ramp = wp.clamp(wp.min(at[2] - rim[0], inside) / rim[1], 0.0, 1.0)
+            ramp = wp.clamp(wp.min(at[2] - RIM_START, inside) / RIM_WIDTH, 0.0, 1.0)
             if inside >= 0.0 and ramp > 0.0:
                 weight = area * ramp * ramp * (3.0 - 2.0 * ramp)
                 i = wp.int32(at[1])
@@ -411,7 +373,6 @@ def make_gather_probe_kernel(linear: bool = False) -> wp.Kernel:
         table: wp.array[wp.vec3],
         probes: wp.array[Probe],
         corners: wp.array3d[wp.vec3],
-        rim: wp.vec2,
         own: wp.int32,
         # Out:
         view_out: EnvironmentView,
@@ -433,8 +394,8 @@ def make_gather_probe_kernel(linear: bool = False) -> wp.Kernel:
             texel.c11 = corners[row + 1, column + 1, index]
             facing = wp.min(wp.min(texel.c00[2], texel.c01[2]), wp.min(texel.c10[2], texel.c11[2])) >= 0.0
             closest = wp.max(wp.max(texel.c00[2], texel.c01[2]), wp.max(texel.c10[2], texel.c11[2]))
-            if facing and closest > rim[0]:
-                found = average_footprint(frame, table, texel, rim)
+            if facing and closest > RIM_START:
+                found = average_footprint(frame, table, texel)
                 if found.total > 0.0:
                     across = texel.c11 - texel.c00
                     along = texel.c10 - texel.c01
@@ -457,37 +418,17 @@ def make_gather_probe_kernel(linear: bool = False) -> wp.Kernel:
     return gather_probe_kernel
 
 
-def gather_probe(
-    frame: wp.array,
-    decode_table: wp.array,
-    probes: wp.array,
-    corners: wp.array,
-    view_out: EnvironmentView,
-    *,
-    rim_start: float = RIM_START,
-    rim_width: float = RIM_WIDTH,
-    own: int = ALL_ALIKE,
-    rows: Rows | None = None,
-) -> None:
-    """Average the frame over every texel's footprint and undo the ball's reflectance.
+gather_probe = row_launcher(make_gather_probe_kernel, like=lambda *given: given[-1].radiance)
+"""Average the frame over every texel's footprint and undo the ball's reflectance.
 
-    Args:
-        frame: ``wp.vec3ub`` (frame rows, columns), RGB codes; or ``wp.vec3``, linear radiance.
-        decode_table: Linear value of each code, ``wp.vec3`` (256); for a linear frame where it clips, and where beside
-            another channel that does, (2,).
-        probes: ``Probe`` (P); reflectances must be positive.
-        corners: From ``project_corners``, (h + 1, w + 1, P).
-        view_out: (h, w); of every texel its footprint's mean, and the share of it that is at clipping.
-        rim_start: Pixels from the silhouette that are not used.
-        rim_width: Pixels over which confidence then rises.
-        own: The ball whose light is asked for: others then tell only of what it does not see. ``ALL_ALIKE``: all balls
-            make one map, in which the one that sees more sharply has the say.
-        rows: Band of texel rows, None for all.
-    """
-    launch_rows(
-        make_gather_probe_kernel(frame.dtype is wp.vec3),
-        view_out.radiance.shape,
-        [frame, decode_table, probes, corners, wp.vec2(rim_start, rim_width), own],
-        [view_out],
-        rows=rows,
-    )
+Args:
+    linear: Whether the frame is linear.
+    frame: ``wp.vec3ub`` (frame rows, columns), RGB codes; or ``wp.vec3``, linear radiance.
+    decode_table: Linear value of each code, ``wp.vec3`` (256); for a linear frame where it clips, and where beside
+        another channel that does, (2,).
+    probes: ``Probe`` (P); reflectances must be positive.
+    corners: From ``project_corners``, (h + 1, w + 1, P).
+    own: The ball whose light is asked for: others then tell only of what it does not see. ``ALL_ALIKE``: all balls
+        make one map, in which the one that sees more sharply has the say.
+    view_out: (h, w); of every texel its footprint's mean, and the share of it that is at clipping.
+"""

@@ -46,7 +46,7 @@ import warp as wp
 
 from warp_ar.kernels.color import decode
 from warp_ar.kernels.latlong import sample_latlong
-from warp_ar.kernels.launch import Rows, launch, launch_rows, row_launcher
+from warp_ar.kernels.launch import launch, row_launcher
 from warp_ar.kernels.rays.shapes import FAR, intersect_sphere
 from warp_ar.kernels.rays.trace import TraceConfig, make_trace
 from warp_ar.kernels.structs import FrameParams, Picture, Probe, RayScene
@@ -87,6 +87,12 @@ def clipping(code: wp.vec3ub) -> wp.vec3:
     for channel in range(3):
         clipped[channel] = wp.clamp((wp.float32(code[channel]) - KNEE) / (CLIPPED - KNEE), 0.0, 1.0)
     return clipped
+
+
+@wp.func
+def half(extent: wp.int32) -> wp.int32:
+    """Rows or columns of the first level."""
+    return (extent + 1) / 2
 
 
 @wp.func
@@ -150,7 +156,6 @@ def pull_frame_kernel(
     frame: wp.array2d[wp.vec3ub],
     decode_table: wp.array[wp.vec3],
     completed: wp.array2d[wp.vec3],
-    columns: wp.int32,
     # Out:
     levels_out: wp.array[wp.vec4],
 ):
@@ -167,7 +172,7 @@ def pull_frame_kernel(
                         total += weighted_hue(completed[r, c])
                 elif wp.max(clipped) == 0.0:
                     total += weighted_hue(decode(decode_table, frame[r, c]))
-    levels_out[i * columns + j] = total
+    levels_out[i * half(frame.shape[1]) + j] = total
 
 
 @wp.kernel(enable_backward=False)
@@ -261,8 +266,6 @@ def complete_kernel(
     frame: wp.array2d[wp.vec3ub],
     decode_table: wp.array[wp.vec3],
     levels: wp.array[wp.vec4],
-    rows: wp.int32,
-    columns: wp.int32,
     # Out:
     declipped_out: wp.array2d[wp.vec3],
 ):
@@ -275,7 +278,7 @@ def complete_kernel(
     radiance = decode(decode_table, code)
     clipped = clipping(code)
     if wp.max(clipped) > 0.0 and wp.min(clipped) == 0.0:
-        hue = hue_of(sample_coarser(levels, 0, rows, columns, i, j))
+        hue = hue_of(sample_coarser(levels, 0, half(frame.shape[0]), half(frame.shape[1]), i, j))
         kept = wp.vec3()
         for channel in range(3):
             kept[channel] = wp.where(clipped[channel] > 0.0, 0.0, 1.0)
@@ -340,8 +343,6 @@ def make_complete_core_kernel(config: DeclipConfig) -> wp.Kernel:
         row_start: wp.int32,
         picture: Picture,
         levels: wp.array[wp.vec4],
-        rows: wp.int32,
-        columns: wp.int32,
         params: wp.array[FrameParams],
         scene: RayScene,
         probes: wp.array[Probe],
@@ -354,7 +355,8 @@ def make_complete_core_kernel(config: DeclipConfig) -> wp.Kernel:
         clipped = clipping(picture.frame[i, j])
         if wp.min(clipped) == 0.0:
             return
-        filled = sample_coarser(levels, 0, rows, columns, i, j)
+        rows = half(declipped_out.shape[0])
+        filled = sample_coarser(levels, 0, rows, half(declipped_out.shape[1]), i, j)
         hue = hue_of(filled)
         edge = hue / wp.min(hue)
         inside = 2.0 * edge
@@ -404,28 +406,16 @@ def widen_tiles(marked: wp.array, active_out: wp.array) -> None:
     launch(widen_tiles_kernel, active_out.shape, [marked], [active_out], device=marked.device)
 
 
-def pull_frame(
-    active: wp.array,
-    frame: wp.array,
-    decode_table: wp.array,
-    completed: wp.array | None,
-    levels_out: wp.array,
-    *,
-    rows: Rows | None = None,
-) -> None:
-    """Write the first level: weighted hues of the pixels that do not clip.
+pull_frame = row_launcher(pull_frame_kernel, like=lambda active, frame, *_: level_shapes(*frame.shape)[0])
+"""Write the first level: weighted hues of the pixels that do not clip.
 
-    Args:
-        active: Tiles of ``widen_tiles``; the others give and get nothing.
-        frame: (H, W) vec3ub, RGB.
-        decode_table: (256,) vec3 of ``color.decode_table``.
-        completed: (H, W) vec3 of ``complete``, whose pixels that do not clip in all channels count; None: the frame's.
-        levels_out: (``level_texels(H, W)``,) vec4: sums of weighted hue, and of weights.
-        rows: Band of rows of the first level; None means all.
-    """
-    shape = level_shapes(*frame.shape)[0]
-    given = [active, frame, decode_table, completed, shape[1]]
-    launch_rows(pull_frame_kernel, shape, given, [levels_out], rows=rows, device=frame.device)
+Args:
+    active: Tiles of ``widen_tiles``; the others give and get nothing.
+    frame: (H, W) vec3ub, RGB.
+    decode_table: (256,) vec3 of ``color.decode_table``.
+    completed: (H, W) vec3 of ``complete``, whose pixels that do not clip in all channels count; None: the frame's.
+    levels_out: (``level_texels(H, W)``,) vec4: sums of weighted hue, and of weights.
+"""
 
 
 def fill_levels(active: wp.array, shape: tuple[int, int], levels_out: wp.array) -> None:
@@ -450,55 +440,28 @@ def fill_levels(active: wp.array, shape: tuple[int, int], levels_out: wp.array) 
         coarser = (offsets[level], *shapes[level])
 
 
-def complete(
-    active: wp.array,
-    frame: wp.array,
-    decode_table: wp.array,
-    levels: wp.array,
-    declipped_out: wp.array,
-    *,
-    rows: Rows | None = None,
-) -> None:
-    """Write the frame's linear radiance, channels that clip beside others that do not completed by the filled hue.
+complete = row_launcher(complete_kernel)
+"""Write the frame's linear radiance, channels that clip beside others that do not completed by the filled hue.
 
-    Args:
-        active: Tiles of ``widen_tiles``; pixels of others stay as they are.
-        frame: (H, W) vec3ub, RGB.
-        decode_table: (256,) vec3 of ``color.decode_table``.
-        levels: Filled levels of ``pull_frame`` and ``fill_levels``.
-        declipped_out: (H, W) vec3.
-        rows: Band of rows; None means all.
-    """
-    shape = level_shapes(*frame.shape)[0]
-    given = [active, frame, decode_table, levels, *shape]
-    launch_rows(complete_kernel, frame.shape, given, [declipped_out], rows=rows, device=frame.device)
+Args:
+    active: Tiles of ``widen_tiles``; pixels of others stay as they are.
+    frame: (H, W) vec3ub, RGB.
+    decode_table: (256,) vec3 of ``color.decode_table``.
+    levels: Filled levels of ``pull_frame`` and ``fill_levels``.
+    declipped_out: (H, W) vec3.
+"""
 
 
-def complete_core(
-    config: DeclipConfig,
-    picture: Picture,
-    levels: wp.array,
-    params: wp.array,
-    scene: RayScene,
-    probes: wp.array,
-    environment: wp.array | None,
-    declipped_out: wp.array,
-    *,
-    rows: Rows | None = None,
-) -> None:
-    """Write the estimate of pixels that clip in all channels.
+complete_core = row_launcher(make_complete_core_kernel)
+"""Write the estimate of pixels that clip in all channels.
 
-    Args:
-        config: Whether the ball's light is used, and which kinds of proxy there are.
-        picture: The frame's codes, (H, W), and where its pixels look.
-        levels: Filled levels of ``pull_frame`` of what was completed, and ``fill_levels``.
-        params: (1,) FrameParams; the camera's pose.
-        scene: Proxies.
-        probes: Balls; ``environment`` is the light at the first.
-        environment: (rows, columns) vec3, with clipped energy put back; None without ``config.ball``.
-        declipped_out: (H, W) vec3; other pixels stay.
-        rows: Band of rows; None means all.
-    """
-    kernel, size = make_complete_core_kernel(config), picture.frame.shape
-    given = [picture, levels, *level_shapes(*size)[0], params, scene, probes, environment]
-    launch_rows(kernel, size, given, [declipped_out], rows=rows, device=picture.frame.device)
+Args:
+    config: Whether the ball's light is used, and which kinds of proxy there are.
+    picture: The frame's codes, (H, W), and where its pixels look.
+    levels: Filled levels of ``pull_frame`` of what was completed, and ``fill_levels``.
+    params: (1,) FrameParams; the camera's pose.
+    scene: Proxies.
+    probes: Balls; ``environment`` is the light at the first.
+    environment: (rows, columns) vec3, with clipped energy put back; None without ``config.ball``.
+    declipped_out: (H, W) vec3; other pixels stay.
+"""

@@ -64,7 +64,7 @@ import functools
 import warp as wp
 
 from warp_ar.kernels.color import below_saturation, decode, encode, is_clipped, saturation_codes
-from warp_ar.kernels.launch import Rows, launch, launch_rows
+from warp_ar.kernels.launch import Rows, launch, launch_rows, row_launcher
 from warp_ar.kernels.picture.composite import Layers, compose, is_changed, read_layers
 from warp_ar.kernels.picture.summed_area import fine_mean
 from warp_ar.kernels.pixels import pixel_run
@@ -370,20 +370,15 @@ def read_scale(params: wp.array, scale_out: wp.array) -> None:
     launch(read_scale_kernel, 1, [params], [scale_out], device=params.device)
 
 
-def count_levels(
-    params: wp.array, picture: Picture, layers: Layers, levels_out: wp.array, *, rows: Rows | None = None
-) -> None:
-    """Count how bright the receiver is under virtual light, for ``auto``.
+count_levels = row_launcher(count_levels_kernel, like=lambda *given: given[-1].shape[:1])
+"""Count how bright the receiver is under virtual light, for ``auto``.
 
-    Args:
-        params: (1,) FrameParams.
-        picture: (H, W) the camera's; its rays are not read.
-        layers: From ``make_layers``, virtual light on the receiver among them.
-        levels_out: (ceil(H / AUTO_STRIDE), LEVELS) int32, one row per sampled row of the frame.
-        rows: Band of rows of ``levels_out``; None means all.
-    """
-    shape, device = levels_out.shape[:1], levels_out.device
-    launch_rows(count_levels_kernel, shape, [params, picture, layers], [levels_out], rows=rows, device=device)
+Args:
+    params: (1,) FrameParams.
+    picture: (H, W) the camera's; its rays are not read.
+    layers: From ``make_layers``, virtual light on the receiver among them.
+    levels_out: (ceil(H / AUTO_STRIDE), LEVELS) int32, one row per sampled row of the frame.
+"""
 
 
 def adapt_scale(params: wp.array, levels: wp.array, scale_out: wp.array) -> None:

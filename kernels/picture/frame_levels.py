@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.launch import row_launcher
 from warp_ar.kernels.pixels import shown_radiance
 from warp_ar.kernels.rays.visibility import inside_rect
 from warp_ar.kernels.structs import FrameParams, Picture
@@ -155,34 +155,26 @@ def shrink_level_kernel(
     levels_out[start_of(height, width, level) + i * rows_of(width, level) + j] = total / pixels
 
 
-def shrink_frame(
-    params: wp.array, picture: Picture, layers: ReceiverLayers, levels_out: wp.array, *, rows: Rows | None = None
-) -> None:
-    """Write level 1 of a picture.
+shrink_frame = row_launcher(shrink_frame_kernel, like=lambda params, picture, *_: level_size(*picture.rays.shape, 1))
+"""Write level 1 of a picture.
 
-    Args:
-        params: (1,) FrameParams: light_rect, beyond which no virtual light is added.
-        picture: (H, W) the camera's.
-        layers: (H, W) what is virtual on the receiver.
-        levels_out: (level_texels(H, W),) vec3, linear radiance in camera values.
-        rows: Band of rows of the level; None means all.
-    """
-    size = level_size(*picture.rays.shape, 1)
-    launch_rows(shrink_frame_kernel, size, [params, picture, layers], [levels_out], rows=rows, device=levels_out.device)
+Args:
+    params: (1,) FrameParams: light_rect, beyond which no virtual light is added.
+    picture: (H, W) the camera's.
+    layers: (H, W) what is virtual on the receiver.
+    levels_out: (level_texels(H, W),) vec3, linear radiance in camera values.
+"""
 
 
-def shrink_level(height: int, width: int, level: int, levels_out: wp.array, *, rows: Rows | None = None) -> None:
-    """Write one of the levels 2 to ``LAST_LEVEL`` from the one below.
+shrink_level = row_launcher(shrink_level_kernel, like=lambda height, width, level, _: level_size(height, width, level))
+"""Write one of the levels 2 to ``LAST_LEVEL`` from the one below.
 
-    Args:
-        height: Rows of the frame.
-        width: Columns of the frame.
-        level: Which.
-        levels_out: As in ``shrink_frame``.
-        rows: Band of rows of the level; None means all.
-    """
-    size = level_size(height, width, level)
-    launch_rows(shrink_level_kernel, size, [height, width, level], [levels_out], rows=rows, device=levels_out.device)
+Args:
+    height: Rows of the frame.
+    width: Columns of the frame.
+    level: Which.
+    levels_out: As in ``shrink_frame``.
+"""
 
 
 @wp.func

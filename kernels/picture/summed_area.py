@@ -151,15 +151,13 @@ def sum_columns_kernel(
             table_out[i, j] = table_out[i, j] + table_out[i - 1, j]
 
 
-def sum_rows(frame: wp.array, table_out: wp.array, *, rows: Rows | None = None) -> None:
-    """Write the sums along each row; first part of the table.
+sum_rows = row_launcher(sum_rows_kernel, like=lambda frame, _: frame.shape[:1])
+"""Write the sums along each row; first part of the table.
 
-    Args:
-        frame: (H, W) vec3ub, RGB.
-        table_out: (H, W) uint32.
-        rows: Band of rows; None means all.
-    """
-    launch_rows(sum_rows_kernel, frame.shape[:1], [frame], [table_out], rows=rows, device=frame.device)
+Args:
+    frame: (H, W) vec3ub, RGB.
+    table_out: (H, W) uint32.
+"""
 
 
 def column_groups(width: int) -> int:

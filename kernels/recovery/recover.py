@@ -21,7 +21,7 @@ from warp_ar.kernels.camera import project
 from warp_ar.kernels.color import decode, is_saturated, saturation_codes
 from warp_ar.kernels.environment.unwrap import reflecting_normal
 from warp_ar.kernels.latlong import PI
-from warp_ar.kernels.launch import Rows, launch_rows, row_launcher
+from warp_ar.kernels.launch import row_launcher
 from warp_ar.kernels.pixels import clip_levels, is_at_clipping, keep_linear
 from warp_ar.kernels.rays.shapes import FAR, ROUNDING
 from warp_ar.kernels.rays.trace import TraceConfig, make_trace, offset_origin
@@ -210,39 +210,21 @@ def make_observe_surfaces_kernel(proxies: tuple[int, ...], linear: bool = False)
     return observe_surfaces_kernel
 
 
-def observe_surfaces(
-    frame: wp.array,
-    decode_table: wp.array,
-    params: wp.array,
-    probes: wp.array,
-    scene: RayScene,
-    points: wp.array,
-    observations_out: wp.array,
-    *,
-    proxies: tuple[int, ...],
-    rows: Rows | None = None,
-) -> None:
-    """Measure the frame's radiance at surface points.
+observe_surfaces = row_launcher(make_observe_surfaces_kernel, configs=2)
+"""Measure the frame's radiance at surface points.
 
-    Args:
-        frame: ``wp.vec3ub`` (frame rows, columns), RGB codes; or ``wp.vec3``, linear radiance.
-        decode_table: Linear value of each code, ``wp.vec3`` (256); for a linear frame where it clips, and where beside
-            another channel that does, ``wp.vec3`` (2).
-        params: ``FrameParams`` (1): the camera.
-        probes: ``Probe`` (P): they hide surfaces.
-        scene: Its proxies hide surfaces as well.
-        points: ``SurfacePoint`` (n).
-        observations_out: ``Observation`` (n).
-        proxies: Kinds of proxy in the scene.
-        rows: Band of points, None for all.
-    """
-    launch_rows(
-        make_observe_surfaces_kernel(proxies, frame.dtype is wp.vec3),
-        observations_out.shape,
-        [frame, decode_table, params, probes, scene, points],
-        [observations_out],
-        rows=rows,
-    )
+Args:
+    proxies: Kinds of proxy in the scene.
+    linear: Whether the frame is linear.
+    frame: ``wp.vec3ub`` (frame rows, columns), RGB codes; or ``wp.vec3``, linear radiance.
+    decode_table: Linear value of each code, ``wp.vec3`` (256); for a linear frame where it clips, and where beside
+        another channel that does, ``wp.vec3`` (2).
+    params: ``FrameParams`` (1): the camera.
+    probes: ``Probe`` (P): they hide surfaces.
+    scene: Its proxies hide surfaces as well.
+    points: ``SurfacePoint`` (n).
+    observations_out: ``Observation`` (n).
+"""
 
 
 # Visibility. From x a cell is hidden in part or whole by a ball, softly: the cell is taken as a disc of its own size,

@@ -12,14 +12,14 @@ import functools
 import warp as wp
 
 from warp_ar.kernels.latlong import direction_from_latlong, latlong_from_direction, texel_solid_angle
-from warp_ar.kernels.launch import Rows, launch_rows, row_launcher
+from warp_ar.kernels.launch import row_launcher
 from warp_ar.kernels.rays.shapes import FAR
 from warp_ar.kernels.rays.trace import TraceConfig, make_trace
 from warp_ar.kernels.structs import Probe, RayScene
 
 wp.set_module_options({"enable_backward": False})
 
-CELL_ROWS = 32
+CELL_ROWS = wp.constant(32)
 CELL_COLUMNS = 64
 FULL_TRUST = wp.constant(wp.float32(0.5))
 """Confidence above which a texel counts as seen; as for filling."""
@@ -70,15 +70,15 @@ def make_leave_out_edges_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
         clipped: wp.array2d[wp.vec3],
         probes: wp.array[Probe],
         scene: RayScene,
-        rows: wp.int32,
         # Out:
         missing_out: wp.array2d[wp.vec3],
     ):
-        """One cell of ``rows`` x 2 ``rows``."""
+        """One cell, of those of ``cell_shape``."""
         band_row, column = wp.tid()
         row = row_start + band_row
         height = clipped.shape[0]
         width = clipped.shape[1]
+        rows = wp.min(CELL_ROWS, height)
         on = wp.float32(0.0)
         beyond = wp.float32(0.0)
         turn = wp.int32(0)
@@ -103,33 +103,20 @@ def make_leave_out_edges_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
     return leave_out_edges_kernel
 
 
-def leave_out_edges(
-    clipped: wp.array,
-    probes: wp.array,
-    scene: RayScene,
-    missing_out: wp.array,
-    *,
-    proxies: tuple[int, ...],
-    rows: Rows | None = None,
-) -> None:
-    """Let proxies lack nothing beside what clips behind their edge.
+leave_out_edges = row_launcher(make_leave_out_edges_kernel, like=lambda clipped, *_: cell_shape(*clipped.shape))
+"""Let proxies lack nothing beside what clips behind their edge.
 
-    A pixel of the ball that shows the edge of a table and the light behind it clips, and so may its neighbours: texels
-    of the table lack light then that comes from beyond it. Where a quarter of what clips in a cell or more lies beyond
-    proxies, what clips on them there is left out.
+A pixel of the ball that shows the edge of a table and the light behind it clips, and so may its neighbours: texels
+of the table lack light then that comes from beyond it. Where a quarter of what clips in a cell or more lies beyond
+proxies, what clips on them there is left out.
 
-    Args:
-        clipped: Share at clipping per channel, ``wp.vec3`` (h, w).
-        probes: ``Probe`` (P), at least one: the ball.
-        scene: Its proxies are known surfaces.
-        missing_out: From ``weigh_boundaries``, ``wp.vec3`` (h, w); set to 0 there.
-        proxies: Kinds of proxy in the scene.
-        rows: Band of rows of cells, None for all.
-    """
-    shape = cell_shape(*clipped.shape)
-    launch_rows(
-        make_leave_out_edges_kernel(proxies), shape, [clipped, probes, scene, shape[0]], [missing_out], rows=rows
-    )
+Args:
+    proxies: Kinds of proxy in the scene.
+    clipped: Share at clipping per channel, ``wp.vec3`` (h, w).
+    probes: ``Probe`` (P), at least one: the ball.
+    scene: Its proxies are known surfaces.
+    missing_out: From ``weigh_boundaries``, ``wp.vec3`` (h, w); set to 0 there.
+"""
 
 
 @functools.cache

@@ -26,7 +26,7 @@ import warp as wp
 
 from warp_ar.kernels.emitters import MAX_DISTANCE, correct_parallax, seen_from, solid_angle_gain
 from warp_ar.kernels.latlong import direction_from_latlong, sample_latlong, texel_solid_angle
-from warp_ar.kernels.launch import Rows, launch, launch_rows, row_launcher
+from warp_ar.kernels.launch import launch, row_launcher
 from warp_ar.kernels.recovery.recover_cells import Cell, trust
 from warp_ar.kernels.structs import Emitter
 
@@ -197,34 +197,20 @@ Args:
 """
 
 
-def share_recovered(
-    other: tuple[wp.array, wp.array, wp.array],
-    environment: wp.array,
-    captured: wp.array,
-    emitters: wp.array | None,
-    cells: wp.array,
-    sent: wp.array,
-    environment_out: wp.array,
-    *,
-    rows: Rows | None = None,
-) -> None:
-    """Add what was recovered in the first ball's map where another's clips; not if an emitter has a place.
+share_recovered = row_launcher(share_recovered_kernel)
+"""Add what was recovered in the first ball's map where another's clips; not if an emitter has a place.
 
-    Args:
-        other: (h, w) the other ball's light as captured and completed, and its share and confidence as for
-            ``send_recovered``.
-        environment: (h, w) the first ball's, with what was recovered.
-        captured: (h, w) the first ball's without.
-        emitters: Of the first ball's map; None: the method knows none.
-        cells: As for ``send_recovered``.
-        sent: From there.
-        environment_out: (h, w) ``wp.vec3``.
-        rows: Band of rows, None for all.
-    """
-    device = environment.device
-    emitters = wp.empty(0, dtype=Emitter, device=device) if emitters is None else emitters
-    inputs = [*other, environment, captured, emitters, cells, sent]
-    launch_rows(share_recovered_kernel, environment.shape, inputs, [environment_out], rows=rows)
+Args:
+    other: (h, w) ``wp.vec3``, the other ball's light as captured and completed.
+    missing: As for ``send_recovered``.
+    confidence: Likewise.
+    environment: (h, w) the first ball's, with what was recovered.
+    captured: (h, w) the first ball's without.
+    emitters: Of the first ball's map; None: the method knows none.
+    cells: As for ``send_recovered``.
+    sent: From there.
+    environment_out: (h, w) ``wp.vec3``.
+"""
 
 
 def move_emitters(emitters: wp.array, places: wp.array, emitters_out: wp.array, *, ball: int) -> None:

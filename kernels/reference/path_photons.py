@@ -41,7 +41,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_ar.kernels.camera import project
-from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
+from warp_ar.kernels.launch import MOST_REGISTERS, row_launcher
 from warp_ar.kernels.rays.shadow import sample_light
 from warp_ar.kernels.rays.trace import TraceConfig, make_trace, offset_origin
 from warp_ar.kernels.reference.path_following import (
@@ -395,33 +395,16 @@ def make_light_image(shape: tuple[int, int], device: wp.DeviceLike) -> LightImag
     return image
 
 
-def follow_lights(
-    trace: TraceConfig,
-    params: wp.array[FrameParams],
-    scene: LocalScene,
-    image_out: LightImage,
-    *,
-    count: int,
-    of_lights: int,
-    seed: int,
-    number: int,
-    part: Rows | None = None,
-) -> None:
-    """Follow paths from virtual lights and near emitters, and add what pixels have of them.
+follow_lights = row_launcher(make_follow_lights_kernel, like=lambda *given: given[5:6])
+"""Follow paths from virtual lights and near emitters, and add what pixels have of them.
 
-    Args:
-        trace: Kinds of shape in the scene.
-        params: (1,) FrameParams: the camera.
-        scene: All that paths meet; its lights as ``follows_lights`` has them.
-        image_out: Of ``make_light_image``.
-        count: Paths, at most 2^31.
-        of_lights: How many of these, the first ones, are from virtual lights; the others are from near emitters.
-        seed: Of the random numbers.
-        number: Of this pass, by which its random numbers are others than those of the passes before.
-        part: First path, and one past the last, on CPU; None means all.
-    """
-    kernel = make_follow_lights_kernel(trace)
-    device = image_out.sums.device
-    launch_rows(
-        kernel, (count,), [params, scene, seed, number, count, of_lights], [image_out], rows=part, device=device
-    )
+Args:
+    trace: Kinds of shape in the scene.
+    params: (1,) FrameParams: the camera.
+    scene: All that paths meet; its lights as ``follows_lights`` has them.
+    seed: Of the random numbers.
+    number: Of this pass, by which its random numbers are others than those of the passes before.
+    count: Paths, at most 2^31.
+    of_lights: How many of these, the first ones, are from virtual lights; the others are from near emitters.
+    image_out: Of ``make_light_image``.
+"""

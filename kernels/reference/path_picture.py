@@ -90,6 +90,7 @@ class Round:
     e: wp.array[wp.vec3]
     shows: wp.array[wp.float32]
     rays: wp.array[wp.int32]  # that were traced for it
+    count: wp.int32  # N
 
 
 # A pass adds ``share`` samples to a pixel: after n passes it has floor(n share + u), u its own number from 0 to 1. So
@@ -172,8 +173,8 @@ def _make_room(samples_out: Round, count: int) -> None:
     samples_out.rays = wp.empty(count, dtype=wp.int32, device=device)
 
 
-def list_samples(shares: wp.array2d[wp.float32], samples_out: Round, *, seed: int, begun: int, count: int) -> int:
-    """List the samples of some passes.
+def list_samples(shares: wp.array2d[wp.float32], samples_out: Round, *, seed: int, begun: int, count: int) -> None:
+    """List the samples of some passes, and count them.
 
     Args:
         shares: (H, W) samples of a pixel in a pass.
@@ -181,19 +182,15 @@ def list_samples(shares: wp.array2d[wp.float32], samples_out: Round, *, seed: in
         seed: Of the random numbers.
         begun: Passes with these shares that were made before.
         count: Passes.
-
-    Returns:
-        How many samples there are.
     """
     device, counts, ends = shares.device, samples_out.counts, samples_out.ends
     inputs = [seed, begun, count, shares]
     launch_rows(count_samples_kernel, shares.shape, inputs, [counts], rows=None, device=device)
     wp.utils.array_scan(counts, ends, inclusive=True)
-    total = int(ends[-1:].numpy()[0])
-    if samples_out.pixels.shape[0] < total:
-        _make_room(samples_out, total)
+    samples_out.count = int(ends[-1:].numpy()[0])
+    if samples_out.pixels.shape[0] < samples_out.count:
+        _make_room(samples_out, samples_out.count)
     launch_rows(list_samples_kernel, counts.shape, [counts, ends], [samples_out.pixels], rows=None, device=device)
-    return total
 
 
 add_samples = row_launcher(add_samples_kernel, like=lambda samples, moments: moments.samples)
@@ -379,33 +376,18 @@ def map_reflectance(scene: LocalScene, moments: Moments, reflectance_out: wp.arr
     launch_rows(map_reflectance_kernel, shape, inputs, outputs, rows=None, device=device)
 
 
-def finish_picture(
-    scene: LocalScene,
-    moments: Moments,
-    image: LightImage,
-    encode_table: wp.array[wp.vec3],
-    radiance_out: wp.array2d[wp.vec3],
-    error_out: wp.array2d[wp.vec3],
-    sampled_out: wp.array2d[wp.vec3],
-    image_out: wp.array2d[wp.vec3ub],
-    *,
-    followed: float = 0.0,
-    exposure: float = 1.0,
-) -> None:
-    """Write what the moments say.
+finish_picture = row_launcher(finish_picture_kernel, outputs=4)
+"""Write what the moments say.
 
-    Args:
-        scene: Whose frame is read where proxies are shown, without what they mirror.
-        moments: (H, W).
-        image: What paths from virtual lights brought, for as many pixels.
-        encode_table: Of ``color.encode_table``.
-        radiance_out: (H, W) linear radiance in camera values, not clipped.
-        error_out: (H, W) its standard error, per channel.
-        sampled_out: (H, W) what it would be without that of ``image``.
-        image_out: (H, W) encoded.
-        followed: Paths from virtual lights per pixel, 0 if none were.
-        exposure: Factor on the radiance that is encoded.
-    """
-    outputs = [radiance_out, error_out, sampled_out, image_out]
-    inputs = [scene.matt, encode_table, moments, image, followed, exposure]
-    launch_rows(finish_picture_kernel, image_out.shape, inputs, outputs, rows=None, device=image_out.device)
+Args:
+    radiance: Of the frame, where proxies are shown, without what they mirror: ``LocalScene.matt``.
+    encode_table: Of ``color.encode_table``.
+    moments: (H, W).
+    image: What paths from virtual lights brought, for as many pixels.
+    followed: Paths from virtual lights per pixel, 0 if none were.
+    exposure: Factor on the radiance that is encoded.
+    radiance_out: (H, W) linear radiance in camera values, not clipped.
+    error_out: (H, W) its standard error, per channel.
+    sampled_out: (H, W) what it would be without that of ``image``.
+    image_out: (H, W) encoded.
+"""

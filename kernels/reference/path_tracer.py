@@ -14,7 +14,7 @@ import functools
 
 import warp as wp
 
-from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows, row_launcher
+from warp_ar.kernels.launch import MOST_REGISTERS, row_launcher
 from warp_ar.kernels.rays.trace import TraceConfig
 from warp_ar.kernels.reference.path_following import ENDED, SURFACE, PathPair, end_without, make_visit, meet
 from warp_ar.kernels.reference.path_picture import Round
@@ -217,36 +217,19 @@ def make_find_shown_kernel(trace: TraceConfig) -> wp.Kernel:
     return find_shown_kernel
 
 
-def trace_paths(
-    trace: TraceConfig,
-    params: wp.array[FrameParams],
-    scene: LocalScene,
-    done: wp.array2d[wp.int32],
-    samples_out: Round,
-    *,
-    count: int,
-    asked: int,
-    seed: int,
-    first: int,
-    part: Rows | None = None,
-) -> None:
-    """Trace the samples of a round.
+trace_paths = row_launcher(make_trace_paths_kernel, like=lambda *given: (given[-1].count,))
+"""Trace the samples of a round.
 
-    Args:
-        trace: Kinds of shape in the scene.
-        params: (1,) FrameParams: the camera.
-        scene: All that paths meet.
-        done: (H, W) samples of each pixel in rounds before.
-        samples_out: Of ``list_samples``.
-        count: Its samples.
-        asked: ``WHOLE``, ``DIFFERENCE`` or ``IRRADIANCE``; all but the first need the frame's radiance.
-        seed: Of the random numbers.
-        first: Number of a pixel's first sample among those of the seed.
-        part: First sample, and one past the last, on CPU; None means all.
-    """
-    inputs = [params, scene, asked, seed, first, done]
-    kernel = make_trace_paths_kernel(trace)
-    launch_rows(kernel, (count,), inputs, [samples_out], rows=part, device=done.device)
+Args:
+    trace: Kinds of shape in the scene.
+    params: (1,) FrameParams: the camera.
+    scene: All that paths meet.
+    asked: ``WHOLE``, ``DIFFERENCE`` or ``IRRADIANCE``; all but the first need the frame's radiance.
+    seed: Of the random numbers.
+    first: Number of a pixel's first sample among those of the seed.
+    done: (H, W) samples of each pixel in rounds before.
+    samples_out: Of ``list_samples``.
+"""
 
 
 find_shown = row_launcher(make_find_shown_kernel)

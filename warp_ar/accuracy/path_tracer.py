@@ -307,17 +307,16 @@ class PathTracer:
         """
 
         def trace(part: tuple[int, int]) -> None:
-            path_tracer.trace_paths(
-                self._config, self._params, self._local, self._moments.samples, self._round,
-                count=samples, asked=asked, seed=self.seed, first=first, part=part,
-            )  # fmt: skip
+            numbers = asked, self.seed, first
+            given = self._params, self._local, *numbers, self._moments.samples, self._round
+            path_tracer.trace_paths(self._config, *given, rows=part)
 
         while count > 0:
             room = self._most // (self.camera.width * self.camera.height)
             passes = 1 if self._sliced else min(count, max(1, room))
             with translating(self.device), wp.ScopedDevice(self.device):
-                samples = list_samples(self._shares, self._round, seed=self.seed, begun=self._passes, count=passes)
-            yield from self._in_parts("paths", trace, samples)
+                list_samples(self._shares, self._round, seed=self.seed, begun=self._passes, count=passes)
+            yield from self._in_parts("paths", trace, self._round.count)
             with translating(self.device), wp.ScopedDevice(self.device):
                 add_samples(self._round, self._moments)
             self._passes += passes
@@ -333,10 +332,8 @@ class PathTracer:
         count = of_lights + (each if self._follows_emitters else 0)
 
         def trace(part: tuple[int, int]) -> None:
-            follow_lights(
-                self._config, self._params, self._local, self._image_of_lights,
-                count=count, of_lights=of_lights, seed=self.seed, number=self._followed, part=part,
-            )  # fmt: skip
+            numbers = self.seed, self._followed, count, of_lights
+            follow_lights(self._config, self._params, self._local, *numbers, self._image_of_lights, rows=part)
 
         yield from self._in_parts("lights", trace, count)
         self._followed += 1
@@ -419,18 +416,9 @@ class PathTracer:
     def _finish(self) -> None:
         """Write picture and error of the samples so far."""
         kinds = int(self._follows_lights) + int(self._follows_emitters)
-        finish_picture(
-            self._local,
-            self._moments,
-            self._image_of_lights,
-            self._encode,
-            self._radiance,
-            self._error,
-            self._sampled,
-            self._image,
-            followed=self._followed * kinds * self._paths_of_each() / (self.camera.width * self.camera.height),
-            exposure=self.exposure,
-        )
+        followed = self._followed * kinds * self._paths_of_each() / (self.camera.width * self.camera.height)
+        given = self._local.matt, self._encode, self._moments, self._image_of_lights, followed, self.exposure
+        finish_picture(*given, self._radiance, self._error, self._sampled, self._image)
 
     def sample(self, count: int) -> None:
         """Add ``count`` samples per pixel: in the mean, from ``FIRST_ROUND`` on more where neighbours are noisy.

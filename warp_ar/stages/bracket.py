@@ -9,7 +9,8 @@ import warp as wp
 
 from warp_ar.kernels.environment import bracket as kernels
 from warp_ar.kernels.launch import copy
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring, unobserved
+from warp_ar.kernels.structs import filled
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring, over_rows, unobserved
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.probe_maps import UNWRAPPED, find_view
 
@@ -59,7 +60,7 @@ class Bracket(Stage):
         """The reference joins the others; what clips nearby; their mean."""
         height = self.request.quality.environment_height
         reference = self.request.exposures.index(1.0)
-        stack = kernels.make_exposure_stack(*(arrays[f"bracket_{part}"] for part in (*UNWRAPPED, "spread")))
+        stack = filled(kernels.ExposureStack(), **{part: arrays[f"bracket_{part}"] for part in (*UNWRAPPED, "spread")})
         merged = find_view(arrays, "merged")
         own = [(arrays[f"bracket_{part}"][reference], arrays[f"probe_{part}"]) for part in UNWRAPPED]
 
@@ -67,10 +68,8 @@ class Bracket(Stage):
             for target, source in own:
                 copy(target, source)
 
-        def spread(rows: Rows | None) -> None:
-            kernels.spread_clipping(stack, rows=rows)
-
-        def merge(rows: Rows | None) -> None:
-            kernels.merge_exposures(arrays["bracket_exposures"], stack, merged, rows=rows)
-
-        return [Pass(store), Pass(spread, rows=height), Pass(merge, rows=height)]
+        return [
+            Pass(store),
+            over_rows(height, kernels.spread_clipping, kernels.REACH, stack),
+            over_rows(height, kernels.merge_exposures, arrays["bracket_exposures"], stack, kernels.REACH, merged),
+        ]

@@ -87,24 +87,24 @@ class EnvironmentSamples(Stage):
         out = arrays["environment_samples_directions"], arrays["environment_samples_flux"], samples
         probes, turn = self.request.scene.probes, (ball, self.features.others + 1)
         origin = wp.vec3(*probes[ball].center) if probes else wp.vec3()
-        known = environment, cumulative, sums, origin
+        known = environment, cumulative, sums, origin, turn
         passes = [
             Pass(lambda rows: environment_samples.sum_environment(environment, cumulative, sums)),
-            Pass(lambda rows: environment_samples.draw_samples(*known, *out, turn=turn)),
+            Pass(lambda rows: environment_samples.draw_samples(*known, *out)),
         ]
         found = [samples]
         if lists_texels(self.features):
             small, texels = arrays["environment_samples_map"], [arrays[name] for name in sample_names(self.features)]
             passes += [
                 Pass(lambda rows: pyramid.reduce_latlong(environment, small)),
-                Pass(lambda rows: environment_samples.list_texels(small, origin, *texels, turn=turn)),
+                Pass(lambda rows: environment_samples.list_texels(small, origin, turn, *texels)),
             ]
             found.append(texels[-1])
         if emitters is not None:
 
             def place(rows: Rows | None) -> None:
                 for one in found:
-                    environment_samples.place_emitters(emitters, one, turn=turn)
+                    environment_samples.place_emitters(emitters, turn, one)
 
             passes.append(Pass(place))
         return passes

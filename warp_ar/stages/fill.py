@@ -11,7 +11,7 @@ import warp as wp
 
 from warp_ar.kernels.environment import change, fill, fill_frame
 from warp_ar.scene.kinds import trace_config
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring, unobserved
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring, over_rows, unobserved
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.lighting import trace_variant
 from warp_ar.stages.shared.picture import find_picture, frame_reads
@@ -73,16 +73,11 @@ class Fill(Stage):
         for ball in range(self.features.others):
             names = *other_names(self.features, KEPT)[:2], self.wiring.writes[1]
             maps.append(tuple(arrays[name][ball] for name in names))
-
-        def measure(rows: Rows | None) -> None:
-            change.measure_difference(
-                arrays[self.wiring.writes[0]], arrays["fill_published"], arrays["fill_difference"], rows=rows
-            )
-
         proxies = trace_variant(trace_config(self.request.scene), device).proxies
         passes = [one for ball, known in enumerate(maps) for one in self._complete(arrays, ball, known, most, proxies)]
         if self._on_cpu:
-            passes.append(Pass(measure, rows=height))
+            seen = (arrays[name] for name in (self.wiring.writes[0], "fill_published", "fill_difference"))
+            passes.append(over_rows(height, change.measure_difference, *seen))
         return [dataclasses.replace(one, enabled=lambda: not self._holds) for one in passes]
 
     @staticmethod
@@ -94,15 +89,11 @@ class Fill(Stage):
         shape = height, _ = radiance.shape
         levels = arrays["fill_levels"]
         scene = find_picture(arrays), arrays["params"], arrays["probes"], arrays["ray_scene"]
-
-        def see(rows: Rows | None) -> None:
-            fill_frame.fill_frame(*scene, levels, shape, proxies=proxies, ball=ball, rows=rows)
-
         return [
-            Pass(lambda rows: fill.seed_fill(radiance, confidence, levels, rows=rows), rows=height),
-            Pass(see, rows=height),
+            over_rows(height, fill.seed_fill, radiance, confidence, levels),
+            over_rows(height, fill_frame.fill_frame, proxies, *scene, shape, ball, levels),
             Pass(lambda rows: fill.push_pull(levels, *shape, most=most)),
-            Pass(lambda rows: fill.finish_fill(levels, filled, rows=rows), rows=height),
+            over_rows(height, fill.finish_fill, levels, filled),
         ]
 
     def begin(self) -> None:

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_ar.kernels.environment import irradiance, sphere_map
-from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring
+from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring, over_rows
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.settled import settled_environment
 
@@ -109,6 +109,6 @@ class Irradiance(Stage):
         blocks = self._blocks()
         clusters = arrays["irradiance_clusters"]
         return [
-            Pass(lambda rows: irradiance.gather_clusters(environment, blocks, clusters, rows=rows), rows=blocks[0]),
-            Pass(lambda rows: irradiance.sum_clusters(clusters, target, rows=rows), rows=MAP_SIZE[0]),
+            over_rows(blocks[0], irradiance.gather_clusters, environment, blocks, clusters),
+            over_rows(MAP_SIZE[0], irradiance.sum_clusters, clusters, target),
         ]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -22,7 +21,7 @@ from warp_ar.kernels.environment.lobes import (
 )
 from warp_ar.scene import Material, MirrorMaterial, PhongMaterial, Scene
 from warp_ar.scene.object_materials import reflects_glossily, scene_materials
-from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring
+from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring, over_rows
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.settled import settled_environment
 
@@ -119,27 +118,25 @@ class Prefilter(Stage):
         height, device = self.request.quality.environment_height, environment.device
         lobe = scene_lobe(self.request.scene)
         if self._mirrors_only:
-            return [Pass(lambda rows: pyramid.copy_safe(environment, levels, rows=rows), rows=height)]
+            return [over_rows(height, pyramid.copy_safe, environment, levels)]
         texels = levels.shape[0]
         if self.method == "brute_force":
-            return [Pass(lambda rows: prefilter.integrate_lobes(environment, lobe, levels, rows=rows), rows=texels)]
+            return [over_rows(texels, prefilter.integrate_lobes, environment, lobe == "phong", levels)]
 
         mips = arrays["prefilter_pyramid"]
         passes = [Pass(lambda rows: pyramid.build_pyramid(environment, mips))]
         if self.method == "energy_mip":
             weights = wp.array(mip_weights(height, lobe).astype(np.float32), dtype=wp.float32, device=device)
-            passes.append(Pass(lambda rows: prefilter.mix_mips(mips, weights, height, levels, rows=rows), rows=texels))
+            passes.append(over_rows(texels, prefilter.mix_mips, mips, weights, height, levels))
         else:
             drawn = make_lobe_samples(height, lobe, int(self.method.removeprefix("fis")), device)
             samples = drawn.directions, drawn.weights
-            passes.append(
-                Pass(lambda rows: prefilter.sample_lobes(mips, *samples, height, levels, rows=rows), rows=texels)
-            )
+            passes.append(over_rows(texels, prefilter.sample_lobes, mips, *samples, height, levels))
         row_energy, energy = arrays["prefilter_row_energy"], arrays["prefilter_energy"]
         return [
             *passes,
             Pass(lambda rows: prefilter.measure_energy(levels, height, row_energy, energy)),
-            Pass(lambda rows: prefilter.scale_levels(energy, height, levels, rows=rows), rows=texels),
+            over_rows(texels, prefilter.scale_levels, energy, height, levels),
         ]
 
     def _look_up(self, arrays: Arrays) -> list[Pass]:
@@ -150,7 +147,6 @@ class Prefilter(Stage):
         passes = []
         for lobe in range(1 if self._mirrors_only else lobes):
             size = lobe_size(height, lobe)
-            place = sphere_map.glossy_level(lobe, lobes), size, out
-            look_up = functools.partial(sphere_map.look_up_level, *known, *place, first=lobe_offset(height, lobe))
-            passes.append(Pass(lambda rows, look_up=look_up: look_up(rows=rows), rows=size[0]))  # type: ignore[misc]
+            place, first = (sphere_map.glossy_level(lobe, lobes), size, out), lobe_offset(height, lobe)
+            passes.append(over_rows(size[0], sphere_map.look_up_level, *known, *place, first=first))
         return passes

@@ -26,7 +26,7 @@ from warp_ar.light.config import CONFIG, Kind
 from warp_ar.light.estimate import Estimate
 from warp_ar.light.surfaces import find_surfaces
 from warp_ar.scene.kinds import trace_config
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring, unobserved
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring, over_rows, unobserved
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.host_copies import HostCopies
 from warp_ar.stages.shared.lighting import trace_variant
@@ -221,10 +221,10 @@ class Recover(Stage):
             passes.append(Pass(self._launch(change.measure_difference, *names), rows=height))
         return passes
 
-    def _launch(self, launcher: Any, *names: str, **more: Any) -> Any:
+    def _launch(self, launcher: Any, *names: str) -> Any:
         """Return what calls a launcher with named arrays, on a band of rows."""
         given = [self._arrays[name] for name in names]
-        return lambda rows: launcher(*given, **more, rows=rows)
+        return lambda rows: launcher(*given, rows=rows)
 
     def _equations(self, height: int, rows: int) -> list[Pass]:
         """Return the passes that find what cells lack, and both sides of the equations where an estimate is begun."""
@@ -239,7 +239,7 @@ class Recover(Stage):
         passes = [Pass(weigh, rows=height, reads=("environment_clipped", "pose"))]
         if self._proxies:
             names = "environment_clipped", "probes", "ray_scene", "recover_missing"
-            passes.append(Pass(self._launch(leave_out_edges, *names, proxies=self._proxies), rows=rows))
+            passes.append(Pass(self._launch(functools.partial(leave_out_edges, self._proxies), *names), rows=rows))
         return [
             *passes,
             asked(
@@ -289,18 +289,16 @@ class Recover(Stage):
         clipped, confidence = (arrays[f"{KEPT}_{part}"][ball] for part in ("clipped", "confidence"))
         own = arrays["params"], arrays["probes"][ball + 1 : ball + 2], missing
         found = arrays["recover_cells"], arrays["recover_levelled"]
-        other, cells = (filled, missing, confidence), found[0]
-        send = functools.partial(relocate.send_recovered, missing, confidence, *found, sent)
-        share = functools.partial(relocate.share_recovered, other, *first, emitters, cells, sent, out)
+        cells = found[0]
+        known = filled, missing, confidence, *first, emitters, cells, sent
         passes = [
-            Pass(lambda rows: weigh_boundaries(clipped, *own, rows=rows), rows=height),
-            Pass(lambda rows: send(rows=rows), rows=cells.shape[0]),
-            Pass(lambda rows: share(rows=rows), rows=height),
+            over_rows(height, weigh_boundaries, clipped, *own),
+            over_rows(cells.shape[0], relocate.send_recovered, missing, confidence, *found, sent),
+            over_rows(height, relocate.share_recovered, *known, out),
         ]
         if emitters is not None:
             moved = arrays["others_emitters"][ball]
-            put = functools.partial(relocate.relocate, filled, *first, emitters, places, ball + 1, out)
-            passes.append(Pass(lambda rows: put(rows=rows), rows=height))
+            passes.append(over_rows(height, relocate.relocate, filled, *first, emitters, places, ball + 1, out))
             passes.append(Pass(lambda rows: relocate.move_emitters(emitters, places, moved, ball=ball + 1)))
         return passes
 
@@ -308,7 +306,7 @@ class Recover(Stage):
         arrays, linear = self._arrays, "linear_frame" in self.wiring.reads
         frame = arrays["linear_frame" if linear else "frame"], arrays["linear_clip" if linear else "decode"]
         scene = arrays["params"], arrays["probes"], arrays["ray_scene"]
-        kernels.observe_surfaces(*frame, *scene, points, observations, proxies=self._proxies, rows=rows)
+        kernels.observe_surfaces(self._proxies, linear, *frame, *scene, points, observations, rows=rows)
 
     def _look_at_card(self, rows: Rows | None) -> None:
         arrays = self._arrays

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_ar.kernels.environment import sphere_map
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring, unobserved
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring, over_rows, unobserved
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.picture import frame_reads
 
@@ -40,9 +40,9 @@ class SphereMap(Stage):
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """The ball's square, then its levels."""
-        known = arrays["params"], arrays["probes"], arrays["frame"], arrays["decode"]
-        texture, linear = arrays["sphere_map"], arrays["linear_frame"]
+        texture = arrays["sphere_map"]
+        known = (arrays[name] for name in ("params", "probes", "frame", "decode", "linear_frame"))
         return [
-            Pass(lambda rows: sphere_map.copy_ball(*known, texture, linear=linear, rows=rows), rows=sphere_map.SIZE),
+            over_rows(sphere_map.SIZE, sphere_map.copy_ball, *known, texture),
             Pass(lambda rows: sphere_map.halve_levels(texture)),
         ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -9,14 +10,12 @@ import warp as wp
 
 from warp_ar.kernels.environment import sphere_map, unwrap
 from warp_ar.kernels.environment.probe_weights import measure_seen
-from warp_ar.kernels.structs import BOX, MESH, PLANE
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring, unobserved
+from warp_ar.scene.kinds import trace_config
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring, over_rows, unobserved
 from warp_ar.stages.features import Features
-from warp_ar.stages.shared.lighting import shares_kernels
+from warp_ar.stages.shared.lighting import trace_variant
 from warp_ar.stages.shared.picture import frame_reads
 from warp_ar.stages.shared.probe_maps import OTHERS, find_view, other_maps, other_names, other_views
-
-_KINDS = {"plane": PLANE, "box": BOX, "mesh": MESH}
 
 
 class Unwrap(Stage):
@@ -82,43 +81,20 @@ class Unwrap(Stage):
         """Corners first, then texels between them; or texels looked up in the sphere map."""
         if self.method == "sphere_map":
             return self._look_up(arrays)
-        kinds = sorted({_KINDS[proxy.shape] for proxy in self.request.scene.proxies})
-        config = unwrap.ProjectConfig(tuple(kinds))
-        config = config.general() if shares_kernels(device) else config
+        kinds = trace_variant(trace_config(self.request.scene), device).proxies
         height = self.request.quality.environment_height
         linear = "linear_frame" in self.wiring.reads
-
-        def project(rows: Rows | None) -> None:
-            unwrap.project_corners(
-                arrays["params"],
-                arrays["probes"],
-                arrays["rays"],
-                arrays["ray_scene"],
-                arrays["unwrap_corners"],
-                config=config,
-                rows=rows,
-            )
-
         frame = arrays["linear_frame" if linear else "frame"], arrays["linear_clip" if linear else "decode"]
         probes, corners, others = arrays["probes"], arrays["unwrap_corners"], self.features.others
-        view = find_view(arrays, "probe")
-        own = 0 if others else unwrap.ALL_ALIKE
-
-        def gather(rows: Rows | None) -> None:
-            unwrap.gather_probe(*frame, probes, corners, view, own=own, rows=rows)
-
-        passes = [Pass(project, rows=height + 1), Pass(gather, rows=height)]
+        view, own = find_view(arrays, "probe"), 0 if others else unwrap.ALL_ALIKE
+        seen = arrays["params"], probes, arrays["rays"], arrays["ray_scene"], corners
+        gather: Any = functools.partial(over_rows, height, unwrap.gather_probe, linear, *frame)
+        passes = [over_rows(height + 1, unwrap.project_corners, kinds, *seen), gather(probes, corners, own, view)]
         for ball, other in enumerate(other_views(self.features, arrays, OTHERS), 1):
-            alone = probes[ball : ball + 1], corners[:, :, ball : ball + 1], other
-            passes.append(
-                Pass(
-                    lambda rows, alone=alone: unwrap.gather_probe(*frame, *alone, rows=rows),  # type: ignore[misc]
-                    rows=height,
-                )
-            )
+            alone = probes[ball : ball + 1], corners[:, :, ball : ball + 1]
+            passes.append(gather(*alone, unwrap.ALL_ALIKE, other))
         if others:
-            seen, size = arrays["probes_seen"], self.request.size
-            passes.append(Pass(lambda rows: measure_seen(corners, size, seen, rim_start=unwrap.RIM_START)))
+            passes.append(Pass(lambda rows: measure_seen(corners, self.request.size, arrays["probes_seen"])))
         return passes
 
     def _look_up(self, arrays: Arrays) -> list[Pass]:
@@ -126,9 +102,8 @@ class Unwrap(Stage):
         height = self.request.quality.environment_height
         shape = height, 2 * height
         params, texture, out = arrays["params"], arrays["sphere_map"], arrays["probe_radiance"].flatten()
-        seen = params, arrays["probes"], arrays["frame"], arrays["probe_confidence"], arrays["probe_clipped"]
-        linear = {name: arrays[f"linear_{word}"] for name, word in (("linear", "frame"), ("linear_clip", "clip"))}
+        names = "frame", "linear_frame", "linear_clip", "probe_confidence", "probe_clipped"
         return [
-            Pass(lambda rows: sphere_map.look_up_level(params, texture, 0, shape, out, rows=rows), rows=height),
-            Pass(lambda rows: sphere_map.trust_ball(*seen, **linear, rows=rows), rows=height),
+            over_rows(height, sphere_map.look_up_level, params, texture, 0, shape, out),
+            over_rows(height, sphere_map.trust_ball, params, arrays["probes"], *(arrays[name] for name in names)),
         ]
