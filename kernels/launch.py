@@ -12,14 +12,11 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
-import math
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import warp as wp
-
-from warp_ar.kernels.pixel_order import RECTANGLE_FIRST, RECTANGLE_ONLY
 
 Rows = tuple[int, int]
 """A band of rows: first, and one past the last."""
@@ -30,33 +27,6 @@ MOST_REGISTERS = 80
 They wait for memory most of their time. Left alone they take 120 to 255, with which a multiprocessor of 65,536 holds
 one or two blocks of 256 threads; with three it has others to go on with, and gains more than spilling costs.
 """
-
-BLOCK = 256
-"""Threads of a block, where nothing else is said."""
-MOST_BLOCKS = 4096
-"""Blocks of ``BLOCK`` threads with which a CUDA device does all pixels of a frame, where most of them are soon done."""
-
-
-def takes_few_blocks(shape: Sequence[int], device: wp.DeviceLike) -> bool:
-    """Return whether a launch over all of a shape with ``rectangle_first`` has a limited number of blocks.
-
-    What its rectangle does not reach is then better cleared before, while the device has little to do.
-    """
-    return not wp.get_device(device).is_cpu and math.prod(shape) > BLOCK * MOST_BLOCKS
-
-
-MAX_PARTIALS = 8
-"""Threads of a CUDA device that share a cell's samples at most, each with a partial sum."""
-ENOUGH_THREADS = 1 << 20
-"""Threads from which more make a CUDA device slower: each finds the cell's point and picks its samples anew."""
-
-
-def count_partials(rows: int, columns: int, device: wp.DeviceLike, most: int = MAX_PARTIALS) -> int:
-    """Threads per cell: on CUDA as many as it takes to fill the device, up to ``most``, a power of 2; one on CPU."""
-    partials = 1 if wp.get_device(device).is_cpu else most
-    while partials > 1 and partials * rows * columns > ENOUGH_THREADS:
-        partials //= 2
-    return partials
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,8 +119,6 @@ def launch_rows(
     rows: Rows | None,
     device: wp.DeviceLike = None,
     stream: wp.Stream | None = None,
-    rectangle_first: bool = False,
-    alone: bool = False,
 ) -> None:
     """Launch ``kernel`` over ``shape``, restricted to ``rows`` along the first axis.
 
@@ -162,21 +130,12 @@ def launch_rows(
         rows: Band to launch; None means all rows.
         device: Where the arrays live; None: as ``device_of`` says.
         stream: CUDA stream; None means the device's current one.
-        rectangle_first: Whether the kernel takes ``own_pixel``: on CUDA a limited number of blocks does all rows, and
-            those of its rectangle first.
-        alone: Whether, where that is so (``takes_few_blocks``), other pixels need not be written.
     """
     device = device_of(device, [*outputs, *inputs])
-    whole = rows is None or tuple(rows) == (0, shape[0])
-    limited = rectangle_first and whole and takes_few_blocks(shape, device)
 
     def do() -> None:
         start, stop = rows if rows is not None else (0, shape[0])
-        if limited:
-            given = {"outputs": outputs, "device": device, "stream": stream, "max_blocks": MOST_BLOCKS}
-            code = RECTANGLE_ONLY if alone else RECTANGLE_FIRST
-            wp.launch(kernel, dim=tuple(shape), inputs=[code, *inputs], **given)
-        elif stop > start:
+        if stop > start:
             dim = (stop - start, *shape[1:])
             wp.launch(kernel, dim=dim, inputs=[start, *inputs], outputs=outputs, device=device, stream=stream)
 

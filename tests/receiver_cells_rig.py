@@ -1,7 +1,6 @@
 """A camera above the desk, the cells of its surfaces, and all that their launchers ask for."""
 
 import dataclasses
-import math
 
 import numpy as np
 import warp as wp
@@ -126,15 +125,11 @@ class View:
     def cells(self, stride):
         return tuple(-(-n // stride) for n in self.size)
 
-    def share(self, samples, stride=4, count=None, rows=None, out=None, cells=None, bounced=False, partials=1):
+    def share(self, samples, stride=4, count=None, rows=None, out=None, cells=None, bounced=False):
         share = wp.full(self.cells(stride), wp.vec3(7.0, 7.0, 7.0), dtype=wp.vec3) if out is None else out[0]
         surface = wp.full(self.cells(stride), 7, dtype=wp.int32) if out is None else out[1]
         written = ReceiverCells()
         written.ambient_visibility, written.ambient_surface, written.ambient_stride = share, surface, stride
-        sums = None
-        if partials > 1:
-            poison = wp.vec3(math.nan, math.nan, math.nan)
-            sums = wp.full(receiver_cells.partial_sums_shape(partials, *share.shape), poison, dtype=wp.vec3)
         receiver_cells.estimate_ambient_visibility(
             self.config,
             self.params,
@@ -142,9 +137,8 @@ class View:
             self.lights,
             self.receiver(cells),
             samples[:count],
+            bounced,
             written,
-            bounced=bounced,
-            sums_out=sums,
             rows=rows,
         )
         return share.numpy(), surface.numpy()

@@ -74,7 +74,6 @@ from warp_ar.kernels.objects.reflect import (
     make_shade_unoccluded,
 )
 from warp_ar.kernels.picture.frame_levels import Footprint, ReceiverLayers, covered_on, look_up_covered, shown_as
-from warp_ar.kernels.pixel_order import own_pixel
 from warp_ar.kernels.rays.shapes import FAR
 from warp_ar.kernels.rays.trace import make_trace, offset_origin
 from warp_ar.kernels.rays.visibility import VisibleObjects, inside_rect, make_primary, make_sample_direction
@@ -600,9 +599,7 @@ def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
         near_out: NearLight,
     ):
         i, j = wp.tid()
-        objects = visible.objects
-        pixel = own_pixel(i, j, row_start, params[0].object_rect, objects.shape[0], objects.shape[1])
-        i, j = pixel[0], pixel[1]
+        i += row_start
         if not inside_rect(i, j, params[0].object_rect):
             return
         if visible.objects[i, j] < 0:
@@ -721,8 +718,7 @@ def make_filter_kernel(config: NearFieldConfig) -> wp.Kernel:
         i, j = wp.tid()
         rect = params[0].object_rect
         objects = visible.objects
-        pixel = own_pixel(i, j, row_start, rect, objects.shape[0], objects.shape[1])
-        i, j = pixel[0], pixel[1]
+        i += row_start
         if not inside_rect(i, j, rect):
             return
         hits = visible.hits
@@ -773,9 +769,7 @@ def make_filter_kernel(config: NearFieldConfig) -> wp.Kernel:
     return filter_near_field_kernel
 
 
-estimate_near_field = row_launcher(
-    make_near_field_kernel, like=lambda params, picture, *_: picture.rays, rectangle_first=True, alone=True
-)
+estimate_near_field = row_launcher(make_near_field_kernel, like=lambda params, picture, *_: picture.rays)
 """Estimate what surrounds the objects, each pixel with one set of samples.
 
 Args:
@@ -791,9 +785,7 @@ Args:
 """
 
 
-filter_near_field = row_launcher(
-    make_filter_kernel, like=lambda params, scene, visible, *_: visible.objects, rectangle_first=True, alone=True
-)
+filter_near_field = row_launcher(make_filter_kernel, like=lambda params, scene, visible, *_: visible.objects)
 """Average the estimates over tiles, along objects only; arguments as those of ``estimate_near_field``.
 
 Of ``near_out``, irradiance and reflected are written; the last of reflected becomes the share of the prefiltered

@@ -33,7 +33,6 @@ from warp_ar.kernels.objects.reflect import (
     make_distant_irradiance,
     make_reflected_radiance,
 )
-from warp_ar.kernels.pixel_order import own_pixel
 from warp_ar.kernels.rays.area_lights import (
     POINT_SAMPLES,
     lobe_solid_angle,
@@ -409,10 +408,7 @@ def make_shade_kernel(config: ShadeConfig, edges: str = SAMPLED) -> wp.Kernel:
         result = wp.vec4(0.0)
         samples = wp.int32(0)
         rect = params[0].object_rect
-        own = own_pixel(i, j, row_start, rect, virtual_out.shape[0], virtual_out.shape[1])
-        i, j = own[0], own[1]
-        if i < 0:
-            return
+        i += row_start
         if inside_rect(i, j, rect):
             found = visible.objects[i, j]
             hit = Hit()
@@ -483,7 +479,6 @@ def shade(
     virtual_out: wp.array2d[wp.vec4],
     *,
     edge_lists: EdgeLists | None = None,
-    cleared: bool = False,
     rows: Rows | None = None,
 ) -> None:
     """Shade what ``trace_pixels`` found.
@@ -500,7 +495,6 @@ def shade(
         visible: (H, W) as ``trace_pixels`` writes.
         virtual_out: (H, W) premultiplied linear RGB and coverage; zero outside ``params.object_rect``.
         edge_lists: Scratch, for a launch over all rows.
-        cleared: Whether ``virtual_out`` is zero, so that on CUDA it need not be written outside.
         rows: Band of rows; None means all.
     """
     inputs = [params, rays, scene, light, visible]
@@ -510,9 +504,8 @@ def shade(
         return
     edge_lists.listed.count.zero_()
     outputs = [virtual_out, edge_lists.listed]
-    given = {"rows": rows, "device": device, "rectangle_first": True, "alone": cleared}
     for kernel in (make_shade_kernel(config, LISTED), make_shade_kernel(config, LEFT)):
-        launch_rows(kernel, rays.shape, inputs, outputs, **given)
+        launch_rows(kernel, rays.shape, inputs, outputs, rows=rows)
     sample_listed_edges(
         make_sample_edges_kernel(config), inputs, edge_lists, config.edge_samples, virtual_out, weighted=False
     )

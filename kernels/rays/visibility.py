@@ -12,7 +12,6 @@ import math
 import warp as wp
 
 from warp_ar.kernels.launch import row_launcher
-from warp_ar.kernels.pixel_order import own_pixel
 from warp_ar.kernels.rays.shapes import FAR, ROUNDING
 from warp_ar.kernels.rays.trace import TraceConfig, make_trace, meets_probe
 from warp_ar.kernels.structs import FrameParams, Hit, Probe, RayScene
@@ -138,9 +137,7 @@ def make_trace_pixels_kernel(config: TraceConfig) -> wp.Kernel:
         visible_out: VisibleObjects,
     ):
         i, j = wp.tid()
-        pixel = own_pixel(i, j, row_start, params[0].object_rect, rays.shape[0], rays.shape[1])
-        i = pixel[0]
-        j = pixel[1]
+        i += row_start
         found = wp.int32(-1)
         if inside_rect(i, j, params[0].object_rect):
             ray = rays[i, j]
@@ -154,7 +151,7 @@ def make_trace_pixels_kernel(config: TraceConfig) -> wp.Kernel:
     return trace_pixels_kernel
 
 
-trace_pixels = row_launcher(make_trace_pixels_kernel, like=lambda params, rays, *_: rays, rectangle_first=True)
+trace_pixels = row_launcher(make_trace_pixels_kernel, like=lambda params, rays, *_: rays)
 """Trace a ray through the centre of every pixel of ``params.object_rect``.
 
 Args:

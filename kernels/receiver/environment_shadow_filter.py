@@ -18,7 +18,6 @@ import warp as wp
 
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows, row_launcher
 from warp_ar.kernels.objects.reflect import DistantLightConfig
-from warp_ar.kernels.pixel_order import own_pixel
 from warp_ar.kernels.pixels import pixel_run
 from warp_ar.kernels.rays.shapes import FACES, MESH_KEY, surface_key
 from warp_ar.kernels.rays.visibility import inside_rect, make_visible_proxy
@@ -201,12 +200,7 @@ def make_spread_ratio_kernel(config: DistantLightConfig) -> wp.Kernel:
         i, place = wp.tid()
         rect = params[0].shadow_rect
         begin = place * run
-        if run == 1:
-            pixel = own_pixel(i, place, row_start, rect, shadow_ratio_out.shape[0], shadow_ratio_out.shape[1])
-            i = pixel[0]
-            begin = pixel[1]
-        else:
-            i += row_start
+        i += row_start
         changed = cells.changed
         stride = cells.stride
         stop = wp.min(begin + run, shadow_ratio_out.shape[1])
@@ -279,5 +273,4 @@ def spread_ratio(
         [shadow_ratio_out],
         rows=rows,
         device=device,
-        rectangle_first=run == 1,
     )

@@ -51,6 +51,10 @@ WARP_LANES = 32
 """Threads that go the same way or wait for each other."""
 TILE_ROWS, TILE_COLUMNS = 4, 8
 """Cells of a warp, which takes a square of the frame."""
+MAX_PARTIALS = 8
+"""Threads of a CUDA device that share a cell's samples at most, each with a partial sum."""
+ENOUGH_THREADS = 1 << 20
+"""Threads from which more make a CUDA device slower: each finds the cell's point and picks its samples anew."""
 QUEUE_THREADS = 1 << 17
 """Threads that trace the queue, each what is left of it when the others have theirs."""
 
@@ -344,6 +348,14 @@ def make_reduce_partials_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
         cells_out.bounced[i, j] = bounced_of(without, hidden, sent, returned)
 
     return reduce_partials_kernel
+
+
+def count_partials(rows: int, columns: int) -> int:
+    """Threads per cell: as many as it takes to fill a CUDA device, up to ``MAX_PARTIALS``, a power of 2."""
+    partials = MAX_PARTIALS
+    while partials > 1 and partials * rows * columns > ENOUGH_THREADS:
+        partials //= 2
+    return partials
 
 
 def make_wavefront(config: EnvironmentShadowConfig, rows: int, columns: int, device: wp.DeviceLike) -> Wavefront | None:

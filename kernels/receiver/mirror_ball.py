@@ -23,7 +23,6 @@ from warp_ar.kernels.launch import MOST_REGISTERS, row_launcher
 from warp_ar.kernels.materials import reflect
 from warp_ar.kernels.objects.reflect import DistantLight, look_up_layer, make_find_in_frame
 from warp_ar.kernels.objects.shade import NearPoint, ShadeConfig, make_shade_hit
-from warp_ar.kernels.pixel_order import own_pixel
 from warp_ar.kernels.pixels import shown_radiance
 from warp_ar.kernels.rays.shadow import tile_turn
 from warp_ar.kernels.rays.shapes import FAR, ROUNDING, intersect_sphere
@@ -187,10 +186,8 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
         mirrored_out: wp.array2d[wp.vec3],
     ):
         i, j = wp.tid()
-        pixel = own_pixel(i, j, row_start, params[0].ball_rect, mirrored_out.shape[0], mirrored_out.shape[1])
-        i, j = pixel[0], pixel[1]
-        if i < 0:
-            return
+        i += row_start
+        pixel = wp.vec2i(i, j)
         if not inside_rect(i, j, params[0].ball_rect):
             mirrored_out[i, j] = wp.vec3(0.0, 0.0, 0.0)
             return
@@ -205,7 +202,7 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
     return mirror_ball_kernel
 
 
-mirror_ball = row_launcher(make_mirror_ball_kernel, rectangle_first=True)
+mirror_ball = row_launcher(make_mirror_ball_kernel)
 """Write what virtual objects change in the picture of mirror balls; zero outside ``params[0].ball_rect``.
 
 Args:
@@ -218,5 +215,4 @@ Args:
     shadow_ratio: (H, W) vec3 of ``environment_shadow``; needed if ``config.ratio``.
     side: Rays per pixel are its square, spread as ``shade``'s along edges. A number, not a kernel of its own.
     mirrored_out: (H, W) vec3, change of linear radiance in camera values.
-    alone: Whether ``mirrored_out`` is zero, so that on CUDA it need not be written outside.
 """

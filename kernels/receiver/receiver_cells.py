@@ -38,7 +38,7 @@ from warp_ar.kernels.cells import cell_pixel
 from warp_ar.kernels.environment.environment_samples import EnvironmentSample, Incidence, ball_of_sample, sample_toward
 from warp_ar.kernels.environment.interpolated_irradiance import make_irradiance_at
 from warp_ar.kernels.environment.probe_weights import probe_share
-from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch, launch_rows, row_launcher
+from warp_ar.kernels.launch import MOST_REGISTERS, row_launcher
 from warp_ar.kernels.materials import material_at
 from warp_ar.kernels.objects.reflect import look_up, make_find_in_frame
 from warp_ar.kernels.rays.shadow import make_shadow, sample_light, tile_turn
@@ -63,12 +63,6 @@ NEGLIGIBLE = wp.constant(wp.float32(1.0 / 1024.0))
 """Bounced light over the environment's that no 8-bit picture shows: an eighth of a code at most, taken for none."""
 MIN_FACING = wp.constant(wp.float32(0.02))
 """Least cosine at which the area that pixels show is believed: beyond it a patch would reach over the horizon."""
-MAX_PARTIALS = 16
-"""Threads of a CUDA device that share the samples of a cell at most: few cells are asked, each of many samples."""
-KINDS = wp.constant(2)
-"""Values of a partial sum: the environment, and what is lost of it."""
-PENDING = wp.constant(-2)
-"""Value of ``surface_out`` less the cell's surface while partials of its share are not yet added."""
 
 
 @wp.struct
@@ -227,7 +221,6 @@ def make_ambient_visibility_kernel(config: RelightConfig) -> wp.Kernel:
         bounced: wp.bool,
         # Out:
         cells_out: ReceiverCells,
-        sums_out: wp.array3d[wp.vec3],
     ):
         ci, cj = wp.tid()
         ci += row_start
@@ -235,13 +228,8 @@ def make_ambient_visibility_kernel(config: RelightConfig) -> wp.Kernel:
         stride = cells_out.ambient_stride
         share_out = cells_out.ambient_visibility
         surface_out = cells_out.ambient_surface
-        partials = wp.max(sums_out.shape[0] / KINDS, 1)
-        partial = ci / share_out.shape[0]
-        ci = ci % share_out.shape[0]
-        # One thread of a cell writes its surface, and no surface that another may still read as found before.
         if not bounced:
-            if partial == 0:
-                surface_out[ci, cj] = -1
+            surface_out[ci, cj] = -1
         elif surface_out[ci, cj] >= 0:
             return
         if not in_lit_cells(ci, cj, stride, params[0].light_rect):
@@ -260,13 +248,11 @@ def make_ambient_visibility_kernel(config: RelightConfig) -> wp.Kernel:
             needed = is_shone_on(lights, hit)
         if not needed:
             return
-        if partial == 0:
-            surface_out[ci, cj] = wp.where(partials > 1, PENDING - key, key)
+        surface_out[ci, cj] = key
         solids = bound_solids(scene)
         whole = wp.vec3()
         lost = wp.vec3()
-        count = samples.shape[0]
-        for k in range(count * partial / partials, count * (partial + 1) / partials):
+        for k in range(samples.shape[0]):
             sample = samples[k]
             toward = sample_toward(sample, hit.point)
             cosine = wp.dot(hit.normal, toward.direction)
@@ -279,34 +265,9 @@ def make_ambient_visibility_kernel(config: RelightConfig) -> wp.Kernel:
                 hider = find_hider(params[0], scene, receiver, hit, toward, solids)
                 if hider.hides:
                     lost += cosine * toward.measure * (sample.radiance - hider.radiance)
-        if partials > 1:
-            sums_out[partial * KINDS, ci, cj] = whole
-            sums_out[partial * KINDS + 1, ci, cj] = lost
-        else:
-            share_out[ci, cj] = visible_shares_of(lost, whole)
+        share_out[ci, cj] = visible_shares_of(lost, whole)
 
     return ambient_visibility_kernel
-
-
-@wp.kernel(enable_backward=False)
-def reduce_partials_kernel(
-    # In:
-    sums: wp.array3d[wp.vec3],
-    # Out:
-    cells_out: ReceiverCells,
-):
-    """Shares of cells whose samples several threads have just summed."""
-    i, j = wp.tid()
-    pending = cells_out.ambient_surface[i, j]
-    if pending > PENDING:
-        return
-    whole = wp.vec3()
-    lost = wp.vec3()
-    for partial in range(sums.shape[0] / KINDS):
-        whole += sums[partial * KINDS, i, j]
-        lost += sums[partial * KINDS + 1, i, j]
-    cells_out.ambient_visibility[i, j] = visible_shares_of(lost, whole)
-    cells_out.ambient_surface[i, j] = PENDING - pending
 
 
 @wp.func
@@ -488,53 +449,23 @@ def make_gather_light_kernel(config: RelightConfig) -> wp.Kernel:
     return gather_light_kernel
 
 
-def estimate_ambient_visibility(
-    config: RelightConfig,
-    params: wp.array[FrameParams],
-    scene: RayScene,
-    lights: wp.array[Light],
-    receiver: Receiver,
-    samples: wp.array[EnvironmentSample],
-    cells_out: ReceiverCells,
-    *,
-    bounced: bool = False,
-    sums_out: wp.array3d[wp.vec3] | None = None,
-    rows: Rows | None = None,
-) -> None:
-    """Estimate which part of the environment reaches the receiver, for cells that virtual lights may shine on.
+estimate_ambient_visibility = row_launcher(
+    make_ambient_visibility_kernel, like=lambda *given: given[-1].ambient_visibility
+)
+"""Estimate which part of the environment reaches the receiver, for cells that virtual lights may shine on.
 
-    Args:
-        config: Kinds of shape, form of the environment's irradiance.
-        params: (1,) FrameParams: camera and light_rect.
-        scene: Proxies.
-        lights: (n,) Light.
-        receiver: From ``make_receiver``: picture, balls and the environment's irradiance; with the cells of
-            ``gather_light`` if ``bounced``.
-        samples: (n,) of the environment. The same for all cells, so there is no noise; the first n of a longer
-            sequence are an aligned block of Sobol's if n is a power of 2.
-        cells_out: Cells whose ambient visibility and its surface are written.
-        bounced: Whether to add cells that get bounced light to those that were estimated before.
-        sums_out: Scratch of ``partial_sums_shape`` in which several threads share a cell; ``rows`` must be None then.
-            None means one thread per cell.
-        rows: Band of rows of cells; None means all.
-    """
-    partials = 1 if sums_out is None else sums_out.shape[0] // int(KINDS)
-    shape, device = cells_out.ambient_visibility.shape, receiver.picture.rays.device
-    launch_rows(
-        make_ambient_visibility_kernel(config),
-        (shape[0] * partials, shape[1]),
-        [params, scene, lights, receiver, samples, bounced],
-        [cells_out, sums_out],
-        rows=rows,
-        device=device,
-    )
-    if partials > 1:
-        launch(reduce_partials_kernel, shape, [sums_out], [cells_out], device=device)
-
-
-def partial_sums_shape(partials: int, rows: int, columns: int) -> tuple[int, int, int]:
-    """Shape of the array that holds the partial sums of so many cells."""
-    return partials * int(KINDS), rows, columns
+Args:
+    config: Kinds of shape, form of the environment's irradiance.
+    params: (1,) FrameParams: camera and light_rect.
+    scene: Proxies.
+    lights: (n,) Light.
+    receiver: From ``make_receiver``: picture, balls and the environment's irradiance; with the cells of
+        ``gather_light`` if ``bounced``.
+    samples: (n,) of the environment. The same for all cells, so there is no noise; the first n of a longer
+        sequence are an aligned block of Sobol's if n is a power of 2.
+    bounced: Whether to add cells that get bounced light to those that were estimated before.
+    cells_out: Cells whose ambient visibility and its surface are written.
+"""
 
 
 send_light = row_launcher(make_send_light_kernel)

@@ -28,7 +28,6 @@ import warp as wp
 from warp_ar.kernels.cells import any_cell_above_zero
 from warp_ar.kernels.edges import EdgeList, EdgeLists, holds_all, list_edge, listed_edges, sample_listed_edges
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows, row_launcher
-from warp_ar.kernels.pixel_order import own_pixel
 from warp_ar.kernels.rays.area_lights import make_area_count, make_area_sample
 from warp_ar.kernels.rays.shadow import (
     LightSample,
@@ -199,10 +198,7 @@ def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
         visibility_out: wp.array2d[wp.int32],
     ):
         i, j = wp.tid()
-        pixel = own_pixel(i, j, row_start, params[0].light_rect, added_out.shape[0], added_out.shape[1])
-        i, j = pixel[0], pixel[1]
-        if i < 0:
-            return
+        i += row_start
         black = wp.vec3(0.0, 0.0, 0.0)
         added_out[i, j] = black
         if not inside_rect(i, j, params[0].light_rect):
@@ -315,8 +311,7 @@ def make_smooth_edges_kernel(config: RelightConfig, *, left: bool = False) -> wp
             if holds_all(listed):
                 return
         rect = params[0].light_rect
-        pixel = own_pixel(i, j, row_start, rect, added_out.shape[0], added_out.shape[1])
-        i, j = pixel[0], pixel[1]
+        i += row_start
         if not inside_rect(i, j, rect):
             return
         if not is_edge(visibility, rect, i, j):
@@ -343,8 +338,7 @@ def list_edges_kernel(
     """List the pixels that ``is_edge`` finds."""
     i, j = wp.tid()
     rect = params[0].light_rect
-    pixel = own_pixel(i, j, row_start, rect, visibility.shape[0], visibility.shape[1])
-    i, j = pixel[0], pixel[1]
+    i += row_start
     if inside_rect(i, j, rect):
         if is_edge(visibility, rect, i, j):
             list_edge(i, j, list_out)
@@ -378,7 +372,7 @@ def make_sample_edges_kernel(config: RelightConfig) -> wp.Kernel:
     return sample_lighting_edges_kernel
 
 
-relight = row_launcher(make_relight_kernel, outputs=2, rectangle_first=True)
+relight = row_launcher(make_relight_kernel, outputs=2)
 """Write the radiance that virtual lights add to the receiver; zero outside ``params[0].light_rect``.
 
 One sample per pixel: where ``config.edge_samples`` is more than 1, ``smooth_edges`` comes next.
@@ -392,7 +386,6 @@ Args:
     added_out: (H, W) linear radiance in camera values.
     visibility_out: (H, W) which surface a pixel sees and which lights do not; None if ``config.edge_samples`` is 1.
         Only what lies in ``light_rect`` is written.
-    alone: Whether ``added_out`` is zero, so that on CUDA it need not be written outside.
 """
 
 
@@ -428,9 +421,8 @@ def smooth_edges(
         launch_rows(kernel, shape, [*inputs, visibility, EdgeList()], [added_out], rows=rows, device=device)
         return
     edge_lists.listed.count.zero_()
-    whole = {"rows": None, "device": device, "rectangle_first": True, "alone": True}
-    launch_rows(list_edges_kernel, shape, [params, visibility], [edge_lists.listed], **whole)
+    launch_rows(list_edges_kernel, shape, [params, visibility], [edge_lists.listed], rows=None)
     kernel = make_smooth_edges_kernel(config, left=True)
-    launch_rows(kernel, shape, [*inputs, visibility, edge_lists.listed], [added_out], **whole)
+    launch_rows(kernel, shape, [*inputs, visibility, edge_lists.listed], [added_out], rows=None)
     kernel = make_sample_edges_kernel(config)
     sample_listed_edges(kernel, inputs, edge_lists, config.edge_samples, added_out, weighted=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -9,7 +10,6 @@ import warp as wp
 
 from warp_ar.kernels.cells import cell_shape, cell_stride
 from warp_ar.kernels.environment.environment_samples import SampleSets
-from warp_ar.kernels.launch import count_partials
 from warp_ar.kernels.receiver import environment_shadow_filter as filters
 from warp_ar.kernels.receiver import environment_shadow_wavefront as wavefront
 from warp_ar.kernels.receiver.environment_shadow import (
@@ -57,7 +57,6 @@ def shadow_config(features: Features, device: Any) -> EnvironmentShadowConfig:
         method.bounce,
         method.secondary,
         features.emitters,
-        count_partials(*shadow_cells(features), device),
     )
 
 
@@ -123,7 +122,11 @@ class EnvironmentShadow(Stage):
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Estimates, then their mean."""
         config = shadow_config(self.features, device)
-        wave = None if device.is_cpu else wavefront.make_wavefront(config, *arrays[f"{self.name}_ratio"].shape, device)
+        wave = None
+        if not device.is_cpu:
+            size = shadow_cells(self.features)
+            config = dataclasses.replace(config, partials=wavefront.count_partials(*size))
+            wave = wavefront.make_wavefront(config, *size, device)
         distant = make_distant_light(self.features, arrays)
         distant.environment = arrays["environment"]
         if self.features.others:

@@ -27,7 +27,7 @@ from warp_ar.stages.shared.lighting import (
     shares_kernels,
     trace_variant,
 )
-from warp_ar.stages.shared.picture import GrowingRows, clear_first, frame_reads
+from warp_ar.stages.shared.picture import GrowingRows, frame_reads
 
 SIDES: Mapping[str, int] = {"single": 1, "smooth": 2, "brute_force": 8}
 """Roots of rays per pixel, by method; cheapest first, after ``none``."""
@@ -144,6 +144,5 @@ class MirrorBall(Stage):
             arrays["shadow_ratio"] if config.ratio else None,
         )
         out, extent = arrays["mirror_ball"], GrowingRows(arrays["ball_rows"])
-        side, first = SIDES[self.request.quality.method(self.name)], clear_first(out, device)
-        given: dict[str, Any] = {"alone": bool(first), "extent": extent}
-        return [*first, over_rows(self.height, mirror_ball.mirror_ball, variant, *inputs, side, out, **given)]
+        side = SIDES[self.request.quality.method(self.name)]
+        return [over_rows(self.height, mirror_ball.mirror_ball, variant, *inputs, side, out, extent=extent)]

@@ -10,7 +10,6 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_ar.kernels.cells import cell_shape, cell_stride
-from warp_ar.kernels.launch import count_partials
 from warp_ar.kernels.receiver import receiver_cells, relight
 from warp_ar.kernels.receiver.receiver import Receiver, ReceiverCells, RelightConfig
 from warp_ar.kernels.structs import PLANE
@@ -21,7 +20,7 @@ from warp_ar.stages.request import Request
 from warp_ar.stages.shared.edge_lists import edge_arrays, make_edge_lists
 from warp_ar.stages.shared.environment_sets import SAMPLES
 from warp_ar.stages.shared.lighting import find_receiver, relight_config, relight_reads, relight_variant
-from warp_ar.stages.shared.picture import GrowingRows, clear_first
+from warp_ar.stages.shared.picture import GrowingRows
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,18 +115,15 @@ class Relight(Stage):
         inputs = arrays["params"], arrays["ray_scene"], arrays["light_array"], receiver
         added, light_rows = arrays["added_light"], arrays["light_rows"]
         visibility = arrays["relight_visibility"] if config.edge_samples > 1 else None
-        passes = clear_first(added, device)
-        named: dict[str, Any] = {"alone": bool(passes), "extent": GrowingRows(light_rows)}
-        passes += self._cell_passes(config, inputs, arrays, device)
-        passes.append(over_rows(self.height, relight.relight, config, *inputs, added, visibility, **named))
+        passes = self._cell_passes(config, inputs, arrays)
+        own = config, *inputs, added, visibility
+        passes.append(over_rows(self.height, relight.relight, *own, extent=GrowingRows(light_rows)))
         if config.edge_samples > 1:
-            named = {"edge_lists": make_edge_lists(arrays, device, self.name), "extent": light_rows}
+            named: dict[str, Any] = {"edge_lists": make_edge_lists(arrays, device, self.name), "extent": light_rows}
             passes.append(over_rows(self.height, relight.smooth_edges, config, *inputs, visibility, added, **named))
         return passes
 
-    def _cell_passes(
-        self, config: RelightConfig, inputs: tuple[Any, Any, Any, Receiver], arrays: Arrays, device: Any
-    ) -> list[Pass]:
+    def _cell_passes(self, config: RelightConfig, inputs: tuple[Any, Any, Any, Receiver], arrays: Arrays) -> list[Pass]:
         """Ambient visibility and bounced light of cells, where the method knows them."""
         params, scene, _, receiver = inputs
         cells, light_rows = receiver.cells, arrays["light_rows"]
@@ -147,16 +143,12 @@ class Relight(Stage):
 
         def ambient_pass(bounced: bool) -> Pass:
             samples = arrays["environment_samples"][: _grain(self.features).samples]
-            extent = rows_of(int(cells.ambient_stride), shape[0], 2)
-            named: dict[str, Any] = {"bounced": bounced, "sums_out": sums, "extent": extent}
+            count = cells.ambient_visibility.shape[0]
+            extent = rows_of(int(cells.ambient_stride), count, 2)
             estimate = receiver_cells.estimate_ambient_visibility
-            return over_rows(shape[0], estimate, place, *inputs, samples, cells, **named)
+            return over_rows(count, estimate, place, *inputs, samples, bounced, cells, extent=extent)
 
         if config.ambient_visibility:
-            shape, sums = cells.ambient_visibility.shape, None
-            partials = count_partials(*shape, device, receiver_cells.MAX_PARTIALS)
-            if partials > 1:
-                sums = wp.empty(receiver_cells.partial_sums_shape(partials, *shape), dtype=wp.vec3, device=device)
             passes.append(ambient_pass(bounced=False))
         if config.bounced:
             patches, listed, count = (arrays[f"relight_{name}"] for name in ("patches", "listed", "count"))

@@ -20,7 +20,7 @@ from warp_ar.stages.shared.lighting import (
     shade_config,
     shade_variant,
 )
-from warp_ar.stages.shared.picture import GrowingRows, clear_first, find_visible
+from warp_ar.stages.shared.picture import GrowingRows, find_visible
 
 
 class Shade(Stage):
@@ -80,6 +80,4 @@ class Shade(Stage):
         light = make_object_light(distant, arrays["light_array"] if config.lights else None, near)
         out, extent = arrays["virtual"], GrowingRows(arrays["object_rows"])
         inputs = arrays["params"], arrays["rays"], arrays["ray_scene"], light, find_visible(arrays)
-        first = clear_first(out, device) if lists is not None else []
-        given: dict[str, Any] = {"edge_lists": lists, "cleared": bool(first), "extent": extent}
-        return [*first, over_rows(self.height, shade, variant, *inputs, out, **given)]
+        return [over_rows(self.height, shade, variant, *inputs, out, edge_lists=lists, extent=extent)]

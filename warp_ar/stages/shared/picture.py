@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from warp_ar.kernels.launch import takes_few_blocks
 from warp_ar.kernels.picture import composite
 from warp_ar.kernels.picture.expose import ClippedEvidence, make_clipped_evidence
 from warp_ar.kernels.rays.visibility import VisibleObjects, make_visible
 from warp_ar.kernels.structs import Picture, make_picture
-from warp_ar.stages.base import Arrays, Pass, Rows, Wiring
+from warp_ar.stages.base import Arrays, Rows, Wiring
 from warp_ar.stages.features import Features
 from warp_ar.stages.request import Request
 
@@ -59,14 +58,6 @@ def clipped_evidence(request: Request, wiring: Wiring, arrays: Arrays) -> Clippe
     """All of it that a stage with this wiring reads."""
     known = [arrays[name] if name in wiring.reads else None for name in (SUMMED, "declipped", SUMMED_CUT)]
     return make_clipped_evidence(request.size[1], *known, levels=arrays["linear_clip"] if request.linear else None)
-
-
-def clear_first(array: Any, device: Any) -> list[Pass]:
-    """A stage's first pass on CUDA: zero where its rectangle will not reach, while the device has little to do.
-
-    None where its kernel writes all of the array.
-    """
-    return [Pass(lambda rows: array.zero_(), reads=())] if takes_few_blocks(array.shape, device) else []
 
 
 class GrowingRows:
