@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import sys
 import threading
 import types
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -361,19 +362,26 @@ def launch_order(monkeypatch: pytest.MonkeyPatch, **passes: list[dict[str, Any]]
         stages.append(type(name, (AddOne,), fields))
     plan = plan_of(monkeypatch, tuple(stages), tuple(reads))
     waits: dict[str, set[str]] = {}
+    on: list[FakeStream] = []
 
-    def note(_: Scheduler, stream: FakeStream, step: Any) -> None:
-        waits[step.launch] = set(stream.behind)
-        stream.behind = {step.launch}
+    @contextlib.contextmanager
+    def enter(stream: FakeStream, sync_enter: bool) -> Iterator[None]:
+        on.append(stream)
+        yield
+
+    def note(name: str) -> None:
+        waits[name] = set(on[-1].behind)
+        on[-1].behind = {name}
 
     monkeypatch.setattr(wp, "Stream", FakeStream)
-    monkeypatch.setattr(Scheduler, "_launch_on", note)
+    monkeypatch.setattr(wp, "ScopedStream", enter)
     scheduler = Scheduler.__new__(Scheduler)
     scheduler.device, scheduler._stream, scheduler._streams = None, FakeStream(), []
     steps = []
     for kind, wiring in plan.stages:
         given = passes.get(kind.name, [{}])
-        own = [Pass(f"{kind.name}{index}", **fields) for index, fields in enumerate(given)]  # type: ignore[arg-type]
+        names = [f"{kind.name}{index}" for index in range(len(given))]
+        own = [Pass(lambda _, name=name: note(name), **fields) for name, fields in zip(names, given, strict=True)]
         steps.append((kind(plan.features, wiring), own))
     scheduler._launch_side_by_side(steps)
     assert scheduler._stream.behind >= {f"{name}{len(passes.get(name, [{}])) - 1}" for name in reads}

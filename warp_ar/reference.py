@@ -12,9 +12,8 @@ if __name__ == "__main__":
     begin("warp_ar.reference")
 
 import argparse
-import functools
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -27,15 +26,15 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from warp_ar.accuracy.known_frame import KnownFrame, light_up_to
 from warp_ar.accuracy.path_tracer import DEFAULT_SAMPLES, PathTracer, TracedPicture
 from warp_ar.command_line import EXIT_DONE, Parser, count, run_command
-from warp_ar.errors import SinkError, SourceError, UsageError, reason, say
-from warp_ar.exr_file import write_exr
-from warp_ar.files import write_whole
+from warp_ar.errors import SinkError, SourceError, UsageError, say
+from warp_ar.exr_file import exr_header, store_exr
+from warp_ar.files import store
 from warp_ar.light.captured import Light
 from warp_ar.output.places import check_places, check_replaceable, reads_of
 from warp_ar.output.sink import make_folder
 from warp_ar.scene import Scene
 from warp_ar.session import chosen_scene
-from warp_ar.signature import PROGRAM, sign_png
+from warp_ar.signature import sign_png
 
 SUFFIXES = (".png", ".exr")
 STEP = 8
@@ -206,16 +205,9 @@ def write_picture(path: Path, picture: TracedPicture) -> None:
     if path.suffix.lower() == ".png":
         write_png(path, picture.image)
         return
-    header = {
-        "compression": OpenEXR.ZIP_COMPRESSION,
-        "type": OpenEXR.scanlineimage,
-        "software": PROGRAM,
-        "samples": picture.samples,
-    }
     channels = {name: np.ascontiguousarray(picture.radiance[..., c]) for c, name in enumerate("RGB")}
     channels |= {f"error.{name}": np.ascontiguousarray(picture.error[..., c]) for c, name in enumerate("RGB")}
-    image = OpenEXR.File(header, channels)
-    _write(path, functools.partial(write_exr, image=image))
+    store_exr(path, OpenEXR.File(exr_header(samples=picture.samples), channels))
 
 
 def write_png(path: Path, image: npt.NDArray[np.uint8]) -> None:
@@ -227,11 +219,4 @@ def write_png(path: Path, image: npt.NDArray[np.uint8]) -> None:
     done, data = cv2.imencode(".png", image[..., ::-1])
     if not done:
         raise SinkError(f"{path} cannot be encoded as PNG")
-    _write(path, sign_png(data.tobytes()))
-
-
-def _write(path: Path, data: bytes | Callable[[Path], object]) -> None:
-    try:
-        write_whole(path, data)
-    except (RuntimeError, OSError) as error:
-        raise SinkError(f"{path} cannot be written: {reason(error)}") from error
+    store(path, sign_png(data.tobytes()))

@@ -258,8 +258,9 @@ class Session(Closing):
 
     def __iter__(self) -> Iterator[tuple[Frame, Result]]:
         pipeline, live = self.pipeline, self.source.live
-        kept = pipeline.device.is_cpu or set(pipeline.plan.request.outputs) <= {"image", "pose"}
-        called = live and pipeline.device.is_cpu  # which is to have no copy of the frame
+        on_cpu = pipeline.device.is_cpu
+        kept = on_cpu or set(pipeline.plan.request.outputs) <= {"image", "pose"}
+        called = live and on_cpu  # which is to have no copy of the frame
         if not self.ahead or called or not kept or not isinstance(pipeline, Pipeline):
             for frame in self._frames():
                 yield frame, self.pipeline(frame.deepest, **self._known_of(frame))

@@ -26,7 +26,7 @@ from warp_ar.kernels.rays.visibility import (
     make_primary,
     make_sample_direction,
 )
-from warp_ar.kernels.structs import FrameParams, Probe, RayScene, filled, vec8
+from warp_ar.kernels.structs import FrameParams, Probe, RayScene, vec8
 
 wp.set_module_options({"enable_backward": False})
 
@@ -132,11 +132,6 @@ def make_trace_surfaces_kernel(config: TraceConfig) -> wp.Kernel:
         out.position[i, j] = surface.position
 
     return trace_surfaces_kernel
-
-
-def make_surfaces(index: wp.array, depth: wp.array, normal: wp.array, position: wp.array) -> Surfaces:
-    """The arrays of ``trace_surfaces`` together."""
-    return filled(Surfaces(), index=index, depth=depth, normal=normal, position=position)
 
 
 trace_surfaces = row_launcher(make_trace_surfaces_kernel, like=lambda params, rays, *_: rays)

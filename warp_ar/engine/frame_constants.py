@@ -44,12 +44,13 @@ class FrameBlock:
             size += -(-bytes_needed // _ALIGNMENT) * _ALIGNMENT
         self._device_buffer = wp.zeros(size, dtype=wp.uint8, device=device)
         self._pinned: list[tuple[Any, Any, Any]] = []
-        if not device.is_cpu:
+        if device.is_cpu:
+            self._bytes = self._device_buffer.numpy()
+        else:
             buffers = [wp.zeros(size, dtype=wp.uint8, device="cpu", pinned=True) for _ in range(_SLOTS)]
             self._pinned = [(buffer, buffer.numpy(), wp.Event(device)) for buffer in buffers]
-            self._stream = wp.get_stream(device)
+            self._stream, self._bytes = wp.get_stream(device), np.zeros(size, np.uint8)
         self._uploads = 0
-        self._bytes = self._device_buffer.numpy() if device.is_cpu else np.zeros(size, np.uint8)
         self._host: dict[str, Any] = {}
         self._device: dict[str, Any] = {}
         for (name, struct, count), offset in zip(layout, offsets, strict=True):

@@ -79,7 +79,8 @@ def _from_dlpack(image: Any, size: tuple[int, int], device: Any, kind: str) -> A
             raise UsageError(f"frame is {kind}, which gives no array by __dlpack__: {reason(error)}") from error
     if place not in CUDA or not device.is_cuda or ordinal != device.ordinal:
         where = f"cuda:{ordinal}" if place in CUDA else f"a device of DLPack's kind {place}"
-        raise UsageError(f"frame is {kind} on {where}; expected one on the host{_or_here(device)}")
+        here = f" or on {device}" if device.is_cuda else ""
+        raise UsageError(f"frame is {kind} on {where}; expected one on the host{here}")
     try:
         with exclusive(device):
             array = wp.from_dlpack(image)
@@ -115,10 +116,6 @@ def _check_strides(
         raise UsageError(f"frame is {kind} {dtype} {tuple(shape)}; expected uint8 RGB {expected}")
     if strides is not None and tuple(strides[1:]) != (3, 1):
         raise UsageError(f"frame is {kind} with strides {tuple(strides)}; expected pixels of 3 bytes side by side")
-
-
-def _or_here(device: Any) -> str:
-    return f" or on {device}" if device.is_cuda else ""
 
 
 class Borrowed:

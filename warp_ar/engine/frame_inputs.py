@@ -106,10 +106,10 @@ class FrameInputs:
         self.block.upload()
         self.frame = wp.zeros(shape, dtype=wp.vec3ub, device=device)
         """The picture that stages read."""
-        self._host_frame = self.frame.numpy() if device.is_cpu else None
+        self.transfers = None if device.is_cpu else Transfers(shape, device)
+        self._host_frame = self.frame.numpy() if self.transfers is None else None
         self._linear_frame = wp.zeros(shape if linear else (0, 0), dtype=wp.vec3, device=device)
         self._linear_clip = wp.zeros(2, dtype=wp.vec3, device=device)
-        self.transfers = None if device.is_cpu else Transfers(shape, device)
         self.decode = decode_table(camera.transfer)
         """Linear value of each code, (256, 3)."""
         self.saturation = SaturationLevels()

@@ -59,16 +59,17 @@ class LayerArrays:
             return self
         deep = radiance
         if np.isfinite(clip).any():
-            deep = np.where(radiance >= clip, np.maximum(radiance, _copied(self.arrays["plate"])), radiance)
+            deep = np.where(radiance >= clip, np.maximum(radiance, copied(self.arrays["plate"])), radiance)
         return dataclasses.replace(self, arrays={**self.arrays, "plate": deep})
 
     def to_host(self) -> LayerArrays:
         """Return copies on the host: float32 (height, width[, components]), ``ids`` int32."""
-        scale = None if self.scale is None else _copied(self.scale)
-        return LayerArrays({name: _copied(array) for name, array in self.arrays.items()}, scale)
+        scale = None if self.scale is None else copied(self.scale)
+        return LayerArrays({name: copied(array) for name, array in self.arrays.items()}, scale)
 
 
-def _copied(array: Any) -> npt.NDArray[Any]:
+def copied(array: Any) -> npt.NDArray[Any]:
+    """A copy of one's own of a Warp array, or of one of the host."""
     if not isinstance(array, wp.array):
         return np.array(array)
     with exclusive(array.device):
@@ -113,7 +114,7 @@ def neutral_layers(request: Request, frame: Any, decode: npt.NDArray[np.float32]
             continue
         neutral = LAYERS[name].neutral
         if neutral is None:
-            codes = _copied(frame)
+            codes = copied(frame)
             found[name] = np.stack([decode[codes[..., c], c] for c in range(3)], axis=-1).astype(np.float32)
             continue
         components = _COMPONENTS.get(name, 3)

@@ -623,8 +623,7 @@ class Pipeline(Closing):
         if rendered.layers is not None:
             rendered = dataclasses.replace(rendered, layers=rendered.layers.to_host())
         if transfers is None or "image" not in self._arrays:
-            with exclusive(self.device):
-                rendered = rendered.with_light_kept()
+            rendered = rendered.with_light_kept()
         if isinstance(lit, wp.array):
             lit = np.array(lit.numpy()) if transfers is None else transfers.download(lit)
         return dataclasses.replace(rendered, image=lit)

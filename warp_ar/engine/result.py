@@ -14,7 +14,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_ar.device import exclusive
-from warp_ar.engine.layers import LayerArrays, compose_layers
+from warp_ar.engine.layers import LayerArrays, compose_layers, copied
 from warp_ar.engine.scheduler import StageTiming
 from warp_ar.engine.transfer import Image, Picture
 from warp_ar.errors import UsageError
@@ -53,9 +53,7 @@ class Rendered:
 
     def with_light_kept(self) -> Rendered:
         """The same with arrays of its own for all that is known of the light."""
-        light, others = (
-            None if one is None else np.array(one.numpy()) for one in (self.environment_array, self.others_array)
-        )
+        light, others = (None if one is None else copied(one) for one in (self.environment_array, self.others_array))
         emitters = None if self.emitters_array is None else struct_values(self.emitters_array)
         return dataclasses.replace(self, environment=light, others=others, emitters=emitters)
 
@@ -123,11 +121,7 @@ class Result:
         rendered = self._rendered.result()
         if rendered.image is not None:
             return rendered.image.result() if isinstance(rendered.image, Picture) else rendered.image
-        lit = rendered.image_array
-        if not isinstance(lit, wp.array):
-            return np.array(lit)
-        with exclusive(lit.device):
-            return np.array(lit.numpy())
+        return copied(rendered.image_array)
 
     @functools.cached_property
     def environment(self) -> npt.NDArray[np.float32] | None:
@@ -135,8 +129,7 @@ class Result:
         rendered = self._rendered.result()
         if rendered.environment is not None or rendered.environment_array is None:
             return rendered.environment
-        with exclusive(rendered.environment_array.device):
-            return np.array(rendered.environment_array.numpy())
+        return copied(rendered.environment_array)
 
     @functools.cached_property
     def environments(self) -> tuple[npt.NDArray[np.float32], ...]:
@@ -147,8 +140,7 @@ class Result:
         rendered = self._rendered.result()
         others = rendered.others
         if others is None and rendered.others_array is not None:
-            with exclusive(rendered.others_array.device):
-                others = np.array(rendered.others_array.numpy())
+            others = copied(rendered.others_array)
         return () if self.environment is None else (self.environment, *(() if others is None else others))
 
     @functools.cached_property

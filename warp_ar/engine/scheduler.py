@@ -9,12 +9,11 @@ cannot be split, or for the last rows of one that can.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import itertools
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import warp as wp
@@ -79,14 +78,13 @@ class Scheduler:
         self.plan = plan
         self._on_host = on_host
         self.arrays = arrays
-        self.device = device
+        self.device, self._on_cpu = device, bool(device.is_cpu)
         cores = usable_cores()
         self.bands = bands
         self._threads = min(cores, bands or cores)
         if bands is not None and bands > 1:
             self._threads = max(self._threads, 2)  # so that bands run side by side on one core, too
         self._crew: Crew | None = None
-        self._alone = False
         self._ran: set[str] = set()
         self._prepared = False
         self._stages: list[Step] = []
@@ -96,9 +94,9 @@ class Scheduler:
         self._translated: set[int] = set()
         self._patterns: dict[Any, list[Segment]] = {}
         self._graphs: dict[tuple[int, ...], Any] = {}
-        self._stream: Any = wp.get_stream(device) if device.is_cuda else None
+        self._stream: Any = None if self._on_cpu else wp.get_stream(device)
         self._streams: list[Any] = []
-        self._marks: dict[tuple[int, ...], tuple[Any, Any]] | None = {} if profile and device.is_cuda else None
+        self._marks: dict[tuple[int, ...], tuple[Any, Any]] | None = {} if profile and not self._on_cpu else None
         self.clock = time.perf_counter
         """Seconds by which stages are timed on the host."""
         self._build(spare or {})
@@ -158,11 +156,6 @@ class Scheduler:
             for owner in (self.arrays, self):
                 vars(owner).clear()
 
-    @property
-    def crew(self) -> Crew | None:
-        """The native threads that it has; None until it is prepared, and on CUDA."""
-        return self._crew
-
     def stage(self, name: str) -> Stage | None:
         """The stage of that name, where it is part of the plan."""
         return next((stage for stage, _ in self._stages if stage.name == name), None)
@@ -199,7 +192,7 @@ class Scheduler:
 
     def spare(self) -> dict[str, Any]:
         """Return the arrays that neither a result nor the next pipeline needs; none on CUDA, which has its own pool."""
-        if self.device.is_cuda:
+        if not self._on_cpu:
             return {}
         needed = {*self.plan.request.resources, *LIGHT_ARRAYS}
         needed.update(*(stage.remembers for stage, _ in self._stages))
@@ -230,9 +223,10 @@ class Scheduler:
                             notes[id(step)] = noted
         found = [*(note for each in notes.values() for note in each), *self._first_launches]
         launched = [(note.kernel, note.block_dim) for note in found if note.kernel is not None]
-        kernels = [kernel for kernel, size in launched if self._has_usual_blocks(kernel, size)]
-        blocks = [(kernel, size) for kernel, size in launched if not self._has_usual_blocks(kernel, size)]
-        own = [serve_kernel] if self._threads > 1 and self.device.is_cpu else []
+        # A launch takes its module as compiled unasked; on CUDA blocks of another size do not.
+        blocks = [one for one in launched if not self._on_cpu and one[1] != one[0].module.options["block_dim"]]
+        kernels = [one[0] for one in launched if one not in blocks]
+        own = [serve_kernel] if self._threads > 1 and self._on_cpu else []
         load_modules([*own, *kernels, *host_kernels], self.device, progress, blocks=blocks, on_host=self._on_host)
         with wp.ScopedDevice(self.device), translating(self.device):
             for note in self._first_launches:
@@ -250,10 +244,6 @@ class Scheduler:
                 )
         self._prepared = True
 
-    def _has_usual_blocks(self, kernel: wp.Kernel, size: int) -> bool:
-        """Return whether a launch takes its module as compiled unasked; on CUDA blocks of another size do not."""
-        return bool(self.device.is_cpu) or size == kernel.module.options["block_dim"]
-
     def warm_up(self, progress: Progress | None = None) -> None:
         """Have every kernel compiled and loaded; on CUDA launch everything once, on whatever the arrays hold.
 
@@ -265,7 +255,7 @@ class Scheduler:
         """
         self.prepare(progress)
         self._demand.forget()
-        if self.device.is_cpu:
+        if self._on_cpu:
             return
         with exclusive(self.device):
             stream = wp.Stream(self.device)
@@ -281,16 +271,6 @@ class Scheduler:
         with exclusive(self.device):
             wp.synchronize_stream(stream)
 
-    @contextlib.contextmanager
-    def alone(self, clock: Callable[[], float]) -> Iterator[None]:
-        """On CPU run stages one after another on the caller's thread, timed by its clock."""
-        before = self._alone, self.clock
-        self._alone, self.clock = True, clock
-        try:
-            yield
-        finally:
-            self._alone, self.clock = before
-
     def run(self, receive: Callable[[], None] | None = None) -> Mapping[str, StageTiming]:
         """Run the stages that this frame needs and whose inputs changed since they ran; returns the time of each.
 
@@ -299,9 +279,9 @@ class Scheduler:
         """
         self.prepare()
         self._look()
-        if not self.device.is_cpu:
+        if not self._on_cpu:
             return self._run_captured(receive)
-        if self._crew is None or self._alone or sys.gettrace() is not None:
+        if self._crew is None or sys.gettrace() is not None:
             return self._run_eager()  # under a debugger launchers are called, so that their breakpoints are hit
         return self._run_side_by_side(self._crew)
 
@@ -348,10 +328,8 @@ class Scheduler:
             if stage.changed(name) or self.arrays.version(name) == 0:
                 self.arrays.touch(name)
 
-    def _run_eager(self, receive: Callable[[], None] | None = None) -> dict[str, StageTiming]:
-        """Stage after stage, on this thread."""
-        if receive is not None:
-            receive()
+    def _run_eager(self) -> dict[str, StageTiming]:
+        """Stage after stage, on this thread: on CPU."""
         timings: dict[str, StageTiming] = {}
         for stage, passes in self._stages:
             versions = self._due(stage)
@@ -360,8 +338,7 @@ class Scheduler:
                 continue
             start = self.clock()
             for step in self._begin(stage, passes):
-                # Extents are a saving of the CPU's; elsewhere a pass runs whole, as a captured graph replays it.
-                self._launch(step, step.extent() if step.extent is not None and self.device.is_cpu else None)
+                self._launch(step, None if step.extent is None else step.extent())
             self._seen[stage.name] = versions
             self._publish(stage)
             timings[stage.name] = StageTiming((self.clock() - start) * 1e3, False)
@@ -512,14 +489,11 @@ class Scheduler:
                 for name in [name for name in awaited if name in reads]:
                     own.wait_event(written[name])
                     awaited.remove(name)
-                self._launch_on(own, step)
+                with wp.ScopedStream(own, sync_enter=False):
+                    step.launch(None)
             done = own.record_event()
             written.update(dict.fromkeys(stage.wiring.writes, done))
             stream.wait_event(done)
-
-    def _launch_on(self, stream: Any, step: Pass) -> None:
-        with wp.ScopedStream(stream, sync_enter=False):
-            step.launch(None)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -46,20 +46,18 @@ class Target:
 class PipelineSwitcher:
     """Holds the pipeline that lights the next frame. One thread calls it; another builds."""
 
-    def __init__(
-        self, *, builder: ThreadPoolExecutor | None = None, keep: int = 0, profile: bool = True, **arguments: Any
-    ) -> None:
+    def __init__(self, *, builder: ThreadPoolExecutor | None = None, keep: int = 0, **arguments: Any) -> None:
         """Start without a pipeline.
 
         Args:
             builder: Thread that builds; None makes one that ends with the switcher.
             keep: Pipelines that have lit frames and are kept for coming back to them.
-            profile: As for ``Pipeline``: on CUDA only a pipeline that profiles knows what each stage takes.
             **arguments: For every ``Pipeline``: ``device``, ``bands``, ``estimates``.
         """
         self._own_builder = ThreadPoolExecutor(1, "warp-ar-build") if builder is None else None
         self._builder = builder or self._own_builder
-        self._keep, self._arguments = keep, {"profile": profile, **arguments}
+        # On CUDA only a pipeline that profiles knows what each stage takes.
+        self._keep, self._arguments = keep, {"profile": True, **arguments}
         self._kept: list[Pipeline] = []
         self._wanted: Target | None = None
         self._shown: Target | None = None
@@ -220,21 +218,17 @@ class PipelineSwitcher:
         assert self._builder is not None
         self._builder.submit(let_go, pipeline)
 
-    def _drop_building(self) -> None:
-        if self._building is not None:
-            self._building.add_done_callback(_close_built)
-            self._building = None
-
     def close(self, *, wait: bool = True) -> None:
         """Let every pipeline go. It can be used again, unless its builder was its own.
 
         Args:
             wait: Wait for what is being built; else it goes as soon as it is.
         """
-        building = self._building
-        self._drop_building()
-        if wait and building is not None:
-            building.exception()
+        building, self._building = self._building, None
+        if building is not None:
+            building.add_done_callback(_close_built)
+            if wait:
+                building.exception()
         pipelines = [*self._kept, *([] if self.pipeline is None else [self.pipeline])]
         self._kept.clear()
         self.pipeline = self._wanted = self._shown = self._refused = None

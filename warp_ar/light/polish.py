@@ -83,8 +83,6 @@ class Polish:
     """Likely, least and most; None: it mirrors, but only light that clips in the ball."""
     gain: float
     """Share of the differences between views that are explained."""
-    turned: float
-    """The same of the best of the turned surroundings."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -164,9 +162,7 @@ def estimate_polish(
     most = ROUGHNESS[min(ROUGHNESS.index(wide[-1]) + 1, len(ROUGHNESS) - 1)]
     found = USUAL * float(fits[best].strength[0])
     known = len(fits[best].strength) == 1 or fits[best].strength[1] > CONTRADICTED
-    return Polish(
-        (best, least, most), (found, found / FACTOR, FACTOR * found) if known else None, gains[best], float(turned)
-    )
+    return Polish((best, least, most), (found, found / FACTOR, FACTOR * found) if known else None, gains[best])
 
 
 def _observe(

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Mapping
+import dataclasses
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import warp as wp
 
 from warp_ar.kernels.environment import accumulate
 from warp_ar.kernels.environment.probe_weights import update_places
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring, unobserved
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring, over_rows, unobserved
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.probe_maps import KEPT, OTHERS, UNWRAPPED, find_view, other_maps, other_names, other_views
 
@@ -73,33 +73,17 @@ class Accumulate(Stage):
         view = find_view(arrays, self.wiring.reads[0].removesuffix("_radiance"))
         environment, change, params = find_view(arrays, "environment"), arrays["accumulate_change"], arrays["params"]
 
-        def measure(rows: Rows | None) -> None:
-            accumulate.measure_change(view, environment, change)
-
-        def follow(rows: Rows | None) -> None:
-            accumulate.accumulate_environment(view, change, params, environment, rows=rows)
-
-        def tells() -> bool:
-            return not arrays["ball_covered"]()
-
-        passes = [Pass(measure, enabled=tells), Pass(follow, rows=height, enabled=tells)]
-        return [*passes, *self._follow_others(arrays, tells)]
-
-    def _follow_others(self, arrays: Arrays, tells: Callable[[], bool]) -> list[Pass]:
-        """The same for each ball after the first, and how far each ball is to be trusted."""
-        if not self.features.others:
-            return []
-        height, params = self.request.quality.environment_height, arrays["params"]
-        seen, places = (arrays["probes_seen"], arrays["probes"], params), arrays["probe_places"]
-        passes = [Pass(lambda rows: update_places(*seen, places), enabled=tells)]
-        views, kept = (other_views(self.features, arrays, name) for name in (OTHERS, KEPT))
-        for ball, (view, environment) in enumerate(zip(views, kept, strict=True)):
-            change = arrays["accumulate_others"][ball]
-            known = view, change, params, environment
-            measure = functools.partial(accumulate.measure_change, view, environment, change)
-            follow = functools.partial(accumulate.accumulate_environment, *known)
-            passes += [
-                Pass(lambda rows, measure=measure: measure(), enabled=tells),  # type: ignore[misc]
-                Pass(lambda rows, follow=follow: follow(rows=rows), rows=height, enabled=tells),  # type: ignore[misc]
+        def follow(view: Any, environment: Any, change: Any) -> list[Pass]:
+            return [
+                Pass(lambda rows: accumulate.measure_change(view, environment, change)),
+                over_rows(height, accumulate.accumulate_environment, view, change, params, environment),
             ]
-        return passes
+
+        passes = follow(view, environment, change)
+        if self.features.others:  # how far each ball is to be trusted, and the same for each after the first
+            seen = arrays["probes_seen"], arrays["probes"], params, arrays["probe_places"]
+            passes.append(Pass(lambda rows: update_places(*seen)))
+        others = (other_views(self.features, arrays, name) for name in (OTHERS, KEPT))
+        for ball, (view, environment) in enumerate(zip(*others, strict=True)):
+            passes += follow(view, environment, arrays["accumulate_others"][ball])
+        return [dataclasses.replace(one, enabled=lambda: not arrays["ball_covered"]()) for one in passes]

@@ -70,7 +70,7 @@ class Captured(Stage):
             if self.features.emitters:
                 values["emitters"] = self._emitters
             # Pinned, so that the host does not wait until the device has rendered the frame before.
-            copies.send(values, wp.get_stream(device) if device.is_cuda else None)
+            copies.send(values)
 
         return [Pass(copy, on_host=True)]
 

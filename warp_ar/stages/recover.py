@@ -175,7 +175,7 @@ class Recover(Stage):
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Both sides of the equations on the device, their solution on the host beside it, its effect on the map."""
         self._proxies = trace_variant(trace_config(self.request.scene), device).proxies
-        self._arrays, self._device = arrays, device
+        self._arrays, self._on_cpu = arrays, bool(device.is_cpu)
         arrays["recover_points"].assign(self._surfaces.points)
         self._progress = _Progress(self._new_solver())
         self._asks = self._arrives = self._news = self._follows = False
@@ -191,8 +191,10 @@ class Recover(Stage):
         self._effects = copies("recovered", "cells", "found", "share", "level")
         self._places, self._received = copies("emitters"), copies("emitter_transfer")
         # Streams of its own: beside frames, and beside their capture.
-        self._stream = None if device.is_cpu else wp.Stream(device)
-        self._frames_stream = None if device.is_cpu else wp.get_stream(device)
+        self._stream: Any = None
+        self._frames_stream: Any = None
+        if not self._on_cpu:
+            self._stream, self._frames_stream = wp.Stream(device), wp.get_stream(device)
         height, rows = self.request.quality.environment_height, arrays["recover_cells"].shape[0]
         looks = (
             Pass(self._look_at_card, enabled=lambda: self._asks or self._follows),
@@ -216,7 +218,7 @@ class Recover(Stage):
             ),
             *(one for ball in range(self.features.others) for one in self._relocate(ball)),
         ]
-        if device.is_cpu:
+        if self._on_cpu:
             names = "environment", "recover_published", "recover_difference"
             passes.append(Pass(self._launch(change.measure_difference, *names), rows=height))
         return passes
@@ -371,13 +373,13 @@ class Recover(Stage):
         at_once = waits or now.frames <= EVERY_FRAME
         # On CUDA, and in real time, frames are bound by the interpreter's lock, which a solution in this process holds.
         # On CPU frames take all cores. What is found is the same to the bit.
-        beside = self._real_time or not (waits or self._device.is_cpu)
+        beside = self._real_time or not (waits or self._on_cpu)
         if beside:
             solving.PROCESS.prepare()
         # Where a frame waits, a process that is there already is used; to start one takes longer than most clips.
         beside = solving.PROCESS.ready if waits else beside and not at_once
         # On CPU the frame's values are no copy: the next frame writes where the camera is, beside the worker.
-        camera = self._camera_place() if self._device.is_cpu else None
+        camera = self._camera_place() if self._on_cpu else None
         now.pending = self._worker.submit(self._solve, now.solver, beside, camera)
         if at_once:
             self._take(None)
@@ -467,7 +469,7 @@ class Recover(Stage):
             "recover_share": np.array(estimate.card_share, np.float32),
             "recover_level": np.ones(3, np.float32),
         }
-        self._effects.send(values, self._frames_stream)
+        self._effects.send(values)
         for part in ("card", "upward"):
             asked, then = (self._arrays[f"recover_{part}_{when}"] for when in ("asked", "then"))
             if len(then):
@@ -490,7 +492,7 @@ class Recover(Stage):
         """As ``Fill.changed``; emitters change where an estimate takes effect."""
         if name == "emitters":
             return self._news
-        if name != "environment" or not self._device.is_cpu:
+        if name != "environment" or not self._on_cpu:
             return True
         if not self._arrays["recover_difference"].numpy().max() > 1.0:
             return False

@@ -8,7 +8,9 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_ar.kernels.rays.visibility import VisibleObjects
-from warp_ar.kernels.receiver.surfaces import make_surfaces, trace_surfaces
+from warp_ar.kernels.receiver.surfaces import Surfaces as SurfaceMaps
+from warp_ar.kernels.receiver.surfaces import trace_surfaces
+from warp_ar.kernels.structs import filled
 from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.base import NOT_ASKED, Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring, over_rows
 from warp_ar.stages.features import Features
@@ -50,5 +52,6 @@ class Surfaces(Stage):
         config = trace_variant(trace_config(self.request.scene), device)
         inputs = tuple(arrays[name] for name in ("params", "rays", "ray_scene", "probes"))
         visible = find_visible(arrays) if "hits" in self.wiring.reads else VisibleObjects()
-        out = make_surfaces(*(arrays[name] for name in self.wiring.writes))
+        names = {"index": "surface_ids", "depth": "depth", "normal": "normals", "position": "position"}
+        out = filled(SurfaceMaps(), **{field: arrays[name] for field, name in names.items()})
         return [over_rows(self.height, trace_surfaces, config, *inputs, visible, out)]

@@ -34,7 +34,7 @@ class HostCopies:
                 for name, array in arrays.items()
             }
             self._done, self._begun = wp.Event(device), wp.Event(device)
-            self._used = False
+            self._used, self._frames = False, wp.get_stream(device)
         self._views: dict[str, npt.NDArray[Any]] = {name: host.numpy() for name, host in self._hosts.items()}
 
     def fetch(self, stream: Any, after: Any, count: int | None = None) -> None:
@@ -59,14 +59,15 @@ class HostCopies:
             wait_for(self._done)
         return self._views
 
-    def send(self, values: Mapping[str, npt.NDArray[Any]], stream: Any) -> None:
-        """Begin to copy ``values`` to the device on ``stream``."""
+    def send(self, values: Mapping[str, npt.NDArray[Any]], stream: Any = None) -> None:
+        """Begin to copy ``values`` to the device on a stream; None: that of the frames."""
         if self._done is not None and self._used:
             wait_for(self._done)
         for name, value in values.items():
             self._views[name][...] = value
         if self._done is None:
             return
+        stream = stream or self._frames
         for name in values:
             wp.copy(self._arrays[name], self._hosts[name], stream=stream)
         stream.record_event(self._done)
