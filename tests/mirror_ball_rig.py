@@ -112,7 +112,7 @@ def run(
         lit = irradiance is not None
         forms = DistantLightConfig(trace, models, False, "sh" if lit else "none", lit, True)
         shading = ShadeConfig(forms, kinds(lights), 1)
-        relighting = RelightConfig(method, trace, "sh", True) if lights and proxies else None
+        relighting = RelightConfig(method, trace, "sh") if lights and proxies else None
         config = mirror_ball.MirrorBallConfig(trace, shading if objects else None, relighting, ratio is not None)
     inverse = pose.inverse()
     camera = camera_fields(inverse.translation, inverse.rotation, FOCAL, (H, W))

@@ -83,7 +83,7 @@ class View:
         trace = TraceConfig(
             tuple(sorted({int(item["kind"]) for item in objects})), kinds if scene is None else (BOX, PLANE, MESH)
         )
-        self.relight = RelightConfig("reflectance", trace, "sh" if irradiance is None else "map", bool(probes), **forms)
+        self.relight = RelightConfig("reflectance", trace, "sh" if irradiance is None else "map", **forms)
         self.config = self.relight
         self.size = size
         self.params = records(

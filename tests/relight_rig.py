@@ -62,7 +62,6 @@ def run(
         method,
         TraceConfig(tuple(sorted({o["kind"] for o in objects})), tuple(sorted({p["kind"] for p in proxies}))),
         "sh" if irradiance_map is None else "map",
-        bool(probes),
         several=others is not None,
     )
     params = records(FrameParams, {"camera_position": CAMERA, "world_from_camera": LOOK_DOWN, "light_rect": rect})
@@ -112,7 +111,7 @@ def run_edges(
         (np.arange(width) - (width - 1) / 2) / (60 * detail), (np.arange(height) - (height - 1) / 2) / (60 * detail)
     )
     kinds = [tuple(sorted({s["kind"] for s in shapes})) for shapes in (objects, proxies)]
-    config = RelightConfig("reflectance", TraceConfig(*kinds), "sh", bool(probes), soft=soft, edge_samples=samples)
+    config = RelightConfig("reflectance", TraceConfig(*kinds), "sh", soft=soft, edge_samples=samples)
     place = {"camera_position": CAMERA, "world_from_camera": LOOK_DOWN, "light_rect": rect, "focal": (60, 60)}
     params = records(FrameParams, place)
     scene = RayScene()

@@ -41,8 +41,8 @@ FLOAT = 1e-4
 
 
 @functools.cache
-def make_find_kernel(probes):
-    find_in_frame = make_find_in_frame(TraceConfig((), (PLANE, BOX)), probes)
+def make_find_kernel():
+    find_in_frame = make_find_in_frame(TraceConfig((), (PLANE, BOX)))
 
     @wp.kernel(module="unique", enable_backward=False)
     def find_kernel(
@@ -86,7 +86,7 @@ def find(points, normals, scale=1.0, shift=(0.0, 0.0, 0.0), proxies=(), ball=Non
     balls = [] if ball is None else [{"center": scale * np.array(ball[0]) + shift, "radius": scale * ball[1]}]
     out = wp.zeros(len(points), wp.vec2)
     wp.launch(
-        make_find_kernel(bool(balls)),
+        make_find_kernel(),
         dim=len(points),
         inputs=[
             camera,

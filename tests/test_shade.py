@@ -32,7 +32,7 @@ EVERYTHING = ShadeConfig(
         textures=True,
         diffuse="sh",
         specular=True,
-        probes=False,
+        known=False,
     ),
     lights=(structs.POINT, structs.SPOT, structs.DIRECTIONAL),
     edge_samples=4,

@@ -255,7 +255,7 @@ def make_look_near(config: NearFieldConfig) -> wp.Function:
     footprint_of = make_footprint_of(config)
     trace = make_trace(config.distant.trace)
     closest_object, closest_proxy = trace.closest_object, trace.closest_proxy
-    find_in_frame = make_find_in_frame(config.distant.trace, config.distant.probes)
+    find_in_frame = make_find_in_frame(config.distant.trace)
     shade_unoccluded = make_shade_unoccluded(config.distant)
 
     @wp.func(module="unique")

@@ -62,28 +62,25 @@ class DistantLightConfig:
     """Source of the environment's irradiance: nine coefficients, a latlong map, or nowhere."""
     specular: bool
     """True if the prefiltered environment is read."""
-    probes: bool
-    """True if there are mirror balls, which hide the receiver."""
+    known: bool
+    """True if the environment is known, from mirror balls or from a file."""
     emitters: bool = False
     """True if emitters of the environment are known by their places."""
-    captured: bool = False
-    """True if the environment is known without mirror balls, from a file."""
     several: bool = False
     """True if the light is interpolated between that of several mirror balls."""
     gathered: bool = True
     """True if rays that happen to meet what emits bring its light; else ``area_lights`` are looked for themselves."""
 
     def general(self, form: DiffuseForm) -> DistantLightConfig:
-        """For any scene with as many mirror balls, textures or not: forms that it does not call for may be empty.
+        """For any scene, textures or not: forms that it does not call for may be empty.
 
         Args:
             form: Where irradiance comes from in scenes that call for it.
         """
         models = tuple(sorted(map(int, (LAMBERT, PHONG, MIRROR, METALLIC_ROUGHNESS))))
-        known = self.probes or self.captured
-        diffuse: DiffuseForm = form if known else "none"
+        diffuse: DiffuseForm = form if self.known else "none"
         trace = self.trace.general()
-        return dataclasses.replace(self, trace=trace, models=models, diffuse=diffuse, specular=known)
+        return dataclasses.replace(self, trace=trace, models=models, diffuse=diffuse, specular=self.known)
 
 
 @wp.struct
@@ -138,7 +135,7 @@ def knows_levels(distant: DistantLight) -> wp.bool:
 
 
 @functools.cache
-def make_find_in_frame(trace: TraceConfig, probes: bool) -> wp.Function:
+def make_find_in_frame(trace: TraceConfig) -> wp.Function:
     """``find_in_frame(params, picture, scene, probes, hit) -> vec2``: (x, y) of a point of a proxy, or x = -1."""
     occluded_by_proxies = make_trace(trace).occluded_by_proxies
 
@@ -159,9 +156,8 @@ def make_find_in_frame(trace: TraceConfig, probes: bool) -> wp.Function:
             return nowhere
         if occluded_by_proxies(scene, params.camera_position, from_camera, 1.0 - HIDDEN_MARGIN):
             return nowhere
-        if wp.static(probes):
-            if meets_probe(balls, params.camera_position, from_camera, 1.0 - HIDDEN_MARGIN):
-                return nowhere
+        if meets_probe(balls, params.camera_position, from_camera, 1.0 - HIDDEN_MARGIN):
+            return nowhere
         return wp.vec2(at[0], at[1])
 
     return find_in_frame

@@ -53,7 +53,7 @@ def make_primary(config: TraceConfig) -> wp.Function:
 
 
 @functools.cache
-def make_visible_proxy(config: TraceConfig, probes: bool) -> wp.Function:
+def make_visible_proxy(config: TraceConfig) -> wp.Function:
     """``visible_proxy(params, ray, scene, probes) -> Hit``: the proxy that a pixel shows, or shape -1.
 
     A face that is seen from behind, or a mirror ball before it, is not what the camera sees of it.
@@ -67,9 +67,8 @@ def make_visible_proxy(config: TraceConfig, probes: bool) -> wp.Function:
         if hit.shape >= 0:
             if wp.dot(hit.geometric_normal, direction) >= 0.0:
                 hit.shape = -1
-            if wp.static(probes):
-                if meets_probe(balls, params.camera_position, direction, hit.t):
-                    hit.shape = -1
+            if meets_probe(balls, params.camera_position, direction, hit.t):
+                hit.shape = -1
         return hit
 
     return visible_proxy

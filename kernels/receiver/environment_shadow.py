@@ -243,10 +243,9 @@ def make_masks(config: EnvironmentShadowConfig, count: int) -> tuple[wp.Function
             elif shape.kind != BOX or index != own:
                 cone = mask_cone(sets, first, point, shape.position - point, bounding_radius(shape))
                 mask.proxies = mask.proxies | cone
-        if wp.static(config.distant.probes):
-            for index in range(distant.probes.shape[0]):
-                probe = distant.probes[index]
-                mask.balls = mask.balls | mask_cone(sets, first, point, probe.center - point, probe.radius)
+        for index in range(distant.probes.shape[0]):
+            probe = distant.probes[index]
+            mask.balls = mask.balls | mask_cone(sets, first, point, probe.center - point, probe.radius)
         return mask
 
     return mask_objects, mask_physical
@@ -303,7 +302,7 @@ def make_find_sender(config: EnvironmentShadowConfig) -> wp.Function:
     """
     closest_proxy = make_trace(config.distant.trace).closest_proxy
     traced = config.bounce == "traced"
-    find_in_frame = make_find_in_frame(config.distant.trace, config.distant.probes) if traced else None
+    find_in_frame = make_find_in_frame(config.distant.trace) if traced else None
     look_wide = make_look_wide(config.distant)
 
     @wp.func(module="unique")
@@ -343,16 +342,15 @@ def make_find_sender(config: EnvironmentShadowConfig) -> wp.Function:
                     else:
                         from_ball = sample_latlong(distant.environment, toward)
                     sender.radiance = wp.min(from_ball, wp.vec3(1.0, 1.0, 1.0))
-        if wp.static(config.distant.probes):
-            if by_ball:
-                for ball in range(distant.probes.shape[0]):
-                    probe = distant.probes[ball]
-                    t = intersect_sphere(probe.radius, ray.origin - probe.center, ray.direction, sender.distance)
-                    if t < sender.distance:
-                        sender.distance = t
-                        normal = (ray.origin + t * ray.direction - probe.center) / probe.radius
-                        wi = reflect(-ray.direction, normal)
-                        sender.radiance = wp.cw_mul(probe.reflectance, look_wide(distant, probe.center, wi))
+        if by_ball:
+            for ball in range(distant.probes.shape[0]):
+                probe = distant.probes[ball]
+                t = intersect_sphere(probe.radius, ray.origin - probe.center, ray.direction, sender.distance)
+                if t < sender.distance:
+                    sender.distance = t
+                    normal = (ray.origin + t * ray.direction - probe.center) / probe.radius
+                    wi = reflect(-ray.direction, normal)
+                    sender.radiance = wp.cw_mul(probe.reflectance, look_wide(distant, probe.center, wi))
         return sender
 
     return find_sender
@@ -364,7 +362,7 @@ def make_environment_shadow_kernel(config: EnvironmentShadowConfig) -> wp.Kernel
     trace = make_trace(config.distant.trace)
     closest_object, occluded_by_objects = trace.closest_object, trace.occluded_by_objects
     mask_objects, mask_physical = make_masks(config, min(config.count, CHUNK))
-    visible_proxy = make_visible_proxy(config.distant.trace, config.distant.probes)
+    visible_proxy = make_visible_proxy(config.distant.trace)
     aim, find_sender = make_aim(config.emitters, config.distant.several), make_find_sender(config)
     traced = config.bounce == "traced"
     look_before = None if traced else make_look_before(config.distant)

@@ -213,7 +213,7 @@ def make_reflect_traced(config: DistantLightConfig) -> wp.Function:
     closest_object, closest_proxy = trace.closest_object, trace.closest_proxy
     occluded_by_objects = trace.occluded_by_objects
     surface_at = make_surface(config.models, config.textures)
-    find_in_frame = make_find_in_frame(config.trace, config.probes)
+    find_in_frame = make_find_in_frame(config.trace)
     shade_unoccluded = make_shade_unoccluded(config)
     reflected_radiance = make_reflected_radiance(config)
     distant_irradiance, captured_along = make_distant_irradiance(config), make_radiance_along(config, captured=True)

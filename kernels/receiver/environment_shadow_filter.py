@@ -181,7 +181,7 @@ def ratio_between(cells: ShadowCells, key: wp.int32, y: wp.float32, x: wp.float3
 @functools.cache
 def make_spread_ratio_kernel(config: DistantLightConfig) -> wp.Kernel:
     """Kernel of ``spread_ratio``, specialised to ``config``."""
-    visible_proxy = make_visible_proxy(config.trace, config.probes)
+    visible_proxy = make_visible_proxy(config.trace)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def spread_ratio_kernel(
@@ -258,7 +258,7 @@ def spread_ratio(
         params: (1,) FrameParams: camera, shadow_rect, frame_index.
         rays: (H, W) undistorted (x / z, y / z) of each pixel's centre.
         scene: Proxies.
-        probes: Mirror balls; needed if ``config.distant.probes``.
+        probes: Mirror balls.
         cells: From ``filter_ratio``. Without changed, every pixel is looked at.
         shadow_ratio_out: (H, W) factor on the frame; 1 outside the rectangle and where no proxy is seen.
         rows: Band of rows; None means all.

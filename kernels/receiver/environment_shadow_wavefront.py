@@ -102,7 +102,7 @@ def make_find_occluded_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
     mask_objects, mask_physical = make_masks(config, size)
     aim, trace = make_aim(config.emitters, config.distant.several), make_trace(config.distant.trace)
     closest_proxy, occluded_by_objects = trace.closest_proxy, trace.occluded_by_objects
-    visible_proxy = make_visible_proxy(config.distant.trace, config.distant.probes)
+    visible_proxy = make_visible_proxy(config.distant.trace)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def find_occluded_kernel(
@@ -154,13 +154,12 @@ def make_find_occluded_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
                         if (physical.proxies & bit) != wp.uint64(0):
                             proxy = closest_proxy(scene, ray.origin, ray.direction, ray.distance)
                             ray.distance = wp.min(ray.distance, proxy.t)
-                        if wp.static(config.distant.probes):
-                            if (physical.balls & bit) != wp.uint64(0):
-                                for index in range(distant.probes.shape[0]):
-                                    probe = distant.probes[index]
-                                    from_ball = ray.origin - probe.center
-                                    t = intersect_sphere(probe.radius, from_ball, ray.direction, ray.distance)
-                                    ray.distance = wp.min(ray.distance, t)
+                        if (physical.balls & bit) != wp.uint64(0):
+                            for index in range(distant.probes.shape[0]):
+                                probe = distant.probes[index]
+                                from_ball = ray.origin - probe.center
+                                t = intersect_sphere(probe.radius, from_ball, ray.direction, ray.distance)
+                                ray.distance = wp.min(ray.distance, t)
                         if occluded_by_objects(scene, ray.origin, ray.direction, ray.distance):
                             found = found | (wp.uint32(1) << wp.uint32(k - begin))
                             if k < secondary_count:
@@ -194,7 +193,7 @@ def make_sum_light_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
     size = config.count // config.partials
     side = config.side
     _, mask_physical = make_masks(config, size)
-    visible_proxy = make_visible_proxy(config.distant.trace, config.distant.probes)
+    visible_proxy = make_visible_proxy(config.distant.trace)
     aim, find_sender = make_aim(config.emitters, config.distant.several), make_find_sender(config)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
@@ -255,7 +254,7 @@ def make_trace_secondary_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
     side = config.side
     aim = make_aim(config.emitters, config.distant.several)
     closest_object = make_trace(config.distant.trace).closest_object
-    visible_proxy = make_visible_proxy(config.distant.trace, config.distant.probes)
+    visible_proxy = make_visible_proxy(config.distant.trace)
     traced = config.bounce == "traced"
     look_before = None if traced else make_look_before(config.distant)
     reflect_back = make_reflect_back(config.distant, traced)

@@ -155,7 +155,7 @@ def make_follow(config: GlossConfig) -> wp.Function:
     trace = make_trace(config.trace)
     closest_object, closest_proxy = trace.closest_object, trace.closest_proxy
     shade_hit = make_shade_hit(config.shade) if config.shade is not None else None
-    find_in_frame = make_find_in_frame(config.trace, True)
+    find_in_frame = make_find_in_frame(config.trace)
 
     @wp.func(module="unique")
     def follow(

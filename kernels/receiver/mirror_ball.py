@@ -114,7 +114,7 @@ def make_mirrored_change(config: MirrorBallConfig) -> wp.Function:
     reflect_at_ball = make_reflect_at_ball(config)
     shade_hit = make_shade_hit(config.shade) if config.shade is not None else None
     direct_lighting = make_direct_lighting(config.relight) if config.relight is not None else None
-    find_in_frame = make_find_in_frame(config.trace, True)
+    find_in_frame = make_find_in_frame(config.trace)
 
     @wp.func(module="unique")
     def mirrored_change(

@@ -86,8 +86,6 @@ class RelightConfig:
     """Kinds of shape in the scene."""
     irradiance: Literal["sh", "map"] = "sh"
     """Form of the environment's irradiance, for ``reflectance``."""
-    probes: bool = False
-    """True if there are mirror balls, which hide the receiver and throw shadows of virtual light."""
     soft: bool = False
     """True if lights with a radius cast soft shadows; those of mirror balls stay hard."""
     emitters: bool = False
@@ -304,7 +302,7 @@ def make_receiver(
     Args:
         config: Method and forms of light.
         picture: (H, W) the camera's.
-        probes: (p,) Probe; needed if ``config.probes``.
+        probes: (p,) Probe, mirror balls, which hide the receiver and throw shadows of virtual light.
         key_lights: (k,) KeyLight, brightest first; needed by the paper's blend.
         irradiance: Irradiance of the environment, nine coefficients or a latlong map as ``config.irradiance`` says;
             needed by ``reflectance``.

@@ -152,7 +152,7 @@ class Hider:
 def make_find_hider(config: RelightConfig) -> wp.Function:
     """``find_hider(params, scene, receiver, hit, toward, solids) -> Hider``; ``solids`` of ``bound_solids``."""
     mean_facing = make_mean_facing(config)
-    find_in_frame = make_find_in_frame(config.trace, config.probes)
+    find_in_frame = make_find_in_frame(config.trace)
     closest_proxy = make_trace(config.trace).closest_proxy
     only_planes = set(config.trace.proxies) <= {PLANE}
 
@@ -206,7 +206,7 @@ def is_shone_on(lights: wp.array[Light], hit: Hit) -> wp.bool:
 @functools.cache
 def make_ambient_visibility_kernel(config: RelightConfig) -> wp.Kernel:
     """Kernel of ``estimate_ambient_visibility``."""
-    visible_proxy = make_visible_proxy(config.trace, config.probes)
+    visible_proxy = make_visible_proxy(config.trace)
     find_hider = make_find_hider(config)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
@@ -316,7 +316,7 @@ def make_sent_by_object(trace: TraceConfig) -> wp.Function:
 @functools.cache
 def make_send_light_kernel(config: RelightConfig) -> wp.Kernel:
     """Kernel of ``send_light``."""
-    visible_proxy = make_visible_proxy(config.trace, config.probes)
+    visible_proxy = make_visible_proxy(config.trace)
     direct_lighting = make_direct_lighting(dataclasses.replace(config, bounced=False))
     has_objects = bool(config.trace.objects)
     closest_object = make_trace(config.trace).closest_object
@@ -398,7 +398,7 @@ def list_patches_kernel(
 @functools.cache
 def make_gather_light_kernel(config: RelightConfig) -> wp.Kernel:
     """Kernel of ``gather_light``."""
-    visible_proxy = make_visible_proxy(config.trace, config.probes)
+    visible_proxy = make_visible_proxy(config.trace)
     mean_facing = make_mean_facing(config)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)

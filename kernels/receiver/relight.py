@@ -91,9 +91,8 @@ def make_area_response(config: RelightConfig) -> wp.Function:
             light.distance = area.distance
             if not is_lit(scene, hit.point, hit.geometric_normal, hit.error, light):
                 continue
-            if wp.static(config.probes):
-                if meets_probe(receiver.probes, hit.point, area.wi, area.distance):
-                    continue
+            if meets_probe(receiver.probes, hit.point, area.wi, area.distance):
+                continue
             total += respond(matter, area.wi, n_dot_l) * area.irradiance_normal
         return total
 
@@ -145,10 +144,9 @@ def make_direct_lighting(config: RelightConfig) -> wp.Function:
                 if not is_lit(scene, hit.point, hit.geometric_normal, hit.error, light):
                     result.visibility |= bit
                     continue
-            if wp.static(config.probes):
-                if meets_probe(receiver.probes, hit.point, light.wi, light.distance):
-                    result.visibility |= bit
-                    continue
+            if meets_probe(receiver.probes, hit.point, light.wi, light.distance):
+                result.visibility |= bit
+                continue
             result.visibility |= _LIT
             if wp.static(config.method != "flat"):
                 if not known:
@@ -217,11 +215,10 @@ def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
         # A face that is seen from behind is not the surface that the camera sees.
         if hit.shape < 0 or wp.dot(hit.geometric_normal, direction) >= 0.0:
             return
-        if wp.static(config.probes):
-            if meets_probe(receiver.probes, params[0].camera_position, direction, hit.t):
-                if wp.static(config.edge_samples > 1):
-                    visibility_out[i, j] = _BALL
-                return
+        if meets_probe(receiver.probes, params[0].camera_position, direction, hit.t):
+            if wp.static(config.edge_samples > 1):
+                visibility_out[i, j] = _BALL
+            return
         lit = direct_lighting(scene, lights, receiver, hit, i, j, black, tile_turn(i, j))
         added_out[i, j] = lit.added
         if wp.static(config.edge_samples > 1):
@@ -277,9 +274,8 @@ def make_sample_lighting(config: RelightConfig) -> wp.Function:
     ) -> wp.vec4:
         direction = sample_direction(params, receiver.picture.rays[row, col], sample)
         hit = closest_proxy(scene, params[0].camera_position, direction, FAR)
-        if wp.static(config.probes):
-            if meets_probe(receiver.probes, params[0].camera_position, direction, hit.t):
-                return wp.vec4(0.0)
+        if meets_probe(receiver.probes, params[0].camera_position, direction, hit.t):
+            return wp.vec4(0.0)
         if hit.shape < 0 or wp.dot(hit.geometric_normal, direction) >= 0.0:
             return wp.vec4(0.0, 0.0, 0.0, 1.0)
         lit = direct_lighting(scene, lights, receiver, hit, row, col, wp.vec3(), tile_turn(row, col))

@@ -144,7 +144,7 @@ def make_hidden_by_physical(trace: TraceConfig) -> wp.Function:
 @functools.cache
 def make_see_in_frame(trace: TraceConfig) -> wp.Function:
     """``see_in_frame(params, scene, hit) -> Seen``: a proxy's point where the frame shows it, bilinear."""
-    find_in_frame = make_find_in_frame(trace, True)
+    find_in_frame = make_find_in_frame(trace)
 
     @wp.func(module="unique")
     def see_in_frame(params: FrameParams, scene: LocalScene, hit: Hit) -> Seen:

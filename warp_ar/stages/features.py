@@ -273,9 +273,8 @@ def _find_forms(
         textures=is_detailed(scene),
         diffuse=form if environment and diffuse else "none",
         specular=environment and (any(map(reflects_glossily, materials)) or "reflected" in layers),
-        probes=bool(scene.probes),
+        known=environment,
         emitters=emitters,
-        captured=scene.captured is not None,
         several=several,
         gathered=gathered,
     )

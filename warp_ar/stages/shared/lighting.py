@@ -169,7 +169,6 @@ def relight_config(features: Features) -> RelightConfig:
         "reflectance" if method in LOCAL else method,
         trace_config(features.request.scene),
         "sh" if features.irradiance == "irradiance_sh" else "map",
-        bool(features.request.scene.probes),
         features.soft_lights,
         method in MEASURED and features.emitters,
         features.ambient_visibility,
