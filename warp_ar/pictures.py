@@ -7,14 +7,14 @@ import io
 import os
 import struct
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 import PIL.Image
-from PIL import BmpImagePlugin, ExifTags, GifImagePlugin, ImageCms, PpmImagePlugin, WebPImagePlugin
+from PIL import BmpImagePlugin, ExifTags, GifImagePlugin, ImageCms, JpegImagePlugin, PpmImagePlugin, WebPImagePlugin
 
 from warp_ar.errors import WarpArError, reason
 from warp_ar.files import check_size, read_bytes
@@ -246,35 +246,6 @@ def _png(data: bytes) -> Size:
     return width, height
 
 
-def jpeg_segments(data: bytes) -> Iterator[tuple[int, int]]:
-    """Marker and place of each segment of a JPEG that has a length, up to its pixels, or to what is no segment."""
-    at = 2
-    while at + 4 <= len(data) and data[at] == 0xFF:
-        marker = data[at + 1]
-        if marker == 0xFF:  # filling
-            at += 1
-        elif marker == 0x01 or 0xD0 <= marker <= 0xD8:  # without a length
-            at += 2
-        elif marker in (0xD9, 0xDA):  # the end, or pixels
-            return
-        else:
-            yield marker, at
-            length = struct.unpack_from(">H", data, at + 2)[0]
-            if length < 2:
-                return
-            at += 2 + length
-
-
-def _jpeg(data: bytes) -> Size | None:
-    for marker, at in jpeg_segments(data):
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-            if at + 9 > len(data):
-                return None
-            height, width = struct.unpack_from(">HH", data, at + 5)
-            return width, height
-    return None
-
-
 def _tiff_tags(data: bytes) -> dict[int, int]:
     """Return the first value of those tags of a TIFF's first picture that are whole numbers."""
     order = "<" if data[:2] == b"II" else ">"
@@ -310,6 +281,7 @@ def _by_pillow(data: bytes) -> Size:
 
 
 _PILLOW: dict[bytes, Any] = {
+    b"\xff\xd8": JpegImagePlugin.JpegImageFile,
     b"BM": BmpImagePlugin.BmpImageFile,
     b"RIFF": WebPImagePlugin.WebPImageFile,
     b"GIF8": GifImagePlugin.GifImageFile,
@@ -317,7 +289,6 @@ _PILLOW: dict[bytes, Any] = {
 }
 _READERS: dict[bytes, Callable[[bytes], Size | None]] = {
     b"\x89PNG\r\n\x1a\n": _png,
-    b"\xff\xd8": _jpeg,
     **dict.fromkeys(_TIFF_STARTS, _tiff),
     **dict.fromkeys(_PILLOW, _by_pillow),
 }

@@ -70,9 +70,7 @@ class MeshPart:
         Raises:
             SceneError: A vertex is not finite or a face has an index out of range.
         """
-        if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
-            wrong = int(faces.max() if faces.max() >= len(vertices) else faces.min())
-            raise SceneError(f"{label}: a face has vertex index {wrong}; there are {len(vertices)} vertices from 0 on")
+        check_indices(label, faces, len(vertices))
         finite = (np.abs(vertices) < LARGEST).all(axis=1)
         if not finite.all():
             row = int(np.argmin(finite))
@@ -158,6 +156,17 @@ class MeshPart:
             along = unit_or(np.einsum("nij,nj->ni", linear, tangents[:, :3]), tangents[:, :3])
             tangents = np.concatenate([along, tangents[:, 3:]], axis=1)
         return dataclasses.replace(self, vertices=vertices, normals=normals, tangents=tangents)
+
+
+def check_indices(label: str, index: npt.NDArray[np.int64], count: int) -> None:
+    """Check that faces name vertices of which there are ``count``.
+
+    Raises:
+        SceneError: They do not; ``label`` stands in the message.
+    """
+    if index.size and not (index.min() >= 0 and index.max() < count):
+        wrong = int(index.max() if index.max() >= count else index.min())
+        raise SceneError(f"{label}: a face has vertex index {wrong}; there are {count} vertices from 0 on")
 
 
 def strip_triangles(indices: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import difflib
 import json
+import math
 import re
 from collections.abc import Iterable
-from typing import Final
+from typing import Any, Final
 
 # Beyond these a square leaves single precision.
 LARGEST, SMALLEST = 1e18, 1e-18
@@ -25,6 +26,14 @@ def show_value(value: object) -> str:
 def show_key(key: str) -> str:
     """A key as a TOML file would have it, on one line and not too long."""
     return key if re.fullmatch(r"[A-Za-z0-9_-]{1,60}", key) else show_value(key)
+
+
+def is_number(value: Any) -> bool:
+    """Return whether a word or value is a finite number."""
+    try:
+        return math.isfinite(float(value))
+    except (TypeError, ValueError):
+        return False
 
 
 def nearest(word: str, known: Iterable[str]) -> str:

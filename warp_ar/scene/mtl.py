@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import math
 import re
 from typing import Any, Final, cast
 
@@ -31,6 +30,7 @@ from warp_ar.scene.materials import (
     Wrap,
 )
 from warp_ar.scene.mesh_source import MeshSource
+from warp_ar.scene.messages import is_number
 
 ByteArray = npt.NDArray[np.uint8]
 
@@ -122,7 +122,7 @@ class _Library:
                 or (key == "map_ka" and "map_kd" in self._values)
                 or not isinstance(words, list)
             )
-            if not shown and not (all(map(_is_number, words)) and set(map(float, words)) == nothing):
+            if not shown and not (all(map(is_number, words)) and set(map(float, words)) == nothing):
                 self._source.note(f"the key {key[:40]} of materials")
         color = self._map("map_kd", color=True)
         white = (1.0, 1.0, 1.0)
@@ -224,7 +224,7 @@ class _Library:
                 name.append(word)
                 continue
             most = _OPTIONS.get(option, 3)
-            numbers = list(itertools.takewhile(_is_number, rest[:most]))
+            numbers = list(itertools.takewhile(is_number, rest[:most]))
             said[option] = numbers if most == 3 else rest[:most]
             del rest[: len(said[option])]
             unchanged = _NOT_FOLLOWED.get(option, ("", said[option]))[1]
@@ -242,7 +242,7 @@ class _Library:
             (su, 0.0, ou, 0.0, sv, ov),
             said.get("-clamp", ["off"])[0].lower() == "on",
             {"r": 0, "g": 1, "b": 2, "m": 3}.get(channel),
-            float(strength) if _is_number(strength) else 1.0,
+            float(strength) if is_number(strength) else 1.0,
         )
 
     def _color(self, key: str, default: RGB, most: float = 1.0) -> RGB:
@@ -259,16 +259,9 @@ class _Library:
         if words[:1] == ["-halo"]:
             self._source.note("-halo of d")
             words = words[1:]
-        if words and (len(words) not in counts or not all(map(_is_number, words))):
+        if words and (len(words) not in counts or not all(map(is_number, words))):
             self._source.note(f"{key} {' '.join(map(str, words))[:40]}, which is not {counts[-1]} numbers")
             return []
         if any(not low <= float(word) <= high for word in words):
             self._source.note(f"{key} beyond {low:g} to {high:g}")
         return [min(max(float(word), low), high) for word in words]
-
-
-def _is_number(value: object) -> bool:
-    try:
-        return math.isfinite(float(cast(Any, value)))
-    except (TypeError, ValueError):
-        return False

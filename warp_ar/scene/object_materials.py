@@ -31,7 +31,7 @@ from warp_ar.scene.materials import (
 )
 from warp_ar.scene.mesh_files import load_mesh, load_moving_mesh, mesh_from_trimesh
 from warp_ar.scene.node_animation import MovingMesh
-from warp_ar.scene.textures import load_emission
+from warp_ar.scene.textures import file_stamp, load_emission
 
 _LOG = logging.getLogger(__name__)
 _NO_FILE = (MeshMaterial(),)
@@ -138,15 +138,6 @@ def _read_moving(path: Path, stamp: tuple[int, int], animation: str | int) -> Mo
     if moving.rest.notes:
         _say(path, moving.rest.notes)
     return moving
-
-
-def file_stamp(path: Path) -> tuple[int, int]:
-    """Return a stamp that differs once a file has changed."""
-    try:
-        status = path.stat()
-    except OSError:
-        return 0, 0  # reading it says what is wrong
-    return status.st_mtime_ns, status.st_size
 
 
 def file_mesh(path: Path) -> Mesh:

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from warp_ar.errors import SceneError
 from warp_ar.scene.materials import LambertMaterial, MeshMaterial, TextureUse
-from warp_ar.scene.mesh_parts import MeshPart, strip_triangles
+from warp_ar.scene.mesh_parts import MeshPart, check_indices, strip_triangles
 from warp_ar.scene.mesh_source import MeshSource
 from warp_ar.scene.mtl import parse_library, read_library
 from warp_ar.srgb import decode_srgb
@@ -63,9 +63,7 @@ class Corners:
             SceneError: They are not.
         """
         index = self.vertex
-        if index.size and not (index.min() >= 0 and index.max() < count):
-            wrong = int(index.max() if index.max() >= count else index.min())
-            raise SceneError(f"{source.path}: a face has vertex index {wrong}; there are {count} vertices from 0 on")
+        check_indices(f"{source.path}", index, count)
         if self.uv is None and self.vertex_uv is not None:
             self.uv = self.vertex_uv[index]
         if self.normal is None and self.vertex_normal is not None:

@@ -22,6 +22,7 @@ from warp_ar.files import limits, parse_json, read_bytes, read_text, too_much
 from warp_ar.scene.description import PoseSpec
 from warp_ar.scene.fields import Vec3
 from warp_ar.scene.geometry import quaternion_matrix, rotation_matrix
+from warp_ar.scene.messages import is_number
 
 RawPose = tuple[tuple[float, ...], Vec3]
 """R, 9 numbers row by row, and t in metres: ``camera_from_world``, OpenCV's axes."""
@@ -185,24 +186,16 @@ def _read_colmap(path: Path, text: str) -> list[tuple[str, RawPose]]:
         words = line.split(maxsplit=9)
         count = len(line.split())
         # A line of points has triples of numbers.
-        named = count >= 10 and not (count % 3 == 0 and all(map(_is_number, line.split())))
+        named = count >= 10 and not (count % 3 == 0 and all(map(is_number, line.split())))
         if line.lstrip().startswith("#") or (of_points and not named) or (not words and not of_points):
             of_points = of_points and line.lstrip().startswith("#")
             continue
         label = f"{path}: image {len(found)}"
-        if not named or not all(map(_is_number, words[:9])):
+        if not named or not all(map(is_number, words[:9])):
             raise SceneError(f"{label}: expected ID QW QX QY QZ TX TY TZ CAMERA NAME, as COLMAP writes")
         found.append((words[9], _colmap_pose(label, [float(word) for word in words[1:8]])))
         of_points = True
     return found
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 def _read_colmap_binary(path: Path) -> list[tuple[str, RawPose]]:

@@ -116,6 +116,15 @@ RADIANCE_SUFFIXES: Final = (".exr", ".hdr")
 """Suffixes of files with linear radiance."""
 
 
+def file_stamp(path: Path) -> tuple[int, int]:
+    """Return a stamp that differs once a file has changed."""
+    try:
+        status = path.stat()
+    except OSError:
+        return 0, 0  # reading it says what is wrong
+    return status.st_mtime_ns, status.st_size
+
+
 def load_emission(path: Path) -> tuple[npt.NDArray[np.uint8], float]:
     """A picture to emit, kept as long as the file is the same.
 
@@ -128,12 +137,7 @@ def load_emission(path: Path) -> tuple[npt.NDArray[np.uint8], float]:
     Raises:
         SceneError: The file is missing, no such picture, too large, or holds a value that is not finite or negative.
     """
-    try:
-        status = path.stat()
-        stamp = status.st_mtime_ns, status.st_size
-    except OSError:
-        stamp = 0, 0  # reading it says what is wrong
-    return _load(path, stamp)
+    return _load(path, file_stamp(path))
 
 
 @functools.lru_cache(maxsize=4)

@@ -39,8 +39,9 @@ from warp_ar.scene import (
 from warp_ar.scene.geometry import rotation_matrix
 from warp_ar.scene.materials import MATERIALS
 from warp_ar.scene.mesh_files import GLTF_SUFFIXES, animations_of
-from warp_ar.scene.object_materials import file_stamp, mesh_of, moving_mesh_of
+from warp_ar.scene.object_materials import mesh_of, moving_mesh_of
 from warp_ar.scene.scene_files import files_of
+from warp_ar.scene.textures import file_stamp
 from warp_ar.stages import STAGES
 from warp_ar.stages.quality import Quality
 from warp_ar.tracking.card_layout import RINGS, SHEET, ball_center
