@@ -4,26 +4,32 @@ from __future__ import annotations
 
 import base64
 import dataclasses
+import fractions
 import io
 import json
 import pathlib
 import struct
+import sys
 from typing import Any
 
+import av
 import cv2
 import numpy as np
 import OpenEXR
 import pytest
-from PIL import Image
+from PIL import Image, PngImagePlugin
 
 from docs.tables import formats
 from tests.gltf_files import SQUARE, SQUARE_FACES, SQUARE_UVS, Gltf
-from tests.test_foreign_files import adobe_profile
-from warp_ar.errors import SceneError
+from tests.test_foreign_files import adobe_profile, photograph
+from warp_ar.errors import SceneError, WarpArError
 from warp_ar.exr_file import read_linear_picture
 from warp_ar.scene import load_calibration
+from warp_ar.scene.exif import camera_by_exif
 from warp_ar.scene.mesh_files import load_mesh, load_moving_mesh
 from warp_ar.scene.pose_file import load_pose_file
+from warp_ar.sources.frame_folder import read_frame
+from warp_ar.sources.video_file import VideoFile
 
 NOT_HERE = {
     "axes taken": "test_linear_pictures",  # of lights, not of pictures
@@ -99,6 +105,32 @@ def profiled() -> bytes:
     data = io.BytesIO()
     Image.new("RGB", (2, 2), (160, 90, 47)).save(data, "PNG", icc_profile=adobe_profile())
     return data.getvalue()
+
+
+def encoded(suffix: str, cicp: tuple[int, int] = (1, 13)) -> bytes:
+    """A picture of noise; ``cicp``: primaries and transfer of a PNG."""
+    data, said = io.BytesIO(), PngImagePlugin.PngInfo()
+    said.add(b"cICP", bytes([*cicp, 0, 1]))
+    picture = Image.fromarray(np.random.default_rng(1).integers(0, 255, (32, 32, 3), np.uint8))
+    picture.save(data, Image.registered_extensions()[suffix], **({"pnginfo": said} if suffix == ".png" else {}))
+    return data.getvalue()
+
+
+def film(path: pathlib.Path, shape: int = 1) -> None:
+    """Write a video of three frames whose pixels have a shape."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mjpeg", 30)
+        stream.width, stream.height, stream.pix_fmt = 32, 32, "yuvj420p"
+        stream.codec_context.sample_aspect_ratio = fractions.Fraction(shape)
+        for _ in range(3):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.full((32, 32, 3), 90, np.uint8))))
+        container.mux(stream.encode())
+
+
+def open_video(path: pathlib.Path) -> Any:
+    """Open a video; an AVI at no rate."""
+    with VideoFile(path, fps=0.0 if path.suffix == ".avi" else None) as source:
+        print(source.note, file=sys.stderr)
 
 
 UV = {"attributes": {"TEXCOORD_0": SQUARE_UVS}, "material": 0}
@@ -292,6 +324,40 @@ CASES: dict[str, list[Case]] = {
             )
         ),
     ],
+    "pictures": [
+        *(
+            Case("damaged", f"a{suffix}", encoded(suffix)[:count], said)
+            for suffix in (".png", ".jpg", ".tif", ".webp", ".bmp")
+            for count, said in ((0, "is empty"), (10, "cannot be decoded"), (-200, "cannot be decoded"))
+            if suffix != ".png" or count == 0
+        ),
+        Case("damaged", "a.png", encoded(".png")[:-200], "is cut off"),
+        *(
+            Case(
+                "PNG of PQ or HLG",
+                "a.png",
+                encoded(".png", cicp=(9, transfer)),
+                f"and transfer {transfer}; save it as SDR",
+            )
+            for transfer in (16, 18)
+        ),
+    ],
+    "video": [
+        Case(
+            "damaged before its first frame", "a.mp4", b"\0\0\0\x18ftypisom" + bytes(200), "cannot be read as a video"
+        ),
+        Case("`fps` or one of `exposures` is not positive", "a.avi", lambda path: film(path), "fps"),
+        Case("pixels made square", "a.mkv", lambda path: film(path, shape=2), "pixels of 2:1"),
+    ],
+    "EXIF": [
+        Case("damaged", "a.jpg", encoded(".jpg")[:12], "cannot be decoded"),
+        Case(
+            "focal lengths that contradict each other (the 35 mm equivalent is taken)",
+            "a.jpg",
+            lambda path: photograph(path, (1200, 800), (1200, 800), 77),
+            "contradicts itself",
+        ),
+    ],
     "calibrations": [
         Case("damaged", "a.json", "{", "cannot be read"),
         Case("missing keys", "a.json", {"image_width": 640, "image_height": 480}, "camera_matrix is missing"),
@@ -350,7 +416,9 @@ def test_what_else_an_animation_moves_is_named(tmp_path: pathlib.Path) -> None:
 
 
 def write(path: pathlib.Path, data: Any) -> None:
-    if isinstance(data, Gltf):
+    if callable(data):
+        data(path)
+    elif isinstance(data, Gltf):
         data.save(path)
     elif isinstance(data, bytes):
         path.write_bytes(data)
@@ -363,6 +431,9 @@ def write(path: pathlib.Path, data: Any) -> None:
 
 
 READERS = {
+    "pictures": read_frame,
+    "video": open_video,
+    "EXIF": camera_by_exif,
     "`.exr` `.hdr`": lambda path: read_linear_picture(path, SceneError, str(path)),
     "calibrations": load_calibration,
     "poses": load_pose_file,
@@ -381,10 +452,10 @@ def test_what_is_declared_is_refused_or_named(
         case.declared in next(row for row in formats().splitlines() if row.startswith(f"| {name} ")).split(" | ")[2]
     )
     if refused:
-        with pytest.raises(SceneError) as told:
+        with pytest.raises(WarpArError) as told:
             READERS.get(name, load_mesh)(tmp_path / case.name)
         said = str(told.value)
-        assert case.name in said
+        assert case.name in said or case.said == "fps"
     else:
         found = READERS.get(name, load_mesh)(tmp_path / case.name)
         said = " ".join(getattr(found, "notes", ())) + capsys.readouterr().err

@@ -16,16 +16,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import ExifTags, Image, ImageCms, PngImagePlugin, TiffImagePlugin
 
-from warp_ar import calibrate
+from warp_ar import calibrate, signals
 from warp_ar.calibration.camera_calibration import BoardViews
-from warp_ar.errors import SceneError
+from warp_ar.errors import SceneError, SourceError
 from warp_ar.pictures import srgb_by_profile
 from warp_ar.scene import CharucoBoard, Marker, load_scene, loads_scene
 from warp_ar.scene.calibration_file import load_calibration
 from warp_ar.scene.exif import camera_by_exif, read_exif
 from warp_ar.scene.pixel_rays import project, undistorted
+from warp_ar.scene.textures import decode_rgba
 from warp_ar.sources.frame_folder import read_frame
 from warp_ar.sources.sources import open_source
+from warp_ar.srgb import decode_srgb, encode_srgb
 from warp_ar.tracking.markers import make_pattern
 
 PIXELS = 0.1
@@ -131,6 +133,41 @@ def test_gamma_and_chromaticities_of_a_png_are_followed(tmp_path_factory, gamma,
     light = np.clip((np.array(color) / 255) ** (1 / gamma) @ (ADOBE.T if wide else np.eye(3)), 0, 1)
     shown = 255 * np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
     assert np.abs(found - shown).max() <= 1
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.sampled_from([1, 9, 12]), st.sampled_from([1, 4, 8, 13]), st.tuples(*[st.integers(20, 235)] * 3))
+def test_a_png_s_code_points_are_followed(tmp_path_factory, primaries, transfer, color):
+    path, info = tmp_path_factory.mktemp("png") / "a.png", PngImagePlugin.PngInfo()
+    info.add(b"cICP", bytes([primaries, transfer, 0, 1]))
+    Image.new("RGB", (4, 4), color).save(path, pnginfo=info)
+    codes = np.array(color) / 255
+    light = {4: codes**2.2, 8: codes}.get(transfer, decode_srgb(codes))
+    own = {1: signals.REC_709, 9: signals.REC_2020, 12: signals.P3_D65}[primaries]
+    shown = 255 * encode_srgb(np.clip(signals.rgb_from_rgb(own, signals.REC_709) @ light, 0, 1))
+    assert np.abs(read_frame(path)[0][0, 0] - shown).max() <= 1
+
+
+@pytest.mark.parametrize("coding", [(9, 16), (9, 18), (1, 9), (4, 13)])
+def test_a_png_of_other_code_points_is_refused(tmp_path, coding):
+    info = PngImagePlugin.PngInfo()
+    info.add(b"cICP", bytes([*coding, 0, 1]))
+    Image.new("RGB", (4, 4)).save(tmp_path / "a.png", pnginfo=info)
+    with pytest.raises(SourceError, match=f"cICP of primaries {coding[0]} and transfer {coding[1]}; save it as SDR"):
+        read_frame(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("mode", ["1", "L", "P", "RGB", "RGBA", "CMYK", "YCbCr", "LA"])
+@pytest.mark.parametrize("orientation", [1, 6])
+def test_a_tiff_is_the_texture_that_was_written(tmp_path, mode, orientation):
+    """Red stays red, black black, whatever the TIFF has codes of; glTF and MTL know no orientation but TIFF's own."""
+    picture = Image.new("RGB", (6, 4), (160, 90, 47))
+    picture.paste((20, 200, 240), (3, 0, 6, 2))
+    picture = picture.quantize(8) if mode == "P" else picture.convert(mode)
+    picture.save(tmp_path / "a.tif", tiffinfo={274: orientation})
+    found = decode_rgba((tmp_path / "a.tif").read_bytes(), "a.tif")
+    right = np.rot90(np.asarray(picture.convert("RGBA")), 0 if orientation == 1 else -1)
+    assert np.abs(found.astype(int) - right).max() <= 3  # of YCbCr's and CMYK's rounding
 
 
 @settings(max_examples=20, deadline=None)

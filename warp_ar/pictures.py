@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import re
 import struct
 import tempfile
 from collections.abc import Callable
@@ -18,8 +19,8 @@ from PIL import BmpImagePlugin, ExifTags, GifImagePlugin, ImageCms, JpegImagePlu
 
 from warp_ar.errors import WarpArError, reason
 from warp_ar.files import check_size, read_bytes
-from warp_ar.signals import ADOBE_RGB, REC_709, Chromaticities, are_primaries, converted
-from warp_ar.srgb import encode_srgb
+from warp_ar.signals import ADOBE_RGB, P3_D65, REC_709, REC_2020, Chromaticities, are_primaries, converted
+from warp_ar.srgb import decode_srgb, encode_srgb
 
 FORMATS = "PNG, JPEG, BMP, TIFF, WebP, GIF or PNM"
 """Formats that are read: those whose headers are known here."""
@@ -30,6 +31,10 @@ HEIF = frozenset({".heic", ".heif", ".hif", ".avif"})
 """Pictures of phones that nothing here decodes, by their names' endings."""
 _BRANDS = (b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1", b"avif")
 
+_PRIMARIES = {1: REC_709, 9: REC_2020, 12: P3_D65}
+_CURVES = {1: 0.0, 4: 2.2, 5: 2.8, 6: 0.0, 8: 1.0, 13: 0.0, 14: 0.0, 15: 0.0}
+"""Primaries and gammas (0: sRGB's curve, as for videos) of a PNG's cICP by their numbers in ITU-T H.273."""
+
 Size = tuple[int, int]
 
 _HEAD = 1 << 16
@@ -37,7 +42,8 @@ _HEAD = 1 << 16
 _SAME_GAMMA = 0.02
 """Share by which a gamma may differ from sRGB's 1/2.2 and is taken for it."""
 
-# OpenCV 5.0 leaves TIFFs of more than 8 bits undecoded, or their channels in the other order, where it is to give RGB.
+# OpenCV 5.0 leaves TIFFs of more than 8 bits undecoded, or their channels in the other order, where it is to give RGB;
+# as they lie, it gives those of three channels in the other order, and black of one bit as white.
 _TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
 
@@ -83,7 +89,7 @@ def decode_picture(data: bytes, flags: int, error: type[WarpArError], label: str
 
     Follows:
         8 and 16 bits; TIFF: floats, planes; EXIF: orientation, Adobe RGB; ICC profiles: RGB, grey (16 bits: to one code
-        of 8); PNG: gamma, chromaticities.
+        of 8); PNG: gamma, chromaticities, cICP.
 
     Args:
         data: The whole file.
@@ -95,13 +101,15 @@ def decode_picture(data: bytes, flags: int, error: type[WarpArError], label: str
         OpenCV's array: (height, width) or (height, width, channels).
 
     Raises:
-        WarpArError: As ``error``: damaged.
+        WarpArError: As ``error``: damaged; PNG of PQ or HLG.
     """
     check_picture(data, error, label)
     asked = flags
     if data[:4] in _TIFF_STARTS:
         tags = _tiff_tags(data)
-        if tags.get(284) == 2 or tags.get(339) == 3 or tags.get(277, 1) not in (1, 3):
+        if flags < 0 and tags.get(262) == 6:
+            flags = cv2.IMREAD_COLOR_BGR  # of Y'CbCr OpenImageIO applies half of the orientation
+        elif flags < 0 or tags.get(284) == 2 or tags.get(339) == 3 or tags.get(277, 1) not in (1, 3):
             return _in_color(_read_tiff(data, tags.get(274, 1), flags, error, label), data, flags)
     turns = bool(flags & cv2.IMREAD_COLOR_RGB) and data[:4] in _TIFF_STARTS
     if turns:
@@ -140,6 +148,9 @@ def in_srgb(picture: npt.NDArray[Any], data: bytes) -> npt.NDArray[Any]:
             adobe = b"R03\0" in data[:_HEAD] and header.getexif().get_ifd(ExifTags.IFD.Interop).get(1) == "R03"
     except (OSError, ValueError, SyntaxError, PIL.Image.DecompressionBombError, struct.error):
         return picture
+    if coding := _cicp(data):
+        primaries, curve = _PRIMARIES[coding[1][0]], _CURVES[coding[2][0]]
+        return picture if (primaries, curve) == (REC_709, 0.0) else _srgb_of(picture, curve, primaries)
     if profile := said.get("icc_profile"):
         return srgb_by_profile(picture, profile)
     if adobe:
@@ -152,10 +163,16 @@ def in_srgb(picture: npt.NDArray[Any], data: bytes) -> npt.NDArray[Any]:
     return _srgb_of(picture, 1.0 / gamma if gamma > 0.0 else 1.0, primaries if known else REC_709)
 
 
+def _cicp(data: bytes) -> re.Match[bytes] | None:
+    """Return a PNG's chunk of coding-independent code points: bytes of primaries and transfer."""
+    return re.search(b"\0\0\0\x04cICP(.)(.)", data[:_HEAD], re.DOTALL) if data.startswith(b"\x89PNG") else None
+
+
 def _srgb_of(picture: npt.NDArray[Any], gamma: float, primaries: Chromaticities) -> npt.NDArray[Any]:
-    """Return codes of sRGB of those whose power ``gamma`` is light of other primaries."""
+    """Return codes of sRGB of those whose power ``gamma``, or sRGB's curve (0), is light of other primaries."""
     most = float(np.iinfo(picture.dtype).max)
-    light = (np.arange(most + 1) / most) ** gamma
+    codes = np.arange(most + 1) / most
+    light = codes**gamma if gamma else decode_srgb(codes)
     shown = encode_srgb(np.clip(converted(light.astype(np.float32)[picture], primaries, REC_709), 0.0, 1.0))
     return np.asarray(np.round(most * shown), dtype=picture.dtype)
 
@@ -233,6 +250,10 @@ def check_picture(data: bytes, error: type[WarpArError], label: str) -> None:
     # libpng would refuse a file without its last chunk too, but writes to stderr when it does.
     if data.startswith(b"\x89PNG") and b"IEND\xaeB`\x82" not in data:
         raise error(f"{label} is cut off after {len(data)} bytes; copy the whole file")
+    coding = _cicp(data)
+    if coding is not None and not (coding[1][0] in _PRIMARIES and coding[2][0] in _CURVES):
+        told = f"cICP of primaries {coding[1][0]} and transfer {coding[2][0]}"
+        raise error(f"{label} has a {told}; save it as SDR of Rec. 709, P3 or Rec. 2020 (PQ and HLG: as OpenEXR)")
     size = picture_size(data)
     if size is None and (words := foreign_words("", data)):
         raise error(f"{label} is {words}")
