@@ -138,6 +138,8 @@ IMAGE = {"images": [{"uri": "none.png"}], "textures": [{"source": 0}]}
 MOVED = {"name": "a", "samplers": [], "channels": [{"target": {"node": 0, "path": "weights"}, "sampler": 0}]}
 
 MTL_KEYS = "map_bump bump disp map_ns refl decal map_tr tf pc ps aniso map_ka map_emissive map_orm"
+DAMAGED = "damaged"
+"""Feature that the page says once of all formats."""
 CASES: dict[str, list[Case]] = {
     "`.obj`": [
         Case("damaged", "a.obj", CORNERS + "f 1 2 9\n", "vertex index 8"),
@@ -179,11 +181,11 @@ CASES: dict[str, list[Case]] = {
         ),
         library("-halo of d", "d -halo 0.5", "-halo of d"),
         *(
-            library("… …, which is not … numbers", line, f"{line[:2].lower()}{line[2:]}, which is not")
+            library("the value … …, which is not … numbers", line, f"{line[:2].lower()}{line[2:]}, which is not")
             for line in ("Kd xyz 0.4 0.2 0.1", "Kd spectral a.rfl", "Ns 0,5", "Ke 1 2")
         ),
-        library("… beyond … to …", "Kd 204 102 51", "kd beyond 0 to 1"),
-        library("… beyond … to …", "d 2", "d beyond 0 to 1"),
+        library("a value of … beyond … to …", "Kd 204 102 51", "kd beyond 0 to 1"),
+        library("a value of … beyond … to …", "d 2", "d beyond 0 to 1"),
     ],
     "`.ply`": [
         Case("damaged", "a.ply", ply()[:-12], "is the file whole"),
@@ -405,7 +407,7 @@ def declared() -> dict[str, set[str]]:
 
 @pytest.mark.parametrize("name", CASES)
 def test_every_declared_feature_has_a_case(name: str) -> None:
-    fed = {case.declared for case in CASES[name]}
+    fed = {case.declared for case in CASES[name]} - {DAMAGED}
     assert fed | (declared()[name] & NOT_HERE.keys()) == declared()[name]
 
 
@@ -449,7 +451,8 @@ def test_what_is_declared_is_refused_or_named(
     for file, data in (*case.beside, (case.name, case.data)):
         write(tmp_path / file, data)
     refused = (
-        case.declared in next(row for row in formats().splitlines() if row.startswith(f"| {name} ")).split(" | ")[2]
+        case.declared == DAMAGED
+        or case.declared in next(row for row in formats().splitlines() if row.startswith(f"| {name} ")).split(" | ")[2]
     )
     if refused:
         with pytest.raises(WarpArError) as told:

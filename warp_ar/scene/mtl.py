@@ -260,8 +260,8 @@ class _Library:
             self._source.note("-halo of d")
             words = words[1:]
         if words and (len(words) not in counts or not all(map(is_number, words))):
-            self._source.note(f"{key} {' '.join(map(str, words))[:40]}, which is not {counts[-1]} numbers")
+            self._source.note(f"the value {key} {' '.join(map(str, words))[:40]}, which is not {counts[-1]} numbers")
             return []
         if any(not low <= float(word) <= high for word in words):
-            self._source.note(f"{key} beyond {low:g} to {high:g}")
+            self._source.note(f"a value of {key} beyond {low:g} to {high:g}")
         return [min(max(float(word), low), high) for word in words]
