@@ -43,6 +43,7 @@ def test_a_new_frame_is_sent_from_where_it_lies(hosts_side) -> None:
     """Nothing is copied on the host; it is held until it has been sent, and given again when nobody refers to it."""
     (make, done), size = hosts_side, (1080, 1920)
     transfers, frame = make(size), wp.zeros(size, dtype=wp.vec3ub, device="cpu")
+    assert done == ["up waits for compute", "down waits for compute"]  # which clears the slots
     values = np.random.default_rng(3).integers(0, 256, (*size, 3), np.uint8)
     first = transfers.new_frame()
     first[...] = values
@@ -96,6 +97,9 @@ class _Stream:
 
     def wait_event(self, event: object) -> None:
         self.done.append(f"{self.name} wait")
+
+    def wait_stream(self, other: _Stream) -> None:
+        self.done.append(f"{self.name} waits for {other.name}")
 
 
 @pytest.fixture
