@@ -343,6 +343,7 @@ def test_calibrations_of_other_programs(tmp_path, name, text, distortion):
                 ({"s1": 0.1}, "s1: not understood"),
                 ({"radial": [0.1, 0]}, "radial: not understood"),
                 ({"dist": {"k1": 0.1}}, "distortion_coefficients"),
+                ({"dist": [0.1, 0, 0, 0], "k1": 0.2}, "or one of both"),
                 ({"dist": ["-0.3", "0.1", "0", "0"]}, "distortion_coefficients"),
             )
         ),

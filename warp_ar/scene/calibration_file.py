@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from collections.abc import Sequence
@@ -121,9 +122,10 @@ def load_calibration(path: str | Path, transfer: str | Path = "srgb") -> Camera:
         fail(_MATRIX[0], k, "expected [fx, 0, cx, 0, fy, cy, 0, 0, 1]: a camera without skew")
     terms = ("k1", "k2", "k3", "k4") if fisheye else _TERMS
     distortion = numbers(*_DISTORTION)
-    if not distortion and any(term in tree for term in _TERMS):
-        distortion = [sum(numbers(term) or []) for term in terms]
-    distortion = distortion or list(Camera.distortion)
+    single = [sum(numbers(term) or []) for term in terms] if any(term in tree for term in _TERMS) else []
+    if distortion and single and any(a != b for a, b in itertools.zip_longest(distortion, single, fillvalue=0.0)):
+        fail(_DISTORTION[0], distortion, f"expected the values of its {' '.join(terms)}, or one of both")
+    distortion = distortion or single or list(Camera.distortion)
     columns, rows, (fx, _, cx, _, fy, cy, *_) = *map(int, size), k
     columns, fx, cx = _read_out(path, tree, "x", columns, fx, cx)
     rows, fy, cy = _read_out(path, tree, "y", rows, fy, cy)
