@@ -16,6 +16,7 @@ import numpy.typing as npt
 import pytest
 
 from warp_ar.engine.pipeline import Pipeline, Result
+from warp_ar.engine.scheduler import StageTiming
 from warp_ar.errors import SceneError, UpdateError, UsageError
 from warp_ar.scene import (
     Camera,
@@ -329,7 +330,14 @@ def test_captured_graph_equals_eager(frames: Frames, device: str) -> None:
         Pipeline(make_scene(), device=device, quality="low") as replayed,
         Pipeline(make_scene(), device=device, quality="low") as eager,
     ):
-        eager._scheduler.run = eager._scheduler._run_eager  # type: ignore[method-assign]
+        scheduler = eager._scheduler
+
+        def run_eager(receive: Callable[[], None] | None = None) -> dict[str, StageTiming]:
+            if receive is not None:
+                receive()
+            return scheduler._run_eager()
+
+        scheduler.run = run_eager  # type: ignore[method-assign]
         for one, other in zip(run(replayed, frames * 2), run(eager, frames * 2), strict=True):
             np.testing.assert_array_equal(one.image, other.image)
 
