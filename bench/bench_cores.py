@@ -46,7 +46,7 @@ class Watch:
         pipeline.warm_up()
         self._time(pipeline, "_look", "track")
         self._time(pipeline, "_render", "render")
-        crew = pipeline._scheduler.crew
+        crew = pipeline._scheduler._crew
         if crew is not None:
             self._follow(crew)
 
