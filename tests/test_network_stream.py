@@ -3,14 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import http.server
 import itertools
-import pathlib
-import signal
 import socket
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -143,35 +138,6 @@ def test_a_size_that_changes_ends_it() -> None:
         camera.close()
 
 
-def test_a_reader_that_fails_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever has happened to it: who opens the stream would wait for ever."""
-
-    def fail(self: NetworkStream) -> Iterator[np.ndarray]:
-        raise MemoryError("no room for a picture")
-
-    monkeypatch.setattr(NetworkStream, "_pictures", fail)
-    opened: list[Any] = []
-
-    def open_stream() -> None:
-        try:
-            NetworkStream("http://127.0.0.1:9/video")
-        except SourceError as error:
-            opened.append(str(error))
-
-    thread = threading.Thread(target=open_stream, daemon=True)
-    thread.start()
-    thread.join(0.5 * PATIENCE)
-    assert opened == ["http://127.0.0.1:9/video: no room for a picture"]
-
-
-def test_no_thread_is_left(camera: Camera) -> None:
-    before = {thread for thread in threading.enumerate() if thread.name == "warp-ar-camera"}
-    with open_source(camera.url) as source:
-        next(iter(source))
-    source.close()
-    assert {thread for thread in threading.enumerate() if thread.name == "warp-ar-camera"} == before
-
-
 def test_what_is_no_stream_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(network_stream, "OPEN_SECONDS", 1.0)
     with socket.create_server(("127.0.0.1", 0)) as taken:
@@ -208,89 +174,6 @@ def test_an_address_that_gives_no_video_is_named() -> None:
     finally:
         server.shutdown()
         server.server_close()
-
-
-class RtspCamera:
-    """GStreamer's RTSP server as a process, which can drop its clients, fall silent and go away."""
-
-    def __init__(self, way: str) -> None:
-        with socket.create_server(("127.0.0.1", 0)) as taken:
-            port = taken.getsockname()[1]
-        script = pathlib.Path(__file__).with_name("rtsp_server.py")
-        self.process = subprocess.Popen(
-            [gstreamer_python(), str(script), str(port), way], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-        )
-        assert self.process.stdout is not None
-        assert self.process.stdout.readline().strip() == "ready"
-        self.url = f"rtsp://user:secret@127.0.0.1:{port}/live"
-
-    def cut(self) -> None:
-        assert self.process.stdin is not None
-        self.process.stdin.write("cut\n")
-        self.process.stdin.flush()
-
-    def close(self) -> None:
-        self.process.kill()
-        self.process.wait()
-        for stream in (self.process.stdin, self.process.stdout):
-            assert stream is not None
-            with contextlib.suppress(OSError):
-                stream.close()
-
-
-@functools.cache
-def gstreamer_python() -> str:
-    """An interpreter with GStreamer's RTSP server: not always the one of the tests."""
-    asked = "import gi; gi.require_version('GstRtspServer', '1.0'); from gi.repository import Gst, GstRtspServer as _; "
-    asked += "Gst.init(None); assert Gst.ElementFactory.find('x264enc')"
-    for python in (sys.executable, "/usr/bin/python3", "python3"):
-        with contextlib.suppress(OSError, subprocess.TimeoutExpired):
-            if subprocess.run([python, "-c", asked], capture_output=True, timeout=30).returncode == 0:
-                return python
-    return ""
-
-
-@pytest.fixture(params=["tcp", "udp"])
-def rtsp(request: pytest.FixtureRequest) -> Iterator[RtspCamera]:
-    if not gstreamer_python():
-        pytest.skip(
-            "no RTSP server: apt install python3-gi gir1.2-gst-rtsp-server-1.0 gstreamer1.0-plugins-{good,ugly}"
-        )
-    made = RtspCamera(request.param)
-    yield made
-    made.close()
-
-
-def test_ten_cuts_of_an_rtsp_line(rtsp: RtspCamera) -> None:
-    with open_source(rtsp.url) as source:
-        assert isinstance(source, NetworkStream)
-        assert source.size == SIZE
-        cuts, times = 0, []
-        for frame in source:
-            times.append(frame.time)
-            assert frame.image.shape == (SIZE[1], SIZE[0], 3)
-            assert frame.image.std() > 5.0, "the ball before its background"
-            if len(times) % 3 == 0:
-                if cuts == 10:
-                    break
-                rtsp.cut()
-                cuts += 1
-        assert source.reconnects >= 10
-        assert all(b > a for a, b in itertools.pairwise(times))
-
-
-def test_an_rtsp_line_that_falls_silent_ends_with_its_reason(rtsp: RtspCamera, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(network_stream, "OPEN_SECONDS", 1.0)
-    with NetworkStream(rtsp.url, grace=0.5) as source:
-        frames = iter(source)
-        next(frames)
-        rtsp.process.send_signal(signal.SIGSTOP)
-        with pytest.raises(
-            SourceError, match=r"gave no picture for 0\.5 s \(no picture came for 1 s\); check its address"
-        ) as error:
-            for _ in frames:
-                pass
-        assert "secret" not in str(error.value)
 
 
 def test_a_server_that_never_answers_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
