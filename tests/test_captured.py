@@ -21,7 +21,6 @@ from warp_ar.light.captured import (
 from warp_ar.light.latlong_axes import DESCRIPTIONS, to_axes, world_from_marker
 from warp_ar.scene import dumps_scene, loads_scene
 from warp_ar.scene.geometry import rotation_matrix
-from warp_ar.session import with_light
 from warp_ar.signals import REC_709
 from warp_ar.stages.quality import PRESETS
 from warp_ar.stages.request import Request
@@ -84,16 +83,6 @@ def test_a_light_survives_its_file(tmp_path):
     assert header["chromaticities"] == pytest.approx(REC_709)
     assert "row 0 toward +z" in header["axes"]
     assert json.loads(header["emitters"])[0]["power"] == [1.0, 2.0, 3.0]
-
-
-def test_somebody_elses_map_is_cleaned(tmp_path):
-    radiance = np.ones((4, 8, 3), np.float32)
-    radiance[0, 0], radiance[1, 1], radiance[2, 2] = np.nan, -5.0, np.inf
-    OpenEXR.File({}, {"RGB": radiance}).write(str(tmp_path / "a.exr"))
-    light = Light.load(tmp_path / "a.exr")
-    assert np.isfinite(light.radiance).all()
-    assert light.radiance.min() == 0.0
-    assert light.exposure is None
 
 
 NO_NUMBER = (
@@ -190,16 +179,6 @@ def test_scale_and_turn_are_the_scenes(tmp_path, device):
     wanted = 2.0 * Light.load(tmp_path / "light.exr").resampled(64, rotation_matrix([0.0, 0.0, 90.0]))
     assert np.allclose(environment, wanted, rtol=1e-5)
     check_error("captured", environment, 2.0 * slope(latlong_directions(64) @ rotation_matrix([0.0, 0.0, 90.0])))
-
-
-def test_a_light_replaces_what_a_ball_shows(tmp_path, device):
-    constant(0.25).save(tmp_path / "light.exr")
-    text = SCENE.split("[light]")[0] + "[probe]\ncenter = [0.1, 0.0, 0.04]\nradius = 0.04\n"
-    scene = with_light(loads_scene(text, tmp_path / "scene.toml"), tmp_path / "light.exr")
-    with Pipeline(scene, device=device, quality="medium", outputs=("image", "environment")) as pipeline:
-        result = pipeline(np.full((72, 96, 3), 30, np.uint8))
-        assert np.allclose(result.environment, 0.25, atol=1e-6)
-        assert result.image.shape == (72, 96, 3)
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ from warp_ar.errors import SceneError, WarpArError
 from warp_ar.exr_file import read_linear_picture
 from warp_ar.scene import load_calibration
 from warp_ar.scene.exif import camera_by_exif
-from warp_ar.scene.mesh_files import load_mesh, load_moving_mesh
+from warp_ar.scene.mesh_files import load_mesh
 from warp_ar.scene.pose_file import load_pose_file
 from warp_ar.sources.frame_folder import read_frame
 from warp_ar.sources.video_file import VideoFile
@@ -34,9 +34,9 @@ from warp_ar.sources.video_file import VideoFile
 NOT_HERE = {
     "axes taken": "test_linear_pictures",  # of lights, not of pictures
     "parts not taken": "test_linear_pictures",
-    "deep pixels": "test_linear_pictures",  # written by a process of OpenImageIO
+    "deep pixels": "test_linear_pictures",  # written by OpenImageIO
     "frames without a pose": "test_pose_file",  # needs frames
-    "animated …": "test_what_else_an_animation_moves_is_named",
+    "animated …": "test_node_animation",
 }
 """Features that other files of tests feed, by what is declared."""
 
@@ -396,10 +396,13 @@ CASES: dict[str, list[Case]] = {
 }
 
 
+TABLE = formats().splitlines()
+
+
 def declared() -> dict[str, set[str]]:
     """Features that the page's table declares as refused or named, by format."""
     found = {}
-    for row in formats().splitlines()[2:]:
+    for row in TABLE[2:]:
         name, _, refused, named = (cell.strip() for cell in row.strip("|").split("|"))
         found[name] = {feature for cell in (refused, named) for feature in cell.split("; ") if feature}
     return found
@@ -409,12 +412,6 @@ def declared() -> dict[str, set[str]]:
 def test_every_declared_feature_has_a_case(name: str) -> None:
     fed = {case.declared for case in CASES[name]} - {DAMAGED}
     assert fed | (declared()[name] & NOT_HERE.keys()) == declared()[name]
-
-
-def test_what_else_an_animation_moves_is_named(tmp_path: pathlib.Path) -> None:
-    moved = MOVED | {"channels": [{"target": {"path": "pointer"}, "sampler": 0}]}
-    gltf("animated …", "", animations=[moved]).data.save(tmp_path / "a.glb")
-    assert "animated pointer" in load_moving_mesh(tmp_path / "a.glb", 0).rest.notes
 
 
 def write(path: pathlib.Path, data: Any) -> None:
@@ -452,7 +449,7 @@ def test_what_is_declared_is_refused_or_named(
         write(tmp_path / file, data)
     refused = (
         case.declared == DAMAGED
-        or case.declared in next(row for row in formats().splitlines() if row.startswith(f"| {name} ")).split(" | ")[2]
+        or case.declared in next(row for row in TABLE if row.startswith(f"| {name} ")).split(" | ")[2]
     )
     if refused:
         with pytest.raises(WarpArError) as told:

@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 import OpenEXR
 import pytest
-import trimesh
 
 import warp_ar
 from docs.tables import READERS, formats
@@ -20,7 +19,7 @@ from warp_ar.output.environment_file import ENVIRONMENT_SUFFIXES
 from warp_ar.output.gltf_file import GLTF_SUFFIX
 from warp_ar.output.usd_file import USD_SUFFIXES
 from warp_ar.output.video_sink import VIDEO_SUFFIXES
-from warp_ar.scene.mesh_files import MESH_SUFFIXES, load_mesh
+from warp_ar.scene.mesh_files import MESH_SUFFIXES
 from warp_ar.sources.frame_folder import IMAGE_SUFFIXES, LINEAR_SUFFIX
 from warp_ar.sources.sources import open_source
 
@@ -90,13 +89,3 @@ def test_videos_of_every_ending_are_frames(tmp_path: pathlib.Path, suffix: str, 
     assert len(frames) == len(pictures)
     for frame, picture in zip(frames, pictures, strict=True):
         assert np.abs(frame.astype(int) - picture).mean() <= LOSSY
-
-
-def test_a_gltf_is_a_mesh(tmp_path: pathlib.Path) -> None:
-    box = trimesh.creation.box((1.0, 2.0, 3.0))
-    files = trimesh.exchange.gltf.export_gltf(trimesh.Scene(box))
-    for name, data in files.items():
-        (tmp_path / name).write_bytes(data)
-    mesh = load_mesh(tmp_path / "model.gltf")
-    np.testing.assert_allclose(sorted(np.ptp(mesh.vertices, axis=0)), (1.0, 2.0, 3.0), atol=1e-6)
-    assert len(mesh.faces) == 12

@@ -41,11 +41,6 @@ def test_rotation_is_scipys_extrinsic_xyz(rotate: tuple[float, float, float]) ->
     np.testing.assert_allclose(rotation_matrix(rotate), expected, atol=ROUNDING)
 
 
-def test_rotation_order_is_x_then_y_then_z() -> None:
-    # x turns +z to -y, y leaves it, z turns -y to +x.
-    np.testing.assert_allclose(rotation_matrix((90, 0, 90)) @ [0, 0, 1], [1, 0, 0], atol=ROUNDING)
-
-
 # --- Primitives -------------------------------------------------------------------------------------------------------
 
 
@@ -182,33 +177,6 @@ def test_normals_are_always_unit(data: st.DataObject) -> None:
 # --- Files ------------------------------------------------------------------------------------------------------------
 
 
-def test_bunny(shared: pathlib.Path) -> None:
-    mesh = load_mesh(shared / "mesh/bunny.ply")
-    assert (mesh.vertices.shape, mesh.faces.shape) == ((1839, 3), (3674, 3))
-    assert (mesh.uvs, mesh.texture) == (None, None)
-    assert edges_that_do_not_close(mesh) == 0
-    assert signed_volume(mesh) > 0
-    facing = np.einsum("nd,nd->n", mesh.normals, trimesh.load_mesh(shared / "mesh/bunny.ply").vertex_normals)
-    assert facing.min() > 0.5
-
-
-def test_spot_with_its_texture(shared: pathlib.Path) -> None:
-    mesh = load_mesh(shared / "mesh/spot/spot.obj")
-    assert mesh.faces.shape == (5856, 3)
-    assert mesh.uvs is not None
-    assert mesh.texture is not None
-    np.testing.assert_array_equal(mesh.texture, load_texture(shared / "mesh/spot/spot_texture.png"))
-    assert mesh.texture.dtype == np.uint8
-    # Row 0 is v = 1: the eyes, in front, are the darkest of the picture and lie where the head is.
-    rows = np.clip(((1.0 - mesh.uvs[:, 1]) * 1024).astype(int), 0, 1023)
-    columns = np.clip((mesh.uvs[:, 0] * 1024).astype(int), 0, 1023)
-    dark = mesh.texture[rows, columns].max(axis=1) < 40
-    assert dark.any()
-    assert mesh.vertices[dark, 1].min() > 0.3
-    assert mesh.vertices[dark, 2].max() < -0.3
-    np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1.0, atol=SINGLE)
-
-
 @pytest.mark.parametrize("suffix", [".ply", ".obj", ".glb", ".stl", ".off"])
 def test_every_format(tmp_path: pathlib.Path, suffix: str) -> None:
     path = tmp_path / f"tetrahedron{suffix}"
@@ -276,18 +244,11 @@ PLY = (
     ("name", "content", "message"),
     [
         ("model.fbx", "", r"unknown mesh format '\.fbx'; use one of \.ply, \.obj"),
-        ("empty.ply", "", r"the mesh cannot be read; is the file whole\?"),
-        ("words.gltf", "hello", r"cannot be read"),
         ("points.ply", PLY.format(vertices=1, faces=0) + "0 0 0\n", r"holds no triangle"),
         (
             "range.ply",
             PLY.format(vertices=3, faces=1) + "0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n",
             r"vertex index 7; there are 3",
-        ),
-        (
-            "nan.ply",
-            PLY.format(vertices=3, faces=1) + "0 0 0\n1 nan 0\n0 1 0\n3 0 1 2\n",
-            r"vertex 1 is .*must be finite",
         ),
         ("huge.obj", "v 0 0 0\nv 1e39 0 0\nv 0 1 0\nf 1 2 3\n", r"vertex 1 is .*must be finite"),
     ],

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.gltf_files import SQUARE, SQUARE_FACES, SQUARE_UVS, Gltf
+from tests.gltf_files import SQUARE, SQUARE_UVS, Gltf
 from warp_ar.errors import SceneError
 from warp_ar.scene import MetallicRoughnessMaterial, Object, Play
 from warp_ar.scene.mesh_files import load_mesh
@@ -223,16 +223,10 @@ def broken(change: Any) -> Gltf:
     return made
 
 
-def deep(tree: dict[str, Any]) -> None:
-    tree["nodes"] = [{"children": [k + 1]} for k in range(10_000)] + [{"mesh": 0, "children": [0]}]
-    tree["scenes"] = [{"nodes": [0]}]
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         (lambda t: t["nodes"].append({"children": [1]}) or t.update(scenes=[{"nodes": [1]}]), "reached twice"),
-        (lambda t: t["nodes"][0].update(children=[0]), "below each other in a circle"),
         (lambda t: t["nodes"][0].update(children=[-1]), "child of node 0 is -1"),
         (lambda t: t["nodes"][0].update(rotation=[0, 0, 0, 0]), "rotation without length"),
         (lambda t: t["nodes"][0].update(matrix=[1] * 15), "matrix .* 16 numbers is right"),
@@ -244,14 +238,8 @@ def deep(tree: dict[str, Any]) -> None:
         (lambda t: t["bufferViews"][1].update(byteLength=10**9), "of a buffer of 172"),
         (lambda t: t["bufferViews"][1].pop("buffer"), "buffer view 1 lies in buffer None; there are 1"),
         (lambda t: t["bufferViews"][1].update(byteStride=1), "elements of 12 bytes, one every 1"),
-        (
-            lambda t: t["accessors"][0].update(sparse={"count": 10**9, "indices": {}, "values": {}}),
-            "the sparse part of accessor 0",
-        ),
         (lambda t: t["materials"][0].update(alphaMode="SHINE"), "alphaMode 'SHINE'"),
         (lambda t: t["materials"][0].update(emissiveFactor=[1, 2]), "emissiveFactor .* 3 numbers"),
-        (lambda t: t.update(images=[{"uri": "https://a.example/x.png"}]), "nothing is fetched"),
-        (lambda t: t.update(extensionsRequired=["KHR_draco_mesh_compression"]), "compressed with KHR_draco"),
         (lambda t: t.update(extensionsUsed=7), "is no list"),
     ],
 )
@@ -263,15 +251,6 @@ def test_damage_is_one_clear_line(tmp_path: pathlib.Path, change: Any, message: 
     assert len(str(caught.value).splitlines()) == 1
 
 
-def test_an_index_out_of_range_is_named(tmp_path: pathlib.Path) -> None:
-    made = Gltf()
-    primitive = made.square()
-    primitive["indices"] = made.array(np.uint16([0, 1, 4]))
-    made.node(primitive)
-    with pytest.raises(SceneError, match="vertex index 4; there are 4 vertices"):
-        load_mesh(made.save(tmp_path / "a.glb"))
-
-
 def test_many_copies_of_a_mesh_are_counted(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made = Gltf()
     made.node(made.square())
@@ -281,14 +260,3 @@ def test_many_copies_of_a_mesh_are_counted(tmp_path: pathlib.Path, monkeypatch: 
     monkeypatch.setenv("WARP_AR_MAX_MESH_ELEMENTS", "1000")
     with pytest.raises(SceneError, match=r"1,00\d faces; at most 1,000"):
         load_mesh(path)
-
-
-def test_degenerate_coordinates_leave_unit_frames(tmp_path: pathlib.Path) -> None:
-    made = Gltf()
-    made.material(normalTexture={"index": made.texture(PICTURE)})
-    made.node(made.square(0, TEXCOORD_0=made.array(np.zeros((4, 2), np.float32))))
-    mesh = load_mesh(made.save(tmp_path / "a.glb"))
-    assert mesh.tangents is not None
-    np.testing.assert_allclose(np.linalg.norm(mesh.tangents[:, :3], axis=1), 1.0, atol=SINGLE)
-    np.testing.assert_allclose((mesh.tangents[:, :3] * mesh.normals).sum(axis=1), 0.0, atol=SINGLE)
-    assert len(SQUARE_FACES) == len(mesh.tangents)

@@ -7,6 +7,7 @@ import json
 import os
 import pathlib
 import stat
+import time
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from warp_ar.files import create_new, name_aside, write_whole
 from warp_ar.output.places import OwnFiles
 from warp_ar.output.sinks import open_sink, write_environment
 from warp_ar.output.video_sink import VideoSink, WholeFragments
-from warp_ar.scene import Camera, load_calibration
+from warp_ar.scene import Camera
 from warp_ar.signature import COMMENT, PROGRAM, is_signed, sign_png
 from warp_ar.tracking.card_layout import SHEET
 
@@ -68,6 +69,8 @@ OPENERS = {"files.py", "farm/manifest.py", "farm/pools.py"}
 PRIVATE = ("farm/plan.py",)
 """Files that rename inside a folder of the program's own, where nobody else writes."""
 FRAME = np.zeros((32, 32, 3), np.uint8)
+PATIENCE = 120.0
+"""Seconds within which a file appears on a busy machine."""
 
 
 def test_a_link_under_the_earlier_name_of_files_set_aside_is_not_followed(tmp_path: pathlib.Path) -> None:
@@ -127,13 +130,20 @@ def test_nothing_is_left_beside_and_the_mode_stays(tmp_path: pathlib.Path) -> No
     assert [entry.name for entry in tmp_path.iterdir()] == ["scene.toml"]
 
 
+def wait_for(path: pathlib.Path) -> None:
+    """Wait until a thread has made a file."""
+    deadline = time.monotonic() + PATIENCE
+    while not path.exists():
+        assert time.monotonic() < deadline, f"{path} never appears"
+        time.sleep(0.01)
+
+
 def test_a_second_run_on_one_video_is_found_out_by_the_first(tmp_path: pathlib.Path) -> None:
     path = tmp_path / "clip.mp4"
     first = VideoSink(path, fps=2.0)
     for _ in range(8):
         first.write(FRAME)
-    while not path.exists():
-        pass
+    wait_for(path)
     second = VideoSink(path, fps=2.0, overwrite=True)
     for _ in range(8):
         second.write(FRAME)
@@ -156,8 +166,7 @@ def test_a_folder_that_is_removed_while_a_video_is_written_is_said(tmp_path: pat
     sink = VideoSink(folder / "clip.mp4", fps=2.0)
     for _ in range(8):
         sink.write(FRAME)
-    while not (folder / "clip.mp4").exists():
-        pass
+    wait_for(folder / "clip.mp4")
     (folder / "clip.mp4").unlink()
     folder.rmdir()
     with pytest.raises(SinkError, match="removed while it was written"):
@@ -225,12 +234,6 @@ def test_what_is_written_here_is_known(tmp_path: pathlib.Path, name: str) -> Non
     assert not is_signed(path)
 
 
-@pytest.mark.parametrize("suffix", ["yml", "json", "xml"])
-def test_a_signed_calibration_is_read(tmp_path: pathlib.Path, suffix: str) -> None:
-    write_camera(REPORT, tmp_path / f"a.{suffix}")
-    assert load_calibration(tmp_path / f"a.{suffix}").matrix() == pytest.approx(REPORT.camera.matrix())
-
-
 def test_others_are_not(tmp_path: pathlib.Path) -> None:
     for number, data in enumerate((b"", b"warp_ar", b"{}", b'{"frames": [], "program": "warp_ar"}', b"\x89PNG")):
         (tmp_path / str(number)).write_bytes(data)
@@ -246,23 +249,3 @@ def test_a_signed_png_is_the_same_picture() -> None:
     ok, data = cv2.imencode(".png", image)
     assert ok
     assert np.array_equal(cv2.imdecode(np.frombuffer(sign_png(data.tobytes()), np.uint8), cv2.IMREAD_COLOR), image)
-
-
-def test_a_card_is_replaced_with_a_word_and_a_foreign_picture_only_if_asked(
-    tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "card.png"
-    card = ["card", "--output", str(path), "--dpi", "100"]
-    assert calibrate.main(card) == 0
-    assert capsys.readouterr().err == ""
-    assert calibrate.main(card) == 0
-    assert "this program wrote it before" in capsys.readouterr().err
-    path.write_bytes(b"mine")
-    assert calibrate.main(card) == 2
-    assert path.read_bytes() == b"mine"
-    assert calibrate.main([*card, "--overwrite"]) == 0
-    assert is_signed(path)
-    picture = path.read_bytes()
-    assert calibrate.main(["response", str(path), "--exposures", "1", "--output", str(path)]) == 2
-    assert "name another" in capsys.readouterr().err
-    assert path.read_bytes() == picture

@@ -44,18 +44,6 @@ def test_ten_bits_are_read(tmp_path):
     assert np.abs(patch_centers(frames[-1].image) - patch_centers(patches())).max() <= HEVC_LEVELS
 
 
-@pytest.mark.parametrize("transfer", [18, 16], ids=["HLG", "PQ"])
-@pytest.mark.parametrize("suffix", [".mp4", ".mkv"])
-def test_hdr_is_read_as_light(tmp_path, transfer, suffix):
-    """What a phone records by default; how its codes become light is `test_deep_frames`'s."""
-    path = write_hevc(tmp_path / f"clip{suffix}", [patches()] * 2, transfer=transfer, primaries=9, matrix=9)
-    with open_source(path) as source:
-        assert source.deep == "light"
-        frames = list(source)
-    assert len(frames) == 2
-    assert frames[0].image.dtype == np.uint8
-
-
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_photographs_are_upright(tmp_path, orientation):
     upright = np.zeros((48, 96, 3), np.uint8)

@@ -28,13 +28,6 @@ def test_exif_gives_exposure_and_focal_length(tmp_path):
     assert (camera.cx, camera.cy) == (399.5, 299.5)
 
 
-def test_a_turned_photograph_is_upright(tmp_path):
-    path = write_photo(tmp_path / "a.jpg", GREY, denominator=50, orientation=6)
-    photo = read_photograph(path)
-    assert photo.image.shape == (800, 600, 3)
-    assert (photo.info.width, photo.info.height) == (600, 800)
-
-
 def test_a_cut_picture_has_no_focal_length(tmp_path):
     info = read_exif(write_photo(tmp_path / "a.jpg", GREY[:590, :600], denominator=50))
     assert info.focal_35mm is not None

@@ -83,7 +83,8 @@ def test_a_polygon_that_crosses_itself_ends() -> None:
     assert clip_ears(np.zeros((7, 3))).shape == (5, 3)
 
 
-def ply(kind: str, vertices: list, faces: list, declared: str, of_faces: str, types: str = "") -> bytes:
+def ply(kind: str, vertices: list, faces: list, declared: str, of_faces: str, codes: tuple = ("", "")) -> bytes:
+    """Return a PLY; ``codes``: of what stands behind places and behind indices, in binary."""
     head = f"ply\nformat {kind} 1.0\nelement vertex {len(vertices)}\nproperty float x\n"
     head += (
         "property float y\nproperty float z\n"
@@ -94,9 +95,9 @@ def ply(kind: str, vertices: list, faces: list, declared: str, of_faces: str, ty
         rows = [*vertices, *([len(index), *index, *more] for index, more in faces)]
         return (head + "\n".join(" ".join(map(str, row)) for row in rows) + "\n").encode()
     order = "<" if "little" in kind else ">"
-    body = b"".join(struct.pack(order + "3f" + types, *row) for row in vertices)
+    body = b"".join(struct.pack(order + "3f" + codes[0], *row) for row in vertices)
     for index, more in faces:
-        body += struct.pack(f"{order}B{len(index)}i{types}", len(index), *index, *more)
+        body += struct.pack(f"{order}B{len(index)}i{codes[1]}", len(index), *index, *more)
     return head.encode() + body
 
 
@@ -113,41 +114,13 @@ def test_colours_of_vertices_and_faces_of_a_ply(
     said = [round(share * white, 6) if white == 1 else int(share * white) for share in (1.0, 0.4, 0.2)]
     linear = srgb(np.array(said) / white)
     declared = "".join(f"property {type_} {name}\n" for name in names)
-    bare = [(index, ()) for index in polygons]
     path = tmp_path / "a.ply"
-    path.write_bytes(
-        ply(kind, [(*p, *said) for p in SQUARE], [(i, m) for i, m in bare], declared, "", 3 * code)
-        if kind == "ascii"
-        else _binary(kind, polygons, said, declared, code, False)
-    )
+    bare = [(index, ()) for index in polygons]
+    path.write_bytes(ply(kind, [(*p, *said) for p in SQUARE], bare, declared, "", (3 * code, "")))
     np.testing.assert_allclose(load_mesh(path).colors[:, :3], [linear] * 4, atol=1e-6)
-    path.write_bytes(
-        ply(kind, SQUARE, [(index, said) for index in polygons], "", declared)
-        if kind == "ascii"
-        else _binary(kind, polygons, said, declared, code, True)
-    )
+    path.write_bytes(ply(kind, SQUARE, [(index, said) for index in polygons], "", declared, ("", 3 * code)))
     colors = load_mesh(path).colors
     np.testing.assert_allclose(colors[:, :3], [linear] * len(colors), atol=1e-6)
-
-
-def _binary(kind: str, polygons: list, said: list, declared: str, code: str, of_faces: bool) -> bytes:
-    order = "<" if "little" in kind else ">"
-    color = struct.pack(order + 3 * code, *said)
-    head = ply(kind, [], [], "" if of_faces else declared, declared if of_faces else "").decode()
-    head = head.replace("vertex 0", "vertex 4").replace("face 0", f"face {len(polygons)}")
-    body = b"".join(struct.pack(order + "3f", *p) + (b"" if of_faces else color) for p in SQUARE)
-    for index in polygons:
-        body += struct.pack(f"{order}B{len(index)}i", len(index), *index) + (color if of_faces else b"")
-    return head.encode() + body
-
-
-def test_what_a_ply_declares_and_is_not_shown_is_named(tmp_path: pathlib.Path) -> None:
-    rows = [(*p, 5) for p in SQUARE]
-    (tmp_path / "a.ply").write_bytes(ply("ascii", rows, [((0, 1, 2), ())], "property float gloss\n", ""))
-    assert load_mesh(tmp_path / "a.ply").notes == ("the property gloss of each vertex",)
-    strips = b"element tristrips 0\nproperty list uchar int vertex_indices\nend_header"
-    (tmp_path / "a.ply").write_bytes(ply("ascii", SQUARE, [((0, 1, 2), ())], "", "").replace(b"end_header", strips))
-    assert load_mesh(tmp_path / "a.ply").notes == ("strips of triangles beside faces",)
 
 
 @hypothesis.settings(max_examples=25, deadline=None)
@@ -234,16 +207,6 @@ def test_each_face_of_a_ply_has_the_texture_of_its_number(tmp_path: pathlib.Path
     }
 
 
-def test_what_an_stl_and_an_obj_declare_and_is_not_shown_is_named(tmp_path: pathlib.Path) -> None:
-    triangle = struct.pack("<12f", 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0)
-    for head, more in ((b"solid", 0x8000), (b"COLOR=\xff\0\0\xff", 0)):
-        (tmp_path / "a.stl").write_bytes(head.ljust(80) + struct.pack("<I", 1) + triangle + struct.pack("<H", more))
-        mesh = load_mesh(tmp_path / "a.stl")
-        assert (len(mesh.faces), mesh.notes) == (1, ("colours of triangles",))
-    (tmp_path / "a.obj").write_text(f"{TRIANGLE}l 1 2\nf 1 2 3\n")
-    assert load_mesh(tmp_path / "a.obj").notes == ("points and lines",)
-
-
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\n"
 
 
@@ -266,14 +229,6 @@ def test_libraries_of_an_obj(tmp_path: pathlib.Path, text: str, encoding: str) -
     assert mesh.materials[0].surface.base_color == (1.0, 0.0, 0.0)
     assert len(mesh.faces) == 1
     assert [note for note in mesh.notes if "none.mtl" not in note] == []
-
-
-def test_materials_that_no_library_has_are_named(tmp_path: pathlib.Path) -> None:
-    (tmp_path / "a.mtl").write_text("newmtl a\nKd 1 0 0\n")
-    (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{TRIANGLE}usemtl a\nf 1 2 3\nusemtl b\nf 2 4 3\n")
-    mesh = load_mesh(tmp_path / "a.obj")
-    assert mesh.notes == ("the material b, which no library has",)
-    assert len(mesh.faces) == 2
 
 
 def test_colours_of_an_obj_in_255_steps(tmp_path: pathlib.Path) -> None:

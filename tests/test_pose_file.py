@@ -88,20 +88,6 @@ def test_poses_of_a_clip(tmp_path):
         load_pose_file(tmp_path / "images.txt")
 
 
-def test_poses_of_absurd_numbers(tmp_path):
-    """Whole numbers too large for a float, and quaternions whose squares are no numbers any more."""
-    (tmp_path / "poses.json").write_text(f'[{{"R": [{", ".join(["1" + 400 * "0"] * 9)}], "t": [0, 0, 1]}}]')
-    with pytest.raises(SceneError, match="pose 0: expected R, a rotation matrix"):
-        load_pose_file(tmp_path / "poses.json")
-    (tmp_path / "images.txt").write_text("1 1e-200 0 0 1e-200 0 0 1 1 a.png\n")
-    rotation, _ = load_pose_file(tmp_path / "images.txt").poses[0]
-    assert np.allclose(rotation, [0, -1, 0, 1, 0, 0, 0, 0, 1])
-    for huge in ("1e308 1e308 1e308 1e308", "1e999 0 0 0"):
-        (tmp_path / "images.txt").write_text(f"1 {huge} 0 0 1 1 a.png\n")
-        with pytest.raises(SceneError, match="QW QX QY QZ"):
-            load_pose_file(tmp_path / "images.txt")
-
-
 @pytest.mark.parametrize("points", ["\n", "", "1.5 2 -1 3 4 5 6 7 8 9 10 11\n"], ids=["none", "left out", "four"])
 def test_poses_are_those_of_the_pictures_of_their_names(tmp_path, points):
     names = ["left/f1.jpg", "right/f1.jpg", "left/f2.jpg", "left/f10.jpg"]

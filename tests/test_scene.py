@@ -14,7 +14,6 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import strategies as st
 
 from warp_ar import keys
 from warp_ar import scene as sc
@@ -224,12 +223,6 @@ def test_scaled_camera_sees_the_same_directions(size: tuple[int, int]) -> None:
 def test_another_aspect_cannot_be_scaled(size: tuple[int, int]) -> None:
     with pytest.raises(SceneError, match=f"calibrated for 640x480, frames are {size[0]}x{size[1]}.*aspect"):
         loads_scene(CAMERA).camera.scaled_to(*size)
-
-
-def test_calibration_of_the_real_clip(shared: pathlib.Path) -> None:
-    camera = load_calibration(shared / "real/aruco_clip/intrinsics.yml")
-    distortion = (0.0995485, -0.206384, 0.00754589, 0.00336531, 0.0)
-    assert camera == Camera(640, 480, 628.158, 628.156, 324.099, 260.908, distortion)
 
 
 @pytest.mark.parametrize("suffix", [".yml", ".json", ".xml"])
@@ -484,33 +477,6 @@ def test_cones_at_their_limits_are_legal(text: str) -> None:
     assert len(loads_scene(text).lights) == 1
 
 
-VALUES = st.recursive(
-    st.none()
-    | st.booleans()
-    | st.integers(-(2**70), 2**70)
-    | st.floats()
-    | st.text(max_size=8)
-    | st.sampled_from(["mesh", "sphere", "spot", "phong", "frames", "model.ply", "auto", "grid 4x3 0.04 0.01"]),
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
-    max_leaves=6,
-)
-
-
-def toml(value: Any) -> str:
-    """Any value as TOML; None becomes an empty table."""
-    if value is None:
-        return "{}"
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007F")
-    if isinstance(value, list):
-        return "[" + ", ".join(map(toml, value)) + "]"
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{toml(key)} = {toml(entry)}" for key, entry in value.items()) + "}"
-    return repr(value)
-
-
 # --- Scenes from outside name no file but those that came with them, whatever key names it ----------------------------
 
 
@@ -607,27 +573,18 @@ def test_a_users_own_scene_names_any_file(tmp_path: pathlib.Path) -> None:
         (sc.Object, {"shape": "cube"}, "Object: shape = 'cube': unknown; .*"),
         (sc.Object, {"shape": "sphere", "radius": 0}, "Object: radius = 0: expected a number above 0"),
         (sc.Object, {"shape": "mesh"}, "a mesh needs its file"),
-        (sc.Object, {"shape": "torus", "major_radius": 0.1, "minor_radius": 0.2}, "less than major_radius, 0.1"),
         (sc.Object, {"shape": "sphere", "radius": 1, "at": (0, 0)}, r"at = \(0, 0\): expected 3 numbers"),
         (sc.Probe, {"center": (0, 0, 0), "radius": 1, "reflectance": (2, 1, 1)}, "each from 0.01 to 1"),
         (sc.LambertMaterial, {"base_color": (255, 0, 0)}, r"base_color = \(255, 0, 0\): .*each from 0 to 1"),
         (sc.Light, {"kind": "sun", "intensity": 1}, "kind = 'sun': unknown"),
-        (sc.Light, {"kind": "spot", "intensity": 1}, "a spot light needs a target or a direction"),
         (sc.Light, {"kind": "point", "intensity": True}, "intensity = True: expected a number"),
         (sc.Light, {"kind": "directional", "intensity": 1, "direction": (0, 0, 0)}, "the way the light travels"),
         (sc.CapturedLight, {"file": pathlib.Path("a.exr"), "axes": "up"}, "axes = 'up': unknown"),
         (sc.Object, {"shape": "sphere", "radius": 1, "material": "red"}, "material = 'red': expected .*Material or"),
-        (sc.Object, {"shape": "sphere", "radius": 1, "name": 3}, "name = 3: expected str"),
         (sc.Object, {"shape": "sphere", "radius": 1, "marker": 7}, "marker = 7: expected Marker"),
         (sc.CapturedLight, {"file": 3}, "file = 3: expected Path"),
-        (sc.Object, {"shape": "box"}, "expected 3 lengths above 0"),
         (sc.AreaLight, {"kind": "rect", "intensity": 1, "at": (0, 0, 1)}, "expected 2 lengths above 0"),
         (sc.Marker, {"size": -0.08}, "size = -0.08: expected a number above 0"),
-        (
-            sc.Camera,
-            {"width": 0, "height": 9, "fx": 9, "fy": 9, "cx": 4, "cy": 4},
-            "width = 0: expected a number from 1",
-        ),
         (sc.Camera, {"width": 9, "height": 9, "fx": -9, "fy": 9, "cx": 4, "cy": 4}, "fx = -9: expected a number above"),
     ],
 )
@@ -666,14 +623,6 @@ def test_all_keys_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
     assert keys.main([]) == 0
     text = capsys.readouterr().out
     assert all(f"  {key.name} = " in text for key in all_keys())
-
-
-def test_one_section(capsys: pytest.CaptureFixture[str]) -> None:
-    assert keys.main(["[marker]"]) == 0
-    text = capsys.readouterr().out
-    assert text.startswith("[marker]\n")
-    assert "  size = " in text
-    assert "[camera]" not in text
 
 
 def test_a_section_that_is_none_is_named(capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,6 +14,7 @@ import pytest
 import tomlkit
 from hypothesis import given, settings
 
+from tests.hostile.corpus import SCENE
 from tests.viewer_rig import page_scene
 from warp_ar.errors import SceneError, WarpArError
 from warp_ar.farm.jobs import parse_jobs
@@ -78,42 +79,7 @@ def nothing_appears(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 KEYS = [(key.section, key.name) for key in keys()]
-SOUND = tomllib.loads(
-    """
-schema = 1
-[source]
-path = "frames"
-[camera]
-width = 640
-height = 480
-fx = 600.0
-fy = 600.0
-cx = 320.0
-cy = 240.0
-[marker]
-id = 0
-size = 0.08
-[[probe]]
-center = [0.1, 0.0, 0.03]
-radius = 0.03
-[[proxy]]
-shape = "plane"
-size = [1.0, 1.0]
-[[light]]
-kind = "spot"
-at = [0.0, 0.0, 0.5]
-target = [0.0, 0.0, 0.0]
-intensity = 0.1
-inner_angle = 15.0
-outer_angle = 20.0
-[[object]]
-shape = "sphere"
-radius = 0.03
-at = [0.0, 0.1, 0.03]
-[object.material]
-model = "lambert"
-"""
-)
+SOUND = tomllib.loads(SCENE)
 
 
 def changed(changes: list[tuple[tuple[str, str], Any]]) -> str:

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import fractions
 import pathlib
 import shutil
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 import av
 import cv2
@@ -15,9 +12,8 @@ import numpy as np
 import pytest
 
 from tests.test_sources import no_thread_left, patches  # noqa: F401  (a fixture)
-from warp_ar.command_line import Terminated, ended_by_signals
 from warp_ar.errors import SinkError, UsageError
-from warp_ar.output.sink import FRAMES_WAITING, ThreadedSink
+from warp_ar.output.sink import FRAMES_WAITING
 from warp_ar.output.sinks import (
     EnvironmentSink,
     FolderSink,
@@ -171,6 +167,33 @@ def test_png_that_cannot_be_written_is_told_once(tmp_path: pathlib.Path) -> None
     assert not list(tmp_path.glob(".*"))
 
 
+def test_environment_sink_numbers_its_files(tmp_path: pathlib.Path) -> None:
+    with EnvironmentSink(tmp_path / "env") as sink:
+        for index in range(6):
+            sink.write(radiance() + np.float32(index))
+        with pytest.raises(SinkError, match="float32"):
+            sink.write(flat(0))
+    for index in range(6):
+        assert np.array_equal(read_environment(tmp_path / "env" / f"{index:04d}.exr"), radiance() + np.float32(index))
+
+
+def test_light_of_balls_of_an_earlier_run_goes(tmp_path: pathlib.Path) -> None:
+    for folder in (tmp_path, tmp_path / "ball_1", tmp_path / "ball_2", tmp_path / "ball_room"):
+        with EnvironmentSink(folder) as sink:
+            sink.write(radiance())
+            sink.write(radiance())
+    theirs = tmp_path / "ball_2" / "0007.exr"
+    theirs.write_bytes(b"somebody's")
+    with EnvironmentSink(tmp_path) as sink:
+        assert (tmp_path / "ball_1" / "0001.exr").exists(), "nothing goes before there is a frame"
+        assert sink.replaced.endswith("ball_*: 4 environments of an earlier run are removed")
+        sink.write(radiance())
+    assert not (tmp_path / "ball_1").exists()
+    assert list((tmp_path / "ball_2").iterdir()) == [theirs]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["0000.exr", "ball_2", "ball_room"]
+    assert len(list((tmp_path / "ball_room").iterdir())) == 2
+
+
 # ---------------------------------------------------------------------------------------------------------------- video
 
 
@@ -268,27 +291,6 @@ def test_odd_sizes_are_padded_and_say_so(tmp_path: pathlib.Path, size: tuple[int
     assert abs(int(decoded[height // 2, even[0] - 1, 1]) - 60) <= RAMP_LEVELS + 10 * (width > 1)
 
 
-@pytest.mark.parametrize("name", VIDEOS)
-def test_file_is_a_video_while_it_grows(tmp_path: pathlib.Path, name: str) -> None:
-    rng = np.random.default_rng(0)
-    counts = []
-    with open_sink(tmp_path / name, fps=24) as sink:
-        for index in range(96):
-            sink.write(rng.integers(0, 256, (48, 64, 3), dtype=np.uint8))
-            if index in {60, 90}:
-                copy = tmp_path / f"copy{index}{pathlib.Path(name).suffix}"
-                shutil.copy(tmp_path / name, copy)
-                counts.append(0)
-                # The copy may end within a fragment; what comes before plays.
-                with av.open(str(copy)) as container, contextlib.suppress(av.error.InvalidDataError):
-                    for _ in container.decode(video=0):
-                        counts[-1] += 1
-    # What is not on disk yet: half a second of fragment, the encoder's look-ahead, and the frames that wait.
-    assert counts[0] >= 60 - 40
-    assert counts[1] >= 90 - 40
-    assert len(levels(tmp_path / name)) == 96
-
-
 def test_no_frame_leaves_no_file_and_no_loss(tmp_path: pathlib.Path) -> None:
     open_sink(tmp_path / "new.mp4", fps=24).close()
     assert not (tmp_path / "new.mp4").exists()
@@ -315,12 +317,6 @@ def test_bad_paths_are_told_at_open(tmp_path: pathlib.Path) -> None:
     assert (tmp_path / "frames.v3").is_dir()
 
 
-@pytest.mark.skipif(not pathlib.Path("/proc/self").exists(), reason="needs /proc, where nobody can make a file")
-def test_unwritable_places_are_told_at_open() -> None:
-    for name in ("clip.mp4", "frames"):
-        assert "cannot be written" in error_of(pathlib.Path("/proc") / name)
-
-
 @pytest.mark.parametrize("fps", [0.0, -3.0, float("nan")])
 def test_impossible_rate(tmp_path: pathlib.Path, fps: float) -> None:
     with pytest.raises(UsageError, match="fps"):
@@ -338,49 +334,6 @@ def test_other_images_are_refused(tmp_path: pathlib.Path, name: str) -> None:
             sink.write(flat(0, (32, 48)))
     with pytest.raises(SinkError, match="closed"):
         sink.write(flat(0))
-
-
-# -------------------------------------------------------------------------------------------------------------- signals
-
-
-@pytest.mark.parametrize("name", [*VIDEOS, "frames", "light"])
-def test_a_signal_on_the_way_into_close_loses_nothing(tmp_path: pathlib.Path, name: str, monkeypatch) -> None:
-    """The exception may come up before the first line of ``close``, where that cannot catch it, or anywhere in it."""
-
-    def run(place: pathlib.Path, interrupted: str) -> None:
-        owner = ThreadPoolExecutor if interrupted in ("submit", "shutdown") else ThreadedSink
-        plain = getattr(owner, interrupted)
-
-        def interrupt(self: Any, *arguments: Any, **options: Any) -> Any:
-            if (interrupted == "close" or sink._closed) and not told:
-                told.append(True)
-                if interrupted == "submit":
-                    plain(self, *arguments, **options)  # the job is taken, and its ticket lost
-                raise Terminated
-            return plain(self, *arguments, **options)
-
-        def fill() -> None:
-            with sink:
-                for level in range(10):
-                    image = flat(20 * level)
-                    sink.write(image.astype(np.float32) if name == "light" else image)
-                patch.setattr(owner, interrupted, interrupt)
-
-        told: list[bool] = []
-        sink = EnvironmentSink(place) if name == "light" else open_sink(place, fps=24)
-        with monkeypatch.context() as patch, pytest.raises(Terminated), ended_by_signals():
-            fill()
-        assert told
-        assert sink.written == 10
-
-    for interrupted in ("close", "submit", "_settle", "_wait_out", "shutdown"):
-        place = tmp_path / interrupted / name
-        run(place, interrupted)
-        if name == "light":
-            assert len([read_environment(path) for path in place.iterdir()]) == 10
-        else:
-            assert levels(place) == pytest.approx([20 * level for level in range(10)], abs=VIDEO_LEVELS)
-        assert not list(place.parent.rglob(".*"))
 
 
 def test_last_png_that_cannot_be_written_is_told_by_close(tmp_path: pathlib.Path) -> None:

@@ -23,13 +23,11 @@ from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
 from warp_ar.errors import SourceError, UsageError
 from warp_ar.sources import video_file
 from warp_ar.sources.source import FRAMES_AHEAD
-from warp_ar.sources.sources import QueueSource, Source, Synthetic, open_source
+from warp_ar.sources.sources import QueueSource, Source, open_source
 from warp_ar.sources.video_file import _IN_PLANES, TO_RGB, rgb_from_video
 
 # 4:2:0 at limited range keeps 219 of 255 levels, and the codec adds its own rounding.
 VIDEO_LEVELS = 3
-# The card's texels are half a pixel wide and blur edges by as much; 1 is what a shift by a pixel would change.
-CARD_PIXELS = 0.2
 # Long enough for any thread to come by on a loaded machine; a test that passes never waits for it.
 PATIENCE = 20.0
 # The colour matrix of a stream that says nothing of it.
@@ -38,8 +36,11 @@ UNNAMED = 2
 
 @pytest.fixture(autouse=True)
 def no_thread_left() -> Iterator[None]:
+    """Fail where a test leaves a thread; one that was told to end has time to."""
     before = set(threading.enumerate())
     yield
+    for thread in set(threading.enumerate()) - before:
+        thread.join(PATIENCE)
     assert set(threading.enumerate()) <= before
 
 
@@ -409,8 +410,7 @@ FFMPEG = ["ffmpeg", "-v", "error", "-y"]
 
 
 @pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs ffmpeg, whose picture is compared with")
-@pytest.mark.parametrize("matrix", [*TURNS, *MIRRORS])
-@pytest.mark.parametrize("shape", [(1, 1), (2, 1), (1, 2)])
+@pytest.mark.parametrize(("matrix", "shape"), [(TURNS[1], (2, 1)), (MIRRORS[3], (1, 2))])
 def test_a_display_matrix_and_pixel_shapes_together_are_as_ffmpeg_shows_them(
     tmp_path: pathlib.Path, matrix: tuple[int, int, int, int], shape: tuple[int, int]
 ) -> None:
@@ -465,14 +465,6 @@ def test_frames_that_an_edit_list_leaves_out_are_none(tmp_path: pathlib.Path) ->
         frames = list(source)
         assert container.streams.video[0].frames > shown == len(frames) == source.length
     assert [frame.time for frame in frames] == pytest.approx([index / 24 for index in range(shown)], abs=1e-3)
-
-
-def test_frames_counted_but_not_shown_are_no_damage(shared: pathlib.Path) -> None:
-    path = shared / "cases" / "video_edit_list" / "desk_trim.mp4"
-    if not path.exists():
-        pytest.skip(f"needs {path.name}")
-    with open_source(path) as source:
-        assert sum(1 for _ in source) == source.length == 12
 
 
 @pytest.mark.parametrize("kept", [0.25, 0.6, 0.97])
@@ -576,45 +568,6 @@ def test_queue_refuses_other_images(image: np.ndarray) -> None:
 # ------------------------------------------------------------------------------------------------------------ synthetic
 
 
-def test_synthetic_is_the_same_every_time() -> None:
-    for name in Synthetic.NAMES:
-        with open_source(f"synthetic:{name}") as first, Synthetic(name) as second:
-            for one, two, _ in zip(first, second, range(3), strict=False):
-                assert np.array_equal(one.image, two.image)
-                assert one.image.shape == (480, 640, 3)
-                assert one.image.std() > 10
-
-
-def trace_card(source: Synthetic, index: int) -> np.ndarray:
-    """Grey levels by following 8x8 rays through each pixel to the marker's plane, in float64."""
-    width, height = source.size
-    rotation, translation = source.pose(index)
-    steps = (np.arange(8) + 0.5) / 8 - 0.5
-    x = (np.arange(width)[:, None] + steps).ravel()
-    y = (np.arange(height)[:, None] + steps).ravel()
-    pixels = np.stack(np.broadcast_arrays(x[None, :], y[:, None], 1.0), axis=-1)
-    rays = pixels @ np.linalg.inv(source.camera_matrix).T @ rotation
-    eye = -rotation.T @ translation
-    points = eye - rays * (eye[2] / rays[..., 2:])
-    bits = cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), 0, 6)
-    card = np.pad(np.pad(bits, 2, constant_values=240), 1, constant_values=120)
-    column = np.floor(points[..., 0] / source.MARKER_SIZE * 6 + 6).clip(0, 11).astype(int)
-    row = np.floor(-points[..., 1] / source.MARKER_SIZE * 6 + 6).clip(0, 11).astype(int)
-    return card[row, column].reshape(height, 8, width, 8).mean(axis=(1, 3))
-
-
-def test_synthetic_card_is_where_its_pose_says() -> None:
-    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50))
-    with Synthetic("card", size=(240, 180), length=3) as source:
-        for frame in source:
-            assert np.linalg.det(source.pose(frame.index)[0]) == pytest.approx(1)
-            assert detector.detectMarkers(frame.image)[1].ravel().tolist() == [0]
-            expected = trace_card(source, frame.index)
-            error = np.abs(frame.image[..., 0] - expected).mean()
-            moved = np.abs(np.diff(expected, axis=1)).mean()
-            assert error < CARD_PIXELS * moved
-
-
 def test_unknown_synthetic_names_the_nearest() -> None:
     with pytest.raises(UsageError, match="did you mean card"):
         open_source("synthetic:cart")
@@ -650,22 +603,6 @@ def test_close_ends_a_reading_in_progress(tmp_path: pathlib.Path) -> None:
     next(frames)
     source.close()
     assert list(frames) == []
-
-
-@pytest.mark.parametrize(
-    ("matrix", "clockwise"), [((1, 0, 0, 1), 0), ((0, 1, -1, 0), 1), ((-1, 0, 0, -1), 2), ((0, -1, 1, 0), 3)]
-)
-def test_rotation_is_honoured(tmp_path: pathlib.Path, matrix: tuple[int, int, int, int], clockwise: int) -> None:
-    picture = np.zeros((32, 64, 3), np.uint8)
-    picture[:16, :32] = 250  # The upper left quarter.
-    path = write_video(tmp_path / "clip.mp4", [picture] * 3)
-    turn(path, matrix)
-    upright = np.rot90(picture, -clockwise)
-    with open_source(path) as source:
-        assert source.size == (upright.shape[1], upright.shape[0])
-        image = next(iter(source)).image
-    assert np.abs(image.astype(int) - upright).mean() < VIDEO_LEVELS
-    assert image.flags.c_contiguous
 
 
 def test_video_cut_between_two_frames(tmp_path: pathlib.Path) -> None:
