@@ -24,23 +24,19 @@ pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install
 pytestmark = [pytest.mark.slow, needs_browser]
 
 
-def test_by_keyboard_alone(open_tab: Callable[..., Tab]) -> None:
-    tab = open_tab()
+def move_the_teapot(tab: Tab) -> None:
+    """It is reached by Tab, moved, turned and held."""
     page = tab.page
-    for _ in range(40):
-        page.keyboard.press("Tab")
-        if page.evaluate("document.activeElement.dataset?.key") == "object 0":
-            break
-    else:
-        pytest.fail("Tab never reaches the teapot")
+    reach(page, '[data-key="object 0"]')
     x, y, _ = page.evaluate("warpAr.scene.objects[0].at")
     page.keyboard.press("ArrowLeft")
     page.keyboard.press("ArrowUp")
     tab.until(f"Math.hypot(warpAr.scene.objects[0].at[0] - {x}, warpAr.scene.objects[0].at[1] - {y}) > 0.005")
     page.keyboard.press("]")
     tab.until("warpAr.scene.objects[0].rotate[2] === -20")
-    page.keyboard.press(" ")
-    tab.until("warpAr.state.playing === false")
+    for playing in ("false", "true"):
+        page.keyboard.press(" ")
+        tab.until(f"warpAr.state.playing === {playing}")
 
 
 PRESSED = """import('/static/geometry.js').then(({ project }) => {
@@ -80,16 +76,20 @@ TOPS = """() => [...document.querySelectorAll(".toolbar > *")].filter((e) => e.o
   .map((e) => { const box = e.getBoundingClientRect(); return box.top + box.height / 2; })"""
 
 
-@pytest.mark.parametrize("size", [(1280, 800), (390, 844), (844, 390)], ids=["desktop", "phone", "phone on its side"])
-def test_nothing_hinders_anybody(open_tab: Callable[..., Tab], size: Any, artefacts: Path) -> None:
-    phone = min(size) < 800
-    shape = {"viewport": {"width": size[0], "height": size[1]}, "has_touch": phone, "is_mobile": phone}
-    tab = open_tab(**shape)
+def test_nothing_hinders_anybody(open_tab: Callable[..., Tab], artefacts: Path) -> None:
+    """On a desktop, a phone, and a phone on its side."""
+    for size in ((1280, 800), (390, 844), (844, 390)):
+        phone = min(size) < 800
+        shape = {"viewport": {"width": size[0], "height": size[1]}, "has_touch": phone, "is_mobile": phone}
+        look_over(open_tab(**shape), size, phone, artefacts)
+
+
+def look_over(tab: Tab, size: tuple[int, int], phone: bool, artefacts: Path) -> None:
     page = tab.page
     if size == (390, 844):
         pinch_the_teapot(tab)
     page.evaluate(axe_core())
-    for scheme in ("dark", "light"):
+    for scheme in ("dark",) if phone else ("dark", "light"):  # colours are those of every size
         page.emulate_media(color_scheme=scheme)
         assert page.evaluate("document.documentElement.scrollWidth") <= size[0], "wider than the screen"
         middles = page.evaluate(TOPS)
@@ -202,6 +202,7 @@ def point_out_a_plane(tab: Tab) -> None:
 
 def test_a_desk_is_set_up_by_keyboard_alone(open_tab: Callable[..., Tab], artefacts: Path) -> None:
     tab = open_tab()
+    move_the_teapot(tab)
     type_sizes(tab)
     ask_for_another_marker(tab, artefacts)
     check_everything(tab)

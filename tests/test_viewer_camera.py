@@ -62,6 +62,7 @@ def test_the_browsers_camera_is_lit(open_tab: Callable[..., Tab], artefacts: Pat
     tab.until("document.getElementById('coverage').hidden")
     page.click("#use-clip")
     tab.until("warpAr.state.camera === false")
+    turn_a_phone(open_tab())
 
 
 # A camera whose pictures change their shape, as a phone's do.
@@ -81,8 +82,8 @@ TURNING = """() => {
 }"""
 
 
-def test_a_phone_that_is_turned(open_tab: Callable[..., Tab]) -> None:
-    tab = open_tab()
+def turn_a_phone(tab: Tab) -> None:
+    """Its pictures are upright from then on, on the same connection."""
     tab.page.evaluate(TURNING)
     tab.page.click("#use-camera")
     tab.until("warpAr.view.stats.stamped && warpAr.camera.width === 640 && warpAr.camera.height === 480")

@@ -25,6 +25,7 @@ pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install
 pytestmark = needs_browser
 
 
+@pytest.mark.slow
 def test_a_button_shows_the_difference_to_the_reference(open_tab: Callable[..., Tab], artefacts: Path) -> None:
     """It holds the frame; colours, a scale and samples that grow; pressed again, and let go on, all of it is gone."""
     tab = open_tab()
@@ -53,7 +54,7 @@ def test_a_button_shows_the_difference_to_the_reference(open_tab: Callable[..., 
     tab.until("warpAr.state.playing && warpAr.state.convergence === null")
 
 
-def test_the_picture_is_the_frame_that_its_header_says(open_tab: Callable[..., Tab]) -> None:
+def test_the_picture_is_the_frame_that_its_header_says_and_clocks_agree(open_tab: Callable[..., Tab]) -> None:
     tab = open_tab()
     for _ in range(10):
         seen = tab.page.evaluate(CODE)
@@ -63,6 +64,9 @@ def test_the_picture_is_the_frame_that_its_header_says(open_tab: Callable[..., T
     stats = tab.page.evaluate("warpAr.view.stats")
     assert stats["fps"] > 0
     assert stats["latency"] > 0
+    # Half of the way there and back would be 200 ms off, and frames could be shown before they were taken.
+    # The frame was 1 ms on its way; the page's clock is told in steps of 0.1 ms, and the lines take a moment.
+    assert 4990.0 < tab.page.evaluate(OFFSET) <= 5000.5
 
 
 OFFSET = """async () => {
@@ -88,10 +92,4 @@ OFFSET = """async () => {
   socket.onmessage({ data: data.buffer });
   return connection.offset;
 }"""
-
-
-def test_the_clock_of_the_server_is_bounded_by_what_arrives(open_tab: Callable[..., Tab]) -> None:
-    """Half of the way there and back would be 200 ms off, and frames could be shown before they were taken."""
-    offset = open_tab().page.evaluate(OFFSET)
-    # The frame was 1 ms on its way; the page's clock is told in steps of 0.1 ms, and the lines above take a moment.
-    assert 4990.0 < offset <= 5000.5
+"""The offset of the server's clock, milliseconds, where it is 5 s ahead and its answer took 400 ms on the way back."""
