@@ -10,11 +10,24 @@ import warp as wp
 
 from tests.kernel_rig import SMALL_CAMERA
 from tests.reference import area_lights as twin
+from tests.test_path_tracer import look
+from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SceneError
 from warp_ar.kernels.rays.area_lights import AreaSample, area_numbers, make_area_count, make_area_sample
 from warp_ar.kernels.structs import RayScene
-from warp_ar.scene import AreaLight, Camera, EmissiveMaterial, Object, Scene, dumps_scene, loads_scene
+from warp_ar.scene import (
+    AreaLight,
+    Camera,
+    EmissiveMaterial,
+    LambertMaterial,
+    Object,
+    Proxy,
+    Scene,
+    dumps_scene,
+    loads_scene,
+)
 from warp_ar.scene.ray_scene import HostScene
+from warp_ar.stages.quality import PRESETS
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
 DOWN = (180.0, 0.0, 0.0)
@@ -295,3 +308,26 @@ def test_what_is_wrong_is_said_with_its_key(kind, keys, complaint):
         loads_scene(TEXT.format(kind=kind) + keys)
     assert complaint in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+# Of the mean. Noise of 16 samples per cell of two pixels, at most; all but one pixel in a hundred, where the shadow is
+# sharper than a cell.
+CELL_MEAN, CELL_WORST = 0.01, 0.15
+
+
+@pytest.mark.parametrize("method", ["coarse", "fine"])
+def test_cells_know_the_light_that_each_pixel_would_ask_for(device, method):
+    """A receiver under a rect, in a box's shadow too."""
+    box = Object("box", size=(0.05, 0.05, 0.1), at=(-0.03, 0.0, 0.05), material=LambertMaterial((0.0, 0.0, 0.0)))
+    light = AreaLight("rect", 2.0, at=(0.1, 0.0, 0.3), rotate=(160.0, 0.0, 30.0), size=(0.2, 0.1))
+    camera = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
+    scene = Scene(camera, proxies=(Proxy("plane", size=(3.0, 3.0)),), objects=(box, light.as_object()))
+    added = {}
+    for asked in ("brute_force", method):
+        quality = PRESETS["low"].with_methods(area_light=asked)
+        with Pipeline(scene, device=device, quality=quality) as pipeline:
+            pipeline(np.full((120, 160, 3), 60, np.uint8), time_seconds=0.0, pose=look((-0.2, -0.5, 0.5)))
+            added[asked] = pipeline.arrays["added_light"].numpy()
+    off = np.abs(added[method] - added["brute_force"]) / added["brute_force"].mean()
+    assert 0.0 < off.mean() < CELL_MEAN, off.mean()
+    assert np.quantile(off, 0.99) < CELL_WORST, np.quantile(off, 0.99)

@@ -100,6 +100,8 @@ class RelightConfig:
     """True if the light of several mirror balls is interpolated."""
     area_samples: int = 0
     """Samples of what emits, per point; ``area_lights.POINT_SAMPLES``: as lights at points; 0: nothing emits."""
+    area_cells: bool = False
+    """True if cells of the frame know what emitters send there; else each pixel asks."""
 
     def general(self, *, soft: bool) -> RelightConfig:
         """For any scene in which as much is known of the receiver."""
@@ -165,6 +167,9 @@ class ReceiverCells:
     bounced: wp.array2d[wp.vec3]  # irradiance by virtual light that other proxies send there
     bounced_surface: wp.array2d[wp.int32]
     bounced_stride: wp.int32
+    area: wp.array2d[wp.vec3]  # irradiance by what emits
+    area_surface: wp.array2d[wp.int32]
+    area_stride: wp.int32
 
 
 @wp.struct
@@ -197,6 +202,15 @@ def look_up_bounced(scene: RayScene, receiver: Receiver, hit: Hit, row: wp.int32
     key = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
     size = wp.vec2i(receiver.picture.frame.shape[0], receiver.picture.frame.shape[1])
     return look_up_cells(cells.bounced, cells.bounced_surface, cells.bounced_stride, key, size, row, col)
+
+
+@wp.func
+def look_up_area(scene: RayScene, receiver: Receiver, hit: Hit, row: wp.int32, col: wp.int32) -> wp.vec4:
+    """Irradiance by what emits, at what a pixel shows, and 1; zero where no cell around it knows."""
+    cells = receiver.cells
+    key = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
+    size = wp.vec2i(receiver.picture.rays.shape[0], receiver.picture.rays.shape[1])
+    return look_up_cells(cells.area, cells.area_surface, cells.area_stride, key, size, row, col)
 
 
 @wp.struct
@@ -308,7 +322,7 @@ def make_receiver(
             needed by ``reflectance``.
         emitters: (q,) Emitter, seen from the first probe; needed if ``config.emitters``.
         others: The balls after the first; needed if ``config.several``.
-        cells: From ``receiver_cells``; needed if ``config.ambient_visibility`` or ``config.bounced``.
+        cells: From ``receiver_cells``; needed if the config names any.
     """
     given = {"probes": probes, "key_lights": key_lights, f"irradiance_{config.irradiance}": irradiance}
     return filled(Receiver(), picture=picture, emitters=emitters, others=others, cells=cells, **given)

@@ -15,6 +15,9 @@ camera sees of it there, and where it sees nothing what grey paper would. Planes
 where the environment has them. A CUDA device has several threads share the samples of a cell; their sums are added in
 one order, so that the same frame gives the same bits.
 
+**Light of emitters.** It is wide and its shadows are soft, so cells ask for it, and pixels interpolate between those of
+their surface (``area_lights``).
+
 **Bounced light.** A lit proxy lights the others. Every cell of a coarse grid is a patch: radiance L that virtual light
 adds there (``relight``'s own, direct), and the area A of the surface that its pixels show. Where a virtual object is in
 front the patch lies on that, and sends the light that falls on it by its material's colour to all sides alike. A
@@ -47,12 +50,13 @@ from warp_ar.kernels.rays.trace import TraceConfig, make_trace, offset_origin
 from warp_ar.kernels.rays.visibility import inside_rect, make_visible_proxy
 from warp_ar.kernels.receiver.receiver import (
     DEFAULT_REFLECTANCE,
+    Matter,
     Receiver,
     ReceiverCells,
     RelightConfig,
     look_up_bounced,
 )
-from warp_ar.kernels.receiver.relight import make_direct_lighting
+from warp_ar.kernels.receiver.relight import make_area_response, make_direct_lighting
 from warp_ar.kernels.structs import MIRROR, PHONG, PLANE, FrameParams, Hit, Light, RayScene
 
 wp.set_module_options({"enable_backward": False})
@@ -270,6 +274,40 @@ def make_ambient_visibility_kernel(config: RelightConfig) -> wp.Kernel:
     return ambient_visibility_kernel
 
 
+@functools.cache
+def make_area_light_kernel(config: RelightConfig) -> wp.Kernel:
+    """Kernel of ``estimate_area_light``."""
+    visible_proxy = make_visible_proxy(config.trace)
+    area_response = make_area_response(dataclasses.replace(config, method="flat"))
+
+    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
+    def area_light_kernel(
+        # In:
+        row_start: wp.int32,
+        params: wp.array[FrameParams],
+        scene: RayScene,
+        receiver: Receiver,
+        # Out:
+        cells_out: ReceiverCells,
+    ):
+        ci, cj = wp.tid()
+        ci += row_start
+        rays = receiver.picture.rays
+        stride = cells_out.area_stride
+        cells_out.area_surface[ci, cj] = -1
+        if not in_lit_cells(ci, cj, stride, params[0].light_rect):
+            return
+        i = cell_pixel(ci, stride, rays.shape[0])
+        j = cell_pixel(cj, stride, rays.shape[1])
+        hit = visible_proxy(params[0], rays[i, j], scene, receiver.probes)
+        if hit.shape < 0:
+            return
+        cells_out.area_surface[ci, cj] = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
+        cells_out.area[ci, cj] = area_response(scene, receiver, hit, Matter(), tile_turn(ci, cj))
+
+    return area_light_kernel
+
+
 @wp.func
 def sent_share(scene: RayScene, hit: Hit) -> wp.vec3:
     """Share of light that an object sends on, as if to all sides alike: its colour; of a picture a grey one's.
@@ -465,6 +503,18 @@ Args:
         sequence are an aligned block of Sobol's if n is a power of 2.
     bounced: Whether to add cells that get bounced light to those that were estimated before.
     cells_out: Cells whose ambient visibility and its surface are written.
+"""
+
+
+estimate_area_light = row_launcher(make_area_light_kernel, like=lambda *given: given[-1].area)
+"""Find the irradiance that emitting objects send to the receiver, per cell.
+
+Args:
+    config: Kinds of shape, and samples of what emits per cell.
+    params: (1,) FrameParams: camera and light_rect.
+    scene: Objects and proxies.
+    receiver: From ``make_receiver``: picture and balls.
+    cells_out: Cells whose irradiance and its surface are written.
 """
 
 

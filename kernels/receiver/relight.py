@@ -45,6 +45,7 @@ from warp_ar.kernels.receiver.receiver import (
     Matter,
     Receiver,
     RelightConfig,
+    look_up_area,
     look_up_bounced,
     make_find_matter,
     make_respond,
@@ -155,11 +156,17 @@ def make_direct_lighting(config: RelightConfig) -> wp.Function:
             added += visible * respond(matter, light.wi, n_dot_l) * light.irradiance_normal
         if wp.static(config.area_samples > 0):
             if scene.area_lights.shape[0] > 0:
+                stored = wp.vec4()
+                if wp.static(config.area_cells):
+                    if mirror[0] <= 0.0:
+                        stored = look_up_area(scene, receiver, hit, row, col)
+                by_areas = wp.vec3(stored[0], stored[1], stored[2])
                 if wp.static(config.method != "flat"):
-                    if not known:
+                    if not known and (stored[3] <= 0.0 or wp.max(by_areas) > 0.0):
                         known = True
                         matter = find_matter(scene, receiver, hit, row, col, mirror)
-                by_areas = area_response(scene, receiver, hit, matter, turn)
+                if stored[3] <= 0.0:
+                    by_areas = area_response(scene, receiver, hit, matter, turn)
                 if wp.max(by_areas) > 0.0:
                     result.visibility |= _LIT
                     added += by_areas

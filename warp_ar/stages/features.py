@@ -41,6 +41,8 @@ AREA_SAMPLES: Mapping[str, int] = MappingProxyType(
     {"point": POINT_SAMPLES, "coarse": 8, "fine": 32, "brute_force": 256}
 )
 """Samples of what emits, per point, by method of ``area_light``."""
+AREA_CELLS: Mapping[str, tuple[int, int]] = MappingProxyType({"coarse": (16, 8), "fine": (32, 6)})
+"""The same per cell of the receiver, and pixels per cell; by other methods each pixel asks."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,6 +82,8 @@ class Features:
     """Virtual lights with a size cast soft shadows."""
     area_samples: int
     """Samples of objects that emit, per point that they light; 0: none does."""
+    area_cells: bool
+    """Cells of the receiver know what these send there."""
     others: int
     """Mirror balls after the first whose light is interpolated with the first one's, on objects and on the receiver;
     0: one map is all."""
@@ -189,6 +193,7 @@ def find_features(request: Request) -> Features:
         bounced=relight_method in LOCAL and proxies_face(scene),
         soft_lights=quality.method("light_shadow") == "soft" and has_sized_lights(scene),
         area_samples=area_samples,
+        area_cells=area_samples > 0 and area_method(quality) in AREA_CELLS and relight_method in (FLAT, *MEASURED),
         others=others,
         near_field=_near_method(scene, quality) if environment else "",
         irradiance="irradiance_sh" if by_series else "irradiance_map",

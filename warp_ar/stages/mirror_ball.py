@@ -60,7 +60,7 @@ def mirror_variant(features: Features, device: Any) -> mirror_ball.MirrorBallCon
 
 def mirrored_relighting(features: Features) -> RelightConfig:
     """Return the response of the receiver that a ball shows: cells of the frame say nothing about it."""
-    return dataclasses.replace(relight_config(features), ambient_visibility=False, bounced=False)
+    return dataclasses.replace(relight_config(features), ambient_visibility=False, bounced=False, area_cells=False)
 
 
 def _reads(features: Features, *, lit: bool) -> set[str]:

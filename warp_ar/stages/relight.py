@@ -15,7 +15,7 @@ from warp_ar.kernels.receiver.receiver import Receiver, ReceiverCells, RelightCo
 from warp_ar.kernels.structs import PLANE
 from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring, over_rows
-from warp_ar.stages.features import Features, sheds_light
+from warp_ar.stages.features import AREA_CELLS, Features, area_method, sheds_light
 from warp_ar.stages.request import Request
 from warp_ar.stages.shared.edge_lists import edge_arrays, make_edge_lists
 from warp_ar.stages.shared.environment_sets import SAMPLES
@@ -98,6 +98,10 @@ class Relight(Stage):
             cells = _cells(self.request, _grain(self.features).ambient)
             specs["relight_ambient_visibility"] = ArraySpec(cells, wp.vec3)
             specs["relight_ambient_surface"] = ArraySpec(cells, wp.int32, -1)
+        if self.features.area_cells:
+            cells = _cells(self.request, AREA_CELLS[area_method(self.request.quality)][1])
+            specs["relight_area"] = ArraySpec(cells, wp.vec3)
+            specs["relight_area_surface"] = ArraySpec(cells, wp.int32, -1)
         if self.features.bounced:
             grain = _grain(self.features)
             cells, patches = _cells(self.request, grain.bounced), _cells(self.request, grain.patch)
@@ -148,6 +152,12 @@ class Relight(Stage):
             estimate = receiver_cells.estimate_ambient_visibility
             return over_rows(count, estimate, place, *inputs, samples, bounced, cells, extent=extent)
 
+        if config.area_cells:
+            samples = AREA_CELLS[area_method(self.request.quality)][0]
+            estimate, count = receiver_cells.estimate_area_light, len(cells.area)
+            extent = rows_of(int(cells.area_stride), count, 2)
+            asked = dataclasses.replace(place, area_samples=samples)
+            passes.append(over_rows(count, estimate, asked, params, scene, receiver, cells, extent=extent))
         if config.ambient_visibility:
             passes.append(ambient_pass(bounced=False))
         if config.bounced:
@@ -192,6 +202,9 @@ def make_cells(features: Features, arrays: Arrays) -> ReceiverCells:
     if features.relight_method in GRAINS:
         grain, request = _grain(features), features.request
         cells.ambient_stride, cells.bounced_stride = _stride(request, grain.ambient), _stride(request, grain.bounced)
+    if features.area_cells:
+        cells.area, cells.area_surface = arrays["relight_area"], arrays["relight_area_surface"]
+        cells.area_stride = _stride(features.request, AREA_CELLS[area_method(features.request.quality)][1])
     if features.ambient_visibility:
         cells.ambient_visibility = arrays["relight_ambient_visibility"]
         cells.ambient_surface = arrays["relight_ambient_surface"]

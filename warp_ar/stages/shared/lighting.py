@@ -176,4 +176,5 @@ def relight_config(features: Features) -> RelightConfig:
         features.request.quality.edge_samples,
         several=method in MEASURED and features.others > 0,
         area_samples=features.area_samples,
+        area_cells=features.area_cells,
     )
