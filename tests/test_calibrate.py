@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
 import re
 
 import cv2
@@ -18,7 +16,7 @@ from warp_ar.ball.ball_measure import measure_ball
 from warp_ar.calibration import camera_calibration, card, response
 from warp_ar.errors import UsageError
 from warp_ar.kernels.color import decode_table
-from warp_ar.scene import Camera, CharucoBoard, Marker, Pose, Probe, load_calibration, load_scene
+from warp_ar.scene import Camera, CharucoBoard, Marker, Pose, Probe, load_calibration
 from warp_ar.tracking.tracking import Tracker
 
 pytestmark = pytest.mark.slow
@@ -30,8 +28,6 @@ CURVE = 0.012
 """Of clipping, linear: quantised codes and OpenCV's smoothing; measured 0.0097."""
 BALL_DRAWN_MM = 1.0
 """A plain disc: what lies just outside the rim pushes it off by half a pixel; measured 0.86."""
-BALL_MM = 1.2
-"""By the mirrored desk, from 5 mm off; measured 0.2 to 0.7, most of it along the line of sight."""
 
 
 def test_card_prints_at_exact_size(tmp_path):
@@ -75,11 +71,6 @@ def test_default_board_fits_the_default_paper(tmp_path):
         str(tmp_path / "card.png"),
     ]
     assert calibrate.main(card) == 0
-
-
-def test_card_does_not_fit(tmp_path, capsys):
-    assert calibrate.main(["card", "--size", "0.25", "--output", str(tmp_path / "card.png")]) == 2
-    assert "does not fit" in capsys.readouterr().err
 
 
 def views(camera: Camera) -> list[np.ndarray]:
@@ -137,8 +128,8 @@ def test_camera_needs_views():
 
 def test_response_is_recovered(tmp_path, capsys):
     """A bracket of a scene with every brightness, encoded as sRGB."""
-    y, x = np.mgrid[0:200, 0:300]
-    scene = np.stack([0.02 * 60 ** (x / 300), 0.02 * 60 ** (y / 200), 0.02 * 60 ** ((x + y) / 500)], -1)
+    y, x = np.mgrid[0:100, 0:150]
+    scene = np.stack([0.02 * 60 ** (x / 150), 0.02 * 60 ** (y / 100), 0.02 * 60 ** ((x + y) / 250)], -1)
     exposures = [0.25, 0.5, 1.0, 2.0, 4.0]
     paths = []
     for k, exposure in enumerate(exposures):
@@ -177,54 +168,6 @@ def test_ball_stands_where_it_was_drawn():
     assert fit is None or not fit.is_good  # it mirrors nothing
     report = measure_ball(frames, camera, Probe(tuple(rough), 0.035), keep_radius=True)
     assert np.linalg.norm(np.subtract(report.center, center)) < BALL_DRAWN_MM / 1e3
-
-
-def truth_frames(path, step):
-    """Camera, ball, proxies and posed frames of a path-traced case."""
-    case = json.loads(path.read_text())
-    scene = load_scene(path.parent / "scene_object.toml")
-    frames = [
-        (imageio.v3.imread(path.parent / "camera" / f"{p['frame']:04d}.png"), Pose(np.array(p["R"]), np.array(p["t"])))
-        for p in case["poses"][::step]
-    ]
-    return scene, frames
-
-
-def test_ball_on_truth_by_the_desk_in_it(shared):
-    for path in sorted((shared / "truth").glob("*/case.json")):
-        scene, frames = truth_frames(path, 4)
-        few = frames[:: -(-len(frames) // 6)]
-        truth = np.array(scene.probes[0].center)
-        probe = dataclasses.replace(scene.probes[0], center=tuple(truth + np.array([0.004, -0.003, 0.0])))
-        fit = fit_ball(few, scene.camera, probe, scene.proxies, search=0.01)
-        assert fit is not None, path
-        assert fit.is_good, path
-        assert np.linalg.norm(np.subtract(fit.center, truth)) * 1e3 < BALL_MM, path
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        ([], "required"),
-        (["paint"], "invalid choice"),
-        (["card", "--dictionary", "DICT_9X9"], "DICT_9X9"),
-        (["card", "--board", "charuco 5x7"], "charuco 5x7"),
-        (["card", "--id", "50"], "50"),
-        (["card", "--size", "-1"], "-1"),
-        (["card", "--paper", "a9"], "letter"),
-        (["card", "--output", "nowhere/card.png"], "nowhere"),
-        (["camera", "nowhere"], "nowhere"),
-        (["ball", "nowhere"], "nowhere"),
-        (["response", "nowhere.png", "--exposures", "fast"], "1/50"),
-    ],
-)
-def test_errors_are_one_line(arguments, said, capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert calibrate.main(arguments) == 2
-    error = capsys.readouterr().err
-    assert said in error
-    assert error.count("\n") == 1
-    assert not list(tmp_path.iterdir())
 
 
 def test_a_picture_without_a_marker_is_counted(capsys, tmp_path):

@@ -1,6 +1,5 @@
 """The command: photographs of a mirror ball become light, and light a picture."""
 
-import argparse
 import re
 
 import cv2
@@ -12,11 +11,9 @@ from tests.photo_room import GAIN, environment, exposed, project, write_bracket
 from tests.test_photo_bracket import s_curve
 from warp_ar.ball.ball_finder import find_ball
 from warp_ar.capture import main
-from warp_ar.checks.checkup import check_up
 from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, EXIT_USAGE
 from warp_ar.light.captured import Light, irradiance_above, latlong_directions, texel_solid_angles
 from warp_ar.live import main as live
-from warp_ar.live_start import say_quick_check
 from warp_ar.photo_capture import capture_light
 from warp_ar.photographs.support import plane_from_contact
 from warp_ar.scene import load_scene
@@ -28,8 +25,6 @@ LIT = 0.12
 """Relative error of irradiance: 10 % are asked for after one scale; the plane that is picked here is exact."""
 REFLECTANCE = 0.85
 """Of the ball, as the command takes it."""
-DARK_OUTLINE = 0.06
-"""Share of the radius by which an outline may be off in a photograph whose rim is two codes high."""
 
 
 def irradiance(radiance):
@@ -183,17 +178,6 @@ def test_a_response_that_was_found_is_written_into_the_scene(tmp_path, capsys):
     assert scene.camera.transfer == tmp_path / "light.response.txt"
 
 
-def test_a_photograph_too_dark_for_a_rim_is_shown_by_another(bracket):
-    """The ball is found where it is seen best, and its light comes in camera values of the one that is asked for."""
-    dark = capture_light(bracket, device="cpu", shown=4)
-    assert not any("no rim of the ball" in note for note in dark.notes)
-    found = capture_light(bracket, device="cpu", shown=1)
-    assert dark.outline.center == pytest.approx(found.outline.center, abs=DARK_OUTLINE * found.outline.radius)
-    assert irradiance(dark.light.radiance).sum() * BRACKET[4] / BRACKET[1] == pytest.approx(
-        irradiance(found.light.radiance).sum(), rel=0.1
-    )
-
-
 def test_an_outline_of_another_photograph_is_said(tmp_path):
     """Of one so dark that no rim is seen in it."""
     clear = write_photo(tmp_path / "clear.jpg", exposed(60), denominator=60)
@@ -206,37 +190,12 @@ def test_an_outline_of_another_photograph_is_said(tmp_path):
     assert found.outline.center == pytest.approx(find_ball(exposed(60).astype(np.uint8)).center, abs=0.5)
 
 
-@pytest.mark.parametrize("outside", [True, False])
-def test_a_scene_whose_objects_the_photograph_does_not_show_is_said(tmp_path, capsys, outside):
-    """Of a photograph cut to the ball alone; and of one with its surroundings."""
-    x, y = map(round, project([0.0, 0.0, 0.04]))
-    columns, rows = (slice(x - 62, x + 62), slice(y - 62, y + 62)) if outside else (slice(10, None), slice(10, None))
-    photo = write_photo(tmp_path / "ball.jpg", exposed(60)[rows, columns])
-    contact = np.subtract(project([0.0, 0.0, 0.0]), [columns.start, rows.start])
-    scene = tmp_path / "ball.toml"
-    files = ["--output", str(tmp_path / "light.exr"), "--scene", str(scene)]
-    assert main([str(photo), "--contact", *map(str, contact), "--device", "cpu", *files]) == EXIT_DONE
-    said = capsys.readouterr().err
-    assert (f"{scene}: [[object]] 0 (sphere) lies right of the picture, [[object]] 1" in said) == outside
-    assert ("outside" in str([finding.name for finding in check_up(load_scene(scene), photo)])) == outside
-    say_quick_check(argparse.Namespace(scene=str(scene), source=None), load_scene(scene))
-    said = capsys.readouterr().err
-    assert said.count("right of the picture") == outside
-    assert ("use pictures that show more" in said) == outside
-
-
 def test_a_focal_length_that_is_given_counts_for_a_cut_picture_too(tmp_path):
     write_photo(tmp_path / "cut.jpg", exposed(60)[100:350, 120:420])
     alone, given = (capture_light([tmp_path / "cut.jpg"], device="cpu", focal_35mm=mm) for mm in (None, 50.0))
     assert any("was cut, so that EXIF's focal length says nothing" in note for note in alone.notes)
     assert not any("focal" in note for note in given.notes)
     assert given.camera.fx == pytest.approx(50.0 / np.hypot(36, 24) * np.hypot(300, 250))
-
-
-def test_a_picture_without_exif_was_not_cut(tmp_path):
-    cv2.imwrite(str(tmp_path / "cut.png"), exposed(60)[100:350, 120:420, ::-1])
-    notes = capture_light([tmp_path / "cut.png"], device="cpu").notes
-    assert any("cut.png has no focal length in its EXIF" in note for note in notes)
 
 
 def test_lying_exposures_end_the_command(tmp_path, capsys):
@@ -264,67 +223,6 @@ def test_a_moved_photograph_is_left_out_and_said(tmp_path):
     notes = capture_light(photos, device="cpu", shown=1).notes
     assert any(note.startswith("photo_c.jpg is left out: it shows something else") for note in notes)
     assert any(note.startswith("photo_d.jpg lies 6.4 pixels apart") and "was moved" in note for note in notes)
-
-
-def test_a_missing_exposure_is_said(tmp_path):
-    photos = write_bracket(tmp_path, BRACKET[:2])
-    write_photo(photos[1], exposed(BRACKET[1]))
-    notes = capture_light(photos, device="cpu").notes
-    assert "photo_b.jpg tells no exposure, so none is taken from EXIF" in notes
-    assert any("exposures are from the pixels alone" in note for note in notes)
-
-
-@pytest.mark.parametrize("size", [(1, 1), (16, 12), (23, 400)])
-def test_too_small_a_photograph_is_said(tmp_path, capsys, size):
-    noise = np.random.default_rng(0).integers(0, 256, (size[1], size[0], 3)).astype(np.uint8)
-    cv2.imwrite(str(tmp_path / "small.png"), noise)
-    assert main([str(tmp_path / "small.png"), "--output", str(tmp_path / "light.exr")]) == EXIT_USAGE
-    assert f"the picture is {size[0]}x{size[1]} pixels; expected 24 or more" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("ball", ["5000 5 30", "-90 200 30", "200 700 30"])
-def test_a_circle_outside_the_photograph_is_said(bracket, tmp_path, capsys, ball):
-    output = ["--output", str(tmp_path / "light.exr")]
-    assert main([str(bracket[0]), "--ball", *ball.split(), *output]) == EXIT_USAGE
-    said = f"ball {ball.replace(' ', ', ')}: the circle lies outside the picture, 600x450 pixels"
-    assert said in capsys.readouterr().err
-
-
-def test_light_is_written_as_openexr_alone(bracket, tmp_path, capsys):
-    assert main([str(bracket[0]), "--output", str(tmp_path / "light.jpg")]) == EXIT_USAGE
-    assert "light.jpg: expected a name that ends in .exr" in capsys.readouterr().err
-
-
-def test_a_folder_is_no_photograph(tmp_path, capsys):
-    assert main([str(tmp_path), "--output", str(tmp_path / "light.exr")]) == EXIT_USAGE
-    assert f"{tmp_path} is a folder; name the photographs in it" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--rectangle-size", "1", "2"], "belong together"),
-        (["--scene", "x.toml"], "--scene needs the plane"),
-        (["--shown", "nothing.jpg"], "expected one of the photographs"),
-        (["--reflectance", "1.5"], "0.01 to 1"),
-        (["--exposures", "0.1", "0.2"], "expected one for each"),
-        (["--exposures", "pixels", "0.2"], "stands alone"),
-        (["--focal-35mm", "0"], "--focal-35mm 0: expected millimetres"),
-        (["--focal-35mm", "nan"], "--focal-35mm nan: expected millimetres"),
-        (["--ball-radius", "-3"], "--ball-radius -3: expected metres above 0, 1 at most"),
-        (["--ball-radius", "4"], "1 at most; 4 cm are 0.04"),
-        (["--ball-radius", "35"], "1 at most; 35 mm are 0.035"),
-        (["--contact", "nan", "100"], "--contact nan 100: expected pixels"),
-        (["--outline", "outline.jpg"], "--outline outline.jpg: expected a name that ends in .png"),
-        (["--height", "8"], "--height 8: expected 16 to 4096 rows"),
-        (["--ball", "1", "2", "9", "--circle", "1", "2", "9"], "--ball is a rough circle and --circle an exact one"),
-    ],
-)
-def test_bad_usage_is_one_line(bracket, tmp_path, capsys, arguments, message):
-    assert main([str(bracket[0]), *arguments, "--output", str(tmp_path / "light.exr")]) == EXIT_USAGE
-    said = capsys.readouterr().err
-    assert message in said
-    assert said.count("\n") == 1
 
 
 def test_a_place_that_cannot_be_written_is_told_before_anything_is_computed(bracket, tmp_path, capsys, monkeypatch):

@@ -18,7 +18,6 @@ from warp_ar.errors import UsageError
 from warp_ar.light.captured import latlong_directions, texel_solid_angles
 from warp_ar.output.environment_axes import (
     AXES,
-    CUBES,
     basis,
     cube_directions,
     encode_harmonics,
@@ -148,19 +147,6 @@ def test_a_cubes_faces_lie_as_its_program_has_them(axes: str, directions: np.nda
     np.testing.assert_allclose(faces, linear(marker_from(directions)), atol=SMOOTH)
 
 
-def test_neighbouring_faces_meet() -> None:
-    """Of OpenEXR's faces: the right edge of +z, as seen from inside, is the left edge of -x."""
-    faces = cube_directions("y-up", 4, 0.5, 1.0)
-    np.testing.assert_allclose(faces[4, :, 3], cube_directions("y-up", 4, 0.5, 0.0)[1, :, 0], atol=EXACT)
-
-
-@pytest.mark.parametrize("axes", CUBES)
-def test_a_constant_environment_is_a_constant_cube(axes: str) -> None:
-    cube = to_cube(np.full((8, 16, 3), 0.7, np.float32), axes)
-    assert cube.shape == (24, 4, 3)
-    np.testing.assert_allclose(cube, 0.7, atol=EXACT)
-
-
 def test_samples_are_exact_at_texel_centres_and_continuous_at_seam_and_pole() -> None:
     noise = np.random.default_rng(2).random((8, 16, 3)).astype(np.float32)
     directions = from_axes(blender_latlong(8).astype(np.float32), "blender").astype(np.float64)
@@ -258,34 +244,6 @@ def test_a_cube_has_the_size_asked_for(captured: pathlib.Path) -> None:
     output = captured.parent / "out.exr"
     assert environment.main([str(captured), "--output", str(output), "--layout", "cube", "--size", "5"]) == 0
     assert pixels(output).shape == (30, 5, 3)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--output", "out.png"], "ends in '.png'; use .exr, .hdr, .json"),
-        (["--output", "out.exr", "--size", "5"], "add --layout cube"),
-        (["--output", "out.exr", "--layout", "cube", "--axes", "blender"], "expected y-up, opengl for a cube"),
-        (["--output", "out.exr", "--taken", "noon"], "'noon': expected a time"),
-        (["--output", "out.exr", "--taken", "2026-05-01T12:00:00"], "expected a time with its zone"),
-        (["--output", "captured.exr"], "is the same as the environment"),
-    ],
-)
-def test_wrong_options_are_one_line(
-    captured: pathlib.Path, capsys: pytest.CaptureFixture[str], options: list[str], message: str
-) -> None:
-    folder = captured.parent
-    options = [str(folder / option) if "." in option and "-" not in option else option for option in options]
-    assert environment.main([str(captured), *options]) == 2
-    error = capsys.readouterr().err
-    assert message in error
-    assert error.count("\n") == 1
-    assert [path.name for path in folder.iterdir()] == ["captured.exr"]
-
-
-def test_a_missing_environment_is_one_line(tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert environment.main([str(tmp_path / "none.exr"), "--output", str(tmp_path / "o.exr")]) == 2
-    assert "there is no file" in capsys.readouterr().err
 
 
 # --- The environment within a glTF: its faces, its roughness, its harmonics, against sums that are written out here ---

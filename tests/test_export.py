@@ -17,7 +17,6 @@ from tests.gltf_files import Gltf
 from tests.layer_rig import POSES, make_scene
 from tests.test_live import message, write_scene
 from warp_ar import export
-from warp_ar.errors import SinkError
 from warp_ar.output.gltf_file import write_glb
 from warp_ar.output.shot import Shot, exchange_materials_of, mesh_of, placement, texture_files
 from warp_ar.output.sinks import read_environment
@@ -26,7 +25,6 @@ from warp_ar.scene import Camera, Light, Object
 from warp_ar.scene.description import Animation
 from warp_ar.scene.materials import EmissiveMaterial, PhongMaterial
 from warp_ar.scene.mesh_files import load_mesh
-from warp_ar.scene.pose_file import load_pose_file
 
 pytestmark = pytest.mark.slow
 
@@ -100,35 +98,6 @@ def test_every_balls_light_is_written(clip: pathlib.Path, tmp_path: pathlib.Path
     assert maps[0].exists()
     assert not maps[1].exists()
     assert theirs.exists()
-
-
-def test_a_way_comes_back_as_poses(clip: pathlib.Path, tmp_path: pathlib.Path) -> None:
-    assert run(clip, "--output", tmp_path / "way.jsonl", "--frames", 2) == 0
-    assert not (tmp_path / "way_environment.exr").exists()
-    assert len(load_pose_file(tmp_path / "way.jsonl").poses) == 2
-    pytest.importorskip("pxr.Usd", reason="needs usd-core, of the extra exchange")
-    assert run(clip, "--output", tmp_path / "way.usda", "--frames", 2, "--no-environment") == 0
-    for one, other in zip(
-        load_pose_file(tmp_path / "way.usda").poses, load_pose_file(tmp_path / "way.jsonl").poses, strict=True
-    ):
-        np.testing.assert_allclose(np.concatenate(one), np.concatenate(other), atol=1e-9)
-    assert run(clip, "--output", tmp_path / "way.usda", "--frames", 1, "--no-environment") == 0
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (("--output", "shot.fbx"), "--output shot.fbx ends in '.fbx'; use .usda, .usdc, .usd, .glb, .jsonl"),
-        (("--output", "shot.glb", "--frames", "0"), "--frames: 0: expected 1 or more"),
-        (("--output", "shot.glb", "--source", "missing"), "missing"),
-    ],
-)
-def test_what_cannot_be_is_said(
-    clip: pathlib.Path, tmp_path: pathlib.Path, monkeypatch, capsys, arguments: tuple, words: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert run(clip, *arguments) != 0
-    assert words in message(capsys)
 
 
 def test_frames_without_a_marker_have_no_way(clip: pathlib.Path, tmp_path: pathlib.Path, capsys) -> None:
@@ -403,14 +372,6 @@ def test_a_phong_lobe_becomes_as_wide_a_one():
     assert (material.base_color, material.metallic, material.specular) == ((0.1, 0.2, 0.3), 0.0, (0.4, 0.5, 0.6))
     assert material.roughness == pytest.approx((2 / 32) ** 0.25)
     assert not material.pictures
-
-
-def test_what_cannot_be_written_is_said(shot, tmp_path):
-    pytest.importorskip("pxr.Usd", reason="needs usd-core, of the extra exchange")
-    (tmp_path / "missing").write_text("a file, where a folder should be")
-    for write, name in ((write_usd, "shot.usda"), (write_glb, "shot.glb")):
-        with pytest.raises(SinkError, match=rf"{name} cannot be written"):
-            write(tmp_path / "missing" / name, shot)
 
 
 def test_emission_is_told(tmp_path):

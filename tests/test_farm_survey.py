@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import time
 
 import numpy as np
@@ -118,22 +117,3 @@ def test_what_goes_wrong_beside_fails_the_survey(folder, tmp_path, monkeypatch):
         outcome = work.do(Job("survey"))
     assert outcome.state == "failed"
     assert "no room" in outcome.reason
-
-
-def test_frames_parse_no_text(monkeypatch):
-    """Two threads that parse at once fail in Python 3.11, and frames flow in several."""
-    parsed, parse = [], ast.parse
-
-    def noted(source, *arguments, **named):
-        parsed.append(source)
-        return parse(source, *arguments, **named)
-
-    options = {"outputs": ("pose", "environment"), "estimates": "synchronous"}
-    with Pipeline("desk", device="cpu", quality="low", size=(320, 240), **options) as pipeline:
-        for number, image in enumerate(desk_frames(8)):
-            if number == 4:
-                monkeypatch.setattr(ast, "parse", noted)
-            result = pipeline.submit(image, time_seconds=number / 5)
-            assert result.environment is not None
-            assert result.emitters is not None
-    assert not parsed

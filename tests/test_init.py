@@ -14,10 +14,9 @@ from warp_ar import init
 from warp_ar.calibration.board_finder import recognise_board
 from warp_ar.calibration.card import draw_card, write_card
 from warp_ar.errors import SceneError
-from warp_ar.scene import Camera, CharucoBoard, Marker, dumps_scene, load_scene, loads_scene
+from warp_ar.scene import CharucoBoard, Marker, dumps_scene, load_scene, loads_scene
 from warp_ar.signature import is_signed
 from warp_ar.tracking import card_layout
-from warp_ar.tracking.tracking import Tracker
 
 pytestmark = pytest.mark.slow
 
@@ -44,27 +43,6 @@ def test_folder_is_a_scene(tmp_path, capsys):
         ["scene.toml", "teapot.ply", *(name for name, _, _ in init.CARDS)]
     )
     assert [path.name for path in tmp_path.iterdir()] == ["my desk"]  # nothing is left aside
-
-
-def test_nothing_is_written_over(tmp_path, capsys):
-    (tmp_path / "desk").mkdir()
-    assert init.main([str(tmp_path / "desk")]) == 2
-    assert "is there already" in capsys.readouterr().err
-    assert not list((tmp_path / "desk").iterdir())
-    assert init.main([str(tmp_path / "nowhere" / "desk")]) == 2
-    assert init.main([str(tmp_path / "other"), "--radius", "3"]) == 2
-    assert "3 cm are 0.03" in capsys.readouterr().err
-    assert init.main([str(tmp_path / "other"), "--radius", "35"]) == 2
-    assert "35 mm are 0.035" in capsys.readouterr().err
-
-
-def test_a_folder_needs_one_scene(tmp_path):
-    with pytest.raises(SceneError, match="it has none"):
-        load_scene(tmp_path)
-    for name in ("a.toml", "b.toml"):
-        (tmp_path / name).write_text("schema = 1\n")
-    with pytest.raises(SceneError, match=r"a\.toml, b\.toml"):
-        load_scene(tmp_path)
 
 
 def test_guessed_camera_fits_any_frame():
@@ -151,14 +129,6 @@ def test_no_board_where_there_is_none():
     assert recognise_board(np.full((480, 640), 128, np.uint8)) is None
     single = draw_card(Marker(), 2000.0)
     assert recognise_board(np.pad(single, 100, constant_values=255)) is None
-
-
-def test_tracker_follows_the_sheet():
-    card = draw_card(card_layout.SHEET, 2000.0)
-    height, width = card.shape
-    camera = Camera(width, height, 1000.0, 1000.0, (width - 1) / 2, (height - 1) / 2)
-    track = Tracker(card_layout.SHEET, camera).track(np.repeat(card[..., None], 3, 2), 0.0)
-    assert np.allclose(track.pose.translation, (0, 0, 0.5), atol=1e-3)
 
 
 def test_template_is_toml_with_the_reference_s_words(tmp_path, capsys):

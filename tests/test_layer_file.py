@@ -27,6 +27,8 @@ from warp_ar.output.layer_file import (
 from warp_ar.scene import Exposure
 from warp_ar.stages.request import LAYERS, PICTURE_LAYERS
 
+pytestmark = pytest.mark.slow
+
 # 16-bit floats have a step of 2^-11 of their value: at white an eighth of a code, and the picture sums five of them.
 HALF_CODES = 1.0
 HALF = 2.0**-11

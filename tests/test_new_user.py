@@ -10,7 +10,7 @@ import pytest
 
 from tests.printed_card import PrintedCard, poses
 from tests.rendered_room import look_at
-from warp_ar import __main__, calibrate, doctor, live
+from warp_ar import __main__, calibrate, doctor
 from warp_ar.calibration.camera_calibration import MOST_FOCAL
 from warp_ar.scene import Camera, Pose, load_scene
 
@@ -73,26 +73,6 @@ def test_a_ball_that_is_not_there_is_not_written(desk, capsys):
     assert "the camera is guessed" in told
     assert "no mirror ball is seen" in told or "too wide to be used" in told or "the picture is flat" in told
     assert (desk / "my_desk" / "scene.toml").read_text() == before
-
-
-def test_the_folder_of_the_desk_is_no_picture(desk, capsys):
-    assert calibrate.main(["camera", "my_desk"]) == 2
-    assert "my_desk: is the folder of a scene; expected photographs" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("main", "arguments", "said"),
-    [
-        (doctor.main, ["mydesk"], 'did you mean "my_desk"?'),
-        (live.main, ["my_desk", "--qualty", "low"], "did you mean --quality?"),
-        (calibrate.main, ["ball", "my_desk", "--sorce", "x"], "did you mean --source?"),
-        (__main__.main, ["doctr", "my_desk"], 'no command doctr; did you mean "doctor"?'),
-        (live.main, ["my_desk", "--radius", "3"], "unrecognized arguments: --radius 3; see"),
-    ],
-)
-def test_typos_are_told_from_what_was_meant(desk, main, arguments, said, capsys):
-    assert main(arguments) == 2
-    assert said in capsys.readouterr().err
 
 
 def test_all_commands_are_listed(capsys):

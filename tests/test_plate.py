@@ -8,7 +8,7 @@ from tests.photo_files import encode_srgb, write_photo
 from tests.photo_room import FOCAL, GAIN, ROOM, SIZE, exposed, project
 from tests.rendered_room import look_at, render
 from warp_ar import capture, live, pose
-from warp_ar.command_line import EXIT_DONE, EXIT_USAGE
+from warp_ar.command_line import EXIT_DONE
 from warp_ar.light.captured import Light
 from warp_ar.scene import load_scene
 
@@ -77,17 +77,3 @@ def test_points_in_depth_tell_pose_and_focal_length(tmp_path, capsys):
     eye = -rotation.T @ np.array(found.pose.poses[0][1])
     assert np.abs(eye - -PLATE[0].T @ PLATE[1]).max() < 0.01
     assert np.degrees(np.arccos((np.trace(rotation @ PLATE[0].T) - 1) / 2)) < 0.5
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ([], "give --rectangle with --rectangle-size, or four or more --point"),
-        (["--point", "0", "0", "0", "1", "1"], "1 points; expected four or more"),
-        (["--rectangle", *"12345678"], "--rectangle and --rectangle-size belong together"),
-    ],
-)
-def test_bad_usage_is_one_line(tmp_path, capsys, arguments, message):
-    given = [str(tmp_path / "plate.jpg"), "--light", str(tmp_path / "light.exr"), *arguments]
-    assert pose.main(given) == EXIT_USAGE
-    assert message in capsys.readouterr().err

@@ -88,41 +88,6 @@ def test_a_light_that_is_turned_is_not_saved(tmp_path: Path, capsys: pytest.Capt
     assert "would be applied again" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        (["--samples", "0"], "--samples: 0: expected 1 or more"),
-        (["--error", "-1"], "--error -1: expected a number above 0"),
-        (["--output", "x.jpg"], "--output x.jpg ends in '.jpg'; use .png, .exr"),
-        (["--save-light", "x.png"], "--save-light x.png ends in '.png'; use .exr"),
-        (["--compare", "x.exr"], "--compare x.exr ends in '.exr'; use .png"),
-        (["--size", "64"], "--size 64: expected width x height"),
-        (["--size", "64x64"], "another aspect ratio"),
-        (["--quality", "best"], "quality 'best' is no preset"),
-        (["--seed", "-3"], "seed = -3: expected 0 to"),
-    ],
-)
-def test_wrong_usage_is_one_line(options: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([*QUICK, *options]) == EXIT_USAGE
-    text = capsys.readouterr().err
-    assert words in text
-    assert text.count("\n") == 1
-
-
-def test_a_frame_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    cv2.imwrite(str(tmp_path / "0.png"), np.zeros((480, 640, 3), np.uint8))
-    assert main([*QUICK, "--source", str(tmp_path), "--frame", "1"]) == EXIT_FAILED
-    assert "has no frame 1; it ends before" in capsys.readouterr().err
-
-
-def test_files_of_others_stay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "own.png"
-    path.write_bytes(b"mine")
-    assert main([*QUICK, "--output", str(path)]) != EXIT_DONE
-    assert path.read_bytes() == b"mine"
-    assert "--overwrite" in capsys.readouterr().err
-
-
 def test_a_place_that_cannot_be_written_is_told_before_paths_are_followed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

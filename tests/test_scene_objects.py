@@ -14,6 +14,7 @@ from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SceneError, UsageError
 from warp_ar.scene import AreaLight, LambertMaterial, MirrorMaterial, Object, Scene, dumps_scene, loads_scene
 
+pytestmark = pytest.mark.slow
 __all__ = ["frames"]  # a fixture
 
 BALL = Object("sphere", radius=0.02, at=(0.0, 0.06, 0.02), material=LambertMaterial((0.2, 0.5, 0.9)), name="ball")

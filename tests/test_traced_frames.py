@@ -62,24 +62,6 @@ def test_a_frame_without_a_marker_stays_as_the_pipeline_gave_it() -> None:
         assert traced(frame, lost) is lost.image
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["--samples", "0"], "--samples 0: expected 1 or more"),
-        (["--samples", "4", "--error", "0"], "--error 0: expected a number above 0"),
-        (["--error", "0.1"], "--error 0.1 needs --samples"),
-        (["--samples", "4", "--quality", "auto"], "--samples with --quality auto: name a preset"),
-    ],
-)
-def test_what_cannot_be_traced_is_said(
-    arguments: list[str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "scene.toml"
-    path.write_text(dumps_scene(page_scene()))
-    assert main([str(path), "--headless", "--device", "cpu", "--frames", "1", *arguments]) == 2
-    assert words in capsys.readouterr().err
-
-
 def test_a_darker_exposure_scales_what_is_encoded() -> None:
     """The radiance stays; the picture is that of the scaled one."""
     frame = np.full((24, 32, 3), 0.5, np.float32)

@@ -13,8 +13,8 @@ from PIL import Image
 from bench import paper_figures
 from tests.accuracy_rig import case, frames, report, setting  # noqa: F401  (fixtures)
 from warp_ar import paper, tradeoff
-from warp_ar.accuracy import measure, tradeoff_page
-from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, EXIT_USAGE
+from warp_ar.accuracy import tradeoff_page
+from warp_ar.command_line import EXIT_DONE, EXIT_FAILED
 from warp_ar.signature import is_signed
 
 pytestmark = pytest.mark.slow
@@ -71,32 +71,7 @@ def test_presets_alone(tmp_path, device):
     assert all(0.0 < whole["error"] < 1.0 and whole["ms"] > 0.0 for whole in listed["presets"]["darken"].values())
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["desk", "--presets", "--stage", "irradiance"], "--presets --stage irradiance: expected one of both"),
-        (["desk", "--only", "low"], "--only low: expected --presets beside it"),
-        (["desk", "--presets", "--only", "low,best"], "--only best: expected presets of paper, low, medium"),
-        (["desk", "--frames", "0"], "--frames: 0: expected 1 or more"),
-        (["desk", "--shrink", "0"], "--shrink: 0: expected 1 or more"),
-        (["desk", "--stage", "colour", "--frames", "1"], "--stage colour: expected one of environment_height"),
-        (["--truth", "TMP"], "expected folders with scene_"),
-        (["darken", "--stage", "irradiance", "--frames", "1"], "nothing to turn"),
-    ],
-)
-def test_bad_usage_is_one_line(arguments, message, tmp_path, capsys):
-    arguments = [str(tmp_path) if argument == "TMP" else argument for argument in arguments]
-    assert tradeoff.main(arguments) == EXIT_USAGE
-    error = capsys.readouterr().err
-    assert message in error
-    assert error.count("\n") == 1
-
-
 # --- The page: one file that needs nothing else -----------------------------------------------------------------------
-
-
-pytest.importorskip("flip_evaluator")
-pytest.importorskip("matplotlib")
 
 
 class Checker(html.parser.HTMLParser):
@@ -137,15 +112,7 @@ def test_the_page_is_whole_and_needs_nothing_else(report):
         assert base64.b64decode(code)[:4] == b"RIFF"
 
 
-def whole(label, flip, over):
-    return measure.Whole(label, 10.0 * over, flip, {"irradiance": "sh2"}, {}, over)
-
-
 # --- The command that makes the paper's figures -----------------------------------------------------------------------
-
-
-pytest.importorskip("flip_evaluator")
-pytest.importorskip("matplotlib")
 
 
 def test_a_figure_is_a_picture_numbers_and_a_plot(tmp_path, monkeypatch, capsys, device):
@@ -168,18 +135,3 @@ def test_a_figure_is_a_picture_numbers_and_a_plot(tmp_path, monkeypatch, capsys,
     assert paper.main(arguments) == EXIT_FAILED
     assert "figure7.webp is there, and this program did not write it" in capsys.readouterr().err
     assert (out / "figure7.webp").read_bytes() == kept
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["2"], "figure 2: expected 1, 3, 4"),
-        (["1", "--frames", "0"], "--frames: 0: expected 1 or more"),
-        (["1", "--shrink", "0"], "--shrink: 0: expected 1 or more"),
-    ],
-)
-def test_paper_bad_usage_is_one_line(arguments, message, capsys):
-    assert paper.main(arguments) == EXIT_USAGE
-    error = capsys.readouterr().err
-    assert message in error
-    assert error.count("\n") == 1

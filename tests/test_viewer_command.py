@@ -59,34 +59,6 @@ def test_address() -> None:
     assert Address("127.0.0.1").outside_url is None
 
 
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [
-        (["--port", "70000"], "--port 70000"),
-        (["--token", "a b"], "--token"),
-        (["--token", ""], "--token"),
-        (["--tls", "/no/such.pem"], "/no/such.pem"),
-        (["--report", "run.json"], "--report needs"),
-        (["--quality", "auto", "--budget-ms", "-5"], "--budget-ms -5"),
-        (["--quality", "auto", "--budget-ms", "inf"], "--budget-ms inf"),
-        (["--budget-ms", "20"], "needs --quality auto"),
-        (["--host", "no.such.host.invalid", "--device", "cpu", "--quality", "low"], "cannot serve"),
-    ],
-)
-def test_bad_usage_of_the_page(
-    arguments: list[str],
-    expected: str,
-    capsys: pytest.CaptureFixture[str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert live.main(["desk", *arguments]) == 2
-    text = capsys.readouterr().err
-    assert expected in text
-    assert text.count("\n") == 1
-
-
 def test_the_command_serves_until_its_frames_are_lit(capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["desk", "--device", "cpu", "--quality", "low", "--port", "0", "--no-browser", "--frames", "3"]
     assert live.main(arguments) == 0
