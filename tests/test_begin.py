@@ -18,7 +18,7 @@ FIRST = "warp_ar.begin"
 """The module that commands begin with."""
 
 
-PATIENCE = 60.0
+PATIENCE = 300.0
 """Seconds after which a command that goes on is killed."""
 
 

@@ -71,8 +71,7 @@ def test_output_that_nobody_reads_or_that_does_not_fit_is_no_traceback():
     assert (done.returncode, done.stderr) == (141, "")
 
 
-@pytest.mark.parametrize("kind", ["closed", "broken"])
-@pytest.mark.parametrize("way", ["page", "clip"])
+@pytest.mark.parametrize(("way", "kind"), [("page", "broken"), ("clip", "closed")])
 def test_nobody_has_to_listen_to_what_is_said(way, kind, tmp_path):
     """Frames are lit whether or not somebody reads the standard error; nothing of it comes into a file."""
     report = tmp_path / "report.json"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from concurrent.futures import Future
 
 import pytest
@@ -107,14 +106,6 @@ def test_a_poisoned_job_fails_alone_after_two_tries(jobs, tmp_path):
     assert drive(jobs, tmp_path / "run")[0].given == []
 
 
-def test_a_survey_that_fails_takes_only_its_clip(jobs, tmp_path):
-    pool, failed, _ = drive(
-        jobs, tmp_path / "run", lambda job, _: Outcome("failed", reason="cut off") if job == Job("survey", 0) else None
-    )
-    assert failed == {"a/survey": "cut off"}
-    assert [key for key in keys(jobs, pool.given) if key.startswith("a")] == ["a/survey", "a/survey"]
-
-
 def test_a_second_try_may_succeed(jobs, tmp_path):
     pool, failed, _ = drive(
         jobs,
@@ -148,28 +139,6 @@ def test_outputs_without_a_line_are_taken_over(jobs, tmp_path):
     assert len(done) == len((run / "manifest.jsonl").read_text().splitlines()) == 21
     assert done["b/survey"]["length"] == FRAMES, "a survey takes an hour, and is not done again"
     assert done["b/segment-000003"]["frames"] == 2
-
-
-def test_a_survey_whose_record_is_damaged_is_done_again(jobs, tmp_path):
-    run = tmp_path / "run"
-    drive(jobs, run)
-    lines = (run / "manifest.jsonl").read_text().splitlines()
-    (run / "manifest.jsonl").write_text("".join(f"{line}\n" for line in lines if '"b/' not in line))
-    (run / "b.mp4").unlink()
-    (run / "clips/b" / RECORD).write_text(json.dumps({"job": "b/survey", "length": "many", "bytes": 1}))
-    pool, failed, _ = drive(jobs, run)
-    assert keys(jobs, pool.given) == ["b/survey", "b/join"]
-    assert not failed
-
-
-def test_lines_without_outputs_are_forgotten(jobs, tmp_path):
-    run = tmp_path / "run"
-    drive(jobs, run)
-    (run / "b.mp4").unlink()
-    shutil.rmtree(run / "parts/b/000003")
-    pool, failed, _ = drive(jobs, run)
-    assert keys(jobs, pool.given) == ["b/segment-000003", "b/join"]
-    assert not failed
 
 
 def test_a_full_disk_ends_the_run_and_says_how_to_go_on(jobs, tmp_path):

@@ -165,15 +165,14 @@ def attacked(port: int) -> Iterator[None]:
             process.stdin.close()
 
 
-@pytest.mark.parametrize("token", [SECRET])
 def test_a_polite_viewer_keeps_its_frames_beside_silent_connections(
-    token: str | None, few_files: None, capfd: pytest.CaptureFixture[str]
+    few_files: None, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    query = "" if token is None else f"?token={token}"
+    query = f"?token={SECRET}"
 
     @run
     async def test() -> None:
-        async with served(token=token) as site:
+        async with served(token=SECRET) as site:
             live = f"{site.url}/live{query}"
             async with site.session.ws_connect(live, max_msg_size=1 << 24) as polite:
                 page = Page(polite)

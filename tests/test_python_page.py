@@ -74,9 +74,11 @@ def test_a_phone_s_camera_and_a_captured_light(tmp_path: pathlib.Path, monkeypat
 
 
 def test_tensors_that_stay_on_the_gpu() -> None:
-    torch = pytest.importorskip("torch")
-    if not wp.get_cuda_devices() or not torch.cuda.is_available():
+    if not wp.get_cuda_devices():
         pytest.skip("needs a CUDA device")
+    torch = pytest.importorskip("torch")
+    if not torch.cuda.is_available():
+        pytest.skip("needs a PyTorch for CUDA")
     tensor = torch.full((480, 640, 3), 90, dtype=torch.uint8, device="cuda:0")
     found = run("from_dlpack", tensors=[tensor], poses=[AHEAD])
     assert found["lit"].device.type == found["light"].device.type == "cuda"

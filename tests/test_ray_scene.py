@@ -344,11 +344,6 @@ def crowd(count: int) -> tuple[scenes.Proxy, ...]:
 SENDING = {
     "box": PROXIES,
     "wall": (PROXIES[0], scenes.Proxy("plane", size=(1.0, 0.6), at=(0.0, 0.4, 0.3), rotate=(90.0, 0.0, 0.0))),
-    "roof": (PROXIES[0], scenes.Proxy("plane", size=(0.5, 0.3), at=(0.0, 0.2, 0.4), rotate=(130.0, 0.0, 0.0))),
-    "boxes": (
-        *PROXIES,
-        scenes.Proxy("box", size=(0.1, 0.3, 0.3), at=(-0.2, 0.1, 0.15), rotate=(0.0, 20.0, 0.0)),
-    ),
     "a crowd": (*PROXIES, *crowd(25)),
 }
 

@@ -34,7 +34,7 @@ def calibration_of(running: Running) -> dict[str, Any]:
 
 
 def test_a_calibration_that_tells_too_little_is_not_used() -> None:
-    """The same words as the command has; the views stay, and others that are added make it good."""
+    """The same words as the command has; the views stay, so that others can be added."""
     used: list[Camera] = []
     truth = Camera(480, 360, 430.0, 430.0, 243.0, 176.0, (0.0, 0.0, 0.0, 0.0))
     with ThreadPoolExecutor(1) as helper:
@@ -58,9 +58,6 @@ def test_a_calibration_that_tells_too_little_is_not_used() -> None:
             session.camera_file()
         assert session.message()["on"]
         assert session.message()["views"] == count
-        show(list(rendered_cards(truth, 14, seed=5, marker=SHEET)))
-        session.step("finish")
-    assert used[0].fx == pytest.approx(truth.fx, rel=CALIBRATED_ERROR)
 
 
 def alike_views(camera: Camera, slant: float) -> list[np.ndarray]:

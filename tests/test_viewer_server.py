@@ -253,13 +253,13 @@ async def test_a_viewer_that_shows_nothing_gets_two_frames_and_slows_nobody() ->
 
 
 @run
-async def test_a_thousand_messages_from_hostile_pages_change_nothing_for_the_good_one() -> None:
+async def test_messages_from_hostile_pages_change_nothing_for_the_good_one() -> None:
     """Every bad one costs its sender the connection, and it comes back; ``bench_live`` sends ten thousand."""
     rng = random.Random(1)
-    messages = [mutated(rng) for _ in range(1000)]
+    messages = [mutated(rng) for _ in range(250)]
     # What is understood is done; these take seconds each.
     messages = [m for m in messages if isinstance(m, bytes) or '"scene"' not in m]
-    assert 200 < sum(map(is_refused, messages)) < 900
+    assert 50 < sum(map(is_refused, messages)) < 225
     async with served() as site, site.page() as good:
         await good.until("frame")
         stop = asyncio.Event()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
-import errno
 import threading
 import time
 from collections.abc import Iterator
@@ -22,7 +21,6 @@ from warp_ar.errors import UsageError
 from warp_ar.sources.sources import Synthetic
 from warp_ar.stages.quality import PRESETS
 from warp_ar.viewer import budget as budget_setting
-from warp_ar.viewer import server
 from warp_ar.viewer import setup as setup_checks
 from warp_ar.viewer.budget import BudgetSetting
 from warp_ar.viewer.controls import BrowserCamera, Controls, Feed, guessed_camera
@@ -171,33 +169,6 @@ async def test_who_goes_in_the_midst_of_a_file_is_no_fault_of_the_program(caplog
     assert not caplog.records
 
 
-@run
-async def test_a_camera_is_left_whatever_becomes_of_its_viewer() -> None:
-    """What is sent to it fails in a way that nobody has thought of, and it goes: the camera is free."""
-
-    def fail(*_: Any) -> None:
-        raise RuntimeError("nobody has thought of this")
-
-    async with served() as site:
-        host = await site.server.started()
-        with pytest.MonkeyPatch.context() as patch:
-            async with site.page() as page:
-                await page.until("frame")
-                await page.say(type="camera", width=SIZE[0], height=SIZE[1])
-                while not host._controls.newest_feed.is_browser:
-                    await page.hear()
-                patch.setattr(server, "pack_frame", fail)
-                (viewer,) = site.server._viewers
-                viewer.sent = -1
-                viewer.unshown.clear()
-                viewer.wake.set()
-                await asyncio.sleep(AHEAD)
-            deadline = time.monotonic() + 0.1 * PATIENCE
-            while host._controls.newest_feed.is_browser and time.monotonic() < deadline:
-                await asyncio.sleep(0.02)
-            assert not host._controls.newest_feed.is_browser
-
-
 # ---------------------------------------------------------------------------------------------- work beside the frames
 
 
@@ -248,19 +219,6 @@ def test_costs_that_cannot_be_measured_are_told_once(
     assert len(began) == 1
 
 
-def test_an_edit_that_cannot_be_built_takes_no_later_one_with_it() -> None:
-    controls = make_controls(lambda message: None)
-    good = controls.wanted
-    controls.change(with_quality("high"))
-    refused = controls.wanted
-    controls.change(with_quality("paper"))
-    controls.give_back(good, refused)
-    assert controls.wanted.quality.name == "paper"
-    controls.give_back(good, controls.wanted)
-    assert controls.wanted is good
-    controls.close()
-
-
 def test_a_camera_can_be_left_where_the_scene_has_no_source() -> None:
     """Such a scene may be dropped onto the page. It says so, and others can bring a camera."""
     with Running(page_scene()) as running:
@@ -273,15 +231,3 @@ def test_a_camera_can_be_left_where_the_scene_has_no_source() -> None:
         running.until(lambda: host.state_message()["missing"])
         host.edit(Command("camera", {"width": SIZE[0], "height": SIZE[1]}), "you")
         assert host.camera_size("you") == SIZE
-
-
-def test_a_file_that_is_still_being_written_does_not_hinder_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    host = Host(page_scene(), device="cpu", quality="low")
-    cleanup = host._folder.cleanup
-
-    def fail() -> None:
-        cleanup()
-        raise OSError(errno.ENOTEMPTY, "Directory not empty", host._folder.name)
-
-    monkeypatch.setattr(host._folder, "cleanup", fail)
-    assert host.close()
