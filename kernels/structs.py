@@ -100,7 +100,6 @@ class Shape:
         wp.vec3
     )  # local: half sizes (plane: x, y; box: x, y, z); radius (sphere: x); major, minor radius (torus: x, y)
     mesh: wp.uint64  # for MESH, id of the wp.Mesh in local space: corner k of triangle f is its point 3 f + k
-    tree: wp.uint64  # on CPU the address of its tree of kernels/rays/wide_bvh.py; 0: rays walk the wp.Mesh's own
     first_vertex: wp.int32  # where this mesh's vertices start in the vertex arrays
     material: wp.int32  # index of its first material; -1 for proxies
     smooth: wp.int32  # 1: interpolate vertex normals

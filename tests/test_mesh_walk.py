@@ -20,7 +20,7 @@ from tests.mesh_rays_rig import (
     rays_toward,
 )
 from warp_ar.kernels.rays.mesh_walk import STACK, find_closest_face, meets_any_face
-from warp_ar.scene.ray_mesh import BVH_CONSTRUCTOR, BVH_LEAF_SIZE
+from warp_ar.scene.ray_mesh import BVH_CONSTRUCTOR, BVH_LEAF_SIZES
 
 UV_TOLERANCE = 2e-5
 """Weights of a triangle that a ray grazes are products of differences over a small one."""
@@ -46,7 +46,8 @@ def bare_mesh(corners, device):
     """Triangles by the tree that CUDA devices have, on any device, and without a margin."""
     points = wp.array(np.asarray(corners, np.float32).reshape(-1, 3), dtype=wp.vec3, device=device)
     indices = wp.array(np.arange(3 * len(corners), dtype=np.int32), dtype=wp.int32, device=device)
-    return wp.Mesh(points=points, indices=indices, bvh_constructor=BVH_CONSTRUCTOR, bvh_leaf_size=BVH_LEAF_SIZE)
+    leaf_size = BVH_LEAF_SIZES["cuda"]
+    return wp.Mesh(points=points, indices=indices, bvh_constructor=BVH_CONSTRUCTOR, bvh_leaf_size=leaf_size)
 
 
 @pytest.mark.parametrize("name", MESHES)

@@ -89,7 +89,7 @@ class World:
         record["rotation"], record["scale"], record["smooth"], record["material"] = rotation, scale, 1, -1
         if mesh is not None:
             made = make_ray_mesh(mesh, self.device)
-            record["mesh"], record["tree"] = made.mesh.id, made.tree_address
+            record["mesh"] = made.mesh.id
             record["first_vertex"], extent = self._corners, made.half
             position = position + scale * rotation @ made.center
             triangles = (mesh.vertices.astype(np.float64) - made.center)[mesh.faces]

@@ -1,4 +1,4 @@
-"""Rays through a mesh's triangles by the tree of a ``wp.Mesh``, as CUDA devices walk it.
+"""Rays through a mesh's triangles by the tree of a ``wp.Mesh``.
 
 The walk is that of ``wp.mesh_query_ray`` [AL09]: from the nearer child to the farther, which waits on a stack. At a
 triangle there is less to do. Warp picks the ray's axes by indices, which puts vectors into local memory, divides anew

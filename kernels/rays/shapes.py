@@ -1,9 +1,8 @@
 """Intersection of a ray with one shape: a sphere, a box, a plane or a mesh, in the shape's own coordinates.
 
-Spheres, boxes and planes are intersected analytically, meshes through a BVH in local space: Warp's own on CUDA
-(``kernels/rays/mesh_walk.py``), one of eight children per node on CPU (``kernels/rays/wide_bvh.py``). Ray parameters
-``t`` are in
-multiples of the direction's length, which need not be 1; every test accepts 0 < t < t_max.
+Spheres, boxes and planes are intersected analytically, meshes through Warp's BVH in local space
+(``kernels/rays/mesh_walk.py``). Ray parameters ``t`` are in multiples of the direction's length, which need not be 1;
+every test accepts 0 < t < t_max.
 
 References:
     [WBW13] Woop, Benthin, Wald, "Watertight Ray/Triangle Intersection", JCGT 2(1), 2013.
@@ -17,7 +16,6 @@ from __future__ import annotations
 import warp as wp
 
 from warp_ar.kernels.rays.mesh_walk import find_closest_face, meets_any_face
-from warp_ar.kernels.rays.wide_bvh import walk_any, walk_closest
 from warp_ar.kernels.structs import BOX, MESH, Shape
 
 wp.set_module_options({"enable_backward": False})
@@ -173,11 +171,7 @@ def intersect_mesh(shape: Shape, origin: wp.vec3, direction: wp.vec3, t_max: wp.
     start = enter_mesh(shape.extent, origin, direction)
     if start < t_max:
         entry = origin + start * direction
-        near = wp.vec4(0.0)  # no ternary: in a kernel it takes both walks
-        if shape.tree != wp.uint64(0):
-            near = walk_closest(shape.tree, entry, direction, t_max - start)
-        else:
-            near = find_closest_face(shape.mesh, entry, direction, t_max - start)
+        near = find_closest_face(shape.mesh, entry, direction, t_max - start)
         contact.face = wp.cast(near[3], wp.int32)
         if contact.face >= 0:
             contact.t = start + near[0]
@@ -192,10 +186,7 @@ def meets_mesh(shape: Shape, origin: wp.vec3, direction: wp.vec3, t_max: wp.floa
     start = enter_mesh(shape.extent, origin, direction)
     if start >= t_max:
         return False
-    entry = origin + start * direction
-    if shape.tree != wp.uint64(0):
-        return walk_any(shape.tree, entry, direction, t_max - start)
-    return meets_any_face(shape.mesh, entry, direction, t_max - start)
+    return meets_any_face(shape.mesh, origin + start * direction, direction, t_max - start)
 
 
 @wp.func

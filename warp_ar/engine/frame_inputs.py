@@ -21,15 +21,12 @@ from warp_ar.calibration.saturation import PERIOD, WATCHED, SaturationLevels, ba
 from warp_ar.device import exclusive
 from warp_ar.engine.frame_constants import FrameBlock
 from warp_ar.engine.graph import INPUTS
-from warp_ar.engine.modules import load_modules
 from warp_ar.engine.scheduler import StageTiming
 from warp_ar.engine.transfer import Slot, Transfers
 from warp_ar.kernels.color import camera_table, decode_table, encode_table
-from warp_ar.kernels.launch import Note, noting
-from warp_ar.kernels.rays.wide_bvh import build_wide_bvh_kernel
-from warp_ar.kernels.structs import MESH, Probe, struct_dtype
+from warp_ar.kernels.launch import noting
+from warp_ar.kernels.structs import Probe, struct_dtype
 from warp_ar.scene import Camera, Pose, Scene
-from warp_ar.scene.kinds import shape_kind
 from warp_ar.scene.pixel_rays import pixel_rays
 from warp_ar.scene.ray_scene import HostScene
 from warp_ar.scene.screen_extents import EMPTY, Outline, Rect, screen_rects
@@ -97,7 +94,8 @@ class FrameInputs:
         """
         shape = (camera.height, camera.width)
         self._camera, self._arrays = camera, arrays
-        self.host_scene, self.first_launches = _make_host_scene(scene, device)
+        with noting() as self.first_launches:
+            self.host_scene = HostScene(scene, device)
         self.host_scene.set_pixel_spread(1.0 / max(camera.fx, camera.fy))
         self.block = FrameBlock(device, len(scene.lights), self.host_scene.shape_count, len(scene.proxies))
         self.host_scene.ray_scene.objects = self.block.device_array("objects")
@@ -445,12 +443,3 @@ def _probe_values(probes: Sequence[scenes.Probe], reflectances: Sequence[scenes.
     for value, probe, reflectance in zip(values, probes, told, strict=True):
         value["center"], value["radius"], value["reflectance"] = probe.center, probe.radius, reflectance
     return values
-
-
-def _make_host_scene(scene: Scene, device: Any) -> tuple[HostScene, list[Note]]:
-    """A scene as rays meet it, and what is to be launched for it before the first frame."""
-    shapes = {shape_kind(item) for item in scene.objects} | {shape_kind(item) for item in scene.proxies}
-    if device.is_cpu and MESH in shapes:
-        load_modules([build_wide_bvh_kernel], device)
-    with noting() as launches:
-        return HostScene(scene, device), launches

@@ -12,7 +12,6 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_ar import scene as scenes
-from warp_ar.kernels.rays.wide_bvh import build_wide_bvh, refit_wide_bvh
 from warp_ar.scene.geometry import Mesh
 from warp_ar.scene.object_materials import file_mesh
 from warp_ar.scene.object_shapes import ObjectShape
@@ -23,9 +22,9 @@ FloatArray = npt.NDArray[np.float64]
 BOX_MARGIN: Final = 2.0**-18
 """Margin of a triangle's box in the BVH, in radii of the mesh; see ``kernels/rays/shapes.py``."""
 BVH_CONSTRUCTOR: Final = "sah"
-"""Constructor of trees on CUDA; Warp's default builds faster, but rays take 1.2 to 1.5 times as long."""
-BVH_LEAF_SIZE: Final = 1
-"""Triangles per leaf there: a ray that tests triangles holds up those beside it that still walk."""
+"""Constructor of trees; Warp's default on CUDA builds faster, but rays take 1.2 to 1.5 times as long."""
+BVH_LEAF_SIZES: Final = {"cpu": 4, "cuda": 1}
+"""Triangles per leaf: on CUDA a ray that tests triangles holds up those beside it that still walk."""
 PICTURE_CELLS: Final = 16
 """Into how many parts along either side a rect is cut whose picture emits: light is looked for where it is bright."""
 
@@ -44,13 +43,6 @@ class RayMesh:
     """Unit normal of each corner, (3 m, 3)."""
     uvs: npt.NDArray[np.float32]
     """Texture coordinates of each corner, (3 m, 2)."""
-    tree: Any
-    """On CPU what rays walk, of ``kernels.wide_bvh``; None: they walk the ``wp.Mesh``'s own."""
-
-    @property
-    def tree_address(self) -> int:
-        """Value of ``structs.Shape.tree``."""
-        return 0 if self.tree is None else int(self.tree.ptr)
 
 
 def make_ray_mesh(mesh: Mesh, device: Any) -> RayMesh:
@@ -58,8 +50,7 @@ def make_ray_mesh(mesh: Mesh, device: Any) -> RayMesh:
 
     The BVH is built over triangles that span the enlarged boxes; then the true corners take their place. Nothing is
     refitted afterwards, so the boxes keep their margin, and the triangles that rays are tested against are exact.
-    Most meshes stand still in their own space: the tree is built once, so it is the one that is walked fastest. On CPU
-    that is one of ``kernels.wide_bvh``, and Warp's own, which only holds the triangles, the one that is built fastest.
+    Most meshes stand still in their own space: the tree is built once, so it is the one that is walked fastest.
 
     Args:
         mesh: The triangles.
@@ -70,14 +61,12 @@ def make_ray_mesh(mesh: Mesh, device: Any) -> RayMesh:
     corners, half, margin = _corners(mesh, center)
     points = wp.array(_spanning(corners, margin), dtype=wp.vec3, device=device)
     indices = wp.array(np.arange(corners.shape[0] * 3, dtype=np.int32), dtype=wp.int32, device=device)
-    on_cpu = points.device.is_cpu
-    constructor = "median" if on_cpu else BVH_CONSTRUCTOR
-    ray_mesh = wp.Mesh(points=points, indices=indices, bvh_constructor=constructor, bvh_leaf_size=BVH_LEAF_SIZE)
+    leaf_size = BVH_LEAF_SIZES["cpu" if points.device.is_cpu else "cuda"]
+    ray_mesh = wp.Mesh(points=points, indices=indices, bvh_constructor=BVH_CONSTRUCTOR, bvh_leaf_size=leaf_size)
     wp.copy(points, wp.array(corners.reshape(-1, 3), dtype=wp.vec3, device=device))
-    tree = build_wide_bvh(corners, margin) if on_cpu else None
     uvs = np.zeros((len(mesh.vertices), 2), np.float32) if mesh.uvs is None else mesh.uvs
     normals = mesh.normals[mesh.faces].reshape(-1, 3)
-    return RayMesh(ray_mesh, center, half, normals, uvs[mesh.faces].reshape(-1, 2), tree)
+    return RayMesh(ray_mesh, center, half, normals, uvs[mesh.faces].reshape(-1, 2))
 
 
 def _corners(mesh: Mesh, center: FloatArray) -> tuple[npt.NDArray[np.float32], FloatArray, float]:
@@ -103,12 +92,9 @@ def bend_ray_mesh(ray_mesh: RayMesh, mesh: Mesh) -> RayMesh:
     """
     corners, half, margin = _corners(mesh, ray_mesh.center)
     points = ray_mesh.mesh.points
-    if ray_mesh.tree is None:
-        points.assign(_spanning(corners, margin))
-        ray_mesh.mesh.refit()
+    points.assign(_spanning(corners, margin))
+    ray_mesh.mesh.refit()
     points.assign(corners.reshape(-1, 3))
-    if ray_mesh.tree is not None:
-        refit_wide_bvh(ray_mesh.tree, points, margin)
     return dataclasses.replace(ray_mesh, half=half, normals=mesh.normals[mesh.faces].reshape(-1, 3))
 
 

@@ -205,7 +205,7 @@ class HostScene:
             key = mesh_key(shape)
             if key is not None:
                 _, mesh, record["first_vertex"] = self._load(key, device)
-                record["mesh"], record["tree"] = mesh.mesh.id, mesh.tree_address
+                record["mesh"] = mesh.mesh.id
                 record["extent"], record["smooth"] = mesh.half, 1
                 position = position + rotation @ (scale * mesh.center)
             elif isinstance(item, scenes.Object) and item.shape == "sphere":
@@ -305,7 +305,7 @@ class HostScene:
                 tangents = bent.tangents[bent.faces].reshape(-1, 4)
                 scene.vertex_tangents[first : first + len(tangents)].assign(tangents)
         self._meshes[key] = mesh, ray_mesh, first
-        record["extent"], record["tree"] = ray_mesh.half, ray_mesh.tree_address
+        record["extent"] = ray_mesh.half
         return True
 
     def set_gain(self, gain: npt.NDArray[np.float64]) -> None:
