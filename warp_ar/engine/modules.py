@@ -32,7 +32,6 @@ def load_modules(
     progress: Progress | None = None,
     *,
     blocks: Iterable[tuple[wp.Kernel, int]] = (),
-    on_host: Iterable[wp.Kernel] = (),
 ) -> None:
     """Compile the modules of ``kernels`` where they are not in the cache, and load them.
 
@@ -41,10 +40,8 @@ def load_modules(
         device: Warp device.
         progress: Called on the caller's thread after each module that was compiled.
         blocks: Kernels that CUDA runs in blocks of another size than its usual one, and that size.
-        on_host: Kernels that the CPU runs, whatever the device.
     """
-    found: dict[_Variant, None] = dict.fromkeys((kernel.module, "cpu", None) for kernel in on_host)
-    found |= dict.fromkeys((kernel.module, str(device), None) for kernel in kernels)
+    found: dict[_Variant, None] = dict.fromkeys((kernel.module, str(device), None) for kernel in kernels)
     found |= dict.fromkeys((kernel.module, str(device), size) for kernel, size in blocks)
     with compiling():
         missing = [variant for variant in found if not _is_cached(variant)]

@@ -35,7 +35,6 @@ from warp_ar.engine.scheduler import Scheduler, StageTiming
 from warp_ar.engine.short_frames import ShortFrames
 from warp_ar.engine.transfer import Image
 from warp_ar.errors import UpdateError, UsageError, WarpArError
-from warp_ar.kernels.picture.marker_edge_fit import fit_edges_kernel
 from warp_ar.light.captured import has_places
 from warp_ar.scene import Pose, Scene
 from warp_ar.scene.kinds import difference
@@ -222,10 +221,7 @@ class Pipeline(Closing):
             watches_ball=self.plan.features.recovered and not self.plan.request.exposures,
             linear=deep,
         )
-        tracking = [fit_edges_kernel] if self._tracker is not None or self._own_markers else []
-        self._scheduler = Scheduler(
-            self.plan, self._arrays, self.device, on_host=tracking, spare=spare, **self._running
-        )
+        self._scheduler = Scheduler(self.plan, self._arrays, self.device, spare=spare, **self._running)
         self._scheduler.launch_first(self.inputs.first_launches)
         request = self.plan.request
         waits = self._running["profile"] or request.asks_for_layers or request.estimates == "synchronous"

@@ -60,7 +60,6 @@ class Scheduler:
         bands: int | None = None,
         profile: bool = False,
         culling: bool = True,
-        on_host: Iterable[wp.Kernel] = (),
         spare: Mapping[str, Any] | None = None,
     ) -> None:
         """Allocate what the stages declared and build their passes.
@@ -72,11 +71,9 @@ class Scheduler:
             bands: Bands per CPU pass; None means one or two per core that this process may use.
             profile: On CUDA wait for every frame and time each stage on the device; stages then run one by one.
             culling: Whether stages that can change no pixel of a frame are left out of it.
-            on_host: Kernels that the CPU runs for others than stages: they are compiled with the stages'.
             spare: Arrays that are taken instead of new ones where name, shape and type are the same.
         """
         self.plan = plan
-        self._on_host = on_host
         self.arrays = arrays
         self.device, self._on_cpu = device, bool(device.is_cpu)
         cores = usable_cores()
@@ -227,7 +224,7 @@ class Scheduler:
         blocks = [one for one in launched if not self._on_cpu and one[1] != one[0].module.options["block_dim"]]
         kernels = [one[0] for one in launched if one not in blocks]
         own = [serve_kernel] if self._threads > 1 and self._on_cpu else []
-        load_modules([*own, *kernels, *host_kernels], self.device, progress, blocks=blocks, on_host=self._on_host)
+        load_modules([*own, *kernels, *host_kernels], self.device, progress, blocks=blocks)
         with wp.ScopedDevice(self.device), translating(self.device):
             for note in self._first_launches:
                 note.do()

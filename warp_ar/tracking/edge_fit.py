@@ -1,18 +1,16 @@
-"""Poses fitted to a marker's printed edges: the host's side of ``warp_ar.kernels.picture.marker_edge_fit``."""
+"""Poses fitted to a marker's printed edges by Gauss-Newton, in NumPy; the derivation stands in ``tracking``."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Final
 
 import cv2
 import numpy as np
-import warp as wp
 from numpy.typing import NDArray
 
-from warp_ar.device import start_warp
 from warp_ar.kernels.color import decode_table
-from warp_ar.kernels.picture import marker_edge_fit
 from warp_ar.scene import Camera, Pose
 from warp_ar.tracking.markers import Pattern
 
@@ -21,7 +19,67 @@ Image = NDArray[np.uint8]
 Box = tuple[slice, slice]
 """Rows and columns of a picture."""
 
-MOST_REACHES = 8
+NOISE_FLOOR: Final = 0.03
+"""Pixels: smallest standard deviation that an edge point is ever given credit for (sampling, lens model, print)."""
+CORRELATED: Final = 2.0
+"""Neighbouring edge points share pixels, so that many of them count as one."""
+_TAPS: Final = np.linspace(-1.0, 1.0, 9)
+"""Places across an edge at which the picture is read."""
+_WEIGHTS: Final = np.array([0.125, *([0.25] * 7), 0.125])
+"""Trapezoid rule over these."""
+_CLEARANCE: Final = 0.45
+"""Share of the way to the nearest parallel edge that is read."""
+_MIN_REACH: Final = 1.0
+"""Pixels: an edge that is read less far is not measured; the blur of its neighbours would reach it."""
+_CONTRAST: Final = 0.3
+"""Least contrast of an edge over the median one's."""
+_LEAST_CONTRAST: Final = 1e-4
+"""The same in linear light."""
+_MIN_EDGES: Final = 16
+"""Fewest measured edge points for a refinement: nine unknowns, and something left to vote."""
+_DONE: Final = 0.05
+"""Pixels: a Gauss-Newton step that moves no edge further is the last; it converges fast enough that the next would move
+a tenth of it."""
+_PRIOR: Final = np.diag([0.0] * 6 + [1.0] * 3)
+"""The shift of edges is a fraction of a pixel: without that a print without inner edges could not tell it from
+distance."""
+_TUKEY: Final = 4.7
+"""Standard deviations at which an edge counts no more: one that is covered, or under a reflection, must not pull."""
+_MIN_CELLS: Final = 8
+"""Fewest cells in the picture that tell a pattern."""
+_NEAR: Final = 1e-6
+"""Least distance from the camera, metres."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Fit:
+    """A pose measured in one frame."""
+
+    pose: Pose
+    information: Array
+    """(6, 6): inverse covariance of rotation vector and translation about the pose."""
+    error: float
+    """Root mean square residual, pixels."""
+    support: float
+    """0 to 1: share of the printed edges that agree."""
+    cost: float
+    """Robust mean squared residual, pixels squared."""
+    pattern: float
+    """Correlation of the cells' brightness with the print."""
+    edges: bool = True
+    """True if it rests on edges; else on the detected corners only."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Solution:
+    """Reweighted least squares of the equations of edges."""
+
+    step: Array
+    """Rotation vector and translation, (6,)."""
+    information: Array
+    """(6, 6), the shift of edges eliminated."""
+    residuals: Array
+    weights: Array
 
 
 class EdgeFitter:
@@ -37,32 +95,12 @@ class EdgeFitter:
             pattern: What is printed.
             camera: Of the pictures.
         """
-        start_warp()
-
-        def array(values: Any, dtype: Any) -> Any:
-            return wp.array(values, dtype=dtype, device="cpu")
-
-        shape = (camera.height, camera.width)
-        gray = wp.zeros(shape, dtype=wp.uint8, device="cpu")
-        self.gray: Image = gray.numpy()
-        printed = marker_edge_fit.Print()
-        for name in ("points", "tangents", "normals", "outline", "cells"):
-            setattr(printed, name, array(getattr(pattern, name), wp.vec3d))
-        for name in ("clearances", "white"):
-            setattr(printed, name, array(getattr(pattern, name), wp.float64))
-        lens = marker_edge_fit.Lens()
-        lens.focal, lens.principal = wp.vec2d(camera.fx, camera.fy), wp.vec2d(camera.cx, camera.cy)
-        lens.distortion = marker_edge_fit.vec8d(*np.resize([*camera.distortion, *([0.0] * 8)], 8).tolist())
-        asked = wp.zeros(1, dtype=marker_edge_fit.Asked, device="cpu")
-        reaches = wp.zeros(MOST_REACHES, dtype=wp.float64, device="cpu")
-        fits = wp.zeros(marker_edge_fit.MOST_POSES, dtype=marker_edge_fit.EdgeFit, device="cpu")
-        information = wp.zeros((marker_edge_fit.MOST_POSES, 6, 6), dtype=wp.float64, device="cpu")
-        linear = array(decode_table(camera.transfer).mean(1), wp.float32)
-        # Kept: what the launch refers to.
-        self._given = gray, linear, printed, lens, asked, reaches, fits, information
-        self._asked, self._reaches, self._fits = asked.numpy(), reaches.numpy(), fits.numpy()
-        self._information = information.numpy()
-        self._launch: Any = None
+        self._pattern = pattern
+        self._matrix = np.asarray(camera.matrix(), float)
+        self._distortion = np.asarray(camera.distortion, float).ravel()
+        self._linear = decode_table(camera.transfer).mean(1).astype(np.float32)
+        self.gray: Image = np.zeros((camera.height, camera.width), np.uint8)
+        self._box: Box = slice(0, camera.height), slice(0, camera.width)
 
     def show(self, image: Image, box: Box) -> Image:
         """Take a part of a picture as the one to fit to.
@@ -74,35 +112,142 @@ class EdgeFitter:
         Returns:
             It in grey; it holds until another is shown.
         """
-        rows, columns = box
         part = self.gray[box]
         if image.ndim == 2:
             part[...] = image[box]
         else:
             cv2.cvtColor(image[box], cv2.COLOR_RGB2GRAY, dst=part)
-        self._asked[0] = (0, 0, rows.start, rows.stop, columns.start, columns.stop)
+        self._box = box
         return part
 
-    def fit(self, poses: Sequence[Pose], reaches: Sequence[float]) -> list[Any]:
-        """Fit poses to the edges of the part that was shown.
+    def project(self, points: Array) -> tuple[Array, Array]:
+        """Pixels (n, 2) of camera points (n, 3), and their derivative (n, 2, 3) by the camera point."""
+        # With no rotation and no translation, OpenCV's derivative by translation is the one by the point.
+        zero = np.zeros(3)
+        pixels, jacobian = cv2.projectPoints(points, zero, zero, self._matrix, self._distortion)
+        return pixels.reshape(-1, 2), np.asarray(jacobian)[:, 3:6].reshape(-1, 2, 3)
+
+    def fit(self, pose: Pose, reaches: Sequence[float]) -> Fit | None:
+        """Fit a pose to the edges of the part that was shown; None where too few are seen.
 
         Args:
-            poses: ``MOST_POSES`` or fewer, ``camera_from_world``.
-            reaches: Half width of the sampled window in pixels per Gauss-Newton step, ``MOST_REACHES`` or fewer.
-
-        Returns:
-            Records of ``EdgeFit``, one for each; they hold until the next call, as does ``information``.
+            pose: ``camera_from_world`` to begin with.
+            reaches: Half width of the sampled window in pixels per Gauss-Newton step.
         """
-        if self._launch is None:
-            self._launch = marker_edge_fit.record_fit_edges(*self._given)
-        asked, fits = self._asked, self._fits
-        asked["poses"], asked["reaches"] = len(poses), len(reaches)
-        self._reaches[: len(reaches)] = reaches
-        for fit, pose in zip(fits, poses, strict=False):
-            fit["rotation"], fit["translation"] = pose.rotation, pose.translation
-        self._launch()
-        return list(fits[: len(poses)])
+        solved: _Solution | None = None
+        for reach in reaches:
+            measured = self._measure(pose, reach)
+            solved = None if measured is None else _solve(*measured)
+            if measured is None or solved is None:
+                return None
+            step = solved.step
+            pose = Pose(cv2.Rodrigues(step[:3])[0] @ pose.rotation, pose.translation + step[3:])
+            moved = float(np.abs(measured[0][:, :6] @ step).max())
+            if reach == reaches[-1] or (reach <= reaches[1] and moved < _DONE):
+                break
+        is_behind = pose.apply(self._pattern.outline)[:, 2].min() <= 0.0
+        if solved is None or is_behind or pose.rotation[:, 2] @ pose.translation >= 0.0:
+            return None
+        squares, kept = solved.residuals**2, float(solved.weights.sum())
+        return Fit(
+            pose,
+            solved.information,
+            error=float(np.sqrt((solved.weights * squares).sum() / kept)),
+            support=kept / len(self._pattern.points),
+            cost=float(np.minimum(squares, 1.0).mean()),
+            pattern=self.correlate(pose),
+        )
 
-    def information(self, index: int) -> Array:
-        """Inverse covariance (6, 6) of rotation vector and translation of a pose of the last call, a copy."""
-        return np.array(self._information[index])
+    def correlate(self, pose: Pose) -> float:
+        """Correlation, -1 to 1, of the brightness at cell centres with the print; 0 where it cannot be seen."""
+        points = pose.apply(self._pattern.cells)
+        if points[:, 2].min() <= _NEAR:
+            return 0.0
+        at = self.project(points)[0]
+        inside = self._holds(at, at)
+        if inside.sum() < _MIN_CELLS:
+            return 0.0
+        values = self._sample(at[inside])
+        # Lamps' reflections and sparkle must not outvote the print.
+        values = np.clip(values, *np.percentile(values, (5, 95)))
+        white = self._pattern.white[inside]
+        a, b = values - values.mean(), white - white.mean()
+        scale = float(np.sqrt((a @ a) * (b @ b)))
+        return float(a @ b) / scale if scale > 1e-9 else 0.0
+
+    def _holds(self, low: Array, high: Array) -> NDArray[np.bool_]:
+        """Return whether the part that was shown holds what lies between two pixels, (n,)."""
+        rows, columns = self._box
+        begins, ends = (columns.start, rows.start), (columns.stop - 1, rows.stop - 1)
+        return np.asarray((low >= begins).all(axis=-1) & (high <= ends).all(axis=-1))
+
+    def _sample(self, at: Array) -> Array:
+        """Linear light between four pixels, (...,), of places (..., 2) inside the picture."""
+        height, width = self.gray.shape
+        corner = np.floor(at)
+        right, below = (at - corner).astype(np.float32).transpose(-1, *range(at.ndim - 1))
+        left, top = corner.astype(np.intp).transpose(-1, *range(at.ndim - 1))
+        first = top * width + left
+        beside = np.minimum(left + 1, width - 1) - left
+        under = (np.minimum(top + 1, height - 1) - top) * width
+        a, b, c, d = (self._linear[self.gray.ravel()[first + more]] for more in (0, beside, under, beside + under))
+        upper, lower = a + right * (b - a), c + right * (d - c)
+        return np.asarray(upper + below * (lower - upper), np.float64)
+
+    def _measure(self, pose: Pose, reach: float) -> tuple[Array, Array] | None:
+        """One row of equations, (n, 9), for each edge that is seen, and how far it lies from where it is expected.
+
+        The nine are rotation vector, translation and the three numbers of the shift of edges.
+        """
+        pattern, turn = self._pattern, pose.rotation.T
+        arm = pattern.points @ turn
+        points = arm + pose.translation
+        if points[:, 2].min() <= _NEAR:
+            return None
+        at, jacobian = self.project(points)
+        along = np.einsum("nij,nj->ni", jacobian, pattern.tangents @ turn)
+        normal = np.stack([-along[:, 1], along[:, 0]], -1) / np.maximum(np.linalg.norm(along, axis=1), 1e-9)[:, None]
+        pull = np.einsum("ni,nij->nj", normal, jacobian)
+        width = (pull * (pattern.normals @ turn)).sum(axis=1)
+        half = np.minimum(_CLEARANCE * np.abs(width) * pattern.clearances, reach)
+        way = half[:, None] * np.abs(normal)
+        inside = (half >= _MIN_REACH) & self._holds(at - way, at + way)
+        if inside.sum() < _MIN_EDGES:
+            return None
+        toward_white = np.where(width < 0.0, -1.0, 1.0)[inside, None]
+        at, half, arm = at[inside], half[inside], arm[inside]
+        normal, pull = toward_white * normal[inside], toward_white * pull[inside]
+        values = self._sample(at[:, None] + (half[:, None] * _TAPS)[..., None] * normal[:, None])
+        # Each end's level is the mean of its two outermost samples.
+        black, white = 0.5 * (values[:, 0] + values[:, 1]), 0.5 * (values[:, -2] + values[:, -1])
+        contrast = white - black
+        seen = contrast > max(_CONTRAST * float(np.median(contrast)), _LEAST_CONTRAST)
+        if seen.sum() < _MIN_EDGES:
+            return None
+        half, pull = half[seen], pull[seen]
+        area = (2.0 * white - values @ _WEIGHTS)[seen] / contrast[seen]
+        x, y = normal[seen].T
+        shift = np.stack([np.ones_like(x), x * x - y * y, 2.0 * x * y], axis=1)
+        design = np.hstack([np.cross(arm[seen], pull), pull, shift])
+        return design, np.clip(half * (area - 1.0), -half, half)
+
+
+def _solve(design: Array, offsets: Array) -> _Solution | None:
+    """Reweighted least squares; None where there is no solution."""
+    weights = np.ones(len(design))
+    for _ in range(3):
+        weighted = weights[:, None] * design
+        try:
+            solution = np.linalg.solve(weighted.T @ design + _PRIOR, weighted.T @ offsets)
+        except np.linalg.LinAlgError:
+            return None
+        residuals = offsets - design @ solution
+        ranked = np.sort(np.abs(residuals))
+        spread = max(1.4826 * float(ranked[len(ranked) // 2]), NOISE_FLOOR)
+        weights = np.maximum(1.0 - (residuals / (_TUKEY * spread)) ** 2, 0.0) ** 2
+    if not np.isfinite(solution).all():
+        return None
+    normal = (weights[:, None] * design).T @ design + _PRIOR
+    shared = normal[:6, 6:] @ np.linalg.solve(normal[6:, 6:], normal[6:, :6])
+    information = (normal[:6, :6] - shared) / (CORRELATED * spread**2)
+    return _Solution(*(np.asarray(values, float) for values in (solution[:6], information, residuals, weights)))

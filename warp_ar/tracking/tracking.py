@@ -32,7 +32,7 @@ import contextlib
 import dataclasses
 import enum
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TypeGuard
 
@@ -41,11 +41,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warp_ar.errors import UsageError
-from warp_ar.kernels.picture.marker_edge_fit import CORRELATED, NOISE_FLOOR
 from warp_ar.scene import Camera, Light, Marker, Object, Pose, Probe, Proxy, Scene
 from warp_ar.scene.description import PoseSpec
 from warp_ar.sources.source import Frame, Source
-from warp_ar.tracking.edge_fit import Box, EdgeFitter
+from warp_ar.tracking.edge_fit import CORRELATED, NOISE_FLOOR, Box, EdgeFitter, Fit
 from warp_ar.tracking.markers import Detection, MarkerDetector, pattern_of
 
 Array = NDArray[np.float64]
@@ -157,25 +156,6 @@ def _moved(pose: Pose, step: Array) -> Pose:
     return Pose(_rotation(step[:3]) @ pose.rotation, pose.translation + step[3:6])
 
 
-@dataclasses.dataclass(frozen=True)
-class _Fit:
-    """A pose measured in one frame."""
-
-    pose: Pose
-    information: Array
-    """(6, 6): inverse covariance of rotation vector and translation about the pose."""
-    error: float
-    """Root mean square residual, pixels."""
-    support: float
-    """0 to 1: share of the printed edges that agree."""
-    cost: float
-    """Robust mean squared residual, pixels squared."""
-    pattern: float
-    """Correlation of the cells' brightness with the print."""
-    edges: bool
-    """True if it rests on edges; else on the detected corners only."""
-
-
 class Tracker:
     """Follows one marker or board through a sequence of frames.
 
@@ -269,17 +249,10 @@ class Tracker:
         guess = _moved(self._pose, self._velocity * (-np.expm1(-decay * elapsed) / decay))
         return guess if guess.apply(self._pattern.outline)[:, 2].min() > 0 else self._pose
 
-    def _project(self, points: Array) -> tuple[Array, Array]:
-        """Pixels (n, 2) of camera points (n, 3), and their derivative (n, 2, 3) by the camera point."""
-        # With no rotation and no translation, OpenCV's derivative by translation is the one by the point.
-        zero = np.zeros(3)
-        pixels, jacobian = cv2.projectPoints(points, zero, zero, self._matrix, self._distortion)
-        return pixels.reshape(-1, 2), np.asarray(jacobian)[:, 3:6].reshape(-1, 2, 3)
-
     def _outline(self, pose: Pose) -> NDArray[np.float32]:
-        return self._project(pose.apply(self._pattern.outline))[0].astype(np.float32)
+        return self._fitter.project(pose.apply(self._pattern.outline))[0].astype(np.float32)
 
-    def _measure(self, image: Image, guess: Pose | None) -> _Fit | None:
+    def _measure(self, image: Image, guess: Pose | None) -> Fit | None:
         """The pose in this image alone; ``guess`` only says where to look, and which of two like poses to prefer."""
         if guess is not None:
             # A board has no second pose to confuse it with, and dozens of markers to decode: its edges come first.
@@ -320,7 +293,7 @@ class Tracker:
     def _smallest(self, guess: Pose) -> float:
         """Edge length in pixels below which nothing is a marker where one is expected at ``guess``."""
         corners = np.concatenate([guess.apply(c) for c in self._pattern.markers.values()])
-        pixels = self._project(corners)[0].reshape(-1, 4, 2)
+        pixels = self._fitter.project(corners)[0].reshape(-1, 4, 2)
         sides = pixels - pixels[:, _BEFORE]
         return 0.6 * float(np.sqrt((sides**2).sum(axis=2)).mean(axis=1).min())
 
@@ -349,7 +322,7 @@ class Tracker:
         origin = np.array((0, 0) if box is None else (box[1].start, box[0].start), np.float32)
         return [Detection(d.id, d.corners + origin) for d in detected if d.id in self._pattern.markers]
 
-    def _fit_detections(self, found: list[Detection], guess: Pose | None) -> _Fit | None:
+    def _fit_detections(self, found: list[Detection], guess: Pose | None) -> Fit | None:
         found = self._chosen(found, guess)
         if not found:
             return None
@@ -372,7 +345,7 @@ class Tracker:
         def rank(d: Detection) -> float:
             if guess is None:
                 return -abs(float(cv2.contourArea(d.corners)))
-            expected = self._project(guess.apply(self._pattern.markers[d.id]))[0]
+            expected = self._fitter.project(guess.apply(self._pattern.markers[d.id]))[0]
             return float(np.linalg.norm(d.corners - expected, axis=1).mean())
 
         best: dict[int, Detection] = {}
@@ -400,11 +373,11 @@ class Tracker:
                 continue
             pose = Pose(_rotation(r) @ facing, np.asarray(t, float).ravel())
             if pose.apply(self._pattern.outline)[:, 2].min() > 0:
-                residual = self._project(pose.apply(points))[0] - corners
+                residual = self._fitter.project(pose.apply(points))[0] - corners
                 poses.append((pose, float(np.sqrt((residual**2).sum(1).mean()))))
         return sorted(poses, key=lambda p: p[1])
 
-    def _preferred(self, fits: list[_Fit], guess: Pose | None) -> _Fit:
+    def _preferred(self, fits: list[Fit], guess: Pose | None) -> Fit:
         """One of the two poses of a plane: the better in this frame, unless earlier frames speak for the other."""
         if guess is None or len(fits) < 2:
             self._evidence = 0.0
@@ -419,42 +392,27 @@ class Tracker:
         self._evidence = 0.0
         return far
 
-    def _refined(self, poses: list[Pose], points: Array, corners: Array) -> list[_Fit]:
+    def _refined(self, poses: list[Pose], points: Array, corners: Array) -> list[Fit]:
         """Poses fitted to the edges, or to the corners where the edges are too small to be measured."""
-        fits = []
-        for pose, fit in zip(poses, self._fit_edges(poses, _REACH), strict=True):
-            fits.append(fit if _holds(fit) else self._fit_corners(pose, points, corners))
-        return fits
+        found = [(pose, self._fitter.fit(pose, _REACH)) for pose in poses]
+        return [fit if _holds(fit) else self._fit_corners(pose, points, corners) for pose, fit in found]
 
-    def _fit_corners(self, pose: Pose, points: Array, corners: Array) -> _Fit:
+    def _fit_corners(self, pose: Pose, points: Array, corners: Array) -> Fit:
         """A pose as corners that were detected have it."""
         camera = pose.apply(points)
-        pixels, jacobian = self._project(camera)
+        pixels, jacobian = self._fitter.project(camera)
         residual = pixels - corners
         rows = _pose_rows(jacobian, camera - pose.translation).reshape(-1, 6)
         information = rows.T @ rows / _CORNER_NOISE**2
         cost = float((residual**2).mean())
-        pattern = float(self._fitter.fit([pose], ())[0]["pattern"])
-        return _Fit(pose, information, float(np.sqrt(2 * cost)), 0.5, cost, pattern, edges=False)
+        pattern = self._fitter.correlate(pose)
+        return Fit(pose, information, float(np.sqrt(2 * cost)), 0.5, cost, pattern, edges=False)
 
-    def _fit_guess(self, guess: Pose) -> _Fit | None:
-        fit = self._fit_edges([guess], _LOST_REACH)[0]
+    def _fit_guess(self, guess: Pose) -> Fit | None:
+        fit = self._fitter.fit(guess, _LOST_REACH)
         return fit if _holds(fit) else None
 
-    def _fit_edges(self, poses: list[Pose], reaches: Sequence[float]) -> list[_Fit | None]:
-        """Gauss-Newton on the printed edges from each pose; None where too few are seen."""
-        fits: list[_Fit | None] = []
-        for index, found in enumerate(self._fitter.fit(poses, reaches)):
-            if not found["fitted"]:
-                fits.append(None)
-                continue
-            pose = Pose(found["rotation"].copy(), found["translation"].copy())
-            error, support, cost, pattern = (float(found[name]) for name in ("error", "support", "cost", "pattern"))
-            information = self._fitter.information(index)
-            fits.append(_Fit(pose, information, error, support, cost, pattern, edges=True))
-        return fits
-
-    def _steadied(self, fit: _Fit, guess: Pose | None, time: float) -> Pose:
+    def _steadied(self, fit: Fit, guess: Pose | None, time: float) -> Pose:
         """The measured pose, averaged with the last one as far as both agree within the measurement's own noise.
 
         With innovation x of information L, s = x'Lx / 6 is 1 on average where nothing moved. Taking the share s / (s +
@@ -467,7 +425,7 @@ class Tracker:
         share = max(deviation / (deviation + _SETTLE), -np.expm1(-(time - self._time) / _FORGET))
         return _moved(self._pose, share * step)
 
-    def _judge(self, fit: _Fit) -> float:
+    def _judge(self, fit: Fit) -> float:
         """Quality from what supports the pose and how well it is determined."""
         variances = [max(value, 0.0) for value in _inverse(fit.information).diagonal().tolist()]
         turn = math.degrees(math.sqrt(sum(variances[:3])))
@@ -495,7 +453,7 @@ def _is_inside(corners: NDArray[np.float32], box: Box) -> bool:
     )
 
 
-def _holds(fit: _Fit | None) -> TypeGuard[_Fit]:
+def _holds(fit: Fit | None) -> TypeGuard[Fit]:
     return fit is not None and fit.support >= _SUPPORT and fit.pattern >= _PATTERN
 
 
