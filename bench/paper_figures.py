@@ -455,7 +455,6 @@ READINGS: tuple[Reading, ...] = (
     Reading("4.4", "several physical lights", "alpha fades with their balance", {"relight": "paper_weighted"}),
     Reading("4.3", "the factor", "s + (1 - s) clamp(2 a - 1, 0, 1) (taken)", {}),
     Reading("4.3", "the factor", "s + (1 - s) a", {"expose": "paper_mean"}),
-    Reading("4.3", "the factor", "as taken, at most 2 s", {"expose": "box"}),
 )
 """What ``docs/paper.md`` compares."""
 READING_SCENES = ("desk", "torus", "wire_coincident", "wire_opposing", "darken")

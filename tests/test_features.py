@@ -72,7 +72,7 @@ def test_the_table_is_left_out_for_a_reason_that_is_true() -> None:
     """Of an exposure of 0.5 whose method looks above clipping, not that it is not lowered."""
     reasons = dict(plan_of(exposure=Exposure(0.5), lights=()).left_out)
     assert reasons["summed_area"] == "the exposure does not look at means of a pixel's surroundings"
-    assert "summed_area" not in dict(plan_of("low", exposure=Exposure(0.5), lights=()).left_out)
+    assert "summed_area" not in dict(plan_of("paper", exposure=Exposure(0.5), lights=()).left_out)
 
 
 def explained(scene: object, tmp_path: Path, capsys: pytest.CaptureFixture[str], *more: str) -> str:

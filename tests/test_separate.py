@@ -59,7 +59,7 @@ def test_layers_change_nothing_of_the_picture(device):
 
 def test_plate_matches_twin(device):
     """Linear radiance of the frame, clipped pixels as the exposure guesses them."""
-    quality = PRESETS["low"].with_methods(expose="box")
+    quality = PRESETS["low"].with_methods(expose="paper")
     scene = make_scene(exposure=Exposure(0.5))
     frame = make_frame()
     with Pipeline(scene, device=device, quality=quality, outputs=("plate",)) as pipeline:

@@ -27,10 +27,6 @@ reading (``paper_mean``), an edge would stay half bright and nothing would be de
 ``KNEE`` up, so noise around clipping does not show, and the light is guessed before virtual light is added to it: that
 is known and needs no guess. docs/paper.md compares the readings.
 
-``box``: the same, the factor no further than ``MAX_GAIN`` above s. Factor / s is a guess of the clipped pixel's
-radiance; the bound of one stop keeps the guess near the likeliest values: in renderings and photographs of environments
-most clipped pixels lie less than one stop above clipping. Here s = 0 is black everywhere, as no light is.
-
 A longer exposure, s > 1, is scaled and clipped: what a camera does.
 
 ``declipped``: each clipped pixel has the radiance that ``declip`` estimates for it, at least what the camera
@@ -72,15 +68,13 @@ from warp_ar.kernels.structs import FrameParams, Picture, filled
 
 wp.set_module_options({"enable_backward": False})
 
-METHODS = ("plain", "paper", "box", "declipped")
+METHODS = ("plain", "paper", "declipped")
 """Cheapest first."""
-BOXES = ("paper", "paper_mean", "box")
+BOXES = ("paper", "paper_mean")
 """Methods that look at a box around clipped pixels, and a reading of the paper that docs/paper.md compares."""
 
 MAX_BOX = 1.0 / 8.0
 """Side of the largest box in frame heights."""
-MAX_GAIN = wp.constant(wp.float32(2.0))
-"""Largest guess of a clipped pixel over clipping: one stop."""
 LEAST_SCALE = wp.constant(wp.float32(1.0e-3))
 """Scale below which the paper's factor falls to 0 too: without light there is no picture."""
 KNEE = wp.constant(wp.float32(250.0))
@@ -138,14 +132,6 @@ def surrounding_mean(clipped: ClippedEvidence, row: wp.int32, col: wp.int32, sca
 def is_light(clipped: ClippedEvidence) -> wp.bool:
     """Return whether the frame is linear light that says by itself how bright what is above 1 is."""
     return clipped.levels.shape[0] > 0 and clipped.levels[0][0] > 1.0
-
-
-@wp.func
-def clipped_gain(mean: wp.float32, scale: wp.float32) -> wp.float32:
-    """Guessed radiance of a clipped pixel, factor / s, for a box mean in 0..255 and a scale in 0..1."""
-    w = wp.clamp(2.0 / 255.0 * mean - 1.0, 0.0, 1.0)
-    # min(s + (1 - s) w, G s) / s with 1 / s bounded first, so that s = 0 is no division.
-    return wp.min(1.0 + (1.0 / wp.max(scale, 1.0e-6) - 1.0) * w, MAX_GAIN)
 
 
 @wp.func
@@ -257,7 +243,7 @@ def make_find_gain(method: str) -> wp.Function:
 
     It is 1 for pixels that do not clip, and on methods that look at no box.
     """
-    box_gain = {"paper": paper_gain, "paper_mean": paper_mean_gain}.get(method, clipped_gain)
+    box_gain = paper_mean_gain if method == "paper_mean" else paper_gain
 
     @wp.func(module="unique")
     def find_gain(code: wp.vec3ub, i: wp.int32, j: wp.int32, clipped: ClippedEvidence, s: wp.float32) -> wp.float32:

@@ -153,7 +153,7 @@ def request_for(stage: str, method: str) -> Request | None:
     # where the frames alternate between exposure times, some only in the paper's way or where layers are asked for.
     best = {one.name: list(one.methods)[-1] for one in STAGES if len(one.methods) > 1}
     ways = itertools.product(
-        ((), tuple(LAYERS)), ({}, best, {"relight": "paper", "expose": "box"}), (0.7, 1.0), ((), BRACKET)
+        ((), tuple(LAYERS)), ({}, best, {"relight": "paper", "expose": "paper"}), (0.7, 1.0), ((), BRACKET)
     )
     for layers, others, scale, times in ways:
         quality = make_quality(**{**others, **methods})

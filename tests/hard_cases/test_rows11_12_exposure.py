@@ -93,7 +93,7 @@ def exposed(method, image, scale, device):
     return out.numpy()
 
 
-KERNEL_METHODS = [method for method in METHODS["expose"] if method in ("plain", "paper", "box")]
+KERNEL_METHODS = [method for method in METHODS["expose"] if method in ("plain", "paper")]
 
 
 @pytest.mark.atlas(row=11, stage="expose")

@@ -4,7 +4,7 @@ import numpy as np
 
 from tests.reference import summed_area
 
-MAX_GAIN, KNEE = 2.0, 250.0
+KNEE = 250.0
 
 
 def surrounding_mean(values, i, j, scale, max_box):
@@ -13,12 +13,6 @@ def surrounding_mean(values, i, j, scale, max_box):
     inner = int(reach)
     near, far = (summed_area.box_mean(values, i, j, 2 * k + 1) for k in (inner, inner + 1))
     return near + (reach - inner) * (far - near)
-
-
-def factor(mean, scale):
-    """What a clipped pixel's linear value is multiplied by; ``mean`` in 0..255."""
-    w = np.clip(2.0 * mean / 255.0 - 1.0, 0.0, 1.0)
-    return np.minimum(scale + (1.0 - scale) * w, MAX_GAIN * scale)
 
 
 def paper_factor(mean, scale):
@@ -32,10 +26,10 @@ def paper_mean_factor(mean, scale):
     return scale + (1.0 - scale) * mean / 255.0
 
 
-FACTORS = {"box": factor, "paper": paper_factor, "paper_mean": paper_mean_factor}
+FACTORS = {"paper": paper_factor, "paper_mean": paper_mean_factor}
 
 
-def gains(frame, scale, max_box, method="box"):
+def gains(frame, scale, max_box, method="paper"):
     """Factor / scale of every pixel."""
     factor = FACTORS[method]
     values = summed_area.intensity(frame)

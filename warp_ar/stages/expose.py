@@ -21,7 +21,6 @@ class Expose(Stage):
     methods: ClassVar[Mapping[str, str]] = {
         "plain": "scaled",
         "paper": "scaled less where surroundings clip too",
-        "box": "the same, by one stop at most",
         "ball": "from their glow and the ball's view of the emitter",
     }
     remembers: ClassVar[tuple[str, ...]] = ("expose_scale",)

@@ -41,7 +41,7 @@ _METHODS: Mapping[str, tuple[str, str, str, str, str]] = {
     "relight": ("paper", "reflectance", "reflectance", "bounce", "brute_force"),
     "recover": ("clipped", "shading", "shading", "shading", "shading"),
     "environment_shadow": ("none", "coarse", "coarse", "bounce", "brute_force"),
-    "expose": ("paper", "box", "ball", "ball", "ball"),
+    "expose": ("paper", "ball", "ball", "ball", "ball"),
     "mirror_ball": ("none", "none", "single", "smooth", "brute_force"),
     "shade": ("environment", "environment", "few_rays", "one_bounce", "one_bounce"),
 }
