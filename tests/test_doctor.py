@@ -69,11 +69,9 @@ def first_object(scene: Scene, **changes) -> Scene:
 
 NUMBERS = {
     "radius in millimetres": ("units.ball", lambda s: ball(s, radius=35.0)),
-    "radius in centimetres": ("units.ball", lambda s: ball(s, radius=3.5)),
     "center in millimetres": ("units.ball", lambda s: ball(s, center=(-120.0, 30.0, 34.6))),
     "radius of a pinhead": ("units.ball", lambda s: ball(s, radius=0.0005)),
     "marker in millimetres": ("units.card", lambda s: marker(s, size=80.0)),
-    "marker in centimetres": ("units.card", lambda s: marker(s, size=8.0)),
     "marker of a millimetre": ("units.card", lambda s: marker(s, size=0.001)),
     "grey paper": ("card.white", lambda s: marker(s, white=0.2)),
     "sunk ball": ("ball.sunk", lambda s: ball(s, center=(-0.12, 0.03, 0.02))),
@@ -98,27 +96,22 @@ def test_of_several_balls_the_wrong_one_is_named():
 
 SEEN = {
     "another marker": ("marker.other", lambda s: marker(s, id=3)),
-    "another dictionary": ("marker.other", lambda s: marker(s, dictionary="DICT_6X6_250")),
     "focal length 3 % long": ("camera.focal", lambda s: camera(s, fx=1.03, fy=1.03)),
-    "focal length 3 % short": ("camera.focal", lambda s: camera(s, fx=0.97, fy=0.97)),
     "focal length of another size": ("camera.focal", lambda s: camera(s, fx=0.8, fy=0.8)),
     "focal length that no pose fits": ("camera.focal", lambda s: camera(s, fx=0.15, fy=0.15)),
 }
 
 
 BALLS = {
-    "radius 10 % long": ("ball.radius", lambda s: ball(s, radius=0.0385, center=(-0.12, 0.03, 0.0381))),
     "radius 10 % short": ("ball.radius", lambda s: ball(s, radius=0.0315, center=(-0.12, 0.03, 0.0311))),
     "10 mm aside": ("ball.place", lambda s: ball(s, center=(-0.11, 0.03, 0.0346))),
-    "10 mm behind": ("ball.place", lambda s: ball(s, center=(-0.12, 0.042, 0.0346))),
     "on the other side": ("ball.unfound", lambda s: ball(s, center=(0.12, 0.03, 0.0346))),
     "reflectance of steel": ("ball.reflectance", lambda s: ball(s, reflectance=(0.6, 0.6, 0.6))),
     "out of the picture": ("ball.outside", lambda s: ball(s, center=(0.9, 0.03, 0.0346))),
 }
 
 
-@pytest.mark.parametrize("clip", ["desk", "wire_opposing"])
-@pytest.mark.parametrize("told", [0.6, 1.0])
+@pytest.mark.parametrize(("clip", "told"), [("desk", 0.6), ("wire_opposing", 1.0)])
 def test_reflectance_is_told_by_what_is_seen_twice(clip, told, looks):
     """Of 0.85, 0.85, 0.87; the median of frames is 3 % off, for the desk's texture is mirrored smaller."""
     scene, look = load_scene(clip), looks[clip]
@@ -155,28 +148,21 @@ def test_a_box_beside_its_edges_is_seen(looks):
     few = look.views[::24]
     assert check_proxies(scene, look.camera, few) == []
     box = next(index for index, proxy in enumerate(scene.proxies) if proxy.shape == "box")
-    for off in ((0.015, 0.0, 0.0), (-0.01, 0.01, 0.0)):
-        at = tuple(a + b for a, b in zip(scene.proxies[box].at, off, strict=True))
-        proxies = list(scene.proxies)
-        proxies[box] = dataclasses.replace(proxies[box], at=at)
-        (found,) = check_proxies(dataclasses.replace(scene, proxies=tuple(proxies)), look.camera, few)
-        assert found.name == "proxy.edges"
-        right = [float(value) for value in found.remedy.split("[")[1].split("]")[0].split(",")]
-        assert right == pytest.approx(scene.proxies[box].at, abs=0.003)
+    (found,) = check_proxies(beside(scene), look.camera, few)
+    assert found.name == "proxy.edges"
+    right = [float(value) for value in found.remedy.split("[")[1].split("]")[0].split(",")]
+    assert right == pytest.approx(scene.proxies[box].at, abs=0.003)
 
 
 CODES = np.arange(256) / 255.0
 
 
-def bent(share: float):
-    """A tone curve between that of the clip and smoothstep."""
-    codes = np.rint(255 * (CODES + share * (CODES**2 * (3 - 2 * CODES) - CODES))).astype(np.uint8)
-    return lambda image, _: codes[image]
+BENT = np.rint(255 * CODES**2 * (3 - 2 * CODES)).astype(np.uint8)
+"""The tone curve smoothstep."""
 
 
 PICTURES = {
-    "an S-shaped tone curve": ("camera.response", bent(1.0)),
-    "half an S-shaped tone curve": ("camera.response", bent(0.5)),
+    "an S-shaped tone curve": ("camera.response", lambda image, _: BENT[image]),
     "overexposed": ("card.clipped", gain(2.2)),
     "underexposed": ("card.dark", gain(0.2)),
     "haze": ("card.contrast", lambda image, _: (170 + image // 4).astype(np.uint8)),
@@ -194,8 +180,7 @@ SHORT = {
 """Cameras whose codes end below 255, where, and what is said of it."""
 
 
-@pytest.mark.parametrize("clip", CLIPS)
-@pytest.mark.parametrize("fault", SHORT)
+@pytest.mark.parametrize(("fault", "clip"), list(zip(SHORT, CLIPS, strict=True)))
 def test_codes_that_end_early_are_seen(fault, clip, looks):
     change, level, words = SHORT[fault]
     views = looks[clip].views[::4]
@@ -434,13 +419,17 @@ def test_lives_line_names_what_frames_show(fault, monkeypatch, looks):
     assert Finding(names[0], "", "").error >= Finding(name, "", "").error
 
 
-def test_lives_line_names_a_print_that_is_not_true(monkeypatch):
-    rng = np.random.default_rng(0)
+def photographed(scale=1.0):
+    """The printed card from three sides, and the camera."""
     camera = Camera(640, 480, 600.0, 600.0, 321.0, 238.0)
-    card = PrintedCard(rng, paper="a4", scale=0.97)
+    card = PrintedCard(np.random.default_rng(0), paper="a4", scale=scale)
     eyes = ((0.12 * (k - 1), -0.42, 0.5 + 0.04 * k) for k in range(3))
     views = [Pose(*look_at(np.array(eye), np.array([0.0, 0.02, 0.0]))) for eye in eyes]
-    frames = [card.photograph(camera, pose, 0.7, lambda linear: np.clip(linear, 0, 1) ** (1 / 2.2)) for pose in views]
+    return camera, [card.photograph(camera, p, 0.7, lambda linear: np.clip(linear, 0, 1) ** (1 / 2.2)) for p in views]
+
+
+def test_lives_line_names_a_print_that_is_not_true(monkeypatch):
+    camera, frames = photographed(0.97)
     scene = dataclasses.replace(load_scene("desk"), camera=camera, marker=SHEET, proxies=(), probes=(), lights=())
     said, names = lives_words(scene, frames, monkeypatch)
     assert "card.print" in names
@@ -449,15 +438,10 @@ def test_lives_line_names_a_print_that_is_not_true(monkeypatch):
 
 @pytest.fixture(scope="module")
 def card_frames():
-    """The printed card from three sides, and the camera."""
-    camera = Camera(640, 480, 600.0, 600.0, 321.0, 238.0)
-    card = PrintedCard(np.random.default_rng(0), paper="a4")
-    eyes = ((0.12 * (k - 1), -0.42, 0.5 + 0.04 * k) for k in range(3))
-    views = [Pose(*look_at(np.array(eye), np.array([0.0, 0.02, 0.0]))) for eye in eyes]
-    return camera, [card.photograph(camera, p, 0.7, lambda linear: np.clip(linear, 0, 1) ** (1 / 2.2)) for p in views]
+    return photographed()
 
 
-@pytest.mark.parametrize("number", [0, 7, 9])
+@pytest.mark.parametrize("number", [0, 9])
 def test_card_is_recognised_where_a_single_marker_is_expected(number, monkeypatch, card_frames):
     """The card holds markers 0 to 9: any of them would be followed at the wrong scale."""
     camera, frames = card_frames
