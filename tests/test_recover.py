@@ -36,11 +36,11 @@ from warp_ar.kernels.recovery.recover_cells import (
     leave_out_edges,
 )
 from warp_ar.kernels.recovery.saturation_boundaries import weigh_boundaries
-from warp_ar.light import fit, priors, recovery
+from warp_ar.light import emitters, fit, priors, recovery
 from warp_ar.light import surfaces as light_surfaces
 from warp_ar.light.config import CONFIG, Kind
-from warp_ar.light.emitters import EmitterSearch
-from warp_ar.light.problem import Candidate, emitter_directions, mirroring_points
+from warp_ar.light.emitters import TRIED, EmitterSearch, room
+from warp_ar.light.problem import Candidate, Problem, emitter_directions, mirroring_points
 from warp_ar.scene.geometry import rotation_matrix
 from warp_ar.scene.kinds import trace_config
 from warp_ar.scene.ray_scene import HostScene
@@ -333,16 +333,34 @@ SOLVED = 1e-8
 """Two exact methods on one quadratic problem."""
 
 
-def test_nonnegative_solution_is_the_reference_one():
+def test_nonnegative_solutions_are_the_reference_ones():
+    """Of problems that are solved at once, each by as many turns as it takes."""
     rng = np.random.default_rng(2)
     for size in (1, 5, 30):
-        for _ in range(20):
-            matrix, target = rng.normal(size=(2 * size, size)), rng.normal(size=2 * size)
-            want = nnls(matrix, target)[0]
-            got = fit.solve_nonnegative(matrix.T @ matrix, matrix.T @ target)
-            assert got == pytest.approx(want, abs=SOLVED * 1e2)
-            warm = fit.solve_nonnegative(matrix.T @ matrix, matrix.T @ target, got)
-            assert warm == pytest.approx(got, abs=SOLVED)
+        matrices, targets = rng.normal(size=(20, 2 * size, size)), rng.normal(size=(20, 2 * size))
+        want = np.array([nnls(matrix, target)[0] for matrix, target in zip(matrices, targets, strict=True)])
+        sides = matrices.transpose(0, 2, 1) @ matrices, (targets[:, None] @ matrices)[:, 0]
+        got = fit.solve_nonnegative(*sides)
+        assert got == pytest.approx(want, abs=SOLVED * 1e2)
+        assert fit.solve_nonnegative(*sides, got) == pytest.approx(got, abs=SOLVED)
+
+
+def test_candidates_that_are_tried_at_once_cost_what_each_costs_alone(device, scene):
+    radiance, _, _ = lit_environment(((-0.5, -0.6, 0.5), 0.985, 40.0), ((0.7, -0.5, 0.5), 0.985, 5.0))
+    light = DistantLight(device, scene, noise=0.1)
+    cells, *rest = light.equations(radiance)
+    aim = emitter_directions(cells)
+    origin = mirroring_points(aim, np.array([-0.12, 0.03, 0.035]), 0.035, None)
+    problem = Problem(cells, *rest, light.surfaces, 0.85, light.trace, aim, origin)
+    search = EmitterSearch(problem, problem.card_means()[0])
+    fits = search.fit_anew()
+    cells_in = np.flatnonzero(problem.may_hold_candidate)
+    places = [Candidate(int(cell), distance) for cell in cells_in[:2] for distance in (0.6, np.inf)]
+    together = search.costs_at(places, fits)
+    assert together == pytest.approx([search.costs_at([place], fits)[0] for place in places], rel=SOLVED)
+    problem.push(places[1])
+    alone = fit.fit_channels(problem, np.insert(fits.z, problem.first_mean - 1, 0.0, axis=1), TRIED).cost
+    assert together[1] == pytest.approx(alone.mean() - room(np.inf), rel=SOLVED)
 
 
 def test_regions_join_across_seam_and_poles():
@@ -531,20 +549,21 @@ def test_wide_regions_are_split_into_compact_parts():
 @pytest.mark.parametrize(
     ("falls", "is_added"), [((6.0, 0.9, 0.3), False), ((2.0, 1.3, 0.4), True), ((0.3, 1.3, 1.3), True)]
 )
-def test_two_channels_must_show_an_emitter(falls, is_added):
+def test_two_channels_must_show_an_emitter(falls, is_added, monkeypatch):
     """What one says alone, however clearly, is no emitter; what two say is one, where the third clips."""
     candidates = []
+
+    def fitted(*_):
+        costs = 100.0 - CONFIG.search.evidence * np.array(falls) * len(candidates)
+        return SimpleNamespace(z=np.zeros((3, 1)), cost=costs)
 
     class Search(EmitterSearch):
         def __init__(self):
             self.evidence = CONFIG.search.evidence
-            self.problem = SimpleNamespace(
-                push=candidates.append, pop=candidates.pop, with_candidate=lambda z: z, candidates=candidates
-            )
+            self.problem = SimpleNamespace(push=candidates.append, pop=candidates.pop, first_mean=1)
 
-        def fit(self, z, iterations):
-            costs = 100.0 - CONFIG.search.evidence * np.array(falls) * len(candidates)
-            return SimpleNamespace(z=z, costs=costs, cost=costs.mean())
+        def costs_at(self, places, fits):
+            return np.zeros(len(places))
 
         def gains(self, fits, columns):
             return CONFIG.search.evidence * np.array(falls)[:, None]
@@ -552,8 +571,8 @@ def test_two_channels_must_show_an_emitter(falls, is_added):
         def settled(self, candidate, cost, fits, least):
             return candidate
 
-    search = Search()
-    added = search.add_candidate(search.fit([None] * 3, 1), [Candidate(7, np.inf)], np.zeros((1, 1)))
+    monkeypatch.setattr(emitters, "fit_channels", fitted)
+    added = Search().add_candidate(fitted(), [Candidate(7, np.inf)], np.zeros((1, 1)))
     assert (added is not None) == is_added
     assert candidates == [Candidate(7, np.inf)] * is_added
 

@@ -204,7 +204,8 @@ def _solve(shown: _Shown, white: float, channel: int) -> tuple[Array, Array]:
             noise.append(np.full(count, NOISE[kind] * max(float(values[own].mean()), 1e-4) * alike))
         weighted = (matrix := np.concatenate(rows)) / np.concatenate(noise)[:, None] ** 2
         precision = inverse + matrix.T @ weighted
-        light = solve_nonnegative(precision, inverse @ prior + weighted.T @ np.concatenate(right))
+        gradient = inverse @ prior + weighted.T @ np.concatenate(right)
+        light = solve_nonnegative(precision[None], gradient[None])[0]
     covariance = np.asarray(np.linalg.inv(precision), np.float64)
     return light, covariance
 

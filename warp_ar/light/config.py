@@ -153,8 +153,6 @@ class SolverConfig:
     """The same from a solution of nearly the same problem."""
     halvings: int = 4
     """Largest number of halvings of a step that raises the cost."""
-    converged: float = 1.0e-3
-    """Relative change of the largest unknown at which reweighting has converged."""
     settled: int = 10
     """Number of estimates, from several views, after which emitters and steady light count as known."""
     still: float = 0.02

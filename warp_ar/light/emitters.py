@@ -23,14 +23,13 @@ is taken away, with d no more than ``farthest``. Where falling off tells distanc
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from warp_ar.light.config import CONFIG
-from warp_ar.light.fit import Fit, fit_channel
+from warp_ar.light.fit import Fits, fit_channels
 from warp_ar.light.problem import Candidate, Problem
 
 Array = NDArray[np.float64]
@@ -38,30 +37,10 @@ Array = NDArray[np.float64]
 
 STEP = 1.1
 """Ratio of neighbouring distances that are tried."""
+TRIED = 4
+"""Iterations of reweighting where a place is tried."""
 MOST_STEPS = 4
 """Largest number of steps from the end of a search."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Fits:
-    """One fit of each channel, of the same candidates."""
-
-    channels: tuple[Fit, ...]
-
-    @property
-    def z(self) -> list[Array]:
-        """Unknowns of each channel."""
-        return [fit.z for fit in self.channels]
-
-    @property
-    def costs(self) -> Array:
-        """Of each channel, (3,)."""
-        return np.array([fit.cost for fit in self.channels])
-
-    @property
-    def cost(self) -> float:
-        """Of all: their mean, for they share their errors."""
-        return float(self.costs.mean())
 
 
 def room(distance: float) -> float:
@@ -79,63 +58,48 @@ class EmitterSearch:
         self.evidence = search.evidence * max(problem.texture / search.even, 1.0) ** search.textured
         """Fall of the cost that an emitter must be worth here: on textured surfaces stains look like shadows."""
 
-    def fit(self, z: Sequence[Array], iterations: int) -> Fits:
-        """Fit of all channels, from unknowns of each."""
-        return Fits(tuple(fit_channel(self.problem, c, start, iterations) for c, start in enumerate(z)))
-
     def fit_anew(self) -> Fits:
-        """The same from what the card alone has them."""
-        return self.fit([self.problem.start(mean) for mean in self.means], CONFIG.solver.iterations)
+        """Fit all channels from what the card alone has them."""
+        return fit_channels(self.problem, self.problem.start(self.means), CONFIG.solver.iterations)
 
     def gains(self, fits: Fits, columns: Array) -> Array:
         """Fall of the costs, to second order, if each of ``columns`` (points, q) were a free unknown more, (3, q)."""
-        found = []
-        for c, fit in enumerate(fits.channels):
-            free = fit.z > 0.0
-            added = columns[fit.rows] / self.problem.light[fit.rows, c][:, None]
-            weighted = fit.weights[:, None] * added
-            pull = weighted.T @ (fit.target - fit.equations.times(fit.z))
-            overlap = fit.equations.transposed(weighted)[free]
+        equations, found = fits.equations, []
+        for c in range(3):
+            free = fits.z[c] > 0.0
+            added = columns[equations.rows] / equations.shown[c][:, None]
+            weighted = fits.weights[c][:, None] * added
+            pull = -fits.off[c] @ weighted
+            overlap = equations.transposed(c, weighted)[free]
             own = (added * weighted).sum(axis=0)
-            own -= (overlap * np.linalg.solve(fit.hessian[np.ix_(free, free)], overlap)).sum(axis=0)
+            own -= (overlap * np.linalg.solve(fits.hessian[c][np.ix_(free, free)], overlap)).sum(axis=0)
             found.append(np.where(pull > 0.0, pull**2 / np.maximum(own, 1e-9), 0.0))
         return np.array(found)
 
-    def tried(self, candidate: Candidate, z: Sequence[Array], iterations: int) -> Fits:
-        """Fits with one candidate more, starting from unknowns without it."""
-        self.problem.push(candidate)
-        fits = self.fit([self.problem.with_candidate(one) for one in z], iterations)
-        self.problem.pop()
-        return fits
-
-    def cost_at(self, candidate: Candidate, z: Sequence[Array]) -> float:
-        """Cost with one candidate more, by how much room there is where it stands."""
-        return self.tried(candidate, z, 4).cost - room(candidate.distance)
+    def costs_at(self, places: Sequence[Candidate], fits: Fits) -> Array:
+        """Mean of the costs with one candidate more at each of some places, less how much room there is, (places,)."""
+        z = np.insert(fits.z, self.problem.first_mean, 0.0, axis=1)
+        tried = np.tile(z, (len(places), 1))
+        cost = fit_channels(self.problem, tried, TRIED, self.problem.light_of(places)).cost
+        return np.asarray(cost.reshape(-1, 3).mean(axis=1) - [room(place.distance) for place in places], np.float64)
 
     def add_candidate(self, fits: Fits, candidates: Sequence[Candidate], columns: Array) -> Fits | None:
         """Add the best candidate if it is worth it; returns the new fits, or None."""
-        gain = np.median(self.gains(fits, columns), axis=0)
-        best: tuple[Candidate, float] | None = None
-        seen: list[Candidate] = []
+        gain, tried = np.median(self.gains(fits, columns), axis=0), list[Candidate]()
         for place in np.argsort(-gain, kind="stable"):
-            candidate = candidates[place]
-            if gain[place] < 0.3 * self.evidence or len(seen) == 5:
+            one = candidates[place]
+            if gain[place] < 0.3 * self.evidence or len(tried) == 5:
                 break
-            if any(
-                candidate.distance == s.distance
-                and self.problem.direction[candidate.cell] @ self.problem.direction[s.cell] > 0.95
-                for s in seen
-            ):
-                continue
-            seen.append(candidate)
-            cost = self.cost_at(candidate, fits.z)
-            if best is None or cost < best[1]:
-                best = (candidate, cost)
-        if best is None:
+            toward = [self.problem.direction[other.cell] for other in tried if other.distance == one.distance]
+            if not toward or (np.array(toward) @ self.problem.direction[one.cell]).max() <= 0.95:
+                tried.append(one)
+        if not tried:
             return None
+        best = self._best_of(tried, tried[0], np.inf, fits, 0.0)
         self.problem.push(self.settled(*best, fits, CONFIG.search.better))
-        added = self.fit([self.problem.with_candidate(one) for one in fits.z], CONFIG.solver.iterations)
-        if np.median(fits.costs - added.costs) < self.evidence:
+        z = np.insert(fits.z, self.problem.first_mean - 1, 0.0, axis=1)
+        added = fit_channels(self.problem, z, CONFIG.solver.iterations)
+        if np.median(fits.cost - added.cost) < self.evidence:
             self.problem.pop()
             return None
         return added
@@ -163,10 +127,9 @@ class EmitterSearch:
         self, places: Sequence[Candidate], candidate: Candidate, cost: float, fits: Fits, least: float
     ) -> tuple[Candidate, float]:
         """The best of some places and its cost; the candidate itself where none lowers that by more than ``least``."""
-        for place in places:
-            other = self.cost_at(place, fits.z)
+        for place, other in zip(places, self.costs_at(places, fits), strict=True):
             if other < cost - least:
-                candidate, cost = place, other
+                candidate, cost = place, float(other)
         return candidate, cost
 
     def _at_its_distance(self, candidate: Candidate, cost: float, fits: Fits, least: float) -> Candidate:
@@ -178,36 +141,38 @@ class EmitterSearch:
         """
         if self.problem.trace is None or not np.isfinite(candidate.distance):
             return candidate
-        costs = {0: cost}
 
-        def at(step: int) -> float:
-            place = Candidate(candidate.cell, candidate.distance * STEP**step)
-            if step not in costs:
-                near = place.distance <= CONFIG.search.nearest
-                costs[step] = np.inf if near else self.cost_at(place, fits.z)
-            return costs[step]
+        def place(step: float) -> Candidate:
+            return Candidate(candidate.cell, candidate.distance * STEP**step)
 
-        best = 0
+        def try_steps(*steps: int) -> None:
+            far = [step for step in steps if place(step).distance > CONFIG.search.nearest]
+            costs.update(dict.fromkeys(steps, np.inf))
+            if far:
+                costs.update(zip(far, self.costs_at([place(step) for step in far], fits), strict=True))
+
+        costs, best = {0: cost}, 0
+        try_steps(-1, 1)
         for way in (-1, 1):
-            while abs(best) < MOST_STEPS and at(best + way) < at(best) - least:
+            while abs(best) < MOST_STEPS and costs[best + way] < costs[best] - least:
                 best += way
+                try_steps(best + way)
             if best:
                 break
-        low, middle, high = at(best - 1), at(best), at(best + 1)
+        low, middle, high = (costs[best + way] for way in (-1, 0, 1))
         bend = low - 2.0 * middle + high
-        found = Candidate(candidate.cell, candidate.distance * STEP**best)
         if not (np.isfinite(bend) and bend > 0.0):
-            return found
-        place = best + float(np.clip(0.5 * (low - high) / bend, -0.5, 0.5))
-        between = Candidate(candidate.cell, candidate.distance * STEP**place)
-        return between if self.cost_at(between, fits.z) < middle - least else found
+            return place(best)
+        between = place(best + float(np.clip(0.5 * (low - high) / bend, -0.5, 0.5)))
+        return between if self.costs_at([between], fits)[0] < middle - least else place(best)
 
     def move_candidate(self) -> None:
         """Move the first candidate to where it does better, if that is nearby; it becomes the last."""
         candidate = self.problem.candidates.pop(0)
         self.problem.candidate_columns = self.problem.candidate_columns[:, :, 1:]
         fits = self.fit_anew()
-        self.problem.push(self.settled(candidate, self.cost_at(candidate, fits.z), fits, CONFIG.search.worth_moving))
+        cost = float(self.costs_at([candidate], fits)[0])
+        self.problem.push(self.settled(candidate, cost, fits, CONFIG.search.worth_moving))
 
     def neighbours(self, candidate: Candidate) -> list[Candidate]:
         """Candidates in cells nearby, and at distances nearby."""

@@ -1,4 +1,7 @@
-"""The solution of one channel: iteratively reweighted least squares with unknowns that are not negative.
+"""The solution of the equations: iteratively reweighted least squares with unknowns that are not negative.
+
+All channels are solved at once, each with every candidate that is tried: arrays begin with the number of the fit, whose
+channel is that number modulo 3. Products of one fit take microseconds, about as long as a call of NumPy.
 
 Every deviation is relative to an unknown, a mean or a reflectance. The derivative with respect to that unknown is kept:
 without it, the more parts and equations there are, the more all of them would shrink together.
@@ -53,273 +56,265 @@ def one_blas_thread() -> Iterator[None]:
 
 
 def solve_nonnegative(hessian: Array, gradient: Array, start: Array | None = None) -> Array:
-    """Minimise x' H x / 2 - g' x over x >= 0.
+    """Minimise x' H x / 2 - g' x over x >= 0, for several problems at once.
 
     Block pivoting: free unknowns that turn negative are held at zero; once none does, held ones that pull upward are
     let go.
 
     Args:
-        hessian: H, positive definite, (n, n).
-        gradient: g, (n,).
-        start: Solution of a similar problem: its positive unknowns start free.
+        hessian: H, positive definite, (problems, n, n).
+        gradient: g, (problems, n).
+        start: Solutions of similar problems: their positive unknowns start free.
     """
-    free = np.ones(len(gradient), bool) if start is None else start > 0.0
-    x = np.zeros(len(gradient))
-    tolerance = 1e-9 * float(np.abs(gradient).max(initial=0.0))
+    free = np.ones(gradient.shape, bool) if start is None else start > 0.0
+    tolerance = 1e-9 * np.abs(gradient).max(axis=1, initial=0.0, keepdims=True)
+    x, left, diagonal = np.zeros_like(gradient), np.arange(len(gradient)), np.arange(gradient.shape[1])
     for _ in range(60):
-        x[:] = 0.0
-        index = np.flatnonzero(free)
-        if len(index) == len(x):
-            x[:] = np.linalg.solve(hessian, gradient)
-        elif len(index):
-            x[index] = np.linalg.solve(hessian[index[:, None], index], gradient[index])
-        negative = free & (x < 0.0)
-        if negative.any():
-            free &= ~negative
-            continue
-        pulled = ~free & (hessian @ x - gradient < -tolerance)
-        if not pulled.any():
+        own, h, g = free[left], hessian[left], gradient[left]
+        held = np.where(own[:, :, None] & own[:, None], h, 0.0)
+        held[:, diagonal, diagonal] += ~own
+        x[left] = now = np.linalg.solve(held, np.where(own, g, 0.0)[..., None])[..., 0]
+        negative = own & (now < 0.0)
+        pulled = ~own & ((h @ now[..., None])[..., 0] - g < -tolerance[left]) & ~negative.any(axis=1, keepdims=True)
+        free[left] = own & ~negative | pulled
+        left = left[(negative | pulled).any(axis=1)]
+        if not len(left):
             break
-        free |= pulled
     return np.maximum(x, 0.0)
 
 
 LEAST = CONFIG.priors.least
 
 
+@dataclasses.dataclass
+class Fits:
+    """Solutions, and the quadratic problems that they solve."""
+
+    z: Array
+    """Unknowns, in the order that ``Problem`` gives, (fits, unknowns)."""
+    cost: Array
+    """Twice a negative log likelihood, (fits,)."""
+    equations: Equations
+    """Both sides."""
+    off: Array
+    """Left sides less right ones, (fits, rows)."""
+    weights: Array
+    """Weights of the last quadratic problem, (fits, rows)."""
+    hessian: Array
+    """The same, priors included, (fits, unknowns, unknowns)."""
+
+
+@dataclasses.dataclass
+class _State:
+    """Unknowns, and what a quadratic problem about them takes."""
+
+    z: Array
+    u: Array
+    """1 / reflectance of surfaces, (fits, surfaces)."""
+    off: Array
+    relative: Array
+    """The same over their standard deviation; 0 where a point that clips may be as bright, (fits, rows)."""
+    deviation: Array
+    """Standard deviations of priors, (fits, priors)."""
+    strayed: Array
+    """Deviations from priors over these, (fits, priors)."""
+    cost: Array
+
+
 class Equations:
-    """Left sides of equations, by what is in them: light, which all have in common, and one surface each.
+    """Equations and priors of all channels, as matrices.
 
     An equation is light of parts and candidates less 1 / reflectance of its surface, so that with many surfaces nearly
     all of a matrix would be zeros. What is kept is the light and the number of the surface: products take time in
     proportion to equations, and not to equations times surfaces.
     """
 
-    def __init__(self, light: Array, surface: NDArray[np.int64], first: int, count: int) -> None:
-        """Keep both.
+    def __init__(
+        self,
+        problem: Problem,
+        added: Array | None = None,
+        centre: Array | None = None,
+        known: tuple[Array, NDArray[np.bool_]] | None = None,
+    ) -> None:
+        """Set up.
 
         Args:
-            light: Of parts and candidates, divided by pi times the radiance shown, (rows, parts and candidates).
-            surface: Of each row, ascending, (rows,).
-            first: Place of the first surface among the unknowns.
-            count: Of surfaces.
+            problem: The equations.
+            added: Irradiance per power of candidates, each tried by itself beside those of the problem, (3, points, q).
+            centre: Draws parts and candidates to itself instead of to means, (3, parts + candidates).
+            known: 1 / reflectances by a channel that is known better, (surfaces,), and the channels in which surfaces
+                are of about these, (3,).
         """
-        self.light, self.surface, self.first, self.count = light, surface, first, count
-        self._present, self._starts = np.unique(surface, return_index=True)
-
-    @property
-    def unknowns(self) -> int:
-        """Number of unknowns."""
-        return self.first + self.count
-
-    def times(self, z: Array) -> Array:
-        """Left sides of unknowns ``z``, (rows,)."""
-        return np.asarray(self.light @ z[: self.light.shape[1]] - z[self.first + self.surface], np.float64)
-
-    def transposed(self, values: Array) -> Array:
-        """Product of the transposed matrix with ``values`` (rows, ...), (unknowns, ...)."""
-        product = np.zeros((self.unknowns, *values.shape[1:]))
-        if len(values):
-            product[: self.light.shape[1]] = self.light.T @ values
-            product[self.first + self._present] = -np.add.reduceat(values, self._starts, axis=0)
-        return product
-
-    def add_normal(self, hessian: Array, weights: Array) -> None:
-        """Add the transposed matrix times ``weights`` (rows,) times the matrix to ``hessian`` (unknowns, unknowns)."""
-        if not len(weights):
-            return
-        bright = self.light.shape[1]
-        weighted = weights[:, None] * self.light
-        hessian[:bright, :bright] += self.light.T @ weighted
-        places = self.first + self._present
-        across = np.add.reduceat(weighted, self._starts, axis=0)
-        hessian[places, :bright] -= across
-        hessian[:bright, places] -= across.T
-        hessian[places, places] += np.add.reduceat(weights, self._starts)
-
-
-@dataclasses.dataclass
-class Fit:
-    """A solution and the quadratic problem that it solves."""
-
-    z: Array
-    """Unknowns, in the order that ``Problem`` gives."""
-    cost: float
-    """Twice a negative log likelihood."""
-    rows: NDArray[np.int64]
-    """Points that have an equation."""
-    equations: Equations
-    """Left sides."""
-    target: Array
-    """Right sides, (rows,)."""
-    weights: Array
-    """Weights of the last quadratic problem, (rows,)."""
-    hessian: Array
-    """The same, priors included, (unknowns, unknowns)."""
-
-
-def fit_channel(
-    problem: Problem, c: int, z: Array, iterations: int, centre: Array | None = None, other: Array | None = None
-) -> Fit:
-    """Solve for one channel from a start.
-
-    Args:
-        problem: The equations.
-        c: Channel.
-        z: Unknowns to start from.
-        iterations: Of reweighting.
-        centre: Draws parts and candidates to itself instead of to means.
-        other: Unknowns of a channel that is known better: surfaces are of about that reflectance.
-    """
-    return _Channel(problem, c, centre, other).solve(z, iterations)
-
-
-class _Channel:
-    """One channel's equations and priors, as matrices."""
-
-    def __init__(self, problem: Problem, c: int, centre: Array | None, other: Array | None) -> None:
-        self.problem, self.centre = problem, centre
-        u_at, count = problem.first_surface, len(problem.kinds)
-        self.usable = np.bincount(problem.surface[problem.exact[:, c]], minlength=count) >= 4
-        known = problem.kind == Kind.CARD
-        self.rows = rows = np.flatnonzero(
-            (problem.exact[:, c] & (self.usable[problem.surface] | known))
-            | (problem.bound[:, c] & self.usable[problem.surface])
-            | (problem.bound[:, c] & known)
-        )
-        self.surface, self.exact = problem.surface[rows], problem.exact[rows, c]
-        light = problem.light[rows, c]
-        sources = np.concatenate([problem.columns[c][rows], problem.candidate_columns[c][rows]], axis=1)
-        self.equations = Equations(sources / light[:, None], self.surface, u_at, count)
-        self.target = -problem.captured[rows, c] / light
+        self.problem, self.centre, count = problem, centre, len(problem.kinds)
+        card, exact = problem.kind == Kind.CARD, problem.exact.T
+        self.usable = np.stack([np.bincount(problem.surface[own], minlength=count) >= 4 for own in exact])
+        used = (exact | problem.bound.T) & (self.usable[:, problem.surface] | card)
+        self.rows = rows = np.flatnonzero(used.any(axis=0))
+        used, self.surface, tries = used[:, rows], problem.surface[rows], 1 if added is None else added.shape[2]
+        self.shown = np.where(used, problem.light[rows].T, 1.0)
+        light = np.concatenate([problem.columns, problem.candidate_columns], axis=2)[:, rows]
+        if added is not None:
+            tried = np.moveaxis(added[:, rows], 2, 0)[..., None]
+            light = np.concatenate([np.broadcast_to(light, (tries, *light.shape)), tried], axis=3)
+        self.light = (light / self.shown[..., None]).reshape(3 * tries, len(rows), -1)
+        self.target = np.tile(-problem.captured[rows].T / self.shown, (tries, 1))
+        self.weigh = np.tile(used / problem.shared[rows], (tries, 1))
+        self.one_sided = np.tile(~exact[:, rows], (tries, 1))
         surfaces = CONFIG.surfaces
-        self.prior_u = np.where(
-            problem.kinds == Kind.CARD, 1.0 / problem.white, 1.0 / np.array(surfaces.reflectance)[problem.kinds]
-        )
-        self.spread_u = np.array(surfaces.reflectance_spread)[problem.kinds]
-        if other is not None:
-            self.prior_u, self.spread_u = other[-count:], np.array(surfaces.hue_spread)[problem.kinds]
         self.sigma = np.hypot(problem.noise[self.surface], surfaces.mirror_trust * problem.mirrored_share[rows])
-        self.shared = problem.shared[rows]
-        self.tied = np.concatenate([*problem.ties.T])
+        usual = np.where(problem.kinds == Kind.CARD, problem.white, np.array(surfaces.reflectance)[problem.kinds])
+        self.prior_u = np.tile(1.0 / usual, (3 * tries, 1))
+        self.spread_u = np.tile(np.array(surfaces.reflectance_spread)[problem.kinds], (3 * tries, 1))
+        if known is not None:
+            self.prior_u[known[1]], self.spread_u[known[1]] = known[0], np.array(surfaces.hue_spread)[problem.kinds]
+        self.present, self.starts = np.unique(self.surface, return_index=True)
+        self.mean_at = self.light.shape[2]
+        self.surface_at = self.mean_at + problem.components + 1
         self._set_priors()
 
     def _set_priors(self) -> None:
-        """Left and right sides of what parts and means deviate from."""
-        problem = self.problem
-        mean_at, u_at = problem.first_mean, problem.first_surface
-        self.prior = np.eye(u_at)
-        self.prior_target = np.zeros(u_at)
+        """Left and right sides of what parts, means and reflectances deviate from."""
+        problem, mean_at, at = self.problem, self.mean_at, self.surface_at
+        self.prior = np.zeros((at + len(problem.ties), at + len(problem.kinds)))
+        self.prior[:at, :at] = np.eye(at)
+        self.target_prior = np.zeros((len(self.light), len(self.prior)))
         if self.centre is None:
             free = np.flatnonzero(~problem.is_surface)
             self.prior[free, mean_at + problem.component[free]] = -1.0
-            self.prior[mean_at : mean_at + problem.components, u_at - 1] = -problem.expected
+            self.prior[mean_at : at - 1, at - 1] = -problem.expected
         else:
-            self.prior_target[:mean_at] = self.centre
-        self.deviation = np.ones(u_at)
+            self.target_prior[:, :mean_at] = self.centre
+        ties = at + np.arange(len(problem.ties))
+        self.prior[ties, at + problem.ties[:, 0]], self.prior[ties, at + problem.ties[:, 1]] = 1.0, -1.0
 
-    def solve(self, z: Array, iterations: int) -> Fit:
-        """Reweight and solve in turn."""
-        u_at = self.problem.first_surface
-        z = z.copy()
-        if not z[u_at:].any():
-            self._guess_reflectances(z)
-        hessian, weights = np.zeros((len(z), len(z))), np.zeros(len(self.rows))
-        least = self._cost(z)
-        for _ in range(iterations):
-            self._set_deviations(z)
-            hessian, gradient, weights = self._quadratic(z)
-            last, z = z, solve_nonnegative(hessian, gradient, z)
-            z, least = self._shortened(last, z, least)
-            if np.abs(z - last).max() < CONFIG.solver.converged * np.abs(z).max():
-                break
-        z[u_at:] = np.maximum(z[u_at:], 1e-3)
-        return Fit(z, self._cost(z), self.rows, self.equations, self.target, weights, hessian)
+    def guess_reflectances(self, z: Array) -> None:
+        """Set the reflectances of surfaces to the medians over their points, by the light of unknowns."""
+        ratio = self._sum(z) - self.target
+        z[:, self.surface_at :] = self.prior_u
+        for c in range(3):
+            own = np.flatnonzero(~self.one_sided[c] & (self.problem.kinds != Kind.CARD)[self.surface])
+            order = own[np.lexsort((ratio[c, own], self.surface[own]))]
+            found, first, count = np.unique(self.surface[order], return_index=True, return_counts=True)
+            middle = 0.5 * (ratio[c, order[first + (count - 1) // 2]] + ratio[c, order[first + count // 2]])
+            told = self.usable[c, found]
+            z[c, self.surface_at + found[told]] = np.maximum(middle[told], 1e-3)
 
-    def _shortened(self, last: Array, z: Array, least: float) -> tuple[Array, float]:
-        """A step halved until it does not raise the cost above the least so far; and the least cost now.
+    def solve(self, z: Array, iterations: int) -> Fits:
+        """Reweight and solve in turn.
 
-        Each quadratic problem has deviations about the last unknowns. Where the card clips, little more than priors of
-        reflectances bounds the light as a whole, and whole steps may lead ever farther from the least cost.
+        Steps are halved until they do not raise the cost above the least so far. Each quadratic problem has deviations
+        about the last unknowns. Where the card clips, little more than priors of reflectances bounds the light as a
+        whole, and whole steps may lead ever farther from the least cost.
+
+        Args:
+            z: Unknowns to start from, (fits, unknowns).
+            iterations: Of reweighting.
         """
-        cost = self._cost(z)
-        for _ in range(CONFIG.solver.halvings):
-            if cost <= least:
-                break
-            z = 0.5 * (last + z)
-            cost = self._cost(z)
-        return z, min(cost, least)
+        state = self._at(z)
+        least = state.cost
+        for _ in range(iterations):
+            hessian, gradient, weights = self._quadratic(state)
+            last, state = state.z, self._at(solve_nonnegative(hessian, gradient, state.z))
+            for _ in range(CONFIG.solver.halvings):
+                worse = state.cost > least
+                if not worse.any():
+                    break
+                state = self._at(np.where(worse[:, None], 0.5 * (last + state.z), state.z))
+            least = np.minimum(state.cost, least)
+        z = np.concatenate([state.z[:, : self.surface_at], state.u], axis=1)
+        return Fits(z, state.cost, self, state.off, weights, hessian)
 
-    def _cost(self, z: Array) -> float:
-        """Twice a negative log likelihood, deviations about these unknowns."""
-        self._set_deviations(z)
-        u_at = self.problem.first_surface
-        u = np.maximum(z[u_at:], 1e-3)
-        relative = (self.equations.times(z) - self.target) / (u[self.surface] * self.sigma)
-        relative[~self.exact & (relative > 0.0)] = 0.0
-        cost = float((4.0 * np.log1p(0.25 * relative**2) / self.shared).sum())
-        cost += float((((self.prior @ z[:u_at] - self.prior_target) / self.deviation) ** 2).sum())
-        a, b = self.problem.ties.T
-        cost += float((self.tie_weight * (u[a] - u[b]) ** 2).sum())
-        return cost + float(((np.log(u / self.prior_u) / self.spread_u) ** 2).sum())
+    def _sum(self, z: Array) -> Array:
+        """Light of parts and candidates, (fits, rows)."""
+        return np.asarray((self.light @ z[:, : self.mean_at, None])[..., 0], np.float64)
 
-    def _guess_reflectances(self, z: Array) -> None:
-        """Set the reflectances of surfaces that were left open by the start's light."""
-        problem, u_at = self.problem, self.problem.first_surface
-        ratio = self.equations.light @ z[: problem.first_mean] - self.target
-        z[u_at:] = self.prior_u
-        for k in np.flatnonzero(self.usable & (problem.kinds != Kind.CARD)):
-            z[u_at + k] = max(float(np.median(ratio[self.exact & (self.surface == k)])), 1e-3)
+    def _at(self, z: Array) -> _State:
+        """Deviations about unknowns, and the cost."""
+        u, mean = np.maximum(z[:, self.surface_at :], 1e-3), z[:, self.surface_at - 1, None]
+        off = self._sum(z) - u[:, self.surface] - self.target
+        relative = off / (u[:, self.surface] * self.sigma)
+        relative = np.where(self.one_sided & (relative > 0.0), 0.0, relative)
+        deviation = self._deviations(z, u, mean)
+        strayed = (z @ self.prior.T - self.target_prior) / deviation
+        cost = (4.0 * np.log1p(0.25 * relative**2) * self.weigh).sum(axis=1) + (strayed**2).sum(axis=1)
+        cost += ((np.log(u / self.prior_u) / self.spread_u) ** 2).sum(axis=1)
+        return _State(z, u, off, relative, deviation, strayed, cost)
 
-    def _set_deviations(self, z: Array) -> None:
-        """Standard deviations of priors about the last estimate."""
-        problem, deviation, priors = self.problem, self.deviation, CONFIG.priors
-        parts, mean_at, u_at = problem.parts, problem.first_mean, problem.first_surface
-        u = np.maximum(z[u_at:], 1e-3)
+    def _deviations(self, z: Array, u: Array, mean: Array) -> Array:
+        """Standard deviations of priors about unknowns."""
+        problem, priors, parts, mean_at = self.problem, CONFIG.priors, self.problem.parts, self.mean_at
         if self.centre is None:
-            about = np.maximum(z[mean_at : u_at - 1][problem.component], LEAST)
-            deviation[:parts] = np.where(problem.is_surface, priors.surface_recovered, priors.inside * about)
-            deviation[parts:mean_at] = 10.0 * np.maximum(z[parts:mean_at], LEAST)
+            about = np.maximum(z[:, mean_at : self.surface_at - 1][:, problem.component], LEAST)
+            of_parts = np.where(problem.is_surface, priors.surface_recovered, priors.inside * about)
+            of_candidates = 10.0 * np.maximum(z[:, parts:mean_at], LEAST)
         else:
-            deviation[:parts] = priors.hue * np.maximum(self.centre[:parts], 0.1)
-            deviation[parts:mean_at] = priors.hue * np.maximum(self.centre[parts:], 0.01)
-        deviation[mean_at : u_at - 1] = priors.spread * np.maximum(problem.expected * z[u_at - 1], LEAST)
-        deviation[u_at - 1] = 3.0 * max(z[u_at - 1], LEAST)
-        a, b = problem.ties.T
-        self.tie_weight = 1.0 / (CONFIG.surfaces.tie * 0.5 * (u[a] + u[b])) ** 2
+            of_parts = priors.hue * np.maximum(self.centre[:, :parts], 0.1)
+            of_candidates = priors.hue * np.maximum(self.centre[:, parts:], 0.01)
+        of_means = priors.spread * np.maximum(problem.expected * mean, LEAST)
+        of_ties = CONFIG.surfaces.tie * 0.5 * u[:, problem.ties].sum(axis=2)
+        return np.concatenate([of_parts, of_candidates, of_means, 3.0 * np.maximum(mean, LEAST), of_ties], axis=1)
 
-    def _quadratic(self, z: Array) -> tuple[Array, Array, Array]:
+    def _quadratic(self, state: _State) -> tuple[Array, Array, Array]:
         """Hessian, gradient and the equations' weights about the last estimate."""
-        problem, count = self.problem, len(self.problem.kinds)
-        mean_at, u_at = problem.first_mean, problem.first_surface
-        u = np.maximum(z[u_at:], 1e-3)
-        diagonal = np.arange(u_at, len(z))
-        hessian, gradient = np.zeros((len(z), len(z))), np.zeros(len(z))
-        scaled = self.prior / self.deviation[:, None]
-        hessian[:u_at, :u_at] = scaled.T @ scaled
-        gradient[:u_at] = scaled.T @ (self.prior_target / self.deviation)
-        a, b = u_at + problem.ties.T
-        hessian[a, b] = hessian[b, a] = -self.tie_weight
-        both = np.concatenate([self.tie_weight, self.tie_weight])
-        hessian[diagonal, diagonal] = np.bincount(self.tied, both, minlength=count)
+        problem, mean_at, at = self.problem, self.mean_at, self.surface_at
+        z, u, places = state.z, state.u, at + self.present
+        weights = self.weigh / (1.0 + 0.25 * state.relative**2) / (u[:, self.surface] * self.sigma) ** 2
+        weights[self.one_sided & (state.off > 0.0)] = 0.0
+        scaled = self.prior.T / state.deviation[:, None] ** 2
+        hessian = scaled @ self.prior
+        gradient = (scaled @ self.target_prior[..., None])[..., 0]
         # Log-normal prior of 1 / reflectance, about the last estimate.
-        hessian[diagonal, diagonal] += 1.0 / (u * self.spread_u) ** 2
-        gradient[u_at:] += np.maximum(1.0 + np.log(self.prior_u / u), 0.2) / (u * self.spread_u**2)
-        off = self.equations.times(z) - self.target
-        relative = off / (u[self.surface] * self.sigma)
-        weights = 1.0 / (1.0 + 0.25 * relative**2) / ((u[self.surface] * self.sigma) ** 2 * self.shared)
-        weights[~self.exact & (relative > 0.0)] = 0.0
-        self.equations.add_normal(hessian, weights)
-        gradient += self.equations.transposed(weights * self.target)
+        diagonal = np.arange(at, z.shape[1])
+        hessian[:, diagonal, diagonal] += 1.0 / (u * self.spread_u) ** 2
+        gradient[:, at:] += np.maximum(1.0 + np.log(self.prior_u / u), 0.2) / (u * self.spread_u**2)
+        weighted = weights[..., None] * self.light
+        hessian[:, :mean_at, :mean_at] += self.light.transpose(0, 2, 1) @ weighted
+        across = self.by_surface(weighted)
+        hessian[:, places, :mean_at] -= across
+        hessian[:, :mean_at, places] -= across.transpose(0, 2, 1)
+        hessian[:, places, places] += self.by_surface(weights)
+        gradient[:, :mean_at] += (self.target[:, None] @ weighted)[:, 0]
         # Deviations are relative: what they are relative to must not shrink for their sake.
-        gradient[u_at:] += np.bincount(self.surface, weights * off**2, minlength=count) / u
+        gradient[:, places] += self.by_surface(weights * (state.off**2 / u[:, self.surface] - self.target))
         if self.centre is None:
-            means = z[mean_at : u_at - 1]
-            strayed = (scaled @ z[:u_at]) ** 2
-            about = np.maximum(means[problem.component], LEAST)
-            within = np.where(problem.is_surface | (about <= LEAST), 0.0, strayed[: problem.parts])
-            sums = np.bincount(problem.component, within, minlength=problem.components)
-            gradient[mean_at : u_at - 1] += sums / np.maximum(means, LEAST)
-            wide = problem.expected * z[u_at - 1] > LEAST
-            gradient[u_at - 1] += (strayed[mean_at : u_at - 1] * wide).sum() / max(z[u_at - 1], LEAST)
+            means, mean, strayed = z[:, mean_at : at - 1], z[:, at - 1], state.strayed[:, :at] ** 2
+            within = strayed[:, : problem.parts] @ -self.prior[: problem.parts, mean_at : at - 1]
+            gradient[:, mean_at : at - 1] += np.where(means > LEAST, within / np.maximum(means, LEAST), 0.0)
+            wide = problem.expected * mean[:, None] > LEAST
+            gradient[:, at - 1] += (strayed[:, mean_at : at - 1] * wide).sum(axis=1) / np.maximum(mean, LEAST)
         return hessian, gradient, weights
+
+    def transposed(self, c: int, values: Array) -> Array:
+        """Product of a channel's transposed matrix with ``values`` (rows, q), (unknowns, q)."""
+        product = np.zeros((self.prior.shape[1], values.shape[1]))
+        product[: self.mean_at] = self.light[c].T @ values
+        product[self.surface_at + self.present] = -self.by_surface(values[None])[0]
+        return product
+
+    def by_surface(self, values: Array) -> Array:
+        """Sums of rows' values over each surface that has any, (fits, present, ...)."""
+        return np.add.reduceat(values, self.starts, axis=1) if len(self.starts) else values
+
+
+def fit_channels(
+    problem: Problem,
+    z: Array,
+    iterations: int,
+    added: Array | None = None,
+    centre: Array | None = None,
+    known: tuple[Array, NDArray[np.bool_]] | None = None,
+) -> Fits:
+    """Solve for all channels from a start.
+
+    Args:
+        problem: The equations.
+        z: Unknowns to start from, (fits, unknowns); surfaces may be left open, as 0.
+        iterations: Of reweighting.
+        added: As for `Equations`; there is a fit of each channel for each.
+        centre: As for `Equations`.
+        known: As for `Equations`.
+    """
+    equations, z = Equations(problem, added, centre, known), z.copy()
+    if not z[:, equations.surface_at :].any():
+        equations.guess_reflectances(z)
+    return equations.solve(z, iterations)

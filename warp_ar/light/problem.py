@@ -226,25 +226,22 @@ class Problem:
 
     def card_means(self) -> tuple[Array, tuple[bool, bool, bool]]:
         """Common mean per channel that makes the card right, and whether that is a lower bound only."""
-        means, bounds = np.zeros(3), [False] * 3
-        expected = self.expected[self.component]
-        card = self.kind == Kind.CARD
-        for c in range(3):
-            use = card & self.exact[:, c]
-            if use.sum() < max(3.0, 0.3 * card.sum()):
-                bounds[c] = True
-                use = card & (self.exact[:, c] | self.bound[:, c])
-            gain = self.columns[c][use] @ expected
-            if not gain.any():
-                continue
-            irradiance = self.light[use, c] / self.white
-            missing = irradiance - self.captured[use, c]
-            mean = max(0.0, float(np.median(missing) / np.median(gain))) if np.median(gain) > 0 else 0.0
-            for _ in range(10):
-                weights = 1.0 / (1.0 + ((missing - gain * mean) / (0.03 * irradiance)) ** 2) / irradiance**2
-                mean = max(0.0, float((weights * gain * missing).sum() / (weights * gain**2).sum()))
-            means[c] = mean
-        return means, (bounds[0], bounds[1], bounds[2])
+        card = np.flatnonzero(self.kind == Kind.CARD)
+        exact = self.exact[card]
+        bounds = exact.sum(axis=0) < max(3.0, 0.3 * len(card))
+        use = exact | (bounds & self.bound[card])
+        irradiance = np.where(use, self.light[card] / self.white, 1.0)
+        missing = irradiance - self.captured[card]
+        gain = (self.columns[:, card] @ self.expected[self.component]).T
+        means = np.zeros(3)
+        for c in np.flatnonzero((use & (gain > 0.0)).any(axis=0)):
+            middle = np.median(gain[use[:, c], c])
+            means[c] = max(0.0, float(np.median(missing[use[:, c], c]) / middle)) if middle > 0.0 else 0.0
+        for _ in range(10):
+            weights = use / (1.0 + ((missing - gain * means) / (0.03 * irradiance)) ** 2) / irradiance**2
+            total = np.maximum((weights * gain**2).sum(axis=0), 1e-30)
+            means = np.maximum((weights * gain * missing).sum(axis=0) / total, 0.0)
+        return means, (bool(bounds[0]), bool(bounds[1]), bool(bounds[2]))
 
     def card_factor(self, bounds: tuple[bool, bool, bool], doubt: float) -> float:
         """Return the share, 0 to 1, of the correction by the card that is applied.
@@ -287,17 +284,13 @@ class Problem:
         """Place of the first surface's 1 / reflectance."""
         return self.first_mean + self.components + 1
 
-    def start(self, mean: float) -> Array:
-        """Unknowns as the card alone has them; surfaces are left open (0)."""
-        z = np.zeros(self.first_surface + len(self.kinds))
-        z[: self.parts] = mean * self.expected[self.component]
-        z[self.first_mean : self.first_surface - 1] = mean * self.expected
-        z[self.first_surface - 1] = mean
+    def start(self, means: Array) -> Array:
+        """Unknowns of channels as the card alone has them, (3, unknowns); surfaces are left open (0)."""
+        z = np.zeros((3, self.first_surface + len(self.kinds)))
+        z[:, : self.parts] = means[:, None] * self.expected[self.component]
+        z[:, self.first_mean : self.first_surface - 1] = means[:, None] * self.expected
+        z[:, self.first_surface - 1] = means
         return z
-
-    def with_candidate(self, z: Array) -> Array:
-        """Unknowns of a problem with one candidate less, and that candidate at zero."""
-        return np.insert(z, self.first_mean - 1, 0.0)
 
     def power_columns(self, candidates: Sequence[Candidate]) -> Array:
         """Irradiance per unit power of candidates, (points, q)."""
@@ -322,18 +315,22 @@ class Problem:
         total = self.solid_angle[near] @ self.missing[near]
         return np.asarray(near[:, None] / np.maximum(total, 1e-6), np.float64)
 
+    def light_of(self, candidates: Sequence[Candidate]) -> Array:
+        """Irradiance per unit power of candidates as channels show it, (3, points, q)."""
+        light = np.repeat(self.power_columns(candidates)[None], 3, axis=0)
+        for k, candidate in enumerate(candidates):
+            patch = self.patch(candidate.cell)
+            inside = np.flatnonzero(patch.any(axis=1))
+            if np.isfinite(candidate.distance):
+                light[:, :, k] *= (self.lost[inside].max(axis=0) > LOST)[:, None]
+            else:
+                light[:, :, k] = (self.transfer[:, inside] @ (patch * self.missing)[inside]).T
+        return light
+
     def push(self, candidate: Candidate) -> None:
         """Add a candidate to the unknowns."""
-        patch = self.patch(candidate.cell)
-        if np.isfinite(candidate.distance):
-            column = self.power_columns([candidate])[:, 0]
-            near = patch[:, 0] > 0.0
-            block = np.stack([column * (self.lost[near, c].max() > LOST) for c in range(3)])
-        else:
-            inside = np.flatnonzero(patch.any(axis=1))
-            block = (self.transfer[:, inside] @ (patch * self.missing)[inside]).T
+        self.candidate_columns = np.concatenate([self.candidate_columns, self.light_of([candidate])], axis=2)
         self.candidates.append(candidate)
-        self.candidate_columns = np.concatenate([self.candidate_columns, block[:, :, None]], axis=2)
 
     def pop(self) -> None:
         """Take the last candidate away."""

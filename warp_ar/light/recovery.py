@@ -53,7 +53,7 @@ from warp_ar.light.config import CONFIG
 from warp_ar.light.emitters import EmitterSearch
 from warp_ar.light.estimate import Estimate, FoundEmitter, Seen, Steadiness, Stillness
 from warp_ar.light.evidence import CardCheck, check_card, covered_card, doubt_of, irradiance_interval, most_by_card
-from warp_ar.light.fit import fit_channel, one_blas_thread
+from warp_ar.light.fit import fit_channels, one_blas_thread
 from warp_ar.light.priors import least_missing
 from warp_ar.light.problem import Candidate, Problem, Trace, emitter_directions, mirroring_points
 from warp_ar.light.surfaces import Surfaces
@@ -253,33 +253,21 @@ def _solve_channels(problem: Problem, best: int, means: Array, bounds: tuple[boo
         means: What the card alone has it, per channel.
         bounds: Channels in which the card does not tell.
     """
-    iterations, bright = CONFIG.solver.iterations, problem.first_mean
+    bright, start = problem.first_mean, problem.start(means)
     # Where the card does not tell, reflectances in a channel in which it does are worth more than guesses.
-    known = min(range(3), key=lambda c: (bounds[c], c != best))
-    told = fit_channel(problem, known, problem.start(means[known]), iterations).z
-    others = [told if bounds[c] and c != known else None for c in range(3)]
-    first = [
-        told if c == known else fit_channel(problem, c, problem.start(means[c]), iterations, other=others[c]).z
-        for c in range(3)
-    ]
-    solution = np.stack([z[:bright] for z in first], -1)
-    if not bright:
-        return solution
-    solid = np.bincount(
-        problem.part[problem.part >= 0],
-        (problem.solid_angle * problem.missing.max(axis=1))[problem.part >= 0],
-        minlength=problem.parts,
-    )
-    total = np.concatenate([solid, np.ones(len(problem.candidates))]) @ solution + 1e-9
-    shared = solution.sum(axis=1) / total.sum()
-    again = CONFIG.solver.warm_iterations
-    return np.stack(
-        [
-            fit_channel(problem, c, first[c], again, centre=shared * total[c], other=others[c]).z[:bright]
-            for c in range(3)
-        ],
-        -1,
-    )
+    told = min(range(3), key=lambda c: (bounds[c], c != best))
+    known, follows = None, np.array(bounds) & (np.arange(3) != told)
+    first = fit_channels(problem, start, CONFIG.solver.iterations).z
+    if follows.any():
+        known = first[told, problem.first_surface :], follows
+        first = fit_channels(problem, start, CONFIG.solver.iterations, known=known).z
+    if bright:
+        solid = np.ones(bright)
+        solid[: problem.parts] = (problem.solid_angle * problem.missing.max(axis=1)) @ problem.member
+        total = first[:, :bright] @ solid + 1e-9
+        centre = total[:, None] * first[:, :bright].sum(axis=0) / total.sum()
+        first = fit_channels(problem, first, CONFIG.solver.warm_iterations, centre=centre, known=known).z
+    return first[:, :bright].T
 
 
 def choose_channel(problem: Problem) -> int:

@@ -228,10 +228,11 @@ def measured_noise(
         logs = np.log(light[own]).mean(axis=1)
         weights = np.ones(len(own))
         for _ in range(CONFIG.surfaces.scatter_iterations):
-            course = np.linalg.lstsq(terms * weights[:, None], logs * weights, rcond=None)[0]
+            weighted = weights * terms.T
+            course = np.linalg.solve(weighted @ terms + 1e-9 * len(own) * np.eye(terms.shape[1]), weighted @ logs)
             off = np.abs(logs - terms @ course)
             scatter = 1.4826 * float(np.median(off))
-            weights = 1.0 / np.sqrt(1.0 + (off / (2.0 * scatter + 1e-6)) ** 2)
+            weights = 1.0 / (1.0 + (off / (2.0 * scatter + 1e-6)) ** 2)
         scatter *= np.sqrt(len(own) / (len(own) - terms.shape[1]))
         texture[number] = max(scatter, noise[number])
         noise[number] = np.clip(scatter, CONFIG.surfaces.least_noise, noise[number])
