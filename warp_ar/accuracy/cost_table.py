@@ -65,9 +65,9 @@ _SHARED: Mapping[str, tuple[str, Mapping[str, str]]] = {
         "light of objects that emit",
         {
             "point": "as a point in its middle",
-            "coarse": "8 samples per point",
-            "fine": "32 samples",
-            "brute_force": "256 samples",
+            "coarse": "8 samples per point of objects; 16 per 8x8 pixels of receivers",
+            "fine": "32 samples; 32 per 6x6 pixels of receivers",
+            "brute_force": "256 samples per point",
         },
     ),
     "light_shadow": (
