@@ -156,7 +156,7 @@ def test_scene_files_say_markers() -> None:
     [
         ("size = 0.08\nid = 3", "3", "marker 3 of DICT_4X4_50 is the world's own; use another"),
         ("size = 0.08", "{ id = 0, size = 0.01 }", "marker 0 of DICT_4X4_50 is the world's own"),
-        ("size = 0.08", "50", r"object\[0\]\.marker = 50: expected a whole number from 0 to 49"),
+        ("size = 0.08", "50", r"object\[0\]\.marker\.id = 50: expected a whole number from 0 to 49"),
         ("size = 0.08", '"seven"', r"object\[0\]\.marker = .*seven.*: expected a table .* or an id"),
         ("size = 0.08", "{ id = 7, white = 0.5 }", r"object\[0\]\.marker\.white: unknown key"),
         ("size = 0.08", "{ id = 7, size = -1 }", r"object\[0\]\.marker\.size = -1: expected"),

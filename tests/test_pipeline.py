@@ -17,7 +17,7 @@ import pytest
 
 from warp_ar.engine.pipeline import Pipeline, Result
 from warp_ar.engine.scheduler import StageTiming
-from warp_ar.errors import SceneError, UpdateError, UsageError
+from warp_ar.errors import UpdateError, UsageError
 from warp_ar.scene import (
     Camera,
     Exposure,
@@ -283,27 +283,6 @@ def test_poses_and_scenes_that_are_none_are_refused_by_name(frames: Frames) -> N
     ):
         with pytest.raises(UsageError, match=wrong):
             Pose(rotation, translation)  # type: ignore[arg-type]
-
-
-def test_numbers_of_a_scene_that_are_not_finite_are_named(frames: Frames) -> None:
-    """A scene of a file cannot have any; one that was made in Python can, and every pixel would be one."""
-    good = make_scene(lights=(Light("point", 1.0, at=(0.0, 0.0, 0.4)),))
-    ball = dataclasses.replace(good.probes[0], radius=math.inf)
-    light = dataclasses.replace(good.lights[0], at=(0.0, math.nan, 0.4))
-    wrong = (
-        (dataclasses.replace(good, lights=(light,)), r"lights\[0\]\.at\[1\] = nan: expected a finite number"),
-        (dataclasses.replace(good, probes=(ball,)), r"probes\[0\]\.radius = inf"),
-        (dataclasses.replace(good, camera=dataclasses.replace(good.camera, fx=math.nan)), r"camera\.fx = nan"),
-    )
-    for scene, expected in wrong:
-        with pytest.raises(SceneError, match=expected):
-            Pipeline(scene, device="cpu", quality="low")
-    with Pipeline(good, device="cpu", quality="low") as pipeline:
-        before = pipeline(frames[0]).image.copy()
-        for scene, expected in wrong[:2]:
-            with pytest.raises(SceneError, match=expected):
-                pipeline.update(scene)
-        assert (pipeline(frames[0]).image == before).all()
 
 
 def test_ways_to_wait_that_are_none_are_refused() -> None:

@@ -422,7 +422,7 @@ ERRORS = [
     # Objects.
     (
         BASE + "[[object]]\nshape = 'torus'\nmajor_radius = 1\nminor_radius = 1",
-        r"minor_radius = 1: must be below major_",
+        r"minor_radius = 1: expected less than major_",
     ),
     (BASE + SPHERE + "animate = { period = 3 }", r"animate\.period = 3: .*give sway too"),
     # Materials.
@@ -439,7 +439,7 @@ ERRORS = [
     (light(direction="[0, 0, 1]"), r"light\[0\]\.direction = .*target is given too"),
     (light(target="", direction="[0, 0, 0]"), r"light\[0\]\.direction = .*has no length"),
     (light(target="[0, 0, 1]"), r"light\[0\]\.target = .*is where the light itself is"),
-    (light(inner_angle="31"), r"light\[0\]\.inner_angle = 31: must not be above outer_angle \(30\)"),
+    (light(inner_angle="31"), r"light\[0\]\.inner_angle = 31: expected no more than outer_angle, 30"),
     (light(attenuation="[0, 0, 0]"), r"light\[0\]\.attenuation = .*is zero everywhere"),
     # Exposure.
     (BASE + "[exposure]\nscale = 'of'", r'exposure\.scale = "of": expected a number, 0 or more, or "auto"'),
@@ -570,16 +570,19 @@ def test_a_users_own_scene_names_any_file(tmp_path: pathlib.Path) -> None:
 @pytest.mark.parametrize(
     ("make", "values", "message"),
     [
-        (sc.Object, {"shape": "cube"}, "Object: shape = 'cube': unknown; .*"),
+        (sc.Object, {"shape": "cube"}, "Object: shape = 'cube': expected one of .*"),
         (sc.Object, {"shape": "sphere", "radius": 0}, "Object: radius = 0: expected a number above 0"),
         (sc.Object, {"shape": "mesh"}, "a mesh needs its file"),
-        (sc.Object, {"shape": "sphere", "radius": 1, "at": (0, 0)}, r"at = \(0, 0\): expected 3 numbers"),
-        (sc.Probe, {"center": (0, 0, 0), "radius": 1, "reflectance": (2, 1, 1)}, "each from 0.01 to 1"),
-        (sc.LambertMaterial, {"base_color": (255, 0, 0)}, r"base_color = \(255, 0, 0\): .*each from 0 to 1"),
-        (sc.Light, {"kind": "sun", "intensity": 1}, "kind = 'sun': unknown"),
+        (sc.Object, {"shape": "sphere", "radius": 1, "at": (0, 0)}, r"at = \(0, 0\): expected a list of 3 numbers"),
+        (sc.Probe, {"center": (0, 0, 0), "radius": 1, "reflectance": (2, 1, 1)}, "from 0.01 to 1"),
+        (sc.LambertMaterial, {"base_color": (255, 0, 0)}, r"base_color = \(255, 0, 0\): .* from 0 to 1"),
+        (sc.Light, {"kind": "sun", "intensity": 1}, "kind = 'sun': expected one of"),
         (sc.Light, {"kind": "point", "intensity": True}, "intensity = True: expected a number"),
         (sc.Light, {"kind": "directional", "intensity": 1, "direction": (0, 0, 0)}, "the way the light travels"),
-        (sc.CapturedLight, {"file": pathlib.Path("a.exr"), "axes": "up"}, "axes = 'up': unknown"),
+        (sc.Light, {"kind": "point", "intensity": 1, "at": (0, math.nan, 0)}, r"at = .*nan.*each finite"),
+        (sc.Probe, {"center": (0, 0, 0), "radius": math.inf}, "radius = inf"),
+        (sc.PoseSpec, {"poses": ((9 * (1.0,), (0.0, math.inf, 1.0)),)}, "finite"),
+        (sc.CapturedLight, {"file": pathlib.Path("a.exr"), "axes": "up"}, "axes = 'up': expected one of"),
         (sc.Object, {"shape": "sphere", "radius": 1, "material": "red"}, "material = 'red': expected .*Material or"),
         (sc.Object, {"shape": "sphere", "radius": 1, "marker": 7}, "marker = 7: expected Marker"),
         (sc.CapturedLight, {"file": 3}, "file = 3: expected Path"),

@@ -15,7 +15,6 @@ import numpy as np
 from warp_ar.engine.layers import check_outputs, expand_outputs
 from warp_ar.errors import UsageError
 from warp_ar.scene import Camera, CapturedLight, Exposure, Light, Marker, Object, Probe, Proxy, Scene, load_scene
-from warp_ar.scene.fields import check_finite
 from warp_ar.stages.request import Estimates
 
 
@@ -41,17 +40,6 @@ def check_estimates(estimates: object) -> None:
         raise UsageError(f"estimates = {estimates!r}: expected {', '.join(map(repr, ways))}")
 
 
-def check_exposure(scene: Scene) -> None:
-    """Check a scene's exposure.
-
-    Raises:
-        UsageError: It is no number that a camera can have.
-    """
-    scale = scene.exposure.scale
-    if scale != "auto" and (isinstance(scale, str) or not 0.0 <= scale < math.inf):
-        raise UsageError(f'exposure.scale = {scale!r}: expected a finite number, 0 or more, or "auto"')
-
-
 _ONE: Final[dict[str, Any]] = {
     "camera": Camera,
     "marker": Marker,
@@ -61,11 +49,10 @@ _ONE: Final[dict[str, Any]] = {
 _SEVERAL: Final[dict[str, Any]] = {"objects": Object, "lights": Light, "proxies": Proxy, "probes": Probe}
 
 
-def check_scene(scene: Any, *, leave: tuple[str, ...] = ()) -> None:
-    """Check a scene that a program may have made; arguments as ``check_finite``.
+def check_scene(scene: Any) -> None:
+    """Check a scene that a program may have made.
 
     Raises:
-        SceneError: One of its numbers is not finite.
         UsageError: It is no scene, or a part of it is something else.
     """
     if not isinstance(scene, Scene):
@@ -78,15 +65,13 @@ def check_scene(scene: Any, *, leave: tuple[str, ...] = ()) -> None:
             if not isinstance(item, kind):
                 right = getattr(kind, "__name__", str(kind))
                 raise UsageError(f"scene.{name} holds {type(item).__name__}; expected {right}")
-    check_exposure(scene)
-    check_finite(scene, leave=leave)
 
 
 def read_scene(scene: object) -> Scene:
     """Return the scene that was given, checked.
 
     Raises:
-        SceneError: It cannot be read, or one of its numbers is not finite.
+        SceneError: It cannot be read.
         UsageError: It is none, or a part of it is something else.
     """
     if isinstance(scene, str | os.PathLike):

@@ -290,7 +290,7 @@ class Pipeline(Closing):
     def _check_next(self, scene: Scene) -> Scene:
         """Return a scene that is to be shown next, at the size of the frames, with all that was submitted rendered."""
         self._check_usable()
-        check_scene(scene, leave=("pose",))  # whose numbers the file's reader has checked
+        check_scene(scene)
         self._finish()
         return dataclasses.replace(scene, camera=scene.camera.scaled_to(*self.size))
 

@@ -30,14 +30,12 @@ ORIGIN: Final[Vec3] = (0.0, 0.0, 0.0)
 NO_DISTORTION: Final = (0.0, 0.0, 0.0, 0.0, 0.0)
 SILVERED: Final = (0.85, 0.85, 0.85)
 """Reflectance of a silvered ornament."""
-Size: TypeAlias = Annotated[tuple[float, ...], Key("metres", "[0.2, 0.1]", low=SMALLEST, sizes=(), required=True)]
+Size: TypeAlias = Annotated[tuple[float, ...], Key("metres", "[0.2, 0.1]", sizes=(), required=True)]
 MeshFile: TypeAlias = Annotated[Path | None, Key("metres inside", '"table.ply"', right="a mesh", required=True)]
 Intensity: TypeAlias = Annotated[float, Key("camera values", "2.2", low=0.0)]
 ObjectName: TypeAlias = Annotated[str | None, Key("-", '"lamp"')]
 LightPlace: TypeAlias = Annotated[Vec3, Key("metres", "[0.07, -0.06, 0.4]", required=True)]
-Angle: TypeAlias = Annotated[
-    float, Key("degrees", "13.0", low=0.0, high=90.0, required=True, beside="target = [0.0, 0.0, 0.0]")
-]
+Angle: TypeAlias = Annotated[float, Key("degrees", "13.0", low=0.0, high=90.0, required=True)]
 Pixel: TypeAlias = Annotated[float, Key("pixels", "239.5")]
 Focal: TypeAlias = Annotated[float, Key("pixels", "640.0", low=SMALLEST)]
 
@@ -121,7 +119,7 @@ class Camera(Checked):
 
 
 @dataclasses.dataclass(frozen=True)
-class SourceSpec:
+class SourceSpec(Checked):
     """Source of frames: exactly one of ``path``, ``camera`` and ``synthetic`` is given."""
 
     path: Annotated[Path | None, Key("-", '"frames"', right="a folder of frames or a video")] = None
@@ -130,18 +128,16 @@ class SourceSpec:
     """Index of a capture device."""
     synthetic: Annotated[str | None, Key("-", '"moving_card"', right="the name of a generated source")] = None
     """Name of a generated source."""
-    fps: Annotated[float | None, Key("frames per second", "24.0", low=1e-3, high=1e5, beside='path = "frames"')] = None
+    fps: Annotated[float | None, Key("frames per second", "24.0", low=1e-3, high=1e5)] = None
     """Frames per second; default: the source's own."""
     exposures: Annotated[
         tuple[float, ...] | None,
-        Key("seconds", "[0.016, 0.001]", low=1e-6, high=1e3, sizes=(2, 3, 4, 5, 6, 7, 8), beside="camera = 0"),
+        Key("seconds", "[0.016, 0.001]", low=1e-6, high=1e3, sizes=(2, 3, 4, 5, 6, 7, 8)),
     ] = None
     """Exposure times, seconds, that the frames have in turn; a camera is set to them."""
-    shown: Annotated[
-        float | None, Key("seconds", "0.001", low=1e-6, high=1e3, beside="camera = 0\nexposures = [0.016, 0.001]")
-    ] = None
+    shown: Annotated[float | None, Key("seconds", "0.001", low=1e-6, high=1e3)] = None
     """Exposure time, seconds, of the frames that are shown; default: the longest."""
-    metering: Annotated[Literal["fixed", "automatic"] | None, Key("-", '"automatic"', beside="camera = 0")] = None
+    metering: Annotated[Literal["fixed", "automatic"] | None, Key("-", '"automatic"')] = None
     """Metering: "fixed" (default), or "automatic" if exposure and white balance may drift: a change of all surfaces
     alike is then the camera's."""
 
@@ -238,12 +234,14 @@ class Marker(Checked):
     """Diffuse reflectance of the white paper, 0 to 1."""
     board: Annotated[Board | None, Key("metres", '"charuco 5x7 0.035 0.026"')] = None
     """Board instead of a single marker, lengths in metres."""
-    turn: Annotated[int, Key("degrees", "180", low=0, high=270, beside="size = 0.08")] = 0
+    turn: Annotated[int, Key("degrees", "180", low=0, high=270)] = 0
     """Counterclockwise turn of the print from OpenCV's drawing, degrees: 0, 90, 180 or 270; 180 for the pictures that
     AprilTag's authors publish."""
 
     def __post_init__(self) -> None:
         """Check all values."""
+        if self.turn not in TURNS:
+            fail(self, "turn", "expected 0, 90, 180 or 270 degrees")
         if self.board is None:  # which has its own size
             super().__post_init__()
 
@@ -259,7 +257,9 @@ class Probe(Checked):
     """Centre, metres."""
     radius: Length
     """Radius, metres."""
-    reflectance: Annotated[RGB, Key("0 to 1 per channel", "[0.85, 0.85, 0.87]", low=0.01, high=1.0)] = SILVERED
+    reflectance: Annotated[RGB, Key("0 to 1 per channel", "[0.85, 0.85, 0.87]", low=0.01, high=1.0, grey=True)] = (
+        SILVERED
+    )
     """Share of light that the ball reflects, 0 to 1, RGB or one number; default: a silvered ornament. Corrected where
     frames show another, except in the preset ``paper``."""
     marker: OwnMarker = None
@@ -272,7 +272,11 @@ class ProxyMaterial(Checked):
 
     roughness: Share = 0.1
     """glTF's roughness: 0 (mirror) to 1 (matt); a polished table has about 0.1."""
-    reflectance: Annotated[RGB, Key("0 to 1 per channel", "[0.04, 0.04, 0.05]", low=0.0, high=1.0)] = (0.04, 0.04, 0.04)
+    reflectance: Annotated[RGB, Key("0 to 1 per channel", "[0.04, 0.04, 0.05]", low=0.0, high=1.0, grey=True)] = (
+        0.04,
+        0.04,
+        0.04,
+    )
     """Specular reflectance seen from ahead, glTF's F0, RGB or one number; 0.04 is lacquer or glass."""
 
 
@@ -306,7 +310,7 @@ class Proxy(Checked):
 
 
 @dataclasses.dataclass(frozen=True)
-class Animation:
+class Animation(Checked):
     """Motion of an object or a light; nothing moves by default.
 
     At t seconds a body stands at R(t) (at - pivot) + pivot + sway sin(2 pi t / period), turned by R(t): ``turn`` t
@@ -315,11 +319,11 @@ class Animation:
 
     turn: Annotated[Vec3, Key("degrees per second", "[0.0, 0.0, 30.0]")] = ORIGIN
     """Degrees per second about the fixed x, y and z axis."""
-    pivot: Annotated[Vec3 | None, Key("metres", "[0.0, 0.0, 0.0]", beside="turn = [0.0, 0.0, 30.0]")] = None
+    pivot: Annotated[Vec3 | None, Key("metres", "[0.0, 0.0, 0.0]")] = None
     """Centre of ``turn``, metres; default: the body's own ``at``."""
     sway: Annotated[Vec3, Key("metres", "[0.02, 0.0, 0.0]")] = ORIGIN
     """Amplitude of a swing to and fro, metres."""
-    period: Annotated[float, Key("seconds", "3.0", low=1e-3, beside="sway = [0.02, 0.0, 0.0]")] = 4.0
+    period: Annotated[float, Key("seconds", "3.0", low=1e-3)] = 4.0
     """Duration of one swing, seconds."""
 
     def rotation_at(self, seconds: float) -> FloatMatrix:
@@ -338,7 +342,7 @@ Motion: TypeAlias = Annotated[Animation | None, Key("-", "{ sway = [0.05, 0.0, 0
 
 
 @dataclasses.dataclass(frozen=True)
-class Play:
+class Play(Checked):
     """Playing of an animation of a glTF file's nodes."""
 
     animation: Annotated[str | int, Key("-", '"Open"')] = 0
@@ -403,7 +407,7 @@ class Object(Checked):
     """Material."""
     animate: Motion = None
     """Movement."""
-    play: Annotated[Play | None, Key("-", "{ animation = 0 }", beside='shape = "mesh"\nfile = "watch.glb"')] = None
+    play: Annotated[Play | None, Key("-", "{ animation = 0 }")] = None
     """Animation of its glTF file to play; default: its nodes stand still."""
     marker: OwnMarker = None
     """Own marker or board, in whose frame it stands; absent while that is lost."""
@@ -453,7 +457,7 @@ class Light(Checked):
     """Position, metres."""
     target: Annotated[Vec3 | None, Key("metres", "[0.135, 0.04, 0.01]")] = None
     """Point, metres, that a spot aims at, also when it moves."""
-    direction: Annotated[Vec3 | None, Key("-", "[0.3, 0.0, -1.0]", beside='kind = "directional"')] = None
+    direction: Annotated[Vec3 | None, Key("-", "[0.3, 0.0, -1.0]")] = None
     """Direction in which the light travels, instead of a target; turns with the light."""
     inner_angle: Angle = 0.0
     """Half angle, degrees, of a spot's full intensity."""
@@ -473,8 +477,13 @@ class Light(Checked):
         super().__post_init__()
         if self.kind == "spot" and self.target is None and self.direction is None:
             fail(self, "target", "a spot light needs a target or a direction")
-        if self.direction is not None and not any(self.direction):
-            fail(self, "direction", "expected the way the light travels, such as (0, 0, -1)")
+        if self.direction is not None and max(map(abs, self.direction)) < SMALLEST:
+            fail(self, "direction", "has no length; expected the way the light travels, such as (0, 0, -1)")
+        if self.inner_angle > self.outer_angle:
+            fail(self, "inner_angle", f"expected no more than outer_angle, {self.outer_angle:g}")
+        if max(self.attenuation) < SMALLEST:
+            right = "expected constant, linear and quadratic term, such as (0, 0, 1)"
+            fail(self, "attenuation", f"is zero everywhere; {right}")
 
     def pose_at(self, seconds: float) -> tuple[FloatMatrix, FloatMatrix]:
         """Position (3,) in metres and unit direction (3,) that the light travels, ``seconds`` after the first frame.
@@ -573,19 +582,15 @@ class CapturedLight(Checked):
 class PoseKeys:
     """Keys of a file by which a ``PoseSpec`` is said, in one of four ways."""
 
-    R: Annotated[
-        tuple[float, ...] | None, Key("-", "[1, 0, 0, 0, 0, -1, 0, 1, 0]", sizes=(9,), beside="t = [0.0, 0.1, 0.6]")
-    ] = None
+    R: Annotated[tuple[float, ...] | None, Key("-", "[1, 0, 0, 0, 0, -1, 0, 1, 0]", sizes=(9,))] = None
     """Rotation of camera_from_world, row by row; camera axes x right, y down, z forward."""
-    t: Annotated[Vec3 | None, Key("metres", "[0.0, 0.1, 0.6]", beside="R = [1, 0, 0, 0, 0, -1, 0, 1, 0]")] = None
+    t: Annotated[Vec3 | None, Key("metres", "[0.0, 0.1, 0.6]")] = None
     """Translation of camera_from_world, metres, with R or quaternion."""
-    quaternion: Annotated[
-        tuple[float, ...] | None, Key("-", "[0.7, 0.7, 0.0, 0.0]", sizes=(4,), beside="t = [0.0, 0.1, 0.6]")
-    ] = None
+    quaternion: Annotated[tuple[float, ...] | None, Key("-", "[0.7, 0.7, 0.0, 0.0]", sizes=(4,))] = None
     """Rotation of camera_from_world: w, x, y, z."""
     position: Annotated[Vec3 | None, Key("metres", "[0.0, -0.6, 0.1]")] = None
     """Position of the camera, metres, instead of camera_from_world."""
-    rotate: Annotated[Vec3 | None, Key("degrees", "[-20.0, 0.0, 0.0]", beside="position = [0.0, -0.6, 0.3]")] = None
+    rotate: Annotated[Vec3 | None, Key("degrees", "[-20.0, 0.0, 0.0]")] = None
     """Degrees about the fixed x, then y, then z axis, from a level camera that looks along +y."""
     file: Annotated[
         Path | None, Key("-", '"images.txt"', right="poses: COLMAP's images, OpenTrackIO, USD, or JSON")
@@ -606,6 +611,11 @@ class PoseSpec:
     """File that they were read from."""
     names: tuple[str, ...] = ()
     """Names of the pictures that they are of; empty where the file has none."""
+
+    def __post_init__(self) -> None:
+        """Check that all numbers are finite."""
+        if not all(map(math.isfinite, itertools.chain.from_iterable(itertools.chain(*self.poses)))):
+            fail(self, "poses", "expected finite numbers")
 
     @functools.cached_property
     def _places(self) -> dict[str, list[int]]:
@@ -649,7 +659,7 @@ class PoseSpec:
 
 
 @dataclasses.dataclass(frozen=True)
-class Exposure:
+class Exposure(Checked):
     """A simulated shorter exposure."""
 
     scale: Annotated[float | Literal["auto"], Key("-", "0.5", low=0.0)] = 1.0

@@ -2,17 +2,16 @@
 
 A dataclass of a section annotates its fields, ``radius: Annotated[float, Key("metres", "0.03", low=SMALLEST)]``. What a
 value is (a number, a list, a word, a path, a table) follows from the type. Constructors check what they are given by
-the same declarations; values that are not finite pass there, and `check_finite` names them with their place.
+these declarations; readers of files let them, and say of what they refuse in which file and at which key it stands.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import math
 import numbers
 import types
 import typing
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Literal, NoReturn, TypeAlias
 
@@ -20,6 +19,11 @@ import numpy as np
 
 from warp_ar.errors import SceneError
 from warp_ar.scene.messages import LARGEST, SMALLEST, nearest
+
+MOST: Final = 10**9
+"""Largest whole number without another bound."""
+_UNITS: Final = ("metres", "degrees", "pixels", "seconds", "frames per second")
+"""Units that messages name; the others are ranges, which are said anyway."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,8 +46,8 @@ class Key:
     """Words that a text may be."""
     required: bool = False
     """True if a file must give it wherever the section's kind uses it, though the field has a default."""
-    beside: str = ""
-    """Other keys as TOML, without which the example is not complete; those that are required go without saying."""
+    grey: bool = False
+    """True if one number may stand for a list of equal ones."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,16 +62,76 @@ class Field:
     """``dataclasses.MISSING`` where there is none."""
     words: tuple[str, ...] = ()
     """Words that are allowed."""
-    kind: Any = None
-    """Dataclass of a table."""
     optional: bool = False
     """True if the value may be None."""
     kinds: tuple[Any, ...] = ()
     """Types of which a value may be, where it is no number, list or word."""
 
+    def admit(self, value: Any) -> Any:
+        """Return a value as the field holds it: plain numbers, tuples in place of lists, paths in place of texts.
 
-_KINDS: Final = ("table", "path", "flag", "text")
-"""Forms of which constructors check the type alone."""
+        Raises:
+            ValueError: It cannot be; the message says what would be right.
+        """
+        if (value is None and self.optional) or (isinstance(value, str) and value in self.words):
+            return value
+        if self.form in ("table", "path", "flag", "text"):
+            value = Path(value) if self.form == "path" and isinstance(value, str) else value
+            if isinstance(value, self.kinds):
+                return value
+        elif self.form in ("number", "integer"):
+            if self._is_right(value):
+                return int(value) if self.form == "integer" else float(value)
+        elif self.form == "color" and isinstance(value, Path):
+            return value
+        elif self.form != "word":
+            value = 3 * (value,) if self.key.grey and self._is_right(value) else value
+            listed = isinstance(value, Collection) and not isinstance(value, str)
+            if listed and len(value) in (self.key.sizes or (len(value),)) and all(map(self._is_right, value)):
+                return tuple(map(float, value))
+        raise ValueError(self._right(value))
+
+    def _is_right(self, value: Any) -> bool:
+        """Return whether a number is within the key's bounds; one that is not finite is not."""
+        kinds: Any = (numbers.Integral, np.integer) if self.form == "integer" else (numbers.Real, np.generic)
+        low, high = self._bounds()
+        # Compared before it is converted: an integer may be too large for a float.
+        return isinstance(value, kinds) and not isinstance(value, bool) and bool(low <= value <= high)
+
+    def _bounds(self) -> tuple[float, float]:
+        low, high = self.key.low, self.key.high
+        if self.form == "integer":
+            low, high = (0 if low == -LARGEST else low), (MOST if high == LARGEST else high)
+        return low, high
+
+    def _right(self, value: Any) -> str:
+        """Return words for what would be right in the place of a value."""
+        key, words = self.key, " or ".join(f'"{word}"' for word in self.words)
+        match self.form:
+            case "word" if len(self.words) < 8:
+                return f"expected one of {words.replace(' or ', ', ')}"
+            case "word":
+                known = isinstance(value, str) and value
+                return f"unknown; {nearest(value, self.words)}" if known else f"expected a name such as {self.words[0]}"
+            case "integer":
+                return "expected a whole number from {} to {}".format(*self._bounds())
+            case "number":
+                what, each = "a number", ""
+            case "vector" | "color":
+                what, each = f"a list of {' or '.join(map(str, key.sizes)) or 'several'} numbers", "each "
+            case _:
+                return f"expected {' or '.join(kind.__name__ for kind in self.kinds)}"
+        if key.low == SMALLEST:
+            bound = f", {each}above 0" if each else " above 0"
+        elif key.low > -LARGEST:
+            bound = f" from {key.low:g} to {key.high:g}" if key.high < LARGEST else f", {key.low:g} or more"
+        else:
+            bound = f", {each}finite"
+        unit = f" ({key.unit})" if key.unit in _UNITS else ""
+        also = f", or {words}" * bool(words) + ", or the path of a texture" * (self.form == "color")
+        return f"expected {what}{bound}{unit}{also}"
+
+
 _KNOWN: Final[dict[Any, dict[str, Field]]] = {}
 
 
@@ -84,21 +148,33 @@ def fields_of(kind: Any) -> dict[str, Field]:
 def _field(name: str, default: Any, hint: Any, key: Key) -> Field:
     """Return a field by its type and its key."""
     parts = typing.get_args(hint) if typing.get_origin(hint) in (types.UnionType, typing.Union) else (hint,)
-    own = [part for part in parts if part is not type(None)]
-    optional, first = len(own) < len(parts), own[0]
-    if key.words or typing.get_origin(first) is Literal:
-        return Field(name, key, "word", default, key.words or typing.get_args(first), optional=optional)
-    if typing.get_origin(first) is tuple:
-        return Field(name, key, "color" if Path in own else "vector", default, optional=optional)
+    words = key.words or sum((typing.get_args(part) for part in parts if typing.get_origin(part) is Literal), ())
+    own = [part for part in parts if part is not type(None) and typing.get_origin(part) is not Literal]
+    optional = type(None) in parts
+    if key.words or not own:
+        return Field(name, key, "word", default, words, optional)
+    if typing.get_origin(own[0]) is tuple:
+        return Field(name, key, "color" if Path in own else "vector", default, (), optional)
     forms = {bool: "flag", int: "integer", float: "number", str: "text", Path: "path"}
-    return Field(name, key, forms.get(first, "table"), default, kind=first, optional=optional, kinds=tuple(own))
+    return Field(name, key, forms.get(own[0], "table"), default, words, optional, tuple(own))
+
+
+class FieldError(SceneError):
+    """A value of a dataclass cannot be."""
+
+    def __init__(self, item: object, key: str, right: str) -> None:
+        """Name class, field, value and what would be right."""
+        value = repr(getattr(item, key))
+        shown = value if len(value) <= 80 else f"{value[:60]}..."
+        super().__init__(f"{type(item).__name__}: {key} = {shown}: {right}")
+        self.key, self.right = key, right
 
 
 class Checked:
     """A dataclass that checks what it is given against the keys of its fields.
 
     Raises:
-        SceneError: A value cannot be; the message names class, field, value and what would be right.
+        FieldError: A value cannot be.
     """
 
     USES: ClassVar[dict[str, tuple[str, ...]]] = {}
@@ -106,34 +182,17 @@ class Checked:
 
     def __post_init__(self) -> None:
         """Check all values."""
-        every = fields_of(type(self))
         unused: set[str] = set()
-        if self.USES:
-            selector = next(iter(every))
-            _check_word(self, every[selector], getattr(self, selector), tuple(self.USES))
-            unused = not_used(self.USES, getattr(self, selector))
-        for field in every.values():
-            value = getattr(self, field.name)
-            if field.name in unused or (value is None and field.optional):
+        for number, field in enumerate(fields_of(type(self)).values()):
+            if field.name in unused:
                 continue
-            if field.form in _KINDS:
-                _check_kind(self, field, value)
-            elif field.form == "word":
-                _check_word(self, field, value, field.words)
-            elif field.form in ("number", "integer"):
-                _check_numbers(self, field, (value,), "a number ")
-                object.__setattr__(self, field.name, _plain(value))
-            elif field.key.sizes and not (field.form == "color" and isinstance(value, Path)):
-                count = " or ".join(map(str, field.key.sizes))
-                if not isinstance(value, Collection) or isinstance(value, str) or len(value) not in field.key.sizes:
-                    fail(self, field.name, f"expected {count} numbers")
-                _check_numbers(self, field, tuple(value), f"{count} numbers, each ")
-                object.__setattr__(self, field.name, tuple(map(_plain, value)))
-
-
-def _plain(value: Any) -> Any:
-    """Return a number as Python's own: scenes are compared and hashed."""
-    return value.item() if isinstance(value, np.generic) else value
+            try:
+                value = field.admit(getattr(self, field.name))
+            except ValueError as error:
+                fail(self, field.name, str(error))
+            object.__setattr__(self, field.name, value)
+            if number == 0 and self.USES:
+                unused = not_used(self.USES, value)
 
 
 def not_used(uses: dict[str, tuple[str, ...]], kind: str) -> set[str]:
@@ -145,67 +204,9 @@ def fail(item: object, key: str, right: str) -> NoReturn:
     """Raise the error that names class, field, value and what would be right.
 
     Raises:
-        SceneError: Always.
+        FieldError: Always.
     """
-    value = repr(getattr(item, key))
-    shown = value if len(value) <= 80 else f"{value[:60]}..."
-    raise SceneError(f"{type(item).__name__}: {key} = {shown}: {right}")
-
-
-def _check_kind(item: object, field: Field, value: object) -> None:
-    if field.form == "path" and isinstance(value, str):
-        object.__setattr__(item, field.name, Path(value))
-    elif not isinstance(value, field.kinds):
-        fail(item, field.name, f"expected {' or '.join(kind.__name__ for kind in field.kinds)}")
-
-
-def _check_word(item: object, field: Field, value: object, words: tuple[str, ...]) -> None:
-    if value not in words:
-        known = f"unknown; {nearest(str(value), words)}" if value else f"expected one of {', '.join(words)}"
-        fail(item, field.name, known)
-
-
-def _check_numbers(item: object, field: Field, values: tuple[Any, ...], what: str) -> None:
-    low, high = field.key.low, field.key.high
-    bound = "of any size"
-    if low == SMALLEST:
-        bound = "above 0"
-    elif low > -LARGEST:
-        bound = f"from {low:g} to {high:g}" if high < LARGEST else f"{low:g} or more"
-    for value in values:
-        real = isinstance(value, numbers.Real | np.generic) and not isinstance(value, bool)
-        # Written so that NaN passes.
-        if not real or (low > -LARGEST and float(value) < low) or (high < LARGEST and float(value) > high):
-            fail(item, field.name, f"expected {what}{bound}")
-
-
-def check_finite(scene: Any, *, leave: tuple[str, ...] = ()) -> None:
-    """Raise an error if a number of a scene is not finite: it would be every pixel's.
-
-    Args:
-        scene: The scene.
-        leave: Names of its fields that are known to be in order.
-
-    Raises:
-        SceneError: A number is infinite or none; the message names it.
-    """
-    for field in dataclasses.fields(scene):
-        if field.name not in leave:
-            for name in _not_finite(getattr(scene, field.name), field.name):
-                raise SceneError(f"{name}: expected a finite number")
-
-
-def _not_finite(value: Any, name: str) -> Iterator[str]:
-    """Yield what is not finite in a value, with its name."""
-    if isinstance(value, float):
-        if not math.isfinite(value):
-            yield f"{name} = {value}"
-    elif isinstance(value, tuple):
-        for index, item in enumerate(value):
-            yield from _not_finite(item, f"{name}[{index}]")
-    elif dataclasses.is_dataclass(value):
-        for field in dataclasses.fields(value):
-            yield from _not_finite(getattr(value, field.name), f"{name}.{field.name}")
+    raise FieldError(item, key, right) from None
 
 
 Vec3: TypeAlias = tuple[float, float, float]

@@ -5,7 +5,7 @@ the printed page, z out of the page. Paths are relative to the scene file. What 
 field; sections other than ``[camera]`` are optional, and ``[marker]`` must be there as soon as anything has a place in
 the world.
 
-A scene built or changed in Python is checked by ``loads_scene(dumps_scene(scene))``.
+Constructors check what a program gives them likewise; ``loads_scene(dumps_scene(scene))`` checks a whole scene.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from warp_ar.scene.description import (
 from warp_ar.scene.fields import fields_of
 from warp_ar.scene.messages import nearest
 from warp_ar.scene.scene_files import SceneFiles
-from warp_ar.scene.sections import SceneTable
+from warp_ar.scene.sections import SceneTable, read_fields
 
 _TOP_KEYS: Final = ("schema", "name")
 _SECTIONS: Final = ("camera", "source", "marker", "probe", "proxy", "object", "light", "pose", "exposure")
@@ -209,21 +209,21 @@ def loads_scene(text: str, path: str | Path | None = None, files: SceneFiles | N
     own_light = None
     if captured is not None:
         table = SceneTable(label, files, *captured, list(fields_of(CapturedLight)))
-        own_light = sections.read_fields(table, CapturedLight)
+        own_light = read_fields(table, CapturedLight)
     scene = Scene(
         schema=SCHEMA,
         name=top.text("name", "scene" if path is None else path.stem),
         camera=camera,
         source=read.one("source", fields_of(SourceSpec), sections.read_source),
         marker=read.marker or Marker(),
-        probes=read.many("probe", fields_of(Probe), sections.read_probe, single=True),
-        proxies=read.many("proxy", fields_of(Proxy), sections.read_proxy),
+        probes=read.many("probe", fields_of(Probe), lambda table: read_fields(table, Probe), single=True),
+        proxies=read.many("proxy", fields_of(Proxy), lambda table: read_fields(table, Proxy)),
         objects=objects + emitting,
         lights=tuple(light for light in shining if isinstance(light, Light)),
         captured=own_light,
         pose=read.one("pose", fields_of(PoseKeys), sections.read_pose),
         has_marker="marker" in data or "pose" not in data,
-        exposure=read.one("exposure", fields_of(Exposure), sections.read_exposure) or Exposure(),
+        exposure=read.one("exposure", fields_of(Exposure), lambda table: read_fields(table, Exposure)) or Exposure(),
         path=path,
     )
     read.check_placed()

@@ -11,7 +11,6 @@ import dataclasses
 import functools
 import inspect
 import itertools
-import json
 import types
 from collections.abc import Iterator
 from typing import Any, Final
@@ -20,7 +19,6 @@ import tomlkit
 
 from warp_ar.scene import description
 from warp_ar.scene.description import (
-    SIDES,
     Animation,
     AreaLight,
     Camera,
@@ -36,7 +34,7 @@ from warp_ar.scene.description import (
     ProxyMaterial,
     SourceSpec,
 )
-from warp_ar.scene.fields import Field, fields_of, not_used
+from warp_ar.scene.fields import Field, fields_of
 from warp_ar.scene.materials import MATERIALS, FileMaterial
 
 
@@ -56,8 +54,6 @@ class Key:
     """Value if the key is left out, as TOML; or "required", or "none"."""
     example: str
     """A value as TOML."""
-    beside: str = ""
-    """Other keys of the section that the example needs, as lines of TOML."""
 
     @property
     def description(self) -> str:
@@ -108,17 +104,15 @@ SECTIONS: Final[tuple[Section, ...]] = (
     Section("exposure", False, "A simulated shorter exposure.", (Exposure,)),
 )
 
-# Keys that are no fields of a dataclass: example, other keys that it needs, unit and meaning.
-_OTHERS: Final[dict[tuple[str, str], tuple[str, str, str, str]]] = {
+# Keys that are no fields of a dataclass: example, unit and meaning.
+_OTHERS: Final[dict[tuple[str, str], tuple[str, str, str]]] = {
     ("camera", "calibration"): (
         '"camera.yml"',
-        "",
         "-",
         'Calibration file instead of the numbers; "exif": EXIF of the source\'s first picture.',
     ),
     ("object.material", "model"): (
         '"metallic_roughness"',
-        "",
         "-",
         "Reflection model, one of " + ", ".join(MATERIALS) + "; each has keys of its own.",
     ),
@@ -148,42 +142,16 @@ def keys() -> Iterator[Key]:
     yield Key("", "schema", "Version of the format.", "-", "required", str(description.SCHEMA))
     yield Key("", "name", "Name to show.", "-", "the file's own", '"my desk"')
     for section in SECTIONS:
-        for (own, name), (example, beside, unit, meaning) in _OTHERS.items():
+        for (own, name), (example, unit, meaning) in _OTHERS.items():
             if own == section.name:
-                yield Key(own, name, meaning, unit, "required" if name == "model" else "none", example, beside)
+                yield Key(own, name, meaning, unit, "required" if name == "model" else "none", example)
         for name in dict.fromkeys(name for kind in section.kinds for name in fields_of(kind)):
             kinds = [kind for kind in section.kinds if name in fields_of(kind)]
             meaning = " / ".join(dict.fromkeys(field_docs(kind)[name] for kind in kinds))
             defaults = [_toml(fields_of(kind)[name]) for kind in kinds]
             key = fields_of(kinds[0])[name].key
             default = " or ".join(dict.fromkeys(defaults))
-            yield Key(section.name, name, meaning, key.unit, default, key.example, _beside(kinds[0], name))
-
-
-def _beside(kind: type[Any], name: str) -> str:
-    """Return the keys as TOML that a file must give beside one."""
-    every = fields_of(kind)
-    given = dict(line.split(" = ", 1) for line in every[name].key.beside.splitlines())
-    if (kind, name) in ((Camera, "field_of_view"), (Marker, "board")):
-        return ""  # which stands instead of the others
-    unused: set[str] = set()
-    if uses := getattr(kind, "USES", None):
-        selector = next(iter(every))
-        usual = json.loads(every[selector].key.example)
-        using = [one for one in uses if name not in not_used(uses, one) and (name != "size" or SIDES[one] == 2)]
-        chosen = json.loads(given.get(selector, "null")) or (usual if usual in using else using[0])
-        given.setdefault(selector, json.dumps(chosen))
-        unused = not_used(uses, chosen)
-        if "size" in uses[chosen]:
-            given.setdefault("size", "[0.2, 0.1, 0.1]" if SIDES[chosen] == 3 else "[0.2, 0.1]")
-    model = next((word for word, material in MATERIALS.items() if material is kind), None)
-    if model is not None:
-        given["model"] = json.dumps(model)
-    for field in every.values():
-        if field.name not in unused and (field.key.required or field.default is dataclasses.MISSING):
-            given.setdefault(field.name, field.key.example)
-    given.pop(name, None)
-    return "\n".join(f"{key} = {value}" for key, value in given.items())
+            yield Key(section.name, name, meaning, key.unit, default, key.example)
 
 
 def _toml(field: Field) -> str:

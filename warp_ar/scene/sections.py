@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
 import math
 import re
 from collections.abc import Sequence
@@ -15,29 +17,26 @@ from warp_ar.scene.calibration_file import load_calibration
 from warp_ar.scene.description import (
     INTRINSICS,
     SIDES,
-    TURNS,
     AreaLight,
     Board,
     Camera,
     CharucoBoard,
-    Exposure,
     GridBoard,
     Light,
     Marker,
     Object,
+    PoseKeys,
     PoseSpec,
-    Probe,
-    Proxy,
     SourceSpec,
 )
 from warp_ar.scene.exif import camera_by_exif
-from warp_ar.scene.fields import Field, fields_of, not_used
+from warp_ar.scene.fields import Field, FieldError, fields_of, not_used
 from warp_ar.scene.materials import MATERIALS, Material
 from warp_ar.scene.mesh_files import GLTF_SUFFIXES, MESH_SUFFIXES
 from warp_ar.scene.messages import LARGEST, SMALLEST
 from warp_ar.scene.pose_file import check_rotation, load_pose_file, pose_of_position, rotation_of_quaternion
 from warp_ar.scene.scene_files import SceneFiles
-from warp_ar.scene.table import MISSING, MOST, Table
+from warp_ar.scene.table import Table
 
 _T = TypeVar("_T")
 _SOURCES: Final = ("path", "camera", "synthetic")
@@ -66,13 +65,31 @@ class SceneTable(Table):
         """Return a table within this one: the value of a key."""
         return type(self)(self.label, self.files, self.name(key), data, keys)
 
-    def find(self, text: str) -> Path | None:
-        """Return the path that a text names; None if this scene must not name it."""
-        return self.files.resolve(text)
+    def resolve(self, key: str, right: str) -> Path:
+        """Return a path, links followed; whether anything is there is not asked."""
+        value = self.text(key, right=f"the path of {right}")
+        try:
+            path = self.files.resolve(value)
+        except (OSError, RuntimeError, ValueError):  # too long, a loop of links, a zero byte
+            self.fail(key, f"expected the path of {right}; this cannot be one")
+        if path is None:
+            self.fail(
+                key,
+                f"expected {right}; no file of this name came with the scene; open a scene with its own "
+                "files by python -m warp_ar.live, or drop a ZIP that holds them",
+            )
+        return path
+
+    def file(self, key: str, right: str) -> Path:
+        """The path of a file that is there."""
+        path = self.resolve(key, right)
+        if not is_file(path):
+            self.fail(key, f"no such file: {path}")
+        return path
 
 
 def read_fields(table: SceneTable, kind: type[_T], **given: Any) -> _T:
-    """Read a table into its dataclass.
+    """Read a table into its dataclass, which checks the values.
 
     Args:
         table: The table; keys that the kind of thing does not use are refused.
@@ -87,61 +104,53 @@ def read_fields(table: SceneTable, kind: type[_T], **given: Any) -> _T:
     unused: set[str] = set()
     if uses:
         selector = next(iter(every))
-        chosen = table.choice(selector, uses)
-        given[selector] = chosen
-        table.only(selector, uses[chosen], (key for keys in uses.values() for key in keys))
+        chosen = given[selector] = table.choice(selector, uses)
+        table.only(selector, uses)
         unused = not_used(uses, chosen)
         if "size" in uses[chosen]:
-            given["size"] = _numbers(table, every["size"], (SIDES[chosen],))
+            key = dataclasses.replace(every["size"].key, sizes=(SIDES[chosen],), low=SMALLEST)
+            given["size"] = table.admit(dataclasses.replace(every["size"], key=key))
     for name, field in every.items():
-        if (name not in given and name not in unused and (name in table or field.key.required)) or (
-            field.default is MISSING and name not in given
-        ):
-            given[name] = _read(table, field)
-    return kind(**given)
+        needed = name not in unused and (field.key.required or field.default is dataclasses.MISSING)
+        if name not in given and (name in table or needed):
+            given[name] = read_value(table, field)
+    try:
+        return kind(**given)
+    except FieldError as error:
+        table.fail(error.key, error.right)
 
 
-def _read(table: SceneTable, field: Field) -> Any:
-    """Read the value of a key, which must be there."""
-    name, key = field.name, field.key
+def read_value(table: SceneTable, field: Field) -> Any:
+    """Read the value of a key, which must be there.
+
+    Raises:
+        SceneError: It is missing or cannot be.
+    """
+    name, kind = field.name, field.kinds[0] if field.kinds else type(None)
+    is_text = isinstance(table.data.get(name), str)
     match field.form:
-        case "number":
-            return table.number(name, low=key.low, high=key.high, unit=_unit(field))
-        case "integer":
-            return table.integer(name, low=round(max(key.low, 0)), high=round(min(key.high, MOST)))
+        case "text" if is_text or int not in field.kinds:
+            return table.text(name, right=field.key.right or "some text")
+        case "text":
+            return table.integer(name, low=0)
+        case "path":
+            path = table.file(name, field.key.right)
+            if field.key.right == "a mesh" and path.suffix.lower() not in MESH_SUFFIXES:
+                table.fail(name, f"unknown mesh format; use one of {', '.join(MESH_SUFFIXES)}")
+            return path
+        case "color" if is_text:
+            return table.file(name, "a picture")
+        case "table" if kind is Marker:
+            return _own_marker(table)
+        case "table" if kind is CharucoBoard:
+            return _read_board(table)
+        case "table" if kind in MATERIALS.values():
+            return _read_material(table)
+        case "table":
+            return read_fields(table.inner(name, table.data[name], list(fields_of(kind))), kind)
         case "flag":
             return table.flag(name)
-        case "text":
-            return table.text(name, right=key.right or "some text")
-        case "word":
-            return table.choice(name, field.words)
-        case "path":
-            return table.file(name, key.right) if "mesh" not in key.right else _mesh_path(table)
-        case "color" if isinstance(table.data[name], str):
-            return table.file(name, "a picture")
-        case "color" if not isinstance(table.data[name], list):
-            table.fail(name, "expected a list of 3 numbers from 0 to 1, or the path of a texture")
-        case "table":
-            keys = list(fields_of(field.kind))
-            return read_fields(table.inner(name, table.data[name], keys), field.kind)
-    return _numbers(table, field, key.sizes)
-
-
-def _numbers(table: SceneTable, field: Field, sizes: tuple[int, ...]) -> tuple[float, ...]:
-    return table.vector(field.name, sizes=sizes, low=field.key.low, high=field.key.high, unit=_unit(field))
-
-
-def _unit(field: Field) -> str:
-    """Return a unit as messages name it; ranges are said anyway."""
-    return field.key.unit if field.key.unit in ("metres", "degrees", "pixels", "seconds", "frames per second") else ""
-
-
-def _grey(table: SceneTable, field: Field) -> dict[str, Any]:
-    """Return a reflectance for which one number may stand."""
-    key = field.key
-    if field.name not in table or isinstance(table.data[field.name], list):
-        return {}
-    return {field.name: (table.number(field.name, low=key.low, high=key.high),) * 3}
+    return table.admit(field)
 
 
 # ---- the camera ------------------------------------------------------------------------------------------------------
@@ -165,7 +174,7 @@ def read_camera(table: SceneTable, source: object = None) -> Camera:
     if way == "calibration":
         return load_calibration(table.file("calibration", "a calibration file"), transfer)
     if way == "field_of_view":
-        return Camera.guessed(*_NOMINAL_SIZE, _read(table, fields_of(Camera)[way]), transfer)
+        return Camera.guessed(*_NOMINAL_SIZE, table.admit(fields_of(Camera)[way]), transfer)
     if not any(key in table for key in INTRINSICS):
         names = ", ".join(INTRINSICS[:6])
         right = f"give {names}, or field_of_view, or calibration with the path of OpenCV's YAML or JSON"
@@ -215,6 +224,10 @@ def read_pose(table: SceneTable) -> PoseSpec:
     if len(given) != 1:
         table.fail(given[1] if given else "R", f"{given[0]} is given too; {_POSES}" if given else _POSES)
     way = given[0]
+
+    def read(key: str) -> Any:
+        return table.admit(dataclasses.replace(fields_of(PoseKeys)[key], optional=False))
+
     for key in table.data:
         if key != way and key not in ways[way]:
             table.fail(key, f"not used with {way}; {_POSES}")
@@ -222,27 +235,18 @@ def read_pose(table: SceneTable) -> PoseSpec:
         path = table.file("file", "poses: COLMAP's images, OpenTrackIO, USD, or JSON")
         return load_pose_file(path)
     if way == "position":
-        rotate = table.vec3("rotate", (0.0, 0.0, 0.0), unit="degrees")
-        return PoseSpec((pose_of_position(table.vec3("position", unit="metres"), rotate),))
-    translation = table.vec3("t", unit="metres")
+        rotate = read("rotate") if "rotate" in table else (0.0, 0.0, 0.0)
+        return PoseSpec((pose_of_position(read("position"), rotate),))
+    translation = read("t")
     if way == "R":
-        rotation = table.vector("R", sizes=(9,))
+        rotation = read("R")
         if not check_rotation(rotation):
             table.fail("R", "expected a rotation matrix, 9 numbers row by row: camera_from_world, as OpenCV has it")
         return PoseSpec(((rotation, translation),))
-    w, x, y, z = table.vector("quaternion", sizes=(4,), low=-1e6, high=1e6)
+    w, x, y, z = read("quaternion")
     if w == x == y == z == 0.0:
         table.fail("quaternion", "has no length; expected w, x, y, z as COLMAP has them")
     return PoseSpec(((rotation_of_quaternion(w, x, y, z), translation),))
-
-
-def read_exposure(table: SceneTable) -> Exposure:
-    """Read ``[exposure]``."""
-    if table.data.get("scale") == "auto":
-        return Exposure("auto")
-    if isinstance(table.data.get("scale"), str):
-        table.fail("scale", 'expected a number, 0 or more, or "auto"')
-    return read_fields(table, Exposure)
 
 
 # ---- what stands on the desk -----------------------------------------------------------------------------------------
@@ -252,41 +256,35 @@ def read_marker(table: SceneTable) -> Marker:
     """Read ``[marker]``."""
     dictionary = table.choice("dictionary", _DICTIONARIES, Marker.dictionary)
     count = len(cv2.aruco.getPredefinedDictionary(_DICTIONARIES[dictionary]).bytesList)
-    if table.data.get("turn", 0) not in TURNS:
-        table.fail("turn", "expected 0, 90, 180 or 270 degrees")
     if "board" not in table:
         number = table.integer("id", Marker.id, low=0, high=count - 1)
         return read_fields(table, Marker, dictionary=dictionary, id=number)
     for key in ("id", "size"):
         if key in table:
             table.fail(key, "not used beside board, which says its own sizes; remove one of the two")
-    board = _read_board(table)
-    if board.marker_count > count:
-        table.fail("board", f"needs {board.marker_count} markers; {dictionary} has {count}")
-    return read_fields(table, Marker, dictionary=dictionary, board=board, size=Marker.size)
+    marker = read_fields(table, Marker, dictionary=dictionary, size=Marker.size)
+    if marker.board is not None and marker.board.marker_count > count:
+        table.fail("board", f"needs {marker.board.marker_count} markers; {dictionary} has {count}")
+    return marker
 
 
-def _own_marker(parent: SceneTable) -> dict[str, Any]:
+def _own_marker(parent: SceneTable) -> Marker:
     """Return the marker that something rides on: a number, of the world's dictionary and size, or a table."""
-    if "marker" not in parent:
-        return {}
     world, value = parent.world, parent.data["marker"]
     if isinstance(value, dict):
         given = {"dictionary": world.dictionary, **value} if world else value
         if world and world.board is None and "board" not in value:
             given = {"size": world.size, **given}
-        keys = [key for key in fields_of(Marker) if key != "white"]
-        own = read_marker(parent.inner("marker", given, keys))
     elif world is None or world.board is not None or isinstance(value, bool) or not isinstance(value, int):
         right = 'a table such as { id = 7, size = 0.05 } or { board = "grid 2x2 0.03 0.01" }'
         parent.fail("marker", f"expected {right}" + (", or an id" if world and world.board is None else ""))
     else:
-        count = len(cv2.aruco.getPredefinedDictionary(_DICTIONARIES[world.dictionary]).bytesList)
-        own = Marker(world.dictionary, parent.integer("marker", low=0, high=count - 1), world.size)
+        given = {"dictionary": world.dictionary, "id": value, "size": world.size}
+    own = read_marker(parent.inner("marker", given, [key for key in fields_of(Marker) if key != "white"]))
     if world is not None and own.dictionary == world.dictionary and (both := _ids(own) & _ids(world)):
         right = f"marker {min(both)} of {own.dictionary} is the world's own; use another id or dictionary"
         parent.fail("marker", right)
-    return {"marker": own}
+    return own
 
 
 def _ids(marker: Marker) -> set[int]:
@@ -317,60 +315,24 @@ def _read_board(table: SceneTable) -> Board:
     return CharucoBoard(columns, rows, first, second, words[0] == "charuco-legacy")
 
 
-def read_probe(table: SceneTable) -> Probe:
-    """Read a ``[[probe]]``."""
-    return read_fields(table, Probe, **_grey(table, fields_of(Probe)["reflectance"]), **_own_marker(table))
-
-
-def read_proxy(table: SceneTable) -> Proxy:
-    """Read a ``[[proxy]]``."""
-    given = _own_marker(table)
-    if "material" in table:
-        field = fields_of(Proxy)["material"]
-        inner = table.inner("material", table.data["material"], list(fields_of(field.kind)))
-        given["material"] = read_fields(inner, field.kind, **_grey(inner, fields_of(field.kind)["reflectance"]))
-    return read_fields(table, Proxy, **given)
-
-
-def _mesh_path(table: SceneTable) -> Path:
-    path = table.file("file", "a mesh")
-    if path.suffix.lower() not in MESH_SUFFIXES:
-        table.fail("file", f"unknown mesh format; use one of {', '.join(MESH_SUFFIXES)}")
-    return path
-
-
 # ---- what is virtual -------------------------------------------------------------------------------------------------
 
 
 def read_object(table: SceneTable) -> Object:
     """Read an ``[[object]]``."""
     _check_motion(table)
-    given = _own_marker(table)
-    if "material" in table:
-        given["material"] = _read_material(table)
-    if "play" in table:
-        plays = table.data.get("shape") == "mesh" and _mesh_path(table).suffix.lower() in GLTF_SUFFIXES
-        if not plays:
-            table.fail("play", f"plays an animation of a file; give one that ends in {' or '.join(GLTF_SUFFIXES)}")
-        play = fields_of(Object)["play"].kind
-        inner = table.inner("play", table.data["play"], list(fields_of(play)))
-        number = {}
-        if "animation" in inner and not isinstance(inner.data["animation"], str):
-            number = {"animation": inner.integer("animation", low=0)}
-        given["play"] = read_fields(inner, play, **number)
-    if table.data.get("shape") == "torus":
-        major, minor = table.length("major_radius"), table.length("minor_radius")
-        if minor >= major:
-            table.fail("minor_radius", f"must be below major_radius ({major:g}), else the torus has no hole")
-    return read_fields(table, Object, **given)
+    item = read_fields(table, Object)
+    if item.play is not None and (item.file is None or item.file.suffix.lower() not in GLTF_SUFFIXES):
+        table.fail("play", f"plays an animation of a file; give one that ends in {' or '.join(GLTF_SUFFIXES)}")
+    return item
 
 
 def _read_material(parent: SceneTable) -> Material:
-    names = {model: tuple(fields_of(kind)) for model, kind in MATERIALS.items()}
-    every = list(dict.fromkeys(key for keys in names.values() for key in keys))
-    table = parent.inner("material", parent.data["material"], ["model", *every])
+    uses = {model: tuple(fields_of(kind)) for model, kind in MATERIALS.items()}
+    keys = dict.fromkeys(itertools.chain(["model"], *uses.values()))
+    table = parent.inner("material", parent.data["material"], list(keys))
     model = table.choice("model", MATERIALS)
-    table.only("model", names[model], every)
+    table.only("model", uses)
     return read_fields(table, MATERIALS[model])
 
 
@@ -388,24 +350,15 @@ def read_light(table: SceneTable) -> Light | AreaLight:
     """Read a ``[[light]]`` that is virtual."""
     uses: dict[str, tuple[str, ...]] = {**Light.USES, **AreaLight.USES}
     kind = table.choice("kind", uses)
-    table.only("kind", uses[kind], (key for keys in uses.values() for key in keys))
+    table.only("kind", uses)
     _check_motion(table)
-    given = _own_marker(table)
     if kind in AreaLight.USES:
-        return read_fields(table, AreaLight, **given)
-    if "target" in table:
-        if "direction" in table:
-            table.fail("direction", "target is given too; expected exactly one of the two")
-        if table.vec3("target", unit="metres") == table.vec3("at", unit="metres"):
-            table.fail("target", "is where the light itself is; move one of the two")
-    elif kind != "point":
-        if kind == "spot" and "direction" not in table:
-            table.fail("target", "a spot light needs a target (a point) or a direction")
-        if not any(abs(component) >= SMALLEST for component in table.vec3("direction")):
-            table.fail("direction", "has no length; expected the way the light travels, such as [0, 0, -1]")
-    light = read_fields(table, Light, **given)
-    if light.inner_angle > light.outer_angle:
-        table.fail("inner_angle", f"must not be above outer_angle ({light.outer_angle:g})")
-    if not any(term >= SMALLEST for term in light.attenuation):
-        table.fail("attenuation", "is zero everywhere; expected constant, linear and quadratic term, such as [0, 0, 1]")
+        return read_fields(table, AreaLight)
+    if "target" in table and "direction" in table:
+        table.fail("direction", "target is given too; expected exactly one of the two")
+    if kind == "directional" and "direction" not in table:
+        table.fail("direction", "expected the way the light travels, such as [0, 0, -1]")
+    light = read_fields(table, Light)
+    if light.kind == "spot" and light.target == light.at:
+        table.fail("target", "is where the light itself is; move one of the two")
     return light

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterable, Mapping
+import dataclasses
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
+
+import tomlkit
 
 from warp_ar.errors import SceneError
 from warp_ar.scene.description import INTRINSICS, Board, Marker, PoseSpec, Scene
@@ -31,67 +33,48 @@ def dumps_scene(scene: Scene, folder: str | Path | None = None) -> str:
     if any(item.mesh is not None for item in scene.objects):
         raise SceneError("object: a mesh in memory cannot be written; export it, and give the object its file")
     own = ("field_of_view",) if scene.camera.field_of_view is not None else INTRINSICS
-    entries: list[tuple[str, Any, Iterable[str] | None]] = [("[camera]", scene.camera, (*own, "transfer"))]
-    entries += [("[source]", scene.source, None)] * (scene.source is not None)
-    entries += [("[marker]", scene.marker, _marker_keys(scene.marker))] * scene.has_marker
-    entries += [("[pose]", scene.pose, ())] * (scene.pose is not None)
-    for section, items in (("probe", scene.probes), ("proxy", scene.proxies), ("object", scene.objects)):
-        entries += [(f"[[{section}]]", item, None) for item in items]
-    entries += [("[[light]]", item, None) for item in (*scene.lights, scene.captured) if item is not None]
-    entries += [("[exposure]", scene.exposure, None)]
-    lines = [f"schema = {scene.schema}", f"name = {_value(scene.name, base)}"]
-    for head, item, keys in entries:
-        lines += ["", head, *_table(item, keys, base)]
-    return "\n".join(lines) + "\n"
+    sections: dict[str, Any] = {
+        "camera": _table(scene.camera, base, (*own, "transfer")),
+        "source": _table(scene.source, base),
+        "marker": _table(scene.marker, base) if scene.has_marker else None,
+        "pose": _table(scene.pose, base, ("R", "t")),
+        "probe": [_table(item, base) for item in scene.probes],
+        "proxy": [_table(item, base) for item in scene.proxies],
+        "object": [_table(item, base) for item in scene.objects],
+        "light": [_table(item, base) for item in (*scene.lights, scene.captured) if item is not None],
+        "exposure": _table(scene.exposure, base),
+    }
+    given = {name: value for name, value in sections.items() if value}
+    return tomlkit.dumps({"schema": scene.schema, "name": scene.name, **given})
 
 
-def _table(item: Any, keys: Iterable[str] | None, base: Path | None) -> list[str]:
-    """Return the lines of a section and of the tables below it."""
+def _table(item: Any, base: Path | None, keys: Iterable[str] = ()) -> dict[str, Any]:
+    """Return the keys of a dataclass with their values, without those that its kind does not use; empty for None."""
+    if item is None:
+        return {}
     if isinstance(item, PoseSpec):
-        rotation, translation = item.poses[0]
-        given: dict[str, Any] = {"R": rotation, "t": translation} if item.file is None else {"file": item.file}
-        return [f"{key} = {_value(value, base)}" for key, value in given.items()]
-    values = _values(item, keys)
-    material = values.pop("material", None)
-    lines = [f"{key} = {_value(value, base)}" for key, value in values.items()]
-    if material is not None:
-        section = "object" if type(material) in MATERIALS.values() else "proxy"
-        model = next((name for name, kind in MATERIALS.items() if isinstance(material, kind)), None)
-        lines += ["", f"[{section}.material]", *([] if model is None else [f"model = {_value(model, base)}"])]
-        lines += _table(material, None, base)
-    return lines
-
-
-def _values(item: Any, keys: Iterable[str] | None = None) -> dict[str, Any]:
-    """Return what a dataclass gives for its keys, without those that its kind does not use."""
-    if keys is None and isinstance(item, Marker):
-        keys = [key for key in _marker_keys(item) if key != "white"]
-    names = list(fields_of(type(item))) if keys is None else list(keys)
+        values = {"file": item.file} if item.file is not None else dict(zip(keys, item.poses[0], strict=True))
+        return {key: _value(value, base) for key, value in values.items()}
+    names = list(keys) or list(fields_of(type(item)))
+    if isinstance(item, Marker):
+        gone = {"board"} if item.board is None else {"id", "size"}
+        names = [name for name in names if name not in gone | ({"turn"} if not item.turn else set())]
     if uses := getattr(item, "USES", None):
         unused = not_used(uses, getattr(item, names[0]))
         names = [name for name in names if name not in unused]
-    return {name: value for name in names if (value := getattr(item, name)) is not None}
+    values = {name: _value(getattr(item, name), base) for name in names}
+    model = next(({"model": name} for name, kind in MATERIALS.items() if type(item) is kind), {})
+    return {**model, **{name: value for name, value in values.items() if value is not None}}
 
 
-def _marker_keys(marker: Marker) -> tuple[str, ...]:
-    own = ("id", "size") if marker.board is None else ("board",)
-    return ("dictionary", *own, "white", *(("turn",) if marker.turn else ()))
-
-
-def _value(item: Any, base: Path | None) -> str:
-    """Return a value as TOML; paths inside ``base`` are relative to it."""
+def _value(item: Any, base: Path | None) -> Any:
+    """Return a value as TOML has it; paths inside ``base`` are relative to it."""
     if isinstance(item, Path):
-        item = (item.relative_to(base) if base and item.is_relative_to(base) else item).as_posix()
-    if isinstance(item, bool):
-        return str(item).lower()
-    if isinstance(item, str):
-        return json.dumps(item, ensure_ascii=False).replace("\x7f", "\\u007F")  # TOML, unlike JSON, escapes DEL
+        return (item.relative_to(base) if base and item.is_relative_to(base) else item).as_posix()
     if isinstance(item, Board):
-        return _value(str(item), base)
+        return str(item)
     if isinstance(item, tuple):
-        return "[" + ", ".join(_value(entry, base) for entry in item) + "]"
-    if hasattr(item, "__dataclass_fields__"):
-        item = _values(item)
-    if isinstance(item, Mapping):
-        return "{ " + ", ".join(f"{key} = {_value(entry, base)}" for key, entry in item.items()) + " }"
-    return repr(float(item)) if isinstance(item, float) else repr(item)  # NumPy's say their type
+        return [_value(entry, base) for entry in item]
+    if isinstance(item, Marker):  # only the world's white is measured
+        return {key: value for key, value in _table(item, base).items() if key != "white"}
+    return _table(item, base) if dataclasses.is_dataclass(item) else item
