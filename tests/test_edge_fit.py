@@ -9,7 +9,7 @@ import pytest
 from tests.test_tracking import CAMERA, look, make_camera, render
 from warp_ar.scene import Camera, GridBoard, Marker, Pose
 from warp_ar.tracking.edge_fit import EdgeFitter
-from warp_ar.tracking.markers import make_pattern
+from warp_ar.tracking.markers import pattern_of
 
 PIXELS = {"blurred": 2.0, "half hidden": 0.2, "board": 0.2}
 """Of the outline's corners, where not 0.1: a blur that is not symmetric is none of a camera's; half of an outline is
@@ -55,7 +55,7 @@ CASES = {
 def test_a_fit_is_near_the_truth(case):
     """Within a part of a pixel, and as sure of itself as it is near."""
     marker, camera, truth, seen_as = CASES[case]
-    pattern = make_pattern(marker.dictionary, marker.id, marker.size, marker.board)
+    pattern = pattern_of(marker)
     fitter, squares = EdgeFitter(pattern, camera), []
     expected = fitter.project(truth.apply(pattern.outline))[0]
     for seed in range(6):
@@ -78,7 +78,7 @@ def test_a_fit_counts_the_edges_that_it_sees():
     support = {}
     for case in ("sharp", "half hidden"):
         marker, camera, truth, seen_as = CASES[case]
-        fitter = EdgeFitter(make_pattern(marker.dictionary, marker.id, marker.size, marker.board), camera)
+        fitter = EdgeFitter(pattern_of(marker), camera)
         fitter.show(seen_as(render((marker, truth), camera=camera)), whole(camera))
         support[case] = fitter.fit(truth, REACHES).support
     assert support["sharp"] > 0.85
@@ -89,14 +89,14 @@ def test_a_fit_counts_the_edges_that_it_sees():
 def test_no_pose_where_none_can_be_seen(pose):
     """Behind the camera, through it, or from behind the page."""
     marker = Marker()
-    fitter = EdgeFitter(make_pattern(marker.dictionary, marker.id, marker.size, None), CAMERA)
+    fitter = EdgeFitter(pattern_of(marker), CAMERA)
     fitter.show(render((marker, look(30, 10))), whole(CAMERA))
     assert fitter.fit(pose, REACHES) is None
 
 
 @pytest.mark.parametrize("level", [0, 128, 255])
 def test_nothing_is_fitted_to_an_even_picture(level):
-    fitter = EdgeFitter(make_pattern("DICT_4X4_50", 0, 0.08, None), CAMERA)
+    fitter = EdgeFitter(pattern_of(Marker()), CAMERA)
     fitter.show(np.full((CAMERA.height, CAMERA.width), level, np.uint8), whole(CAMERA))
     assert fitter.fit(look(30, 10), REACHES) is None
     assert fitter.correlate(look(30, 10)) == 0.0

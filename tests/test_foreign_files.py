@@ -27,7 +27,7 @@ from warp_ar.scene.textures import decode_rgba
 from warp_ar.sources.frame_folder import read_frame
 from warp_ar.sources.sources import open_source
 from warp_ar.srgb import decode_srgb, encode_srgb
-from warp_ar.tracking.markers import make_pattern
+from warp_ar.tracking.markers import pattern_of
 
 PIXELS = 0.1
 """Error of the rational model that stands for a fisheye's, pixels."""
@@ -463,8 +463,7 @@ def test_a_fisheye_is_calibrated(tmp_path):
 def test_the_print_of_an_old_board_is_as_opencv_draws_it():
     """The cells between the markers are dark where the picture of the board is: printed edges are fitted to them."""
     for legacy in (False, True):
-        board = Marker("DICT_5X5_100", board=CharucoBoard(5, 4, 0.08, 0.06, legacy=legacy)).board
-        pattern = make_pattern("DICT_5X5_100", 0, 0.0, board)
+        pattern = pattern_of(Marker("DICT_5X5_100", board=CharucoBoard(5, 4, 0.08, 0.06, legacy=legacy)))
         picture = board_picture(5, 4, legacy)[40:-40, 40:-40]
         at = np.round(pattern.cells[:, :2] * (1000, -1000) + (200, 160) - 0.5).astype(int)
         shown = picture[np.clip(at[:, 1], 0, 319), np.clip(at[:, 0], 0, 399)] > 127

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warp_ar.errors import UsageError
-from warp_ar.scene import CharucoBoard, GridBoard, Marker, Scene
-from warp_ar.scene.description import TURNS
+from warp_ar.scene import CharucoBoard, Marker, Scene
 from warp_ar.scene.geometry import rotation_matrix
 
 Array = NDArray[np.float64]
@@ -177,34 +176,23 @@ def _edge_points(edges: Array) -> tuple[Array, Array, Array, Array]:
 
 
 @functools.cache
-def make_pattern(
-    dictionary: str, id: int, size: float, board: CharucoBoard | GridBoard | None, turn: int = 0
-) -> Pattern:
+def pattern_of(marker: Marker) -> Pattern:
     """Return the print of a marker or board.
 
-    Args:
-        dictionary: Name of OpenCV's dictionary.
-        id: Number of the marker, where there is no board.
-        size: Side of its black square in metres, where there is no board.
-        board: The board, if there is one.
-        turn: Degrees by which it is turned against the print that OpenCV draws, counterclockwise.
-
     Raises:
-        UsageError: There is no such marker, or its size or turn is impossible.
+        UsageError: There is no such marker.
     """
-    if turn not in TURNS:
-        raise UsageError(f"marker turn: {turn} should be 0, 90, 180 or 270 degrees")
-    book = find_dictionary(dictionary)
+    size, board, turn = marker.size, marker.board, marker.turn
+    book = find_dictionary(marker.dictionary)
     bits = int(book.markerSize) + 2
     edges: list[tuple[float, ...]] = []
     if board is None:
-        if not 0 <= id < len(book.bytesList):
-            raise UsageError(f"marker id: {dictionary} has ids 0 to {len(book.bytesList) - 1}, not {id}")
-        if not (np.isfinite(size) and size > 0):
-            raise UsageError(f"marker size: {size} should be the edge length in metres, above 0")
-        places, width, height, margin = {id: (-size / 2, size / 2)}, size, size, size / bits
+        if not 0 <= marker.id < len(book.bytesList):
+            right = f"{marker.dictionary} has ids 0 to {len(book.bytesList) - 1}"
+            raise UsageError(f"marker id: {right}, not {marker.id}")
+        places, width, height, margin = {marker.id: (-size / 2, size / 2)}, size, size, size / bits
     else:
-        printed = make_board(Marker(dictionary, board=board))
+        printed = make_board(marker)
         size, (width, height) = board.marker_length, board.size
         places = {
             int(number): (float(corners[0][0]) - width / 2, height / 2 - float(corners[0][1]))
@@ -244,11 +232,6 @@ def make_pattern(
         cells=np.concatenate(centres) @ turned,
         white=np.concatenate(white).astype(float),
     )
-
-
-def pattern_of(marker: Marker) -> Pattern:
-    """Return the print of a marker or board; errors as those of ``make_pattern``."""
-    return make_pattern(marker.dictionary, marker.id, marker.size, marker.board, marker.turn)
 
 
 def printed_cells(marker: Marker) -> tuple[Array, NDArray[np.bool_], float, Array]:
