@@ -143,31 +143,32 @@ def _read_json(path: Path, text: str) -> list[tuple[str, RawPose]]:
 
 def _nerf_pose(label: str, entry: Any) -> tuple[str, RawPose]:
     """Pose of a frame of NeRF's ``transforms.json``: ``world_from_camera``, OpenGL's axes of the camera."""
-    try:
-        name, matrix = entry["file_path"], np.array(entry["transform_matrix"], float)
-        good = isinstance(name, str) and matrix.shape in ((3, 4), (4, 4)) and bool(np.isfinite(matrix).all())
-        good = good and check_rotation(matrix[:3, :3].ravel().tolist())
-        good = good and bool((matrix[3:] == (0.0, 0.0, 0.0, 1.0)).all())  # a matrix may lie there by columns
-    except (TypeError, KeyError, ValueError, OverflowError):
-        good = False
-    if not good:
+    said = entry if isinstance(entry, dict) else {}
+    name, numbers = said.get("file_path"), _finite(said.get("transform_matrix"))
+    matrix = numbers.reshape(-1, 4) if len(numbers) in (12, 16) else np.zeros((3, 4))
+    # A matrix may lie there by columns.
+    last = bool((matrix[3:] == (0.0, 0.0, 0.0, 1.0)).all())
+    if not isinstance(name, str) or not last or not check_rotation(matrix[:3, :3].ravel().tolist()):
         raise SceneError(f"{label}: expected file_path and transform_matrix, 4 rows of 4 of which the last is 0 0 0 1")
     return name, pose_of_placement(matrix[:3, :3] @ _OPENCV, matrix[:3, 3])
 
 
 def _json_pose(label: str, entry: Any) -> RawPose:
-    if not isinstance(entry, dict) or not {"R", "t"} <= entry.keys():
-        raise SceneError(f"{label}: expected R and t, camera_from_world")
-    try:
-        rotation = np.array(entry["R"], float).reshape(-1)
-        translation = np.array(entry["t"], float).reshape(-1)
-    except (TypeError, ValueError, OverflowError):
-        rotation = translation = np.zeros(0)
-    finite = np.isfinite(rotation).all() and np.isfinite(translation).all()
-    if len(rotation) != 9 or len(translation) != 3 or not finite or not check_rotation(rotation.tolist()):
-        raise SceneError(f"{label}: expected R, a rotation matrix of 9 numbers, and t, 3 numbers (metres)")
+    rotation, translation = (_finite(entry.get(key) if isinstance(entry, dict) else None) for key in ("R", "t"))
+    if len(rotation) != 9 or len(translation) != 3 or not check_rotation(rotation.tolist()):
+        right = "R, a rotation matrix of 9 numbers, and t, 3 numbers (metres): camera_from_world"
+        raise SceneError(f"{label}: expected {right}")
     x, y, z = translation.tolist()
     return tuple(rotation.tolist()), (x, y, z)
+
+
+def _finite(value: Any) -> Matrix:
+    """Return the numbers of nested lists, (n,); none where one is no finite number."""
+    try:
+        numbers = np.array(value, float).reshape(-1)
+    except (TypeError, ValueError, OverflowError):
+        return np.zeros(0)
+    return numbers if np.isfinite(numbers).all() else np.zeros(0)
 
 
 def _colmap_pose(label: str, numbers: Sequence[float]) -> RawPose:
