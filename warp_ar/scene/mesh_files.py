@@ -18,6 +18,7 @@ from warp_ar.files import is_file, read_bytes
 from warp_ar.scene.geometry import Mesh
 from warp_ar.scene.gltf import Bending, GltfContents, animation_names, load_gltf
 from warp_ar.scene.gltf_file import GltfFile
+from warp_ar.scene.materials import MeshMaterial
 from warp_ar.scene.mesh_parts import LARGEST, MeshPart, filled, join_parts
 from warp_ar.scene.mesh_source import MeshSource
 from warp_ar.scene.node_animation import Anchor, MovingMesh, MovingPart, part_transforms
@@ -183,20 +184,26 @@ def moving_mesh(source: MeshSource, contents: GltfContents) -> MovingMesh:
             f"{source.path}: its animation moves {len(groups):,} parts; at most {MOST_PARTS} are: join meshes, or "
             "leave out the object's play"
         )
-    joint = join_parts(source, [part for _, part, _ in placed])
     anchors, renamed = _used(contents.anchors, [on for on, _, _ in placed])
+    transforms = part_transforms(anchors, [renamed.get(on, -1) for on, _, _ in placed], 0.0)
+    rest = join_parts(source, [_at_rest(part, way) for (_, part, _), way in zip(placed, transforms, strict=True)])
     parts = []
-    vertex = face = 0
     for group in groups:
-        vertices, faces = (sum(len(getattr(part, name)) for _, part, _ in group) for name in ("vertices", "faces"))
-        mesh = _cut(joint, vertex, vertices, face, faces)
+        mesh = _with_materials_of(rest, join_parts(source, [part for _, part, _ in group]))
         own = [bend for _, _, bend in group if bend is not None]
         bend = functools.partial(_bent, mesh, own) if own else None
         parts.append(MovingPart(mesh, renamed.get(group[0][0], -1), bend))
-        vertex, face = vertex + vertices, face + faces
-    transforms = part_transforms(anchors, [renamed.get(on, -1) for on, _, _ in placed], 0.0)
-    rest = [_at_rest(part, transform) for (_, part, _), transform in zip(placed, transforms, strict=True)]
-    return MovingMesh(join_parts(source, rest), tuple(parts), anchors, contents.duration)
+    return MovingMesh(rest, tuple(parts), anchors, contents.duration)
+
+
+def _with_materials_of(whole: Mesh, mesh: Mesh) -> Mesh:
+    """A mesh that is a part of another one, with all of that one's materials and pictures."""
+    numbers = None
+    if len(whole.materials) > 1:
+        own = np.array([whole.materials.index(one) for one in mesh.materials or (MeshMaterial(),)], np.int32)
+        numbers = own[0 if mesh.triangle_materials is None else mesh.triangle_materials]
+        numbers = np.ascontiguousarray(np.broadcast_to(numbers, len(mesh.faces)))
+    return dataclasses.replace(mesh, materials=whole.materials, images=whole.images, triangle_materials=numbers)
 
 
 def _bent(mesh: Mesh, bends: list[Bending], seconds: float) -> Mesh:
@@ -223,21 +230,6 @@ def _used(anchors: tuple[Anchor, ...], carriers: list[int]) -> tuple[tuple[Ancho
     renamed = {old: new for new, old in enumerate(sorted(needed))}
     kept = (dataclasses.replace(anchors[old], parent=renamed.get(anchors[old].parent, -1)) for old in renamed)
     return tuple(kept), renamed
-
-
-def _cut(joint: Mesh, vertex: int, vertices: int, face: int, faces: int) -> Mesh:
-    """A run of vertices and faces, with all materials and pictures."""
-
-    def run(values: npt.NDArray[Any] | None, start: int, count: int) -> Any:
-        return None if values is None else np.ascontiguousarray(values[start : start + count])
-
-    own = {
-        name: run(getattr(joint, name), vertex, vertices)
-        for name in ("vertices", "normals", "uvs", "uvs_second", "colors", "tangents")
-    }
-    numbers = run(joint.triangle_materials, face, faces)
-    cut_faces = np.ascontiguousarray(joint.faces[face : face + faces] - np.int32(vertex))
-    return dataclasses.replace(joint, faces=cut_faces, triangle_materials=numbers, **own)
 
 
 def _at_rest(part: MeshPart, transform: npt.NDArray[np.float64]) -> MeshPart:
