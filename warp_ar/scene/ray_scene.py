@@ -58,28 +58,19 @@ class HostScene:
         Raises:
             SceneError: A mesh or texture cannot be read, or a texture is asked of a mesh without texture coordinates.
         """
-        self.scene = scene
         self._meshes: dict[Any, tuple[Mesh, RayMesh, int]] = {}
         self._corners = 0
         self._bent: dict[Any, float] = {}
-        textures = TexturePack()
-        self._shapes = object_shapes(scene)
-        self._objects = self._shape_records(self._shapes, device)
+        self._textures = textures = TexturePack()
+        self.probes = scene.probes
+        materials = self._take(scene, device)
         self._proxies = self._shape_records(scene.proxies, device)
         self._fixed_proxies = self._proxies.copy()
-        self._textures = textures
-        materials = self._material_records()
-        self._place_objects()
         self._lights = np.zeros(len(scene.lights), structs.struct_dtype(structs.Light))
-        self._lit: Outline | None = None
         self._mirrors: tuple[Outline, Outline] | None = None
         self._placed = b""  # the objects that the polygons below are of
         self._outline = NOTHING
         self._receivers: Outline | None = None
-        self.probes = scene.probes
-        self._balls = ball_outline(scene.probes)
-        self._glossy = np.array([proxy.material is not None for proxy in scene.proxies], bool)
-        self._lights_edited = False
         self._gain = np.ones(3)
         self.ray_scene = ray_scene = structs.RayScene()
         self._add_corners(ray_scene, device)
@@ -158,16 +149,21 @@ class HostScene:
 
     def update(self, scene: scenes.Scene) -> None:
         """Take the numbers of another scene with the same ``skeleton``: poses, sizes, materials, lights."""
+        device = self.ray_scene.materials.device
+        self.ray_scene.materials.assign(self._take(scene, device))
+        self._write_area_lights(device)
+
+    def _take(self, scene: scenes.Scene, device: Any) -> npt.NDArray[Any]:
+        """Take the numbers of a scene; returns the records of its materials."""
         self.scene = scene
         self._shapes = object_shapes(scene)
-        self._objects = self._shape_records(self._shapes, self.ray_scene.materials.device)
+        self._objects = self._shape_records(self._shapes, device)
         self._place_objects()
-        self.ray_scene.materials.assign(self._material_records())
-        self._lit = None
+        self._lit: Outline | None = None
         self._balls = ball_outline(self.probes)
         self._glossy = np.array([proxy.material is not None for proxy in scene.proxies], bool)
         self._lights_edited = True
-        self._write_area_lights(self.ray_scene.materials.device)
+        return self._material_records()
 
     @property
     def shape_count(self) -> int:
