@@ -153,24 +153,29 @@ def check_pictures(scene: Scene, look: Look) -> list[Finding]:
         return [board]
     if (twice := _marker_twice(scene.marker, views)) is not None:
         return [twice]
-    found = []
+    return list(_check_card(scene.marker, look))
+
+
+def _check_card(marker: Marker, look: Look) -> Iterator[Finding]:
+    """Yield findings about the marker, and about camera and light by it."""
     share = len(look.views) / len(look.images)
     if share < RARE:
         text = f"the marker is seen in {share:.0%} of {len(look.images)} frames"
-        found.append(Finding("marker.rare", text, "keep the whole card in the picture, flat, lit and unhidden"))
-    side = float(np.median([_marker_side(scene.marker, look.camera, pose) for _, pose in look.views]))
-    least = CELL_PIXELS * (int(find_dictionary(scene.marker.dictionary).markerSize) + 2)
+        yield Finding("marker.rare", text, "keep the whole card in the picture, flat, lit and unhidden")
+    side = float(np.median([_marker_side(marker, look.camera, pose) for _, pose in look.views]))
+    least = CELL_PIXELS * (int(find_dictionary(marker.dictionary).markerSize) + 2)
     if side < least:
         text = f"a marker is {side:.0f} pixels wide; expected {least:.0f} or more"
-        found.append(Finding("marker.small", text, "move the camera nearer, or print a larger card"))
+        yield Finding("marker.small", text, "move the camera nearer, or print a larger card")
     worst = float(np.median(look.errors))
     if worst > WORST_EDGES:
         text = f"the print's edges are {worst:.1f} pixels from where the camera's numbers have them"
         remedy = "lay the card flat, check [marker], and run python -m warp_ar.calibrate camera PICTURES"
-        found.append(Finding("camera.edges", text, remedy))
-    found += _check_focal(scene.marker, look)
+        yield Finding("camera.edges", text, remedy)
+    yield from _check_focal(marker, look)
     few = look.views[:: max(1, len(look.views) // 6)]
-    return [*found, *_check_light(scene.marker, look, few), *_check_blur(scene.marker, look, few)]
+    yield from _check_light(marker, look, few)
+    yield from _check_blur(marker, look, few)
 
 
 def _marker_twice(marker: Marker, images: Sequence[Image]) -> Finding | None:
@@ -314,17 +319,17 @@ def measure_focal(marker: Marker, look: Look) -> FocalFit | None:
     return FocalFit(best, deviation, count, float(as_given / max(squares.sum(1).min(), 1e-12)))
 
 
-def _check_focal(marker: Marker, look: Look) -> list[Finding]:
+def _check_focal(marker: Marker, look: Look) -> Iterator[Finding]:
     fit = measure_focal(marker, look)
     # Views from one side alone leave the least so flat that anything moves it.
     if fit is None or abs(fit.ratio - 1) < max(FOCAL, 3 * fit.deviation) or fit.gain < 1.02:
-        return []
+        return
     given = look.camera.fx
     text = (
         f"[camera] fx = {given:.0f}: the card's perspective in {fit.views} views fits "
         f"{fit.ratio * given:.0f} +/- {2 * fit.deviation * given:.0f}"
     )
-    return [Finding("camera.focal", text, "python -m warp_ar.calibrate camera PICTURES")]
+    yield Finding("camera.focal", text, "python -m warp_ar.calibrate camera PICTURES")
 
 
 def _squared_errors(
@@ -352,9 +357,9 @@ def _cell_values(marker: Marker, look: Look, image: Image, pose: Pose) -> tuple[
     return cells[inside][white[inside]], codes[white[inside]], codes[~white[inside]]
 
 
-def _check_light(marker: Marker, look: Look, views: Sequence[tuple[Image, Pose]]) -> list[Finding]:
+def _check_light(marker: Marker, look: Look, views: Sequence[tuple[Image, Pose]]) -> Iterator[Finding]:
     """Return whether the card's white can be measured, and whether it stays."""
-    found, clipped, dark, ratios, uneven, whites = [], [], [], [], [], []
+    clipped, dark, ratios, uneven, whites = [], [], [], [], []
     for image, pose in views:
         places, white, black = _cell_values(marker, look, image, pose)
         if len(white) < 6 or len(black) < 6:
@@ -372,38 +377,35 @@ def _check_light(marker: Marker, look: Look, views: Sequence[tuple[Image, Pose]]
         # A shadow's edge leaves two groups: cells that a print's noise or a blurred edge darken are few.
         uneven.append(float(np.percentile(rest, 85) - np.percentile(rest, 15)))
     if not whites:
-        return []
+        return
     if np.median(clipped) > CLIPPED_SHARE:
         text = f"{np.median(clipped):.0%} of the card's white clips, so that it tells nothing of the light"
-        found.append(Finding("card.clipped", text, "set a shorter exposure on the camera"))
+        yield Finding("card.clipped", text, "set a shorter exposure on the camera")
     if np.median(dark) < DARK:
         text = f"the card's white is dark: {np.median(dark):.1%} of clipping"
-        found.append(Finding("card.dark", text, "add light, or set a longer exposure"))
+        yield Finding("card.dark", text, "add light, or set a longer exposure")
     elif np.median(ratios) > CONTRAST:
         text = f"the card's black is {np.median(ratios):.0%} of its white: haze, gloss, or another transfer curve"
-        found.append(
-            Finding("card.contrast", text, "turn the card out of the lamp's reflection; check [camera] transfer")
-        )
+        yield Finding("card.contrast", text, "turn the card out of the lamp's reflection; check [camera] transfer")
     elif (steep := 1.0 / max(float(np.median(ratios)), 1e-3)) > STEEPEST:
         text = (
             f"the card's white is {steep:.0f} times as bright as its black; on plain paper it is 20 to 30 times: the "
             "camera lays a tone curve over [camera] transfer, or the print is on glossy photo paper"
         )
         remedy = "turn its contrast and HDR modes off, or python -m warp_ar.calibrate response PICTURES"
-        found.append(Finding("camera.response", text, remedy))
+        yield Finding("camera.response", text, remedy)
     if np.median(uneven) > SHADOW:
         text = (
             f"a shadow lies across the card: its white differs by a factor of {math.exp(float(np.median(uneven))):.1f}"
         )
-        found.append(Finding("card.shadow", text, "move what shades the card, or the card"))
-    return [*found, *_check_drift(look, views, np.array(whites))]
+        yield Finding("card.shadow", text, "move what shades the card, or the card")
+    yield from _check_drift(look, views, np.array(whites))
 
 
-def _check_drift(look: Look, views: Sequence[tuple[Image, Pose]], whites: Array) -> list[Finding]:
+def _check_drift(look: Look, views: Sequence[tuple[Image, Pose]], whites: Array) -> Iterator[Finding]:
     """Drifts of the camera's own: it changes all of the picture alike; a lamp changes every side differently."""
-    found: list[Finding] = []
     if len(whites) < 2:
-        return found
+        return
     first, last = views[0][0], views[-1][0]
     tints = np.log(whites[:, [0, 2]] / whites[:, 1:2])
     levels = np.log(whites.mean(1))
@@ -411,15 +413,13 @@ def _check_drift(look: Look, views: Sequence[tuple[Image, Pose]], whites: Array)
     low, high = (np.stack([p[..., k, k] for k in range(3)], -1) for p in (a, b))
     known = ((low > 0.01) & (low < 0.85) & (high > 0.01) & (high < 0.85)).all(-1)
     if known.sum() < 100:
-        return found
+        return
     ratio = np.log(high[known] / low[known])
     change = np.median(ratio.mean(1))
     spread = float(np.percentile(ratio.mean(1), 80) - np.percentile(ratio.mean(1), 20))
     if abs(change) > DRIFT and abs(levels[-1] - levels[0]) > DRIFT and spread < 0.5 * abs(change):
         text = f"the exposure drifts: all of the picture changes by a factor of {math.exp(change):.2f}"
-        found.append(
-            Finding("camera.drift", text, 'lock the camera\'s exposure, or say [source] metering = "automatic"')
-        )
+        yield Finding("camera.drift", text, 'lock the camera\'s exposure, or say [source] metering = "automatic"')
     colour = ratio[:, [0, 2]] - ratio[:, 1:2]
     shift, width = np.median(colour, axis=0), np.percentile(colour, 80, axis=0) - np.percentile(colour, 20, axis=0)
     k = int(np.argmax(np.abs(shift)))
@@ -427,11 +427,10 @@ def _check_drift(look: Look, views: Sequence[tuple[Image, Pose]], whites: Array)
     alike = width[k] < 0.75 * abs(shift[k]) and abs(change) < 0.4
     if abs(shift[k]) > TINT and abs(tints[-1, k] - tints[0, k]) > TINT and alike:
         text = f"the white balance drifts: {'red' if k == 0 else 'blue'} by a factor of {math.exp(shift[k]):.2f}"
-        found.append(Finding("camera.balance", text, "lock the camera's white balance"))
-    return found
+        yield Finding("camera.balance", text, "lock the camera's white balance")
 
 
-def _check_blur(marker: Marker, look: Look, views: Sequence[tuple[Image, Pose]]) -> list[Finding]:
+def _check_blur(marker: Marker, look: Look, views: Sequence[tuple[Image, Pose]]) -> Iterator[Finding]:
     """Width of printed edges in the picture."""
     pattern, widths = pattern_of(marker), []
     taps = np.linspace(-8, 8, 65)
@@ -452,8 +451,7 @@ def _check_blur(marker: Marker, look: Look, views: Sequence[tuple[Image, Pose]])
             widths.append(_rise(profile / top, taps))
     if widths and np.median(widths) > BLURRED:
         text = f"the picture is blurred: {np.median(widths):.0f} pixels across a printed edge"
-        return [Finding("picture.blurred", text, "focus on the card, and keep the camera still")]
-    return []
+        yield Finding("picture.blurred", text, "focus on the card, and keep the camera still")
 
 
 def _rise(profile: Array, taps: Any) -> float:

@@ -33,18 +33,9 @@ PIXELS: Final = 640 * 480
 """Pixels of a picture above which fewer frames are read, for the same total."""
 
 
-def check_up(
-    scene: Scene, source: str | int | Path | None, *, frames: int = FRAMES, quick: bool = False
-) -> list[Finding]:
-    """Return what is wrong with a set-up, the worst first.
-
-    Args:
-        scene: The scene.
-        source: The frames; None: look at the scene's numbers alone.
-        frames: How many to look at.
-        quick: Look at a few only, which takes about a second.
-    """
-    return check_and_look(scene, source, frames=frames, quick=quick)[0]
+def check_up(scene: Scene, source: str | int | Path | None, *, quick: bool = False) -> list[Finding]:
+    """Return what is wrong with a set-up, the worst first; arguments as those of `check_and_look`."""
+    return check_and_look(scene, source, quick=quick)[0]
 
 
 def quick_check(scene: Scene, given: str | int | Path | None) -> tuple[list[Finding], bool]:
@@ -72,7 +63,7 @@ def check_and_look(
     quick: bool = False,
     tell: Callable[[str], object] | None = None,
 ) -> tuple[list[Finding], Look | None]:
-    """As ``check_up``, with what the frames show, so that they need not be read twice.
+    """Return what is wrong with a set-up, the worst first, and what its frames show: they need not be read twice.
 
     Args:
         scene: The scene.
@@ -84,20 +75,19 @@ def check_and_look(
     Returns:
         The findings, and None in the look's place where no frames were read.
     """
-    found = check_scene(scene)
-    if source is None:
-        return worst_first(found), None
-    try:
-        look = _read(scene, source, None if quick else frames, tell)
-    except SourceError as error:
-        unread = Finding("source.unreadable", str(error), "check [source], or give --source")
-        return worst_first([*found, unread]), None
-    except SceneError as error:
-        unread = Finding("camera.aspect", str(error), "python -m warp_ar.calibrate camera PICTURES")
-        return worst_first([*found, unread]), None
-    if tell is not None:
-        tell("looking at card, ball and light")
-    return worst_first([*found, *_check_look(scene, look, 1 if quick else 4, found)]), look
+    unread = []
+    if source is not None:
+        try:
+            look = _read(scene, source, None if quick else frames, tell)
+        except SourceError as error:
+            unread = [Finding("source.unreadable", str(error), "check [source], or give --source")]
+        except SceneError as error:
+            unread = [Finding("camera.aspect", str(error), "python -m warp_ar.calibrate camera PICTURES")]
+        else:
+            if tell is not None:
+                tell("looking at card, ball and light")
+            return check_look(scene, look, 1 if quick else 4), look
+    return worst_first([*check_scene(scene), *unread]), None
 
 
 def _read(scene: Scene, source: str | int | Path, frames: int | None, tell: Callable[[str], object] | None) -> Look:
@@ -122,11 +112,12 @@ def check_look(scene: Scene, look: Look, views: int = 4) -> list[Finding]:
         look: What its frames show.
         views: In how many frames the ball is looked for, each about half a second.
     """
-    found = check_scene(scene)
-    return worst_first([*found, *_check_look(scene, look, views, found)])
+    before = check_scene(scene)
+    return worst_first([*before, *_check_frames(scene, look, views, {finding.name for finding in before})])
 
 
-def _check_look(scene: Scene, look: Look, views: int, before: list[Finding]) -> list[Finding]:
+def _check_frames(scene: Scene, look: Look, views: int, told: set[str]) -> list[Finding]:
+    """Return what frames tell beside what the scene's own numbers have told."""
     if not scene.has_marker and look.images:
         # Its poses are written down: no print is there to tell camera, light and ball by.
         return check_objects(scene, look.camera, written_poses(scene))
@@ -136,19 +127,16 @@ def _check_look(scene: Scene, look: Look, views: int, before: list[Finding]) -> 
     few = look.views[:: max(1, -(-len(look.views) // FEW_VIEWS))]
     found += [*check_print(scene.marker, look.camera, few), *check_proxies(scene, look.camera, few)]
     # Where the scene's own numbers cannot be, a picture says nothing more about them.
-    if any(finding.name.startswith("units.") for finding in before):
+    if any(name.startswith("units.") for name in told):
         return found
     found += check_objects(scene, look.camera, [pose for _, pose in look.views])
-    told = {finding.name for finding in before}
     balls = check_balls(scene, look, views)
-    if any(finding.name in ("camera.response", "card.contrast") for finding in found):
-        # What is mirrored is darker than what is seen directly: another curve changes their ratio.
-        balls = [finding for finding in balls if finding.name != "ball.reflectance"]
     if not any(finding.name in ("ball.outside", "ball.unfound") for finding in balls):
         found += check_saturation(scene, look)
-    if "ball.sunk" in told:
-        return [*found, *(f for f in balls if f.name != "ball.place")]
-    return [*found, *balls]
+    # What is mirrored is darker than what is seen directly: another curve changes their ratio.
+    known = {"ball.reflectance"} if {"camera.response", "card.contrast"} & {one.name for one in found} else set()
+    known |= {"ball.place"} if "ball.sunk" in told else set()
+    return [*found, *(finding for finding in balls if finding.name not in known)]
 
 
 def ball_is_seen(scene: Scene, camera: Camera, views: Iterable[tuple[Any, Pose]]) -> bool:
