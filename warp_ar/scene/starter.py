@@ -121,7 +121,7 @@ def amend_scene(
     Args:
         path: The file.
         section: Such as ``probe``; of several of its kind, the one at ``index``.
-        values: Keys with numbers, texts, lists of numbers, or a section below: its own keys.
+        values: Keys with numbers, texts, lists of numbers, or tables.
         index: Which of several.
         remove: Keys that the new ones stand for; what a new desk's file says of them goes with them.
 
@@ -143,10 +143,10 @@ def amend_scene(
     for key in gone:
         del table[key]
     for key, value in values.items():
-        if isinstance(value, Mapping):
-            _set_below(table, key, value)
-        else:
+        if key in table:
             table[key] = value
+        else:
+            _append(table, key, value)
     made = tomlkit.dumps(document)
     for key in gone:
         made = made.replace("\n".join(["", *key_comment(section, key), ""]), "\n")
@@ -157,16 +157,15 @@ def amend_scene(
         raise SinkError(f"{path}: cannot be written: {reason(error)}") from error
 
 
-def _set_below(table: Any, key: str, values: Mapping[str, Any]) -> None:
-    """Put a section below another, before the comment that stands above what follows in the file."""
+def _append(table: Any, key: str, value: Any) -> None:
+    """Put a key behind a section's last, before the comment that stands above what follows in the file."""
     body = table.value.body
     follows: list[Any] = []
     while body and body[-1][0] is None:
         follows.insert(0, body.pop()[1])
-    below = tomlkit.table()
-    for name, value in values.items():
-        below[name] = value
-    table.add(tomlkit.nl())
-    table.append(key, below)
+    if isinstance(value, Mapping):
+        given, value = value, tomlkit.inline_table()
+        value.update(given)
+    table.append(key, value)
     for item in follows:
         table.add(item)
