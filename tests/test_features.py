@@ -14,10 +14,11 @@ from tests.reference import latlong
 from warp_ar import explain
 from warp_ar.engine.graph import Plan, make_plan
 from warp_ar.kernels.environment import change
-from warp_ar.scene import Camera, Exposure, Marker, Probe, Scene, dumps_scene, load_scene
+from warp_ar.scene import Camera, CapturedLight, Exposure, Marker, Probe, Scene, dumps_scene, load_scene
 from warp_ar.stages.base import Arrays
 from warp_ar.stages.features import Features, find_features
 from warp_ar.stages.fill import Fill
+from warp_ar.stages.irradiance import Irradiance
 from warp_ar.stages.quality import PRESETS
 from warp_ar.stages.request import Request
 
@@ -73,6 +74,15 @@ def test_the_table_is_left_out_for_a_reason_that_is_true() -> None:
     reasons = dict(plan_of(exposure=Exposure(0.5), lights=()).left_out)
     assert reasons["summed_area"] == "the exposure does not look at means of a pixel's surroundings"
     assert "summed_area" not in dict(plan_of("paper", exposure=Exposure(0.5), lights=()).left_out)
+
+
+def test_a_captured_light_in_the_paper_s_preset_has_irradiance_by_series() -> None:
+    """There is no ball to look it up: arrays and kernels are both of the method that runs instead."""
+    lit = make_scene(captured=CapturedLight(Path("light.exr")))
+    found = find_features(Request(lit, PRESETS["paper"], SIZE))
+    assert (found.irradiance, found.distant.diffuse) == ("irradiance_sh", "sh")
+    assert Irradiance.method_for(found) == "sh2"
+    assert features_of("paper").irradiance == "irradiance_map"
 
 
 def explained(scene: object, tmp_path: Path, capsys: pytest.CaptureFixture[str], *more: str) -> str:

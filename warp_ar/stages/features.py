@@ -173,7 +173,8 @@ def find_features(request: Request) -> Features:
     area_samples = AREA_SAMPLES[area_method(quality)] if any(map(emits_light, scene.objects)) else 0
     placed = recovered or (environment and not observed and request.emitters)
     emitters = placed and quality.method("recover") == "shading"
-    by_series = quality.method("irradiance") == "sh2"
+    by_texture = quality.method("irradiance") == "sphere_mip"
+    by_series = quality.method("irradiance") == "sh2" or (by_texture and environment and not observed)
     merged = bracketed and len(request.exposures) > 1
     others = len(scene.probes) - 1 if observed and not merged and interpolates(scene, quality) else 0
     return Features(
