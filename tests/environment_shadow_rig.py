@@ -9,8 +9,8 @@ from warp_ar.kernels.environment import environment_samples
 from warp_ar.kernels.environment.environment_samples import EnvironmentSample, SampleSets
 from warp_ar.kernels.objects.reflect import DistantLight, DistantLightConfig
 from warp_ar.kernels.rays.trace import TraceConfig
-from warp_ar.kernels.receiver import environment_shadow, environment_shadow_filter, environment_shadow_wavefront
-from warp_ar.kernels.receiver.environment_shadow import EnvironmentShadowConfig, ShadowCells, shaded_shape
+from warp_ar.kernels.receiver import environment_shadow, environment_shadow_filter, environment_shadow_queue
+from warp_ar.kernels.receiver.environment_shadow import EnvironmentShadowConfig, ShadowCells, ShadowQueue, shaded_shape
 from warp_ar.kernels.structs import (
     LAMBERT,
     MESH,
@@ -111,7 +111,7 @@ def run(
     out=None,
     emitters=False,
     partials=1,
-    as_wavefront=False,
+    queued=False,
     others=None,
     loaded=None,
     single_sided=0,
@@ -121,7 +121,7 @@ def run(
     several = others is not None
     trace = TraceConfig(*kinds) if loaded is None else TraceConfig((MESH,), kinds[1], detail=True)
     forms = DistantLightConfig(trace, (LAMBERT,), False, "sh", False, bool(probes), several=several)
-    config = EnvironmentShadowConfig(forms, count, side, bounce, secondary, emitters, partials)
+    config = EnvironmentShadowConfig(forms, count, side, bounce, secondary, emitters, partials, queued)
     camera = camera_fields(CAMERA, LOOK_DOWN, 60, (H, W))
     params = records(FrameParams, {**camera, "shadow_rect": rect})
     scene = RayScene()
@@ -144,16 +144,18 @@ def run(
     shape = -(-H // stride), -(-W // stride)
     cells = shadow_cells(shape, stride)
     rays = wp.array(RAYS, dtype=wp.vec2)
-    wave = environment_shadow_wavefront.make_wavefront(config, *shape, rays.device) if as_wavefront else None
-    assert as_wavefront == (wave is not None)
+    queue = environment_shadow_queue.make_queue(config, *shape, rays.device) if queued else None
+    assert queued == (queue is not None)
     picture = make_picture(frame, tables()[0], rays)
     sets = SampleSets()
     sets.directions, sets.flux, sets.samples = drawn
     given = params, picture, scene, surroundings, sets
-    if wave is None:
-        environment_shadow.shade_environment(config, *given, cells, rows=rows)
+    if queue is None:
+        environment_shadow.shade_environment(config, *given, cells, ShadowQueue(), rows=rows)
     else:
-        environment_shadow_wavefront.shade_wavefront(config, given, cells, wave)
+        environment_shadow_queue.queue_shadows(config, *given, cells, queue)
+        environment_shadow_queue.trace_queue(config, *given, cells, queue)
+        environment_shadow_queue.reduce_cells(params, queue, cells)
     if not filtered:
         return cells.ratio.numpy()[..., :3], cells.surface.numpy()
     # Around cells that are not shaded nothing is averaged, and tiles in which no cell differs from 1 are passed by.

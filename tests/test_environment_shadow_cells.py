@@ -1,4 +1,4 @@
-"""Which cells of the frame are estimated, on CPU and by wavefronts, and how pixels are filtered from them."""
+"""Which cells of the frame are estimated, with and without a queue of rays, and how pixels are filtered from them."""
 
 import dataclasses
 
@@ -25,8 +25,8 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.mark.parametrize(("secondary", "bounce"), [(1.0, "estimated"), (0.5, "traced")])
-def test_a_wavefront_finds_the_same(device, bounce, secondary):
-    """By one kernel or by four: with a box, a ball and a lamp at a place, all of which may be before the objects."""
+def test_queued_rays_find_the_same(device, bounce, secondary):
+    """By one kernel or by three: with a box, a ball and a lamp at a place, all of which may be before the objects."""
     drawn = draw(with_sun(6, 20, 100.0))
     environment_samples.place_emitters(lamp_at((0.1, 0.05, 0.4)), ONE_BALL, drawn[2])
     scene = {
@@ -42,10 +42,10 @@ def test_a_wavefront_finds_the_same(device, bounce, secondary):
     one = run(drawn, **scene)
     assert one.min() < 0.7
     for partials in (2, 8):
-        found = run(drawn, **scene, partials=partials, as_wavefront=True)
+        found = run(drawn, **scene, partials=partials, queued=True)
         np.testing.assert_allclose(found, one, atol=SUM_ERROR)
-        np.testing.assert_array_equal(run(drawn, **scene, partials=partials, as_wavefront=True), found)
-    dark = run(drawn, **{**scene, "albedo": 0.0}, partials=8, as_wavefront=True)
+        np.testing.assert_array_equal(run(drawn, **scene, partials=partials, queued=True), found)
+    dark = run(drawn, **{**scene, "albedo": 0.0}, partials=8, queued=True)
     assert (dark[one < 0.99] < one[one < 0.99]).mean() > 0.5, "objects send light"
 
 
@@ -69,7 +69,7 @@ def test_what_is_seen_from_one_side_hides_the_sky_from_both(device, tmp_path, se
     }
     expected, _ = run(drawn, **about)
     assert (expected < 0.5).mean() > 0.02
-    for way in ({}, {"as_wavefront": True, "partials": 4}):
+    for way in ({}, {"queued": True, "partials": 4}):
         ratio, _ = run(drawn, **about, single_sided=1, **way)
         np.testing.assert_allclose(ratio, expected, atol=SUM_ERROR)
 

@@ -19,8 +19,8 @@ rays are traced, and cells that have none are done.
 The physical. A ray that meets a proxy or a mirror ball, with objects or without them, finds its light: the camera's
 picture of it where that shows it (``traced``), else what the ball saw in its direction; of a ball what it reflects.
 
-What objects send back is found by ``environment_shadow_bounce``. The estimate is one kernel here, for a CPU and for
-sets of any size, or a wavefront of kernels (``environment_shadow_wavefront``) with the same result.
+What objects send back is found by ``environment_shadow_bounce``: as a ray meets one, for a CPU and for sets of any
+size, or afterwards by rays that were queued (``environment_shadow_queue``), with the same result.
 
 References:
     [Deb98] Debevec 1998, Rendering Synthetic Objects into Real Scenes.
@@ -31,7 +31,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Literal
+from typing import Any, Literal
 
 import warp as wp
 
@@ -63,6 +63,10 @@ SHADED_TILE = wp.constant(4)
 """Cells along a tile that notes whether something in it is shaded."""
 CHUNK = wp.constant(64)
 """Samples that are culled together: the bits of a mask."""
+TILE_ROWS, TILE_COLUMNS = wp.constant(4), wp.constant(8)
+"""Cells of a warp, which takes a square of the frame."""
+QUEUED_REGISTERS = 128
+"""Registers of a CUDA thread where rays are queued: 80 make a frame of ``high`` 3 % slower, all that it takes 4 %."""
 MIN_IRRADIANCE = wp.constant(wp.float32(1.0e-6))
 """Irradiance, in camera values, below which a surface is dark and a shadow on it means nothing."""
 MAX_RATIO = wp.constant(wp.float32(4.0))
@@ -88,7 +92,9 @@ class EnvironmentShadowConfig:
     emitters: bool = False
     """True if some samples are emitters at a known distance."""
     partials: int = 1
-    """Partial sums per cell of the wavefront, a thread each: a divisor of count."""
+    """Partial sums per cell, a thread each: a divisor of count."""
+    queued: bool = False
+    """True if rays that ask what an object sends are queued, for sets of up to 64 samples."""
 
     def __post_init__(self) -> None:
         if self.count > CHUNK and self.count % CHUNK:
@@ -97,6 +103,8 @@ class EnvironmentShadowConfig:
             raise ValueError(f"secondary is {self.secondary}; expected a share of {self.count} samples")
         if self.count % self.partials:
             raise ValueError(f"partials is {self.partials}; expected a divisor of {self.count}")
+        if self.partials > 1 and not self.queued:
+            raise ValueError(f"partials is {self.partials}; expected 1 where rays are not queued")
 
     @property
     def secondary_count(self) -> int:
@@ -115,6 +123,18 @@ class ShadowCells:
     shaded: wp.array2d[wp.int32]  # per tile: number of the last frame in which something in it was shaded
     filtered: wp.array2d[wp.vec3]  # factor on the frame; written only where a surface is seen
     changed: wp.array2d[wp.int32]  # per tile: number of the last frame in which some factor in it was not 1
+
+
+@wp.struct
+class ShadowQueue:
+    """Rays that ask what objects send, and partial sums of cells; empty where rays are not queued."""
+
+    extent: wp.vec2i  # of ``tiled_shape``
+    items: wp.array[wp.int32]  # number of the cell times CHUNK, plus the sample
+    length: wp.array[wp.int32]  # (1,)
+    spans: wp.array3d[wp.vec2i]  # (partials, rows, columns): first ray in the queue and how many; -1: nothing is hidden
+    sums: wp.array3d[wp.vec3]  # (2 partials, rows, columns): light without the objects, and what they hide
+    reflected: wp.array2d[wp.vec3]  # (2, queue): what objects send of the environment, and of the receiver
 
 
 @wp.func
@@ -356,22 +376,65 @@ def make_find_sender(config: EnvironmentShadowConfig) -> wp.Function:
     return find_sender
 
 
+# Threads of a warp take cells of one set, so that their rays go the same way, from a square of the frame, so that they
+# meet the same or nothing: TILE_ROWS x TILE_COLUMNS of them, ``side`` apart. The warps that follow take the other sets
+# there, and all threads after those the next partial sum.
+@wp.func
+def tiled_cell(i: wp.int32, thread: wp.int32, side: wp.int32, extent: wp.vec2i) -> wp.vec3i:
+    """Row and column of the cell of a thread, and its partial sum; ``extent`` is that of ``tiled_shape``."""
+    number = i % extent[0] * extent[1] + thread
+    lane = number % (TILE_ROWS * TILE_COLUMNS)
+    one_of = number / (TILE_ROWS * TILE_COLUMNS) % (side * side)
+    tile = number / (TILE_ROWS * TILE_COLUMNS * side * side)
+    across = extent[1] / (TILE_COLUMNS * side)
+    row = (tile / across * TILE_ROWS + lane / TILE_COLUMNS) * side + one_of / side
+    column = (tile % across * TILE_COLUMNS + lane % TILE_COLUMNS) * side + one_of % side
+    return wp.vec3i(row, column, i / extent[0])
+
+
+def tiled_shape(rows: int, columns: int, side: int) -> tuple[int, int]:
+    """Rows and columns of threads for so many cells: rounded up to whole tiles of ``tiled_cell``."""
+    down, across = side * int(TILE_ROWS), side * int(TILE_COLUMNS)
+    return -(-rows // down) * down, -(-columns // across) * across
+
+
+@wp.func
+def queue_rays(found: wp.uint64, begin: wp.int32, size: wp.int32, cell: wp.int32, queue_out: ShadowQueue) -> wp.vec2i:
+    """Queue the rays of a cell whose bits are set, of samples from ``begin`` on; returns the first and how many."""
+    count = wp.int32(0)
+    for k in range(size):
+        if (found & (wp.uint64(1) << wp.uint64(k))) != wp.uint64(0):
+            count += 1
+    start = wp.int32(0)
+    if count > 0:
+        start = wp.atomic_add(queue_out.length, 0, count)
+    place = wp.int32(start)
+    for k in range(size):
+        if (found & (wp.uint64(1) << wp.uint64(k))) != wp.uint64(0):
+            queue_out.items[place] = cell * CHUNK + begin + k
+            place += 1
+    return wp.vec2i(start, count)
+
+
 @functools.cache
 def make_environment_shadow_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
     """Kernel specialised to ``config``; equal configs share one kernel."""
     trace = make_trace(config.distant.trace)
     closest_object, occluded_by_objects = trace.closest_object, trace.occluded_by_objects
-    mask_objects, mask_physical = make_masks(config, min(config.count, CHUNK))
+    chunk = min(config.count // config.partials, CHUNK)
+    mask_objects, mask_physical = make_masks(config, chunk)
     visible_proxy = make_visible_proxy(config.distant.trace)
     aim, find_sender = make_aim(config.emitters, config.distant.several), make_find_sender(config)
     traced = config.bounce == "traced"
     look_before = None if traced else make_look_before(config.distant)
     reflect_back = make_reflect_back(config.distant, traced)
-    side = config.side
-    chunk = min(config.count, CHUNK)
+    side, queued = config.side, config.queued
+    size = config.count // config.partials
     secondary_count = config.secondary_count
 
-    @wp.kernel(module="unique", enable_backward=False)
+    registers = {"cuda_max_registers": QUEUED_REGISTERS} if queued else {}
+
+    @wp.kernel(module="unique", enable_backward=False, **registers)
     def environment_shadow_kernel(
         # In:
         row_start: wp.int32,
@@ -382,22 +445,32 @@ def make_environment_shadow_kernel(config: EnvironmentShadowConfig) -> wp.Kernel
         sets: SampleSets,
         # Out:
         cells_out: ShadowCells,
+        queue_out: ShadowQueue,
     ):
         i, j = wp.tid()
         i += row_start
+        partial = wp.int32(0)
+        if wp.static(queued):
+            cell = tiled_cell(i, j, side, queue_out.extent)
+            i, j, partial = cell[0], cell[1], cell[2]
+            if i >= cells_out.surface.shape[0] or j >= cells_out.surface.shape[1]:
+                return
+            queue_out.spans[partial, i, j] = wp.vec2i(0, -1)
         rays = picture.rays
         stride = cells_out.stride
         row = cell_pixel(i, stride, rays.shape[0])
         column = cell_pixel(j, stride, rays.shape[1])
-        cells_out.surface[i, j] = -1
+        if partial == 0:
+            cells_out.surface[i, j] = -1
         if not can_matter(row, column, stride * side, params[0].shadow_rect):
             return
         hit = visible_proxy(params[0], rays[row, column], scene, distant.probes)
         if hit.shape < 0:
             return
-        cells_out.surface[i, j] = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
-        cells_out.ratio[i, j] = wp.vec4(1.0, 1.0, 1.0, hit.t)
-        cells_out.bounced[i, j] = wp.vec3(0.0)
+        if partial == 0:
+            cells_out.surface[i, j] = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
+            cells_out.ratio[i, j] = wp.vec4(1.0, 1.0, 1.0, hit.t)
+            cells_out.bounced[i, j] = wp.vec3(0.0)
 
         point = hit.point
         own = hit.shape
@@ -408,24 +481,29 @@ def make_environment_shadow_kernel(config: EnvironmentShadowConfig) -> wp.Kernel
         before = Before()
         # A set is in the order of its sequence: any first part of it is a smaller set.
         first = first_of_set(i, j, side, sets.samples.shape[0])
-        virtual_mask = mask_objects(scene, sets, first, point)
+        begin = partial * size
+        virtual_mask = mask_objects(scene, sets, first + begin, point)
         hides_any = virtual_mask != wp.uint64(0)
-        blocks = wp.int32(wp.static(config.count // chunk))  # a variable: not to be unrolled
-        for block in range(1, blocks):
-            if not hides_any:
-                hides_any = mask_objects(scene, sets, first + block * wp.static(chunk), point) != wp.uint64(0)
+        # Variables: not to be unrolled.
+        every = wp.int32(wp.static(config.count // chunk))
+        blocks = wp.int32(wp.static(size // chunk))
+        for block in range(every):
+            other_block = block * wp.static(chunk)
+            if not hides_any and other_block != begin:
+                hides_any = mask_objects(scene, sets, first + other_block, point) != wp.uint64(0)
         if not hides_any:
             return
+        found = wp.uint64(0)
         for block in range(blocks):
-            at = first + block * wp.static(chunk)
+            at = first + begin + block * wp.static(chunk)
             if block > 0:
                 virtual_mask = mask_objects(scene, sets, at, point)
             physical = mask_physical(scene, distant, sets, at, point, own)
             # Most samples meet nothing: they are but a sum.
             met = virtual_mask | physical.proxies | physical.balls
             bit = wp.uint64(1)
-            size = wp.int32(wp.static(chunk))  # a variable: unrolled, the kernel would hold its rays many times over
-            for k in range(size):
+            samples = wp.int32(wp.static(chunk))  # a variable: unrolled, the kernel would hold its rays many times over
+            for k in range(samples):
                 ray = aim(sets, distant.others.places, at + k, hit)
                 if ray.cosine > 0.0:
                     if (met & bit) == wp.uint64(0):
@@ -440,12 +518,11 @@ def make_environment_shadow_kernel(config: EnvironmentShadowConfig) -> wp.Kernel
                         radiance = sender.radiance
                         without += weight * radiance
                         if (virtual_mask & bit) != wp.uint64(0):
+                            asks = begin + block * wp.static(chunk) + k < wp.static(secondary_count)
                             other = Hit()
                             other.shape = -1
                             sure = wp.bool(False)
-                            if wp.static(secondary_count == config.count) or block * wp.static(chunk) + k < wp.static(
-                                secondary_count
-                            ):
+                            if asks and wp.static(not queued):
                                 other = closest_object(scene, ray.origin, ray.direction, sender.distance)
                                 sure = other.shape >= 0 or not one_sided
                             hides = other.shape >= 0
@@ -453,18 +530,27 @@ def make_environment_shadow_kernel(config: EnvironmentShadowConfig) -> wp.Kernel
                                 hides = occluded_by_objects(scene, ray.origin, ray.direction, sender.distance)
                             if hides:
                                 hidden += weight * radiance
-                            if other.shape >= 0:
-                                stands_for = weight * wp.static(config.count / secondary_count)
-                                meeting = meet_object(scene, other, point, ray.direction, stands_for)
-                                seed = wp.vec3ui()
-                                if wp.static(traced):
-                                    seed = pcg3d_hash(wp.uint32(at + k), wp.uint32(row), wp.uint32(column))
-                                elif before.up == wp.vec3(0.0, 0.0, 0.0):
-                                    before = look_before(distant, hit.point, hit.geometric_normal, ray.direction)
-                                reflected = reflect_back(
-                                    params[0], picture, scene, distant, meeting, before, seed, reflected
-                                )
+                                if asks:
+                                    found = found | bit
+                            if wp.static(not queued):
+                                if other.shape >= 0:
+                                    stands_for = weight * wp.static(config.count / secondary_count)
+                                    meeting = meet_object(scene, other, point, ray.direction, stands_for)
+                                    seed = wp.vec3ui()
+                                    if wp.static(traced):
+                                        seed = pcg3d_hash(wp.uint32(at + k), wp.uint32(row), wp.uint32(column))
+                                    elif before.up == wp.vec3(0.0, 0.0, 0.0):
+                                        before = look_before(distant, hit.point, hit.geometric_normal, ray.direction)
+                                    reflected = reflect_back(
+                                        params[0], picture, scene, distant, meeting, before, seed, reflected
+                                    )
                 bit = bit << wp.uint64(1)
+        if wp.static(queued):
+            cell_number = i * cells_out.surface.shape[1] + j
+            queue_out.spans[partial, i, j] = queue_rays(found, begin, size, cell_number, queue_out)
+            queue_out.sums[2 * partial, i, j] = without
+            queue_out.sums[2 * partial + 1, i, j] = hidden
+            return
         unchanged = hidden + reflected.sent == wp.vec3(0.0, 0.0, 0.0)
         if cells_out.shaded.shape[0] > 0 and not unchanged:
             cells_out.shaded[i / SHADED_TILE, j / SHADED_TILE] = params[0].frame_index
@@ -474,7 +560,15 @@ def make_environment_shadow_kernel(config: EnvironmentShadowConfig) -> wp.Kernel
     return environment_shadow_kernel
 
 
-shade_environment = row_launcher(make_environment_shadow_kernel, like=lambda *given: given[-1].surface)
+def _threads(*given: Any) -> tuple[int, int]:
+    """Extent of a launch: the cells', or that of all partial sums where rays are queued."""
+    cells, queue = given[-2:]
+    if queue.spans is None:
+        return cells.surface.shape
+    return queue.spans.shape[0] * queue.extent[0], queue.extent[1]
+
+
+shade_environment = row_launcher(make_environment_shadow_kernel, outputs=2, like=_threads)
 """Estimate the ratio for one pixel of every ``stride x stride``, each with one set of samples.
 
 Args:
@@ -484,5 +578,7 @@ Args:
     scene: Objects and proxies.
     distant: The environment; what ``config.distant`` leaves out may be empty.
     sets: config.side^2 sets of config.count samples or more.
-    cells_out: (ceil(H / stride), ceil(W / stride)) cells: ratio, bounced, surface and shaded are written.
+    cells_out: (ceil(H / stride), ceil(W / stride)) cells: ratio, bounced, surface and shaded are written; where rays
+        are queued, by ``reduce_cells`` for those that something may shade.
+    queue_out: Rays that were not traced, and sums; empty if ``config.queued`` is not set.
 """

@@ -11,10 +11,11 @@ import warp as wp
 from warp_ar.kernels.cells import cell_shape, cell_stride
 from warp_ar.kernels.environment.environment_samples import SampleSets
 from warp_ar.kernels.receiver import environment_shadow_filter as filters
-from warp_ar.kernels.receiver import environment_shadow_wavefront as wavefront
+from warp_ar.kernels.receiver import environment_shadow_queue as queues
 from warp_ar.kernels.receiver.environment_shadow import (
     EnvironmentShadowConfig,
     ShadowCells,
+    ShadowQueue,
     shade_environment,
     shaded_shape,
 )
@@ -30,9 +31,6 @@ from warp_ar.stages.shared.lighting import (
     make_other_balls,
 )
 from warp_ar.stages.shared.picture import GrowingRows, find_picture, frame_reads
-
-DRAWN = ("pose", "objects", "environment_samples", "probe_places")
-"""Resources that say where the samples are and what hides them."""
 
 
 def find_stride(method: Method, rows: int) -> int:
@@ -122,11 +120,12 @@ class EnvironmentShadow(Stage):
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Estimates, then their mean."""
         config = shadow_config(self.features, device)
-        wave = None
+        queue = None
         if not device.is_cpu:
             size = shadow_cells(self.features)
-            config = dataclasses.replace(config, partials=wavefront.count_partials(*size))
-            wave = wavefront.make_wavefront(config, *size, device)
+            by_queue = dataclasses.replace(config, partials=queues.count_partials(*size), queued=True)
+            queue = queues.make_queue(by_queue, *size, device)
+            config = config if queue is None else by_queue
         distant = make_distant_light(self.features, arrays)
         distant.environment = arrays["environment"]
         if self.features.others:
@@ -143,13 +142,13 @@ class EnvironmentShadow(Stage):
             reach = config.side  # the filter looks beyond the rows that it writes
             return max(start // stride - reach, 0), min(-(-stop // stride) + reach, count)
 
-        if wave is None:
-            estimates = [over_rows(count, shade_environment, config, *given, cells, extent=cell_rows)]
-        else:  # rays need not wait for the light's filtered forms, nor for each other
-            drawn = tuple(name for name in self.wiring.reads if name in DRAWN)
+        if queue is None:
+            estimates = [over_rows(count, shade_environment, config, *given, cells, ShadowQueue(), extent=cell_rows)]
+        else:
             estimates = [
-                Pass(lambda rows, one=one: one(config, given, cells, wave), reads=reads)  # type: ignore[misc]
-                for one, reads in zip(wavefront.PASSES, (drawn, None, None, None), strict=True)
+                Pass(lambda _: queues.queue_shadows(config, *given, cells, queue)),
+                Pass(lambda _: queues.trace_queue(config, *given, cells, queue)),
+                Pass(lambda _: queues.reduce_cells(params, queue, cells)),
             ]
         seen = params, arrays["rays"], scene, arrays["probes"], cells, arrays["shadow_ratio"]
         return [
