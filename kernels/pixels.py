@@ -101,11 +101,3 @@ def is_at_clipping(value: wp.vec3, levels: mat23) -> wp.vec3:
         wp.where(value[1] >= least[1], 1.0, 0.0),
         wp.where(value[2] >= least[2], 1.0, 0.0),
     )
-
-
-def pixel_run(device: wp.DeviceLike) -> int:
-    """Return how many pixels of a row one thread does, where most pixels take next to no time.
-
-    To begin a thread costs a CPU as much as such a pixel. On CUDA neighbours are read side by side by neighbours.
-    """
-    return 32 if wp.get_device(device).is_cpu else 1

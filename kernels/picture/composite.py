@@ -15,8 +15,7 @@ from __future__ import annotations
 import warp as wp
 
 from warp_ar.kernels.color import below_saturation, decode, encode, saturation_codes
-from warp_ar.kernels.launch import Rows, launch_rows
-from warp_ar.kernels.pixels import pixel_run
+from warp_ar.kernels.launch import row_launcher
 from warp_ar.kernels.rays.visibility import inside_rect
 from warp_ar.kernels.structs import FrameParams, filled
 
@@ -120,35 +119,15 @@ def make_layers(
     return filled(Layers(), objects=virtual, added=added_light, ratio=shadow_ratio, mirror_ball=mirror_ball)
 
 
-def composite(
-    params: wp.array,
-    frame: wp.array,
-    decode_table: wp.array,
-    encode_table: wp.array,
-    layers: Layers,
-    image_out: wp.array,
-    *,
-    rows: Rows | None = None,
-) -> None:
-    """Write the picture.
+composite = row_launcher(composite_kernel, runs=True)
+"""Write the picture.
 
-    Args:
-        params: (1,) FrameParams; its rectangles bound the layers.
-        frame: (H, W) vec3ub, the camera's frame, RGB, contiguous.
-        decode_table: (257,) vec3 of ``color.camera_table``, or (256,) of ``color.decode_table``.
-        encode_table: Table of ``color.encode_table``.
-        layers: From ``make_layers``.
-        image_out: (H, W) vec3ub, contiguous; values above clipping give the code where the camera
-            saturates or the frame's, whichever is more; NaN gives 0.
-        rows: Band of rows; None means all.
-    """
-    height, width = frame.shape
-    run = pixel_run(frame.device)
-    launch_rows(
-        composite_kernel,
-        (height, -(-width // run)),
-        [params, frame, decode_table, encode_table, layers, run],
-        [image_out],
-        rows=rows,
-        device=frame.device,
-    )
+Args:
+    params: (1,) FrameParams; its rectangles bound the layers.
+    frame: (H, W) vec3ub, the camera's frame, RGB, contiguous.
+    decode_table: (257,) vec3 of ``color.camera_table``, or (256,) of ``color.decode_table``.
+    encode_table: Table of ``color.encode_table``.
+    layers: From ``make_layers``.
+    image_out: (H, W) vec3ub, contiguous; values above clipping give the code where the camera saturates or the
+        frame's, whichever is more; NaN gives 0.
+"""

@@ -60,10 +60,9 @@ import functools
 import warp as wp
 
 from warp_ar.kernels.color import below_saturation, decode, encode, is_clipped, saturation_codes
-from warp_ar.kernels.launch import Rows, launch, launch_rows, row_launcher
+from warp_ar.kernels.launch import launch, row_launcher
 from warp_ar.kernels.picture.composite import Layers, compose, is_changed, read_layers
 from warp_ar.kernels.picture.summed_area import fine_mean
-from warp_ar.kernels.pixels import pixel_run
 from warp_ar.kernels.structs import FrameParams, Picture, filled
 
 wp.set_module_options({"enable_backward": False})
@@ -377,36 +376,15 @@ def expose_codes(decode_table: wp.array, encode_table: wp.array, scale: wp.array
     launch(expose_codes_kernel, 256, [decode_table, encode_table, scale], [codes_out], device=scale.device)
 
 
-def expose(
-    method: str,
-    params: wp.array,
-    picture: Picture,
-    layers: Layers,
-    clipped: ClippedEvidence,
-    exposure: Exposure,
-    image_out: wp.array,
-    *,
-    rows: Rows | None = None,
-) -> None:
-    """Write the picture at another exposure, layers composed.
+expose = row_launcher(make_expose_kernel, runs=True)
+"""Write the picture at another exposure, layers composed.
 
-    Args:
-        method: One of ``METHODS``, or of the readings in ``BOXES``.
-        params: (1,) FrameParams; its rectangles bound the layers.
-        picture: (H, W) the camera's, contiguous; its rays are not read.
-        layers: From ``make_layers``.
-        clipped: From ``make_clipped_evidence``.
-        exposure: From ``make_exposure``.
-        image_out: (H, W) vec3ub, contiguous.
-        rows: Band of rows; None means all.
-    """
-    (height, width), device = image_out.shape, image_out.device
-    run = pixel_run(device)
-    launch_rows(
-        make_expose_kernel(method),
-        (height, -(-width // run)),
-        [params, picture, layers, clipped, exposure, run],
-        [image_out],
-        rows=rows,
-        device=device,
-    )
+Args:
+    method: One of ``METHODS``, or of the readings in ``BOXES``.
+    params: (1,) FrameParams; its rectangles bound the layers.
+    picture: (H, W) the camera's, contiguous; its rays are not read.
+    layers: From ``make_layers``.
+    clipped: From ``make_clipped_evidence``.
+    exposure: From ``make_exposure``.
+    image_out: (H, W) vec3ub, contiguous.
+"""

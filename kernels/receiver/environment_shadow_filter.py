@@ -16,9 +16,7 @@ import functools
 
 import warp as wp
 
-from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows, row_launcher
-from warp_ar.kernels.objects.reflect import DistantLightConfig
-from warp_ar.kernels.pixels import pixel_run
+from warp_ar.kernels.launch import MOST_REGISTERS, row_launcher
 from warp_ar.kernels.rays.shapes import FACES, MESH_KEY, surface_key
 from warp_ar.kernels.rays.visibility import inside_rect, make_visible_proxy
 from warp_ar.kernels.receiver.environment_shadow import SHADED_TILE, EnvironmentShadowConfig, ShadowCells
@@ -179,9 +177,9 @@ def ratio_between(cells: ShadowCells, key: wp.int32, y: wp.float32, x: wp.float3
 
 
 @functools.cache
-def make_spread_ratio_kernel(config: DistantLightConfig) -> wp.Kernel:
+def make_spread_ratio_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
     """Kernel of ``spread_ratio``, specialised to ``config``."""
-    visible_proxy = make_visible_proxy(config.trace)
+    visible_proxy = make_visible_proxy(config.distant.trace)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def spread_ratio_kernel(
@@ -240,37 +238,15 @@ Args:
 """
 
 
-def spread_ratio(
-    config: EnvironmentShadowConfig,
-    params: wp.array[FrameParams],
-    rays: wp.array2d[wp.vec2],
-    scene: RayScene,
-    probes: wp.array[Probe],
-    cells: ShadowCells,
-    shadow_ratio_out: wp.array2d[wp.vec3],
-    *,
-    rows: Rows | None = None,
-) -> None:
-    """Give every pixel its ratio.
+spread_ratio = row_launcher(make_spread_ratio_kernel, runs=True)
+"""Give every pixel its ratio.
 
-    Args:
-        config: As that of ``shade_environment``.
-        params: (1,) FrameParams: camera, shadow_rect, frame_index.
-        rays: (H, W) undistorted (x / z, y / z) of each pixel's centre.
-        scene: Proxies.
-        probes: Mirror balls.
-        cells: From ``filter_ratio``. Without changed, every pixel is looked at.
-        shadow_ratio_out: (H, W) factor on the frame; 1 outside the rectangle and where no proxy is seen.
-        rows: Band of rows; None means all.
-    """
-    height, width = shadow_ratio_out.shape
-    device = rays.device
-    run = pixel_run(device)
-    launch_rows(
-        make_spread_ratio_kernel(config.distant),
-        (height, -(-width // run)),
-        [params, rays, scene, probes, cells, run],
-        [shadow_ratio_out],
-        rows=rows,
-        device=device,
-    )
+Args:
+    config: As that of ``shade_environment``.
+    params: (1,) FrameParams: camera, shadow_rect, frame_index.
+    rays: (H, W) undistorted (x / z, y / z) of each pixel's centre.
+    scene: Proxies.
+    probes: Mirror balls.
+    cells: From ``filter_ratio``. Without changed, every pixel is looked at.
+    shadow_ratio_out: (H, W) factor on the frame; 1 outside the rectangle and where no proxy is seen.
+"""
