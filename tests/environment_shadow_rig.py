@@ -9,7 +9,7 @@ from warp_ar.kernels.environment import environment_samples
 from warp_ar.kernels.environment.environment_samples import EnvironmentSample, SampleSets
 from warp_ar.kernels.objects.reflect import DistantLight, DistantLightConfig
 from warp_ar.kernels.rays.trace import TraceConfig
-from warp_ar.kernels.receiver import environment_shadow, environment_shadow_filter, environment_shadow_queue
+from warp_ar.kernels.receiver import environment_shadow, environment_shadow_filter
 from warp_ar.kernels.receiver.environment_shadow import EnvironmentShadowConfig, ShadowCells, ShadowQueue, shaded_shape
 from warp_ar.kernels.structs import (
     LAMBERT,
@@ -144,7 +144,7 @@ def run(
     shape = -(-H // stride), -(-W // stride)
     cells = shadow_cells(shape, stride)
     rays = wp.array(RAYS, dtype=wp.vec2)
-    queue = environment_shadow_queue.make_queue(config, *shape, rays.device) if queued else None
+    queue = environment_shadow.make_queue(config, *shape, rays.device) if queued else None
     assert queued == (queue is not None)
     picture = make_picture(frame, tables()[0], rays)
     sets = SampleSets()
@@ -153,9 +153,7 @@ def run(
     if queue is None:
         environment_shadow.shade_environment(config, *given, cells, ShadowQueue(), rows=rows)
     else:
-        environment_shadow_queue.queue_shadows(config, *given, cells, queue)
-        environment_shadow_queue.trace_queue(config, *given, cells, queue)
-        environment_shadow_queue.reduce_cells(params, queue, cells)
+        environment_shadow.shade_by_queue(config, *given, cells, queue)
     if not filtered:
         return cells.ratio.numpy()[..., :3], cells.surface.numpy()
     # Around cells that are not shaded nothing is averaged, and tiles in which no cell differs from 1 are passed by.

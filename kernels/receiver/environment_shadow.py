@@ -20,7 +20,9 @@ The physical. A ray that meets a proxy or a mirror ball, with objects or without
 picture of it where that shows it (``traced``), else what the ball saw in its direction; of a ball what it reflects.
 
 What objects send back is found by ``environment_shadow_bounce``: as a ray meets one, for a CPU and for sets of any
-size, or afterwards by rays that were queued (``environment_shadow_queue``), with the same result.
+size, or afterwards with the same result. Rays that ask trace three more each and are rare: on CUDA they would stall
+their warp. So there rays only stop at objects, several threads sharing a cell's samples; those that ask are queued and
+traced side by side; and sums are added in the order of the samples, with the same bits in every run.
 
 References:
     [Deb98] Debevec 1998, Rendering Synthetic Objects into Real Scenes.
@@ -39,7 +41,7 @@ from warp_ar.kernels.cells import cell_pixel
 from warp_ar.kernels.environment.environment_samples import SampleSets, ball_of_sample, sample_toward
 from warp_ar.kernels.environment.probe_weights import probe_share
 from warp_ar.kernels.latlong import sample_latlong
-from warp_ar.kernels.launch import row_launcher
+from warp_ar.kernels.launch import MOST_REGISTERS, launch, row_launcher
 from warp_ar.kernels.materials import reflect
 from warp_ar.kernels.objects.reflect import DistantLight, DistantLightConfig, look_up, make_find_in_frame
 from warp_ar.kernels.rays.shapes import FAR, intersect_sphere, surface_key
@@ -67,6 +69,14 @@ TILE_ROWS, TILE_COLUMNS = wp.constant(4), wp.constant(8)
 """Cells of a warp, which takes a square of the frame."""
 QUEUED_REGISTERS = 128
 """Registers of a CUDA thread where rays are queued: 80 make a frame of ``high`` 3 % slower, all that it takes 4 %."""
+MAX_QUEUE = 1 << 24
+"""Rays that may be queued: beyond it the queue takes too much memory, 16 bytes each and more."""
+MAX_PARTIALS = 8
+"""Threads of a CUDA device that share a cell's samples at most, each with a partial sum."""
+ENOUGH_THREADS = 1 << 20
+"""Threads from which more make a CUDA device slower: each finds the cell's point and picks its samples anew."""
+QUEUE_THREADS = 1 << 17
+"""Threads that trace the queue, each what is left of it when the others have theirs."""
 MIN_IRRADIANCE = wp.constant(wp.float32(1.0e-6))
 """Irradiance, in camera values, below which a surface is dark and a shadow on it means nothing."""
 MAX_RATIO = wp.constant(wp.float32(4.0))
@@ -579,6 +589,124 @@ Args:
     distant: The environment; what ``config.distant`` leaves out may be empty.
     sets: config.side^2 sets of config.count samples or more.
     cells_out: (ceil(H / stride), ceil(W / stride)) cells: ratio, bounced, surface and shaded are written; where rays
-        are queued, by ``reduce_cells`` for those that something may shade.
+        are queued, not those that something may shade.
     queue_out: Rays that were not traced, and sums; empty if ``config.queued`` is not set.
 """
+
+
+@functools.cache
+def make_trace_queue_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
+    """Kernel of what objects send along the queued rays."""
+    secondary_count, side = config.secondary_count, config.side
+    aim = make_aim(config.emitters, config.distant.several)
+    closest_object = make_trace(config.distant.trace).closest_object
+    visible_proxy = make_visible_proxy(config.distant.trace)
+    traced = config.bounce == "traced"
+    look_before = None if traced else make_look_before(config.distant)
+    reflect_back = make_reflect_back(config.distant, traced)
+
+    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
+    def trace_queue_kernel(
+        # In:
+        threads: wp.int32,
+        params: wp.array[FrameParams],
+        picture: Picture,
+        scene: RayScene,
+        distant: DistantLight,
+        sets: SampleSets,
+        cells: ShadowCells,
+        # Out:
+        queue_out: ShadowQueue,
+    ):
+        rays = picture.rays
+        columns = cells.surface.shape[1]
+        for place in range(wp.tid(), queue_out.length[0], threads):
+            item = queue_out.items[place]
+            i = item / CHUNK / columns
+            j = item / CHUNK % columns
+            index = first_of_set(i, j, side, sets.samples.shape[0]) + item % CHUNK
+            row = cell_pixel(i, cells.stride, rays.shape[0])
+            column = cell_pixel(j, cells.stride, rays.shape[1])
+            hit = visible_proxy(params[0], rays[row, column], scene, distant.probes)
+            ray = aim(sets, distant.others.places, index, hit)
+            ray.origin = offset_origin(hit.point, hit.geometric_normal, ray.direction, hit.error)
+            reflected = ReflectedLight()
+            # What is nearer than all that is physical is nearest.
+            other = closest_object(scene, ray.origin, ray.direction, FAR)
+            if other.shape >= 0:
+                weight = ray.cosine * ray.grown * sets.samples[index].measure
+                stands_for = weight * wp.static(config.count / secondary_count)
+                meeting = meet_object(scene, other, hit.point, ray.direction, stands_for)
+                seed = wp.vec3ui()
+                before = Before()
+                if wp.static(traced):
+                    seed = pcg3d_hash(wp.uint32(index), wp.uint32(row), wp.uint32(column))
+                else:
+                    before = look_before(distant, hit.point, hit.geometric_normal, ray.direction)
+                reflected = reflect_back(params[0], picture, scene, distant, meeting, before, seed, reflected)
+            queue_out.reflected[0, place] = reflected.sent
+            queue_out.reflected[1, place] = reflected.returned
+
+    return trace_queue_kernel
+
+
+@wp.kernel(enable_backward=False)
+def reduce_cells_kernel(
+    # In:
+    params: wp.array[FrameParams],
+    queue: ShadowQueue,
+    # Out:
+    cells_out: ShadowCells,
+):
+    """Sums in the order of the samples, wherever their threads put them: the same bits in every run."""
+    i, j = wp.tid()
+    if queue.spans[0, i, j][1] < 0:
+        return
+    without = wp.vec3(0.0)
+    hidden = wp.vec3(0.0)
+    sent = wp.vec3(0.0)
+    returned = wp.vec3(0.0)
+    for partial in range(queue.spans.shape[0]):
+        without += queue.sums[2 * partial, i, j]
+        hidden += queue.sums[2 * partial + 1, i, j]
+        span = queue.spans[partial, i, j]
+        for place in range(span[0], span[0] + span[1]):
+            sent += queue.reflected[0, place]
+            returned += queue.reflected[1, place]
+    unchanged = hidden + sent == wp.vec3(0.0, 0.0, 0.0)
+    if cells_out.shaded.shape[0] > 0 and not unchanged:
+        cells_out.shaded[i / SHADED_TILE, j / SHADED_TILE] = params[0].frame_index
+    cells_out.ratio[i, j] = ratio_of(without, hidden, cells_out.ratio[i, j][3])
+    cells_out.bounced[i, j] = bounced_of(without, hidden, sent, returned)
+
+
+def count_partials(rows: int, columns: int) -> int:
+    """Threads per cell: as many as it takes to fill a CUDA device, up to ``MAX_PARTIALS``, a power of 2."""
+    partials = MAX_PARTIALS
+    while partials > 1 and partials * rows * columns > ENOUGH_THREADS:
+        partials //= 2
+    return partials
+
+
+def make_queue(config: EnvironmentShadowConfig, rows: int, columns: int, device: wp.DeviceLike) -> ShadowQueue | None:
+    """Scratch for so many cells; None where a cell has more than ``CHUNK`` samples, or too many rays may be queued."""
+    size = rows * columns * config.secondary_count
+    if config.count > CHUNK or size > MAX_QUEUE:
+        return None
+    queue = ShadowQueue()
+    queue.extent = wp.vec2i(*tiled_shape(rows, columns, config.side))
+    queue.items, queue.length = wp.empty(size, dtype=wp.int32, device=device), wp.zeros(1, wp.int32, device=device)
+    queue.spans = wp.empty((config.partials, rows, columns), dtype=wp.vec2i, device=device)
+    queue.sums = wp.empty((2 * config.partials, rows, columns), dtype=wp.vec3, device=device)
+    queue.reflected = wp.empty((2, size), dtype=wp.vec3, device=device)
+    return queue
+
+
+def shade_by_queue(config: EnvironmentShadowConfig, *given: Any) -> None:
+    """Estimate the ratio as ``shade_environment`` does, with its arguments and the scratch of ``make_queue``."""
+    cells, queue = given[-2:]
+    device, threads = queue.items.device, min(queue.items.shape[0], QUEUE_THREADS)
+    queue.length.zero_()
+    shade_environment(config, *given)
+    launch(make_trace_queue_kernel(config), threads, [threads, *given[:-1]], [queue], device=device)
+    launch(reduce_cells_kernel, cells.surface.shape, [given[0], queue], [cells], device=device)

@@ -10,15 +10,9 @@ import warp as wp
 
 from warp_ar.kernels.cells import cell_shape, cell_stride
 from warp_ar.kernels.environment.environment_samples import SampleSets
+from warp_ar.kernels.receiver import environment_shadow as kernels
 from warp_ar.kernels.receiver import environment_shadow_filter as filters
-from warp_ar.kernels.receiver import environment_shadow_queue as queues
-from warp_ar.kernels.receiver.environment_shadow import (
-    EnvironmentShadowConfig,
-    ShadowCells,
-    ShadowQueue,
-    shade_environment,
-    shaded_shape,
-)
+from warp_ar.kernels.receiver.environment_shadow import EnvironmentShadowConfig, ShadowCells, ShadowQueue, shaded_shape
 from warp_ar.kernels.structs import filled
 from warp_ar.stages import base
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring, over_rows
@@ -123,8 +117,8 @@ class EnvironmentShadow(Stage):
         queue = None
         if not device.is_cpu:
             size = shadow_cells(self.features)
-            by_queue = dataclasses.replace(config, partials=queues.count_partials(*size), queued=True)
-            queue = queues.make_queue(by_queue, *size, device)
+            by_queue = dataclasses.replace(config, partials=kernels.count_partials(*size), queued=True)
+            queue = kernels.make_queue(by_queue, *size, device)
             config = config if queue is None else by_queue
         distant = make_distant_light(self.features, arrays)
         distant.environment = arrays["environment"]
@@ -142,17 +136,13 @@ class EnvironmentShadow(Stage):
             reach = config.side  # the filter looks beyond the rows that it writes
             return max(start // stride - reach, 0), min(-(-stop // stride) + reach, count)
 
-        if queue is None:
-            estimates = [over_rows(count, shade_environment, config, *given, cells, ShadowQueue(), extent=cell_rows)]
-        else:
-            estimates = [
-                Pass(lambda _: queues.queue_shadows(config, *given, cells, queue)),
-                Pass(lambda _: queues.trace_queue(config, *given, cells, queue)),
-                Pass(lambda _: queues.reduce_cells(params, queue, cells)),
-            ]
+        own = config, *given, cells
+        estimates = over_rows(count, kernels.shade_environment, *own, ShadowQueue(), extent=cell_rows)
+        if queue is not None:
+            estimates = Pass(lambda _: kernels.shade_by_queue(*own, queue))
         seen = params, arrays["rays"], scene, arrays["probes"], cells, arrays["shadow_ratio"]
         return [
-            *estimates,
+            estimates,
             over_rows(count, filters.filter_ratio, config, params, cells, extent=cell_rows),
             over_rows(self.height, filters.spread_ratio, config, *seen, extent=GrowingRows(shadow_rows)),
         ]
