@@ -245,7 +245,7 @@ class FrameInputs:
         self.host_scene.set_gain(white * self.gain)
 
     def close(self) -> None:
-        """Stop the copying threads."""
+        """Let go of what frames are sent by."""
         if self.transfers is not None:
             self.transfers.close()
 
@@ -419,13 +419,12 @@ class FrameInputs:
         """Have what is launched from now on see the picture that was written, where it is on its way to the device."""
         slot, self._coming = self._coming, None
         if slot is not None and self.transfers is not None:
-            self.transfers.send(slot)
             self.transfers.receive(slot, self.frame)
 
     def _take_picture(self, frame: SeenFrame) -> bool:
         """Copy the picture; False if it is the one that is there: then nothing that reads it needs to run."""
         if frame.slot is not None:
-            self._coming = frame.slot  # received as late as can be: it is being copied meanwhile
+            self._coming = frame.slot  # received as late as can be: it is on its way meanwhile
         elif isinstance(frame.image, wp.array):
             wp.copy(self.frame, frame.image)
         else:

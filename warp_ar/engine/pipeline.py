@@ -495,9 +495,9 @@ class Pipeline(Closing):
     ) -> Result:
         """Light one frame without waiting for it; arguments as those of a call.
 
-        This thread looks for the marker. On CUDA it launches the frame while others copy the picture to where it is
-        sent from, and its picture is sent ahead; on CPU another thread renders it. With the next frame submitted before
-        this one's image is read, tracking, both ways over the bus and the kernels run side by side. The device's own
+        This thread looks for the marker. On CUDA it sends and launches the frame, and its picture is sent ahead; on CPU
+        another thread renders it. With the next frame submitted before this one's image is read, tracking, both ways
+        over the bus and the kernels run side by side. The device's own
         arrays of a result still hold only until the next frame is rendered.
         An image that may not be written (``flags.writeable``) is taken to stay as it is, and not copied on CPU; on CUDA
         one that ``new_frame`` gave is not.
@@ -577,20 +577,18 @@ class Pipeline(Closing):
         return Result(frame.pose, state, (self._keep(rendered) if ahead else rendered).at_once())
 
     def _send(self, frame: SeenFrame) -> SeenFrame:
-        """Begin the copy of a frame to the device, unless it is already there."""
+        """Send a frame to the device, unless it is already there."""
         if self.inputs.transfers is None or frame.lost or isinstance(frame.image, wp.array):
             return frame
-        frame.slot = self.inputs.transfers.begin(frame.image)
+        frame.slot = self.inputs.transfers.upload(frame.image)
         return frame
 
     def _hand_over(self, frame: SeenFrame) -> Future[Rendered]:
         """Have a frame of the host rendered: on CUDA launched by this thread, on CPU by another."""
         while len(self._ahead) >= AHEAD:
             self._ahead.popleft().result()
-        transfers, frame = self.inputs.transfers, self._send(frame)
+        frame = self._send(frame)
         if frame.lost or not self._launches_here:
-            if transfers is not None and frame.slot is not None:
-                transfers.send(frame.slot)
             # The caller may write its picture anew before it is rendered, unless nobody may.
             if frame.slot is not None and "image" in self._arrays:
                 frame.image = frame.slot.host  # no other comes there before this one is rendered: see ``AHEAD``

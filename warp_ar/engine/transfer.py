@@ -5,17 +5,14 @@ A frame goes into pinned memory (host), to the device (copy engine), through the
 engines move a second and the kernels work on a third. Kernels read and write arrays of their own, at addresses that a
 captured graph may keep; they are copied to and from the slots on the device, which takes a hundredth of the way over
 the bus. A picture stays in the pinned memory that it came into until nobody refers to it any more: to copy it again
-takes the host longer than all the rest. So it is with frames: who writes them where ``new_frame`` says has no copy to
-wait for.
+takes the host longer than all the rest. So it is with frames: who writes them where ``new_frame`` says, as a
+``Session`` does, has no copy to wait for.
 """
 
 from __future__ import annotations
 
 import collections
-import itertools
 import math
-import queue
-import threading
 import weakref
 from typing import Any
 
@@ -32,13 +29,6 @@ SLOTS = 3
 
 KEPT = 8
 """Pictures in pinned memory at once; who keeps more gets those in ordinary memory, for which the host waits."""
-
-COPY_THREADS = 4
-"""Threads at most that copy a frame into pinned memory."""
-
-COPY_BYTES = 3_000_000
-"""That each of them copies at least: to hand a part over, and to hear that it is done, takes turns with other threads
-at the interpreter. Of a frame that is smaller than two such parts the caller's thread copies all."""
 
 FRAME_BYTES = 1 << 29
 """Largest total of bytes of pinned frames by ``new_frame``; more are in ordinary memory, which is copied before the
@@ -74,8 +64,6 @@ class Slot:
         self.consumed = wp.Event(device)
         self.downloaded: Any = None
         """Event after the last picture from here, or from a later slot."""
-        self.sent = True
-        """True if the picture that was copied to here has been sent on its way."""
 
     @property
     def host(self) -> Image:
@@ -116,46 +104,6 @@ def _address(image: Image) -> int:
     return int(image.__array_interface__["data"][0])
 
 
-class _Copier:
-    """A thread that copies parts of frames, and lets go of the interpreter's lock meanwhile."""
-
-    def __init__(self) -> None:
-        self._jobs: queue.SimpleQueue[tuple[Image, Image] | None] = queue.SimpleQueue()
-        self._begun, self._done = threading.Lock(), threading.Lock()
-        self._begun.acquire()
-        self._done.acquire()
-        held = self._jobs, self._begun, self._done  # and not this object: the thread ends with it
-        self._thread = threading.Thread(target=_copy, args=held, name="warp_ar-copy", daemon=True)
-        self._thread.start()
-        weakref.finalize(self, self._jobs.put, None)
-
-    def begin(self, target: Image, source: Image) -> None:
-        """Have a part copied."""
-        self._jobs.put((target, source))
-
-    def wait_for_begin(self) -> None:
-        """Let it have the interpreter's lock until it needs it no more."""
-        self._begun.acquire()
-
-    def wait(self) -> None:
-        """Wait until the part that was begun is copied."""
-        self._done.acquire()
-
-    def close(self) -> None:
-        """End the thread."""
-        self._jobs.put(None)
-        self._thread.join()
-
-
-def _copy(jobs: queue.SimpleQueue[tuple[Image, Image] | None], begun: threading.Lock, done: threading.Lock) -> None:
-    """The life of a copying thread."""
-    while (job := jobs.get()) is not None:
-        begun.release()
-        np.copyto(*job)
-        del job  # the caller's picture is not held until the next one comes
-        done.release()
-
-
 class Transfers:
     """Moves frames of one size to and from one CUDA device."""
 
@@ -173,9 +121,6 @@ class Transfers:
         for stream in (self._up, self._down):
             stream.wait_stream(self._compute)  # which clears the slots: a frame must not come before that
         self._uploads = self._downloads = 0
-        self._parts = split_rows(*shape)
-        self._copiers = [_Copier() for _ in self._parts] if len(self._parts) > 1 else []
-        self._are_copying = False
         self._marks = [Marks(device) for _ in range(MARKED)]
         self._marking = self._marks[0]
         self._free = collections.deque(Buffer(shape, device, pinned=True) for _ in range(SLOTS))
@@ -185,9 +130,7 @@ class Transfers:
         self._free_frames: collections.deque[Pinned] = collections.deque()
 
     def close(self) -> None:
-        """Stop the copying threads; what is on its way to the host arrives before the slots that it lies in go."""
-        for copier in self._copiers:
-            copier.close()
+        """Let what is on its way to the host arrive before the slots that it lies in go."""
         for slot in self._slots:
             if slot.downloaded is not None:
                 wait_for(slot.downloaded)
@@ -208,60 +151,28 @@ class Transfers:
             self._frames[_address(memory.host)] = memory
         return memory.lend(self._free_frames)
 
-    def begin(self, image: Image) -> Slot:
-        """Begin to copy a host picture to where it is sent from; ``send`` must follow before the caller writes it anew.
+    def upload(self, image: Image) -> Slot:
+        """Send a host picture on its way; when this returns, the caller may write it anew.
 
-        A picture that ``new_frame`` gave is there, and is held until it has been sent.
+        A picture that ``new_frame`` gave is sent from where it lies, and is held until it has been sent.
 
         Returns:
-            What to ``send`` and to ``receive`` it from, before ``SLOTS`` more are begun.
+            What to ``receive`` it from, before ``SLOTS`` more are sent.
         """
         slot = self._slots[self._uploads % SLOTS]
         if self._uploads >= SLOTS:
             wait_for(slot.marks.arrived)
             self._up.wait_event(slot.consumed)
-        self._wait_for_copies()
         marks = slot.marks = self._marks[self._uploads % MARKED]
-        marks.frame, slot.sent = self._uploads, False
+        marks.frame = self._uploads
         self._uploads += 1
         given = self._frames.get(_address(image))
         slot.source, slot.given = (slot.own, None) if given is None else (given, image)
-        if given is not None:
-            return slot
-        if not self._copiers:
+        if given is None:
             np.copyto(slot.host, image)
-            return slot
-        for copier, part in zip(self._copiers, self._parts, strict=True):
-            copier.begin(slot.host[part], image[part])
-        for copier in self._copiers:
-            copier.wait_for_begin()
-        self._are_copying = True
-        return slot
-
-    def _wait_for_copies(self) -> None:
-        if self._are_copying:
-            for copier in self._copiers:
-                copier.wait()
-            self._are_copying = False
-
-    def send(self, slot: Slot) -> None:
-        """Send a picture on its way once it has been copied, unless it was; then the caller may write it anew."""
-        if slot.sent:
-            return
-        self._wait_for_copies()
-        marks, slot.sent = slot.marks, True
         self._up.record_event(marks.sent)
         wp.copy(slot.frame, slot.source.array, stream=self._up)
         self._up.record_event(marks.arrived)
-
-    def upload(self, image: Image) -> Slot:
-        """Send a host picture on its way; when this returns, the caller may write it anew.
-
-        Returns:
-            What to ``receive`` it from, before ``SLOTS`` more are sent.
-        """
-        slot = self.begin(image)
-        self.send(slot)
         return slot
 
     def receive(self, slot: Slot, frame_out: Any) -> None:
@@ -298,12 +209,6 @@ class Transfers:
         self._down.record_event(buffer.done)
         slot.downloaded = buffer.done
         return Picture(kept, buffer, self._marking)
-
-
-def split_rows(height: int, width: int) -> list[slice]:
-    """Rows of a frame in as many parts as threads copy it: ``COPY_BYTES`` each or more."""
-    parts = min(COPY_THREADS, max(3 * height * width // COPY_BYTES, 1))
-    return [slice(*pair) for pair in itertools.pairwise(height * part // parts for part in range(parts + 1))]
 
 
 class Picture:
