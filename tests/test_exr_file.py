@@ -15,7 +15,7 @@ import pytest
 from tests.test_full_disk import file_limit
 from warp_ar.accuracy.path_tracer import TracedPicture
 from warp_ar.errors import SinkError
-from warp_ar.exr_file import check_whole_exr, write_exr
+from warp_ar.exr_file import write_exr
 from warp_ar.light.captured import Light
 from warp_ar.output.camera_files import distort_map, undistort_map, write_stmap
 from warp_ar.output.environment_file import encode_hdr, write_environment
@@ -27,29 +27,23 @@ from warp_ar.signature import is_signed
 HEADER = {"type": OpenEXR.scanlineimage, "software": "a test"}
 
 
-@pytest.mark.parametrize(
-    "compression",
-    ["NO", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "B44A", "DWAA", "DWAB"],
-)
-@pytest.mark.parametrize("rows", [1, 17, 300])
-def test_whole_files_are_whole(tmp_path: pathlib.Path, compression: str, rows: int) -> None:
-    header = {**HEADER, "compression": getattr(OpenEXR, f"{compression}_COMPRESSION")}
-    pixels = np.random.default_rng(0).random((rows, 9, 3)).astype(np.float32)
-    confidence = np.ones((rows, 9), np.float32)
-    path = tmp_path / "a.exr"
-    write_exr(path, OpenEXR.File(header, {"RGB": pixels, "confidence": confidence}))
-    before = path.read_bytes()
-    check_whole_exr(path)
-    assert path.read_bytes() == before
-    path.write_bytes(before[:-1])
-    with pytest.raises(OSError, match="error"):
-        check_whole_exr(path)
+class CutShort:
+    """A picture of which only so many bytes reach the disk, without a word."""
+
+    def __init__(self, image: OpenEXR.File, length: int) -> None:
+        self.parts, self._image, self._length = image.parts, image, length
+
+    def write(self, name: str) -> None:
+        self._image.write(name)
+        with open(name, "r+b") as stream:
+            stream.truncate(self._length)
 
 
+@pytest.mark.parametrize("compression", ["NO", "ZIP"])
 @pytest.mark.parametrize("parts", [1, 3])
-def test_a_file_is_told_wherever_it_is_cut(tmp_path: pathlib.Path, parts: int) -> None:
+def test_a_file_is_told_wherever_it_is_cut(tmp_path: pathlib.Path, parts: int, compression: str) -> None:
     path = tmp_path / "a.exr"
-    header = {**HEADER, "compression": OpenEXR.ZIP_COMPRESSION}
+    header = {**HEADER, "compression": getattr(OpenEXR, f"{compression}_COMPRESSION")}
     pixels = np.ones((20, 4), np.float32)
     if parts == 1:
         image = OpenEXR.File(header, {"Y": pixels})
@@ -58,9 +52,10 @@ def test_a_file_is_told_wherever_it_is_cut(tmp_path: pathlib.Path, parts: int) -
     write_exr(path, image)
     whole = path.read_bytes()
     for length in range(len(whole)):
-        path.write_bytes(whole[:length])
-        with pytest.raises(OSError, match="error"):
-            check_whole_exr(path)
+        with pytest.raises((OSError, RuntimeError)):
+            write_exr(path, CutShort(image, length))
+    write_exr(path, CutShort(image, len(whole)))
+    assert path.read_bytes() == whole
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no limit of a file's size")

@@ -12,7 +12,6 @@ import functools
 import os
 import pathlib
 import re
-import struct
 from collections.abc import Mapping
 from typing import Any
 
@@ -26,8 +25,6 @@ from warp_ar.files import check_size, is_file, read_bytes, store
 from warp_ar.signals import AP0, AP1, P3_D65, REC_709, REC_2020, are_primaries, converted
 from warp_ar.signature import PROGRAM
 
-_LINES = (1, 1, 1, 16, 32, 16, 32, 32, 32, 256)
-"""Rows of a chunk, by the number of the compression: none, RLE, ZIPS, ZIP, PIZ, PXR24, B44, B44A, DWAA, DWAB."""
 LARGEST = 65504.0
 """Largest half float: what an infinite value is read as."""
 _HDR_HEAD = 1 << 16
@@ -41,8 +38,6 @@ _SPACES = {
     "lin_ap1_scene": AP1,
 }
 """Primaries by the attribute ``colorInteropID`` (ASWF, Color Interop Forum)."""
-_SEVERAL_PARTS = 0x10
-"""Bit of the second byte of the version's four."""
 
 
 def exr_problem(path: pathlib.Path, error: BaseException) -> str:
@@ -266,7 +261,7 @@ def store_exr(path: pathlib.Path, image: OpenEXR.File) -> None:
 
 
 def write_exr(path: pathlib.Path, image: OpenEXR.File) -> None:
-    """Write a picture of rows, or several.
+    """Write a picture of rows, or several, and read it again.
 
     Args:
         path: The file, which is replaced.
@@ -277,65 +272,11 @@ def write_exr(path: pathlib.Path, image: OpenEXR.File) -> None:
         RuntimeError: OpenEXR cannot write this.
     """
     image.write(str(path))
-    check_whole_exr(path)
-
-
-def check_whole_exr(path: pathlib.Path) -> None:
-    """Check that a file that was written does not end before its last chunk does.
-
-    Args:
-        path: The file; its parts are of rows, not of tiles.
-
-    Raises:
-        OSError: It does, with what the system says of the rest.
-    """
-    data = path.read_bytes()
-    try:
-        end = _end_of_chunks(data)
-    except (struct.error, ValueError, IndexError):
-        end = len(data) + 1  # not even the header is whole
-    if end <= len(data):
-        return
+    size = path.stat().st_size
     with path.open("ab", buffering=0) as stream:
-        written = stream.write(bytes(end - len(data)))
-        # The first write beyond what fits is cut short, the next one fails and says why.
-        while written < end - len(data):
-            written += stream.write(bytes(end - len(data) - written))
-    raise OSError(errno.EIO, os.strerror(errno.EIO))
-
-
-def _end_of_chunks(data: bytes) -> int:
-    """Return the end of the last chunk, by the tables that point to chunks."""
-    if data[:4] != _MAGIC:
-        raise ValueError
-    several = bool(data[5] & _SEVERAL_PARTS)
-    count, at = _read_header(data, 8)
-    chunks = count
-    while several and data[at] != 0:
-        count, at = _read_header(data, at)
-        chunks += count
-    at += several
-    table = struct.unpack_from(f"<{chunks}Q", data, at)
-    if min(table) < at + 8 * chunks:
-        raise ValueError  # the table is written last
-    last = int(max(table)) + (4 if several else 0)  # behind the number of the part
-    _, size = struct.unpack_from("<ii", data, last)
-    return last + 8 + int(size)
-
-
-def _read_header(data: bytes, at: int) -> tuple[int, int]:
-    """Chunks of a part by its header, and where that ends."""
-    lines, rows = 0, 0
-    while (name_end := data.index(b"\0", at)) > at:
-        name = data[at:name_end]
-        kind_end = data.index(b"\0", name_end + 1)
-        (size,) = struct.unpack_from("<i", data, kind_end + 1)
-        value, at = kind_end + 5, kind_end + 5 + size
-        if name == b"compression":
-            lines = _LINES[data[value]]
-        elif name == b"dataWindow":
-            _, low, _, high = struct.unpack_from("<4i", data, value)
-            rows = high - low + 1
-    if lines < 1 or rows < 1:
-        raise ValueError
-    return -(-rows // lines), at + 1
+        # Where the end did not fit, one byte more does not either, and the system says why.
+        stream.write(b"\0")
+        stream.truncate(size)
+    with OpenEXR.File(str(path)) as written:  # parts that lack their end are not among its parts
+        if len(written.parts) != len(image.parts):
+            raise OSError(errno.EIO, os.strerror(errno.EIO))

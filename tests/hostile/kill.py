@@ -29,7 +29,6 @@ import OpenEXR
 
 from warp_ar.command_line import Terminated, ended_by_signals
 from warp_ar.errors import WarpArError
-from warp_ar.exr_file import check_whole_exr
 from warp_ar.files import write_whole
 from warp_ar.output.layer_file import LayerFrame, LayerSink
 from warp_ar.output.sinks import EnvironmentSink, open_sink, read_environment
@@ -84,7 +83,6 @@ def check_layers(place: pathlib.Path, *, finished: bool) -> int:
     paths = sorted(place.glob("????.exr"))
     found = []
     for path in paths:
-        check_whole_exr(path)
         with OpenEXR.File(str(path)) as file:
             parts = {part.name(): part for part in file.parts}
             level = int(np.median(parts["ids"].channels["ids.I"].pixels)) - 1
