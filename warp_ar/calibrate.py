@@ -20,7 +20,6 @@ import itertools
 import json
 import math
 from collections.abc import Iterable, Sequence
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -34,9 +33,9 @@ from warp_ar.calibration.camera_calibration import calibrate_camera, write_camer
 from warp_ar.calibration.card import PAPERS, write_card
 from warp_ar.calibration.response import MOST_DEVIATION, measure_grey_response, measure_response, write_response
 from warp_ar.checks.check_ball import DULL, inside_contrast
-from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, run_command
+from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, run_command, seconds
 from warp_ar.errors import UsageError, say
-from warp_ar.output.places import check_places, check_replaceable
+from warp_ar.output.places import claim_places
 from warp_ar.scene import CharucoBoard, Marker, bundled_scenes, load_scene, loads_scene
 from warp_ar.scene.description import INTRINSICS
 from warp_ar.scene.starter import amend_scene, guesses
@@ -69,13 +68,6 @@ def _pictures(paths: Sequence[str], most: int | None = None) -> Iterable[Image]:
         with open_source(path) as source:
             for frame in itertools.islice(source, most):
                 yield frame.image
-
-
-def _fraction(text: str) -> float:
-    try:
-        return float(Fraction(text))
-    except (ValueError, ZeroDivisionError):
-        raise argparse.ArgumentTypeError(f"{text!r}: expected a time in seconds, such as 0.02 or 1/50") from None
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -130,7 +122,7 @@ def make_parser() -> argparse.ArgumentParser:
     text = "the card under several exposures or lights; with --exposures any still scene"
     option("pictures", nargs="+", metavar="PATH|INDEX", help=text)
     text = "seconds of the pictures in turn, such as 1/200 1/50 0.08"
-    option("--exposures", nargs="+", type=_fraction, metavar="S", help=text)
+    option("--exposures", nargs="+", type=seconds, metavar="S", help=text)
     option(
         "--frames",
         type=int,
@@ -254,14 +246,6 @@ def _run_response(options: argparse.Namespace, target: Path | None) -> int:
     return EXIT_DONE
 
 
-def _check_output(options: argparse.Namespace) -> None:
-    """Say what is replaced; nothing is written over what is read, or over what is somebody else's unasked."""
-    pictures = [Path(path) for path in getattr(options, "pictures", ())]
-    check_places({"the picture": pictures}, {"--output": options.output})
-    if replaced := check_replaceable(options.output, overwrite=options.overwrite):
-        say(replaced)
-
-
 def _target(options: argparse.Namespace) -> Path | None:
     """The scene file that a camera or response goes into, with its file beside it; None without ``--write``."""
     if options.command not in ("camera", "response") or options.write is None:
@@ -277,7 +261,8 @@ def _target(options: argparse.Namespace) -> Path | None:
 def _run(options: argparse.Namespace) -> int:
     target = _target(options)
     if options.command != "ball":
-        _check_output(options)
+        pictures = [Path(path) for path in getattr(options, "pictures", ())]
+        claim_places({"the picture": pictures}, {"--output": options.output}, overwrite=options.overwrite)
     if options.command == "card":
         write_card(_marker(options) or SHEET, options.output, options.paper, options.dpi)
         print(

@@ -9,10 +9,9 @@ if __name__ == "__main__":
 
 import argparse
 import dataclasses
-import math
 from collections.abc import Sequence
-from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,37 +19,24 @@ import numpy as np
 from warp_ar.ball.ball_finder import BallOutline
 from warp_ar.calibration.response import write_response
 from warp_ar.checks.check_objects import check_objects, written_poses
-from warp_ar.command_line import EXIT_DONE, Parser, run_command
+from warp_ar.command_line import EXIT_DONE, Parser, ending, number, pixel, run_command, seconds
 from warp_ar.errors import SinkError, UsageError, say
 from warp_ar.files import store
 from warp_ar.light.latlong_axes import AXES
-from warp_ar.output.places import check_places, check_replaceable
-from warp_ar.output.sink import make_folder
+from warp_ar.output.places import claim_places
 from warp_ar.photo_capture import PIXELS, Capture, capture_light
 from warp_ar.photographs.support import Support, plane_from_contact, plane_from_rectangle, scene_on
 from warp_ar.scene import Camera, CapturedLight, Scene, dumps_scene
 from warp_ar.signature import sign_png
 
-SUFFIXES = {"--output": ".exr", "--outline": ".png", "--scene": ".toml"}
-"""Endings of the names of written files."""
 OUTLINE, PREVIEW, RESPONSE = ".outline.png", ".preview.png", ".response.txt"
 """Endings of files beside the light."""
 LARGEST_BALL = 1.0
 """Largest plausible radius, metres; a larger number is probably in another unit."""
 
 
-def _seconds(text: str) -> float:
-    try:
-        value = float(Fraction(text))
-    except (ValueError, ZeroDivisionError):
-        value = 0.0
-    if value <= 0.0:
-        raise argparse.ArgumentTypeError(f"{text!r}: expected a time in seconds, such as 0.02 or 1/50")
-    return value
-
-
-def _exposure(text: str) -> float | str:
-    return PIXELS if text == PIXELS else _seconds(text)
+def _exposure(text: str) -> Any:
+    return PIXELS if text == PIXELS else seconds(text)
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -61,12 +47,18 @@ def make_parser() -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     add("photos", nargs="+", type=Path, metavar="PHOTO", help="photographs of the ball from one place")
-    add("--output", type=Path, default=Path("light.exr"), metavar="FILE", help="file to write (default: light.exr)")
+    add(
+        "--output",
+        type=ending(".exr"),
+        default=Path("light.exr"),
+        metavar="FILE",
+        help="file to write (default: light.exr)",
+    )
     parser.add_common("--overwrite")
     text = "rough circle around the ball, pixels, if it is not found"
     add("--ball", type=float, nargs=3, metavar=("X", "Y", "RADIUS"), help=text)
     text = "picture of the found outline (default: beside the light)"
-    add("--outline", type=Path, metavar="FILE.png", help=text)
+    add("--outline", type=ending(".png"), metavar="FILE.png", help=text)
     add("--circle", type=float, nargs=3, metavar=("X", "Y", "RADIUS"), help="exact outline of the ball, pixels")
     text = "seconds of each photograph instead of EXIF's; pixels: by the pictures"
     add("--exposures", type=_exposure, nargs="+", metavar="S", help=text)
@@ -81,18 +73,19 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_common("--focal-35mm")
     add("--as-clipped", action="store_true", help="do not raise what clips in a single photograph")
     text = "the ball's reflectance (default: measured by the plane, else 0.85)"
-    add("--reflectance", type=float, metavar="R", help=text)
-    add("--height", type=int, metavar="N", help="rows of the light (default: by the ball's pixels)")
+    add("--reflectance", type=number(0.01, 1.0, "a share from 0.01 to 1"), metavar="R", help=text)
+    text = "rows of the light (default: by the ball's pixels)"
+    add("--height", type=number(16, 4096, "16 to 4096 rows", int), metavar="N", help=text)
     add("--axes", choices=AXES, default="z-up", help="axes of the light (default: z-up)")
     parser.add_common("--device")
     support = parser.add_argument_group("the plane under the ball, from the shown photograph")
     add = support.add_argument
     text = "a rectangle's corners in order round it: column and row of each"
-    add("--rectangle", type=float, nargs=8, metavar="N", help=text)
+    add("--rectangle", type=pixel, nargs=8, metavar="N", help=text)
     parser.add_common("--rectangle-size", add=add)
-    add("--contact", type=float, nargs=2, metavar=("X", "Y"), help="pixel where the ball touches the plane")
+    add("--contact", type=pixel, nargs=2, metavar=("X", "Y"), help="pixel where the ball touches the plane")
     add("--ball-radius", type=float, metavar="M", help="the ball's radius in metres; else lengths are radii")
-    add("--scene", type=Path, metavar="FILE.toml", help="also write a scene of it")
+    add("--scene", type=ending(".toml"), metavar="FILE.toml", help="also write a scene of it")
     return parser
 
 
@@ -121,37 +114,20 @@ def _check(options: argparse.Namespace) -> None:
     elif options.exposures is not None and len(options.exposures) != len(options.photos):
         number = _count(len(options.photos), "photograph")
         raise UsageError(f"{_count(len(options.exposures), 'exposure')} for {number}; expected one for each")
-    _check_numbers(options)
+    _check_radius(options)
     options.outline = options.outline or options.output.with_suffix(OUTLINE)
     writes = {"--output": options.output, "--outline": options.outline, "--scene": options.scene}
     writes = {name: path for name, path in writes.items() if path is not None}
-    for name, path in writes.items():
-        if path.suffix.lower() != SUFFIXES[name]:
-            raise UsageError(f"{name} {path}: expected a name that ends in {SUFFIXES[name]}")
     writes |= {f"*{end}": options.output.with_suffix(end) for end in (PREVIEW, RESPONSE)}
-    check_places({"the photographs": list(options.photos)}, writes)
-    for path in writes.values():
-        if words := check_replaceable(path, overwrite=options.overwrite):
-            say(words)
-    for path in writes.values():
-        make_folder(path.parent)
+    claim_places({"the photographs": list(options.photos)}, writes, overwrite=options.overwrite)
 
 
-def _check_numbers(options: argparse.Namespace) -> None:
-    if options.reflectance is not None and not 0.01 <= options.reflectance <= 1.0:
-        raise UsageError(f"--reflectance {options.reflectance:g}: expected a share from 0.01 to 1")
-    if options.height is not None and not 16 <= options.height <= 4096:
-        raise UsageError(f"--height {options.height}: expected 16 to 4096 rows")
-    if options.focal_35mm is not None and not 1.0 <= options.focal_35mm <= 10_000.0:
-        raise UsageError(f"--focal-35mm {options.focal_35mm:g}: expected millimetres from 1 to 10000, such as 26")
+def _check_radius(options: argparse.Namespace) -> None:
     radius = options.ball_radius
     if radius is not None and not 0.0 < radius <= LARGEST_BALL:
         meant = [(unit, per * radius) for unit, per in (("cm", 1e-2), ("mm", 1e-3)) if per * radius <= 0.1]
         hint = f"; {radius:g} {meant[0][0]} are {meant[0][1]:g}" if meant and radius > 0.0 else ""
         raise UsageError(f"--ball-radius {radius:g}: expected metres above 0, {LARGEST_BALL:g} at most{hint}")
-    for name, place in (("--contact", options.contact), ("--rectangle", options.rectangle)):
-        if place is not None and not all(map(math.isfinite, place)):
-            raise UsageError(f"{name} {' '.join(f'{value:g}' for value in place)}: expected pixels")
 
 
 def make_scene(found: Capture, light: Path, ball_radius: float | None) -> Scene:

@@ -8,6 +8,7 @@ import contextlib
 import difflib
 import errno
 import io
+import math
 import os
 import re
 import signal
@@ -15,6 +16,8 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from fractions import Fraction
+from pathlib import Path
 from typing import Any, Final, NoReturn
 
 from warp_ar.begin import EXIT_INTERRUPTED, EXIT_TERMINATED, end_at_once, handling
@@ -32,15 +35,37 @@ _LARGEST = 2**31 - 1
 """Largest whole number of an argument: they count frames, samples, pixels, ports."""
 
 
-def count(text: str) -> int:
-    """Return a number of frames, samples or the like that an argument names.
+def number(low: float, high: float, words: str, kind: Callable[[str], Any] = float) -> Callable[[str], Any]:
+    """Return the type of an argument that is a number from ``low`` to ``high``, or ``words`` say what is expected."""
 
-    Raises:
-        ArgumentTypeError: It is below 1.
-    """
-    if (value := int(text)) < 1:
-        raise argparse.ArgumentTypeError(f"{text}: expected 1 or more")
-    return value
+    def read(text: str) -> Any:
+        with contextlib.suppress(ValueError, ZeroDivisionError):
+            if low <= (value := kind(text)) <= high:
+                return value
+        raise argparse.ArgumentTypeError(f"{text}: expected {words}")
+
+    return read
+
+
+def ending(*suffixes: str) -> Callable[[str], Path]:
+    """Return the type of an argument that names a file of one of these endings."""
+
+    def read(text: str) -> Path:
+        if (path := Path(text)).suffix.lower() not in suffixes:
+            raise argparse.ArgumentTypeError(f"{text}: expected a name that ends in {', '.join(suffixes)}")
+        return path
+
+    return read
+
+
+LEAST: Final = 1e-9
+"""Least number that counts as above 0."""
+count = number(1, math.inf, "1 or more", int)
+"""Number of frames, samples or the like."""
+pixel = number(-1e9, 1e9, "pixels")
+"""Column or row of a picture."""
+seconds = number(LEAST, 1e9, "a time in seconds, such as 0.02 or 1/50", lambda text: float(Fraction(text)))
+"""Time of an exposure."""
 
 
 _COMMON: Final[dict[str, dict[str, Any]]] = {
@@ -77,7 +102,11 @@ _COMMON: Final[dict[str, dict[str, Any]]] = {
     },
     "--overwrite": {"action": "store_true", "help": "also replace files that this program did not write"},
     "--rectangle-size": {"type": float, "nargs": 2, "metavar": ("W", "H"), "help": "the rectangle's sides in metres"},
-    "--focal-35mm": {"type": float, "metavar": "MM", "help": "full-frame focal length, if EXIF does not tell"},
+    "--focal-35mm": {
+        "type": number(1.0, 10_000.0, "millimetres from 1 to 10000, such as 26"),
+        "metavar": "MM",
+        "help": "full-frame focal length, if EXIF does not tell",
+    },
 }
 """Options that mean the same wherever they are."""
 
@@ -121,6 +150,7 @@ class Parser(argparse.ArgumentParser):
         Raises:
             UsageError: Always, with the message in one line.
         """
+        message = re.sub(r"^argument (\S+): (?=.*: expected )", r"\1 ", message)
         unknown = re.match(r"unrecognized arguments: (--[^\s=]+)", message)
         known = [option for option in _options(self) if unknown is None or option != unknown[1]]
         meant = difflib.get_close_matches(unknown[1], known, n=1, cutoff=0.75) if unknown else []

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, run_command
+from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, ending, run_command
 from warp_ar.errors import SinkError, UsageError, say
 from warp_ar.output.environment_axes import AXES, LAYOUTS
 from warp_ar.output.environment_file import (
@@ -29,7 +29,7 @@ from warp_ar.output.environment_file import (
     read_environment_info,
     write_environment,
 )
-from warp_ar.output.places import check_places, check_replaceable
+from warp_ar.output.places import check_places, claim_places
 
 Radiance = npt.NDArray[np.float32]
 
@@ -43,7 +43,8 @@ def make_parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("environment", type=Path, metavar="FILE", help="a latlong .exr or .hdr")
     parser.add_common("--light-axes")
-    add("--output", type=Path, required=True, metavar="FILE", help="an .exr, .hdr, or .json of spherical harmonics")
+    text = "an .exr, .hdr, or .json of spherical harmonics"
+    add("--output", type=ending(*ENVIRONMENT_SUFFIXES), required=True, metavar="FILE", help=text)
     text = "z-up: this program's; blender: also three.js; y-up: OpenEXR, USD (default: y-up)"
     add("--axes", choices=AXES, default="y-up", help=text)
     add("--layout", choices=LAYOUTS, default="latlong", help="latlong, or a cube's six faces (default: latlong)")
@@ -79,8 +80,6 @@ def convert(options: argparse.Namespace) -> int:
         UsageError: The output is no environment by its ending, or options do not fit each other.
     """
     output: Path = options.output
-    if output.suffix.lower() not in ENVIRONMENT_SUFFIXES:
-        raise UsageError(f"--output {output} ends in {output.suffix!r}; use {', '.join(ENVIRONMENT_SUFFIXES)}")
     if options.size is not None and options.layout != "cube":
         raise UsageError(f"--size {options.size} is the edge of a cube's faces; add --layout cube")
     check_places({"the environment": [options.environment]}, {"--output": output})
@@ -94,7 +93,7 @@ def convert(options: argparse.Namespace) -> int:
     radiance = read_environment(options.environment, axes=options.light_axes)
     if options.grey_card:
         radiance, info = _scaled(radiance, info)
-    replaced = check_replaceable(output, overwrite=options.overwrite)
+    claim_places({}, {"--output": output}, overwrite=options.overwrite)
     form: dict[str, Any] = {"axes": options.axes, "layout": options.layout, "size": options.size, "info": info}
     form["color_space"] = options.color_space
     try:
@@ -102,8 +101,6 @@ def convert(options: argparse.Namespace) -> int:
     except SinkError as error:
         say(error)
         return EXIT_FAILED
-    if replaced:
-        say(replaced)
     return EXIT_DONE
 
 

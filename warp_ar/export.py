@@ -17,14 +17,13 @@ from pathlib import Path
 from typing import Any
 
 from warp_ar.begin import importing
-from warp_ar.command_line import EXIT_DONE, Parser, run_command
+from warp_ar.command_line import EXIT_DONE, Parser, ending, run_command
 from warp_ar.errors import SinkError, SourceError, UsageError, say
 from warp_ar.output.camera_files import TRACK_SUFFIX, distort_map, undistort_map, write_stmap, write_track
 from warp_ar.output.environment_file import write_environment
 from warp_ar.output.gltf_file import GLTF_SUFFIX, write_glb
-from warp_ar.output.places import check_places, check_replaceable, reads_of
+from warp_ar.output.places import claim_places, reads_of
 from warp_ar.output.shot import Shot, texture_files
-from warp_ar.output.sink import make_folder
 from warp_ar.output.usd_file import USD_SUFFIXES, load_usd, write_usd
 from warp_ar.scene import Scene, load_scene
 from warp_ar.signature import is_signed
@@ -40,7 +39,7 @@ def make_parser() -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     add("scene", metavar="SCENE", help="scene file, its folder, or a bundled scene's name")
-    add("--output", type=Path, required=True, metavar="FILE", help=f"ends in {', '.join(SUFFIXES)}")
+    add("--output", type=ending(*SUFFIXES), required=True, metavar="FILE", help=f"ends in {', '.join(SUFFIXES)}")
     parser.add_common("--source", "--calibration", "--frames", "--device", "--overwrite")
     text = "write camera, surfaces and virtual lights only"
     add("--no-environment", action="store_true", help=text)
@@ -64,8 +63,6 @@ def export(options: argparse.Namespace) -> int:
         UsageError: The output has another ending, an option makes no sense, or a library is missing.
     """
     output: Path = options.output
-    if output.suffix.lower() not in SUFFIXES:
-        raise UsageError(f"--output {output} ends in {output.suffix!r}; use {', '.join(SUFFIXES)}")
     if output.suffix.lower() in USD_SUFFIXES:
         load_usd()
     scene = load_scene(options.scene)
@@ -77,11 +74,7 @@ def export(options: argparse.Namespace) -> int:
         del beside["undistort"], beside["distort"]
     textures = texture_files(scene, output) if output.suffix.lower() in USD_SUFFIXES else {}
     writes = {"--output": output, **{f"--output's {name}": path for name, path in {**beside, **textures}.items()}}
-    check_places(reads_of(scene, options), writes)
-    for path in writes.values():
-        if words := check_replaceable(path, overwrite=options.overwrite):
-            say(words)
-    make_folder(output.parent)
+    claim_places(reads_of(scene, options), writes, overwrite=options.overwrite)
     shot, light = _read_shot(options, scene)
     beside = {name: path for name, path in beside.items() if name not in maps[len(light) :]}
     for name, radiance in zip(maps, light, strict=False):

@@ -12,7 +12,7 @@ import functools
 from collections.abc import Sequence
 from pathlib import Path
 
-from warp_ar.command_line import EXIT_DONE, Parser, run_command
+from warp_ar.command_line import EXIT_DONE, LEAST, Parser, count, number, run_command
 from warp_ar.errors import UsageError
 from warp_ar.live_clip import RunError, light_clip
 from warp_ar.live_page import DEFAULT_PORT, serve_page
@@ -39,14 +39,14 @@ def make_parser() -> Parser:
     add("--quality", default=DEFAULT_PRESET, metavar="NAME", help=text)
     parser.add_common("--light-axes", add=rare)
     text = f"milliseconds per frame for --quality {AUTO} (default: {DEFAULT_BUDGET_MS:g})"
-    rare("--budget-ms", type=float, metavar="X", help=text)
+    rare("--budget-ms", type=number(LEAST, 1e9, "milliseconds above 0"), metavar="X", help=text)
     rare("--loop", action="store_true", help="start the clip again at its end; the page always does")
     text = "with files: first find the ball by what it mirrors"
     rare("--refine-ball", action="store_true", help=text)
     text = "with files: path-trace with N samples a pixel"
-    rare("--samples", type=int, metavar="N", help=text)
+    rare("--samples", type=count, metavar="N", help=text)
     text = "with --samples: relative standard error to stop at, such as 0.05"
-    rare("--error", type=float, metavar="E", help=text)
+    rare("--error", type=number(LEAST, 1e9, "a number above 0, such as 0.05"), metavar="E", help=text)
     add, rare = files.add_argument, functools.partial(parser.add_rare, group=files)
     add("--output", type=Path, metavar="FILE.mp4|DIR", help="write frames: H.264, or a folder of PNG")
     text = "no page, no progress; write only what options name"
@@ -75,7 +75,8 @@ def make_parser() -> Parser:
     text = "serve over TLS, as phones need; without FILE makes a certificate"
     add("--tls", nargs="?", const=True, metavar="FILE.pem", help=text)
     add("--no-browser", action="store_true", help="only print the page's address")
-    rare("--port", type=int, metavar="N", help=f"port (default: {DEFAULT_PORT}, or the next free one)")
+    text = f"port (default: {DEFAULT_PORT}, or the next free one)"
+    rare("--port", type=number(0, 65535, "a port, 0 to 65535; 0 takes a free one", int), metavar="N", help=text)
     text = "ask for this token (default: a new one if others reach the page)"
     rare("--token", metavar="SECRET", help=text)
     text = "let this site, such as http://localhost:5173, ask for light; repeatable"
@@ -98,8 +99,6 @@ def run(options: argparse.Namespace) -> int:
         return EXIT_DONE
     if options.output is None and (options.coding != "8bit" or options.encoder or options.encoder_option):
         raise UsageError("--coding, --encoder and --encoder-option need --output, the file or folder to write")
-    if options.budget_ms is not None and not 0.0 < options.budget_ms < float("inf"):
-        raise UsageError(f"--budget-ms {options.budget_ms:g}: expected milliseconds above 0")
     if options.budget_ms is not None and options.quality != AUTO:
         raise UsageError(f"--budget-ms {options.budget_ms:g} needs --quality {AUTO}")
     if options.error is not None and options.samples is None:

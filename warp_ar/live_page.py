@@ -43,8 +43,6 @@ def _page_scene(options: argparse.Namespace) -> Scene:
             raise UsageError(f"--{name.replace('_', '-')} needs --headless or --output: the page saves on its own")
     if options.refine_ball:
         raise UsageError("--refine-ball needs --headless or --output; before the page, run warp_ar.calibrate ball")
-    if options.port is not None and not 0 <= options.port <= 65535:
-        raise UsageError(f"--port {options.port}: expected a port, 0 to 65535; 0 takes a free one")
     if options.token is not None and not (options.token.isascii() and options.token.isalnum()):
         raise UsageError("--token: expected letters and digits, for it stands in an address")
     light = None if options.light == "card" else options.light

@@ -14,11 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_ar.command_line import EXIT_DONE, Parser, run_command
+from warp_ar.command_line import EXIT_DONE, LEAST, Parser, ending, number, pixel, run_command
 from warp_ar.errors import SinkError, UsageError, say
 from warp_ar.files import store
 from warp_ar.light.captured import Light
-from warp_ar.output.places import check_places, check_replaceable
+from warp_ar.output.places import claim_places
 from warp_ar.photographs.photographs import Photograph, read_photograph
 from warp_ar.photographs.support import Support, focal_range, plane_from_points, plane_from_rectangle, scene_on
 from warp_ar.scene import Camera, CapturedLight, dumps_scene
@@ -38,22 +38,17 @@ def make_parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("plate", type=Path, metavar="PLATE", help="photograph to put objects into")
     add("--light", type=Path, required=True, metavar="FILE", help="captured light, such as light.exr")
-    add(
-        "--scene",
-        type=Path,
-        default=Path("plate.toml"),
-        metavar="FILE.toml",
-        help="default: plate.toml",
-    )
+    add("--scene", type=ending(".toml"), default=Path("plate.toml"), metavar="FILE.toml", help="default: plate.toml")
     parser.add_common("--overwrite")
     text = "corners of a rectangle, as for capture; the same one turns the light to the plate"
-    add("--rectangle", type=float, nargs=8, metavar="N", help=text)
+    add("--rectangle", type=pixel, nargs=8, metavar="N", help=text)
     parser.add_common("--rectangle-size")
     text = "a known point, metres, z up, and its pixel; four or more"
-    add("--point", type=float, nargs=5, action="append", metavar=("X", "Y", "Z", "COLUMN", "ROW"), help=text)
+    shown = ("X", "Y", "Z", "COLUMN", "ROW")
+    add("--point", type=number(-1e9, 1e9, "metres or pixels"), nargs=5, action="append", metavar=shown, help=text)
     parser.add_common("--focal-35mm")
     text = "radius of the two balls, metres (default: 0.04)"
-    add("--object-radius", type=float, default=0.04, metavar="M", help=text)
+    add("--object-radius", type=number(LEAST, 1e9, "metres above 0"), default=0.04, metavar="M", help=text)
     return parser
 
 
@@ -64,17 +59,8 @@ def _check(options: argparse.Namespace) -> None:
         raise UsageError("--rectangle and --rectangle-size belong together: pixels of the corners, metres of the sides")
     if options.point is not None and len(options.point) < 4:
         raise UsageError(f"{len(options.point)} points; expected four or more --point")
-    if not all(map(math.isfinite, np.ravel(options.rectangle or options.point).tolist())):
-        raise UsageError("pixels and points: expected finite numbers")
-    if options.focal_35mm is not None and not 1.0 <= options.focal_35mm <= 10_000.0:
-        raise UsageError(f"--focal-35mm {options.focal_35mm:g}: expected millimetres from 1 to 10000, such as 26")
-    if not 0.0 < options.object_radius < math.inf:
-        raise UsageError(f"--object-radius {options.object_radius:g}: expected metres above 0")
-    if options.scene.suffix.lower() != ".toml":
-        raise UsageError(f"--scene {options.scene}: expected a name that ends in .toml")
-    check_places({"the plate": [options.plate], "the light": [options.light]}, {"--scene": options.scene})
-    if words := check_replaceable(options.scene, overwrite=options.overwrite):
-        say(words)
+    reads = {"the plate": [options.plate], "the light": [options.light]}
+    claim_places(reads, {"--scene": options.scene}, overwrite=options.overwrite)
 
 
 def find_camera(plate: Photograph, options: argparse.Namespace) -> tuple[Camera, Support]:
@@ -120,7 +106,6 @@ def place(options: argparse.Namespace) -> int:
     captured = CapturedLight(options.light.resolve(), scale=scale)
     middle = (0.0, 0.0) if options.point is None else tuple(np.mean(options.point, 0)[:2].tolist())
     scene = scene_on(support, camera, options.plate, captured, middle, options.object_radius)
-    options.scene.parent.mkdir(parents=True, exist_ok=True)
     store(options.scene, dumps_scene(scene, options.scene.parent).encode())
     print(f"{options.scene}: python -m warp_ar.live {options.scene} --output out/")
     return EXIT_DONE

@@ -25,18 +25,16 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from warp_ar.accuracy.known_frame import KnownFrame, light_up_to
 from warp_ar.accuracy.path_tracer import DEFAULT_SAMPLES, PathTracer, TracedPicture
-from warp_ar.command_line import EXIT_DONE, Parser, count, run_command
+from warp_ar.command_line import EXIT_DONE, LEAST, Parser, count, ending, number, run_command
 from warp_ar.errors import SinkError, SourceError, UsageError, say
 from warp_ar.exr_file import exr_header, store_exr
 from warp_ar.files import store
 from warp_ar.light.captured import Light
-from warp_ar.output.places import check_places, check_replaceable, reads_of
-from warp_ar.output.sink import make_folder
+from warp_ar.output.places import claim_places, reads_of
 from warp_ar.scene import Scene
 from warp_ar.session import chosen_scene
 from warp_ar.signature import sign_png
 
-SUFFIXES = (".png", ".exr")
 STEP = 8
 """Samples per pixel between two reports of progress."""
 MAGNIFIED = 8
@@ -55,17 +53,18 @@ def make_parser() -> argparse.ArgumentParser:
     text = f"mean paths per pixel, at most (default: {DEFAULT_SAMPLES})"
     add("--samples", type=count, default=DEFAULT_SAMPLES, metavar="N", help=text)
     text = "relative standard error to stop at, such as 0.01"
-    add("--error", type=float, metavar="E", help=text)
-    add("--output", type=Path, metavar="FILE", help="picture (.png), or radiance and standard error (.exr)")
+    add("--error", type=number(LEAST, 1e9, "a number above 0, such as 0.01"), metavar="E", help=text)
+    text = "picture (.png), or radiance and standard error (.exr)"
+    add("--output", type=ending(".png", ".exr"), metavar="FILE", help=text)
     text = "write the pipeline's picture, the reference and their difference"
-    add("--compare", type=Path, metavar="FILE.png", help=text)
+    add("--compare", type=ending(".png"), metavar="FILE.png", help=text)
     text = "preset that finds the light (default: high)"
     add("--quality", default="high", metavar="NAME", help=text)
     text = "find in the frame how far the light file's emitters stand"
     add("--places", action="store_true", help=text)
     text = "write the light, with distances of --places, for live --light"
-    add("--save-light", type=Path, metavar="FILE.exr", help=text)
-    add("--size", metavar="WxH", help="size of the picture (default: the frames')")
+    add("--save-light", type=ending(".exr"), metavar="FILE.exr", help=text)
+    add("--size", type=_size, metavar="WxH", help="size of the picture (default: the frames')")
     add("--seed", type=int, default=0, metavar="N", help="seed of the random numbers (default: 0)")
     return parser
 
@@ -77,16 +76,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def trace(options: argparse.Namespace) -> int:
     """Find the light, follow paths, write what is asked for."""
-    size = _check(options)
     scene = chosen_scene(options.scene, options.source, options.calibration, options.light, options.light_axes)
     if options.save_light is not None:
         _check_axes(scene)
     writes = {f"--{name}": getattr(options, name.replace("-", "_")) for name in ("output", "compare", "save-light")}
     writes = {name: path for name, path in writes.items() if path is not None}
-    check_places(reads_of(scene, options), writes)
-    replaced = [check_replaceable(path, overwrite=options.overwrite) for path in writes.values()]
-    for path in writes.values():
-        make_folder(path.parent)
+    claim_places(reads_of(scene, options), writes, overwrite=options.overwrite)
     console = Console(stderr=True)
     known = light_up_to(scene, options.frame, quality=options.quality, device=options.device, source=options.source)
     if options.places:
@@ -94,7 +89,7 @@ def trace(options: argparse.Namespace) -> int:
         say(places_found(known.light))
     if options.save_light is not None:
         known.light.save(options.save_light)
-    tracer = known.tracer(device=options.device, size=size, seed=options.seed)
+    tracer = known.tracer(device=options.device, size=options.size, seed=options.seed)
     pictures: list[TracedPicture] = []
     try:
         render(tracer, options.samples, options.error, console, pictures)
@@ -105,8 +100,6 @@ def trace(options: argparse.Namespace) -> int:
         raise
     picture = pictures[-1]
     _write_all(options, known, picture)
-    for text in filter(None, replaced):
-        say(text)
     print(summary(known, picture, str(tracer.device)))
     return EXIT_DONE
 
@@ -136,20 +129,10 @@ def _write_all(options: argparse.Namespace, known: KnownFrame, picture: TracedPi
         write_png(options.compare, side_by_side(known, picture))
 
 
-def _check(options: argparse.Namespace) -> tuple[int, int] | None:
-    """The size that is asked for; complain about options that cannot be."""
-    if options.error is not None and not options.error > 0.0:
-        raise UsageError(f"--error {options.error:g}: expected a number above 0, such as 0.01")
-    for name, suffixes in (("output", SUFFIXES), ("save_light", (".exr",)), ("compare", (".png",))):
-        path = getattr(options, name)
-        if path is not None and path.suffix.lower() not in suffixes:
-            flag = name.replace("_", "-")
-            raise UsageError(f"--{flag} {path} ends in {path.suffix!r}; use {', '.join(suffixes)}")
-    if options.size is None:
-        return None
-    match = re.fullmatch(r"([1-9][0-9]{0,4})x([1-9][0-9]{0,4})", options.size)
+def _size(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"([1-9][0-9]{0,4})x([1-9][0-9]{0,4})", text)
     if match is None:
-        raise UsageError(f"--size {options.size}: expected width x height, such as 320x240")
+        raise argparse.ArgumentTypeError(f"{text}: expected width x height, such as 320x240")
     return int(match[1]), int(match[2])
 
 

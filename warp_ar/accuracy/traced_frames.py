@@ -30,12 +30,8 @@ class TracedFrames:
         """Complain about what cannot be traced.
 
         Raises:
-            UsageError: The number of samples or the error does not fit, or the pipeline keeps to a budget.
+            UsageError: The pipeline keeps to a budget.
         """
-        if self.samples < 1:
-            raise UsageError(f"--samples {self.samples}: expected 1 or more")
-        if self.error is not None and not self.error > 0.0:
-            raise UsageError(f"--error {self.error:g}: expected a number above 0, such as 0.05")
         if not isinstance(self.pipeline, Pipeline):
             raise UsageError("--samples with --quality auto: name a preset, whose light is used")
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from warp_ar.begin import importing
-from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, run_command
+from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, number, run_command
 from warp_ar.errors import UsageError, printable, say
 from warp_ar.farm.driver import Driver
 from warp_ar.farm.jobs import Context, parse_jobs, program_version, read_jobs
@@ -25,7 +25,7 @@ from warp_ar.farm.manifest import (
 )
 from warp_ar.farm.pools import Pool, ProcessPool, RayPool, devices_of
 
-MOST_WORKERS = 4096
+WORKERS = number(1, 4096, "a number from 1 to 4096", int)
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -47,12 +47,12 @@ def make_parser() -> argparse.ArgumentParser:
     resume.add_argument("--failed", action="store_true", help="try failed jobs again")
     for command in (run, resume):
         text = "workers here (default: one per 4 cores, on GPUs one per 2)"
-        command.add_argument("--workers", type=int, metavar="N", help=text)
+        command.add_argument("--workers", type=WORKERS, metavar="N", help=text)
         text = "workers of a Ray cluster (default: one started here)"
         command.add_argument("--ray", nargs="?", const="", metavar="ADDRESS", help=text)
     plan = add("plan", "count jobs, try three, say what all would take")
     plan.add_argument("jobs", type=Path, metavar="JOBS.toml", help="the job file")
-    plan.add_argument("--workers", type=int, metavar="N", help="workers to plan for")
+    plan.add_argument("--workers", type=WORKERS, metavar="N", help="workers to plan for")
     for command in (run, resume, plan):
         command.add_common("--device")
     status = add("status", "say where a run stands")
@@ -68,9 +68,6 @@ def command(options: argparse.Namespace) -> int:
         RunError: The run is damaged, or cannot go on.
         UsageError: ``--workers`` is out of bounds, the job file cannot be used, or there is no run in the folder.
     """
-    workers = getattr(options, "workers", None)
-    if workers is not None and not 1 <= workers <= MOST_WORKERS:
-        raise UsageError(f"--workers {workers}: expected a number from 1 to {MOST_WORKERS}")
     if options.command == "plan":
         return plan(options)
     if options.command == "status":

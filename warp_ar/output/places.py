@@ -17,6 +17,7 @@ import filelock
 
 from warp_ar.errors import SinkError, UsageError, reason, say
 from warp_ar.files import is_same_file, kind_of, store
+from warp_ar.output.sink import make_folder
 from warp_ar.scene import Scene
 from warp_ar.scene.scene_files import files_of
 from warp_ar.signature import is_signed
@@ -95,6 +96,26 @@ def check_places(reads: Mapping[str, Sequence[Path]], writes: Mapping[str, Path]
             if inside or outside:
                 raise UsageError(f"{written} {place} would number frames beside {role} {path}; name another")
         entries.append((written, place))
+
+
+def claim_places(reads: Mapping[str, Sequence[Path]], writes: Mapping[str, Path], *, overwrite: bool) -> None:
+    """Check places as `check_places`, say which files are replaced, and make the folders of all.
+
+    Args:
+        reads: As for `check_places`.
+        writes: Files that are to be written, by what asks for them.
+        overwrite: Whether files that this program did not write may be replaced.
+
+    Raises:
+        UsageError: Two are one.
+        SinkError: A file may not be replaced, or a folder cannot be made.
+    """
+    check_places(reads, writes)
+    for words in [check_replaceable(path, overwrite=overwrite) for path in writes.values()]:
+        if words:
+            say(words)
+    for path in writes.values():
+        make_folder(path.parent)
 
 
 def reads_of(scene: Scene, options: argparse.Namespace) -> dict[str, list[Path]]:
