@@ -37,7 +37,7 @@ import cv2
 import numpy as np
 
 from bench.common import find_chromium, report
-from warp_ar.output.sinks import VideoSink
+from warp_ar.output.video_sink import VideoSink
 from warp_ar.scene import SourceSpec, dumps_scene, load_scene
 from warp_ar.sources.sources import open_source
 

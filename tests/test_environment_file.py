@@ -13,7 +13,8 @@ import pytest
 
 from warp_ar.errors import SinkError, UsageError
 from warp_ar.light.captured import Light
-from warp_ar.output.environment_axes import AXES, CUBES, DESCRIPTIONS, to_axes, to_cube
+from warp_ar.light.latlong_axes import AXES, DESCRIPTIONS, to_axes
+from warp_ar.output.environment_axes import CUBES, to_cube
 from warp_ar.output.environment_file import (
     EnvironmentInfo,
     read_environment,

@@ -14,13 +14,9 @@ import pytest
 
 from tests.test_sinks import VIDEOS, flat, levels, no_thread_left  # noqa: F401  (a fixture)
 from warp_ar.errors import SinkError
+from warp_ar.output.environment_file import read_environment
 from warp_ar.output.layer_file import LayerFrame, LayerSink
-from warp_ar.output.sinks import (
-    EnvironmentSink,
-    FolderSink,
-    open_sink,
-    read_environment,
-)
+from warp_ar.output.sinks import EnvironmentSink, FolderSink, open_sink
 
 pytestmark = pytest.mark.slow
 

@@ -9,7 +9,7 @@ import pytest
 from tests.random_desk import RandomDesk
 from warp_ar import calibrate, doctor, init, live
 from warp_ar.light.captured import latlong_directions, texel_solid_angles
-from warp_ar.output.sinks import read_environment
+from warp_ar.output.environment_file import read_environment
 from warp_ar.scene import load_scene
 
 pytestmark = pytest.mark.slow

@@ -18,8 +18,9 @@ from warp_ar.calibration.response import write_response
 from warp_ar.command_line import Terminated
 from warp_ar.errors import SinkError, UsageError
 from warp_ar.files import create_new, name_aside, write_whole
+from warp_ar.output.environment_file import write_environment
 from warp_ar.output.places import OwnFiles
-from warp_ar.output.sinks import open_sink, write_environment
+from warp_ar.output.sinks import open_sink
 from warp_ar.output.video_sink import VideoSink, WholeFragments
 from warp_ar.scene import Camera
 from warp_ar.signature import COMMENT, PROGRAM, is_signed, sign_png

@@ -15,7 +15,7 @@ import warp as wp
 
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.engine.scene_objects import SceneObjects
-from warp_ar.output.sinks import write_environment
+from warp_ar.output.environment_file import write_environment
 from warp_ar.scene import LambertMaterial, Object, Pose, load_scene
 from warp_ar.session import Session
 from warp_ar.sources.video_file import VideoFile

@@ -18,7 +18,8 @@ from tests.viewer_rig import Site, run, served
 from warp_ar import live
 from warp_ar.errors import UsageError
 from warp_ar.light.captured import latlong_directions, texel_solid_angles
-from warp_ar.output.environment_axes import AXES, FACES, basis, to_cube
+from warp_ar.light.latlong_axes import AXES
+from warp_ar.output.environment_axes import FACES, basis, to_cube
 from warp_ar.scene import Pose
 from warp_ar.viewer import server
 from warp_ar.viewer.host import Host

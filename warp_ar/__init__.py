@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from warp_ar.engine.switcher import PipelineSwitcher
     from warp_ar.errors import SceneError, SinkError, SourceError, UsageError, WarpArError
     from warp_ar.light.captured import Light
-    from warp_ar.output.sinks import open_sink, read_environment, write_environment
+    from warp_ar.output.environment_file import read_environment, write_environment
+    from warp_ar.output.sinks import open_sink
     from warp_ar.photo_capture import Capture, capture_light
     from warp_ar.scene import Pose, Scene, bundled_scenes, dumps_scene, load_scene
     from warp_ar.session import Session
@@ -38,7 +39,8 @@ _HOMES = {
     "light.captured": ("Light",),
     "photo_capture": ("Capture", "capture_light"),
     "session": ("Session",),
-    "output.sinks": ("open_sink", "read_environment", "write_environment"),
+    "output.environment_file": ("read_environment", "write_environment"),
+    "output.sinks": ("open_sink",),
     "sources.sources": ("Frame", "open_source"),
     "tracking.tracking": ("TrackState", "Tracker"),
 }

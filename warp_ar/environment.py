@@ -19,7 +19,8 @@ import numpy.typing as npt
 
 from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, ending, run_command
 from warp_ar.errors import SinkError, UsageError, say
-from warp_ar.output.environment_axes import AXES, LAYOUTS
+from warp_ar.light.latlong_axes import AXES
+from warp_ar.output.environment_axes import LAYOUTS
 from warp_ar.output.environment_file import (
     COLOR_SPACES,
     ENVIRONMENT_SUFFIXES,

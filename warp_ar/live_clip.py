@@ -22,8 +22,8 @@ from warp_ar.files import is_folder, write_whole
 from warp_ar.live_start import say_quick_check, start_device
 from warp_ar.output.encoders import parse_options
 from warp_ar.output.places import check_places, check_replaceable, folder_to_oneself, reads_of
-from warp_ar.output.sink import make_folder
-from warp_ar.output.sinks import NullSink, Sink, open_sink
+from warp_ar.output.sink import NullSink, Sink, make_folder
+from warp_ar.output.sinks import open_sink
 from warp_ar.scene import Probe, Scene, load_scene
 from warp_ar.signature import PROGRAM
 from warp_ar.stages.quality import AUTO

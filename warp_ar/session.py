@@ -21,7 +21,7 @@ from warp_ar.engine.pipeline import Pipeline, Result
 from warp_ar.errors import UsageError, WarpArError
 from warp_ar.light.captured import Light
 from warp_ar.light.card_light import light_by_card
-from warp_ar.output.sinks import write_environment
+from warp_ar.output.environment_file import write_environment
 from warp_ar.scene import CapturedLight, Scene, load_calibration, load_scene
 from warp_ar.scene.exif import camera_by_exif
 from warp_ar.sources.deep_frame import check_linear

@@ -20,12 +20,13 @@ from warp_ar.accuracy.path_tracer import TracedPicture
 from warp_ar.errors import SinkError
 from warp_ar.light.captured import Light
 from warp_ar.output.camera_files import write_stmap, write_track
+from warp_ar.output.environment_file import write_environment
 from warp_ar.output.gltf_file import write_glb
 from warp_ar.output.layer_file import LayerFrame, LayerSink
 from warp_ar.output.places import check_replaceable
 from warp_ar.output.shot import Shot
-from warp_ar.output.sink import make_folder
-from warp_ar.output.sinks import EnvironmentSink, Sink, open_sink, write_environment
+from warp_ar.output.sink import Sink, make_folder
+from warp_ar.output.sinks import EnvironmentSink, open_sink
 from warp_ar.output.usd_file import write_usd
 from warp_ar.reference import write_picture
 from warp_ar.scene import Pose, loads_scene

@@ -18,8 +18,9 @@ from warp_ar.farm.manifest import read_status, status_lines
 from warp_ar.kernels.color import decode_table
 from warp_ar.light.captured import Light, find_emitters
 from warp_ar.output.camera_files import write_track
+from warp_ar.output.environment_file import read_environment, write_environment
 from warp_ar.output.shot import Shot
-from warp_ar.output.sinks import open_sink, read_environment, write_environment
+from warp_ar.output.sinks import open_sink
 from warp_ar.output.usd_file import write_usd
 from warp_ar.scene import Pose, load_calibration, load_scene, loads_scene
 from warp_ar.scene.exif import read_exif

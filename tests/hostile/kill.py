@@ -30,8 +30,9 @@ import OpenEXR
 from warp_ar.command_line import Terminated, ended_by_signals
 from warp_ar.errors import WarpArError
 from warp_ar.files import write_whole
+from warp_ar.output.environment_file import read_environment
 from warp_ar.output.layer_file import LayerFrame, LayerSink
-from warp_ar.output.sinks import EnvironmentSink, open_sink, read_environment
+from warp_ar.output.sinks import EnvironmentSink, open_sink
 from warp_ar.sources.sources import open_source
 
 SIZE = (96, 128)

@@ -38,26 +38,8 @@ import numpy.typing as npt
 
 from warp_ar.errors import UsageError
 from warp_ar.files import limits, too_much
-from warp_ar.light.latlong_axes import AXES, DESCRIPTIONS, from_axes, to_axes, world_from_marker
+from warp_ar.light.latlong_axes import AXES, world_from_marker
 from warp_ar.signature import PROGRAM
-
-__all__ = [
-    "AXES",
-    "BASIS",
-    "CUBES",
-    "DESCRIPTIONS",
-    "FACES",
-    "LAYOUTS",
-    "LOBE",
-    "basis",
-    "check_axes",
-    "encode_harmonics",
-    "from_axes",
-    "project_radiance",
-    "to_axes",
-    "to_cube",
-    "world_from_marker",
-]
 
 Radiance = npt.NDArray[np.float32]
 Array = npt.NDArray[np.float64]

@@ -26,16 +26,8 @@ from warp_ar.errors import SinkError, UsageError, reason
 from warp_ar.exr_file import exr_header, read_exr_header, read_linear_picture, write_exr
 from warp_ar.files import store
 from warp_ar.light.captured import latlong_directions, texel_solid_angles
-from warp_ar.light.latlong_axes import axes_of
-from warp_ar.output.environment_axes import (
-    CUBES,
-    DESCRIPTIONS,
-    check_axes,
-    encode_harmonics,
-    from_axes,
-    to_axes,
-    to_cube,
-)
+from warp_ar.light.latlong_axes import DESCRIPTIONS, axes_of, from_axes, to_axes
+from warp_ar.output.environment_axes import CUBES, check_axes, encode_harmonics, to_cube
 from warp_ar.output.places import check_replaceable
 from warp_ar.signals import AP1, REC_709, Chromaticities, converted
 from warp_ar.signature import PROGRAM

@@ -23,7 +23,8 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_ar.light.captured import latlong_directions, texel_solid_angles
-from warp_ar.output.environment_axes import LOBE, cube_directions, project_radiance, to_cube, world_from_marker
+from warp_ar.light.latlong_axes import world_from_marker
+from warp_ar.output.environment_axes import LOBE, cube_directions, project_radiance, to_cube
 
 Array = npt.NDArray[np.float64]
 

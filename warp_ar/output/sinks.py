@@ -22,23 +22,12 @@ from warp_ar.errors import SinkError, UsageError, reason
 from warp_ar.exr_file import LARGEST, exr_header, store_exr
 from warp_ar.files import kind_of, store
 from warp_ar.output.encoders import CODINGS, find_encoding
-from warp_ar.output.environment_file import check_environment, read_environment, write_environment
+from warp_ar.output.environment_file import check_environment, write_environment
 from warp_ar.output.places import earlier_frames
-from warp_ar.output.sink import NullSink, Sink, ThreadedSink, check_image, make_folder
+from warp_ar.output.sink import Sink, ThreadedSink, check_image, make_folder
 from warp_ar.output.video_sink import VIDEO_SUFFIXES, VideoSink
 from warp_ar.signals import REC_709
 from warp_ar.signature import is_signed, sign_png
-
-__all__ = [
-    "EnvironmentSink",
-    "FolderSink",
-    "NullSink",
-    "Sink",
-    "VideoSink",
-    "open_sink",
-    "read_environment",
-    "write_environment",
-]
 
 FOLDER_CODINGS: Final = {"8bit": "numbered frames", "16bit": "numbered frames of 16 bits", "exr": "numbered OpenEXRs"}
 """Contents of a folder's pictures, and their words."""

@@ -13,16 +13,8 @@ import numpy.typing as npt
 
 from warp_ar.errors import UsageError
 from warp_ar.light.captured import find_emitters, latlong_directions, texel_solid_angles
-from warp_ar.output.environment_axes import (
-    BASIS,
-    CUBES,
-    FACES,
-    LOBE,
-    check_axes,
-    project_radiance,
-    to_cube,
-    world_from_marker,
-)
+from warp_ar.light.latlong_axes import world_from_marker
+from warp_ar.output.environment_axes import BASIS, CUBES, FACES, LOBE, check_axes, project_radiance, to_cube
 from warp_ar.output.environment_file import encode_hdr, write_environment
 from warp_ar.scene import Pose
 from warp_ar.signature import PROGRAM

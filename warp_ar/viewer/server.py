@@ -38,7 +38,8 @@ import segno
 from aiohttp import WSCloseCode, WSMsgType, web
 
 from warp_ar.errors import SinkError, UsageError, WarpArError
-from warp_ar.output.environment_axes import AXES, FACES, LAYOUTS
+from warp_ar.light.latlong_axes import AXES
+from warp_ar.output.environment_axes import FACES, LAYOUTS
 from warp_ar.scene import bundled_scenes
 from warp_ar.srgb import encode_srgb
 from warp_ar.stages.quality import PRESETS

@@ -24,7 +24,7 @@ from warp_ar.checks.checkup import ball_is_seen, check_look
 from warp_ar.checks.finding import Finding
 from warp_ar.errors import UsageError, WarpArError
 from warp_ar.light.card_light import light_by_card
-from warp_ar.output.sinks import write_environment
+from warp_ar.output.environment_file import write_environment
 from warp_ar.scene import Camera, CapturedLight, Pose, Scene
 from warp_ar.tracking.card_layout import SHEET
 from warp_ar.tracking.tracking import TrackState
