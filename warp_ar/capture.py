@@ -27,7 +27,7 @@ from warp_ar.output.places import claim_places
 from warp_ar.photo_capture import PIXELS, Capture, capture_light
 from warp_ar.photographs.support import Support, plane_from_contact, plane_from_rectangle, scene_on
 from warp_ar.scene import Camera, CapturedLight, Scene, dumps_scene
-from warp_ar.signature import sign_png
+from warp_ar.signature import encode_png
 
 OUTLINE, PREVIEW, RESPONSE = ".outline.png", ".preview.png", ".response.txt"
 """Endings of files beside the light."""
@@ -140,19 +140,19 @@ def make_scene(found: Capture, light: Path, ball_radius: float | None) -> Scene:
 
 def draw_outline(found: Capture) -> bytes:
     """A PNG of the photograph with the ball's outline, as wide as one sees it in the whole picture."""
-    picture = np.ascontiguousarray(found.picture[..., ::-1])
+    picture = np.ascontiguousarray(found.picture)
     width = max(1, round(max(picture.shape[:2]) / 600))
     # With four bits of a fraction of a pixel.
     points = np.round(16.0 * found.outline.points()).astype(np.int32)[:, None]
-    cv2.polylines(picture, [points], isClosed=True, color=(0, 0, 255), thickness=width, lineType=cv2.LINE_AA, shift=4)
-    return sign_png(bytes(cv2.imencode(".png", picture)[1]))
+    cv2.polylines(picture, [points], isClosed=True, color=(255, 0, 0), thickness=width, lineType=cv2.LINE_AA, shift=4)
+    return encode_png(picture)
 
 
 def draw_preview(found: Capture) -> bytes:
     """A PNG of the light, tone-mapped by Reinhard's operator, in the axes of this program."""
-    shown = cv2.createTonemapReinhard(gamma=2.2).process(np.ascontiguousarray(found.light.radiance[..., ::-1]))
+    shown = cv2.createTonemapReinhard(gamma=2.2).process(np.ascontiguousarray(found.light.radiance))
     codes = np.round(255.0 * np.clip(np.nan_to_num(shown), 0.0, 1.0)).astype(np.uint8)
-    return sign_png(bytes(cv2.imencode(".png", codes)[1]))
+    return encode_png(codes)
 
 
 def _count(number: int, what: str) -> str:

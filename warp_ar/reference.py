@@ -33,7 +33,7 @@ from warp_ar.light.captured import Light
 from warp_ar.output.places import claim_places, reads_of
 from warp_ar.scene import Scene
 from warp_ar.session import chosen_scene
-from warp_ar.signature import sign_png
+from warp_ar.signature import encode_png
 
 STEP = 8
 """Samples per pixel between two reports of progress."""
@@ -126,7 +126,7 @@ def _write_all(options: argparse.Namespace, known: KnownFrame, picture: TracedPi
     if options.output is not None:
         write_picture(options.output, picture)
     if options.compare is not None:
-        write_png(options.compare, side_by_side(known, picture))
+        store(options.compare, encode_png(side_by_side(known, picture)))
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -186,20 +186,8 @@ def write_picture(path: Path, picture: TracedPicture) -> None:
         SinkError: The file cannot be written.
     """
     if path.suffix.lower() == ".png":
-        write_png(path, picture.image)
+        store(path, encode_png(picture.image))
         return
     channels = {name: np.ascontiguousarray(picture.radiance[..., c]) for c, name in enumerate("RGB")}
     channels |= {f"error.{name}": np.ascontiguousarray(picture.error[..., c]) for c, name in enumerate("RGB")}
     store_exr(path, OpenEXR.File(exr_header(samples=picture.samples), channels))
-
-
-def write_png(path: Path, image: npt.NDArray[np.uint8]) -> None:
-    """Write an RGB picture as PNG.
-
-    Raises:
-        SinkError: The file cannot be written.
-    """
-    done, data = cv2.imencode(".png", image[..., ::-1])
-    if not done:
-        raise SinkError(f"{path} cannot be encoded as PNG")
-    store(path, sign_png(data.tobytes()))

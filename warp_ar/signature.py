@@ -11,8 +11,12 @@ import os
 import re
 import struct
 import zlib
+from collections.abc import Sequence
+from typing import Any
 
 import av
+import cv2
+import numpy.typing as npt
 import PIL.Image
 
 from warp_ar.files import kind_of
@@ -49,6 +53,20 @@ def sign_png(data: bytes) -> bytes:
     body = b"tEXtSoftware\0" + _NAME
     chunk = struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body))
     return data[:33] + chunk + data[33:]
+
+
+def encode_png(picture: npt.NDArray[Any], options: Sequence[int] = ()) -> bytes:
+    """A signed PNG of 8 or 16 bits.
+
+    Args:
+        picture: Grey (height, width), RGB or RGBA (height, width, 3 or 4).
+        options: OpenCV's, for its encoder.
+    """
+    if picture.ndim == 3:
+        picture = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR if picture.shape[2] == 3 else cv2.COLOR_RGBA2BGRA)
+    done, data = cv2.imencode(".png", picture, options)
+    assert done
+    return sign_png(data.tobytes())
 
 
 def software_exif() -> bytes:

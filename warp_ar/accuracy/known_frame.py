@@ -12,12 +12,13 @@ import numpy.typing as npt
 
 from warp_ar.accuracy.light_places import place_emitters
 from warp_ar.accuracy.path_tracer import LIGHT_SAMPLES, Image, PathTracer
+from warp_ar.device import exclusive
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.engine.result import Result
 from warp_ar.errors import SourceError, UsageError
 from warp_ar.light.captured import CapturedEmitter, Light, texel_solid_angles
 from warp_ar.scene import Exposure, Pose, Scene
-from warp_ar.sources.sources import Frame, Source, open_source
+from warp_ar.sources.sources import open_scene_source
 from warp_ar.stages.quality import Quality
 from warp_ar.tracking.tracking import given_pose
 
@@ -89,26 +90,6 @@ def _tell_first(scene: str, balls: int) -> None:
     )
 
 
-def open_scene_source(scene: Scene, source: str | int | Path | None = None) -> Source:
-    """The source that a scene names, or another.
-
-    Raises:
-        UsageError: The scene names none.
-        SourceError: It cannot be opened.
-    """
-    spec = scene.source
-    if source is not None:
-        return open_source(source)
-    if spec is None:
-        raise UsageError(f"scene {scene.name!r} names no source; give one with --source")
-    where: str | int | Path = f"synthetic:{spec.synthetic}"
-    if spec.path is not None:
-        where = spec.path
-    elif spec.camera is not None:
-        where = spec.camera
-    return open_source(where, fps=spec.fps, exposures=spec.exposures or ())
-
-
 def light_up_to(
     scene: Scene,
     number: int,
@@ -135,7 +116,7 @@ def light_up_to(
         raise UsageError(f"--frame {number}: expected 0 or more")
     shown = scene.source.shown if scene.source is not None and source is None else None
     with (
-        open_scene_source(scene, source) as frames,
+        open_scene_source(scene, source, loop=False) as frames,
         Pipeline(
             scene,
             device=device,
@@ -155,30 +136,22 @@ def light_up_to(
             if frame.index < number:
                 continue
             where = f"frame {number} of {frames.description}"
-            return _known_frame(pipeline, frame, result, frame.time - first, where)
+            if not result.shown:
+                raise SourceError(f"{where} has another exposure than the frames that are shown; name one of those")
+            if result.pose is None:
+                raise SourceError(f"{where} shows no marker, so where objects stand is not known; name another frame")
+            return known_frame(pipeline, frame.image, result, frame.time - first)
     raise SourceError(f"{frames.description} has no frame {number}; it ends before")
 
 
-def _known_frame(pipeline: Pipeline, frame: Frame, result: Result, seconds: float, where: str) -> KnownFrame:
-    """Return the data of the frame that a pipeline lit last, ``seconds`` after the first.
-
-    Raises:
-        SourceError: It is not shown, or shows no marker; ``where`` names it.
-    """
-    if not result.shown:
-        raise SourceError(f"{where} has another exposure than the frames that are shown; name one of those")
-    if result.pose is None:
-        raise SourceError(f"{where} shows no marker, so where objects stand is not known; name another frame")
-    return KnownFrame(
-        exposed_scene(pipeline),
-        frame.image.copy(),
-        result.image,
-        result.pose,
-        light_of(pipeline),
-        seconds,
-        sum(timing.milliseconds for timing in result.stages.values()),
-        pipeline.plan.features.others + 1,
-    )
+def known_frame(pipeline: Pipeline, image: Image, result: Result, seconds: float) -> KnownFrame:
+    """Return what a path tracer needs of the frame that a pipeline has just lit, with a pose, at some seconds."""
+    assert result.pose is not None
+    others = pipeline.plan.features.others
+    with exclusive(pipeline.device):
+        scene, light = exposed_scene(pipeline), light_of(pipeline)
+    milliseconds = sum(timing.milliseconds for timing in result.stages.values())
+    return KnownFrame(scene, image.copy(), result.image, result.pose, light, seconds, milliseconds, others + 1)
 
 
 def exposed_scene(pipeline: Pipeline) -> Scene:

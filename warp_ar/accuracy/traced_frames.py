@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from warp_ar.accuracy.known_frame import KnownFrame, exposed_scene, light_of
+from warp_ar.accuracy.known_frame import known_frame
 from warp_ar.accuracy.path_tracer import Image
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import UsageError
@@ -40,16 +40,7 @@ class TracedFrames:
         self.first = frame.time if self.first is None else self.first
         if result.pose is None or not result.shown:
             return result.image  # type: ignore[no-any-return]
-        known = KnownFrame(
-            exposed_scene(self.pipeline),
-            frame.image,
-            result.image,
-            result.pose,
-            light_of(self.pipeline),
-            frame.time - self.first,
-            0.0,
-            self.pipeline.plan.features.others + 1,
-        )
+        known = known_frame(self.pipeline, frame.image, result, frame.time - self.first)
         tracer = known.tracer(device=str(self.pipeline.device))
         for picture in tracer.render(self.samples, error=self.error):
             traced = picture

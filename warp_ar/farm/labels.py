@@ -33,6 +33,7 @@ from warp_ar.output.shot import mesh_of
 from warp_ar.output.sink import ThreadedSink
 from warp_ar.output.sinks import PNG_OPTIONS
 from warp_ar.scene import Scene
+from warp_ar.signature import encode_png
 
 DEPTH_SCALE = 0.1
 """Millimetres of a step of a depth map; 0 is nothing that is modelled, and whatever is beyond 6.5 m."""
@@ -100,9 +101,9 @@ class LabelWriter(ThreadedSink):
             np.rint((0.5 + 0.5 * np.clip(normals, -1.0, 1.0)) * 65535.0) * (layers["normals"] != 0).any(2)[..., None]
         )
         files = {
-            f"rgb/{number:06d}": cv2.cvtColor(lit.image, cv2.COLOR_RGB2BGR),
+            f"rgb/{number:06d}": lit.image,
             f"depth/{number:06d}": np.rint(depth).astype(np.uint16),
-            f"normals/{number:06d}": np.ascontiguousarray(codes[..., ::-1]).astype(np.uint16),
+            f"normals/{number:06d}": codes.astype(np.uint16),
         }
         self._note_frame(lit)
         self._note_light(lit, key)
@@ -125,7 +126,7 @@ class LabelWriter(ThreadedSink):
 
     def _store(self, index: int, image: Any) -> None:
         for name, picture in image.files.items():
-            store(self._folder / f"{name}.png", _encode_png(picture))
+            store(self._folder / f"{name}.png", encode_png(picture, PNG_OPTIONS if picture.ndim == 3 else ()))
 
     def _trace(self, pipeline: Pipeline) -> npt.NDArray[np.uint64]:
         """Return the objects behind each pixel, a bit each."""
@@ -256,12 +257,6 @@ def _box(mask: Mask) -> list[int]:
 
 def _numbers(values: Any) -> list[float]:
     return [round(float(v), 9) for v in values]
-
-
-def _encode_png(picture: npt.NDArray[Any]) -> bytes:
-    done, data = cv2.imencode(".png", picture, PNG_OPTIONS if picture.ndim == 3 else ())
-    assert done
-    return bytes(data)
 
 
 _LISTED = 50

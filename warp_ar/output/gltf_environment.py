@@ -25,6 +25,7 @@ import numpy.typing as npt
 from warp_ar.light.captured import latlong_directions, texel_solid_angles
 from warp_ar.light.latlong_axes import world_from_marker
 from warp_ar.output.environment_axes import LOBE, cube_directions, project_radiance, to_cube
+from warp_ar.signature import encode_png
 
 Array = npt.NDArray[np.float64]
 
@@ -80,10 +81,8 @@ def encode_rgbd(radiance: npt.NDArray[np.float32]) -> bytes:
     most = np.maximum(radiance.max(-1, keepdims=True), 1e-6)
     divisor = np.clip(np.floor(255.0 / np.maximum(most, 1.0)), 1.0, 255.0) / 255.0
     color = np.clip(radiance * divisor, 0.0, 1.0) ** (1.0 / GAMMA)
-    codes = np.rint(255.0 * np.concatenate([color[..., ::-1], divisor], -1)).astype(np.uint8)
-    done, data = cv2.imencode(".png", codes)
-    assert done
-    return bytes(data)
+    codes = np.rint(255.0 * np.concatenate([color, divisor], -1)).astype(np.uint8)
+    return encode_png(codes)
 
 
 def image_based_light(radiance: npt.NDArray[np.float32], add_image: Any) -> dict[str, Any]:

@@ -26,7 +26,6 @@ import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import OpenEXR
@@ -42,7 +41,7 @@ from warp_ar.output.sinks import EnvironmentSink, FolderSink
 from warp_ar.scene import Scene
 from warp_ar.scene.object_shapes import surface_names
 from warp_ar.signals import REC_709
-from warp_ar.signature import sign_png
+from warp_ar.signature import encode_png
 from warp_ar.stages.request import LAYERS, PICTURE_LAYERS
 
 Layers = Mapping[str, npt.NDArray[Any]]
@@ -186,17 +185,15 @@ def encode_picture(name: str, frame: LayerFrame) -> bytes:
     """Return the PNG of a layer of ``PICTURES``."""
     values = frame.layers[name]
     if name == "plate":
-        picture: npt.NDArray[Any] = cv2.cvtColor(frame.frame, cv2.COLOR_RGB2BGR)
+        picture: npt.NDArray[Any] = frame.frame
     elif name == "ids":
         picture = (values + 1).astype(np.uint16)
     elif name == "depth":
         steps = np.rint(values / DEPTH_STEP)
         picture = np.where(steps <= 65535.0, steps, 0.0).astype(np.uint16)
     else:
-        picture = np.ascontiguousarray(np.rint(32767.5 * (values + 1.0)).astype(np.uint16)[..., ::-1])
-    done, data = cv2.imencode(".png", picture)
-    assert done
-    return sign_png(data.tobytes())
+        picture = np.rint(32767.5 * (values + 1.0)).astype(np.uint16)
+    return encode_png(picture)
 
 
 class LayerSink(FolderSink):

@@ -41,7 +41,7 @@ from warp_ar.scene.object_materials import materials_of
 from warp_ar.scene.object_shapes import ObjectShape, object_shapes, part_placements, surface_names
 from warp_ar.scene.shapes import box_mesh, disk_mesh, sphere_mesh, torus_mesh, tube_mesh
 from warp_ar.scene.textures import load_emission, load_texture
-from warp_ar.signature import sign_png
+from warp_ar.signature import encode_png
 from warp_ar.srgb import decode_srgb, encode_srgb
 
 Array = npt.NDArray[np.float64]
@@ -70,10 +70,7 @@ class Picture:
 
     def encode(self) -> bytes:
         """Return the PNG."""
-        order = cv2.COLOR_RGB2BGR if self.codes.shape[2] == 3 else cv2.COLOR_RGBA2BGRA
-        done, data = cv2.imencode(".png", cv2.cvtColor(self.codes, order))
-        assert done
-        return sign_png(data.tobytes())
+        return encode_png(self.codes)
 
     @property
     def digest(self) -> bytes:

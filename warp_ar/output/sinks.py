@@ -27,7 +27,7 @@ from warp_ar.output.places import earlier_frames
 from warp_ar.output.sink import Sink, ThreadedSink, check_image, make_folder
 from warp_ar.output.video_sink import VIDEO_SUFFIXES, VideoSink
 from warp_ar.signals import REC_709
-from warp_ar.signature import is_signed, sign_png
+from warp_ar.signature import encode_png, is_signed
 
 FOLDER_CODINGS: Final = {"8bit": "numbered frames", "16bit": "numbered frames of 16 bits", "exr": "numbered OpenEXRs"}
 """Contents of a folder's pictures, and their words."""
@@ -113,10 +113,7 @@ class FolderSink(ThreadedSink):
             from warp_ar.kernels.color import encode_codes  # here, for it loads Warp: the page is to be there before
 
             image = np.rint(65535.0 * encode_codes(self._transfer, image)).astype(np.uint16)
-        done, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), PNG_OPTIONS)
-        if not done:
-            raise SinkError(f"{path} cannot be encoded as PNG")
-        store(path, sign_png(data.tobytes()))
+        store(path, encode_png(image, PNG_OPTIONS))
 
 
 class EnvironmentSink(FolderSink):

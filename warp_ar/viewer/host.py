@@ -13,7 +13,6 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Final
 
-import cv2
 import numpy as np
 
 from warp_ar.checks.pointed_shape import point_out
@@ -22,6 +21,7 @@ from warp_ar.engine.pipeline import Pipeline, Result, resolve_quality
 from warp_ar.errors import SourceError, UsageError, WarpArError
 from warp_ar.scene import Camera, Pose, Scene, bundled_scenes, dumps_scene, load_scene
 from warp_ar.scene.object_shapes import object_shapes
+from warp_ar.signature import encode_png
 from warp_ar.sources.sources import Frame, Source
 from warp_ar.stages.quality import AUTO, DEFAULT_PRESET, PRESETS, Quality
 from warp_ar.tracking.tracking import TrackState, given_pose, tell_missing_poses
@@ -318,7 +318,7 @@ class Host:
         """
         if (latest := self.latest) is None:
             raise UsageError("no frame has been lit yet")
-        return cv2.imencode(".png", latest.image[..., ::-1])[1].tobytes()
+        return encode_png(latest.image)
 
     def environment_exr(self) -> bytes:
         """Return the environment as an EXR.

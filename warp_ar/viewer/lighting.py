@@ -18,9 +18,9 @@ from typing import Any, Final
 import cv2
 import numpy as np
 
-from warp_ar.accuracy.known_frame import KnownFrame, exposed_scene, light_of
+from warp_ar.accuracy.known_frame import known_frame
 from warp_ar.accuracy.path_tracer import PathTracer, TracedPicture
-from warp_ar.device import exclusive, resolve_device
+from warp_ar.device import resolve_device
 from warp_ar.engine.graph import Plan, make_plan
 from warp_ar.engine.pipeline import Pipeline, Result
 from warp_ar.engine.switcher import PipelineSwitcher, Target
@@ -326,11 +326,7 @@ class Convergence:
             return
         assert result.pose is not None
         self.drop()
-        with exclusive(pipeline.device):
-            light, scene = light_of(pipeline), exposed_scene(pipeline)
-        known = KnownFrame(
-            scene, frame.copy(), result.image, result.pose, light, seconds, 0.0, pipeline.plan.features.others + 1
-        )
+        known = known_frame(pipeline, frame, result, seconds)
         self._key, self._lit = key, result.image
 
         def make() -> PathTracer:
