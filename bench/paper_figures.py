@@ -23,7 +23,8 @@ from warp_ar.accuracy.cases import Case, Image, Mask, open_scene
 from warp_ar.accuracy.charts import Point, lines, scatter
 from warp_ar.accuracy.cost_table import turn
 from warp_ar.accuracy.measure import picture_error, region_of, run, run_in_turn
-from warp_ar.accuracy.pictures import bounding_box, halves, sheet
+from warp_ar.accuracy.metrics import flip_map
+from warp_ar.accuracy.pictures import Box, bounding_box, crop, error_colors
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.kernels.color import decode_table
 from warp_ar.light.captured import texel_solid_angles
@@ -36,6 +37,8 @@ GRID = 0.05
 """Metres between the lines of figure 5's ground plane."""
 FULL = 0.4
 """Share of the brightest added light from which a pixel lies well inside the light's cone."""
+GAP = 6
+"""Pixels between the pictures of a sheet."""
 CARD = 0.85
 """Half the side of a printed card, in sides of its marker."""
 BAND = 2
@@ -77,6 +80,32 @@ class PaperFigure:
     """Table of numbers."""
     plots: tuple[str, ...]
     """SVG."""
+
+
+def sheet(columns: Sequence[Image], reference: Image | None, box: Box) -> Image:
+    """Crops side by side, and below each its FLIP to ``reference`` where that is known; one picture."""
+    rows = [[crop(image, box) for image in columns]]
+    if reference is not None:
+        errors = [error_colors(flip_map(reference, image)) for image in columns]
+        rows.append([crop(error, box) for error in errors])
+    tall, wide = rows[0][0].shape[:2]
+    size = len(rows) * (tall + GAP) - GAP, len(columns) * (wide + GAP) - GAP
+    out = np.full((*size, 3), 255, np.uint8)
+    for i, row in enumerate(rows):
+        for j, image in enumerate(row):
+            out[i * (tall + GAP) :, j * (wide + GAP) :][:tall, :wide] = image
+    return out
+
+
+def halves(first: Image, second: Image, box: Box, *, above: bool) -> Image:
+    """One picture of two: ``first`` above, or on the left, ``second`` in the other half of the box."""
+    out = second.copy()
+    rows, columns = box
+    if above:
+        out[: (rows.start + rows.stop) // 2] = first[: (rows.start + rows.stop) // 2]
+    else:
+        out[:, : (columns.start + columns.stop) // 2] = first[:, : (columns.start + columns.stop) // 2]
+    return out
 
 
 # ------------------------------------------------------------------------------------------------------ whole pictures

@@ -22,7 +22,7 @@ from PIL import Image
 from rich.console import Console
 from rich.progress import track
 
-from warp_ar.accuracy.charts import require_plots, stand_alone
+from warp_ar.accuracy.charts import require_plots
 from warp_ar.accuracy.report import MIN_COLUMNS, print_table
 from warp_ar.command_line import EXIT_DONE, Parser, count, run_command
 from warp_ar.device import resolve_device
@@ -90,7 +90,7 @@ def write_figure(figure: PaperFigure, out: OwnFiles, folder: str) -> str:
     parts += [f"From left to right: {', '.join(figure.labels)}{below}.", as_markdown(figure.head, figure.rows)]
     for index, plot in enumerate(figure.plots):
         file = f"{name}{'ab'[index] if len(figure.plots) > 1 else ''}.svg"
-        out.write(file, f"{COMMENT}\n{stand_alone(plot)}")
+        out.write(file, f"{COMMENT}\n{plot}")
         parts.append(f"![{figure.head[-1]}]({folder}/{file})")
     return "\n\n".join(parts)
 

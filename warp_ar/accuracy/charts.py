@@ -1,4 +1,4 @@
-"""Charts of cost against error, as SVG that stands inside a page and takes its colours."""
+"""Charts of cost against error, as SVG."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ import dataclasses
 import html
 import io
 import itertools
-import re
-import zlib
 from collections.abc import Sequence
 from typing import Any
 
@@ -21,13 +19,12 @@ _COLORS = {
     "soft": "#5c5f61",
     "ink": "#1b1c1d",
     "line": "#dcdcd1",
-    "card": "#fffff1",
+    "card": "#ffffff",
     "mark": "#2f6fd1",
     "other": "#9a9c91",
     "warm": "#c25711",
 }
-"""Colours by the page's names for them. The page has a dark form: in the SVG each becomes ``var(--NAME)``."""
-_DARK = {"soft": "#a9acb1", "ink": "#ececea", "line": "#303236", "card": "#1c1e21", "mark": "#7aa7ff"}
+"""Colours, as the page has them."""
 _FONT = 9.0
 
 
@@ -114,13 +111,12 @@ def lines(series: Sequence[tuple[str, npt.ArrayLike, npt.ArrayLike]], x_title: s
 
 
 def _axes(x_title: str, y_title: str, size: tuple[float, float]) -> tuple[Any, Any]:
-    """Return an empty drawing and its axes in the page's colours."""
+    """Return an empty drawing and its axes."""
     require_plots()
     from matplotlib.figure import Figure
 
     drawing = Figure(size, dpi=100, layout="constrained")
     axes = drawing.add_subplot()
-    axes.set_facecolor("none")
     axes.grid(axis="y", color=_COLORS["line"], linewidth=0.8)
     axes.set_axisbelow(True)
     for name, spine in axes.spines.items():
@@ -133,33 +129,13 @@ def _axes(x_title: str, y_title: str, size: tuple[float, float]) -> tuple[Any, A
 
 
 def _to_svg(drawing: Any, title: str, description: str) -> str:
-    """Return a drawing as SVG for the inside of a page: text stays text, colours are the page's, ids its own."""
+    """Return a drawing as SVG, for a file or the inside of a page: text stays text, ids are its own."""
     import matplotlib
 
     file = io.StringIO()
     none = dict.fromkeys(("Creator", "Date", "Format", "Type"))
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": title + description}):
-        drawing.savefig(file, format="svg", transparent=True, metadata=none)
+        drawing.savefig(file, format="svg", metadata=none)
     svg = file.getvalue()
-    svg = re.sub(r"<metadata>.*?</metadata>", "", svg[svg.index("<svg ") :], flags=re.S)
-    svg = re.sub(r'(<svg [^>]*?) width="[^"]*"', r"\1", svg, count=1)
-    svg = re.sub(r'(<svg [^>]*?)height="[^"]*" ', r"\1", svg, count=1)
-    salt = f"c{zlib.crc32((title + description).encode()):x}"
-    svg = re.sub(r'((?:id="|href="#|url\(#))', rf"\g<1>{salt}", svg)
-    svg = re.sub(r"font: ([\d.]+px) [^;\"]*", r"font-size: \1", svg)
-    for name, color in _COLORS.items():
-        svg = svg.replace(color, f"var(--{name})")
     label = html.escape(f"{title}: {description}", quote=True)
-    return svg.replace("<svg ", f'<svg role="img" aria-label="{label}" ', 1).strip()
-
-
-def stand_alone(svg: str) -> str:
-    """Return a chart as a file of its own, with the colours that the page would give it."""
-    light = ";".join(f"--{name}:{color}" for name, color in (_COLORS | {"card": "#ffffff"}).items())
-    dark = ";".join(f"--{name}:{color}" for name, color in _DARK.items())
-    style = (
-        f"<style>svg{{{light};background:var(--card);font-family:sans-serif}}"
-        f"@media(prefers-color-scheme:dark){{svg{{{dark}}}}}</style>"
-    )
-    start = svg.index(">") + 1
-    return svg[:start] + style + svg[start:] + "\n"
+    return svg[svg.index("<svg ") :].replace("<svg ", f'<svg role="img" aria-label="{label}" ', 1)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import cv2
@@ -11,7 +10,6 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_ar.accuracy.cases import Image
-from warp_ar.accuracy.metrics import flip_map
 
 Box = tuple[slice, slice]
 """Rows and columns of a crop."""
@@ -19,8 +17,6 @@ CROP_WIDTH = 360
 """Crops are about this many pixels wide: fewer are shown as they are, more are averaged."""
 CROP_ASPECT = 4.0 / 3.0
 """Width over height of a crop."""
-GAP = 6
-"""Pixels between the pictures of a sheet."""
 
 
 def error_colors(errors: npt.NDArray[Any]) -> Image:
@@ -57,29 +53,3 @@ def crop(image: Image, box: Box) -> Image:
         return np.ascontiguousarray(part)
     size = CROP_WIDTH, max(1, round(part.shape[0] * CROP_WIDTH / part.shape[1]))
     return np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_AREA), np.uint8)
-
-
-def sheet(columns: Sequence[Image], reference: Image | None, box: Box) -> Image:
-    """Crops side by side, and below each its FLIP to ``reference`` where that is known; one picture."""
-    rows = [[crop(image, box) for image in columns]]
-    if reference is not None:
-        errors = [error_colors(flip_map(reference, image)) for image in columns]
-        rows.append([crop(error, box) for error in errors])
-    tall, wide = rows[0][0].shape[:2]
-    size = len(rows) * (tall + GAP) - GAP, len(columns) * (wide + GAP) - GAP
-    out = np.full((*size, 3), 255, np.uint8)
-    for i, row in enumerate(rows):
-        for j, image in enumerate(row):
-            out[i * (tall + GAP) :, j * (wide + GAP) :][:tall, :wide] = image
-    return out
-
-
-def halves(first: Image, second: Image, box: Box, *, above: bool) -> Image:
-    """One picture of two: ``first`` above, or on the left, ``second`` in the other half of the box."""
-    out = second.copy()
-    rows, columns = box
-    if above:
-        out[: (rows.start + rows.stop) // 2] = first[: (rows.start + rows.stop) // 2]
-    else:
-        out[:, : (columns.start + columns.stop) // 2] = first[:, : (columns.start + columns.stop) // 2]
-    return out

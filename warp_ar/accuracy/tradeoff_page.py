@@ -28,10 +28,8 @@ REAL_TIME = 1e3 / 30.0
 """Milliseconds of a frame at 30 frames per second."""
 
 _STYLE = """
-:root{color-scheme:light dark;--page:#fbfbf9;--ink:#1b1c1e;--soft:#5c5f65;--line:#dcdcd6;--card:#fff;--mark:#2f6fdf;
+:root{--page:#fbfbf9;--ink:#1b1c1e;--soft:#5c5f65;--line:#dcdcd6;--card:#fff;--mark:#2f6fdf;
 --other:#9a9c9f;--warm:#c2571a}
-@media(prefers-color-scheme:dark){:root{--page:#141517;--ink:#ececea;--soft:#a9acb1;--line:#303236;--card:#1c1e21;
---mark:#7aa7ff;--other:#74777c;--warm:#f09a5e}}
 *{box-sizing:border-box}html{scroll-behavior:smooth}body{margin:0;background:var(--page);color:var(--ink);
 font:15px/1.5 system-ui,-apple-system,"Segoe UI",Roboto,"Helvetica Neue",Arial,sans-serif}
 main{max-width:1180px;margin:0 auto;padding:40px 24px 80px}h1{font-size:34px;line-height:1.15;margin:0 0 8px}
@@ -55,7 +53,6 @@ td{text-align:right;padding:3px 6px;border-bottom:1px solid var(--line);vertical
 tr:last-child td{border-bottom:0}td:first-child,th:first-child,td.text{text-align:left}td.text{color:var(--soft)}
 tr.out td{color:var(--soft)}tr.head td{font-weight:600;padding-top:12px}
 svg{display:block;width:100%;height:auto}
-svg text{font-family:inherit;paint-order:stroke;stroke:var(--card);stroke-width:3px;stroke-linejoin:round}
 .scale{display:inline-grid;grid-template-columns:repeat(5,44px);vertical-align:middle;margin:0 8px;font-size:11px;
 text-align:center}.scale img{grid-column:1/-1;width:100%;height:10px;border-radius:3px}
 @media(max-width:600px){main{padding:24px 16px 60px}h1{font-size:28px}
