@@ -386,7 +386,7 @@ def test_wrong_codings_and_encoders_get_one_line(tmp_path: pathlib.Path) -> None
         ("a", {"coding": "pq"}, r"coding 'pq': .*a is a folder, which holds 8bit, 16bit, exr"),
         ("a", {"coding": "9bit"}, r"coding '9bit': expected 8bit, 10bit"),
         ("a", {"encoder": "libx264"}, r"encoder libx264: .* is a folder; name a video"),
-        ("a.mp4", {"encoder": "libx265x"}, r"there is no encoder 'libx265x'; did you mean libx265\?"),
+        ("a.mp4", {"encoder": "libx265x"}, r"there is no encoder 'libx265x'; did you mean .libx265"),
         ("a.mp4", {"encoder": "aac"}, r"aac encodes audio; choose an encoder of video"),
         ("a.mp4", {"encoder": "mpeg4", "coding": "10bit"}, r"mpeg4 takes no pictures of 10 bits, only yuv420p"),
         ("a.mp4", {"encoder_options": {"crff": "1"}}, r"--encoder-option crff: libx264 has no such option"),

@@ -33,7 +33,7 @@ from warp_ar.calibration.camera_calibration import calibrate_camera, write_camer
 from warp_ar.calibration.card import PAPERS, write_card
 from warp_ar.calibration.response import MOST_DEVIATION, measure_grey_response, measure_response, write_response
 from warp_ar.checks.check_ball import DULL, inside_contrast
-from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, run_command, seconds
+from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, FROM_0, Parser, count, run_command, seconds
 from warp_ar.errors import UsageError, say
 from warp_ar.output.places import claim_places
 from warp_ar.scene import CharucoBoard, Marker, bundled_scenes, load_scene, loads_scene
@@ -89,7 +89,7 @@ def make_parser() -> argparse.ArgumentParser:
     board = f'a board, as in a scene: "{SHEET.board}", "grid 4x3 0.04 0.01" (metres)'
     option = add("card", "write the card, or a marker or board of your own, to print at true size", "card.pdf")
     option("--dictionary", metavar="NAME", help=f"OpenCV's dictionary of your marker (default: {Marker.dictionary})")
-    option("--id", type=int, metavar="N", help="number of your marker, instead of the card (default: 0)")
+    option("--id", type=FROM_0, metavar="N", help="number of your marker, instead of the card (default: 0)")
     option(
         "--size",
         type=float,
@@ -105,7 +105,7 @@ def make_parser() -> argparse.ArgumentParser:
     option("--board", metavar="TEXT", help=board + " (default: the pictures' board)")
     text = "write camera.yml beside this scene and into its [camera]"
     option("--write", type=Path, metavar="SCENE", help=text)
-    option("--frames", type=int, metavar="N", help="stop after N frames of each video or device")
+    option("--frames", type=count, metavar="N", help="stop after N frames of each video or device")
     option("--fisheye", action="store_true", help="for fisheye lenses: action cameras, phones' widest")
     option = add("ball", "measure where a scene's mirror ball stands", None)
     option(
@@ -114,7 +114,7 @@ def make_parser() -> argparse.ArgumentParser:
         help="a scene with camera, marker and a rough [probe] with radius",
     )
     option("--source", metavar="PATH|INDEX", help="frames, if not the scene's own")
-    option("--frames", type=int, default=60, metavar="N", help="frames to look at (default: 60)")
+    option("--frames", type=count, default=60, metavar="N", help="frames to look at (default: 60)")
     option("--keep-radius", action="store_true", help="keep the scene's radius")
     option("--write", action="store_true", help="write center and radius into the scene file")
     text = "measure the response curve by the card's greys or a still scene"
@@ -125,7 +125,7 @@ def make_parser() -> argparse.ArgumentParser:
     option("--exposures", nargs="+", type=seconds, metavar="S", help=text)
     option(
         "--frames",
-        type=int,
+        type=count,
         default=24,
         metavar="N",
         help="frames of each video or device, without --exposures (default: 24)",

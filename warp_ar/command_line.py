@@ -8,7 +8,6 @@ import contextlib
 import difflib
 import errno
 import io
-import math
 import os
 import re
 import signal
@@ -31,7 +30,7 @@ EXIT_USAGE = 2
 EXIT_PIPE = 141
 """Nobody reads what is printed any more."""
 
-_LARGEST = 2**31 - 1
+LARGEST: Final = 2**31 - 1
 """Largest whole number of an argument: they count frames, samples, pixels, ports."""
 
 
@@ -60,8 +59,10 @@ def ending(*suffixes: str) -> Callable[[str], Path]:
 
 LEAST: Final = 1e-9
 """Least number that counts as above 0."""
-count = number(1, math.inf, "1 or more", int)
+count = number(1, LARGEST, f"1 or more, {LARGEST:,} at most", int)
 """Number of frames, samples or the like."""
+FROM_0 = number(0, LARGEST, f"0 or more, {LARGEST:,} at most", int)
+"""Number of something that is counted from 0."""
 pixel = number(-1e9, 1e9, "pixels")
 """Column or row of a picture."""
 seconds = number(LEAST, 1e9, "a time in seconds, such as 0.02 or 1/50", lambda text: float(Fraction(text)))
@@ -158,24 +159,17 @@ class Parser(argparse.ArgumentParser):
         raise UsageError(f"{message}{hint}; see {self.prog} --help")
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """As argparse does it, but nothing empty (a path of no name is the current folder) and no endless number.
+        """As argparse does it, but nothing empty: a path of no name is the current folder.
 
         Raises:
-            UsageError: An argument is empty, or a number has too many digits.
+            UsageError: An argument is empty.
         """
         given = list(sys.argv[1:] if args is None else args)
         for place, word in enumerate(given):
             if word == "" or (word is not None and re.fullmatch(r"--[a-z0-9-]+=", word)):
                 before = given[place - 1] if place and str(given[place - 1]).startswith("-") else "an argument"
                 raise UsageError(f"{word.rstrip('=') or before} is empty; give it a value, or leave it out")
-        found, rest = super().parse_known_args(given, namespace)
-        for action in self._actions:
-            value = getattr(found, action.dest, None)
-            if isinstance(value, int) and abs(value) > _LARGEST:
-                name = action.option_strings[-1] if action.option_strings else action.dest
-                digits = len(str(abs(value)))
-                raise UsageError(f"{name}: a number of {digits} digits; expected {_LARGEST:,} at most")
-        return found, rest
+        return super().parse_known_args(given, namespace)
 
 
 class _HelpAll(argparse.Action):

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, ending, run_command
+from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, count, ending, run_command
 from warp_ar.errors import SinkError, UsageError, say
 from warp_ar.light.latlong_axes import AXES
 from warp_ar.output.environment_axes import LAYOUTS
@@ -49,7 +49,7 @@ def make_parser() -> argparse.ArgumentParser:
     text = "z-up: this program's; blender: also three.js; y-up: OpenEXR, USD (default: y-up)"
     add("--axes", choices=AXES, default="y-up", help=text)
     add("--layout", choices=LAYOUTS, default="latlong", help="latlong, or a cube's six faces (default: latlong)")
-    add("--size", type=int, metavar="TEXELS", help="edge of a cube's faces (default: half the rows)")
+    add("--size", type=count, metavar="TEXELS", help="edge of a cube's faces (default: half the rows)")
     add("--taken", type=_time, metavar="TIME", help="time of capture, such as 2026-05-01T12:00:00+02:00")
     text = "longitude, latitude in degrees, altitude in metres"
     add("--place", type=float, nargs=3, metavar=("EAST", "NORTH", "ALTITUDE"), help=text)

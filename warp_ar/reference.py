@@ -25,7 +25,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from warp_ar.accuracy.known_frame import KnownFrame, light_up_to
 from warp_ar.accuracy.path_tracer import DEFAULT_SAMPLES, PathTracer, TracedPicture
-from warp_ar.command_line import EXIT_DONE, LEAST, Parser, count, ending, number, run_command
+from warp_ar.command_line import EXIT_DONE, FROM_0, LEAST, Parser, count, ending, number, run_command
 from warp_ar.errors import SinkError, SourceError, UsageError, say
 from warp_ar.exr_file import exr_header, store_exr
 from warp_ar.files import store
@@ -49,7 +49,7 @@ def make_parser() -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     parser.add_common("scene", "--source", "--light", "--light-axes", "--calibration", "--device", "--overwrite")
-    add("--frame", type=int, default=0, metavar="N", help="which frame, from 0; earlier ones bring the light")
+    add("--frame", type=FROM_0, default=0, metavar="N", help="which frame, from 0; earlier ones bring the light")
     text = f"mean paths per pixel, at most (default: {DEFAULT_SAMPLES})"
     add("--samples", type=count, default=DEFAULT_SAMPLES, metavar="N", help=text)
     text = "relative standard error to stop at, such as 0.01"
@@ -65,7 +65,7 @@ def make_parser() -> argparse.ArgumentParser:
     text = "write the light, with distances of --places, for live --light"
     add("--save-light", type=ending(".exr"), metavar="FILE.exr", help=text)
     add("--size", type=_size, metavar="WxH", help="size of the picture (default: the frames')")
-    add("--seed", type=int, default=0, metavar="N", help="seed of the random numbers (default: 0)")
+    add("--seed", type=FROM_0, default=0, metavar="N", help="seed of the random numbers (default: 0)")
     return parser
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import fractions
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
@@ -13,6 +12,7 @@ import cv2
 from av.codec import codecs_available
 
 from warp_ar.errors import SinkError, UsageError, reason
+from warp_ar.scene.messages import nearest
 
 CODINGS: Final = ("8bit", "10bit", "pq", "hlg")
 """Codings of video: the camera's codes in 8 or 10 bits, or HDR: BT.2020's primaries in 10 bits."""
@@ -70,9 +70,8 @@ def find_encoding(
     try:
         codec = av.Codec(name, "w")
     except av.codec.codec.UnknownCodecError as error:
-        close = difflib.get_close_matches(name, encoder_names(), 1)
-        hint = f"did you mean {close[0]}? " if close else ""
-        raise SinkError(f"there is no encoder {name!r}; {hint}--encoder list shows those of this machine") from error
+        hint = nearest(name, encoder_names())
+        raise SinkError(f"there is no encoder {name!r}; {hint} (--encoder list shows all)") from error
     if codec.type != "video":
         raise SinkError(f"{name} encodes {codec.type}; choose an encoder of video, --encoder list shows them")
     bits = 8 if coding == "8bit" else 10

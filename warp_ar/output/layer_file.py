@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import difflib
 import json
 import pathlib
 from collections.abc import Mapping, Sequence
@@ -39,6 +38,7 @@ from warp_ar.files import store
 from warp_ar.output.sink import make_folder
 from warp_ar.output.sinks import EnvironmentSink, FolderSink
 from warp_ar.scene import Scene
+from warp_ar.scene.messages import nearest
 from warp_ar.scene.object_shapes import surface_names
 from warp_ar.signals import REC_709
 from warp_ar.signature import encode_png
@@ -238,9 +238,7 @@ def parse_layers(text: str | None) -> tuple[str, ...]:
     names = tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
     for name in names or (text,):
         if name not in LAYERS:
-            close = difflib.get_close_matches(name, LAYERS, 1)
-            hint = f"did you mean {close[0]!r}? " if close else ""
-            raise UsageError(f"--layers: {name!r} is no layer; {hint}expected all, or some of {', '.join(LAYERS)}")
+            raise UsageError(f"--layers: {name!r} is no layer; {nearest(name, ['all', *LAYERS])}")
     return names
 
 
@@ -273,14 +271,13 @@ class SideFiles(Closing):
         self._stack = contextlib.ExitStack()
         self.outputs: tuple[str, ...] = ()
         """Outputs that the pipeline's results must hold."""
-        self.lights: EnvironmentSink | None = None
-        """Takes the captured light."""
-        self._other_lights: list[EnvironmentSink] = []
+        self._lights: list[EnvironmentSink] = []
+        """Take the captured light, of one mirror ball each; all but the first are opened where there is some."""
         self._environment, self._overwrite = environment, overwrite
         self._layers: LayerSink | None = None
         with contextlib.ExitStack() as stack:
             if environment is not None:
-                self.lights = stack.enter_context(EnvironmentSink(environment, overwrite=overwrite))
+                self._lights.append(stack.enter_context(EnvironmentSink(environment, overwrite=overwrite)))
                 self.outputs += ("environment",)
             if layers is not None:
                 held = tuple(name for name in names if name in PICTURES) if pictures else ()
@@ -291,14 +288,14 @@ class SideFiles(Closing):
     @property
     def replaced(self) -> tuple[str, ...]:
         """Words for what the first frame replaces."""
-        return tuple(sink.replaced for sink in (self.lights, self._layers) if sink is not None and sink.replaced)
+        return tuple(sink.replaced for sink in (*self._lights[:1], self._layers) if sink and sink.replaced)
 
     @property
     def written(self) -> str:
         """Words for how much is stored, which begin with a comma; empty where nothing is asked for."""
-        lights = "" if self.lights is None else f", and {self.lights.written} environments"
-        if self._other_lights:
-            lights += f" of each of {len(self._other_lights) + 1} mirror balls"
+        lights = f", and {self._lights[0].written} environments" if self._lights else ""
+        if len(self._lights) > 1:
+            lights += f" of each of {len(self._lights)} mirror balls"
         return lights if self._layers is None else f"{lights}, and layers of {self._layers.written}"
 
     def write(self, frame: npt.NDArray[np.uint8], result: Result, scene: Scene) -> None:
@@ -312,20 +309,14 @@ class SideFiles(Closing):
         Raises:
             SinkError: An earlier one could not be written.
         """
-        if self.lights is not None and result.environment is not None:
-            self.lights.write(result.environment)
-            for ball, radiance in enumerate(result.environments[1:], 1):
-                self._lights_of(ball).write(radiance)
+        if self._environment is not None and result.environment is not None:
+            for ball, radiance in enumerate(result.environments):
+                if ball == len(self._lights):
+                    sink = EnvironmentSink(self._environment / f"ball_{ball}", overwrite=self._overwrite)
+                    self._lights.append(self._stack.enter_context(sink))
+                self._lights[ball].write(radiance)
         if self._layers is not None:
             self._layers.write(layer_frame(frame, result, scene))
-
-    def _lights_of(self, ball: int) -> EnvironmentSink:
-        """Takes the captured light of a mirror ball after the first; opened where there is some."""
-        if ball > len(self._other_lights):
-            assert self._environment is not None
-            sink = EnvironmentSink(self._environment / f"ball_{ball}", overwrite=self._overwrite)
-            self._other_lights.append(self._stack.enter_context(sink))
-        return self._other_lights[ball - 1]
 
     def close(self) -> None:
         """Close the folders."""

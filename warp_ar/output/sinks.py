@@ -64,13 +64,6 @@ class FolderSink(ThreadedSink):
         self._path, self._coding, self._transfer = pathlib.Path(path), coding, transfer
         if coding == "exr":
             self._suffix = ".exr"
-        try:
-            kind = kind_of(self._path)
-        except OSError as error:
-            raise SinkError(f"{self._path} cannot be written to: {reason(error)}") from error
-        if kind not in ("folder", "nothing"):
-            what = "a file" if kind == "file" else kind
-            raise SinkError(f"{self._path} is {what}; name a folder, or a video ending in {', '.join(VIDEO_SUFFIXES)}")
         make_folder(self._path)
         self._earlier: list[pathlib.Path] = []
         self._find_earlier(self._path, self._suffix, overwrite=overwrite)
