@@ -20,7 +20,7 @@ from warp_ar.ball.ball_finder import BallOutline
 from warp_ar.calibration.response import write_response
 from warp_ar.checks.check_objects import check_objects, written_poses
 from warp_ar.command_line import EXIT_DONE, Parser, ending, number, pixel, run_command, seconds
-from warp_ar.errors import SinkError, UsageError, say
+from warp_ar.errors import SinkError, UsageError, counted, say
 from warp_ar.files import store
 from warp_ar.light.latlong_axes import AXES
 from warp_ar.output.places import claim_places
@@ -112,8 +112,8 @@ def _check(options: argparse.Namespace) -> None:
     elif options.exposures is not None and PIXELS in options.exposures:
         raise UsageError(f"--exposures {PIXELS} stands alone; expected no seconds beside it")
     elif options.exposures is not None and len(options.exposures) != len(options.photos):
-        number = _count(len(options.photos), "photograph")
-        raise UsageError(f"{_count(len(options.exposures), 'exposure')} for {number}; expected one for each")
+        number = counted(len(options.photos), "photograph")
+        raise UsageError(f"{counted(len(options.exposures), 'exposure')} for {number}; expected one for each")
     _check_radius(options)
     options.outline = options.outline or options.output.with_suffix(OUTLINE)
     writes = {"--output": options.output, "--outline": options.outline, "--scene": options.scene}
@@ -155,14 +155,10 @@ def draw_preview(found: Capture) -> bytes:
     return encode_png(codes)
 
 
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}{'s' * (number != 1)}"
-
-
 def capture(options: argparse.Namespace) -> int:
     """Capture, write, and say what was found."""
     _check(options)
-    say(f"looking for the ball in {_count(len(options.photos), 'photograph')}")
+    say(f"looking for the ball in {counted(len(options.photos), 'photograph')}")
     wanted = options.rectangle is not None or options.contact is not None
     found = capture_light(
         options.photos,
@@ -181,7 +177,7 @@ def capture(options: argparse.Namespace) -> int:
     for note in found.notes:
         say(note)
     found.light.save(options.output, options.axes)
-    emitters = _count(len(found.light.emitters), "emitter")
+    emitters = counted(len(found.light.emitters), "emitter")
     print(f"{options.output}: light in camera values of {found.shown.name}, {emitters}")
     for emitter in found.light.emitters:
         x, y, z = emitter.direction

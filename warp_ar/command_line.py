@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, Final, NoReturn
 
 from warp_ar.begin import EXIT_INTERRUPTED, EXIT_TERMINATED, end_at_once, handling
-from warp_ar.errors import SinkError, UsageError, WarpArError, reason, say
+from warp_ar.errors import SinkError, UsageError, WarpArError, causes, reason, say
 from warp_ar.output.sink import close_open_sinks
 from warp_ar.scene.description import LATLONG_AXES
 
@@ -223,7 +223,7 @@ def run_command(command: Callable[[], int], failures: type[WarpArError] | tuple[
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
     except Exception as error:
-        if _is_out_of_memory(error):
+        if any(isinstance(cause, MemoryError) or _NO_MEMORY.search(str(cause)) for cause in causes(error)):
             say(f"there is not enough memory: {reason(error)}")
             return EXIT_FAILED
         if not isinstance(error, OSError):
@@ -242,15 +242,6 @@ def run_command(command: Callable[[], int], failures: type[WarpArError] | tuple[
 
 _NO_MEMORY: Final = re.compile("(?i)failed to (allocate|map)|(insufficient|cannot allocate) memory|start new thread")
 """Words of what has no error of its own for it: Warp, OpenCV, the loader of libraries, Python's threads."""
-
-
-def _is_out_of_memory(error: BaseException | None) -> bool:
-    """Return whether an error, or what caused it, is that memory cannot be had."""
-    while error is not None:
-        if isinstance(error, MemoryError) or _NO_MEMORY.search(str(error)):
-            return True
-        error = error.__cause__ or error.__context__
-    return False
 
 
 def _folder_is_gone() -> bool:

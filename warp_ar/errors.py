@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import re
 import sys
+from collections.abc import Iterator
 
 
 class WarpArError(Exception):
@@ -29,6 +30,18 @@ class UsageError(WarpArError, ValueError):
 
 class UpdateError(UsageError):
     """A scene differs from that of a running pipeline in more than numbers: names the part."""
+
+
+def causes(error: BaseException | None) -> Iterator[BaseException]:
+    """Yield an error and what it came from, in turn."""
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__
+
+
+def counted(number: int, what: str) -> str:
+    """Return a number of things in words: 1 frame, 2 frames."""
+    return f"{number} {what}{'s' * (number != 1)}"
 
 
 def reason(error: BaseException) -> str:

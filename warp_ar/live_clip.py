@@ -17,7 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from warp_ar.begin import EXIT_INTERRUPTED, EXIT_TERMINATED, handling, importing
 from warp_ar.command_line import EXIT_DONE
-from warp_ar.errors import UsageError, WarpArError, printable, reason, say
+from warp_ar.errors import UsageError, WarpArError, counted, printable, reason, say
 from warp_ar.files import is_folder, write_whole
 from warp_ar.live_start import say_quick_check, start_device
 from warp_ar.output.encoders import parse_options
@@ -64,10 +64,6 @@ def reflectances_told(probes: Sequence[Probe], status: Callable[[], Mapping[str,
                 f"mirror ball {index} was taken to reflect {taken}, as frames show it, not {said}, as [probe] has it"
             )
     return lines
-
-
-def _counted(number: int, what: str) -> str:
-    return f"{number} {what}{'s' * (number != 1)}"
 
 
 def light_clip(options: argparse.Namespace) -> int:
@@ -308,7 +304,7 @@ class _Clip:
         if not log.never_posed or log.count == 0:
             return
         message = (
-            f"no marker in the first {_counted(log.count, 'frame')}: expected {marker.dictionary} "
+            f"no marker in the first {counted(log.count, 'frame')}: expected {marker.dictionary} "
             f"{marker.board or f'id {marker.id}'}; check the scene's [marker], that the whole marker with its white "
             "border is in view, sharp and not mirrored"
         )
@@ -348,7 +344,7 @@ class _Clip:
         """Return how many frames there are of a run that failed."""
         bare = isinstance(self.sink, NullSink)
         count, how = (self.log.count, "lit") if bare else (self.sink.written, "written")
-        return f"{_counted(count, 'frame')} {'was' if count == 1 else 'were'} {how}{self.side.written}"
+        return f"{counted(count, 'frame')} {'was' if count == 1 else 'were'} {how}{self.side.written}"
 
     def _write_report(self) -> str:
         """Write the report if one is asked for; return the words of a failure."""
@@ -370,7 +366,7 @@ class _Clip:
             print_plan(pipeline.plan, log)
             print("side by side, in ms:", ", ".join(f"{name} {ms:.1f}" for name, ms in log.steps().items()))
         name, (width, height) = printable(self.session.scene.name), pipeline.size
-        frames = f"{_counted(log.count, 'frame')}, {log.fps:.1f} fps"
+        frames = f"{counted(log.count, 'frame')}, {log.fps:.1f} fps"
         print(f"{name}: {width}x{height}, {frames}, quality {pipeline.quality.name}, {pipeline.device}")
         where = self.camera.description if self.options.output is None else self.options.output
         print(f"written to {printable(where)}")

@@ -12,7 +12,6 @@ once it is built and its kernels are loaded.
 from __future__ import annotations
 
 import dataclasses
-import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -40,7 +39,7 @@ from warp_ar.closing import Closing
 from warp_ar.engine.modules import Progress
 from warp_ar.engine.pipeline import Pipeline, Result
 from warp_ar.engine.switcher import PipelineSwitcher, Target
-from warp_ar.errors import UsageError, WarpArError
+from warp_ar.errors import UsageError, WarpArError, say
 from warp_ar.scene import Pose, Scene
 from warp_ar.stages.quality import DEFAULT_BUDGET_MS, Quality
 from warp_ar.stages.request import Estimates
@@ -61,7 +60,6 @@ class AutoPipeline(Closing):
         outputs: tuple[str, ...] = ("image",),
         exposures: Sequence[float] = (),
         shown: float | None = None,
-        bands: int | None = None,
         estimates: Estimates = "delayed",
         costs: Costs | None = None,
         folder: Path | None = None,
@@ -77,7 +75,6 @@ class AutoPipeline(Closing):
             outputs: What results shall hold.
             exposures: As for ``Pipeline``.
             shown: As for ``Pipeline``.
-            bands: Bands of rows per CPU pass; None means one per core.
             estimates: As for ``Pipeline``.
             costs: Known costs; None reads or measures them.
             folder: Where costs are kept; None means the user's cache folder.
@@ -94,7 +91,7 @@ class AutoPipeline(Closing):
         self._errors = load_errors()
         self.settings = relevant_settings(scene, size or (scene.camera.width, scene.camera.height))
         self._base = {setting.name: chosen(BASE, setting) for setting in self.settings}
-        self._switcher = PipelineSwitcher(device=device, bands=bands, estimates=estimates, keep=_KEPT_PIPELINES - 1)
+        self._switcher = PipelineSwitcher(device=device, estimates=estimates, keep=_KEPT_PIPELINES - 1)
         self._target = Target(scene, turn(BASE, self._base), size, outputs, tuple(exposures), shown)
         self.pipeline = self._switcher.open(self._target)
         """The one that lights the next frame."""
@@ -138,7 +135,8 @@ class AutoPipeline(Closing):
             self._controller = self._start(image, found)
         elif not self._switcher.busy and self._wanted() == self.quality:
             first = not self._changes
-            changed = self._controller.observe(_spent_ms(result), self._clock())
+            spent = sum(timing.milliseconds for timing in result.stages.values())
+            changed = self._controller.observe(spent, self._clock())
             if changed or (first and self._controller.chosen):
                 self._want()
             self._tell()
@@ -153,10 +151,9 @@ class AutoPipeline(Closing):
             key = cost_key(self.plan, self.device, self.settings)
             self._costs = read_costs(self._folder, key, self.settings)
             if self._costs is None:
-                print("warp_ar: measuring what each method costs here; this is done once", file=sys.stderr)
-                self._costs = measure_costs(
-                    self._given, _on_host(image), pose, str(self.device), self.size, self.settings
-                )
+                say("measuring what each method costs here; this is done once")
+                shown = image.numpy() if isinstance(image, wp.array) else image
+                self._costs = measure_costs(self._given, shown, pose, str(self.device), self.size, self.settings)
                 write_costs(self._folder, key, self._costs)
         costs = self._costs or Costs(0.0, {})
         return Controller(costs, self._errors, self.budget_ms, self._base)
@@ -188,7 +185,7 @@ class AutoPipeline(Closing):
         try:
             latest = self._switcher.take(self._admit)
         except WarpArError as error:
-            print(f"warp_ar: {error}; others are used", file=sys.stderr)
+            say(f"{error}; others are used")
             self._rejected.append(self._record())
             controller.reject()
             self._want()
@@ -208,11 +205,8 @@ class AutoPipeline(Closing):
         controller = self._controller
         if controller is not None and not controller.fits and not self._told:
             self._told = True
-            print(
-                f"warp_ar: {self.budget_ms:g} ms cannot be kept: {controller.measured_ms:.3g} ms at least, by the "
-                "cheapest methods, which are used",
-                file=sys.stderr,
-            )
+            least = f"{controller.measured_ms:.3g} ms at least, by the cheapest methods, which are used"
+            say(f"{self.budget_ms:g} ms cannot be kept: {least}")
 
     def status(self) -> dict[str, Any]:
         """Return the choice, its expected cost and error, and every change, as plain data."""
@@ -230,11 +224,3 @@ class AutoPipeline(Closing):
             "changes": self._changes,
             "rejected": self._rejected,
         }
-
-
-def _spent_ms(result: Result) -> float:
-    return sum(timing.milliseconds for timing in result.stages.values())
-
-
-def _on_host(image: Any) -> Any:
-    return image.numpy() if isinstance(image, wp.array) else image

@@ -10,7 +10,6 @@ import hashlib
 import importlib.metadata
 import json
 import statistics
-import sys
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from pathlib import Path
@@ -23,6 +22,7 @@ from warp_ar.device import usable_cores
 from warp_ar.engine.graph import Plan
 from warp_ar.engine.pipeline import DEFAULT_FRAME_INTERVAL, TRACK, Pipeline, Result
 from warp_ar.engine.switcher import let_go
+from warp_ar.errors import say
 from warp_ar.files import write_whole
 from warp_ar.scene import Pose, Scene
 from warp_ar.stages.quality import PRESETS, Quality
@@ -254,4 +254,4 @@ def write_costs(folder: Path, key: str, costs: Costs) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         write_whole(path, json.dumps(everything, indent=1).encode())
     except OSError as error:
-        print(f"warp_ar: cannot keep measured costs in {folder}: {error.strerror}", file=sys.stderr)
+        say(f"cannot keep measured costs in {folder}: {error.strerror}")

@@ -503,7 +503,6 @@ class PathTracer:
         *,
         error: float | None = None,
         step: int = 16,
-        wanted: Callable[[], bool] = lambda: True,
     ) -> Iterator[TracedPicture]:
         """Pictures that get better, ``step`` samples at a time.
 
@@ -511,9 +510,8 @@ class PathTracer:
             samples: Per pixel, after which to stop.
             error: Relative standard error at which to stop before.
             step: Samples between two pictures.
-            wanted: Asked between two; False stops.
         """
-        while self.samples < samples and wanted():
+        while self.samples < samples:
             self.sample(min(step, samples - self.samples))
             picture = self.picture()
             yield picture

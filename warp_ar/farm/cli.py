@@ -9,7 +9,7 @@ from pathlib import Path
 
 from warp_ar.begin import importing
 from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, number, run_command
-from warp_ar.errors import UsageError, printable, say
+from warp_ar.errors import UsageError, counted, printable, say
 from warp_ar.farm.driver import Driver
 from warp_ar.farm.jobs import Context, parse_jobs, program_version, read_jobs
 from warp_ar.farm.manifest import (
@@ -132,7 +132,7 @@ def _tell(folder: Path, failed: dict[str, str]) -> int:
     print(printable(f"{folder}: {counts or 'nothing'} done, {status['frames']} frames, {status['bytes'] / 1e6:.1f} MB"))
     if not failed:
         return EXIT_DONE
-    print(f"{len(failed)} job{'s' if len(failed) != 1 else ''} failed:")
+    print(f"{counted(len(failed), 'job')} failed:")
     for key, why in sorted(failed.items())[:50]:
         print(printable(f"  {key}: {why}"))
     return EXIT_FAILED

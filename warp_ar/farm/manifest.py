@@ -25,7 +25,7 @@ from typing import Any
 
 import filelock
 
-from warp_ar.errors import UsageError, WarpArError, printable, reason
+from warp_ar.errors import UsageError, WarpArError, counted, printable, reason
 from warp_ar.files import kind_of, parse_json, read_bytes, take_name, write_whole
 
 MANIFEST, RUN, LOCK, RECORD = "manifest.jsonl", "run.json", "lock", "record.json"
@@ -33,7 +33,7 @@ ASIDE = ".aside"
 """Folder of outputs that are not whole yet."""
 _NUMBERS = ("frames", "bytes", "length", "jobs", "seconds", "ended", "worker")
 """Numbers of a line that says that a job is done."""
-_NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
+NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
 
 LOCK_SECONDS = 1.0
 """Within which a lock must come free: who asks for a run's state may hold it for a moment."""
@@ -41,15 +41,6 @@ LOCK_SECONDS = 1.0
 
 class RunError(WarpArError):
     """A run cannot go on."""
-
-
-def is_no_space(error: BaseException | None) -> bool:
-    """Return whether an error, or what caused it, is a full disk."""
-    while error is not None:
-        if getattr(error, "errno", None) in _NO_SPACE:
-            return True
-        error = error.__cause__ or error.__context__
-    return False
 
 
 class Manifest:
@@ -433,7 +424,7 @@ def status_lines(folder: Path, status: dict[str, Any]) -> list[str]:
 
 def words_of_counts(kinds: Mapping[str, int]) -> str:
     """Jobs of each kind."""
-    return ", ".join(f"{count} {kind}{'s' if count != 1 else ''}" for kind, count in sorted(kinds.items()))
+    return ", ".join(counted(count, kind) for kind, count in sorted(kinds.items()))
 
 
 def words_of_seconds(seconds: float) -> str:

@@ -19,7 +19,7 @@ import threadpoolctl
 
 from warp_ar.closing import Closing
 from warp_ar.engine.layers import RADIANCE
-from warp_ar.errors import WarpArError, reason
+from warp_ar.errors import WarpArError, causes, reason
 from warp_ar.farm.dataset import NoPlace, draw_variation
 from warp_ar.farm.frames import mean_rate, shown_ticks
 from warp_ar.farm.jobs import (
@@ -36,7 +36,7 @@ from warp_ar.farm.jobs import (
 )
 from warp_ar.farm.labels import LAYERS, LabelWriter, write_dataset_files
 from warp_ar.farm.lighting import Lighter
-from warp_ar.farm.manifest import aside, is_no_space, publish, publish_file
+from warp_ar.farm.manifest import NO_SPACE, aside, publish, publish_file
 from warp_ar.farm.survey import lit_scene, survey_clip
 from warp_ar.farm.video import join_parts, open_part_sink
 from warp_ar.files import take_name
@@ -86,7 +86,8 @@ class Work(Closing):
             known = isinstance(error, WarpArError | NoPlace)
             told = str(error) if known else f"{type(error).__name__}: {reason(error)}"
             _note(log, f"failed: {told}", "" if known else traceback.format_exc())
-            full = is_no_space(error) or _free_bytes(context.folder) < LEAST_FREE
+            full = any(getattr(cause, "errno", None) in NO_SPACE for cause in causes(error))
+            full = full or _free_bytes(context.folder) < LEAST_FREE
             return Outcome("full" if full else "failed", reason=told)
         finally:
             if job.kind == "survey" or context.jobs.settings.light == "preroll":
