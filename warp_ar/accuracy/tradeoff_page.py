@@ -28,35 +28,19 @@ REAL_TIME = 1e3 / 30.0
 """Milliseconds of a frame at 30 frames per second."""
 
 _STYLE = """
-:root{--page:#fbfbf9;--ink:#1b1c1e;--soft:#5c5f65;--line:#dcdcd6;--card:#fff;--mark:#2f6fdf;
---other:#9a9c9f;--warm:#c2571a}
-*{box-sizing:border-box}html{scroll-behavior:smooth}body{margin:0;background:var(--page);color:var(--ink);
-font:15px/1.5 system-ui,-apple-system,"Segoe UI",Roboto,"Helvetica Neue",Arial,sans-serif}
-main{max-width:1180px;margin:0 auto;padding:40px 24px 80px}h1{font-size:34px;line-height:1.15;margin:0 0 8px}
-h2{font-size:24px;margin:64px 0 4px;padding-top:20px;border-top:1px solid var(--line)}
-h3{font-size:17px;margin:40px 0 2px}
-p{max-width:76ch;margin:6px 0 14px}.lead{font-size:17px}.soft{color:var(--soft)}a{color:var(--mark)}
-nav{display:flex;flex-wrap:wrap;gap:4px 16px;margin:14px 0}
-.row{display:grid;gap:6px 8px;margin:12px 0;overflow-x:auto;padding-bottom:4px}.row figure{margin:0;min-width:0}
-.row img{width:100%;display:block;border-radius:4px}
-figcaption{font-size:13px;line-height:1.35;color:var(--soft);padding:5px 1px 2px;font-variant-numeric:tabular-nums}
-figcaption b{color:var(--ink);font-weight:600}
-.split{display:grid;grid-template-columns:minmax(0,1fr) minmax(0,1fr);gap:16px;align-items:start}
-.many{display:grid;grid-template-columns:repeat(auto-fill,minmax(min(340px,100%),1fr));gap:16px;margin:16px 0}
-@media(max-width:900px){.split{grid-template-columns:minmax(0,1fr)}}
-.card{background:var(--card);border:1px solid var(--line);border-radius:8px;padding:12px 14px;overflow-x:auto}
-.card h4{margin:0 0 6px;font-size:15px}.card p{margin:8px 0 2px;font-size:14px}
-table{border-collapse:collapse;width:100%;font-size:13.5px;font-variant-numeric:tabular-nums}
-th{font-weight:600;color:var(--soft);text-align:right;border-bottom:1px solid var(--line);padding:3px 6px;
-vertical-align:bottom}
-td{text-align:right;padding:3px 6px;border-bottom:1px solid var(--line);vertical-align:top}
-tr:last-child td{border-bottom:0}td:first-child,th:first-child,td.text{text-align:left}td.text{color:var(--soft)}
-tr.out td{color:var(--soft)}tr.head td{font-weight:600;padding-top:12px}
-svg{display:block;width:100%;height:auto}
-.scale{display:inline-grid;grid-template-columns:repeat(5,44px);vertical-align:middle;margin:0 8px;font-size:11px;
-text-align:center}.scale img{grid-column:1/-1;width:100%;height:10px;border-radius:3px}
-@media(max-width:600px){main{padding:24px 16px 60px}h1{font-size:28px}
-.row{grid-auto-columns:150px}table{font-size:13px}}
+body{margin:0;background:#fbfbf9;color:#1b1c1e;font:15px/1.5 system-ui,sans-serif}
+main{max-width:1180px;margin:0 auto;padding:24px}h2{margin:64px 0 4px;padding-top:20px;border-top:1px solid #dcdcd6}
+p{max-width:76ch}.lead{font-size:17px}.soft,figcaption,th,tr.out td{color:#5c5f65}a{color:#2f6fdf}
+nav{display:flex;flex-wrap:wrap;gap:4px 16px}
+.row{display:grid;gap:6px 8px;overflow-x:auto}figure{margin:0;min-width:0}
+.row img,svg{display:block;width:100%;height:auto}
+.split,.many{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(340px,100%),1fr));gap:16px;align-items:start}
+.card{background:#fff;border:1px solid #dcdcd6;border-radius:8px;padding:12px 14px;overflow-x:auto}
+figcaption,table{font-size:13px;font-variant-numeric:tabular-nums}table{border-collapse:collapse;width:100%}
+th,td{text-align:right;padding:3px 6px;border-bottom:1px solid #dcdcd6;vertical-align:top}
+td:first-child,th:first-child{text-align:left}tr.head td{font-weight:600;padding-top:12px}
+.scale{display:inline-grid;grid-template-columns:repeat(5,44px);font-size:11px;text-align:center}
+.scale img{grid-column:1/-1;width:100%;height:10px}
 """
 
 Cells = Sequence[str]

@@ -119,10 +119,7 @@ def _employer(options: argparse.Namespace) -> Callable[[Context], Pool]:
     if options.ray is None:
         devices = devices_of(options.device, options.workers)
         return lambda context: ProcessPool(context, devices)
-    pool = RayPool(options.ray or None, options.workers)
-    if page := pool.dashboard():
-        say(f"Ray's page: http://{page}")
-    return pool.employ
+    return RayPool(options.ray or None, options.workers).employ
 
 
 def _tell(folder: Path, failed: dict[str, str]) -> int:

@@ -274,12 +274,6 @@ class RayPool(Pool):
             self._actors.append(actor.remote(dataclasses.replace(context, device=device, worker=worker)))
         return self
 
-    def dashboard(self) -> str:
-        """Return the address of Ray's page; empty where it has none."""
-        with contextlib.suppress(Exception):
-            return str(self._ray.get_runtime_context().worker.node.webui_url or "")
-        return ""
-
     def _do(self, worker: int, job: Job, arguments: Any) -> Outcome:
         actor = self._actors[worker]
         try:
