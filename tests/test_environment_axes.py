@@ -16,17 +16,14 @@ import pytest
 from warp_ar import environment
 from warp_ar.errors import UsageError
 from warp_ar.light.captured import latlong_directions, texel_solid_angles
+from warp_ar.light.latlong_axes import AXES, from_axes, to_axes, world_from_marker
 from warp_ar.output.environment_axes import (
-    AXES,
     basis,
     cube_directions,
     encode_harmonics,
-    from_axes,
     project_radiance,
     sample_latlong,
-    to_axes,
     to_cube,
-    world_from_marker,
 )
 from warp_ar.output.environment_file import EnvironmentInfo, read_environment_info, write_environment
 from warp_ar.output.gltf_environment import EXTENSION, LARGEST, encode_rgbd, irradiance_coefficients, specular_cubes

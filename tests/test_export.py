@@ -17,9 +17,9 @@ from tests.gltf_files import Gltf
 from tests.layer_rig import POSES, make_scene
 from tests.test_live import message, write_scene
 from warp_ar import export
+from warp_ar.output.environment_file import read_environment
 from warp_ar.output.gltf_file import write_glb
 from warp_ar.output.shot import Shot, exchange_materials_of, mesh_of, placement, texture_files
-from warp_ar.output.sinks import read_environment
 from warp_ar.output.usd_file import write_usd
 from warp_ar.scene import Camera, Light, Object
 from warp_ar.scene.description import Animation

@@ -20,8 +20,8 @@ import pytest
 
 from warp_ar import live
 from warp_ar.checks.check_ball import is_printed
+from warp_ar.output.environment_file import read_environment
 from warp_ar.output.places import folder_to_oneself
-from warp_ar.output.sinks import read_environment
 from warp_ar.scene import Marker, Pose, load_scene
 from warp_ar.scene.description import CharucoBoard
 from warp_ar.sources.sources import Synthetic

@@ -13,14 +13,9 @@ import pytest
 
 from tests.test_sources import no_thread_left, patches  # noqa: F401  (a fixture)
 from warp_ar.errors import SinkError, UsageError
+from warp_ar.output.environment_file import read_environment, write_environment
 from warp_ar.output.sink import FRAMES_WAITING
-from warp_ar.output.sinks import (
-    EnvironmentSink,
-    FolderSink,
-    open_sink,
-    read_environment,
-    write_environment,
-)
+from warp_ar.output.sinks import EnvironmentSink, FolderSink, open_sink
 from warp_ar.sources.sources import open_source
 
 # 4:2:0 at limited range keeps 219 of 255 levels; at this quality the codec adds its own rounding.

@@ -18,7 +18,7 @@ from tests.test_node_animation import moving
 from tests.viewer_rig import PATIENCE, SIZE, Running, jpeg, page_scene
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SceneError, UsageError
-from warp_ar.output.sinks import read_environment
+from warp_ar.output.environment_file import read_environment
 from warp_ar.scene import Animation, Object, Play, loads_scene
 from warp_ar.sources.sources import QueueSource, Synthetic
 from warp_ar.viewer.controls import Feed

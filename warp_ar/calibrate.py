@@ -35,7 +35,7 @@ from warp_ar.calibration.response import MOST_DEVIATION, measure_grey_response, 
 from warp_ar.checks.check_ball import DULL, inside_contrast
 from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, FROM_0, Parser, count, run_command, seconds
 from warp_ar.errors import UsageError, say
-from warp_ar.output.places import claim_places
+from warp_ar.output.places import check_places, check_replaceable
 from warp_ar.scene import CharucoBoard, Marker, bundled_scenes, load_scene, loads_scene
 from warp_ar.scene.description import INTRINSICS
 from warp_ar.scene.starter import amend_scene, guesses
@@ -262,7 +262,9 @@ def _run(options: argparse.Namespace) -> int:
     target = _target(options)
     if options.command != "ball":
         pictures = [Path(path) for path in getattr(options, "pictures", ())]
-        claim_places({"the picture": pictures}, {"--output": options.output}, overwrite=options.overwrite)
+        check_places({"the picture": pictures}, {"--output": options.output})
+        if replaced := check_replaceable(options.output, overwrite=options.overwrite):
+            say(replaced)
     if options.command == "card":
         write_card(_marker(options) or SHEET, options.output, options.paper, options.dpi)
         print(
