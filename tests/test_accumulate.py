@@ -92,18 +92,6 @@ def test_follows_the_environment_within_half_a_second(device, fps, old, new):
     assert np.abs(now - new).max() <= 0.05 * abs(new - old)
 
 
-def test_small_changes_do_not_depend_on_the_frame_rate(device):
-    """A step of 2 % has its exponential time constant at any rate."""
-    left = []
-    for fps in (10, 25, 100):
-        light = Light()
-        light.step(0.5)
-        for _ in range(int(0.2 * fps)):
-            now = light.step(0.51, time_step=1 / fps)
-        left.append((0.51 - now[0, 0, 0]) / 0.01)
-    np.testing.assert_allclose(left, np.exp(-0.2 / 0.15), rtol=0.02)
-
-
 def test_noise_is_averaged_and_jitter_is_no_change(device):
     """A sharp edge that jumps a texel to and fro, with sensor noise: steadier by more than half, and right on
     average."""

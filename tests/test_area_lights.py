@@ -12,7 +12,6 @@ from tests.kernel_rig import SMALL_CAMERA
 from tests.reference import area_lights as twin
 from tests.test_path_tracer import look
 from warp_ar.engine.pipeline import Pipeline
-from warp_ar.errors import SceneError
 from warp_ar.kernels.rays.area_lights import AreaSample, area_numbers, make_area_count, make_area_sample
 from warp_ar.kernels.structs import RayScene
 from warp_ar.scene import (
@@ -289,25 +288,6 @@ def test_scene_files_have_them_as_lights_and_as_objects(kind, keys):
     assert item.shape == kind
     assert item.material == EmissiveMaterial(intensity=2.0, two_sided="two_sided" in keys)
     assert loads_scene(dumps_scene(scene)) == scene
-
-
-@pytest.mark.parametrize(
-    ("kind", "keys", "complaint"),
-    [
-        ("rect", "", "light[0].size is missing: expected a list of 2 numbers, each above 0 (metres)"),
-        ("rect", "size = [0.2, 0.0]", "light[0].size"),
-        ("rect", "size = [0.2, 0.1]\nradius = 0.1", "light[0].radius = 0.1: not used with kind = \"rect\""),
-        ("tube", "radius = 0.1", "light[0].length is missing"),
-        ("disk", "radius = 0.1\ntwo_sided = 1", "light[0].two_sided = 1: expected true or false"),
-        ("rect", 'size = [0.2, 0.1]\nimage = "nowhere.png"', "light[0].image"),
-        ("area", "", "light[0].kind"),
-    ],
-)  # fmt: skip
-def test_what_is_wrong_is_said_with_its_key(kind, keys, complaint):
-    with pytest.raises(SceneError) as caught:
-        loads_scene(TEXT.format(kind=kind) + keys)
-    assert complaint in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 # Of the mean. Noise of 16 samples per cell of two pixels, at most; all but one pixel in a hundred, where the shadow is

@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 
-from warp_ar.ball import ball
 from warp_ar.ball.ball import BallView, fit_ball
 from warp_ar.scene import Camera, Marker, Pose, Probe, Proxy, Scene, load_scene
 from warp_ar.session import Session
@@ -103,12 +102,6 @@ def test_found_from_some_millimetres_off(clip, offset):
     assert error_mm(fit) < 3 * 1e3 * fit.deviation
 
 
-def test_one_frame_will_do(clip):
-    fit = fit_ball(clip[:1], make_camera(), rough((3.0, -3.0, 0.0)), search=0.006)
-    assert fit.is_good
-    assert error_mm(fit) < FOUND_HARD_MM
-
-
 def test_clutter_is_outvoted(clip):
     cluttered = []
     for image, pose in clip:
@@ -141,16 +134,6 @@ def test_points_are_where_opencv_has_them(count):
     )[0].reshape(-1, 2)
     view = BallView(np.zeros((SIZE[1], SIZE[0], 3), np.uint8), pose, camera, np.zeros((256, 3), np.float32))
     np.testing.assert_allclose(view.project(points)[0], wanted, atol=1e-9)
-
-
-def test_one_plane_hides_nothing():
-    """So it is not asked, which changes nothing; a second shape is."""
-    plane, box = Proxy("plane", at=(0.0, 0.0, 0.0), size=(1.0, 1.0)), Proxy("box", at=(0.1, 0.1, 0.05), size=(0.1,) * 3)
-    assert not ball._Receiver((plane,), ()).hides
-    assert not ball._Receiver((), ()).hides
-    assert ball._Receiver((plane, box), ()).hides
-    assert ball._Receiver((box,), ()).hides
-    assert ball._Receiver((plane,), (Probe((0.0, 0.0, 0.1), 0.03),)).hides
 
 
 def test_a_plain_desk_says_nothing():

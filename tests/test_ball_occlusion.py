@@ -90,15 +90,6 @@ def test_a_hand_is_told_while_it_is_there():
     assert watch([bare, bare, hand, hand, bare]) == [False, False, True, True, False]
 
 
-def test_a_hand_is_told_under_a_gain_that_is_known():
-    scene = loads_scene(SCENE)
-    bare = picture(scene)
-    gain = np.array([0.7, 0.7, 0.7])
-    pictures = [bare, bare, 0.7 * with_hand(bare, scene)]
-    assert watch(pictures, gains=[np.ones(3), np.ones(3), gain])[2]
-    assert not watch([bare, bare, 0.7 * bare], gains=[np.ones(3), np.ones(3), gain])[2]
-
-
 @pytest.mark.parametrize("factor", [0.5, 2.0])
 def test_light_that_changes_is_not_taken_for_a_hand(factor):
     scene = loads_scene(SCENE)

@@ -118,14 +118,6 @@ def test_around_a_lamp_one_exposure_has_the_say(device, turn):
     assert alone[16].sum() < 0.7 * light[16].sum()  # without its surroundings half of the lamp would be lost
 
 
-def test_a_lamp_that_was_just_switched_on_is_bounded_from_below(device):
-    light = np.full((8, 16, 3), 0.2)
-    values, clipped = expose(light)
-    values[0, 4, 8], clipped[0, 4, 8] = 1.0, 1.0
-    merged, _, _ = merge(RATIOS, values, np.ones((3, 8, 16)), clipped)
-    assert (merged[4, 8] == 1.0).all()
-
-
 def test_where_all_clip_the_shortest_stands_and_says_so(device):
     light = np.full((8, 16, 3), 1e4)
     values, clipped = expose(light)

@@ -181,24 +181,6 @@ def test_scale_and_turn_are_the_scenes(tmp_path, device):
     check_error("captured", environment, 2.0 * slope(latlong_directions(64) @ rotation_matrix([0.0, 0.0, 90.0])))
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (('file = "light.exr"', 'file = "other.exr"'), r"light.file.*no such file"),
-        (('file = "light.exr"', 'file = "light.exr"\nscal = 1'), r"light.scal: unknown key"),
-        (("position", "R = [1,0,0,0,1,0,0,0,1]\nposition"), r"pose.position.*R is given too"),
-        (
-            ("position = [0.0, -0.5, 0.2]\nrotate = [-20.0, 0.0, 0.0]", "R = [1,0,0,0,2,0,0,0,1]\nt = [0,0,1]"),
-            "rotation matrix",
-        ),
-    ],
-)
-def test_errors_name_the_key(tmp_path, change, message):
-    constant(0.4).save(tmp_path / "light.exr")
-    with pytest.raises(SceneError, match=message):
-        loads_scene(SCENE.replace(*change), tmp_path / "scene.toml")
-
-
 def test_virtual_lights_stand_beside_a_captured_one(tmp_path):
     constant(0.4).save(tmp_path / "light.exr")
     text = SCENE.replace("[light]", "[[light]]") + '[[light]]\nkind = "point"\nat = [0, 0, 1]\nintensity = 1.0\n'

@@ -26,6 +26,7 @@ from warp_ar.scene import (
 )
 from warp_ar.tracking.tracking import given_pose
 
+pytestmark = pytest.mark.slow
 W, H = 160, 120
 REFLECTANCE, SHOWN, RADIUS = 0.7, 0.3, 0.04
 MATERIALS = {"metal": MetallicRoughnessMaterial((0.95,) * 3, 1.0, 0.05), "chalk": LambertMaterial((0.8,) * 3)}
@@ -96,7 +97,6 @@ def folder(tmp_path_factory):
     return tmp_path_factory.mktemp("contact")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("quality", ["low", "medium", "high"])
 @pytest.mark.parametrize("material", MATERIALS)
 def test_shadows_meet_what_throws_them(material, quality, folder):

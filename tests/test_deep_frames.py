@@ -18,7 +18,7 @@ import pytest
 import warp_ar
 from warp_ar.errors import SinkError, UsageError
 from warp_ar.kernels.color import decode_codes, encode_codes
-from warp_ar.output.encoders import describe_encoders, encoder_names, find_encoding, parse_options
+from warp_ar.output.encoders import parse_options
 from warp_ar.output.sinks import open_sink
 from warp_ar.scene import Pose
 from warp_ar.session import Session
@@ -410,11 +410,3 @@ def test_options_reach_the_encoder(tmp_path: pathlib.Path) -> None:
                 sink.write(noise)
         sizes.append(path.stat().st_size)
     assert sizes[0] > 2 * sizes[1]
-
-
-def test_encoders_are_listed() -> None:
-    lines = describe_encoders()
-    assert any(line.startswith("libx265") and "8 and 10 bits" in line for line in lines)
-    assert {line.split()[0] for line in lines} <= set(encoder_names())
-    assert find_encoding("10bit").pixel_format == "yuv420p10le"
-    assert find_encoding("10bit", "prores_ks").pixel_format == "yuv422p10le"

@@ -11,8 +11,6 @@ from warp_ar.light.config import CONFIG, Kind
 from warp_ar.light.evidence import (
     check_card,
     covered_card,
-    doubt_of,
-    greyer,
 )
 from warp_ar.light.recovery import Recovery
 
@@ -74,19 +72,6 @@ def test_too_few_cells_are_no_card():
     points, kind, light = printed(0.05)
     few = np.concatenate([np.flatnonzero(kind == Kind.INK)[:3], np.flatnonzero(kind == Kind.CARD)])
     assert not check_card(points[few], kind[few], light[few]).holds
-
-
-def test_print_of_low_contrast_may_be_on_grey_paper():
-    usual = CONFIG.surfaces.reflectance[Kind.INK]
-    assert greyer(0.85 / usual, 0.85) == pytest.approx(1.0)
-    assert greyer(0.5 * 0.85 / usual, 0.85) == pytest.approx(2.0)
-    assert greyer(30.0, 0.85) == 1.0
-    assert greyer(0.0, 0.85) == 1.0
-
-
-def test_contrast_beyond_print_makes_the_card_doubtful():
-    assert doubt_of(20.0) == doubt_of(CONFIG.evidence.usual_contrast) == CONFIG.evidence.white
-    assert doubt_of(60.0) > 0.5
 
 
 def test_without_a_card_what_clips_is_raised_by_the_least_that_is_missing(device, scene):

@@ -53,15 +53,6 @@ def test_no_share_of_an_emitter_is_spread_over_what_is_unseen(device, height, wi
     assert filled(lit, confidence)[~known].max() > 2.0, "without a bound it would be spread"
 
 
-def test_confident_texels_are_kept_as_they_are(device):
-    rng = np.random.default_rng(6)
-    radiance = np.float32(rng.uniform(0, 1e5, (32, 64, 3)))
-    confidence = rng.uniform(0.5, 1, (32, 64))
-    confidence[10:14, 20:30] = 0
-    out = filled(radiance, confidence)
-    assert (out[confidence > 0] == radiance[confidence > 0]).all()
-
-
 def test_nothing_known_is_no_light(device):
     assert (filled(np.full((16, 32, 3), 5.0), np.zeros((16, 32))) == 0).all()
     assert (filled(np.full((16, 32, 3), np.nan), np.ones((16, 32))) == 0).all()

@@ -76,7 +76,6 @@ QUALITIES = {
     "paper": dataclasses.replace(PRESETS["paper"], environment_height=16),
     "emitters": dataclasses.replace(PRESETS["low"].with_methods(recover="shading"), environment_height=16),
     "every": make_quality(),
-    "high": dataclasses.replace(PRESETS["high"], environment_height=16),
 }
 """The least that stands on the environment; recovery that only objects and lights need; what balls show, too."""
 FAR = (4.0, 0.0, 0.3)
@@ -221,24 +220,6 @@ def test_what_comes_back_is_fresh(
     number_estimates(monkeypatch)
     results = assert_equal(PATHS[path], device, preset, estimates=estimates)
     assert any(timing.left_out for result in results for timing in result.stages.values())
-
-
-def test_recovery_asks_in_the_frame_that_needs_it_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    """And not while nothing reads the environment."""
-    number_estimates(monkeypatch)
-    asked, now = [], 0.0
-    with Pipeline(
-        scene_of(True, "on"), device="cpu", quality=QUALITIES["emitters"], bands=2, estimates="synchronous"
-    ) as pipeline:
-        for pose, objects, lights, picture, step in PATHS["long"]:
-            pipeline.update(scene_of(objects, lights))
-            now += step
-            # Shadows of the environment are asked for wherever a proxy is seen.
-            seen = POSES[pose] if objects else look_at((0.0, 0.0, 1.0), (-5.0, 0.0, 1.0))
-            pipeline(pictures()[picture], time_seconds=now, pose=seen)
-            asked.append(round(16 * float(pipeline.arrays["recover_recovered"].numpy()[0, 0, 0])))
-    # Three at the start, for in the first bare frame what is virtual is cleared; then one at once, when it is back.
-    assert asked == [1, 2, 3, *[3] * 8, *[4] * 6]
 
 
 def test_reasons_are_those_of_the_frame() -> None:

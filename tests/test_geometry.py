@@ -157,11 +157,6 @@ def test_degenerate_triangles_have_no_say(scale: float) -> None:
     np.testing.assert_array_equal(normals[4:], [[0, 0, 1]] * 3)
 
 
-def test_a_sheet_with_two_sides_gets_the_normal_of_one() -> None:
-    normals = smooth_normals([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 1]])
-    np.testing.assert_array_equal(np.abs(normals), [[0, 0, 1]] * 3)
-
-
 @settings(deadline=None)
 @given(st.data())
 def test_normals_are_always_unit(data: st.DataObject) -> None:

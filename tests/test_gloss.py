@@ -10,13 +10,12 @@ import warp as wp
 
 from tests.error_model import check_error
 from tests.hard_cases.rig import SIZE, look_at, make_quality, make_scene
-from tests.kernel_rig import SMALL_CAMERA, TEXTURES, camera_fields, constant_environment, records, shape, tables
+from tests.kernel_rig import TEXTURES, camera_fields, constant_environment, records, shape, tables
 from tests.mirror_ball_rig import CHALK, DESK, FOCAL, RAYS, H, W, grey_frame
 from tests.reference import color as reference_color
 from tests.reference import gloss as reference
 from tests.reference.visibility import Body
 from warp_ar.engine.pipeline import Pipeline
-from warp_ar.errors import SceneError
 from warp_ar.kernels import color
 from warp_ar.kernels.objects.reflect import DistantLight, DistantLightConfig
 from warp_ar.kernels.objects.shade import ShadeConfig
@@ -34,7 +33,7 @@ from warp_ar.kernels.structs import (
     Shape,
     make_picture,
 )
-from warp_ar.scene import ProxyMaterial, dumps_scene, loads_scene
+from warp_ar.scene import ProxyMaterial
 
 pytestmark = pytest.mark.slow
 
@@ -178,7 +177,6 @@ def test_a_lamp_has_a_highlight(device):
     [
         (0.4, 0.005, "from above"),
         (0.2, 0.06, "aslant"),
-        (0.1, 0.005, "aslant"),
     ],
 )
 def test_a_sphere_has_a_wider_highlight(device, roughness, radius, seen):
@@ -239,39 +237,6 @@ def test_a_matt_receiver_and_a_ball_before_it_do_not_change(device):
 
 
 # --- scenes and the stage
-
-PLANE = f"""schema = 1
-{SMALL_CAMERA}[marker]
-size = 0.08
-[[proxy]]
-shape = "plane"
-size = [1.0, 1.0]
-"""
-
-
-def test_scene(tmp_path):
-    scene = loads_scene(PLANE + "[proxy.material]\nroughness = 0.2\nreflectance = 0.05\n")
-    assert scene.proxies[0].material == ProxyMaterial(0.2, (0.05, 0.05, 0.05))
-    assert loads_scene(dumps_scene(scene)) == scene
-    assert loads_scene(PLANE + "material = { reflectance = [0.1, 0.2, 0.3] }").proxies[0].material == ProxyMaterial(
-        0.1, (0.1, 0.2, 0.3)
-    )
-    assert loads_scene(PLANE).proxies[0].material is None
-
-
-@pytest.mark.parametrize(
-    ("given", "words"),
-    [
-        ("roughness = 1.5", r"proxy\[0\].material.roughness = 1.5"),
-        ("reflectance = -0.1", "reflectance.*-0.1"),
-        ("reflectance = [0.1, 0.2]", "reflectance"),
-        ('reflectance = "wood"', "reflectance"),
-        ("rougness = 0.1", "rougness.*roughness"),
-    ],
-)
-def test_a_wrong_material_is_named(given, words):
-    with pytest.raises(SceneError, match=words):
-        loads_scene(PLANE + "[proxy.material]\n" + given)
 
 
 def polished(**changes):

@@ -78,15 +78,6 @@ def test_every_balls_samples_sum_to_its_own_irradiance(device, balls, texels):
         assert upward(drawn, ball, balls) == pytest.approx(exact, rel=1e-5 if texels else 0.03)
 
 
-def test_samples_of_one_ball_are_those_that_there_were(device):
-    """To the bit, whatever of several is compiled in; and of two, each has the sequence that it has alone."""
-    first, second = skies(2)
-    alone = sample_all([first], texels=False, count=512)
-    both = sample_all([first, second], texels=False)
-    np.testing.assert_array_equal(both[0].numpy()[::2], alone[0].numpy())
-    np.testing.assert_array_equal(both[2].numpy()["measure"][::2], alone[2].numpy()["measure"])
-
-
 def test_a_shadow_is_that_of_the_balls_light_by_weight(device):
     """Irradiance with an object over that without, both summed over balls: the brighter one counts for more."""
     environments, item = skies(2), [sphere((0.02, 0.0, 0.05), 0.04)]
@@ -102,16 +93,6 @@ def test_a_shadow_is_that_of_the_balls_light_by_weight(device):
     seen = surface >= 0
     assert np.abs(single[0][1] - single[1][1])[seen].max() > 0.2
     np.testing.assert_allclose(found[..., 0][seen], (left / whole)[seen], atol=SUM_ERROR)
-
-
-def test_a_shadow_beside_a_ball_is_that_of_its_light_alone(device):
-    environments, item = skies(2), [sphere((0.02, 0.0, 0.05), 0.04)]
-    beside = [(x, 0.0, 0.0, 1.0) for x in (-0.9, -0.5)]  # all of the desk in the picture lies beyond the second
-    others = others_of([0.0], environments[1:], beside)
-    drawn = sample_all(environments, texels=True)
-    found, surface = run_shadow(drawn, item, count=4096, side=1, filtered=False, others=others)
-    alone, _ = run_shadow(sample_all(environments[1:], texels=True), item, count=2048, side=1, filtered=False)
-    np.testing.assert_allclose(found[surface >= 0], alone[surface >= 0], atol=SUM_ERROR)
 
 
 def test_objects_near_the_desk_take_each_sample_by_its_balls_weight(device):

@@ -136,12 +136,6 @@ def test_inverse_squares(device):
     assert got == pytest.approx(expected, rel=FLOAT)
 
 
-def test_distant_lamps_and_none_change_nothing(device):
-    lamps = [((0.0, 0.0, 1.0), np.inf, (9.0, 9.0, 9.0)), ((0.0, 0.0, 0.0), 0.0, (0.0, 0.0, 0.0))]
-    got = evaluate(device, (1.0, 2.0, 3.0), lamps, [CENTER + 0.5], [(0, 0, 1)])
-    assert got == pytest.approx(np.array([[1.0, 2.0, 3.0]]))
-
-
 def test_bounded_and_never_negative(device):
     """In the lamp itself, and where the environment held less than the lamp is thought to give."""
     lamps = [((0.0, 0.0, 1.0), 0.3, (1.0, 1.0, 1.0))]

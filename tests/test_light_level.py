@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import warp as wp
 
-from bench.bench_clipping_prior import errors_of
 from tests.recover_rig import DistantLight, cells_of, lit_environment, scene  # noqa: F401
 from tests.reference import latlong
 from tests.reference import recover as reference
@@ -21,7 +20,6 @@ from warp_ar.light.captured import texel_solid_angles
 from warp_ar.light.config import CONFIG
 from warp_ar.light.estimate import Estimate, FoundEmitter, Seen, Steadiness
 from warp_ar.light.priors import connected_regions, depth_profile, least_missing
-from warp_ar.light.recovery import choose_channel
 
 COUNT = 40
 SHARE = 0.4
@@ -57,12 +55,6 @@ def test_what_the_map_does_not_show_is_followed(device, factor):
 def test_light_that_the_map_shows_as_well_changes_no_level(device, factor):
     shown = 0.3 * (factor * (1.0 - SHARE) + SHARE)
     assert level(device, card(shown), card(), upward=factor) == pytest.approx(1.0, abs=1e-6)
-
-
-def test_channels_have_levels_of_their_own(device):
-    factors = np.array([0.4, 1.0, 1.3])
-    shown = 0.3 * (1.0 - SHARE + SHARE * factors)
-    assert level(device, card(shown), card()) == pytest.approx(factors, abs=ROUNDING / SHARE)
 
 
 def test_noise_is_no_change(device):
@@ -162,22 +154,6 @@ def test_light_that_stays_becomes_the_mean():
         np.testing.assert_allclose(found.emitters[0].power, 10.0 * np.mean(values[:count]))
 
 
-def test_noise_is_averaged_out():
-    rng, steadiness = np.random.default_rng(1), Steadiness()
-    found = [
-        steadiness.follow(
-            estimate(1.0 + 0.1 * rng.standard_normal()),
-            seen(1.0 + 0.1 * STILL_steadiness * rng.standard_normal()),
-            VIEW,
-        )
-        for _ in range(100)
-    ]
-    steps = np.abs(np.diff([one.recovered.mean() for one in found[CONFIG.solver.remembered :]]))
-    # One estimate moves the mean by its own deviation over their number, 3.5 standard deviations at most in 90.
-    assert steps.max() < 0.1 * 3.5 / CONFIG.solver.remembered * 1.2
-    assert found[-1].recovered.mean() == pytest.approx(1.0, abs=0.1)
-
-
 @pytest.mark.parametrize("level", [1.0 + 1.1 * STILL_steadiness, 1.0 - 1.1 * STILL_steadiness, 2.0])
 def test_light_that_changes_is_followed_at_once(level):
     steadiness = Steadiness()
@@ -223,12 +199,6 @@ def shown(exact, bound=(0, 0, 0), missing=(1.0, 1.0, 1.0), points=400):
     )
 
 
-def test_points_that_clip_count_against_their_channel():
-    assert choose_channel(shown((257, 232, 259), (91, 122, 109))) == 0
-    assert choose_channel(shown((385, 391, 413))) == 2
-    assert choose_channel(shown((300, 300, 300))) == 1
-
-
 # What clips is raised, where nothing but the map tells, by how much clips, how many channels do, and how it ends.
 
 
@@ -261,33 +231,6 @@ def test_a_window_is_raised_by_the_root_of_how_much_clips() -> None:
     assert less == pytest.approx(expected * 0.5**config.exponent, rel=ROUNDING_LEAST_MISSING)
 
 
-def test_what_fades_may_be_at_clipping_and_stays() -> None:
-    """A sky that is nearly at clipping beside what clips; half way between the bounds half is added."""
-    radiance, clipped = room()
-    below, nearly = CONFIG.priors.fades
-    for brightness, share in ((0.9, 0.0), (0.5 * (below + nearly), 0.5), (0.3, 1.0)):
-        sky = np.where(WINDOW[..., None], radiance, brightness * LEVEL)
-        found = least_missing(sky, clipped, AREA, EVERYWHERE)
-        dark = least_missing(radiance, clipped, AREA, EVERYWHERE)
-        assert found[WINDOW] == pytest.approx(share * dark[WINDOW], abs=ROUNDING_LEAST_MISSING)
-
-
-def test_nothing_is_added_to_surfaces_or_where_nothing_clips() -> None:
-    """What clips of a modelled plane is lit; what was not seen is unknown."""
-    assert not least_missing(*room(), AREA, ~WINDOW).any()
-    assert not least_missing(*room(np.zeros(SHAPE_LEAST_MISSING, bool)), AREA, EVERYWHERE).any()
-
-
-@pytest.mark.parametrize(("radiance", "better"), [(50.0, True), (3.0, True), (1.02, False)])
-def test_no_worse_where_half_of_it_is_missing(radiance: float, better: bool) -> None:
-    """A lamp far above clipping gains; one that hardly clips, which nearly no place has, would lose."""
-    lamp = np.full((64, 128, 3), 0.2, np.float32)
-    lamp[4:12, 20:40] = radiance
-    found = errors_of(lamp, 1.0)
-    assert (found["least"] < found["clipped"]) == better
-    assert (found["allowed"] > CONFIG.least.least) == better
-
-
 # --- By how much what clips is expected to exceed clipping, by what the captured map shows around it ------------------
 
 
@@ -318,12 +261,6 @@ def test_what_is_missing_grows_inward_from_where_light_fades(level):
     for c in range(3):
         assert np.corrcoef(profile[inside, c], -angle[inside])[0, 1] > 0.95
     assert profile[angle < 0.1].mean() > 4.0 * profile[inside & (angle > 0.45)].mean()
-
-
-@pytest.mark.parametrize("around", [0.05, 0.5])
-def test_a_window_lacks_as_much_at_its_frame(around):
-    values, component, *_ = patch(around)
-    assert (depth_profile(values, component) == 1.0).all()
 
 
 def test_a_sky_around_the_sun_comes_out_bright_in_its_middle(device, scene):
@@ -494,13 +431,6 @@ def test_where_an_emitter_has_a_place_its_light_is_turned_and_else_nothing_is(de
     for emitters, near in ((emitter_records(lamp()), True), (far, False), (emitter_records(), False)):
         assert (shared(clips=[], lamps=[], emitters=emitters) == -1.0).all() == near
         assert (moved(environment, captured, captured, emitters) == 0.0).all() != near
-
-
-def test_nothing_is_taken_away(device):
-    """A map that is darker than what was captured, as where it has just moved on, gives no negative light."""
-    _, captured, environment = maps(np.array([0.0, -0.6, 0.8]))
-    found = moved(captured, environment, captured, emitter_records(lamp()))
-    np.testing.assert_array_equal(found, captured)
 
 
 def test_another_emitter_is_another_light():

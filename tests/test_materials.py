@@ -206,9 +206,9 @@ def test_ggx_matches_reference(device, roughness):
     check_error("shade", lobe, expected)
 
 
-@pytest.mark.parametrize("metallic", [0.0, 0.5, 1.0])
-@pytest.mark.parametrize("roughness", [0.2, 0.5, 1.0])
-@pytest.mark.parametrize("cos_o", [1.0, 0.6, 0.15])
+@pytest.mark.parametrize("metallic", [0.0, 1.0])
+@pytest.mark.parametrize("roughness", [0.2, 1.0])
+@pytest.mark.parametrize("cos_o", [1.0, 0.15])
 def test_virtual_lights_from_everywhere_are_a_white_environment(device, metallic, roughness, cos_o):
     """The integral of direct reflection over all lights is the environment's reflectance: the two ways of lighting
     agree."""
@@ -220,8 +220,8 @@ def test_virtual_lights_from_everywhere_are_a_white_environment(device, metallic
     np.testing.assert_allclose(total, diffuse[0] + reflectance[0], atol=ALBEDO_TOLERANCE)
 
 
-@pytest.mark.parametrize("cos_o", [0.9, 0.5, 0.25])
-@pytest.mark.parametrize("roughness", [0.5, 0.7, 1.0])
+@pytest.mark.parametrize("cos_o", [0.9, 0.25])
+@pytest.mark.parametrize("roughness", [0.5, 1.0])
 @pytest.mark.parametrize("metallic", [0.0, 1.0])
 def test_a_rough_lobe_leans_to_the_normal(device, metallic, roughness, cos_o):
     """Its axis lies nearer to the mean direction of what is reflected than the mirror direction does."""

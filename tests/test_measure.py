@@ -13,7 +13,7 @@ import pytest
 
 from bench.paper_figures import GAP, sheet
 from tests.accuracy_rig import case, frames, report, setting  # noqa: F401  (fixtures)
-from warp_ar.accuracy import cases, charts, measure, pictures
+from warp_ar.accuracy import cases, charts, measure
 from warp_ar.accuracy import report as report_module
 from warp_ar.accuracy.charts import Point
 from warp_ar.accuracy.cost_table import (
@@ -27,7 +27,7 @@ from warp_ar.accuracy.cost_table import (
     turn,
 )
 from warp_ar.accuracy.costs import Costs
-from warp_ar.accuracy.metrics import changed_region, flip_map
+from warp_ar.accuracy.metrics import changed_region
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import UsageError
 from warp_ar.kernels.color import decode_table
@@ -41,6 +41,7 @@ def even(name: str) -> Costs:
     return Costs(1.0, {name: {method: float(place) for place, method in enumerate(setting(name).methods)}})
 
 
+@pytest.mark.slow
 def test_frames_that_are_not_shown_keep_the_light(case, device):
     """They run at another quality, without a trace in the picture that counts."""
     with Pipeline(case.scene, device=device, quality="low") as pipeline:
@@ -51,6 +52,7 @@ def test_frames_that_are_not_shown_keep_the_light(case, device):
     assert np.abs(sparse[3].astype(int) - full).max() <= 1
 
 
+@pytest.mark.slow
 def test_in_turn_is_alone(case, device):
     """Qualities that run in turn do not touch each other."""
     qualities = {"a": PRESETS["low"], "b": PRESETS["low"].with_methods(irradiance="sh2")}
@@ -61,6 +63,7 @@ def test_in_turn_is_alone(case, device):
         assert len(times[label]) == len(case.frames) - measure.WARM_UP
 
 
+@pytest.mark.slow
 def test_the_last_method_is_its_own_reference(case, device):
     rows, pictures = measure.sweep(case, setting("mirror_ball"), device, even("mirror_ball"), base=PRESETS["low"])
     assert [row.method for row in rows] == ["none", "single", "smooth", "brute_force"] == list(pictures)
@@ -70,6 +73,7 @@ def test_the_last_method_is_its_own_reference(case, device):
     assert errors[3] == rows[3].flip == 0.0
 
 
+@pytest.mark.slow
 def test_truth_is_what_pictures_are_compared_with(case, device):
     truth = dataclasses.replace(case, truth={3: np.full_like(case.frames[3].image, 250)})
     rows, _ = measure.sweep(truth, setting("expose"), device, even("expose"), base=PRESETS["low"])
@@ -191,14 +195,6 @@ def test_where_nothing_clips_the_truth_of_a_shorter_exposure_is_known():
 # --- FLIP at its two ends; regions of pictures that count -------------------------------------------------------------
 
 
-def test_flip_ends():
-    pytest.importorskip("flip_evaluator")
-    black, white = np.zeros((16, 24, 3), np.uint8), np.full((16, 24, 3), 255, np.uint8)
-    assert flip_map(black, black).max() == 0.0
-    assert flip_map(black, black).shape == (16, 24)
-    assert flip_map(black, white).mean() > 0.9
-
-
 def test_changed_region_takes_what_changed_and_no_noise():
     camera = np.random.default_rng(0).integers(100, 104, (60, 80, 3)).astype(np.uint8)
     truth = camera.copy()
@@ -210,17 +206,6 @@ def test_changed_region_takes_what_changed_and_no_noise():
 
 
 # --- Crops, and sheets of them ----------------------------------------------------------------------------------------
-
-
-def test_crops_lie_around_what_is_to_be_seen():
-    region = np.zeros((480, 640), bool)
-    region[400:470, 600:630] = True
-    region[0, 0] = True  # one stray pixel
-    rows, columns = pictures.bounding_box(region, region.shape)
-    assert rows.start <= 400 <= 470 <= rows.stop <= 480
-    assert columns.start <= 600 <= 630 <= columns.stop <= 640
-    assert rows.stop - rows.start < 200
-    assert pictures.bounding_box(np.zeros((48, 64), bool), (48, 64)) == (slice(0, 48), slice(0, 64))
 
 
 def test_a_sheet_holds_every_column_and_its_error():

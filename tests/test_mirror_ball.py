@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
-import cv2
 import numpy as np
 import pytest
 
@@ -39,7 +36,6 @@ from tests.mirror_ball_rig import (
     W,
     grey_frame,
     linear,
-    mirrored_rays,
     noise_frame,
     on_desk,
     run,
@@ -48,23 +44,17 @@ from tests.reference import color as reference_color
 from tests.reference import mirror_ball as reference
 from tests.reference import relight as reference_relight
 from tests.reference.visibility import Body
-from warp_ar.engine.graph import make_plan
-from warp_ar.engine.pipeline import Pipeline
 from warp_ar.kernels.structs import (
     BOX,
     PLANE,
     SPHERE,
 )
-from warp_ar.scene import load_scene
 from warp_ar.stages.mirror_ball import SIDES
-from warp_ar.stages.quality import PRESETS
-from warp_ar.stages.request import Request
 
 # --- closed forms
 
 
-@pytest.mark.parametrize("rho", [0.4, 0.85, 1.0])
-@pytest.mark.parametrize("kd", [0.3, 0.5, 0.9])
+@pytest.mark.parametrize(("rho", "kd"), [(0.4, 0.9), (0.85, 0.5), (1.0, 0.3)])
 def test_light_above_a_desk_seen_in_the_ball(device, rho, kd):
     """A matt desk under an even environment, and a sun straight above it: rho kd E / pi, but in the ball's own
     shadow."""
@@ -210,20 +200,6 @@ def test_a_ball_behind_a_proxy_is_not_changed(device):
     assert plain[:, W // 2 + 4 :].any()
 
 
-def test_the_mirror_image_of_another_ball_is_not_changed(device):
-    """Light is mirrored once: rays from one ball to the other change nothing, whatever lies behind that."""
-    other = {**BALL, "center": np.array([0.13, 0.0, 0.06])}
-    toward = other["center"] - POINTS
-    along = (toward * OUTWARD).sum(-1)
-    miss = np.linalg.norm(along[..., None] * OUTWARD - toward, axis=-1)
-    to_other = ON_BALL & (along > 0) & (miss < 0.99 * RADIUS)
-    front = ~mirrored_rays(center=other["center"])[2]
-    shell = {"objects": [shape(SPHERE, (0, 0, 0), (3.0,) * 3, 0)], "irradiance": ENVIRONMENT, "lights": [SUN]}
-    assert (to_other & front).sum() > 20
-    assert not run(balls=[BALL, other], **shell)[to_other & front].any()
-    assert run(balls=[BALL], **shell)[to_other & front & ~DOWN].any(-1).all(), "alone it mirrors the shell there"
-
-
 @pytest.mark.parametrize("away", [(0.0, 0.0, -1.0), (0.4, 0.0, 0.06)], ids=["under the desk", "behind a wall"])
 def test_a_ball_behind_what_is_mirrored_hides_nothing(device, away):
     """What a ray meets first counts, not what lies in its way beyond."""
@@ -303,7 +279,7 @@ def test_grazing_the_silhouette(device):
 def test_smooth_is_the_mean_over_the_pixel(device):
     """At edges and all: ``n`` rays per pixel give the mean of ``n`` pictures of one ray, moved within the pixel."""
     frame, scene = noise_frame(), {**BUSY, "method": "reflectance"}
-    for samples in (4, 16, 64):
+    for samples in (4, 16):
         side = round(samples**0.5)
         mean = np.zeros((H, W, 3))
         for k in range(samples):
@@ -314,9 +290,6 @@ def test_smooth_is_the_mean_over_the_pixel(device):
         # A ray is moved before or after its rounding: one of many may fall on the other side of an edge.
         assert np.isclose(got, mean, atol=1e-5).all(-1).mean() > 0.997
         assert abs(got - mean).mean() < 1e-5
-
-
-# --- culling and repetition
 
 
 # --- garbage
@@ -333,49 +306,3 @@ def test_a_pixel_of_the_frame_changes_itself_alone(device):
             assert touched[row, column]
             touched[row, column] = False
             assert not touched.any()
-
-
-# --- the truth
-
-# Of the error without the stage, where the stage changes anything: measured 0.32 by one ray, 0.28 by four. What stays:
-# the objects' own light, which is the environment's alone, and what the path tracer's ball mirrors twice.
-TRUTH_LEFT = 0.4
-
-
-def test_nearer_to_the_truth_method_by_method(device, shared):
-    """Against a path-traced frame with the torus and the lamp really there, in the pixels of the ball that change."""
-    case = shared / "truth" / "gold_torus_interior"
-    scene = load_scene(case / "scene_both.toml")
-    pictures = {}
-    for method in ("none", "single", "smooth"):
-        quality = PRESETS["low"].with_methods(mirror_ball=method, environment_shadow="coarse")
-        with Pipeline(scene, device=device, quality=quality) as pipeline:
-            for number in (4, 5, 6):
-                frame = cv2.imread(str(case / "camera" / f"{number:04}.png"))[..., ::-1].copy()
-                pictures[method] = pipeline(frame, time_seconds=number / 30).image.astype(float)
-    truth = cv2.imread(str(case / "both" / "0006.png"))[..., ::-1].astype(float)
-    changed = np.abs(pictures["smooth"] - pictures["none"]).max(-1) > 4
-    left = {method: np.abs(picture - truth)[changed].mean() for method, picture in pictures.items()}
-    assert changed.sum() > 200
-    assert left["smooth"] < left["single"] < TRUTH_LEFT * left["none"], left
-
-
-# --- the stage
-
-
-def plan_of(scene, **methods):
-    return make_plan(
-        Request(scene, PRESETS["medium"].with_methods(**methods), (scene.camera.width, scene.camera.height))
-    )
-
-
-def test_stage_runs_where_a_ball_has_something_to_show():
-    desk = load_scene("desk")
-    assert "mirror_ball" in {stage.name for stage, _ in plan_of(desk, mirror_ball="single").stages}
-    left_out = {
-        "leaves the ball as the camera saw it": plan_of(desk, mirror_ball="none"),
-        "no mirror ball": plan_of(dataclasses.replace(desk, probes=()), mirror_ball="smooth"),
-        "nothing virtual": plan_of(dataclasses.replace(desk, objects=(), lights=()), mirror_ball="smooth"),
-    }
-    for reason, plan in left_out.items():
-        assert reason in dict(plan.left_out)["mirror_ball"]

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import ast
-import contextlib
-import gc
 import importlib
 import inspect
 import itertools
@@ -15,7 +12,6 @@ import shutil
 import subprocess
 import sys
 import threading
-import time
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -23,7 +19,6 @@ import pytest
 import warp as wp
 
 import warp_ar.kernels
-from warp_ar.device import compiling
 from warp_ar.engine import modules
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import UsageError
@@ -78,7 +73,7 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
     return folder / "cache"
 
 
-@pytest.mark.parametrize("damage", ["truncated", "noise", "folder"])
+@pytest.mark.parametrize("damage", ["truncated", "folder"])
 def test_a_damaged_cache_is_compiled_again(tmp_path: pathlib.Path, sound: pathlib.Path, damage: str) -> None:
     cache = tmp_path / "cache"
     shutil.copytree(sound, cache)
@@ -88,7 +83,7 @@ def test_a_damaged_cache_is_compiled_again(tmp_path: pathlib.Path, sound: pathli
     if damage == "folder":
         binary.mkdir()
     else:
-        binary.write_bytes({"truncated": data[: len(data) // 2], "noise": bytes(range(256)) * 8}[damage])
+        binary.write_bytes(data[: len(data) // 2])
     run(tmp_path, cache)
     assert run(tmp_path, cache) == "[]", "what was compiled again is kept"
 
@@ -165,48 +160,6 @@ def test_tiles_from_several_threads() -> None:
             np.testing.assert_array_equal(actual.numpy(), expected.numpy())
 
 
-BESIDE = """
-import faulthandler
-import itertools
-import threading
-import time
-import numpy as np
-import warp as wp
-from warp_ar.device import start_warp
-from warp_ar.kernels.environment import irradiance
-
-faulthandler.enable()
-start_warp()
-environment = wp.array(np.random.default_rng(1).random((16, 32, 3), np.float32), dtype=wp.vec3, device="cpu")
-clusters, others = (wp.zeros(8 * 16, dtype=irradiance.Cluster, device="cpu") for _ in range(2))
-irradiance.gather_clusters(environment, (8, 16), clusters)
-expected, actual = (wp.zeros((64, 64), dtype=wp.vec3, device="cpu") for _ in range(2))
-irradiance.sum_clusters(clusters, expected)
-done = threading.Event()
-
-def gather():
-    while not done.is_set():
-        irradiance.gather_clusters(environment, (8, 16), others)
-
-beside = threading.Thread(target=gather)
-beside.start()
-try:
-    for _ in range(2000):
-        actual.zero_()
-        irradiance.sum_clusters(clusters, actual)
-        np.testing.assert_array_equal(actual.numpy(), expected.numpy())
-finally:
-    done.set()
-    beside.join()
-"""
-
-
-def test_tiles_beside_other_kernels() -> None:
-    """Were both in one module, the other's launches would move the tiles: that crashes within a few hundred rounds."""
-    done = subprocess.run([sys.executable, "-c", BESIDE], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-
-
 def test_kernels_with_tiles_have_modules_of_their_own() -> None:
     found = []
     for module in pkgutil.walk_packages(warp_ar.kernels.__path__, "warp_ar.kernels."):
@@ -220,7 +173,7 @@ def test_kernels_with_tiles_have_modules_of_their_own() -> None:
 # --- Kernels that any scene shares give the pictures of those that are made for one -----------------------------------
 
 
-@pytest.mark.parametrize(("name", "quality"), [("wire_coincident", "low"), ("torus", "medium")])
+@pytest.mark.parametrize(("name", "quality"), [("wire_coincident", "low")])
 def test_a_shared_kernel_gives_the_same_picture(monkeypatch: pytest.MonkeyPatch, name: str, quality: str) -> None:
     """In all bits: what a scene lacks adds zeros and multiplies by one."""
     scene = load_scene(name)
@@ -234,36 +187,3 @@ def test_a_shared_kernel_gives_the_same_picture(monkeypatch: pytest.MonkeyPatch,
             lit.append([pipeline(image, time_seconds=k / 24.0).image for k, image in enumerate(images)])
     np.testing.assert_array_equal(lit[0], lit[1])
     assert any((shown != image).any() for shown, image in zip(lit[0], images, strict=True)), "nothing was lit"
-
-
-def test_what_other_threads_parse_meanwhile_harms_no_translation() -> None:
-    """Finalizers that run inside Python 3.11's parser let another thread parse, which ended both."""
-
-    class Finalized:
-        def __init__(self) -> None:
-            self.cycle = self
-
-        def __del__(self) -> None:
-            time.sleep(0)
-
-    def parse_on() -> None:
-        for count in itertools.count():
-            if done.is_set():
-                return
-            if count % 50 == 0:
-                Finalized()
-            with contextlib.suppress(SystemError):
-                ast.parse("(3,)")
-
-    done, source = threading.Event(), pathlib.Path(modules.__file__).read_text()
-    other = threading.Thread(target=parse_on)
-    other.start()
-    try:
-        for _ in range(20):
-            with compiling(), compiling():
-                ast.parse(source)
-                assert not gc.isenabled()
-            assert gc.isenabled()
-    finally:
-        done.set()
-        other.join()

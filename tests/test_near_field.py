@@ -1,10 +1,8 @@
-import dataclasses
 import warnings
 
 import cv2
 import numpy as np
 import pytest
-import trimesh
 import warp as wp
 
 from tests.environment_shadow_rig import COUNT, SIDE, draw, sky, sphere
@@ -30,10 +28,6 @@ from warp_ar.kernels.structs import (
     Shape,
     make_picture,
 )
-from warp_ar.scene import Object, load_scene
-from warp_ar.stages.features import find_features
-from warp_ar.stages.quality import PRESETS
-from warp_ar.stages.request import Request
 
 BALL = (0.0, 0.0, 0.06)
 RADIUS = 0.05
@@ -326,49 +320,6 @@ def test_averages_stop_at_creases_and_at_the_rectangle(device):
     out, _ = average(found, normals, light[..., None].repeat(3, -1), np.ones((16, 16, 4)), rect=(0, 16, 1, 16))
     np.testing.assert_allclose(out[:, 1:8], 1.0, rtol=1e-6)
     np.testing.assert_allclose(out[:, 8:], 5.0, rtol=1e-6)
-
-
-def test_a_lobe_is_averaged_over_normals_by_its_own_width(device):
-    """On a thin tube neighbours count by their normals, unless a pixel has too few rays or none that left it."""
-    turned = np.radians(5.0 * np.arange(16))
-    normals = np.stack([np.sin(turned), np.zeros(16), np.cos(turned)], axis=-1) * np.ones((16, 1, 1))
-    column = np.arange(16.0) * np.ones((16, 1))
-    shown = (column**2)[..., None].repeat(4, -1)
-    nothing = np.zeros((16, 16, 3))
-    inner = np.s_[SIDE:-SIDE, SIDE:-SIDE]
-    away = np.arange(-2, 3)
-    window = np.array((0.5, 1.0, 1.0, 1.0, 0.5))
-    for shininess, lobes in ((256.0, 4), (16.0, 4), (256.0, 1)):
-        _, mirrored = average(
-            np.zeros((16, 16), int), normals, nothing, shown, (PHONG,), lobes=lobes, shininess=shininess
-        )
-        # The width is the root of 1 / shininess.
-        weights = window * (np.exp(-shininess * (1.0 - np.cos(np.radians(5.0 * away)))) if lobes == 4 else 1.0)
-        more = np.average(away**2, weights=weights)
-        np.testing.assert_allclose(mirrored[..., 0][inner], (column**2)[inner] + more, rtol=1e-4)
-    shown[8, 8, 3] = near_field.NO_RAY
-    _, mirrored = average(np.zeros((16, 16), int), normals, nothing, shown, (PHONG,), shininess=256.0)
-    weights = np.outer(window, window)
-    weights[2, 2] = 0.0
-    np.testing.assert_allclose(mirrored[8, 8, 0], np.average((column**2)[6:11, 6:11], weights=weights), rtol=1e-5)
-
-
-def test_models_of_files_shade_themselves_where_the_environment_casts_shadows(tmp_path):
-    path = tmp_path / "cup.ply"
-    mesh = trimesh.creation.icosphere(subdivisions=1)
-    mesh.visual.vertex_colors = np.full((len(mesh.vertices), 4), 200, np.uint8)
-    mesh.export(path)
-    plain = load_scene("mirror")
-    colored = dataclasses.replace(plain, objects=(Object("mesh", file=path),))
-    for preset, scene, expected in (
-        ("medium", colored, "few_rays"),
-        ("medium", plain, "few_rays"),
-        ("low", colored, "few_rays"),
-        ("paper", colored, ""),
-        ("high", colored, "one_bounce"),
-    ):
-        request = Request(scene, PRESETS[preset], (scene.camera.width, scene.camera.height))
-        assert find_features(request).near_field == expected
 
 
 def test_few_rays_have_no_noise_where_nothing_is_near(device):

@@ -22,7 +22,6 @@ from warp_ar.kernels.split_sum import integrate_dfg
 from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, PHONG, RayScene
 from warp_ar.scene import (
     Camera,
-    FileMaterial,
     LambertMaterial,
     Object,
     PhongMaterial,
@@ -31,7 +30,6 @@ from warp_ar.scene import (
     object_from_trimesh,
 )
 from warp_ar.scene.mesh_files import load_mesh, mesh_from_trimesh
-from warp_ar.scene.object_materials import materials_of, reflects_diffusely, reflects_glossily
 from warp_ar.scene.ray_scene import HostScene
 
 CAMERA = Camera(width=64, height=48, fx=600.0, fy=620.0, cx=30.5, cy=24.0)
@@ -384,14 +382,3 @@ def test_meshes_in_memory(device, tmp_path):
         mesh_from_trimesh("ball.ply")
     with pytest.raises(SceneError, match="no triangle"):
         mesh_from_trimesh(trimesh.Trimesh())
-
-
-def test_which_light_file_materials_show(tmp_path):
-    path = square(tmp_path, extensions={"KHR_materials_unlit": {}})
-    (material,) = materials_of(Object("mesh", file=path)).materials
-    assert (reflects_diffusely(material), reflects_glossily(material)) == (False, False)
-    path = square(tmp_path, metallicRoughnessTexture=lambda made: {"index": made.texture(picture())})
-    (material,) = materials_of(Object("mesh", file=path)).materials
-    assert (reflects_diffusely(material), reflects_glossily(material)) == (True, True)
-    assert isinstance(Object("sphere", radius=1.0).material, FileMaterial)
-    assert materials_of(Object("sphere", radius=1.0)).materials[0].surface == LambertMaterial()

@@ -241,23 +241,6 @@ def test_surfaces_are_drawn_as_their_density_says(name: str, device: str) -> Non
     assert drawn.std() < uniform.std() + 1e-6
 
 
-@pytest.mark.slow
-def test_directions_are_drawn_as_often_as_their_density_says(device: str) -> None:
-    sky = make_sky(sunny(), device)
-    _, directions = draw(sky, (0, 0, 0), (0, 0, 1), device)
-    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1.0, atol=1e-6)
-    row = np.clip((np.arccos(np.clip(directions[:, 2], -1, 1)) / math.pi * HEIGHT).astype(int), 0, HEIGHT - 1)
-    column = ((np.arctan2(directions[:, 1], directions[:, 0]) / math.pi + 1.0) * HEIGHT).astype(int) % (2 * HEIGHT)
-    counts = np.zeros((HEIGHT, 2 * HEIGHT))
-    np.add.at(counts, (row, column), 1)
-    expected = sky.density.numpy().astype(np.float64) * solid_angles(HEIGHT) * COUNT
-    often = expected > 20.0
-    assert often.sum() > 100
-    # The mean of chi squared per texel is 1, and its spread over n texels sqrt(2 / n).
-    chi = ((counts - expected)[often] ** 2 / expected[often]).mean()
-    assert abs(chi - 1.0) < ERRORS * math.sqrt(2.0 / often.sum())
-
-
 def test_near_emitters_are_taken_out_of_the_sky() -> None:
     radiance = lamp_sky()
     distant, sent, owner = split_emitters(radiance, near_emitters()[:1])

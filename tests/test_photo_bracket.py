@@ -12,7 +12,7 @@ from tests.photo_room import exposed, photograph, sphere
 from warp_ar.ball.ball_finder import silhouette
 from warp_ar.errors import UsageError
 from warp_ar.kernels.color import decode_table
-from warp_ar.photographs.bracket import MOVED, agree_exposures, align, register, thin_exposures
+from warp_ar.photographs.bracket import MOVED, agree_exposures, align, register
 
 TENTH = 0.1
 """Pixels: what alignment is asked for."""
@@ -72,12 +72,6 @@ def test_lying_exposures_are_refused_with_all_three_figures():
     for figure in ("EXIF says 2", "names say 729", "pixels say"):
         assert figure in message
     assert "--exposures" in message
-
-
-def test_names_that_the_pixels_confirm_beat_exif():
-    agreed = agree_exposures(patches(BRACKET), "srgb", [1.0, 0.8, 0.7, 0.5], TRUE)
-    assert agreed.ratios == pytest.approx([t / TRUE[0] for t in TRUE])
-    assert "names" in agreed.notes[0]
 
 
 def test_equal_pictures_contradict_unequal_exposures_under_every_response():
@@ -150,13 +144,6 @@ def test_without_any_claim_the_pixels_decide():
     steps = [b / a for a, b in itertools.pairwise(agreed.ratios)]
     assert steps == pytest.approx([0.25, 0.24, 0.25], rel=0.1)
     assert "pixels alone" in agreed.notes[0]
-
-
-def test_near_exposures_are_left_out_and_said():
-    kept, notes = thin_exposures([1.0, 0.97, 0.3, 0.05], 1, ["a.jpg", "b.jpg", "c.jpg", "d.jpg"])
-    assert kept == (1, 2, 3)
-    assert notes == ("a.jpg is left out: its exposure and that of b.jpg are 1.03 apart",)
-    assert thin_exposures([1.0, 0.8, 0.63], 0, ["a", "b", "c"])[0] == (0, 1, 2)  # thirds of a stop
 
 
 def test_exposures_far_apart_are_not_judged_by_what_they_share():

@@ -106,30 +106,6 @@ def test_a_track_of_the_callers_is_that_of_the_pipelines_own(frames: Frames, dev
     assert states == {TrackState.TRACKED, TrackState.LOST}
 
 
-def test_light_of_submitted_frames_outlasts_them_where_no_picture_is_made(frames: Frames, device: str) -> None:
-    outputs = ("pose", "environment")
-    rising = [np.minimum(image, np.uint8(100 + 20 * index)) for index, image in enumerate(frames * 2)]
-    with (
-        Pipeline(make_scene(), device=device, quality="low", outputs=outputs, estimates="synchronous") as first,
-        Pipeline(make_scene(), device=device, quality="low", outputs=outputs, estimates="synchronous") as second,
-    ):
-        expected, ahead = [], []
-        for index, image in enumerate(rising):
-            result = first(image, time_seconds=index / 30)
-            expected.append((result.environment, result.emitters))
-        for index, image in enumerate(rising):
-            image.flags.writeable = False
-            ahead.append(second.submit(image, time_seconds=index / 30))
-        for result, (environment, emitters) in zip(ahead, expected, strict=True):
-            assert environment is not None
-            assert emitters is not None
-            np.testing.assert_array_equal(result.environment, environment)
-            assert result.emitters is not None
-            assert result.emitters.tobytes() == emitters.tobytes()
-    maps = {environment.tobytes() for environment, _ in expected if environment is not None}
-    assert len(maps) == len(rising), "the light must change"
-
-
 def test_submitted_frames_may_be_written_anew(frames: Frames, device: str) -> None:
     outputs = ("image", "environment")
     with (
@@ -146,15 +122,6 @@ def test_submitted_frames_may_be_written_anew(frames: Frames, device: str) -> No
             assert result.stages.keys() == wanted.stages.keys()
             if device == "cpu":
                 np.testing.assert_array_equal(result.environment, wanted.environment)
-
-
-def test_steps_of_submitted_frames_are_timed(frames: Frames, device: str) -> None:
-    with Pipeline(make_scene(), device=device, quality="low") as pipeline:
-        results = [pipeline.submit(image) for image in frames]
-        on_device = set() if device == "cpu" else {"upload", "kernels", "download"}
-        for result in results:
-            assert set(result.steps) == {"track", "render"} | on_device
-            assert all(milliseconds > 0.0 for milliseconds in result.steps.values())
 
 
 def test_calls_updates_and_hand_overs_wait_for_what_was_submitted(frames: Frames, device: str) -> None:
@@ -174,16 +141,6 @@ def test_calls_updates_and_hand_overs_wait_for_what_was_submitted(frames: Frames
         heir.continue_from(ahead)
         expected_heir.continue_from(plain)
         np.testing.assert_array_equal(heir(frames[0]).image, expected_heir(frames[0]).image)
-
-
-def test_profiling_changes_times_only(frames: Frames, device: str) -> None:
-    with (
-        Pipeline(make_scene(), device=device, quality="low") as plain,
-        Pipeline(make_scene(), device=device, quality="low", profile=True) as profiled,
-    ):
-        for one, other in zip(run(plain, frames), run(profiled, frames), strict=True):
-            np.testing.assert_array_equal(one.image, other.image)
-            assert one.stages.keys() == other.stages.keys()
 
 
 def test_a_closed_pipeline_says_so(frames: Frames) -> None:
@@ -283,11 +240,6 @@ def test_poses_and_scenes_that_are_none_are_refused_by_name(frames: Frames) -> N
     ):
         with pytest.raises(UsageError, match=wrong):
             Pose(rotation, translation)  # type: ignore[arg-type]
-
-
-def test_ways_to_wait_that_are_none_are_refused() -> None:
-    with pytest.raises(UsageError, match="estimates = True: expected 'synchronous', 'delayed', 'real_time'"):
-        Pipeline(make_scene(), device="cpu", estimates=True)  # type: ignore[arg-type]
 
 
 def test_impossible_exposures_are_refused(frames: Frames) -> None:
@@ -429,17 +381,6 @@ def test_light_is_kept_at_another_size(frames: Frames, device: str) -> None:
             )
 
 
-def test_a_new_material_shows_where_nothing_else_moves(frames: Frames, device: str) -> None:
-    scene = make_scene(lights=(), exposure=Exposure(1.0))
-    sphere, torus = scene.objects
-    painted = dataclasses.replace(sphere, material=LambertMaterial((0.1, 0.9, 0.2)))
-    with Pipeline(scene, device=device, quality="low") as pipeline:
-        for index in range(60):  # the light settles, the tracker too
-            before = pipeline(frames[0], time_seconds=index / 30).image
-        pipeline.update(dataclasses.replace(scene, objects=(painted, torus)))
-        assert (pipeline(frames[0], time_seconds=2.0).image != before).any()
-
-
 def test_an_error_while_rendering_is_raised_with_its_result(frames: Frames) -> None:
     with Pipeline(make_scene(), device="cpu", quality="low") as pipeline:
 
@@ -462,11 +403,3 @@ def test_a_still_picture_runs_only_what_time_moves(frames: Frames) -> None:
     still = [{"irradiance", "prefilter", "visibility", "shade", "composite"} <= one for one in skipped[50:]]
     assert sum(still) >= len(still) - 1, "nothing had changed, but where an estimate came"
     assert "accumulate" not in skipped[-1], "accumulation follows the clock"
-
-
-def test_warmed_up_equals_fresh(frames: Frames, device: str) -> None:
-    with contextlib.ExitStack() as stack:
-        warm, fresh = (stack.enter_context(Pipeline(make_scene(), device=device, quality="medium")) for _ in range(2))
-        warm.warm_up()
-        for one, other in zip(run(warm, frames), run(fresh, frames), strict=True):
-            np.testing.assert_array_equal(one.image, other.image)

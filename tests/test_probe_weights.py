@@ -77,11 +77,6 @@ def test_a_ball_goes_out_without_a_jump(device):
     assert (np.diff(steps[:, :, 1], axis=0) <= ROUNDING).all()
 
 
-def test_balls_at_one_place_share(device):
-    found = weigh((TWO[0], TWO[0]), [(0.1, 0.2, 0.3), TWO[0][:3]])
-    np.testing.assert_allclose(found, 0.5, atol=ROUNDING)
-
-
 def follow(shares, centers, *, seconds=0.1):
     """Places after frames that show these shares of each ball, from the start; and those of the twin."""
     params = np.zeros(1, np.dtype(structs.FrameParams.numpy_dtype()))
@@ -109,13 +104,6 @@ def test_trust_follows_what_is_seen(device):
     expected = np.concatenate([down, 1.0 - (1.0 - down[-1]) * down[1:]])
     np.testing.assert_allclose(history[:, 1, 3], expected, rtol=ROUNDING)
     np.testing.assert_allclose(history[:, 1, :3], np.tile((0.4, 0.0, 0.0), (61, 1)), atol=1e-6)
-
-
-def test_while_no_ball_is_seen_all_stays(device):
-    centers = [[(0.1, 0, 0), (0.4, 0, 0)]] * 2001
-    history = follow([(0.9, 0.2), *[(0.0, 0.0)] * 2000], centers)
-    # Two roundings a frame: fading, and the greatest put back to 1.
-    np.testing.assert_allclose(history[-1], history[0], rtol=2000 * 1.2e-7)
 
 
 def test_a_ball_that_was_never_seen_says_nothing(device):

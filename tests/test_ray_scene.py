@@ -17,7 +17,6 @@ from warp_ar.kernels import structs
 from warp_ar.scene import Pose
 from warp_ar.scene.geometry import rotation_matrix
 from warp_ar.scene.kinds import trace_config
-from warp_ar.scene.object_materials import reflects_diffusely, reflects_glossily
 from warp_ar.scene.ray_scene import HostScene
 from warp_ar.scene.screen_extents import EMPTY, screen_rects
 from warp_ar.scene.texture_pack import linear_texture
@@ -198,22 +197,6 @@ def test_texture_needs_coordinates(device, tmp_path):
         SceneError, match=r"plain\.ply: the mesh has no texture coordinates for the texture .*wood\.png"
     ):
         HostScene(scenes.Scene(CAMERA, objects=(item,)), wp.get_device(device))
-
-
-def test_which_light_a_material_reflects():
-    """Metals need no irradiance, chalk no reflections, black nothing."""
-    black = (0.0, 0.0, 0.0)
-    cases = [
-        (scenes.LambertMaterial(), True, False),
-        (scenes.LambertMaterial(black), False, False),
-        (scenes.MirrorMaterial(), False, True),
-        (scenes.MetallicRoughnessMaterial(metallic=1.0), False, True),
-        (scenes.MetallicRoughnessMaterial(metallic=0.5), True, True),
-        (scenes.PhongMaterial(specular=black), True, False),
-        (scenes.PhongMaterial(diffuse=black), False, True),
-    ]
-    for material, diffuse, glossy in cases:
-        assert (reflects_diffusely(material), reflects_glossily(material)) == (diffuse, glossy)
 
 
 # --- Rectangles -------------------------------------------------------------------------------------------------------

@@ -378,20 +378,3 @@ def test_an_object_sends_the_light_that_falls_on_it(device, name):
     beside = (np.abs(at[..., :2]) > 0.22).any(-1)
     assert beside.any()
     np.testing.assert_array_equal(patches["flux"][beside], plain["flux"][beside])
-
-
-def test_an_object_in_the_dark_sends_nothing(device):
-    """Under another object, which takes the lamp's light."""
-    item = {**shape(BOX, (0.0, 0.0, 0.02), (0.05, 0.05, 0.02)), "material": 0}
-    lid = {**shape(BOX, (0.0, 0.0, 0.7), (0.2, 0.2, 0.01)), "material": 0}
-    material = {"model": LAMBERT, "base_color": (1.0,) * 3, "base_texture": -1}
-    view = View(lights=[point((0, 0, 0.9))], objects=[item, lid], materials=[material])
-    assert view.send().numpy()["area"][4:8, 6:10].max() == 0
-
-
-# --- Garbage ----------------------------------------------------------------------------------------------------------
-
-
-# --- In the pipeline --------------------------------------------------------------------------------------------------
-
-METHODS = ("bounce", "brute_force")

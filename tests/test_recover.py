@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -36,9 +35,7 @@ from warp_ar.kernels.recovery.recover_cells import (
     leave_out_edges,
 )
 from warp_ar.kernels.recovery.saturation_boundaries import weigh_boundaries
-from warp_ar.light import emitters, fit, priors, recovery
-from warp_ar.light import surfaces as light_surfaces
-from warp_ar.light.config import CONFIG, Kind
+from warp_ar.light import fit, priors
 from warp_ar.light.emitters import TRIED, EmitterSearch, room
 from warp_ar.light.problem import Candidate, Problem, emitter_directions, mirroring_points
 from warp_ar.scene.geometry import rotation_matrix
@@ -189,23 +186,6 @@ def test_observation_of_a_linear_frame_reads_light_as_it_is(device, scene):
     kernels.observe_surfaces(trace_config(scene).proxies, False, codes, table, *seen)
     assert abs(out.numpy()["radiance"][0, 0] / 0.0021 - 1.0) > 0.005
     assert out.numpy()["radiance"][1].max() == 1.0
-
-
-def test_points_are_traced_once_when_they_come_into_view(device):
-    """What a row holds stays as it is: the environment does not move."""
-    points = points_of(device, [(5.0, 5.0, 0.0), (4.0, 5.0, 0.0)], [(0, 0, 1)] * 2)
-    views, rows = np.zeros(2, np.dtype(kernels.Observation.numpy_dtype())), []
-    traced = wp.zeros(2, dtype=wp.int32, device=device)
-    out = [wp.full((2, CELL_ROWS * CELL_COLUMNS), -1.0, dtype=wp.float32, device=device) for _ in range(2)]
-    surroundings = cells_of(device)[1], probes_of(device), empty_scene().ray_scene
-    for visible in ((1, 0), (1, 1)):
-        views["visible"] = visible
-        seen_now = wp.array(views, dtype=kernels.Observation, device=device)
-        kernels.trace_transfer((), points, seen_now, *surroundings, traced, *out)
-        rows.append(out[0].numpy().sum(axis=1))
-        out[0][:1].fill_(-1.0)
-    assert rows[0] == pytest.approx([np.pi, -CELL_ROWS * CELL_COLUMNS], rel=QUADRATURE)
-    assert rows[1] == pytest.approx([-CELL_ROWS * CELL_COLUMNS, np.pi], rel=QUADRATURE)
 
 
 # --- Cells of the environment in which light is missing, and the boundaries of what clips -----------------------------
@@ -418,30 +398,6 @@ def test_shading_finds_how_far_an_emitter_is(device, scene, distance):
     assert found.power == pytest.approx(np.full(3, power), rel=0.04)
 
 
-def _cells_that_clip(middle: np.ndarray, radius: float) -> np.ndarray:
-    """Cells of a map that clips within so many radians of a direction, each with its own middle."""
-    cells = np.zeros((32, 64), Cell.numpy_dtype())
-    theta, phi = np.meshgrid(
-        (np.arange(32) + 0.5) / 32 * np.pi, ((np.arange(64) + 0.5) / 32 - 1) * np.pi, indexing="ij"
-    )
-    direction = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
-    cells["direction"], cells["solid_angle"] = direction, np.sin(theta) * (np.pi / 32) ** 2
-    cells["missing"] = (direction @ middle > np.cos(radius))[..., None]
-    return cells
-
-
-def test_emitters_stand_in_the_middle_of_a_spot_but_not_of_a_window():
-    middle = np.array([-0.45, 0.35, 0.82]) / np.linalg.norm([-0.45, 0.35, 0.82])
-    spot, window = (_cells_that_clip(middle, radius) for radius in (0.1, 0.6))
-    clips = spot["missing"].reshape(-1, 3).any(axis=1)
-    assert 4 <= clips.sum() <= 16
-    found = emitter_directions(spot)
-    # Which cells clip in whole tells the middle to a quarter of their width.
-    assert (found[clips] @ middle).min() > np.cos(0.25 * np.pi / 32)
-    assert np.array_equal(found[~clips], spot["direction"].reshape(-1, 3)[~clips])
-    assert np.array_equal(emitter_directions(window), window["direction"].reshape(-1, 3))
-
-
 def test_an_emitter_is_where_the_ball_mirrors_it_to_the_camera(device, scene):
     """The ball shows a near emitter from a point of its surface, not from its middle: two centimetres beside it
     here."""
@@ -530,78 +486,6 @@ def test_all_that_is_estimated_is_finite_for_absurd_frames(device, scene):
             assert (estimate.recovered >= 0).all()
 
 
-def test_unknown_method_is_named(scene):
-    with pytest.raises(ValueError, match=r"'guess'.*white_card or shading"):
-        recovery.Recovery(light_surfaces.find_surfaces(scene), 0.85, (0, 0, 0), method="guess")
-
-
-def test_wide_regions_are_split_into_compact_parts():
-    d, area = reference.cell_directions(CELL_ROWS, CELL_COLUMNS)
-    labels = np.where(d[:, 2] > 0.5, 0, np.where(d[:, 2] < -0.99, 1, -1))
-    parts, count = priors.split_regions(labels, d, area)
-    sizes = np.bincount(parts[parts >= 0], area[parts >= 0])
-    assert count == len(sizes) == parts.max() + 1
-    assert (parts >= 0).tolist() == (labels >= 0).tolist()
-    assert sizes.max() < 3 * CONFIG.priors.region
-    assert len(np.unique(parts[labels == 1])) == 1
-
-
-@pytest.mark.parametrize(
-    ("falls", "is_added"), [((6.0, 0.9, 0.3), False), ((2.0, 1.3, 0.4), True), ((0.3, 1.3, 1.3), True)]
-)
-def test_two_channels_must_show_an_emitter(falls, is_added, monkeypatch):
-    """What one says alone, however clearly, is no emitter; what two say is one, where the third clips."""
-    candidates = []
-
-    def fitted(*_):
-        costs = 100.0 - CONFIG.search.evidence * np.array(falls) * len(candidates)
-        return SimpleNamespace(z=np.zeros((3, 1)), cost=costs)
-
-    class Search(EmitterSearch):
-        def __init__(self):
-            self.evidence = CONFIG.search.evidence
-            self.problem = SimpleNamespace(push=candidates.append, pop=candidates.pop, first_mean=1)
-
-        def costs_at(self, places, fits):
-            return np.zeros(len(places))
-
-        def gains(self, fits, columns):
-            return CONFIG.search.evidence * np.array(falls)[:, None]
-
-        def settled(self, candidate, cost, fits, least):
-            return candidate
-
-    monkeypatch.setattr(emitters, "fit_channels", fitted)
-    added = Search().add_candidate(fitted(), [Candidate(7, np.inf)], np.zeros((1, 1)))
-    assert (added is not None) == is_added
-    assert candidates == [Candidate(7, np.inf)] * is_added
-
-
-def scattered(kind, count, scatter, *, emitter=None, stains=0):
-    """Points of one surface and what they show: a constant or an emitter's light, times noise."""
-    rng = np.random.default_rng(2)
-    points = np.zeros(count, np.dtype(kernels.SurfacePoint.numpy_dtype()))
-    points["position"][:, :2] = rng.uniform(-0.1, 0.1, (count, 2))
-    points["normal"], points["tangent"] = (0, 0, 1), (1, 0, 0)
-    light = np.ones(count)
-    if emitter is not None:
-        away = np.array(emitter) - points["position"]
-        light = away[:, 2] / np.linalg.norm(away, axis=1) ** 3
-    light = light * np.exp(scatter * rng.normal(size=count))
-    light[:stains] *= 0.3
-    exact = np.ones((count, 3), bool)
-    surface = np.zeros(count, np.int64)
-    return light_surfaces.measured_noise(points, surface, np.array([kind]), light[:, None] * np.ones(3), exact)[0][0]
-
-
-@pytest.mark.parametrize("emitter", [None, (-0.2, 0.1, 0.4)])
-@pytest.mark.parametrize("scatter", [0.015, 0.03])
-def test_noise_is_how_far_points_scatter(scatter, emitter):
-    # 40 points tell a deviation to about a seventh, robustly measured; a fifth of them in shadow change little.
-    for stains in (0, 8):
-        assert scattered(Kind.FACE, 40, scatter, emitter=emitter, stains=stains) == pytest.approx(scatter, rel=0.4)
-
-
 def test_boundaries_weigh_the_same_everywhere_on_the_sphere(device):
     height, pixels = 256, 20.0
     d, area = reference.cell_directions(height, 2 * height)
@@ -621,10 +505,3 @@ def test_boundaries_weigh_the_same_everywhere_on_the_sphere(device):
         shares.append((area @ got) / (area @ disc))
     assert 0.2 < min(shares) < 0.8
     assert np.ptp(shares) < 0.03
-
-
-def test_large_pictures_of_a_ball_have_no_boundaries(device):
-    clipped = np.zeros((32, 64, 3))
-    clipped[10:14, 20:24] = 1.0
-    assert weighed_boundaries(device, clipped, 1e5) == pytest.approx(clipped, abs=1e-3)
-    assert np.isfinite(weighed_boundaries(device, clipped, 1e-9)).all()

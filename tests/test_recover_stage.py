@@ -20,9 +20,8 @@ from warp_ar.light import recovery
 from warp_ar.light import surfaces as light_surfaces
 from warp_ar.light.config import CONFIG
 from warp_ar.light.estimate import Estimate
-from warp_ar.scene import Pose, load_scene
+from warp_ar.scene import Pose
 from warp_ar.scene.description import SourceSpec
-from warp_ar.session import Session
 from warp_ar.stages.quality import PRESETS
 from warp_ar.stages.recover import LATENCY, Recover
 
@@ -120,9 +119,7 @@ def test_a_switched_emitter_is_solved_for_at_once(scene, changed):
     assert not solver.rests(*what_is_seen(**changed))
 
 
-@pytest.mark.parametrize(
-    "changed", [{"surroundings": 0.4 * 1.05}, {"table": 0.3 * 0.9}, {"surroundings": 0.35, "table": 0.25}]
-)
+@pytest.mark.parametrize("changed", [{"surroundings": 0.4 * 1.05}, {"surroundings": 0.35, "table": 0.25}])
 def test_other_light_waits_once_at_most(scene, changed):
     solver = settled_solver(scene)
     assert not solver.rests(*what_is_seen())
@@ -130,13 +127,6 @@ def test_other_light_waits_once_at_most(scene, changed):
     solver = settled_solver(scene)
     assert [solver.rests(*what_is_seen()) for _ in range(2)] == [False, True]
     assert not solver.rests(*what_is_seen(**changed))
-
-
-def test_light_that_changes_slowly_is_followed(scene):
-    """What is compared with is what was solved for, not the last frame."""
-    solver = settled_solver(scene)
-    rested = [solver.rests(*what_is_seen(table=0.3 * 1.009**k)) for k in range(12)]
-    assert rested.count(False) >= 4
 
 
 def test_an_emitter_over_a_part_of_the_desk_is_other_light(scene):
@@ -156,37 +146,6 @@ def test_a_failing_estimate_is_reported_with_its_frame(scene, monkeypatch):
     monkeypatch.setattr(recovery.Recovery, "update", update)
     with pytest.raises(ArithmeticError, match="no such light"):
         shown_estimates(scene, "cpu", 1)
-
-
-CLIPPED_ERROR = 0.4
-"""Of the irradiance that clipping takes at least in the case below."""
-
-SHADING_ERROR = 0.2
-"""What may be left: the first frame alone leaves 0.13."""
-
-
-def test_light_of_a_path_traced_environment_comes_back(shared):
-    case = shared / "truth" / "gold_torus_interior"
-    truth = np.load(case / "env" / "0000.npy").astype(float)
-    d, area = reference.cell_directions(*truth.shape[:2])
-    normals = reference.cell_directions(12, 24)[0]
-    cosine = np.maximum(normals @ d.T, 0.0) * area
-
-    def irradiance(map_):
-        return cosine @ np.asarray(map_, float).reshape(-1, 3)
-
-    errors = {}
-    for method in ("clipped", "white_card", "shading"):
-        quality = PRESETS["medium"].with_methods(recover=method)
-        source = load_scene(case / "scene_object.toml")
-        with Session(source, device="cpu", quality=quality, outputs=("environment",)) as session:
-            _, result = next(iter(session))
-        small = result.environment
-        got = np.repeat(np.repeat(small, truth.shape[0] // len(small), 0), truth.shape[0] // len(small), 1)
-        errors[method] = np.linalg.norm(irradiance(got) - irradiance(truth)) / np.linalg.norm(irradiance(truth))
-    assert errors["clipped"] > CLIPPED_ERROR
-    assert errors["white_card"] < errors["clipped"]
-    assert errors["shading"] < SHADING_ERROR
 
 
 @pytest.mark.parametrize("metering", ["fixed", "automatic"])
@@ -224,11 +183,3 @@ def test_an_estimate_that_is_waited_for_lights_its_own_frame(scene, device, monk
     spied_estimates(monkeypatch, 0.05)
     expected = [1, 2, *[3] * 6, *[4] * 6, 5, 5]
     assert shown_estimates(scene, device, len(expected), estimates="synchronous") == expected
-
-
-def test_after_other_light_estimates_come_often_again(scene):
-    solver = settled_solver(scene)
-    for _ in range(12):
-        solver.rests(*what_is_seen())
-    assert not solver.rests(*what_is_seen(surroundings=0.8))
-    assert [solver.rests(*what_is_seen(surroundings=0.8)) for _ in range(3)] == [True, False, True]

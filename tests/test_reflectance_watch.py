@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 
 from warp_ar import PRESETS, Pipeline
-from warp_ar.ball import reflectance_watch
-from warp_ar.ball.ball_reflectance import Reflected, measure_reflectance
-from warp_ar.ball.reflectance_watch import ENOUGH, FIRST, MOST, ReflectanceWatch
+from warp_ar.ball.ball_reflectance import measure_reflectance
+from warp_ar.ball.reflectance_watch import ReflectanceWatch
 from warp_ar.calibration.saturation import ball_discs
 from warp_ar.checks.check_pictures import take_look
 from warp_ar.kernels.color import decode_table
 from warp_ar.live_clip import reflectances_told
-from warp_ar.scene import Pose, load_scene
+from warp_ar.scene import load_scene
 from warp_ar.sources.sources import open_source
 
 pytestmark = pytest.mark.slow
@@ -26,8 +25,6 @@ TOLD = 0.08
 ROUNDED = 0.02
 """Relative error of codes."""
 """Relative: four roundings of float32. OpenCV adds in another order at the end of a row."""
-NOWHERE = Pose(np.eye(3), np.zeros(3))
-BLACK = np.zeros((4, 4, 3), np.uint8)
 
 
 def said(reflectance, clip="desk"):
@@ -86,45 +83,6 @@ def test_what_shines_beside_the_ball_tells_nothing():
     even, less = beside(np.ones(width)), beside(np.full(width, 1.2))
     assert np.array(less.reflectance) * 1.2 == pytest.approx(np.array(even.reflectance), rel=ROUNDED)
     assert beside(np.linspace(0.4, 2.0, width)) is None
-
-
-def telling(monkeypatch, answers):
-    """Frames tell ``answers`` in turn; gives the list of calls."""
-    calls = []
-
-    def measure(*_):
-        calls.append(1)
-        value = answers[min(len(calls), len(answers)) - 1]
-        return None if value is None else Reflected((value,) * 3, 1000)
-
-    monkeypatch.setattr(reflectance_watch, "measure_reflectance", measure)
-    return calls
-
-
-@pytest.mark.parametrize(("answer", "asked"), [(0.8, ENOUGH), (None, MOST)])
-def test_frames_are_asked_until_enough_have_told_or_were_asked_in_vain(monkeypatch, answer, asked):
-    scene, calls = load_scene("desk"), telling(monkeypatch, [answer])
-    looks = watch(scene)
-    for _ in range(1000):
-        looks.observe(BLACK, NOWHERE, scene.probes)
-    assert len(calls) == asked
-    assert looks.values == (scene.probes[0].reflectance,)
-
-
-def test_light_changes_only_where_the_median_moves(monkeypatch):
-    """0.5, then 0.505 changes nothing; a median of 0.7 does; one that agrees with the scene gives its number back."""
-    scene = said((0.85,) * 3)
-    telling(monkeypatch, [0.5, 0.51, 0.7, 0.84, 0.84, 0.84, 0.84])
-    looks = watch(scene)
-    changed, values = [], []
-    for _ in range(40):
-        changed.append(looks.observe(BLACK, NOWHERE, scene.probes))
-        values.append(looks.values[0][0])
-    assert changed[:FIRST] == [True, False, False]  # medians 0.5, 0.505, 0.51
-    assert values[FIRST - 1] == pytest.approx(0.5)
-    assert 0.605 in [pytest.approx(value) for value in values]  # of 0.5, 0.51, 0.7, 0.84
-    assert values[-1] == 0.85
-    assert not looks.is_told
 
 
 def test_the_light_is_that_of_a_scene_which_says_so():

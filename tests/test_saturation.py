@@ -164,14 +164,3 @@ def test_under_a_tone_curve_a_blurred_end_is_told_by_one_frame_unless_something_
     plain.observe(image, disc)
     assert np.abs(told.levels - 237).max() <= 1
     np.testing.assert_array_equal([paper.levels, plain.levels], FULL)
-
-
-def test_what_was_taken_for_the_end_and_moves_with_the_gain_is_taken_back():
-    """A wall that is the brightest of all that is seen, under a tone curve: believed until the gain tells."""
-    seen, disc = SaturationLevels(), [(40.0, 40.0, 20.0)]
-    told = []
-    for k, gain in enumerate((1.0, 1.1, 1.15, 1.05, 0.9, 0.8)):
-        seen.observe(blurred_ball(225.0 * gain ** (1 / 2.2), 2.0, k), disc, gain, bent=True)
-        told.append(seen.levels[0])
-    assert told[0] < FULL
-    assert told[-1] == FULL

@@ -17,6 +17,8 @@ from warp_ar.scene import AreaLight, LambertMaterial, MirrorMaterial, Object, Sc
 pytestmark = pytest.mark.slow
 __all__ = ["frames"]  # a fixture
 
+pytestmark = pytest.mark.slow
+
 BALL = Object("sphere", radius=0.02, at=(0.0, 0.06, 0.02), material=LambertMaterial((0.2, 0.5, 0.9)), name="ball")
 UPRIGHT = np.array([[0.0, -1.0, 0.0, 0.1], [1.0, 0.0, 0.0, 0.02], [0.0, 0.0, 1.0, 0.05], [0.0, 0.0, 0.0, 1.0]])
 

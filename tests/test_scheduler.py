@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import subprocess
 import sys
 import threading
 import types
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -18,7 +17,7 @@ import warp as wp
 
 from warp_ar.engine import graph
 from warp_ar.engine.graph import Plan, make_plan
-from warp_ar.engine.scheduler import Scheduler, _in_launch_order
+from warp_ar.engine.scheduler import Scheduler
 from warp_ar.kernels.launch import copy, launch, launch_rows
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Stage, Wiring
 from warp_ar.stages.features import Features
@@ -317,81 +316,6 @@ def test_passes_take_part_when_they_are_due(monkeypatch: pytest.MonkeyPatch, dev
     if wp.get_device(device).is_cuda:
         assert sorted(len(segments) for segments in scheduler._patterns.values()) == [1, 3]
     scheduler.close()
-
-
-def test_a_stage_gives_way_as_far_as_its_readers_allow(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Behind the last stage that it names, but before whoever reads what it writes."""
-
-    def order(a: tuple[str, ...] = (), b: tuple[str, ...] = ()) -> list[str]:
-        stages = {}
-        for target, source in (("a", "frame"), ("b", "frame"), ("c", "frame"), ("d", "a"), ("e", "frame")):
-            way = {"a": a, "b": b}.get(target, ())
-            fields = {"name": target, "source": source, "target": target, "runs_after": lambda self, way=way: way}
-            stages[target] = type(target, (AddOne,), fields)
-        plan = plan_of(monkeypatch, tuple(stages.values()), ("a", "b", "c", "d", "e"))
-        steps = [(kind(plan.features, wiring), []) for kind, wiring in plan.stages]
-        return [stage.name for stage, _ in _in_launch_order(steps)]
-
-    assert order() == ["a", "b", "c", "d", "e"]
-    assert order(a=("b",)) == ["b", "a", "c", "d", "e"]
-    assert order(a=("b", "c")) == ["b", "c", "a", "d", "e"]
-    assert order(a=("e",)) == ["a", "b", "c", "d", "e"]  # d, in between, reads it
-    assert order(b=("e",)) == ["a", "c", "d", "e", "b"]
-    assert order(b=("a",)) == ["a", "b", "c", "d", "e"]
-
-
-class FakeStream:
-    """Knows which launches and events it comes after."""
-
-    def __init__(self, *_: Any) -> None:
-        self.behind: set[str] = set()
-
-    def record_event(self) -> set[str]:
-        return set(self.behind)
-
-    def wait_event(self, event: set[str]) -> None:
-        self.behind |= event
-
-
-def launch_order(monkeypatch: pytest.MonkeyPatch, **passes: list[dict[str, Any]]) -> dict[str, set[str]]:
-    """What each launch of a captured graph directly waits for: stages a, b (frame -> a -> b), c, d (reads a and c)."""
-    reads = {"a": ("frame",), "b": ("a",), "c": ("frame",), "d": ("a", "c")}
-    stages = []
-    for name, read in reads.items():
-        fields = {"name": name, "wire": classmethod(lambda cls, _, name=name, read=read: Wiring(read, (name,)))}
-        stages.append(type(name, (AddOne,), fields))
-    plan = plan_of(monkeypatch, tuple(stages), tuple(reads))
-    waits: dict[str, set[str]] = {}
-    on: list[FakeStream] = []
-
-    @contextlib.contextmanager
-    def enter(stream: FakeStream, sync_enter: bool) -> Iterator[None]:
-        on.append(stream)
-        yield
-
-    def note(name: str) -> None:
-        waits[name] = set(on[-1].behind)
-        on[-1].behind = {name}
-
-    monkeypatch.setattr(wp, "Stream", FakeStream)
-    monkeypatch.setattr(wp, "ScopedStream", enter)
-    scheduler = Scheduler.__new__(Scheduler)
-    scheduler.device, scheduler._stream, scheduler._streams = None, FakeStream(), []
-    steps = []
-    for kind, wiring in plan.stages:
-        given = passes.get(kind.name, [{}])
-        names = [f"{kind.name}{index}" for index in range(len(given))]
-        own = [Pass(lambda _, name=name: note(name), **fields) for name, fields in zip(names, given, strict=True)]
-        steps.append((kind(plan.features, wiring), own))
-    scheduler._launch_side_by_side(steps)
-    assert scheduler._stream.behind >= {f"{name}{len(passes.get(name, [{}])) - 1}" for name in reads}
-    return waits
-
-
-def test_a_pass_waits_for_what_it_reads(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert launch_order(monkeypatch) == {"a0": set(), "b0": {"a0"}, "c0": set(), "d0": {"a0", "c0"}}
-    found = launch_order(monkeypatch, d=[{"reads": ("frame",)}, {"reads": ("c",)}, {}])
-    assert (found["d0"], found["d1"], found["d2"]) == (set(), {"c0", "d0"}, {"a0", "d1"})
 
 
 def test_two_owners_of_one_resource_are_an_error() -> None:

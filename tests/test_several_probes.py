@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
 import numpy as np
@@ -12,7 +11,6 @@ from tests.reference import latlong
 from tests.rendered_lamp import Array, Desk
 from tests.two_balls import ALBEDO, BALLS, PLACES, TwoBalls, hits, make_scene, material, pose, rms, shares, shown_of
 from warp_ar.engine.pipeline import Pipeline
-from warp_ar.scene import LambertMaterial, dumps_scene, loads_scene
 from warp_ar.stages.quality import PRESETS
 
 pytestmark = pytest.mark.slow
@@ -122,12 +120,3 @@ def test_the_environments_are_those_of_the_balls(device: str) -> None:
         np.testing.assert_allclose(swapped[1 - number][told], found[name][0][told], atol=borrowed)
     # Where one sees the lamp the other sees the room.
     assert np.abs(both[0] - both[1]).max() > 0.98 * (DESK.lamp - max(DESK.room))
-
-
-def test_scene_files_say_several_balls() -> None:
-    scene = make_scene(BALLS, LambertMaterial())
-    assert loads_scene(dumps_scene(scene)).probes == BALLS
-    single = "[probe]\ncenter = [0.0, 0.0, 0.04]\nradius = 0.04\n"
-    header = dumps_scene(dataclasses.replace(scene, probes=()))
-    assert len(loads_scene(header + single).probes) == 1
-    assert len(loads_scene(header + 3 * single.replace("[probe]", "[[probe]]")).probes) == 3

@@ -167,7 +167,7 @@ def test_coverage_of_a_disc(device):
     area = math.pi * (FOCAL * math.tan(math.asin(0.25))) ** 2
     scene = scene_of(ball(device), WHITE["lambert"], device=device)
     errors = []
-    for samples in (1, 4, 16):
+    for samples in (1, 4):
         config = dataclasses.replace(EVERYTHING, edge_samples=samples)
         alpha = render(scene, config, device)[..., 3]
         errors.append(abs(alpha.sum() - area) / area)
@@ -175,11 +175,10 @@ def test_coverage_of_a_disc(device):
     # About 100 edge pixels with a quantisation error of 1 / sqrt(12 n) or less each, of an area of 750.
     assert errors[0] < 0.02
     assert errors[1] < 0.008
-    assert errors[2] < 0.004
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("edge_samples", "listed"), [(4, 5), (16, 3000)])
+@pytest.mark.parametrize(("edge_samples", "listed"), [(4, 5)])
 def test_listed_edges_are_the_same(device, edge_samples, listed):
     """Edges sampled on their own, or in place where the list does not hold them all, are as edges sampled at once."""
     scene = scene_of(ball(device), WHITE["plastic"], device=device)

@@ -57,7 +57,7 @@ def wait_until_ready(process):
     assert process.ready
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def process():
     with contextlib.closing(SolvingProcess()) as found:
         found.prepare()
@@ -93,14 +93,17 @@ def test_it_is_solved_for_here_until_the_process_is_ready():
         assert process.update(solver, sides(), trace)[0] is not solver
 
 
-def test_it_is_solved_for_here_when_the_process_dies(process):
-    process._process.kill()
-    process._process.wait()
-    solver = Doubler()
-    found, (_, count) = process.update(solver, sides(), trace)
-    assert found is solver
-    assert count == 1
-    assert not process.ready
+def test_it_is_solved_for_here_when_the_process_dies():
+    with contextlib.closing(SolvingProcess()) as process:
+        process.prepare()
+        wait_until_ready(process)
+        process._process.kill()
+        process._process.wait()
+        solver = Doubler()
+        found, (_, count) = process.update(solver, sides(), trace)
+        assert found is solver
+        assert count == 1
+        assert not process.ready
 
 
 def test_a_trace_that_fails_leaves_no_process_waiting(process):

@@ -101,10 +101,10 @@ def test_what_codes_say_has_no_rest(device):
     assert (fine_means(white, np.full(white.shape, 7.5, np.float32), 5) == 255.0).all()
 
 
-@pytest.mark.parametrize(("height", "width"), [(2160, 3840), (4320, 7680)], ids=["4K", "8K"])
 @pytest.mark.parametrize("content", ["white", "top half"])
-def test_large_frames_are_exact(device, height, width, content):
+def test_large_frames_are_exact(device, content):
     """Sequential float32 sums are wrong by grey levels here, and plain 32-bit ones overflow at 8K."""
+    height, width = 4320, 7680
     frame = white(height, width)
     if content == "top half":
         frame[height // 2 :] = 0

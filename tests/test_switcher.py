@@ -5,7 +5,6 @@ from __future__ import annotations
 import gc
 import threading
 import weakref
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -144,19 +143,6 @@ def test_a_pipeline_that_cannot_go_on_is_not_said_to_be_shown(monkeypatch: pytes
     assert switcher.shows(now)
     assert go_over(switcher, wanted) is not first
     switcher.close()
-
-
-def test_what_is_no_longer_built_is_no_error(caplog: pytest.LogCaptureFixture) -> None:
-    """A builder that ends takes nothing more: the pipeline that was to come is given up without a word."""
-    busy = threading.Event()
-    with ThreadPoolExecutor(1) as builder:
-        builder.submit(busy.wait, 60.0)
-        switcher = PipelineSwitcher(device="cpu", builder=builder)
-        switcher.want(target())
-        switcher.close(wait=False)
-        builder.shutdown(wait=False, cancel_futures=True)
-        busy.set()
-    assert not caplog.records
 
 
 def test_pipelines_that_are_kept_come_back_at_once() -> None:

@@ -402,18 +402,3 @@ def test_frame(device):
     banded, banded_hits = frame_of(scene, device, rect=(0, 48, 0, 64), bands=((0, 11), (11, 40), (40, 48)))
     np.testing.assert_array_equal(banded, found)
     np.testing.assert_array_equal(banded_hits, hits)
-
-
-def test_proxies_hide_what_is_behind_them(device):
-    """A plane hides from both sides; an object that touches a proxy is seen."""
-    for turn, hidden in ((0, True), (180, True)):
-        world = World(device).add("sphere", extent=(0.5, 0.5, 0.5), at=(0, 0, 2))
-        screen = World(device).add("plane", extent=(9, 9, 0), at=(0, 0, 1), rotate=(turn, 0, 0))
-        scene = world.scene()
-        scene.proxies = screen.scene(proxies=True).proxies
-        found, _ = frame_of(scene, device, rect=(0, 48, 0, 64))
-        assert (found == -1).all() == hidden
-    touching = World(device).add("box", at=(0, 0, 3), extent=(1, 1, 1)).scene()
-    touching.proxies = World(device).add("plane", extent=(9, 9, 0), at=(0, 0, 2)).scene(proxies=True).proxies
-    found, _ = frame_of(touching, device, rect=(0, 48, 0, 64))
-    assert found[24, 32] == 0
