@@ -142,8 +142,8 @@ def test_a_corrupt_clip_fails_alone_and_the_exit_code_says_so(folder, finished, 
 
 
 def test_a_data_set_is_the_same_bytes_for_any_number_of_workers_and_any_deaths(folder, pytestconfig):
-    """One worker's data set, and that of three whose workers and driver are killed again and again."""
-    kills, driver_kills = (20, 3) if pytestconfig.getoption("--long") else (3, 1)
+    """One worker's data set, and that of two whose workers and driver are killed again and again."""
+    kills, driver_kills = (20, 3) if pytestconfig.getoption("--long") else (2, 1)
     if pytestconfig.getoption("--long"):
         (folder / "data.toml").write_text(DATASET.replace("variations = 6", "variations = 40"))
     alone, killed = folder / "alone", folder / "killed"
@@ -164,7 +164,7 @@ def run_with_kills(jobs, run, kills, driver_kills):
     order = ["worker"] * kills + ["driver"] * driver_kills
     dice.shuffle(order)
     dead: collections.Counter[str] = collections.Counter()
-    process = farm("run", jobs, "--output", run, "--workers", 3)
+    process = farm("run", jobs, "--output", run, "--workers", 2)
     manifest, seen, end = run / "manifest.jsonl", 0, time.monotonic() + PATIENCE
     while process.poll() is None and time.monotonic() < end:
         time.sleep(0.02)
@@ -177,7 +177,7 @@ def run_with_kills(jobs, run, kills, driver_kills):
             dead["driver"] += 1
             seen = lines
             order.pop()
-            process = farm("resume", run, "--workers", 3)
+            process = farm("resume", run, "--workers", 2)
             continue
         workers = children(process.pid)
         if workers:
@@ -211,28 +211,6 @@ def test_a_plan_runs_nothing_but_a_few_frames(folder, capsys):
     assert "1 clips, 6 variations, 12 frames to light, 4 to survey" in out
     assert "4 workers: " in out
     assert sorted(folder.iterdir()) == before
-
-
-@pytest.mark.parametrize(
-    ("arguments", "told"),
-    [
-        (["run", "jobs.toml", "--output", "new", "--workers", "0"], "--workers 0: expected a number from 1 to"),
-        (["run", "none.toml", "--output", "new"], "none.toml is not there"),
-        (["resume", "nowhere"], "nowhere holds no run (run.json is missing); begin one with: farm run"),
-        (["status", "nowhere"], "nowhere holds no run"),
-        (["run", "jobs.toml", "--output", "."], ". is not empty"),
-        (["run", "jobs.toml", "--output", "good.mp4"], "--output good.mp4 is a file; name a new folder"),
-        (["run", "jobs.toml", "--output", "new", "--device", "tpu"], "device 'tpu' is not here"),
-        (["run", "jobs.toml"], "the following arguments are required: --output"),
-    ],
-)
-def test_wrong_usage_is_told_in_one_line(folder, monkeypatch, capsys, arguments, told):
-    monkeypatch.chdir(folder)
-    assert main(arguments) == 2
-    err = capsys.readouterr().err
-    assert told in err
-    assert err.count("\n") == 1
-    assert not (folder / "new").exists()
 
 
 def test_a_run_of_another_program_is_not_gone_on_with(tmp_path, capsys):
@@ -269,24 +247,3 @@ def test_the_same_on_a_local_ray_of_two_nodes(folder, finished):
         assert (folder / "ray/good.mp4").read_bytes() == (finished[0] / "good.mp4").read_bytes()
     finally:
         cluster.communicate("")
-
-
-def test_an_address_that_nothing_answers_at_is_told(folder):
-    pytest.importorskip("ray", reason="Ray is not installed: pip install 'warp-ar[farm]'")
-    code, _, err = finish(farm("run", folder / "jobs.toml", "--output", folder / "no", "--ray", "127.0.0.1:1"))
-    assert code == 2
-    assert "--ray 127.0.0.1:1: " in err
-    assert not (folder / "no").exists(), "what cannot be begun leaves no folder"
-    assert "start one with: ray start --head" in err
-
-
-def test_a_clip_that_was_replaced_is_refused_by_its_name(folder, finished, capsys):
-    clip = folder / "good.mp4"
-    kept = clip.read_bytes()
-    try:
-        clip.write_bytes(kept[:-1] + b"x")
-        assert main(["resume", str(finished[0]), "--workers", "1"]) == 2
-        assert f"{clip} is not the file, which " in capsys.readouterr().err
-    finally:
-        clip.write_bytes(kept)
-    assert main(["resume", str(finished[0]), "--workers", "1"]) == 1  # the other clip's failure

@@ -28,7 +28,7 @@ from warp_ar.srgb import encode_srgb
 
 pytestmark = pytest.mark.slow
 
-COUNT = 12
+COUNT = 6
 RATE = 24
 TAGS = {
     "10bit": ("bt709", "bt709", "bt709"),
@@ -105,7 +105,7 @@ def test_segments_of_a_deep_recording_are_joined_as_deep_as_it_came(clip: tuple[
             return [item.radiance.copy() for item in lighter.light(job, outputs=(RADIANCE,))]
 
         one = lit(0, COUNT)
-        for first in (9, 0, 6, 3):
+        for first in (3, 0):
             for number, picture in enumerate(lit(first, first + 3), first):
                 np.testing.assert_array_equal(picture, one[number], err_msg=f"frame {number}")
     joined, alone, before = plates(parts / "a.mp4"), plates(whole / "a.mp4"), plates(folder / "a.mp4")
