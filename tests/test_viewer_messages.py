@@ -13,8 +13,10 @@ import numpy as np
 import pytest
 
 from tests.viewer_rig import GOOD, jpeg, mutated, picture_message
+from warp_ar.checks.finding import Finding
 from warp_ar.viewer import protocol
 from warp_ar.viewer.protocol import Bucket, ProtocolError, parse_picture, parse_text
+from warp_ar.viewer.setup import page_record
 
 
 @pytest.mark.parametrize("message", GOOD, ids=lambda m: m["type"])
@@ -95,3 +97,20 @@ def test_ten_thousand_random_messages_are_understood_or_refused() -> None:
             else:
                 parse_picture(message, (64, 48))
     assert 1000 < understood < 9000  # else the fuzz tries only one of the two
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("no DICT_4X4_50 charuco 5x4 0.032 0.024 in 4 frames", "no printed card in 4 frames"),
+        ("no DICT_4X4_50 id 7; the picture shows DICT_5X5_100 3", "marker 7 of the family 4X4_50; the picture shows"),
+        ("lies as the [marker] says, and run python -m warp_ar.calibrate camera PICTURES", "and press “Calibrate”"),
+        ("[[object]] 0 (mesh) lies left", "the scene’s object 0 (mesh) lies left"),
+        ("or python -m warp_ar.calibrate response PICTURES", "or press “Measure from the card’s greys”"),
+    ],
+)
+def test_findings_name_what_the_page_has(text: str, words: str) -> None:
+    """Not commands, sections of files and names of dictionaries."""
+    said = page_record(Finding("name", text, text))["text"]
+    assert words in said
+    assert not any(word in said for word in ("DICT_", "[", "python -m"))

@@ -61,12 +61,13 @@ NO_BALL: Final = Finding(
 FEWEST: Final = 3
 """Frames without which nothing is measured."""
 PAGE_WORDS: Final = (
-    (r"and run python -m warp_ar\.calibrate camera PICTURES", "and press “Calibrate”"),
-    (r"python -m warp_ar\.calibrate camera PICTURES", "press “Calibrate”"),
+    (r"(?:run )?python -m warp_ar\.calibrate camera PICTURES", "press “Calibrate”"),
     (r"python -m warp_ar\.calibrate ball SCENE --write", "press “Measure the ball”"),
-    (r"DICT_(\w+?) (?:id )?(\d+)", r"marker \2 of the family \1"),
-    (r"the \[marker\]|\[marker\]", "the scene’s marker"),
-    (r"\[(probe|camera|object|light|proxy)\]", r"the scene’s \1"),
+    (r"python -m warp_ar\.calibrate response PICTURES", "press “Measure from the card’s greys”"),
+    (r"DICT_\w+ charuco(?: [\dx.]+)+", "printed card"),
+    (r"DICT_(\w+?) (?:id )?(\d+)\b", r"marker \2 of the family \1"),
+    (r"DICT_(\w+)", r"family \1"),
+    (r"(?:the )?\[\[?([a-z]+)\]\]?", r"the scene’s \1"),
 )
 """Words on the page for commands, sections of scene files and names of dictionaries."""
 
@@ -362,7 +363,7 @@ class SetupChecks:
         self._told = valid = self._valid()
         findings = None
         if "check" in valid:
-            findings = [page_record(one) | {"cost": one.cost, "error": one.error} for one in self._findings]
+            findings = [page_record(one) | {"cost": one.cost} for one in self._findings]
         steps = self._steps.items()
         return {
             "type": "setup",
@@ -370,7 +371,6 @@ class SetupChecks:
             "doing": self._doing,
             "findings": findings,
             "outdated": self._steps["check"].made is not None and findings is None,
-            "frames": len(self._frames),
             "measured": {name: step.words for name, step in steps if step.words and name in valid},
             "failed": {name: step.failed for name, step in steps if step.failed},
         }

@@ -81,7 +81,7 @@ export class SetupPanel {
     const seen = this.#frame?.state;
     const what = this.#scene?.marker.board ? "the whole card" : "the whole black square of the marker";
     const words = missing
-      ? `${sentence(missing.text)} ${["marker.other", "marker.board"].includes(missing.name) ? "Press “Use the card with these sizes” if it is the printed card." : sentence(missing.remedy)}`
+      ? `${sentence(missing.text)} ${remedy(missing)}`
       : seen === "tracked"
         ? "The marker is seen. Go on with the camera."
         : seen
@@ -109,7 +109,7 @@ export class SetupPanel {
     put_step("response", "response-note", "How the camera encodes light, told by the card's grey patches under different exposures or light.");
     put_step("check", "check-note", findings ? (count ? `${count} finding${count === 1 ? "" : "s"}, the worst first:` : "Nothing wrong was found.") : outdated ? "The set-up has changed since it was looked at: check it again." : "Units, card, camera, ball and light are looked at in the frames of the last seconds.");
     $("response-file").hidden = !measured.response;
-    $("findings").replaceChildren(...(findings ?? []).map((one) => el("li", {}, sentence(one.text), el("small", {}, `Spoils: ${one.cost}.`), el("small", {}, `To do: ${one.remedy}.`))));
+    $("findings").replaceChildren(...(findings ?? []).map((one) => el("li", {}, sentence(one.text), el("small", {}, `Spoils: ${one.cost}.`), el("small", {}, `To do: ${remedy(one)}`))));
     if (busy === null) return void (this.#busy = null);
     // Seconds are for the eye alone: a status that is set anew is read out anew.
     if (busy !== this.#busy) this.#began = performance.now();
@@ -123,6 +123,8 @@ export class SetupPanel {
 
 const LOOKING = "Looking at the frames, which takes some seconds …";
 const sentence = (text) => `${text[0].toUpperCase()}${text.slice(1)}${/[.!?]$/.test(text) ? "" : "."}`;
+// What the page has a button for is not to be written into a file.
+const remedy = ({ name, remedy }) => (["marker.other", "marker.board"].includes(name) ? "Press “Use the card with these sizes” if it is the printed card." : sentence(remedy));
 
 /** Text of an element, set only where it changes: what is set anew is read out anew. */
 function put(id, text, inside = false) {
