@@ -123,10 +123,8 @@ class SearchConfig:
     """Estimates between searches for one more candidate; the first searches for all."""
     later_every: int = 6
     """The same after ``settled`` estimates."""
-    first: int = 5
-    """Number of first estimates whose searches try all directions."""
     candidates: int = 160
-    """Directions tried for a candidate in the first estimates."""
+    """Directions tried for a candidate in the first estimate."""
     later_candidates: int = 40
     """Directions tried in a later search, different ones each time."""
     distances: tuple[float, ...] = (2.0, 1.2, 0.8, 0.6, 0.45, 0.35)

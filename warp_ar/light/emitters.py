@@ -37,8 +37,6 @@ Array = NDArray[np.float64]
 
 STEP = 1.1
 """Ratio of neighbouring distances that are tried."""
-TRIED = 4
-"""Iterations of reweighting where a place is tried."""
 MOST_STEPS = 4
 """Largest number of steps from the end of a search."""
 
@@ -80,7 +78,8 @@ class EmitterSearch:
         """Mean of the costs with one candidate more at each of some places, less how much room there is, (places,)."""
         z = np.insert(fits.z, self.problem.first_mean, 0.0, axis=1)
         tried = np.tile(z, (len(places), 1))
-        cost = fit_channels(self.problem, tried, TRIED, self.problem.light_of(places)).cost
+        light, iterations = self.problem.light_of(places), CONFIG.solver.warm_iterations
+        cost = fit_channels(self.problem, tried, iterations, light).cost
         return np.asarray(cost.reshape(-1, 3).mean(axis=1) - [room(place.distance) for place in places], np.float64)
 
     def add_candidate(self, fits: Fits, candidates: Sequence[Candidate], columns: Array) -> Fits | None:

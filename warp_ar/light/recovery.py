@@ -214,8 +214,7 @@ class Recovery:
         if before == 0:
             search.find_candidates(left)
         elif before % (config.later_every if settled else config.every) == 1:
-            candidates = config.candidates if before < config.first else config.later_candidates
-            search.find_candidates(min(left, 1), places=candidates, turn=before // config.every)
+            search.find_candidates(min(left, 1), places=config.later_candidates, turn=before // config.every)
 
     def _estimate(
         self,

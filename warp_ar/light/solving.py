@@ -1,6 +1,6 @@
 """Estimates in a process beside this one, on CUDA and for pictures that are shown as they are made.
 
-A solution is 20 to 100 ms of small NumPy products that hold Python's lock; a thread of this process that launches
+A solution is tens of milliseconds of NumPy products that hold Python's lock; a thread of this process that launches
 kernels or looks for markers would wait for it at each of its calls. A process costs the frames the copies of its
 equations, some 12 MB. It keeps nothing between two estimates: a solver goes there and comes back with what it learnt,
 so a process that dies costs one estimate, which is then made here.
