@@ -281,16 +281,18 @@ _Bones: TypeAlias = Callable[[float], Array]
 class GltfContents:
     """Contents of a file, in its world turned to +Z up."""
 
-    parts: list[MeshPart]
-    """Triangles, one part per primitive and place."""
-    carriers: list[int] = dataclasses.field(default_factory=list)
-    """Number of the anchor that each part hangs on, and in whose coordinates it is; -1: in the world."""
+    placed: list[tuple[int, MeshPart, Bending | None]]
+    """Triangles, a part for each primitive and place: the number of the anchor that it hangs on, and in whose
+    coordinates it is (-1: in the world); the part; and its bending (None: it is rigid)."""
     anchors: tuple[Anchor, ...] = ()
     """Nodes that the animation moves."""
     duration: float = 0.0
     """Duration of the animation, seconds."""
-    bends: list[Bending | None] = dataclasses.field(default_factory=list)
-    """Bending of each part; None for a rigid part."""
+
+    @property
+    def parts(self) -> list[MeshPart]:
+        """Return all triangles."""
+        return [part for _, part, _ in self.placed]
 
 
 def load_gltf(source: MeshSource, *, animation: str | int | None = None, memory: bool = False) -> GltfContents:
@@ -361,18 +363,14 @@ class _Reader:
         count = sum(len(self._file.objects("primitives", self._meshes[number])) for number in meshes)
         if count > _MOST_PLACES:
             self._file.fail(f"its nodes place {count:,} primitives; at most {_MOST_PLACES:,} are read: join them")
-        parts: list[MeshPart] = []
-        carriers: list[int] = []
-        bends: list[Bending | None] = []
+        placed = []
         for node, (index, place) in zip(shown, self._places.items(), strict=True):
             if "mesh" in node:
                 # A skinned mesh stands where its joints are, whatever its own node says.
                 place = place if "skin" not in node else _Place(place.world, self._up @ place.world)
-                for part, bend in self._mesh(node, place.below, moves.weights.get(index)):
-                    parts.append(part)
-                    bends.append(bend)
-                    carriers.append(place.carrier)
-        return GltfContents(parts, carriers, tuple(self._anchors), moves.duration, bends)
+                found = self._mesh(node, place.below, moves.weights.get(index))
+                placed += [(place.carrier, part, bend) for part, bend in found]
+        return GltfContents(placed, tuple(self._anchors), moves.duration)
 
     def _look_at_extensions(self) -> None:
         used, required = (self._file.header.get(key, []) for key in ("extensionsUsed", "extensionsRequired"))

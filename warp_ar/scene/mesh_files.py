@@ -124,7 +124,7 @@ def _read_file(path: Path, animation: str | int | None = None) -> tuple[GltfCont
         if suffix in GLTF_SUFFIXES:
             contents = load_gltf(source, animation=animation)
         else:
-            contents = GltfContents(READERS[suffix](source))
+            contents = GltfContents([(-1, part, None) for part in READERS[suffix](source)])
         if not contents.parts:
             raise SceneError(f"{path}: holds no triangle; a mesh with faces is needed (a point cloud has none)")
         return contents, source
@@ -174,11 +174,12 @@ def moving_mesh(source: MeshSource, contents: GltfContents) -> MovingMesh:
     Raises:
         SceneError: More than ``MOST_PARTS`` nodes move, or a vertex lies too far off.
     """
-    bends = contents.bends or [None] * len(contents.parts)
-    placed = sorted(
-        zip(contents.carriers, contents.parts, bends, strict=True), key=lambda one: (one[0], one[2] is not None)
-    )
-    groups = [list(group) for _, group in itertools.groupby(placed, lambda one: (one[0], one[2] is not None))]
+
+    def moves_as(one: tuple[int, MeshPart, Bending | None]) -> tuple[int, bool]:
+        return one[0], one[2] is not None
+
+    placed = sorted(contents.placed, key=moves_as)
+    groups = [list(group) for _, group in itertools.groupby(placed, moves_as)]
     if len(groups) > MOST_PARTS:
         raise SceneError(
             f"{source.path}: its animation moves {len(groups):,} parts; at most {MOST_PARTS} are: join meshes, or "
