@@ -162,12 +162,10 @@ def _field(name: str, default: Any, hint: Any, key: Key) -> Field:
 class FieldError(SceneError):
     """A value of a dataclass cannot be."""
 
-    def __init__(self, item: object, key: str, right: str) -> None:
-        """Name class, field, value and what would be right."""
-        value = repr(getattr(item, key))
-        shown = value if len(value) <= 80 else f"{value[:60]}..."
-        super().__init__(f"{type(item).__name__}: {key} = {shown}: {right}")
-        self.key, self.right = key, right
+    key: str
+    """The field."""
+    right: str
+    """Words for what would be right."""
 
 
 class Checked:
@@ -206,7 +204,11 @@ def fail(item: object, key: str, right: str) -> NoReturn:
     Raises:
         FieldError: Always.
     """
-    raise FieldError(item, key, right) from None
+    value = repr(getattr(item, key))
+    shown = value if len(value) <= 80 else f"{value[:60]}..."
+    error = FieldError(f"{type(item).__name__}: {key} = {shown}: {right}")
+    error.key, error.right = key, right
+    raise error from None
 
 
 Vec3: TypeAlias = tuple[float, float, float]
