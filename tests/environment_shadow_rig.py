@@ -35,8 +35,6 @@ SUM_ERROR = 2e-5
 RIM = 1e-3
 # 1024 stratified samples of a smooth integrand: far below the 1 / sqrt 1024 of independent ones.
 STRATIFIED = 0.01
-# One sample of a sun may fall into the texel of the sky beside it.
-ONE_SAMPLE = 1.0 / 512
 # One set has 64 samples, of which half follow the light: a step of its visibility is 1/32, a few of them its error.
 SET_ERROR = 0.12
 # Mean over all pixels: 192 tiles of all 1024 samples each.

@@ -11,6 +11,7 @@ import warp as wp
 
 from warp_ar.kernels import color
 from warp_ar.kernels.structs import Material
+from warp_ar.scene import Pose
 from warp_ar.stages.base import Pass
 
 SMALL_CAMERA = """[camera]
@@ -44,6 +45,16 @@ def records(struct: Any, *values: dict[str, Any], device: Any = None) -> wp.arra
         for key, item in value.items():
             record[key] = item
     return wp.array(out, dtype=struct, device=device)
+
+
+def look_at(eye: Any, target: Any = (0.0, 0.0, 0.0)) -> Pose:
+    """Pose of a camera at ``eye`` whose axis goes through ``target``, its x axis level."""
+    forward = np.subtract(target, eye).astype(np.float64)
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, (0.0, 0.0, 1.0) if abs(forward[2]) < 0.99 else (0.0, 1.0, 0.0))
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    return Pose(rotation, -rotation @ np.asarray(eye, np.float64))
 
 
 def camera_fields(position: Any, turn: Any, focal: float, size: tuple[int, int]) -> dict[str, Any]:

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from tests.kernel_rig import look_at
 from warp_ar.engine.pipeline import Pipeline, Result
-from warp_ar.scene import Camera, LambertMaterial, Light, MetallicRoughnessMaterial, Object, Pose, Probe, Proxy, Scene
+from warp_ar.scene import Camera, LambertMaterial, Light, MetallicRoughnessMaterial, Object, Probe, Proxy, Scene
 from warp_ar.scene.description import Animation
 from warp_ar.scene.materials import MirrorMaterial
 
@@ -36,15 +37,6 @@ def make_scene(**changes: Any) -> Scene:
         lights=(Light("point", 0.2, at=(0.1, -0.1, 0.3)),),
     )
     return dataclasses.replace(scene, **changes)
-
-
-def look_at(eye: tuple[float, float, float]) -> Pose:
-    """Camera at ``eye``, metres, that looks at the marker, its x axis level."""
-    forward = -np.array(eye) / np.linalg.norm(eye)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    return Pose(rotation, -rotation @ np.array(eye))
 
 
 POSES = (look_at((0.05, -0.35, 0.3)), look_at((0.06, -0.34, 0.3)), look_at((0.06, -0.34, 0.3)))

@@ -7,8 +7,7 @@ import math
 import numpy as np
 import warp as wp
 
-from tests.hard_cases.rig import look_at
-from tests.kernel_rig import TEXTURES, camera_fields, constant_environment, records, shape, tables
+from tests.kernel_rig import TEXTURES, camera_fields, constant_environment, look_at, records, shape, tables
 from tests.reference import color as reference_color
 from warp_ar.kernels import color
 from warp_ar.kernels.objects.reflect import DistantLight, DistantLightConfig

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from tests.kernel_rig import records
 from tests.reference import recover as reference
 from warp_ar.kernels import structs
 from warp_ar.kernels.recovery import recover as kernels
@@ -64,9 +65,7 @@ def solve_here(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def probes_of(device, center=(-0.12, 0.03, 0.035), radius=0.035, reflectance=0.85):
-    values = np.zeros(1, np.dtype(structs.Probe.numpy_dtype()))
-    values["center"], values["radius"], values["reflectance"] = center, radius, reflectance
-    return wp.array(values, dtype=structs.Probe, device=device)
+    return records(structs.Probe, {"center": center, "radius": radius, "reflectance": reflectance}, device=device)
 
 
 def empty_scene():
@@ -84,9 +83,7 @@ def points_of(device, positions, normals):
 
 
 def seen(device, count):
-    values = np.zeros(count, np.dtype(kernels.Observation.numpy_dtype()))
-    values["visible"] = 1.0
-    return wp.array(values, dtype=kernels.Observation, device=device)
+    return records(kernels.Observation, *[{"visible": 1.0}] * count, device=device)
 
 
 def cells_of(device, radiance=1.0, clipped=0.0):

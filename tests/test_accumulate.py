@@ -3,6 +3,7 @@ import pytest
 import warp as wp
 
 from tests.error_model import check_error
+from tests.kernel_rig import records
 from tests.reference import accumulate as reference
 from warp_ar.kernels.environment import accumulate
 from warp_ar.kernels.structs import FrameParams, make_environment_view
@@ -21,8 +22,7 @@ class Light:
         self.shape = (height, width)
 
     def step(self, radiance, confidence=1.0, clipped=0.0, time_step=1 / 30, reset=0):
-        params = np.zeros(1, np.dtype(FrameParams.numpy_dtype()))
-        params["time_step"], params["environment_reset"] = time_step, reset
+        params = records(FrameParams, {"time_step": time_step, "environment_reset": reset})
         h, w = self.shape
         x = wp.array(np.ascontiguousarray(np.broadcast_to(np.float32(radiance), (h, w, 3))), dtype=wp.vec3)
         c = wp.array(np.ascontiguousarray(np.broadcast_to(np.float32(confidence), (h, w))), dtype=wp.float32)
@@ -30,7 +30,7 @@ class Light:
         view = make_environment_view(x, c, s)
         environment = make_environment_view(self.radiance, self.confidence, self.clipped)
         accumulate.measure_change(view, environment, self.change)
-        accumulate.accumulate_environment(view, self.change, wp.array(params, dtype=FrameParams), environment)
+        accumulate.accumulate_environment(view, self.change, params, environment)
         return self.radiance.numpy()
 
 

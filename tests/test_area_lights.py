@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from tests.kernel_rig import SMALL_CAMERA
+from tests.kernel_rig import SMALL_CAMERA, look_at
 from tests.reference import area_lights as twin
-from tests.test_path_tracer import look
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.kernels.rays.area_lights import AreaSample, area_numbers, make_area_count, make_area_sample
 from warp_ar.kernels.structs import RayScene
@@ -306,7 +305,7 @@ def test_cells_know_the_light_that_each_pixel_would_ask_for(device, method):
     for asked in ("brute_force", method):
         quality = PRESETS["low"].with_methods(area_light=asked)
         with Pipeline(scene, device=device, quality=quality) as pipeline:
-            pipeline(np.full((120, 160, 3), 60, np.uint8), time_seconds=0.0, pose=look((-0.2, -0.5, 0.5)))
+            pipeline(np.full((120, 160, 3), 60, np.uint8), time_seconds=0.0, pose=look_at((-0.2, -0.5, 0.5)))
             added[asked] = pipeline.arrays["added_light"].numpy()
     off = np.abs(added[method] - added["brute_force"]) / added["brute_force"].mean()
     assert 0.0 < off.mean() < CELL_MEAN, off.mean()

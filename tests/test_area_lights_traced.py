@@ -10,7 +10,8 @@ import numpy.typing as npt
 import pytest
 import warp as wp
 
-from tests.test_path_tracer import ERRORS, look
+from tests.kernel_rig import look_at
+from tests.test_path_tracer import ERRORS
 from warp_ar.accuracy.path_tracer import PathTracer, TracedPicture
 from warp_ar.kernels.objects.reflect import DistantLight, DistantLightConfig
 from warp_ar.kernels.objects.shade import NearPoint, ShadeConfig, make_shade_hit
@@ -145,7 +146,7 @@ def test_receiver_and_soft_shadow(kind: str, device: str) -> None:
     """A black box throws the shadow, so that no light goes to and fro."""
     box = Object("box", size=(0.05, 0.05, 0.1), at=(-0.03, 0.0, 0.05), material=LambertMaterial((0.0, 0.0, 0.0)))
     scene = Scene(CAMERA, proxies=(Proxy("plane", size=(3.0, 3.0)),), objects=(box, LIGHTS[kind].as_object()))
-    pose = look((-0.2, -0.5, 0.5))
+    pose = look_at((-0.2, -0.5, 0.5))
     check(picture(scene, pose, device), trace(scene, pose, device, 192))
 
 
@@ -164,5 +165,5 @@ def test_objects_and_highlights_of_the_lights_shape(material: Any, device: str) 
     """A ball under a rect, seen from where the light's image is on it."""
     ball = Object("sphere", radius=0.1, material=material)
     scene = Scene(CAMERA, objects=(ball, LIGHTS["rect"].as_object()))
-    pose = look((0.15, -0.2, 0.22))
+    pose = look_at((0.15, -0.2, 0.22))
     check(picture(scene, pose, device), trace(scene, pose, device, 192))

@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.kernel_rig import look_at
 from warp_ar.ball.ball import BallView, fit_ball
-from warp_ar.scene import Camera, Marker, Pose, Probe, Proxy, Scene, load_scene
+from warp_ar.scene import Camera, Marker, Probe, Proxy, Scene, load_scene
 from warp_ar.session import Session
 
 pytestmark = pytest.mark.slow
@@ -24,12 +25,7 @@ SIZE = (480, 360)
 
 def look_from(position):
     """Camera at ``position`` that looks at a place between card and ball."""
-    forward = np.array([-0.07, 0.0, 0.0]) - position
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    return Pose(rotation, -rotation @ position)
+    return look_at(position, (-0.07, 0.0, 0.0))
 
 
 def texture(points, seed):

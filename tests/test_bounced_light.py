@@ -33,12 +33,6 @@ def test_a_small_patch(device):
     assert (expected == 0).any()
 
 
-def test_a_patch_that_fills_the_hemisphere(device):
-    """Pi L, straight before it."""
-    bounced, _ = View(size=(1, 1)).gather(patches_of((0, 0, 0.01), (0, 0, -1), WHITE, 1e6), patch_stride=1, stride=1)
-    np.testing.assert_allclose(bounced, np.pi, rtol=FLOAT_ERROR)
-
-
 def test_at_the_edge_of_a_lit_strip(device):
     """Two faces at right angles: the desk, and at x = -0.45 a wall of which a strip of 0.2 is lit, 8 m long."""
     size = 0.01

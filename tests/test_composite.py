@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from tests.error_model import check_error
-from tests.kernel_rig import tables
+from tests.kernel_rig import records, tables
 from tests.reference import color as reference_color
 from tests.reference import composite as reference
 from warp_ar.kernels import color
@@ -35,11 +35,8 @@ def make_params(
     scale=1.0,
     time_step=0.0,
 ):
-    params = np.zeros(1, np.dtype(FrameParams.numpy_dtype()))
-    params["object_rect"], params["light_rect"] = object_rect, light_rect
-    params["shadow_rect"], params["ball_rect"] = shadow_rect, ball_rect
-    params["exposure_scale"], params["time_step"] = scale, time_step
-    return wp.array(params, dtype=FrameParams)
+    rects = {"object_rect": object_rect, "light_rect": light_rect, "shadow_rect": shadow_rect, "ball_rect": ball_rect}
+    return records(FrameParams, {**rects, "exposure_scale": scale, "time_step": time_step})
 
 
 def make_layers(seed=0):

@@ -45,10 +45,7 @@ def linear(directions: np.ndarray) -> np.ndarray:
 
 
 def own_map(height: int = HEIGHT) -> np.ndarray:
-    theta = (np.arange(height)[:, None] + 0.5) / height * math.pi
-    phi = ((np.arange(2 * height)[None] + 0.5) / height - 1.0) * math.pi
-    s = np.sin(theta)
-    return linear(np.stack([s * np.cos(phi), s * np.sin(phi), np.cos(theta) + 0 * phi], -1))
+    return linear(latlong_directions(height))
 
 
 def exr_latlong(height: int) -> np.ndarray:

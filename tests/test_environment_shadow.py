@@ -76,21 +76,6 @@ def test_reference_method_matches_the_twin(device):
     assert checked > 20
 
 
-def test_light_that_the_physical_hides_is_not_hidden_again(device):
-    # The sun stands above -y; a mirror ball and, behind it, a virtual ball are in its way to the same pixels.
-    environment = with_sun(12, 16, 3000.0, sky(0.2))
-    sun = reference.texel_directions(32, 64)[0][12, 16]
-    ball = 0.03 * np.array([0, 0, 1]) + 0.0
-    drawn = draw(environment)
-    objects = [sphere(ball + 0.2 * sun, 0.027)]
-    alone = run(drawn, objects)[..., 0]
-    behind = run(drawn, objects, probes=[{"center": ball, "radius": 0.03}])[..., 0]
-    shaded = alone < 0.5
-    assert shaded.sum() > 20
-    # What is left is sky: the virtual ball's share of it.
-    assert behind[shaded].min() > 0.85
-
-
 @pytest.mark.parametrize("albedo", [0.0, 0.8])
 @pytest.mark.parametrize("bounce", ["estimated", "traced"])
 def test_bounce(device, bounce, albedo):

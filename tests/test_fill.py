@@ -3,6 +3,7 @@ import pytest
 import warp as wp
 
 from tests.error_model import check_error
+from tests.kernel_rig import records
 from tests.reference import fill as reference
 from tests.reference import latlong
 from warp_ar.kernels import structs
@@ -144,16 +145,14 @@ def given(device, frame, text, balls):
     """What ``fill_frame`` reads, and the kinds of proxy."""
     scene = loads_scene(text)
     host = HostScene(scene, device)
-    params = np.zeros(1, np.dtype(structs.FrameParams.numpy_dtype()))
-    params["camera_position"], params["world_from_camera"] = EYE, CAMERA
-    params["focal"], params["principal"] = (160.0, 160.0), (159.5, 119.5)
-    probes = np.zeros(len(balls), np.dtype(structs.Probe.numpy_dtype()))
-    probes["center"], probes["radius"], probes["reflectance"] = balls, 0.03, 0.85
+    place = {"camera_position": EYE, "world_from_camera": CAMERA}
+    lens = {"focal": (160.0, 160.0), "principal": (159.5, 119.5)}
+    probes = [{"center": center, "radius": 0.03, "reflectance": 0.85} for center in balls]
     codes, table = wp.array(frame, dtype=wp.vec3ub, device=device), decode_table("linear")
     arguments = (
         structs.make_picture(codes, wp.array(table, dtype=wp.vec3, device=device), None),
-        wp.array(params, dtype=structs.FrameParams, device=device),
-        wp.array(probes, dtype=structs.Probe, device=device),
+        records(structs.FrameParams, {**place, **lens}, device=device),
+        records(structs.Probe, *probes, device=device),
         host.ray_scene,
     )
     return host, arguments, trace_config(scene).proxies
@@ -165,13 +164,6 @@ def filled_fill_frame(device, frame, text, seed, *, balls=((0.0, 0.0, 0.1),), ba
     levels = wp.array(seed.reshape(-1, 4), dtype=wp.vec4, device=device)
     fill_frame(proxies, *arguments, (HEIGHT, WIDTH), ball, levels)
     return levels.numpy().reshape(HEIGHT, WIDTH, 4)
-
-
-def directions():
-    theta = (np.arange(HEIGHT) + 0.5) * np.pi / HEIGHT
-    phi = (2.0 * (np.arange(WIDTH) + 0.5) / WIDTH - 1.0) * np.pi
-    theta, phi = np.meshgrid(theta, phi, indexing="ij")
-    return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
 
 
 def ramp():
@@ -200,7 +192,7 @@ def test_a_map_is_that_of_its_ball(device):
 
 def test_at_infinity_a_direction_is_where_the_camera_looks_along_it(device):
     level = filled_fill_frame(device, ramp(), SCENE, np.zeros((HEIGHT, WIDTH, 4), np.float32))
-    d = directions()
+    d = latlong.directions(HEIGHT, WIDTH)
     pixel = pixels_of(d)
     seen = (d[..., 0] > 0.2) & inside(pixel, 6.0)
     past = seen & (np.arccos(d[..., 0]) > np.arcsin(1.2 * 0.03 / 0.5) + 0.05)
@@ -215,7 +207,7 @@ def test_at_infinity_a_direction_is_where_the_camera_looks_along_it(device):
 
 def test_modelled_surfaces_are_looked_up_where_they_are(device):
     level = filled_fill_frame(device, ramp(), SCENE + PLANE, np.zeros((HEIGHT, WIDTH, 4), np.float32))
-    d = directions()
+    d = latlong.directions(HEIGHT, WIDTH)
     down = (d[..., 2] < -0.15) & (d[..., 0] > 0.0)
     hit = np.array([0.0, 0.0, 0.1]) - 0.1 * d / np.where(down, d[..., 2], -1.0)[..., None]
     pixel = pixels_of(hit - EYE)
@@ -232,7 +224,7 @@ def test_modelled_surfaces_are_looked_up_where_they_are(device):
 
 def test_the_ball_s_own_shadow_is_not_taken_for_light(device):
     level = filled_fill_frame(device, ramp(), SCENE + PLANE, np.zeros((HEIGHT, WIDTH, 4), np.float32))
-    d = directions()
+    d = latlong.directions(HEIGHT, WIDTH)
     to_plane = np.where(d[..., 2] < 0.0, -0.1 / np.minimum(d[..., 2], -1e-6), np.inf)
     near = to_plane < 0.9 * float(OWN_SHADOW) * 0.03
     assert near.sum() > 1000

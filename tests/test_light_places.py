@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from tests.test_path_tracer import look
+from tests.kernel_rig import look_at
 from warp_ar.accuracy.light_places import place_emitters
 from warp_ar.accuracy.path_tracer import PathTracer
 from warp_ar.errors import UsageError
@@ -27,7 +27,7 @@ SCENE = Scene(
     ),
     probes=(Probe(center=(-0.12, 0.03, 0.036), radius=0.035),),
 )
-POSE = look((0.08, -0.6, 0.5), (0.0, 0.03, 0.0))
+POSE = look_at((0.08, -0.6, 0.5), (0.0, 0.03, 0.0))
 REFLECTANCES = ((0.4, 0.3, 0.22), (0.3, 0.3, 0.32))
 TOWARD = np.array((-0.47, 0.45, 0.76)) / np.linalg.norm((-0.47, 0.45, 0.76))
 # Of a distance: a lamp of half a metre on a desk of a metre. Found are 0.3 to 9 % on five desks.

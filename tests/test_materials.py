@@ -9,7 +9,7 @@ import pytest
 import warp as wp
 
 from tests.error_model import check_error
-from tests.kernel_rig import TEXTURES
+from tests.kernel_rig import TEXTURES, records
 from tests.reference import materials as reference
 from warp_ar.kernels.materials import (
     MIN_ALPHA,
@@ -101,13 +101,7 @@ def lobes(wi, wo, parameter, device):
 
 
 def material(**fields):
-    record = np.zeros(1, np.dtype(Material.numpy_dtype()))
-    for name in TEXTURES:
-        record[name] = -1
-    record["base_color"] = record["specular"] = 1.0
-    for name, value in fields.items():
-        record[name] = value
-    return record
+    return records(Material, {**dict.fromkeys(TEXTURES, -1), "base_color": 1.0, "specular": 1.0, **fields}).numpy()
 
 
 @functools.cache

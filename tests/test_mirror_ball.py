@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from tests.error_model import check_error
-from tests.hard_cases.rig import look_at
-from tests.kernel_rig import shape
+from tests.kernel_rig import look_at, shape
 from tests.mirror_ball_rig import (
     BALL,
     BESIDE,

@@ -9,12 +9,13 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from tests.test_path_tracer import ABOVE, ERRORS, WHITE, boxes, latlong_sky, look, polish
+from tests.kernel_rig import look_at
+from tests.test_path_tracer import ABOVE, ERRORS, WHITE, boxes, latlong_sky, polish
 from warp_ar.accuracy import path_tracer
 from warp_ar.accuracy.path_tracer import PathTracer
 from warp_ar.kernels.receiver.receiver import DEFAULT_REFLECTANCE, PRIOR_WEIGHT
 from warp_ar.kernels.reference.path_photons import UNIT
-from warp_ar.light.captured import CapturedEmitter
+from warp_ar.light.captured import CapturedEmitter, latlong_directions
 from warp_ar.light.captured import Light as CapturedLight
 from warp_ar.scene import Camera, Light, MetallicRoughnessMaterial, Object, PhongMaterial, Proxy, Scene
 
@@ -44,11 +45,8 @@ def lamp_above() -> CapturedLight:
     """A dim sky with a lamp that stands 0.5 m from where it was mirrored."""
     height, toward = 64, np.array([0.3, -0.4, 0.866])
     radiance = np.repeat(np.full((height, 2 * height, 1), 0.02, np.float32), 3, axis=2)
-    theta = (np.arange(height) + 0.5)[:, None] * math.pi / height
-    phi = ((np.arange(2 * height) + 0.5)[None] / height - 1.0) * math.pi
-    texels = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta) + 0.0 * phi], -1)
     toward = toward / np.linalg.norm(toward)
-    radiance[texels @ toward > math.cos(math.radians(5.0))] = (60.0, 45.0, 30.0)
+    radiance[latlong_directions(height) @ toward > math.cos(math.radians(5.0))] = (60.0, 45.0, 30.0)
     x, y, z = (float(value) for value in toward)
     emitter = CapturedEmitter((x, y, z), 0.03, (1.0, 0.8, 0.5), (60.0, 45.0, 30.0), None, 0.5, (0.0, 0.0, 0.03))
     return CapturedLight(radiance, np.ones(radiance.shape[:2], np.float32), (emitter,))
@@ -153,7 +151,7 @@ def by_the_wall(x: npt.NDArray[np.float64], y: npt.NDArray[np.float64]) -> npt.N
 def test_a_wall_sends_light_on(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """What a matt wall throws onto the plane, by an integral in float64; the plane is too dark to throw it back."""
     monkeypatch.setattr(path_tracer, "PATHS_OF_LIGHTS", 4.0)
-    pose = look((0.3, 0.0, 0.5), (0.06, 0.0, 0.0))
+    pose = look_at((0.3, 0.0, 0.5), (0.06, 0.0, 0.0))
     dark = 0.002
     # What the white sky and the frame tell of it: white paint would be 1 there.
     rho = (math.pi * dark + PRIOR_WEIGHT * DEFAULT_REFLECTANCE) / (math.pi + PRIOR_WEIGHT)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from tests.kernel_rig import TEXTURES
+from tests.kernel_rig import TEXTURES, records
 from warp_ar.kernels import structs
 from warp_ar.kernels.emitters import add_emitters
 from warp_ar.kernels.materials import make_surface
@@ -32,6 +32,7 @@ from warp_ar.kernels.reference.path_sampling import (
 from warp_ar.kernels.sampling import sample_cosine_hemisphere
 from warp_ar.kernels.split_sum import integrate_dfg
 from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, PHONG, Emitter, Hit, RayScene
+from warp_ar.light.captured import latlong_directions
 
 HEIGHT = 16
 COUNT = 1 << 16
@@ -163,39 +164,31 @@ def test_every_way_to_draw_gives_the_same_irradiance(normal: tuple[float, float,
 
 
 def near_emitters() -> np.ndarray:
-    records = np.zeros(2, np.dtype(Emitter.numpy_dtype()))
-    records["direction"][0] = (0.6, 0.0, 0.8)
-    records["distance"] = (0.8, np.inf)
-    records["direction"][1] = (-0.6, 0.0, 0.8)
-    return records
+    far = {"direction": (-0.6, 0.0, 0.8), "distance": np.inf}
+    return records(Emitter, {"direction": (0.6, 0.0, 0.8), "distance": 0.8}, far).numpy()
 
 
 def lamp_sky(height: int = 64) -> np.ndarray:
     """A dim sky with a lamp toward the first of ``near_emitters``."""
     radiance = np.full((height, 2 * height, 3), 0.2, np.float32)
-    theta = (np.arange(height) + 0.5)[:, None] * math.pi / height
-    phi = ((np.arange(2 * height) + 0.5)[None] / height - 1.0) * math.pi
-    toward = 0.6 * np.sin(theta) * np.cos(phi) + 0.8 * np.cos(theta)
-    radiance[toward > math.cos(math.radians(4.0))] = 50.0
+    radiance[latlong_directions(height) @ (0.6, 0.0, 0.8) > math.cos(math.radians(4.0))] = 50.0
     return radiance
 
 
 @pytest.mark.parametrize("point", [(0.0, 0.0, 0.0), (0.15, 0.05, 0.1)])
 def test_near_emitters_shine_from_where_they_are(point: tuple[float, float, float], device: str) -> None:
     """As ``emitters`` has it, for each way to draw: irradiance of the map, moved."""
-    records = near_emitters()
+    lamps = near_emitters()
     radiance = lamp_sky()
-    estimates, _ = draw(make_sky(radiance, device, records), point, (0, 0, 1), device)
+    estimates, _ = draw(make_sky(radiance, device, lamps), point, (0, 0, 1), device)
     height = len(radiance)
-    theta = (np.arange(height) + 0.5)[:, None] * math.pi / height
-    phi = ((np.arange(2 * height) + 0.5)[None] / height - 1.0) * math.pi
     lamp = (radiance[..., 0] > 1.0) * 49.8 * solid_angles(height)
-    toward = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta) + 0 * phi], -1)
+    toward = latlong_directions(height)
     mean = (lamp[..., None] * toward).sum((0, 1))
-    records["power"][0], records["direction"][0] = lamp.sum(), mean / np.linalg.norm(mean)
+    lamps["power"][0], lamps["direction"][0] = lamp.sum(), mean / np.linalg.norm(mean)
     before = 0.2 * math.pi + (lamp * np.maximum(toward[..., 2], 0.0)).sum()
     irradiance = wp.array(np.full((1, 3), before, np.float32), dtype=wp.vec3, device=device)
-    emitters = wp.array(records, dtype=Emitter, device=device)
+    emitters = wp.array(lamps, dtype=Emitter, device=device)
     normal = wp.vec3(0.0, 0.0, 1.0)
     wp.launch(emitter_kernel, 1, [emitters, wp.vec3(*point), normal], [irradiance], device=device)
     expected = float(irradiance.numpy()[0, 0])
@@ -219,13 +212,8 @@ MATTER = {
 @pytest.mark.parametrize("name", MATTER)
 def test_surfaces_are_drawn_as_their_density_says(name: str, device: str) -> None:
     fields, cosine = MATTER[name]
-    records = np.zeros(1, np.dtype(structs.Material.numpy_dtype()))
-    for name in TEXTURES:
-        records[name] = -1
-    for field, value in fields.items():
-        records[field] = value
     scene = RayScene()
-    scene.materials = wp.array(records, dtype=structs.Material, device=device)
+    scene.materials = records(structs.Material, {**dict.fromkeys(TEXTURES, -1), **fields}, device=device)
     scene.objects = wp.zeros(1, dtype=structs.Shape, device=device)
     dfg = wp.zeros((32, 32), dtype=wp.vec2, device=device)
     integrate_dfg(dfg)

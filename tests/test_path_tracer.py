@@ -10,10 +10,11 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from tests.kernel_rig import look_at
 from warp_ar.accuracy import path_tracer
 from warp_ar.accuracy.path_tracer import PathTracer, TracedPicture
 from warp_ar.errors import UsageError
-from warp_ar.light.captured import CapturedEmitter, Light
+from warp_ar.light.captured import CapturedEmitter, Light, latlong_directions
 from warp_ar.scene import (
     Camera,
     LambertMaterial,
@@ -38,15 +39,6 @@ TABLE_TOLERANCE = 4e-3
 ROUNDING = 2e-5
 WHITE = np.ones((8, 16, 3), np.float32)
 CAMERA = Camera(32, 24, 40.0, 40.0, 15.5, 11.5)
-
-
-def look(eye: tuple[float, float, float], at: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Pose:
-    """``camera_from_world`` of a camera that looks at a point, z up."""
-    forward = np.subtract(at, eye) / np.linalg.norm(np.subtract(at, eye))
-    right = np.cross(forward, (0.0, 0.0, 1.0))
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    return Pose(rotation, -rotation @ np.array(eye))
 
 
 def trace(
@@ -91,7 +83,7 @@ def ball(material: Any, radius: float = 0.3) -> Scene:
     ids=["lambert", "mirror", "smooth metal", "metal", "rough metal", "plastic"],
 )
 def test_white_is_white_in_a_white_furnace(material: Any, device: str) -> None:
-    check(trace(ball(material), WHITE, look((1.0, 0.3, 0.4)), device), 1.0, tolerance=TABLE_TOLERANCE)
+    check(trace(ball(material), WHITE, look_at((1.0, 0.3, 0.4)), device), 1.0, tolerance=TABLE_TOLERANCE)
 
 
 def test_a_sphere_in_a_gradient(device: str) -> None:
@@ -100,7 +92,7 @@ def test_a_sphere_in_a_gradient(device: str) -> None:
     z = np.cos((np.arange(height) + 0.5) * math.pi / height)
     light = np.repeat((1.0 + 0.6 * z)[:, None, None], 2 * height, 1).repeat(3, 2).astype(np.float32)
     scene = ball(LambertMaterial((0.5, 0.25, 1.0)), 0.8)
-    pose = look((1.5, 0.0, 0.0))
+    pose = look_at((1.5, 0.0, 0.0))
     # So near and so small a picture that the sphere fills it.
     picture = trace(scene, light, pose, device, samples=64, size=(16, 12))
     x, y = np.meshgrid((np.arange(16) - 7.5) / 20.0, (np.arange(12) - 5.5) / 20.0)
@@ -120,7 +112,7 @@ def test_light_in_a_closed_sphere(device: str) -> None:
     scene = dataclasses.replace(
         ball(LambertMaterial((rho, rho, rho)), radius), lights=(VirtualLight("point", intensity),)
     )
-    picture = trace(scene, 1e3 * WHITE, look((0.2, 0.1, 0.1)), device, samples=64)
+    picture = trace(scene, 1e3 * WHITE, look_at((0.2, 0.1, 0.1)), device, samples=64)
     check(picture, rho * intensity / radius**2 / math.pi / (1.0 - rho), tolerance=1e-4)
 
 
@@ -129,7 +121,7 @@ def test_a_light_inside_an_object_stays_there(device: str) -> None:
     for radius in (0.0, 0.02):
         light = VirtualLight("point", 100.0, at=(0, 0, 0.1), radius=radius)
         scene = dataclasses.replace(ball(LambertMaterial((0.5, 0.5, 0.5))), lights=(light,))
-        assert not trace(scene, 0.0 * WHITE, look((1.0, 0.3, 0.4)), device).radiance.any()
+        assert not trace(scene, 0.0 * WHITE, look_at((1.0, 0.3, 0.4)), device).radiance.any()
 
 
 def test_a_disk_is_as_bright_in_a_mirror_as_it_lights(device: str) -> None:
@@ -137,7 +129,7 @@ def test_a_disk_is_as_bright_in_a_mirror_as_it_lights(device: str) -> None:
     intensity, distance, radius = 0.5, 1.0, 0.2
     axis, across = np.array([0.0, math.sqrt(0.5), math.sqrt(0.5)]), np.array([0.0, math.sqrt(0.5), -math.sqrt(0.5)])
     light = VirtualLight("point", intensity, at=tuple(distance * axis), radius=radius)
-    pose = look((0.0, -0.4, 0.4))
+    pose = look_at((0.0, -0.4, 0.4))
     box = Object("box", size=(0.6, 0.6, 0.2), at=(0.0, 0.0, -0.1), material=MirrorMaterial())
     shown = trace(Scene(CAMERA, objects=(box,), lights=(light,)), 0 * WHITE, pose, device, samples=64)
     # On the disk's axis its radiance is E / (pi r^2 / d^2).
@@ -165,7 +157,7 @@ def desk(*objects: Object, lights: tuple[VirtualLight, ...] = (), probes: tuple[
 
 
 FRAME = np.full((24, 32, 3), (0.3, 0.4, 0.5), np.float32)
-DOWN = look((0.0, -0.6, 0.6))
+DOWN = look_at((0.0, -0.6, 0.6))
 
 
 def test_without_virtual_things_the_picture_is_the_frame(device: str) -> None:
@@ -191,7 +183,7 @@ def test_the_shadow_of_a_black_sphere(device: str) -> None:
     radius, height = 0.1, 0.3
     sphere = Object("sphere", radius=radius, at=(0.0, 0.0, height), material=LambertMaterial((0.0, 0.0, 0.0)))
     scene = dataclasses.replace(desk(sphere), camera=Camera(8, 6, 400.0, 400.0, 3.5, 2.5))
-    picture = trace(scene, WHITE, look((0.0, -0.6, 0.2)), device, frame=FRAME[:6, :8], samples=256)
+    picture = trace(scene, WHITE, look_at((0.0, -0.6, 0.2)), device, frame=FRAME[:6, :8], samples=256)
     check(picture, FRAME[:6, :8] * (1.0 - (radius / height) ** 2), tolerance=2e-3)
 
 
@@ -250,7 +242,7 @@ def boxes(virtual: bool) -> Scene:
 
 RHO = ((0.4, 0.3, 0.2), (0.2, 0.5, 0.6))
 """Reflectance of the plane and the box of ``boxes``."""
-ABOVE = look((0.1, -0.5, 0.35))
+ABOVE = look_at((0.1, -0.5, 0.35))
 
 
 def sky(directions: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
@@ -262,10 +254,7 @@ def sky(directions: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
 
 
 def latlong_sky(height: int = 64) -> npt.NDArray[np.float32]:
-    theta = (np.arange(height) + 0.5)[:, None] * math.pi / height
-    phi = ((np.arange(2 * height) + 0.5)[None] / height - 1.0) * math.pi
-    parts = np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta) + 0 * phi
-    return sky(np.stack(parts, -1))
+    return sky(latlong_directions(height))
 
 
 @pytest.mark.parametrize("known", [False, True], ids=["whole", "difference"])
@@ -399,7 +388,7 @@ def test_what_is_not_a_number_stays_out(device: str) -> None:
     lamp = VirtualLight("point", 0.1, at=(0.0, 0.0, 0.0))
     sphere = Object("sphere", radius=0.05, at=(0.0, 0.0, 0.05), material=MetallicRoughnessMaterial((1, 1, 1), 0.5, 0.0))
     for height in (0.0, 1e-4, 0.3):
-        pose = look((0.0, -0.6, height), (0.0, 0.0, height))
+        pose = look_at((0.0, -0.6, height), (0.0, 0.0, height))
         picture = trace(desk(sphere, lights=(lamp,)), light, pose, device, frame=FRAME, samples=8)
         assert np.isfinite(picture.radiance).all()
         assert np.isfinite(picture.error).all()

@@ -322,20 +322,6 @@ def test_update_says_why_it_cannot(changes: dict[str, object], told: str, frames
         np.testing.assert_array_equal(pipeline(frames[0], time_seconds=0.0).image, before)
 
 
-def test_a_new_pipeline_continues_with_the_light(frames: Frames) -> None:
-    outputs = ("image", "environment")
-    with (
-        Pipeline(make_scene(), device="cpu", quality="low", outputs=outputs) as old,
-        Pipeline(make_scene(lights=()), device="cpu", quality="low", outputs=outputs) as new,
-    ):
-        run(old, frames)
-        light = old.arrays["environment_radiance"].numpy().copy()
-        new.continue_from(old)
-        np.testing.assert_array_equal(new.arrays["environment_radiance"].numpy(), light)
-        result = new(np.full_like(frames[0], 90), time_seconds=9.0)  # no marker in sight: the kept light is still there
-        assert result.environment_array is not None
-
-
 def dimmed(frames: Frames) -> Frames:
     """The frames again and again, darker and brighter: light, and what clips of it, keeps changing."""
     return [np.uint8(image * gain) for gain in (1.0, 0.5, 0.8, 0.4) for image in frames]

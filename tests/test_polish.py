@@ -6,10 +6,9 @@ import dataclasses
 import re
 
 import cv2
-import numpy as np
 import pytest
 
-from tests.polished_table import HEIGHT, WIDTH, film
+from tests.polished_table import film
 from warp_ar import doctor
 from warp_ar.kernels.color import decode_table
 from warp_ar.light.polish import estimate_polish
@@ -18,7 +17,6 @@ from warp_ar.scene import ProxyMaterial, dumps_scene, load_scene
 pytestmark = pytest.mark.slow
 
 TABLE = decode_table("srgb")
-ROWS, COLUMNS = np.mgrid[-1 : 1 : HEIGHT * 1j, -1 : 1 : WIDTH * 1j]
 SPOILED = {
     "as it is": None,
     "exposure that drifts": lambda linear, number: linear * 0.8 ** (number % 3),

@@ -9,14 +9,13 @@ import warp as wp
 
 from tests.environment_shadow_rig import ONE_BALL, draw, lamp_at, list_texels, sky, with_sun
 from tests.error_model import check_error
-from tests.kernel_rig import records, shape, tables
+from tests.kernel_rig import shape, tables
 from tests.receiver_cells_rig import (
     FOCAL,
     GREY,
     OUTLINE,
     SIZE_OF_FRAME,
     SUM_ERROR,
-    WHITE,
     View,
     ball,
     box,
@@ -30,7 +29,6 @@ from tests.reference.environment_shadow import sphere_form_factor
 from tests.relight_rig import CAMERA, DESK, FLOAT_ERROR, LOOK_DOWN, POINTS, point
 from warp_ar.kernels import cells as frame_cells
 from warp_ar.kernels.environment import environment_samples
-from warp_ar.kernels.environment.environment_samples import EnvironmentSample
 from warp_ar.kernels.receiver.receiver import ReceiverCells
 from warp_ar.kernels.receiver.receiver_cells import Patch
 from warp_ar.kernels.structs import BOX, DIRECTIONAL, LAMBERT, MIRROR, PHONG, PLANE
@@ -62,21 +60,6 @@ def test_a_ball_takes_its_form_factor(device, height):
     assert 0.9 < seen.mean() < 1.0, "the ball hides some of the desk"
     np.testing.assert_allclose(share[seen][:, 0], expected[middles(4)][seen], atol=OUTLINE)
     assert share[seen].min() < 0.95
-
-
-def test_a_hidden_lamp_leaves_what_grey_paper_sends(device):
-    """One sample is all the light: hidden it leaves 0.5 x 0.7 of radiance 20, where nothing stands all of it."""
-    sample = records(
-        EnvironmentSample, {"direction": (0, 0, 1), "radiance": (20,) * 3, "measure": 0.1, "distance": 1e30}
-    )
-    share, _ = View(
-        (DESK, box((-0.04, -0.04, 0.2), (0.04, 0.04, 0.3))), surroundings=0.7 * WHITE, camera=(0, 0, 0.15)
-    ).share(sample)
-    inside = (np.abs(POINTS * 0.25)[..., :2] < 0.04).all(-1)[middles(4)]
-    np.testing.assert_allclose(share[inside], GREY * 0.7 / 20, rtol=SUM_ERROR)
-    assert (share[~inside] == 1.0).all()
-    assert inside.any()
-    assert not inside.all()
 
 
 @pytest.mark.parametrize("code", [20, 128, 230])

@@ -10,6 +10,7 @@ import warp as wp
 from scipy.optimize import nnls
 
 from tests.error_model import check_error
+from tests.kernel_rig import records
 from tests.recover_rig import (  # noqa: F401  # noqa: F401
     DistantLight,
     cells_of,
@@ -138,15 +139,13 @@ def test_far_emitters_are_distant_light(device):
 
 
 def look_down(device, scene, image):
-    params = np.zeros(1, np.dtype(structs.FrameParams.numpy_dtype()))
-    params["camera_position"] = (0.0, 0.0, 0.6)
-    params["world_from_camera"] = rotation_matrix((180.0, 0.0, 0.0))
     camera = scene.camera
-    params["focal"], params["principal"] = (camera.fx, camera.fy), (camera.cx, camera.cy)
+    place = {"camera_position": (0.0, 0.0, 0.6), "world_from_camera": rotation_matrix((180.0, 0.0, 0.0))}
+    lens = {"focal": (camera.fx, camera.fy), "principal": (camera.cx, camera.cy)}
     return (
         wp.array(image, dtype=wp.vec3ub, device=device),
         wp.array(decode_table("linear"), dtype=wp.vec3, device=device),
-        wp.array(params, dtype=structs.FrameParams, device=device),
+        records(structs.FrameParams, {**place, **lens}, device=device),
     )
 
 
@@ -194,14 +193,8 @@ def test_observation_of_a_linear_frame_reads_light_as_it_is(device, scene):
 
 def ball_of(device, pixels):
     """Camera and ball of which it sees as many pixels to each side."""
-    params = np.zeros(1, np.dtype(structs.FrameParams.numpy_dtype()))
-    params["camera_position"], params["focal"] = (-0.12, -0.47, 0.035), 500.0
-    probes = np.zeros(1, np.dtype(structs.Probe.numpy_dtype()))
-    probes["center"], probes["radius"] = (-0.12, 0.03, 0.035), pixels * 0.5 / 500.0
-    return (
-        wp.array(params, dtype=structs.FrameParams, device=device),
-        wp.array(probes, dtype=structs.Probe, device=device),
-    )
+    params = records(structs.FrameParams, {"camera_position": (-0.12, -0.47, 0.035), "focal": 500.0}, device=device)
+    return params, probes_of(device, radius=pixels * 0.5 / 500.0)
 
 
 def weighed_boundaries(device, clipped, pixels):

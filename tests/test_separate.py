@@ -117,22 +117,6 @@ def test_a_lost_frame_has_neutral_layers(device):
                 assert (values == layer.neutral).all(), name
 
 
-def test_submitted_frames_keep_their_layers(device):
-    frames = [make_frame(seed) for seed in range(3)]
-    with (
-        Pipeline(make_scene(), device=device, quality="low", outputs=tuple(LAYERS)) as first,
-        Pipeline(make_scene(), device=device, quality="low", outputs=tuple(LAYERS)) as second,
-    ):
-        expected = run(first)
-        ahead = [
-            second.submit(frame, time_seconds=one, pose=pose)
-            for frame, one, pose in zip(frames, (0.0, 0.1, 0.15), POSES, strict=True)
-        ]
-        for wanted, result in zip(expected, ahead, strict=True):
-            for name in LAYERS:
-                np.testing.assert_array_equal(result.layers[name], wanted.layers[name], err_msg=name)
-
-
 def test_an_unknown_layer_is_named():
     with pytest.raises(UsageError, match=r"outputs: 'dept' is unknown; did you mean 'depth'\? expected any of image"):
         Pipeline(make_scene(), device="cpu", outputs=("dept",))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 
@@ -22,7 +20,6 @@ QUALITY = PRESETS["low"].with_methods(recover="clipped")
 SHADING = 1e-4
 # The same normals turn what a mirror shows by twice as much, across a lamp's edge that is one texel of 0.05 wide.
 MIRRORING = 1e-3
-TRUST_TIME = 0.4
 
 
 def by_maps(
@@ -75,48 +72,3 @@ def test_interpolated_light_is_nearer_to_the_truth_than_either_balls(device: str
     assert between[2].mean() < between[:2].mean(1).min()
     if not mirror:  # which, on its way from ball to ball, is now nearer to one's light, now to the other's
         np.testing.assert_array_less(between[2], between[:2].min(0))
-
-
-def test_a_ball_that_leaves_the_picture_goes_out_smoothly(device: str) -> None:
-    """In the frame in which it leaves nothing changes but by its trust; later objects have the other one's light."""
-    away = -0.5  # the second ball is out of the picture, the first one and the object beside it are in it
-    frames = [(WORLD.photograph(), pose())] * 2 + [(WORLD.photograph(away), pose(away))] * 40
-    with Pipeline(make_scene(BALLS, material(False)), device=device, quality=QUALITY) as pipeline:
-        for number, (frame, at) in enumerate(frames):
-            pipeline(frame, pose=at, time_seconds=0.1 * number)
-            trust = math.exp(-0.1 * max(number - 1, 0) / TRUST_TIME)
-            places = pipeline.arrays["probe_places"].numpy()
-            # One rounding of float32 a frame.
-            np.testing.assert_allclose(places[:, 3], [1.0, trust], rtol=6e-8 * (number + 4))
-            if number % 8 == 2:
-                found, whole = shown_of(pipeline, 1, away)
-                expected = by_maps(pipeline, 1, False, (1.0, trust), away)
-                np.testing.assert_allclose(found[whole], expected[whole], rtol=SHADING)
-    assert trust < 1e-4
-
-
-def test_the_environments_are_those_of_the_balls(device: str) -> None:
-    """As an output: the first one's is ``environment``, each further ball has its own, whatever their order.
-
-    What a ball tells is that ball's, but for a vote of each pixel of the others that counts ``BORROWED``: 0.001, of a
-    radiance that is off by the lamp's at most, and of no more than four times the pixels a steradian.
-    """
-    borrowed = 4.0 * 0.001 * DESK.lamp
-    found = {}
-    for name, balls in (("both", BALLS), ("swapped", BALLS[::-1]), ("first", BALLS[:1]), ("second", BALLS[1:])):
-        scene = make_scene(balls, material(False))
-        with Pipeline(scene, device=device, quality=QUALITY, outputs=("image", "environment")) as pipeline:
-            result = pipeline(WORLD.photograph(), pose=pose(), time_seconds=0.0)
-            found[name] = result.environments
-            np.testing.assert_array_equal(result.environment, result.environments[0])
-            if len(balls) == 1:
-                found[f"{name} told"] = pipeline.arrays["environment_confidence"].numpy()
-    both, swapped = found["both"], found["swapped"]
-    assert [len(found[name]) for name in ("both", "swapped", "first", "second")] == [2, 2, 1, 1]
-    for number, name in enumerate(("first", "second")):
-        told = found[f"{name} told"] > 0.8
-        assert told.mean() > 0.4
-        np.testing.assert_allclose(both[number][told], found[name][0][told], atol=borrowed)
-        np.testing.assert_allclose(swapped[1 - number][told], found[name][0][told], atol=borrowed)
-    # Where one sees the lamp the other sees the room.
-    assert np.abs(both[0] - both[1]).max() > 0.98 * (DESK.lamp - max(DESK.room))

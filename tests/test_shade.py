@@ -10,7 +10,7 @@ import pytest
 import warp as wp
 
 from tests.error_model import check_error
-from tests.kernel_rig import TEXTURES
+from tests.kernel_rig import TEXTURES, constant_environment, records
 from tests.reference import shade as reference
 from tests.test_visibility import GENERAL, World
 from warp_ar.kernels import structs
@@ -53,9 +53,7 @@ CONTRACTION_ULPS = {"cpu": 0, "cuda": 4}
 def make_distant_light(models, device, radiance=1.0):
     """A constant environment for the given material models."""
     surroundings = DistantLight()
-    sh = np.zeros((9, 3), np.float32)
-    sh[0] = math.pi * radiance / 0.28209479
-    surroundings.irradiance_sh = wp.array(sh, dtype=wp.vec3, device=device)
+    surroundings.irradiance_sh = wp.array(constant_environment(radiance), dtype=wp.vec3, device=device)
     levels = np.full((lobe_texels(LEVEL_HEIGHT), 3), radiance, np.float32)
     surroundings.levels = wp.array(levels, dtype=wp.vec3, device=device)
     surroundings.level_height = LEVEL_HEIGHT
@@ -67,22 +65,11 @@ def make_distant_light(models, device, radiance=1.0):
 
 
 def materials(*fields, device):
-    records = np.zeros(len(fields), np.dtype(structs.Material.numpy_dtype()))
-    for name in TEXTURES:
-        records[name] = -1
-    for record, values in zip(records, fields, strict=True):
-        for name, value in values.items():
-            record[name] = value
-    return wp.array(records, dtype=structs.Material, device=device)
+    return records(structs.Material, *[{**dict.fromkeys(TEXTURES, -1), **values} for values in fields], device=device)
 
 
 def lights(*fields, device):
-    records = np.zeros(len(fields), np.dtype(structs.Light.numpy_dtype()))
-    records["attenuation"] = (0, 0, 1)
-    for record, values in zip(records, fields, strict=True):
-        for name, value in values.items():
-            record[name] = value
-    return wp.array(records, dtype=structs.Light, device=device)
+    return records(structs.Light, *[{"attenuation": (0, 0, 1), **values} for values in fields], device=device)
 
 
 def scene_of(world, *fields, device):
@@ -107,10 +94,8 @@ def render(
     listed=0,
 ):
     """Trace and shade a frame of a camera at ``eye`` that looks along +z; (48, 64, 4)."""
-    params = np.zeros(1, np.dtype(structs.FrameParams.numpy_dtype()))
-    params["camera_position"], params["world_from_camera"] = eye, np.eye(3)
-    params["focal"], params["object_rect"] = FOCAL, rect
-    params = wp.array(params, dtype=structs.FrameParams, device=device)
+    place = {"camera_position": eye, "world_from_camera": np.eye(3), "focal": FOCAL, "object_rect": rect}
+    params = records(structs.FrameParams, place, device=device)
     rays = wp.array(pixel_rays().astype(np.float32), dtype=wp.vec2, device=device)
     found = wp.zeros(SIZE, dtype=wp.int32, device=device)
     hits = wp.zeros(SIZE, dtype=Hit, device=device)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from tests.kernel_rig import records, shape
 from tests.test_visibility import GENERAL, World
 from warp_ar.kernels.rays.shadow import (
     MIN_DISTANCE,
@@ -57,17 +58,14 @@ def lit_kernel(
 
 
 def light(**fields):
-    record = np.zeros(1, np.dtype(Light.numpy_dtype()))
     values = {"kind": POINT, "direction": (0, 0, -1), "intensity": 1.0, "attenuation": (0, 0, 1), **fields}
-    for name, value in values.items():
-        record[name] = value
-    return record
+    return records(Light, values)
 
 
 def samples(record, points, device):
     points = np.asarray(points, np.float32)
     outputs = [wp.zeros(len(points), dtype=LightSample, device=device) for _ in range(2)]
-    inputs = [wp.array(record, dtype=Light, device=device), wp.array(points, dtype=wp.vec3, device=device)]
+    inputs = [record.to(device), wp.array(points, dtype=wp.vec3, device=device)]
     wp.launch(sample_kernel, dim=len(points), inputs=inputs, outputs=outputs, device=device)
     return [output.numpy() for output in outputs]
 
@@ -139,7 +137,7 @@ def test_at_the_light_itself(device, kind, radius):
 def lit(scene, record, points, device, *, error=1e-6):
     points = np.asarray(points, np.float32)
     result = wp.zeros(len(points), dtype=wp.int32, device=device)
-    inputs = [scene, wp.array(record, dtype=Light, device=device), wp.array(points, dtype=wp.vec3, device=device)]
+    inputs = [scene, record.to(device), wp.array(points, dtype=wp.vec3, device=device)]
     normal = wp.vec3(0.0, 0.0, 1.0)
     wp.launch(lit_kernel, dim=len(points), inputs=[*inputs, normal, error], outputs=[result], device=device)
     return result.numpy().tolist()
@@ -188,20 +186,16 @@ def share_kernel(
 
 
 def shares(points, radius, shapes=(), position=(0.0, 0.0, 1.0), turn=0.0):
-    dtype = np.dtype(Light.numpy_dtype())
-    light = np.zeros(1, dtype)
-    light["kind"], light["position"], light["radius"] = POINT, position, radius
-    light["intensity"], light["attenuation"] = 1.0, (0, 0, 1)
-    objects = np.zeros(len(shapes), np.dtype(Shape.numpy_dtype()))
-    for record, (kind, at, extent) in zip(objects, shapes, strict=True):
-        record["kind"], record["position"], record["extent"] = kind, at, extent
-        record["rotation"], record["scale"] = np.eye(3), 1.0
     scene = RayScene()
-    scene.objects = wp.array(objects, dtype=Shape)
-    scene.proxies = wp.zeros(0, dtype=Shape)
+    scene.objects, scene.proxies = records(Shape, *(shape(*each) for each in shapes)), wp.zeros(0, dtype=Shape)
     where = wp.array(np.asarray(points, np.float32), dtype=wp.vec3)
     out = wp.zeros(len(points), wp.float32)
-    wp.launch(share_kernel, dim=len(points), inputs=[scene, wp.array(light, dtype=Light), where, turn], outputs=[out])
+    wp.launch(
+        share_kernel,
+        dim=len(points),
+        inputs=[scene, light(position=position, radius=radius), where, turn],
+        outputs=[out],
+    )
     return out.numpy()
 
 

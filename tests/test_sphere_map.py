@@ -10,10 +10,12 @@ import warp as wp
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from tests import kernel_rig
 from tests.error_model import check_error
 from tests.kernel_rig import records
 from tests.reference import color as reference_color
 from tests.reference import sphere_map as reference
+from tests.reference.latlong import directions
 from warp_ar.kernels import color
 from warp_ar.kernels.environment import sphere_map
 from warp_ar.kernels.environment.lobes import lobe_count
@@ -31,11 +33,7 @@ CLIP = 2.5  # radiance from which on a linear picture of these tests clips
 
 def look_at(eye, target):
     """World from camera: z toward the target, x to the right, y down."""
-    z = (target - eye) / np.linalg.norm(target - eye)
-    up = np.array([0.0, 0.0, 1.0]) if abs(z[2]) < 0.99 else np.array([0.0, 1.0, 0.0])
-    x = np.cross(z, up)
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(z, x), z], 1)
+    return kernel_rig.look_at(eye, target).rotation.T
 
 
 def camera(eye, rotation, distortion=(0.0,) * 8):
@@ -62,13 +60,6 @@ def run(frame, eye=EYE, rotation=None, level=0, scale=1.0, distortion=(0.0,) * 8
         sphere_map.look_up_level(params, texture, level, shape, out, scale=scale, rows=band)
         sphere_map.trust_ball(params, probes, frame, linear, clip, confidence, clipped, rows=band)
     return texture.numpy(), out.numpy().reshape(*shape, 3), confidence.numpy(), clipped.numpy()
-
-
-def directions(height, width):
-    theta = (np.arange(height) + 0.5) / height * np.pi
-    phi = ((np.arange(width) + 0.5) / width * 2 - 1) * np.pi
-    theta, phi = np.meshgrid(theta, phi, indexing="ij")
-    return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
 
 
 def noise(seed=0):

@@ -62,8 +62,8 @@ def make_scene(shapes=()):
 BALL = (CENTER, RADIUS, REFLECTANCE)
 
 
-def project(view, balls=(BALL,), shapes=(), kinds=None, height=HEIGHT):
-    kinds = tuple(sorted({shape["kind"] for shape in shapes})) if kinds is None else kinds
+def project(view, balls=(BALL,), shapes=(), height=HEIGHT):
+    kinds = tuple(sorted((PLANE, BOX, MESH))) if shapes else ()  # one kernel for all that hide
     corners = wp.zeros((height + 1, 2 * height + 1, len(balls)), dtype=wp.vec3)
     rays = wp.array(view.rays().astype(np.float32), dtype=wp.vec2)
     unwrap.project_corners(kinds, make_params(view), make_probes(balls), rays, make_scene(shapes), corners)
@@ -78,11 +78,10 @@ def unwrapped(
     shapes=(),
     height=HEIGHT,
     transfer="srgb",
-    kinds=None,
     rows=None,
     own=unwrap.ALL_ALIKE,
 ):
-    corners = project(view, balls, shapes, kinds, height)
+    corners = project(view, balls, shapes, height)
     radiance = wp.full((height, 2 * height), wp.vec3(-1.0), dtype=wp.vec3)
     confidence = wp.full((height, 2 * height), -1.0, dtype=wp.float32)
     clipped = wp.full((height, 2 * height), wp.vec3(-1.0), dtype=wp.vec3)

@@ -10,15 +10,16 @@ import warp as wp
 
 from tests.error_model import check_error
 from tests.hard_cases.generators import closed_sphere
+from tests.kernel_rig import records
 from tests.reference import visibility as reference
 from warp_ar.kernels import structs
 from warp_ar.kernels.rays.shapes import FAR
 from warp_ar.kernels.rays.trace import TraceConfig, make_trace, offset_origin
 from warp_ar.kernels.rays.visibility import make_visible, trace_pixels
 from warp_ar.kernels.structs import Hit
-from warp_ar.scene.geometry import Mesh, rotation_matrix, smooth_normals
+from warp_ar.scene.geometry import rotation_matrix
 from warp_ar.scene.ray_mesh import make_ray_mesh
-from warp_ar.scene.shapes import sphere_mesh, torus_mesh
+from warp_ar.scene.shapes import box_mesh, sphere_mesh, torus_mesh
 
 EVERY = (structs.PLANE, structs.BOX, structs.MESH, structs.SPHERE)
 GENERAL = TraceConfig(EVERY, EVERY)
@@ -274,21 +275,7 @@ def test_specialised_equals_general(device, kind):
 
 def test_axis_aligned_rays_from_a_face(device):
     """Along an axis from an origin on a face, and in the plane of a face: as seen from inside, never NaN."""
-    cube = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)], np.float32)
-    faces = [
-        [0, 1, 3],
-        [0, 3, 2],
-        [4, 6, 7],
-        [4, 7, 5],
-        [0, 4, 5],
-        [0, 5, 1],
-        [2, 3, 7],
-        [2, 7, 6],
-        [0, 2, 6],
-        [0, 6, 4],
-    ]
-    faces = np.array([*faces, [1, 5, 7], [1, 7, 3]], np.int32)
-    mesh = Mesh(cube, faces, smooth_normals(cube, faces))
+    mesh = box_mesh((2.0, 2.0, 2.0))
     origins = [(1, 0, 0), (1, 0.3, -5), (0.2, 1, -5), (0, 0, 1), (1, 1, -5)]
     directions = [(-1, 0, 0), (0, 0, 1), (0, 0, 1), (0, 0, -1), (0, 0, 1)]
     for world in (World(device).add("box"), World(device).add("mesh", mesh=mesh)):
@@ -360,12 +347,10 @@ def test_rays_that_leave_do_not_come_back(device, kind, size, distance):
 
 def camera(device, *, rect, eye=(0.0, 0.0, 0.0), size=(48, 64), focal=60.0):
     """Frame values and rays of a camera at ``eye`` that looks along +z."""
-    params = np.zeros(1, np.dtype(structs.FrameParams.numpy_dtype()))
-    params["camera_position"], params["world_from_camera"] = eye, np.eye(3)
-    params["focal"], params["object_rect"] = focal, rect
+    place = {"camera_position": eye, "world_from_camera": np.eye(3), "focal": focal, "object_rect": rect}
     x, y = np.meshgrid((np.arange(size[1]) - 31.5) / focal, (np.arange(size[0]) - 23.5) / focal)
     return (
-        wp.array(params, dtype=structs.FrameParams, device=device),
+        records(structs.FrameParams, place, device=device),
         wp.array(np.stack([x, y], -1).astype(np.float32), dtype=wp.vec2, device=device),
     )
 
