@@ -13,7 +13,9 @@ import pathlib
 from collections.abc import Iterable
 from typing import Any
 
-from tests.hard_cases.rig import EXACT, METHODS
+import pytest
+
+from tests.hard_cases.rig import COMBINATIONS, EXACT, METHODS, SLOW, methods_in
 
 ROWS = {
     1: "straight back through the ball, the blind cone behind it, the silhouette",
@@ -244,6 +246,19 @@ def cells_of(item: Any) -> list[Cell]:
         if method is None:
             raise ValueError(f"{item.nodeid}: say which method of {stage} it covers, or '*' for what all share")
         found += [(row, stage, one) for one in methods if method in ("*", one)]
+    return found
+
+
+def combinations(row: int, only: Iterable[str] | None = None) -> list[Any]:
+    """Every combination of methods, as a parameter that says which cells of a row it covers; ``only`` names stages."""
+    concerned = set(CONCERNS[row]) if only is None else set(only)
+    found = []
+    for name in COMBINATIONS:
+        marks: list[pytest.MarkDecorator] = [pytest.mark.slow] if name in SLOW else []
+        for stage, method in methods_in(name).items():
+            if stage in concerned:
+                marks.append(pytest.mark.atlas(row=row, stage=stage, method=method))
+        found.append(pytest.param(name, marks=marks, id=name))
     return found
 
 

@@ -14,8 +14,10 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+import pytest
 import warp as wp
 
+from tests import kernel_rig
 from warp_ar.engine.graph import Plan, make_plan
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.kernels.structs import FrameParams, RayScene
@@ -52,24 +54,24 @@ MAY_BE_INFINITE = ("lamps.distance", "depth")
 
 
 def look_at(eye: Any, target: Any = (0.0, 0.0, 0.02)) -> Pose:
-    """Pose of a camera at ``eye`` whose axis goes through ``target``, its x axis level."""
-    forward = np.subtract(target, eye).astype(np.float64)
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, (0.0, 0.0, 1.0) if abs(forward[2]) < 0.99 else (0.0, 1.0, 0.0))
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    return Pose(rotation, -rotation @ np.asarray(eye, np.float64))
+    """Pose of a camera at ``eye`` whose axis goes a little above the marker."""
+    return kernel_rig.look_at(eye, target)
 
 
 POSE = look_at((0.02, -0.3, 0.35))
 
 
-def make_scene(scale: float = 1.0, shift: Any = (0.0, 0.0, 0.0), **changes: Any) -> Scene:
+LIGHT_RADIUS = 0.02
+"""Of lamps in all combinations, metres at scale 1."""
+
+
+def make_scene(scale: float = 1.0, shift: Any = (0.0, 0.0, 0.0), *, radius: float = 0.0, **changes: Any) -> Scene:
     """Every effect: four materials, sphere, box and mesh, two kinds of proxy, three kinds of light, a ball.
 
     Args:
         scale: Metres per unit: everything is that much larger and farther.
         shift: Where the scene's middle lies, metres.
+        radius: Of lamps, metres at scale 1: soft where the method of ``light_shadow`` is.
         changes: Fields of the scene to replace.
     """
 
@@ -109,8 +111,16 @@ def make_scene(scale: float = 1.0, shift: Any = (0.0, 0.0, 0.0), **changes: Any)
             Object("sphere", radius=scale * 0.02, at=at(-0.02, 0.03, 0.02), material=MirrorMaterial((0.9, 0.9, 0.9))),
         ),
         lights=(
-            Light("point", 0.1 * scale**2, at=at(0.0, -0.1, 0.3)),
-            Light("spot", 0.1 * scale**2, at=at(0.2, 0.1, 0.3), target=at(0, 0, 0), inner_angle=10.0, outer_angle=30.0),
+            Light("point", 0.1 * scale**2, at=at(0.0, -0.1, 0.3), radius=scale * radius),
+            Light(
+                "spot",
+                0.1 * scale**2,
+                at=at(0.2, 0.1, 0.3),
+                target=at(0, 0, 0),
+                inner_angle=10.0,
+                outer_angle=30.0,
+                radius=scale * radius,
+            ),
             Light("directional", 0.3, direction=(0.3, 0.2, -1.0)),
         ),
         exposure=Exposure(0.7),
@@ -126,41 +136,38 @@ def make_quality(**methods: str) -> Quality:
 
 
 BRACKET = (1.0, 1.0 / 16.0)
-"""Exposure times between which frames alternate, where a stage calls for it."""
-SOFT = "soft"
-"""A way of two stages, tried as one more method of each: lights with a size, and the most samples along edges."""
-LIGHT_RADIUS = 0.02
-"""Metres, at scale 1."""
+"""Exposure times between which frames of one combination alternate."""
 
 
-def with_sized_lights(scene: Scene, scale: float = 1.0) -> Scene:
-    """The scene with spheres for its point and spot lights."""
-    radius = scale * LIGHT_RADIUS
-    lights = (one if one.kind == "directional" else dataclasses.replace(one, radius=radius) for one in scene.lights)
-    return dataclasses.replace(scene, lights=tuple(lights))
+def _combination(
+    preset: str, scale: float = 0.7, more: tuple[str, ...] = (), times: tuple[float, ...] = (), **methods: str
+) -> Request:
+    base = dataclasses.replace(PRESETS[preset], environment_height=ENVIRONMENT_HEIGHT)
+    chosen = {"unwrap": "area", **dict(base.methods), **methods}
+    scene = make_scene(radius=LIGHT_RADIUS, exposure=Exposure(scale))
+    return Request(scene, base.with_methods(**chosen), SIZE, ("image", "environment", *more), times)
 
 
-@functools.cache
-def request_for(stage: str, method: str) -> Request | None:
-    """A request whose plan holds ``stage`` on ``method``; None if that method means that the stage does not run."""
-    if method == SOFT:
-        request = request_for(stage, next(list(one.methods)[-1] for one in STAGES if one.name == stage))
-        assert request is not None
-        quality = dataclasses.replace(request.quality.with_methods(light_shadow=SOFT), edge_samples=16)
-        return dataclasses.replace(request, scene=with_sized_lights(request.scene), quality=quality)
-    methods = {} if method == "default" else {stage: method}
-    # Some stages run only where another one is on its best method, some only without a change of exposure, one only
-    # where the frames alternate between exposure times, some only in the paper's way or where layers are asked for.
-    best = {one.name: list(one.methods)[-1] for one in STAGES if len(one.methods) > 1}
-    ways = itertools.product(
-        ((), tuple(LAYERS)), ({}, best, {"relight": "paper", "expose": "paper"}), (0.7, 1.0), ((), BRACKET)
-    )
-    for layers, others, scale, times in ways:
-        quality = make_quality(**{**others, **methods})
-        request = Request(make_scene(exposure=Exposure(scale)), quality, SIZE, ("image", "environment", *layers), times)
-        if stage in plan_names(make_plan(request)):
-            return request
-    return None
+def _further_methods() -> Iterator[dict[str, str]]:
+    """Yield methods that no preset names, those of several stages together."""
+    named = {pair for preset in PRESETS.values() for pair in preset.methods} | {("unwrap", "area")}
+    left = {
+        stage.name: [method for method in stage.methods if len(stage.methods) > 1 and (stage.name, method) not in named]
+        for stage in STAGES
+    }
+    for some in itertools.zip_longest(*left.values()):
+        yield {name: method for name, method in zip(left, some, strict=True) if method is not None}
+
+
+COMBINATIONS: dict[str, Request] = {
+    **{name: _combination(name) for name in ("medium", "high", "low", "paper", "reference")},
+    # Some stages run only without a change of exposure, between exposure times, or where layers are asked for.
+    "composed": _combination("medium", 1.0, tuple(LAYERS), BRACKET),
+    **{f"further {number}": _combination("medium", **some) for number, some in enumerate(_further_methods())},
+}
+"""Requests that between them hold every stage on every method, so that few pipelines are compiled."""
+SLOW = ("reference",)
+"""Those that a plain run leaves out."""
 
 
 def plan_names(plan: Plan) -> tuple[str, ...]:
@@ -168,11 +175,25 @@ def plan_names(plan: Plan) -> tuple[str, ...]:
     return tuple(stage.name for stage, _ in plan.stages)
 
 
+@functools.cache
+def methods_in(name: str) -> dict[str, str]:
+    """Method of every stage that runs in a combination."""
+    request = COMBINATIONS[name]
+    kinds = {stage.name: stage for stage in STAGES}
+    return {
+        stage: request.quality.method(stage) if len(kinds[stage].methods) > 1 else next(iter(kinds[stage].methods))
+        for stage in plan_names(make_plan(request))
+    }
+
+
+def combination_of(stage: str, method: str) -> str:
+    """Name of the first combination whose plan holds ``stage`` on ``method``."""
+    return next(name for name in COMBINATIONS if methods_in(name).get(stage) == method)
+
+
 METHODS: dict[str, tuple[str, ...]] = {
     stage.name: tuple(
-        method
-        for method in (*stage.methods, *((SOFT,) if stage.name in ("relight", "shade") else ()))
-        if request_for(stage.name, method) is not None
+        method for method in stage.methods if any(methods_in(name).get(stage.name) == method for name in COMBINATIONS)
     )
     for stage in STAGES
 }
@@ -184,6 +205,20 @@ FILTERS = [
 ]
 """Filters of the environment's map; the paper's filters the frame, and has its tests beside its kernel."""
 STAGE_METHODS = [(stage, method) for stage, methods in METHODS.items() for method in methods]
+
+
+def _marks(stage: str, method: str) -> list[pytest.MarkDecorator]:
+    return [pytest.mark.slow] if combination_of(stage, method) in SLOW else []
+
+
+def cases(*stages: str) -> list[Any]:
+    """Parameters ``stage`` and ``method`` of some stages, those of slow combinations marked so."""
+    return [pytest.param(stage, method, marks=_marks(stage, method)) for stage in stages for method in METHODS[stage]]
+
+
+def methods(stage: str) -> list[Any]:
+    """Parameter ``method`` of one stage, as ``cases`` has it."""
+    return [pytest.param(method, marks=_marks(stage, method)) for method in METHODS[stage]]
 
 
 class FixedPose:
@@ -207,13 +242,12 @@ class Rig:
         stage: str | None = None,
         method: str = "default",
         *,
+        combination: str = "medium",
         bands: int = 1,
         pose: Pose = POSE,
         **changes: Any,
     ) -> None:
-        request = request_for(stage, method) if stage is not None else None
-        if request is None:
-            request = Request(make_scene(), make_quality(), SIZE)
+        request = COMBINATIONS[combination if stage is None else combination_of(stage, method)]
         if changes:
             request = dataclasses.replace(request, scene=dataclasses.replace(request.scene, **changes))
         self.device = device
@@ -379,8 +413,7 @@ class LoneStage:
     """A stage of the environment by itself, with an environment of any height."""
 
     def __init__(self, device: str, name: str, method: str, height: int) -> None:
-        request = request_for(name, method)
-        assert request is not None
+        request = COMBINATIONS[combination_of(name, method)]
         request = dataclasses.replace(request, quality=dataclasses.replace(request.quality, environment_height=height))
         kind = next(stage for stage in STAGES if stage.name == name)
         features = find_features(request)

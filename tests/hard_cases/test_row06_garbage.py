@@ -7,10 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from tests.hard_cases import generators
+from tests.hard_cases import atlas, generators
 from tests.hard_cases.rig import (
     ENVIRONMENT_HEIGHT,
     EXACT,
@@ -76,11 +74,10 @@ def before(rig, stage):
     return names[start : names.index(stage)] if stage in names[start:] else []
 
 
-@pytest.mark.atlas(row=6)
-@pytest.mark.parametrize(("stage", "method"), STAGE_METHODS)
-def test_any_frame_gives_finite_light(rig_for, stage, method):
+@pytest.mark.parametrize("combination", atlas.combinations(6))
+def test_any_frame_gives_finite_light(rig_for, combination):
     """Frames as corrupt as 8 bits can be, through the whole pipeline."""
-    rig = rig_for(stage, method)
+    rig = rig_for(combination)
     for name, image in FRAMES.items():
         rig.frame(image)
         outputs = {key: rig.get(key) for one, _ in rig.pipeline._scheduler._stages for key in one.wiring.writes}
@@ -210,59 +207,4 @@ def test_a_broken_layer_pixel_stays_one_pixel(rig_for, stage, method, bad):
     assert not touched.any()
 
 
-@pytest.mark.atlas(row=6, stage="relight")
-@pytest.mark.parametrize("method", METHODS["relight"])
-def test_a_frame_pixel_changes_its_own_light_alone(rig_for, method):
-    """Its own light alone."""
-    rig = rig_for("relight", method)
-    rig.poke("frame", FRAMES["grey"])
-    clean = rig.run("relight")
-    bad = FRAMES["grey"].copy()
-    row, column = np.argwhere(clean["added_light"].sum(-1) > 0)[40]
-    bad[row, column] = 0
-    rig.poke("frame", bad)
-    touched = changed(rig, "relight", clean, "added_light")
-    assert touched[row, column] == (method != "flat")
-    touched[row, column] = False
-    assert not touched.any()
-
-
-@pytest.mark.atlas(row=6, stage="summed_area")
-def test_a_frame_pixel_changes_only_boxes_that_hold_it(rig_for):
-    rig = rig_for("summed_area", "default")
-    clean = rig.run("summed_area")
-    bad = rig.get("frame")
-    bad[20, 30] ^= 255
-    rig.poke("frame", bad)
-    touched = changed(rig, "summed_area", clean, "summed_area")
-    assert touched[20:, 30:].all()
-    touched[20:, 30:] = False
-    assert not touched.any()
-
-
 # --- Any magnitude ----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.atlas(row=6)
-@pytest.mark.parametrize(
-    ("stage", "method"),
-    [
-        ("fill", "default"),
-        ("key_lights", "default"),
-        ("environment_samples", "default"),
-        *FILTERS,
-    ],
-)
-@given(
-    exponent=st.floats(-8, 8), spread=st.floats(0, 8), row=st.integers(0, MAP[0] - 1), column=st.integers(0, MAP[1] - 1)
-)
-def test_finite_at_any_magnitude(rig_for, stage, method, exponent, spread, row, column):
-    """A lamp of any radiance over a sky of any other."""
-    rig = rig_for(stage, method)
-    surroundings = np.full((*MAP, 3), 10.0**exponent, np.float32)
-    surroundings[row, column] = min(10.0 ** (exponent + spread), 1e8)
-    source = "environment_radiance" if stage == "fill" else "environment"
-    rig.poke(source, surroundings)
-    if stage == "fill":
-        rig.poke("environment_confidence", 1.0)
-    assert_light(rig.run(stage), f"for a lamp of {surroundings.max():g} over {surroundings.min():g}")

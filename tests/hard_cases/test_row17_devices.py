@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from tests.hard_cases import generators
-from tests.hard_cases.rig import SIZE, STAGE_METHODS, Rig, numbers
+from tests.hard_cases import atlas, generators
+from tests.hard_cases.rig import SIZE, Rig, numbers
 from warp_ar.scene import Scene
 from warp_ar.scene.shapes import torus_mesh
 
@@ -76,33 +76,34 @@ def shortest_edge(scene: Scene) -> float:
     return float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).min())
 
 
-def compare(stage: str, method: str, device: str) -> None:
+def compare(cpu: Rig, other: Rig, stage: str) -> None:
+    """Run a stage on both, on the CPU's inputs."""
     bound = BOUNDS.get(stage, DEFAULT)
-    with Rig("cpu", stage, method) as cpu, Rig(device, stage, method) as other:
+    for name, values in cpu.state().items():
+        # Shapes refer to meshes by numbers that belong to a device.
+        if values.size and "mesh" not in (values.dtype.names or ()):
+            other.arrays[name].assign(values)
+    expected, found = cpu.run(stage), other.run(stage)
+    seen = cpu.get("hit_object") >= 0 if "hit_object" in cpu.arrays else None
+    for name, values in expected.items():
+        for (part, a), (_, b) in zip(numbers(values), numbers(found[name]), strict=True):
+            if seen is not None and name in SEEN_ONLY:
+                a, b = a[seen], b[seen]
+            # Where on its triangle a hit is, in shares of its edges: as coarse as the hit's point against them.
+            on_triangle = values["error"].max() / shortest_edge(cpu.pipeline.scene) if part == ".weights" else 0.0
+            share = differences(a, b, max(bound.relative, on_triangle))
+            assert share <= bound.share, f"{name}{part}: {share:.4%} beyond {bound.relative:g} ({bound.cause})"
+
+
+@pytest.mark.parametrize("combination", atlas.combinations(17))
+@pytest.mark.skipif(not CUDA, reason="needs a CUDA device")
+def test_cuda_agrees_with_cpu(combination):
+    with Rig("cpu", combination=combination) as cpu, Rig(CUDA[0], combination=combination) as other:
         for name in ("noise", "torn"):
             cpu.frame(FRAMES[name])
             other.frame(FRAMES[name])
-        for name, values in cpu.state().items():
-            # Shapes refer to meshes by numbers that belong to a device.
-            if values.size and "mesh" not in (values.dtype.names or ()):
-                other.arrays[name].assign(values)
-        expected, found = cpu.run(stage), other.run(stage)
-        seen = cpu.get("hit_object") >= 0 if "hit_object" in cpu.arrays else None
-        for name, values in expected.items():
-            for (part, a), (_, b) in zip(numbers(values), numbers(found[name]), strict=True):
-                if seen is not None and name in SEEN_ONLY:
-                    a, b = a[seen], b[seen]
-                # Where on its triangle a hit is, in shares of its edges: as coarse as the hit's point against them.
-                on_triangle = values["error"].max() / shortest_edge(cpu.pipeline.scene) if part == ".weights" else 0.0
-                share = differences(a, b, max(bound.relative, on_triangle))
-                assert share <= bound.share, f"{name}{part}: {share:.4%} beyond {bound.relative:g} ({bound.cause})"
-
-
-@pytest.mark.atlas(row=17)
-@pytest.mark.parametrize(("stage", "method"), STAGE_METHODS)
-@pytest.mark.skipif(not CUDA, reason="needs a CUDA device")
-def test_cuda_agrees_with_cpu(stage, method):
-    compare(stage, method, CUDA[0])
+        for stage, _ in cpu.pipeline._scheduler._stages:
+            compare(cpu, other, stage.name)
 
 
 @pytest.mark.atlas(row=17, stage="pipeline")

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.hard_cases.rig import ENVIRONMENT_HEIGHT, FILTERS, METHODS, SIZE, LoneStage, solid_angles
+from tests.hard_cases.rig import ENVIRONMENT_HEIGHT, FILTERS, METHODS, SIZE, LoneStage, methods, solid_angles
 from warp_ar.kernels.environment.lobes import lobe_count, lobe_offset, lobe_size
 from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, MIRROR, PHONG
 
@@ -179,7 +179,7 @@ def test_what_surrounds_a_white_object_is_white(furnace_for, name):
 
 
 @pytest.mark.atlas(row=18, stage="environment_shadow")
-@pytest.mark.parametrize("method", METHODS["environment_shadow"])
+@pytest.mark.parametrize("method", methods("environment_shadow"))
 def test_white_objects_give_back_the_light_that_they_take(furnace_for, method):
     """Black ones only take; white ones give it back but for what dies out between them and the desk."""
     black = furnace_for("environment_shadow", method, {**WHITE["lambert"], "base_color": 0.0}).run("environment_shadow")
@@ -192,7 +192,7 @@ def test_white_objects_give_back_the_light_that_they_take(furnace_for, method):
 
 
 @pytest.mark.atlas(row=18, stage="mirror_ball")
-@pytest.mark.parametrize("method", METHODS["mirror_ball"])
+@pytest.mark.parametrize("method", methods("mirror_ball"))
 @pytest.mark.parametrize("name", WHITE)
 def test_white_objects_in_a_white_ball_change_nothing(furnace_for, rig_for, method, name):
     """A perfect mirror among white objects: what it shows of them is what it showed of the environment behind them."""

@@ -13,18 +13,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.hard_cases import generators
-from tests.hard_cases.rig import METHODS, SIZE, assert_finite, look_at
+from tests.hard_cases.rig import METHODS, SIZE, assert_finite, cases, look_at, methods
 from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, MIRROR, PHONG
 
 FRAMES = generators.frames(SIZE[1], SIZE[0])
 LIGHTS = generators.lights()
 WHOLE = (0, SIZE[1], 0, SIZE[0])
-SHADING = [
-    (stage, method)
-    for stage in ("shade", "environment_shadow", "near_field", "mirror_ball")
-    for method in METHODS[stage]
-]
-LIT = [(stage, method) for stage in ("relight", "shade", "mirror_ball") for method in METHODS[stage]]
 # A change of what the camera saw.
 SIGNED = ("mirror_ball",)
 ENDS = (
@@ -87,7 +81,7 @@ def assert_light(outputs, cause):
 
 
 @pytest.mark.atlas(row=8)
-@pytest.mark.parametrize(("stage", "method"), SHADING)
+@pytest.mark.parametrize(("stage", "method"), cases("shade", "environment_shadow", "near_field", "mirror_ball"))
 @pytest.mark.parametrize("eye", [(0.02, -0.3, 0.35), (0.0, -0.5, 1e-4)], ids=["above", "grazing"])
 def test_materials_at_their_ends(rig_of, stage, method, eye):
     """Every end of every model, from above and along the desk, under lights from above and along the desk."""
@@ -118,7 +112,7 @@ def test_materials_anywhere_between(rig_of, method, shininess, roughness, metall
 
 
 @pytest.mark.atlas(row=9)
-@pytest.mark.parametrize(("stage", "method"), LIT)
+@pytest.mark.parametrize(("stage", "method"), cases("relight", "shade", "mirror_ball"))
 @pytest.mark.parametrize("name", LIGHTS)
 def test_lights_in_hard_places(rig_for, stage, method, name):
     rig = rig_for(stage, method)
@@ -133,7 +127,7 @@ def test_lights_in_hard_places(rig_for, stage, method, name):
 
 
 @pytest.mark.atlas(row=10, stage="relight")
-@pytest.mark.parametrize("method", METHODS["relight"])
+@pytest.mark.parametrize("method", methods("relight"))
 def test_the_blend_from_one_end_of_alpha_to_the_other(rig_for, method):
     """The key light turned from along the virtual one to against it: bounded, continuous, and the ends differ."""
     rig = rig_for("relight", method)
