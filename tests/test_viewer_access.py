@@ -76,6 +76,14 @@ TOPS = """() => [...document.querySelectorAll(".toolbar > *")].filter((e) => e.o
   .map((e) => { const box = e.getBoundingClientRect(); return box.top + box.height / 2; })"""
 
 
+NOTICE = """() => {
+  const text = "a_file_with_a_name_that_is_long_and_has_no_spaces.toml: foo: unknown key";
+  warpAr.connection.dispatchEvent(new CustomEvent("notice", { detail: { text, bad: true } }));
+}"""
+BEYOND = """() => [...document.querySelectorAll("aside :is(select, input, button)")].filter((e) => e.offsetParent
+  && e.getBoundingClientRect().right > innerWidth + 0.5).map((e) => e.outerHTML)"""
+
+
 def test_nothing_hinders_anybody(open_tab: Callable[..., Tab], artefacts: Path) -> None:
     """On a desktop, a phone, and a phone on its side."""
     for size in ((1280, 800), (390, 844), (844, 390)):
@@ -88,10 +96,16 @@ def look_over(tab: Tab, size: tuple[int, int], phone: bool, artefacts: Path) -> 
     page = tab.page
     if size == (390, 844):
         pinch_the_teapot(tab)
+    page.evaluate(NOTICE)
+    box = page.locator(".notice.bad").bounding_box()
+    assert min(box["x"], box["y"]) >= 0, "the notice is out of sight"
+    assert box["x"] + box["width"] <= size[0], "the notice is out of sight"
+    assert box["y"] + box["height"] <= size[1], "the notice is out of sight"
+    page.click(".notice.bad button", timeout=10_000)
     page.evaluate(axe_core())
+    page.evaluate("for (const one of document.querySelectorAll('aside .own')) one.open = true")
     for scheme in ("dark",) if phone else ("dark", "light"):  # colours are those of every size
         page.emulate_media(color_scheme=scheme)
-        assert page.evaluate("document.documentElement.scrollWidth") <= size[0], "wider than the screen"
         middles = page.evaluate(TOPS)
         assert max(middles) - min(middles) < 12, "the toolbar wraps"
         for name in ("scene", "quality", "light", "setup"):
@@ -99,6 +113,8 @@ def look_over(tab: Tab, size: tuple[int, int], phone: bool, artefacts: Path) -> 
             press(f"#tab-{name}")
             assert page.locator(f"#panel-{name}").is_visible()
             page.wait_for_timeout(300)
+            assert page.evaluate("document.documentElement.scrollWidth") <= size[0], "wider than the screen"
+            assert page.evaluate(BEYOND) == [], "wider than the panel"
             page.screenshot(path=artefacts / f"{size[0]}_{name}_{scheme}.png")
             assert findings(page) == [], (name, scheme)
             if phone:
