@@ -1,57 +1,152 @@
-"""Spread of the recovered light over draws of a camera's noise, on the open cases of ``../shared/truth``.
+"""Spread of recovered light and picture over what should not matter, on the open cases of ``../shared/truth``.
 
-    python -m bench stability [--seeds 16] [--quality high] [--noise 0.7]
+    python -m bench stability [--draws noise,dropped,rows,pose,tables] [--count 16] [--quality high]
 
-Each case is run once for each seed, its frames under Gaussian noise of so many codes. Per case one JSON line: relative
-error of the last frame's irradiance over all directions, its mean and the 10th and 90th percentile over seeds, percent;
-``spread`` is their difference.
+Each case is run once for each number below ``--count``, by each kind of draw:
+
+- ``noise``: its frames under Gaussian noise of so many codes;
+- ``dropped``: three frames of ten, drawn anew, do not come; the first and the last do;
+- ``rows``: the map has 64, 96, 128, 192 or 256 rows;
+- ``pose``: the camera's principal point is off by a pixel, each time to another side;
+- ``tables``: ten random tables, a picture each, under noise.
+
+Per case one JSON line: relative error of the last frame's irradiance over all directions, its mean and the 10th and
+90th percentile, percent; ``spread`` is their difference, ``picture`` that of the share of the last picture's error that
+is left, ``power`` that of all emitters' power over its mean.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
+import functools
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from bench.bench_camera_faults import TRUTH, irradiance
-from warp_ar import Pipeline
-from warp_ar.scene import load_scene
+from bench.bench_camera_faults import TRUTH, flip, irradiance
+from bench.random_tables import make_setup
+from bench.truth_score import read_image
+from warp_ar import PRESETS, Pipeline, Pose
+from warp_ar.scene import load_scene, loads_scene
 from warp_ar.sources.sources import open_source
 
+KINDS = ("noise", "dropped", "rows", "pose", "tables")
+ROWS = (64, 96, 128, 192, 256)
+TABLES = 10
+DROPPED = 0.3
+"""Share of frames that do not come."""
 
-def light_error(case: Path, seed: int, noise: float, quality: str, device: str) -> float:
-    """Return the relative error of the irradiance after all frames of a case, under one draw of noise."""
-    scene, rng = load_scene(case / "scene_object.toml"), np.random.default_rng(seed)
+Measures = tuple[float, float, float]
+"""Relative error of irradiance; share of the picture's error that is left; power of all emitters."""
+
+
+def noisy(image: NDArray[np.uint8], rng: np.random.Generator, noise: float) -> NDArray[np.uint8]:
+    """A picture under noise of so many codes."""
+    return np.clip(np.round(image + rng.normal(0.0, noise, image.shape)), 0, 255).astype(np.uint8)
+
+
+def light_error(environment: object, truth: object) -> float:
+    """Return the relative error of the irradiance over all directions."""
+    light, true = irradiance(environment), irradiance(truth)
+    return float(np.linalg.norm(light - true) / np.linalg.norm(true))
+
+
+def emitted(pipeline: Pipeline) -> float:
+    """Return the power of all emitters that were found."""
+    return float(sum(np.mean(one["power"]) for one in pipeline.arrays["recover_status"]().get("emitters", ())))
+
+
+def left_of(case: Path, name: str, picture: NDArray[np.uint8]) -> float:
+    """Return the share of a picture's error that is left where the virtual object changes it."""
+    camera, truth = (read_image(case / folder / name) for folder in ("camera", "object"))
+    assert camera is not None
+    assert truth is not None
+    differs = cv2.GaussianBlur(np.abs(truth.astype(float) - camera).max(-1), (0, 0), 3) > 5
+    changed = cv2.dilate(differs.astype(np.uint8), np.ones((9, 9))) > 0
+    return float(flip(truth, picture)[changed].mean() / flip(truth, camera)[changed].mean())
+
+
+def measure_case(case: Path, kind: str, number: int, given: argparse.Namespace, device: str) -> Measures:
+    """Run a case once and measure its last frame."""
+    scene, rng = load_scene(case / "scene_object.toml"), np.random.default_rng(number)
+    quality, camera = PRESETS[given.quality], scene.camera
+    if kind == "rows":
+        quality = dataclasses.replace(quality, environment_height=ROWS[number])
+    if kind == "pose":
+        angle = 2.0 * np.pi * number / given.count
+        moved = dataclasses.replace(camera, cx=camera.cx + float(np.cos(angle)), cy=camera.cy + float(np.sin(angle)))
+        scene = dataclasses.replace(scene, camera=moved)
     assert scene.source is not None
+    assert scene.source.path is not None
+    outputs = ("image", "environment")
     with (
         open_source(scene.source.path) as source,
-        Pipeline(scene, device=device, quality=quality, outputs=("environment",)) as pipeline,
+        Pipeline(scene, device=device, quality=quality, outputs=outputs) as pipeline,
     ):
-        for frame in source:
-            noisy = np.round(frame.image + rng.normal(0.0, noise, frame.image.shape))
-            result = pipeline(np.clip(noisy, 0, 255).astype(np.uint8), time_seconds=frame.time)
-        light = irradiance(result.environment)
-    truth = irradiance(np.load(sorted((case / "env").glob("*.npy"))[-1]))
-    return float(np.linalg.norm(light - truth) / np.linalg.norm(truth))
+        frames = list(source)
+        for index, frame in enumerate(frames):
+            if kind == "dropped" and 0 < index < len(frames) - 1 and rng.random() < DROPPED:
+                continue
+            image = noisy(frame.image, rng, given.noise) if kind == "noise" else frame.image
+            result = pipeline(image, time_seconds=frame.time)
+        power = emitted(pipeline)
+    truth = np.load(sorted((case / "env").glob("*.npy"))[-1])
+    name = sorted(path.name for path in (case / "object").glob("*.png"))[-1]
+    return light_error(result.environment, truth), left_of(case, name, result.image), power
+
+
+def measure_table(table: int, number: int, given: argparse.Namespace, device: str) -> Measures:
+    """Run a random table once; there is no picture to compare with."""
+    setup = make_setup(table)
+    with Pipeline(
+        loads_scene(setup.scene), device=device, quality=PRESETS[given.quality], outputs=("environment",)
+    ) as pipeline:
+        image = noisy(setup.image, np.random.default_rng(number), given.noise)
+        result = pipeline(image, time_seconds=0.0, pose=Pose(setup.rotation, setup.translation))
+        return light_error(result.environment, setup.truth), np.nan, emitted(pipeline)
+
+
+def spread_of(values: NDArray[np.float64]) -> float:
+    """Return the 90th less the 10th percentile."""
+    low, high = np.quantile(values, (0.1, 0.9))
+    return float(high - low)
+
+
+def summarise(draws: Sequence[Measures]) -> dict[str, float]:
+    """Figures over all draws of a case, percent; what was not measured is left out."""
+    light, picture, power = 100.0 * np.array(draws).T
+    low, high = np.quantile(light, (0.1, 0.9))
+    figures = {"mean": light.mean(), "p10": low, "p90": high, "spread": spread_of(light), "picture": spread_of(picture)}
+    figures["power"] = 100.0 * spread_of(power) / max(float(power.mean()), 1e-9)
+    return {key: round(float(value), 2) for key, value in figures.items() if np.isfinite(value)}
 
 
 def main(device: str, arguments: Sequence[str] = ()) -> None:
-    """Run all cases and print a line for each, and one for their mean."""
+    """Run all cases and print a line for each, and one for the mean of each kind of draw."""
     parser = argparse.ArgumentParser(prog="python -m bench stability")
-    parser.add_argument("--seeds", type=int, default=16)
-    parser.add_argument("--quality", default="high")
+    parser.add_argument("--draws", default=",".join(KINDS))
+    parser.add_argument("--count", type=int, default=16, help="draws of each kind (default: %(default)s)")
+    parser.add_argument("--quality", default="high", choices=PRESETS)
+    parser.add_argument("--cases", help="names of some cases, with commas (default: all)")
     parser.add_argument("--noise", type=float, default=0.7, help="standard deviation in codes")
     given = parser.parse_args(arguments)
-    spreads = []
-    for case in sorted(path.parent for path in TRUTH.glob("*/case.json")):
-        errors = [light_error(case, seed, given.noise, given.quality, device) for seed in range(given.seeds)]
-        low, high = 100.0 * np.quantile(errors, (0.1, 0.9))
-        spreads.append(high - low)
-        line = {"case": case.name, "mean": 100.0 * np.mean(errors), "p10": low, "p90": high, "spread": high - low}
-        print(
-            json.dumps({key: one if isinstance(one, str) else round(one, 2) for key, one in line.items()}), flush=True
-        )
-    print(json.dumps({"case": "all", "spread": round(float(np.mean(spreads)), 2), "seeds": given.seeds}))
+    every = sorted(path.parent for path in TRUTH.glob("*/case.json"))
+    cases = [case for case in every if given.cases is None or case.name in given.cases.split(",")]
+    for kind in given.draws.split(","):
+        run: dict[str, Callable[[int], Measures]]
+        if kind == "tables":
+            run = {f"table {k}": functools.partial(measure_table, k, given=given, device=device) for k in range(TABLES)}
+        else:
+            run = {case.name: functools.partial(measure_case, case, kind, given=given, device=device) for case in cases}
+        numbers, spreads = range(len(ROWS) if kind == "rows" else given.count), []
+        for name, measure in run.items():
+            figures = summarise([measure(number) for number in numbers])
+            spreads.append(figures["spread"])
+            print(json.dumps({"draws": kind, "case": name, **figures}), flush=True)
+        worst = {"spread": round(float(np.mean(spreads)), 2), "largest": max(spreads)}
+        print(json.dumps({"draws": kind, "case": "all", **worst, "count": len(numbers)}), flush=True)
