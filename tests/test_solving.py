@@ -58,11 +58,17 @@ def wait_until_ready(process):
 
 
 @pytest.fixture(scope="module")
-def process():
+def shared():
     with contextlib.closing(SolvingProcess()) as found:
-        found.prepare()
-        wait_until_ready(found)
         yield found
+
+
+@pytest.fixture
+def process(shared):
+    """The process of this file, started again where a test ended it."""
+    shared.prepare()
+    wait_until_ready(shared)
+    return shared
 
 
 def test_process_solves_traces_by_the_caller_and_learns(process):

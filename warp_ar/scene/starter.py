@@ -11,6 +11,7 @@ from typing import Any
 
 import tomlkit
 from tomlkit.exceptions import TOMLKitError
+from tomlkit.items import Comment, Whitespace
 
 from warp_ar.errors import SceneError, SinkError, reason
 from warp_ar.files import read_text, write_whole
@@ -162,7 +163,9 @@ def _append(table: Any, key: str, value: Any) -> None:
     body = table.value.body
     follows: list[Any] = []
     while body and body[-1][0] is None:
-        follows.insert(0, body.pop()[1])
+        item = body.pop()[1]
+        if isinstance(item, (Comment, Whitespace)):  # tomlkit leaves a null where a key was
+            follows.insert(0, item)
     if isinstance(value, Mapping):
         given, value = value, tomlkit.inline_table()
         value.update(given)
