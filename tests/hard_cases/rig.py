@@ -331,7 +331,8 @@ class Rig:
         return {name: self.get(name) for name, array in self.arrays.items() if isinstance(array, wp.array)}
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
-        """Put back what ``state`` returned."""
+        """Put back what ``state`` returned, with nothing before the ball."""
+        self.pipeline.inputs.covered = False
         for name, values in state.items():
             if values.size:
                 self.arrays[name].assign(values)
