@@ -244,7 +244,7 @@ def test_a_scene_is_found_by_name_and_path(tmp_path: pathlib.Path) -> None:
 
 
 def test_what_is_no_scene_is_told() -> None:
-    with pytest.raises(UsageError, match="scene is int; expected a Scene, a scene file, or a bundled name"):
+    with pytest.raises(UsageError, match="scene = 7: expected Scene or text or a path"):
         Pipeline(7, device="cpu")
     with pytest.raises(SceneError, match="nosuch"):
         Pipeline("nosuch", device="cpu")

@@ -32,6 +32,7 @@ PUBLIC = {
         "SourceError",
         "TrackState",
         "Tracker",
+        "UpdateError",
         "UsageError",
         "WarpArError",
         "bundled_scenes",

@@ -13,6 +13,7 @@ from tests.test_pipeline import SPARED, Frames, frames, make_scene, run
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SceneError, UsageError
 from warp_ar.scene import AreaLight, LambertMaterial, MirrorMaterial, Object, Scene, dumps_scene, loads_scene
+from warp_ar.stages.quality import PRESETS
 
 pytestmark = pytest.mark.slow
 __all__ = ["frames"]  # a fixture
@@ -131,17 +132,24 @@ def test_an_edit_that_cannot_be_changes_nothing(edit, error, told, frames: Frame
 @pytest.mark.parametrize(
     ("given", "told"),
     [
-        ({"quality": ["low"]}, "is no preset"),
+        ({"quality": "lwo"}, "is no preset; did you mean low"),
+        ({"quality": PRESETS["low"].with_methods(recover="shadnig")}, 'did you mean "shading"'),
         ({"outputs": None}, "outputs = None: expected a tuple"),
         ({"exposures": 0.1}, "exposures = 0.1: expected a tuple"),
-        ({"size": "640x480"}, "size = '640x480': expected 2 whole numbers above 0"),
-        ({"size": (320.0, 240.0)}, "expected 2 whole numbers"),
-        ({"bands": -1}, "bands = -1: expected a whole number above 0"),
-        ({"shown": "x"}, "shown = 'x': expected a finite number of seconds"),
-        ({"scene": make_scene(objects=(3,))}, "scene.objects holds int; expected Object"),
-        ({"scene": make_scene(objects=BALL)}, "scene.objects is Object; expected a tuple of Object"),
-        ({"scene": dataclasses.replace(make_scene(), camera=None)}, "scene.camera holds NoneType; expected Camera"),
-        ({"scene": dataclasses.replace(make_scene(), proxies=(BALL,))}, "scene.proxies holds Object; expected Proxy"),
+        ({"size": "640x480"}, "size = '640x480': expected a tuple of 2 times a whole number or None"),
+        ({"size": (320, 0)}, "expected whole numbers above 0"),
+        ({"bands": -1}, "bands = -1: expected whole numbers above 0"),
+        ({"shown": "x"}, "shown = 'x': expected a finite number"),
+        ({"scene": make_scene(objects=(3,))}, "Scene: objects = .3,.: expected a tuple of any number of times Object"),
+        (
+            {"scene": make_scene(objects=BALL)},
+            "Scene: objects = Object.*: expected a tuple of any number of times Object",
+        ),
+        ({"scene": dataclasses.replace(make_scene(), camera=None)}, "Scene: camera = None: expected Camera"),
+        (
+            {"scene": dataclasses.replace(make_scene(), proxies=(BALL,))},
+            "Scene: proxies = .*: expected a tuple of any number of times Proxy",
+        ),
     ],
 )
 def test_a_pipeline_names_what_it_cannot_take(given, told) -> None:

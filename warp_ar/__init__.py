@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from warp_ar.engine.graph import Plan, make_plan
     from warp_ar.engine.pipeline import Pipeline, Result
     from warp_ar.engine.switcher import PipelineSwitcher
-    from warp_ar.errors import SceneError, SinkError, SourceError, UsageError, WarpArError
+    from warp_ar.errors import SceneError, SinkError, SourceError, UpdateError, UsageError, WarpArError
     from warp_ar.light.captured import Light
     from warp_ar.output.environment_file import read_environment, write_environment
     from warp_ar.output.sinks import open_sink
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from warp_ar.tracking.tracking import Tracker, TrackState
 
 _HOMES = {
-    "errors": ("SceneError", "SinkError", "SourceError", "UsageError", "WarpArError"),
+    "errors": ("SceneError", "SinkError", "SourceError", "UpdateError", "UsageError", "WarpArError"),
     "engine.graph": ("Plan", "make_plan"),
     "engine.pipeline": ("Pipeline", "Result"),
     "engine.switcher": ("PipelineSwitcher",),
@@ -65,6 +65,7 @@ __all__ = [
     "SourceError",
     "TrackState",
     "Tracker",
+    "UpdateError",
     "UsageError",
     "WarpArError",
     "bundled_scenes",

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from warp_ar.ball.ball_finder import BallOutline, exact_outline, far_camera, find_ball, sphere_of_circle
 from warp_ar.calibration.response import write_response
 from warp_ar.checks.check_ball import DULL, disc_contrast
+from warp_ar.declared import checked
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import UsageError
 from warp_ar.kernels.color import decode_table
@@ -80,6 +81,7 @@ class Capture:
     """Linear value of each code, (256, 3), where it was estimated from the bracket."""
 
 
+@checked
 def capture_light(
     paths: Sequence[str | Path],
     *,

@@ -16,6 +16,7 @@ from warp_ar.accuracy.budget import AutoPipeline
 from warp_ar.ball.ball import BallFit, posed_frames, refine_balls
 from warp_ar.cache_folder import cache_folder
 from warp_ar.closing import Closing
+from warp_ar.declared import checked
 from warp_ar.engine.modules import Progress
 from warp_ar.engine.pipeline import Pipeline, Result
 from warp_ar.errors import UsageError, WarpArError
@@ -121,6 +122,7 @@ class Session(Closing):
     notes: tuple[str, ...] = ()
     """Exposures that are not merged, frames without a pose, upright of a marker: a line each."""
 
+    @checked
     def __init__(
         self,
         scene: Scene | str | Path = "desk",

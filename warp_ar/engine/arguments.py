@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import math
-import numbers
 import os
 import pathlib
-import typing
-from collections.abc import Collection, Sequence
-from typing import Any, Final
+from collections.abc import Sequence
 
-import numpy as np
-
+from warp_ar.declared import check_fields, fits
 from warp_ar.engine.layers import check_outputs, expand_outputs
 from warp_ar.errors import UsageError
-from warp_ar.scene import Camera, CapturedLight, Exposure, Light, Marker, Object, Probe, Proxy, Scene, load_scene
-from warp_ar.stages.request import Estimates
+from warp_ar.scene import Scene, load_scene
+from warp_ar.scene.messages import nearest
+from warp_ar.stages import STAGES
+from warp_ar.stages.features import AREA_SAMPLES
+from warp_ar.stages.quality import Quality
 
 
 def check_number(name: str, value: object, above: float = -math.inf) -> None:
@@ -24,73 +23,46 @@ def check_number(name: str, value: object, above: float = -math.inf) -> None:
     Raises:
         UsageError: It is no finite number, or not above the bound.
     """
-    if isinstance(value, bool) or not isinstance(value, numbers.Real) or not math.isfinite(value) or value <= above:
+    if not fits(value, float) or value <= above:  # type: ignore[operator]
         right = "a finite number of seconds" if above == -math.inf else f"a finite number of seconds above {above:g}"
         raise UsageError(f"{name} = {value!r}: expected {right}")
 
 
-def check_estimates(estimates: object) -> None:
-    """Check an argument that says how to wait for light that is estimated.
-
-    Raises:
-        UsageError: There is no such way.
-    """
-    ways = typing.get_args(Estimates)
-    if estimates not in ways:
-        raise UsageError(f"estimates = {estimates!r}: expected {', '.join(map(repr, ways))}")
-
-
-_ONE: Final[dict[str, Any]] = {
-    "camera": Camera,
-    "marker": Marker,
-    "exposure": Exposure,
-    "captured": CapturedLight | None,
-}
-_SEVERAL: Final[dict[str, Any]] = {"objects": Object, "lights": Light, "proxies": Proxy, "probes": Probe}
-
-
-def check_scene(scene: Any) -> None:
+def check_scene(scene: object) -> None:
     """Check a scene that a program may have made.
 
     Raises:
         UsageError: It is no scene, or a part of it is something else.
     """
     if not isinstance(scene, Scene):
-        raise UsageError(f"scene is {type(scene).__name__}; expected a Scene, a scene file, or a bundled name")
-    for name, kind in (_ONE | _SEVERAL).items():
-        value = getattr(scene, name)
-        if name in _SEVERAL and not isinstance(value, tuple | list):
-            raise UsageError(f"scene.{name} is {type(value).__name__}; expected a tuple of {kind.__name__}")
-        for item in value if name in _SEVERAL else (value,):
-            if not isinstance(item, kind):
-                right = getattr(kind, "__name__", str(kind))
-                raise UsageError(f"scene.{name} holds {type(item).__name__}; expected {right}")
+        raise UsageError(f"scene is {type(scene).__name__}; expected a Scene, such as load_scene returns")
+    check_fields(scene)
 
 
-def read_scene(scene: object) -> Scene:
+def read_scene(scene: Scene | str | os.PathLike[str]) -> Scene:
     """Return the scene that was given, checked.
 
     Raises:
         SceneError: It cannot be read.
-        UsageError: It is none, or a part of it is something else.
+        UsageError: A part of it is something else.
     """
-    if isinstance(scene, str | os.PathLike):
-        scene = load_scene(scene if isinstance(scene, str) else pathlib.Path(scene))
-    check_scene(scene)
-    return typing.cast(Scene, scene)
+    read = scene if isinstance(scene, Scene) else load_scene(scene if isinstance(scene, str) else pathlib.Path(scene))
+    check_fields(read)
+    return read
 
 
-def check_counts(name: str, value: object, count: int) -> None:
-    """Check an argument that is one whole number above 0, or several; None passes.
+def check_methods(quality: Quality) -> None:
+    """Check the methods of a quality of one's own.
 
     Raises:
-        UsageError: It is not.
+        UsageError: There is no such stage or method.
     """
-    values = value if isinstance(value, tuple | list) and count > 1 else (value,)
-    whole = all(isinstance(one, int | np.integer) and not isinstance(one, bool) and one > 0 for one in values)
-    if value is not None and not (whole and len(values) == count):
-        right = "a whole number above 0" if count == 1 else f"{count} whole numbers above 0"
-        raise UsageError(f"{name} = {value!r}: expected {right}")
+    shared = {"area_light": tuple(AREA_SAMPLES), "light_shadow": ("hard", "soft")}
+    known = {stage.name: ("default", *stage.methods) for stage in STAGES} | shared
+    for stage, method in quality.methods:
+        if method not in known.get(stage, ()):
+            right = nearest(method, known[stage]) if stage in known else f"no such stage; {nearest(stage, known)}"
+            raise UsageError(f"quality: methods: {stage!r} by {method!r}: {right}")
 
 
 def check_frames(exposures: Sequence[float], outputs: tuple[str, ...], linear: bool) -> tuple[str, ...]:
@@ -99,9 +71,6 @@ def check_frames(exposures: Sequence[float], outputs: tuple[str, ...], linear: b
     Raises:
         UsageError: An exposure is none, an output is unknown, or frames of several exposures are linear.
     """
-    for name, value in (("exposures", exposures), ("outputs", outputs)):
-        if isinstance(value, str) or not isinstance(value, Collection):
-            raise UsageError(f"{name} = {value!r}: expected a tuple")
     for exposure in exposures:
         check_number("exposures", exposure, above=0.0)
     check_outputs(outputs)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 
+from warp_ar.declared import checked
 from warp_ar.stages import STAGES
 from warp_ar.stages.base import LeftOut, Stage, Wiring
 from warp_ar.stages.features import Features, find_features
@@ -38,6 +39,7 @@ class Plan:
         return name in self.inputs
 
 
+@checked
 def make_plan(request: Request) -> Plan:
     """Wire in the stages that the request calls for, then walk back from the outputs and drop what nothing consumes.
 

@@ -21,8 +21,9 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_ar.closing import Closing
+from warp_ar.declared import checked
 from warp_ar.device import exclusive, resolve_device, translating
-from warp_ar.engine.arguments import check_counts, check_estimates, check_frames, check_number, check_scene, read_scene
+from warp_ar.engine.arguments import check_frames, check_methods, check_number, check_scene, read_scene
 from warp_ar.engine.environment_history import CarriedLight
 from warp_ar.engine.frame_exchange import Borrowed, adopt_frame
 from warp_ar.engine.frame_inputs import FrameInputs, SeenFrame
@@ -62,9 +63,10 @@ def resolve_quality(quality: str | Quality) -> Quality:
     """Quality value for a preset's name.
 
     Raises:
-        UsageError: No preset has that name.
+        UsageError: No preset has that name, or a value of one's own names a method that is none.
     """
     if isinstance(quality, Quality):
+        check_methods(quality)
         return quality
     if not isinstance(quality, str) or quality not in PRESETS:
         close = difflib.get_close_matches(str(quality), PRESETS, 1)
@@ -104,6 +106,7 @@ class Pipeline(Closing):
     bracket: BracketPlan
     """Exposures that are merged, and the one that is shown."""
 
+    @checked
     def __init__(
         self,
         scene: Scene | str | os.PathLike[str],
@@ -154,12 +157,12 @@ class Pipeline(Closing):
             SceneError: The scene cannot be used, one of its numbers is not finite, or its camera does not fit ``size``.
         """
         scene = read_scene(scene)
-        check_estimates(estimates)
         outputs = check_frames(exposures, outputs, linear)
         if shown is not None:
             check_number("shown", shown, above=0.0)
-        check_counts("size", size, 2)
-        check_counts("bands", bands, 1)
+        for name, numbers in (("size", size), ("bands", bands)):
+            if numbers is not None and np.min(numbers) < 1:
+                raise UsageError(f"{name} = {numbers!r}: expected whole numbers above 0")
         self._closed, self._process = False, os.getpid()
         self._turn = threading.RLock()
         self.device, self.quality = resolve_device(device), resolve_quality(quality)
@@ -522,8 +525,6 @@ class Pipeline(Closing):
         pose = given.pose if isinstance(given, Track) else given
         if pose is not None and not isinstance(pose, Pose):
             raise UsageError(f"pose is {type(pose).__name__}; expected a Pose(R, t), camera_from_world, or a Track")
-        if pose is not None and not (np.isfinite(pose.rotation).all() and np.isfinite(pose.translation).all()):
-            raise UsageError("pose holds a number that is not finite; expected a rotation and a translation")
         plate, image = self._take_depth(image)
         picture = adopt_frame(image, self.size, self.device)
         result = self._light_frame(picture, time_seconds, given, exposure_time, ahead=ahead, plate=plate)

@@ -12,9 +12,10 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeAlias
 
+from warp_ar.declared import check_fields, checked
 from warp_ar.device import exclusive, release_memory
 from warp_ar.engine.pipeline import Pipeline, cannot_run
-from warp_ar.errors import UpdateError, WarpArError
+from warp_ar.errors import UpdateError, UsageError, WarpArError
 from warp_ar.scene import Scene
 from warp_ar.sources.exposures import plan_bracket
 from warp_ar.stages.quality import Quality
@@ -42,10 +43,15 @@ class Target:
     shown: float | None = None
     """That of the frames that are shown; None means the longest."""
 
+    def __post_init__(self) -> None:
+        """Check the types of all values."""
+        check_fields(self)
+
 
 class PipelineSwitcher:
     """Holds the pipeline that lights the next frame. One thread calls it; another builds."""
 
+    @checked
     def __init__(self, *, builder: ThreadPoolExecutor | None = None, keep: int = 0, **arguments: Any) -> None:
         """Start without a pipeline.
 
@@ -53,7 +59,12 @@ class PipelineSwitcher:
             builder: Thread that builds; None makes one that ends with the switcher.
             keep: Pipelines that have lit frames and are kept for coming back to them.
             **arguments: For every ``Pipeline``: ``device``, ``bands``, ``estimates``.
+
+        Raises:
+            UsageError: ``keep`` is below 0, or an argument of another type.
         """
+        if keep < 0:
+            raise UsageError(f"keep = {keep}: expected a number of pipelines, 0 or more")
         self._own_builder = ThreadPoolExecutor(1, "warp-ar-build") if builder is None else None
         self._builder = builder or self._own_builder
         # On CUDA only a pipeline that profiles knows what each stage takes.
@@ -75,6 +86,7 @@ class PipelineSwitcher:
         """Return whether a pipeline is being built."""
         return self._building is not None
 
+    @checked
     def want(self, target: Target, prepare: Prepare = Pipeline.warm_up) -> bool:
         """Say what the next frames shall be lit by; the same target again changes nothing.
 

@@ -23,7 +23,8 @@ import numpy as np
 import OpenEXR
 from numpy.typing import NDArray
 
-from warp_ar.errors import SceneError, SinkError, reason
+from warp_ar.declared import check_fields, checked
+from warp_ar.errors import SceneError, SinkError, UsageError, reason
 from warp_ar.exr_file import read_exr_header, read_linear_picture, write_exr
 from warp_ar.files import parse_json, write_whole
 from warp_ar.light.latlong_axes import DESCRIPTIONS, axes_of, from_axes, to_axes, world_from_marker
@@ -76,6 +77,25 @@ class Light:
     lower_bound: float = 0.0
     """Share of the light that is a lower bound, 0 to 1."""
 
+    def __post_init__(self) -> None:
+        """Check all values.
+
+        Raises:
+            UsageError: A map has another shape or holds a number that is not finite, or a number is out of its range.
+        """
+        check_fields(self)
+        for name, components in (("radiance", (3,)), ("confidence", ())):
+            values = getattr(self, name)
+            if values.shape != (len(values), 2 * len(values), *components) or len(values) < 2:
+                right = "expected (height, 2 height, 3)" if components else "expected (height, 2 height)"
+                raise UsageError(f"Light: {name} has the shape {values.shape}; {right}")
+            if values.dtype.kind != "f" or not np.isfinite(values).all():
+                raise UsageError(f"Light: {name} of {values.dtype}: expected finite floats")
+        for name, most in (("white_level", math.inf), ("exposure", math.inf), ("lower_bound", 1.0 + 1e-6)):
+            if not 0.0 <= (getattr(self, name) or 0.0) <= most:
+                raise UsageError(f"Light: {name} = {getattr(self, name)}: expected a number from 0 to {most:g}")
+
+    @checked
     def save(self, path: str | Path, axes: str = "z-up") -> None:
         """Write the light as OpenEXR.
 
@@ -105,10 +125,11 @@ class Light:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             write_whole(path, lambda part: write_exr(part, OpenEXR.File(header, channels)))
-        except (RuntimeError, OSError) as error:
+        except (RuntimeError, OSError, ValueError) as error:
             raise SinkError(f"{path} cannot be written: {reason(error)}") from error
 
     @classmethod
+    @checked
     def load(cls, path: str | Path, axes: str | None = None) -> Light:
         """Read a captured light, or any latlong OpenEXR or Radiance HDR.
 
@@ -138,7 +159,7 @@ class Light:
             emitters,
             _attribute(path, header, "whiteLevel", 1.0),
             _attribute(path, header, "exposure", 0.0) or None,
-            _attribute(path, header, "lowerBound", 0.0),
+            min(_attribute(path, header, "lowerBound", 0.0), 1.0),
         )
 
     def resampled(self, height: int, rotation: Array | None = None) -> Map:

@@ -22,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 import OpenEXR
 
+from warp_ar.declared import checked
 from warp_ar.errors import SinkError, UsageError, reason
 from warp_ar.exr_file import exr_header, read_exr_header, read_linear_picture, write_exr
 from warp_ar.files import store
@@ -98,6 +99,7 @@ class EnvironmentInfo:
         return known
 
 
+@checked
 def write_environment(
     path: str | pathlib.Path,
     radiance: npt.NDArray[np.float32],
@@ -165,6 +167,7 @@ def write_environment(
     store(path, data)
 
 
+@checked
 def read_environment(path: str | pathlib.Path, *, axes: str | None = None) -> npt.NDArray[np.float32]:
     """Read a latlong OpenEXR or Radiance HDR as float32 (height, width, 3), in this program's axes and primaries.
 

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 import OpenEXR
 
+from warp_ar.declared import checked
 from warp_ar.errors import SinkError, UsageError, reason
 from warp_ar.exr_file import LARGEST, exr_header, store_exr
 from warp_ar.files import kind_of, store
@@ -144,6 +145,7 @@ class EnvironmentSink(FolderSink):
         write_environment(self._path / f"{index:04d}.exr", image, overwrite=True)
 
 
+@checked
 def open_sink(
     path: str | pathlib.Path,
     *,

@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from warp_ar.declared import show
 from warp_ar.errors import UsageError
 
 Array = NDArray[np.float64]
@@ -25,10 +26,10 @@ class Pose:
     """Translation t, float64 (3,), metres."""
 
     def __post_init__(self) -> None:
-        """Check the shapes.
+        """Check the shapes and numbers.
 
         Raises:
-            UsageError: The rotation is not (3, 3) or no rotation, or the translation not (3,).
+            UsageError: The rotation is not (3, 3) or no rotation, the translation not (3,), or a number is not finite.
         """
         for name, value, shape in (("rotation", self.rotation, (3, 3)), ("translation", self.translation, (3,))):
             array = np.asarray(value)
@@ -36,10 +37,12 @@ class Pose:
                 given = f"has the shape {np.shape(value)}" if hasattr(value, "shape") else f"is {type(value).__name__}"
                 right = f"expected an array {shape}, such as M[:3, :3] and M[:3, 3] of a 4x4 matrix M"
                 raise UsageError(f"Pose: {name} {given}; {right}")
+            if not np.isfinite(array).all():
+                raise UsageError(f"Pose: {name} {show(array.tolist())}: expected finite numbers")
             object.__setattr__(self, name, array.astype(np.float64))
         turned = self.rotation
         off = np.abs(turned.T @ turned - np.eye(3)).max()
-        if np.isfinite(turned).all() and (off > _NOT_A_ROTATION or np.linalg.det(turned) < 0.0):
+        if off > _NOT_A_ROTATION or np.linalg.det(turned) < 0.0:
             right = "expected a rotation matrix: orthonormal rows, no scale, no mirror image"
             raise UsageError(f"Pose: rotation {np.round(turned, 4).tolist()}: {right}")
 

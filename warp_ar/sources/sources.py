@@ -13,6 +13,7 @@ import os
 import pathlib
 from collections.abc import Sequence
 
+from warp_ar.declared import checked
 from warp_ar.errors import SourceError, UsageError
 from warp_ar.pictures import foreign_words
 from warp_ar.scene import Scene
@@ -42,6 +43,7 @@ MOST_INDEX = 1023
 """Largest index of a capture device."""
 
 
+@checked
 def open_source(
     spec: str | int | pathlib.Path, *, fps: float | None = None, loop: bool = False, exposures: Sequence[float] = ()
 ) -> Source:

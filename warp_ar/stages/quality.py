@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from types import MappingProxyType
+
+from warp_ar.declared import check_fields
+from warp_ar.errors import UsageError
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,6 +23,18 @@ class Quality:
     """Rows of the latlong environment; it has twice as many columns."""
     edge_samples: int
     """Samples per pixel along the edges of virtual objects; a square number."""
+
+    def __post_init__(self) -> None:
+        """Check all values.
+
+        Raises:
+            UsageError: A value is of another type, or a size cannot be. Names of methods are checked by a pipeline.
+        """
+        check_fields(self)
+        if not 4 <= self.environment_height <= 4096:
+            raise UsageError(f"Quality: environment_height = {self.environment_height}: expected 4 to 4096 rows")
+        if not 1 <= self.edge_samples <= 4096 or math.isqrt(self.edge_samples) ** 2 != self.edge_samples:
+            raise UsageError(f"Quality: edge_samples = {self.edge_samples}: expected a square number, such as 4")
 
     def method(self, stage: str) -> str:
         """Method of ``stage``; a stage that is not named has its only method, ``default``."""

@@ -40,6 +40,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from warp_ar.declared import checked
 from warp_ar.errors import UsageError
 from warp_ar.scene import Camera, Light, Marker, Object, Pose, Probe, Proxy, Scene
 from warp_ar.scene.description import PoseSpec
@@ -167,10 +168,13 @@ class Tracker:
             about the measurement's own uncertainty: a still marker stands still, a moving one does not lag.
 
     Raises:
-        UsageError: if the marker does not exist.
+        UsageError: if the marker does not exist, an argument is of another type, or ``hold`` below 0.
     """
 
+    @checked
     def __init__(self, marker: Marker, camera: Camera, *, hold: float = 0.2, steady: bool = True) -> None:
+        if hold < 0.0:
+            raise UsageError(f"hold = {hold}: expected seconds, 0 or more")
         self._pattern = pattern_of(marker)
         self._detector = MarkerDetector(marker.dictionary)
         self._shape = (camera.height, camera.width)
