@@ -1,15 +1,15 @@
 """Consistent light for augmented reality, in NVIDIA Warp kernels.
 
-A mirror ball beside a printed marker captures the environment; that light shades virtual objects, and virtual lights
-fall on the real desk. ``Session`` opens a scene and lights its frames; ``Pipeline`` lights frames of one's own; the
-launchers of single steps are in ``warp_ar.kernels``. Importing this package does not initialise Warp.
+A mirror ball beside a printed marker captures the environment. Its light shades virtual objects, and virtual lights
+fall on the real desk. ``Session`` opens a scene and lights its frames; ``Pipeline`` lights frames that the caller
+provides; ``warp_ar.kernels`` has the launchers of single steps. Importing this package does not initialise Warp.
 """
 
 from __future__ import annotations
 
 import importlib
 
-TYPE_CHECKING = False  # typing's would have to be loaded, and until then no command handles signals
+TYPE_CHECKING = False  # importing typing for it takes time, during which no command handles signals
 if TYPE_CHECKING:
     from typing import Any
 
@@ -81,7 +81,7 @@ __all__ = [
 
 
 class _Help:
-    """Docstring of a dataclass together with those of its fields, put together when somebody asks for it."""
+    """Docstring of a dataclass followed by the docstrings of its fields, composed when it is read."""
 
     def __init__(self, text: str) -> None:
         self.text = text
@@ -94,7 +94,7 @@ class _Help:
 
 
 def __getattr__(name: str) -> Any:
-    """Import what is asked for only when it is: a scene can be read without loading OpenCV's or Warp's libraries.
+    """Import a public name at its first use, so that a scene can be read without loading OpenCV or Warp.
 
     Raises:
         AttributeError: There is no such name.

@@ -1,4 +1,4 @@
-"""``python -m warp_ar``: all commands, and ``python -m warp_ar COMMAND ...`` as another way to run one."""
+"""``python -m warp_ar`` lists all commands; ``python -m warp_ar COMMAND ...`` runs one."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ COMMANDS = {
     "paper": "the paper's figures",
     "reference": "a path-traced picture that methods are judged by",
 }
-"""Every command with what it is for."""
+"""Names of the commands, each with its purpose."""
 
 
 def _run(arguments: Sequence[str]) -> int:

@@ -1,7 +1,8 @@
-"""Start of ``python -m warp_ar.COMMAND``: signals are handled before anything is imported that takes its time.
+"""Start of ``python -m warp_ar.COMMAND``: handles signals before the slow imports.
 
-A command's file begins with its guard, which comes here. What Python has loaded as ``__main__`` goes no further; the
-file is imported under its own name. This module imports nothing but what Python itself has loaded, or loads at once.
+The file of a command begins with a guard that calls this module. Python loads the file as ``__main__`` and runs it no
+further than the guard; the file is then imported under its own name. This module imports only modules that Python has
+loaded already or that load at once.
 """
 
 from __future__ import annotations
@@ -24,19 +25,19 @@ EXIT_INTERRUPTED: Final = 130
 EXIT_TERMINATED: Final = 143
 
 PATIENCE = 2.0
-"""Seconds of importing after which it is said what takes so long."""
+"""Seconds of importing after which a line says that libraries are being loaded."""
 
 
 def begin(name: str) -> NoReturn:
     """Import the module of a command, run its ``main``, and end the process with the exit code that it returns."""
-    # NumPy's BLAS: products here are small, and would otherwise be shared among a thread for each core.
+    # NumPy's BLAS starts a thread for each core, which does not pay for the small products here.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if sys.stderr is None:
-        # Closed by whoever started this (2>&-). The next file that is opened would take its place, and get its lines.
+        # The parent closed stderr (2>&-). The next file that is opened would get its number, and the error messages.
         os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
         sys.stderr = os.fdopen(2, "w")
-    faulthandler.enable()  # should native code crash, the report says what it was at
-    # For good: when the command is done there is nothing either that an exception would put in order.
+    faulthandler.enable()  # a crash of native code then prints the Python stack
+    # These handlers stay: when the command is done, nothing is left that an exception would have to clean up.
     for signal_name in _heeded():
         signal.signal(getattr(signal, signal_name), end_at_once)
     try:
@@ -49,7 +50,7 @@ def begin(name: str) -> NoReturn:
 
 
 def live() -> NoReturn:
-    """``warp-ar``, the program that is installed: ``python -m warp_ar.live``."""
+    """Run ``warp-ar``, the installed program, as ``python -m warp_ar.live``."""
     begin("warp_ar.live")
 
 
@@ -57,7 +58,8 @@ def live() -> NoReturn:
 def importing() -> Iterator[None]:
     """Context of slow imports while nothing is open: a signal ends the process, and a slow import prints a line.
 
-    An exception would not do: native code, as it is loaded, turns it into another error, or drops it.
+    A signal handler that raises would not do: native code that is being loaded turns the exception into another error,
+    or drops it.
     """
     slow = None
     if sys.stderr is not None and sys.stderr.isatty():
@@ -74,23 +76,23 @@ def importing() -> Iterator[None]:
 
 
 def _heeded() -> list[str]:
-    """Signals that end a process, without those that its parent has it ignore, as a shell does in the background."""
+    """Return names of the signals that end a process, except those that the parent process ignores."""
     names = [name for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
     return [name for name in names if signal.getsignal(getattr(signal, name)) is not signal.SIG_IGN]
 
 
 def end_at_once(number: int, _: object) -> NoReturn:
-    """Handler of a signal where there is nothing to close and nothing to remove."""
+    """Handle a signal by ending the process at once: nothing has to be closed or removed."""
     os._exit(EXIT_INTERRUPTED if number == signal.SIGINT else EXIT_TERMINATED)
 
 
 @contextlib.contextmanager
 def handling(handler: Any, *names: str) -> Iterator[None]:
-    """Handle the signals of these names where there are such; elsewhere than in the main thread nothing is changed."""
+    """Handle the named signals, where the system has them, within this context; outside the main thread do nothing."""
     before = {}
     if threading.current_thread() is threading.main_thread():
         for number in (getattr(signal, name) for name in names if hasattr(signal, name)):
-            # Who was started to outlive its terminal (nohup) goes on doing so.
+            # A process that was started to outlive its terminal (nohup) goes on ignoring SIGHUP.
             if signal.getsignal(number) is not signal.SIG_IGN or number == signal.SIGINT:
                 before[number] = signal.signal(number, handler)
     try:
@@ -101,6 +103,6 @@ def handling(handler: Any, *names: str) -> Iterator[None]:
 
 
 def leave(code: int) -> NoReturn:
-    """End the process of a command: Python does not look for garbage in what goes anyway, for half a second."""
+    """End the process of a command without Python's last garbage collection, which takes half a second."""
     gc.freeze()
     sys.exit(code)

@@ -1,4 +1,4 @@
-"""Folder of files that can be made again, kept between runs."""
+"""Folder for files that are kept between runs and can be made again."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def cache_folder() -> Path:
-    """Return the folder in which this user's programs keep files that they can make again."""
+    """Return the folder for cached files of the current user's programs."""
     if os.environ.get("XDG_CACHE_HOME"):
         return Path(os.environ["XDG_CACHE_HOME"]) / "warp_ar"
     if sys.platform == "win32":

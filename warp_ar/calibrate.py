@@ -46,7 +46,7 @@ Image = NDArray[np.uint8]
 
 
 def _marker(options: argparse.Namespace) -> Marker | None:
-    """The marker that options describe, checked as a scene's is; None where none of them is given."""
+    """Return the marker that the options describe, checked like a marker of a scene; None if no option is given."""
     given = {key: getattr(options, key, None) for key in ("dictionary", "board", "id", "size")}
     if all(value is None for value in given.values()):
         return None
@@ -71,7 +71,7 @@ def _pictures(paths: Sequence[str], most: int | None = None) -> Iterable[Image]:
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """The command's options."""
+    """Return the parser of the command's options."""
     parser = Parser(
         prog="python -m warp_ar.calibrate", description="Print a marker; measure the camera, its response, the ball."
     )
@@ -247,7 +247,7 @@ def _run_response(options: argparse.Namespace, target: Path | None) -> int:
 
 
 def _target(options: argparse.Namespace) -> Path | None:
-    """The scene file that a camera or response goes into, with its file beside it; None without ``--write``."""
+    """Return the scene file to write a camera or response into; None without ``--write``."""
     if options.command not in ("camera", "response") or options.write is None:
         return None
     path = load_scene(options.write).path

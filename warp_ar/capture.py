@@ -1,4 +1,4 @@
-"""``python -m warp_ar.capture PHOTO...``: photographs of a mirror ball become light in a file, without a marker."""
+"""``python -m warp_ar.capture PHOTO...``: captures light from photographs of a mirror ball, without a marker."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from warp_ar.scene import Camera, CapturedLight, Scene, dumps_scene
 from warp_ar.signature import encode_png
 
 OUTLINE, PREVIEW, RESPONSE = ".outline.png", ".preview.png", ".response.txt"
-"""Endings of files beside the light."""
+"""Endings of the files that are written next to the light."""
 LARGEST_BALL = 1.0
 """Largest plausible radius, metres; a larger number is probably in another unit."""
 
@@ -40,7 +40,7 @@ def _exposure(text: str) -> Any:
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """The command's options."""
+    """Return the parser of the command's options."""
     parser = Parser(
         prog="python -m warp_ar.capture",
         description="Make an environment from photographs of a mirror ball, for [light] file and live --light.",
@@ -131,7 +131,7 @@ def _check_radius(options: argparse.Namespace) -> None:
 
 
 def make_scene(found: Capture, light: Path, ball_radius: float | None) -> Scene:
-    """A scene that shows the photograph with a ball on either side of the mirror ball, lit by what was captured."""
+    """Return a scene of the photograph in the captured light, with a virtual ball on each side of the mirror ball."""
     assert found.support is not None
     unit = ball_radius or found.support.radius_of(found.outline.sphere)
     x, y, _ = map(float, found.support.pose.inverse().apply(unit * np.array(found.outline.sphere)))
@@ -139,24 +139,24 @@ def make_scene(found: Capture, light: Path, ball_radius: float | None) -> Scene:
 
 
 def draw_outline(found: Capture) -> bytes:
-    """A PNG of the photograph with the ball's outline, as wide as one sees it in the whole picture."""
+    """Return a PNG of the photograph with the ball's outline, drawn thick enough to be visible in the whole picture."""
     picture = np.ascontiguousarray(found.picture)
     width = max(1, round(max(picture.shape[:2]) / 600))
-    # With four bits of a fraction of a pixel.
+    # Coordinates in sixteenths of a pixel, as OpenCV takes them.
     points = np.round(16.0 * found.outline.points()).astype(np.int32)[:, None]
     cv2.polylines(picture, [points], isClosed=True, color=(255, 0, 0), thickness=width, lineType=cv2.LINE_AA, shift=4)
     return encode_png(picture)
 
 
 def draw_preview(found: Capture) -> bytes:
-    """A PNG of the light, tone-mapped by Reinhard's operator, in the axes of this program."""
+    """Return a PNG of the light in this program's axes, tone-mapped by Reinhard's operator."""
     shown = cv2.createTonemapReinhard(gamma=2.2).process(np.ascontiguousarray(found.light.radiance))
     codes = np.round(255.0 * np.clip(np.nan_to_num(shown), 0.0, 1.0)).astype(np.uint8)
     return encode_png(codes)
 
 
 def capture(options: argparse.Namespace) -> int:
-    """Capture, write, and say what was found."""
+    """Capture the light, write the files and print a summary."""
     _check(options)
     say(f"looking for the ball in {counted(len(options.photos), 'photograph')}")
     wanted = options.rectangle is not None or options.contact is not None

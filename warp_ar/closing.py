@@ -1,4 +1,4 @@
-"""Base of objects that the end of a ``with`` statement closes."""
+"""Base class of context managers that release their resources at the end of the ``with`` block."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from typing import Self
 
 
 class Closing(ABC):
-    """A context manager that is itself what its block works with; ``close`` ends it."""
+    """Context manager that enters as itself and calls ``close`` at the end of the block."""
 
     @abstractmethod
     def close(self) -> None:
-        """Let go of everything; a second call does nothing."""
+        """Release all resources; a second call does nothing."""
 
     def __enter__(self) -> Self:
-        """Itself."""
+        """Return this object."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close it, however the block ends."""
+        """Close this object, with or without an exception in the block."""
         self.close()

@@ -1,4 +1,4 @@
-"""Common part of all commands: exit codes, errors in one line that a terminal cannot mistake, signals."""
+"""Common parts of all commands: options, exit codes, signals, and errors printed in one printable line."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ EXIT_DONE = 0
 EXIT_FAILED = 1
 EXIT_USAGE = 2
 EXIT_PIPE = 141
-"""Nobody reads what is printed any more."""
+"""Exit code if the reader of the printed output has closed its end of the pipe."""
 
 LARGEST: Final = 2**31 - 1
-"""Largest whole number of an argument: they count frames, samples, pixels, ports."""
+"""Largest integer that an option accepts; such options count frames, samples, pixels or ports."""
 
 
 def number(low: float, high: float, words: str, kind: Callable[[str], Any] = float) -> Callable[[str], Any]:
-    """Return the type of an argument that is a number from ``low`` to ``high``, or ``words`` say what is expected."""
+    """Return a parser for a numeric argument from ``low`` to ``high``; ``words`` are the message's expected value."""
 
     def read(text: str) -> Any:
         with contextlib.suppress(ValueError, ZeroDivisionError):
@@ -47,7 +47,7 @@ def number(low: float, high: float, words: str, kind: Callable[[str], Any] = flo
 
 
 def ending(*suffixes: str) -> Callable[[str], Path]:
-    """Return the type of an argument that names a file of one of these endings."""
+    """Return a parser for a file argument that has one of these suffixes."""
 
     def read(text: str) -> Path:
         if (path := Path(text)).suffix.lower() not in suffixes:
@@ -58,15 +58,15 @@ def ending(*suffixes: str) -> Callable[[str], Path]:
 
 
 LEAST: Final = 1e-9
-"""Least number that counts as above 0."""
+"""Least value of arguments that must be above 0."""
 count = number(1, LARGEST, f"1 or more, {LARGEST:,} at most", int)
 """Number of frames, samples or the like."""
 FROM_0 = number(0, LARGEST, f"0 or more, {LARGEST:,} at most", int)
-"""Number of something that is counted from 0."""
+"""Number that may be 0."""
 pixel = number(-1e9, 1e9, "pixels")
 """Column or row of a picture."""
 seconds = number(LEAST, 1e9, "a time in seconds, such as 0.02 or 1/50", lambda text: float(Fraction(text)))
-"""Time of an exposure."""
+"""Exposure time."""
 
 
 _COMMON: Final[dict[str, dict[str, Any]]] = {
@@ -109,23 +109,23 @@ _COMMON: Final[dict[str, dict[str, Any]]] = {
         "help": "full-frame focal length, if EXIF does not tell",
     },
 }
-"""Options that mean the same wherever they are."""
+"""Options that have the same meaning in several commands."""
 
 
 class Parser(argparse.ArgumentParser):
-    """Argument parser whose errors are one line, as all errors here are.
+    """Argument parser whose errors are one line, like all error messages of this package.
 
-    Options that are declared by ``add_rare`` are left out of ``--help``; ``--help-all`` lists them.
+    ``--help`` leaves out options that are declared by ``add_rare``; ``--help-all`` lists them.
     """
 
     def add_rare(self, *flags: str, group: argparse._ActionsContainer, **options: Any) -> None:
-        """Declare an option that few runs need; arguments as those of ``add_argument``."""
+        """Declare an option that few runs need; the arguments are those of ``add_argument``."""
         if not any(action.dest == "help_all" for action in self._actions):
             self.add_argument("--help-all", action=_HelpAll, nargs=0, help="list all options and stop")
         group.add_argument(*flags, **options).rare = True  # type: ignore[attr-defined]
 
     def add_common(self, *names: str, add: Callable[..., Any] | None = None) -> None:
-        """Declare options, or the scene, that several commands have; ``add`` puts them into a group."""
+        """Declare common options by name, or the argument ``scene``; ``add`` may add them to a group."""
         for name in names:
             (add or self.add_argument)(name, **_COMMON[name])
 
@@ -146,7 +146,7 @@ class Parser(argparse.ArgumentParser):
         return super().format_help()
 
     def error(self, message: str) -> NoReturn:
-        """Tell what is wrong with an argument.
+        """Report an invalid argument.
 
         Raises:
             UsageError: Always, with the message in one line.
@@ -159,7 +159,7 @@ class Parser(argparse.ArgumentParser):
         raise UsageError(f"{message}{hint}; see {self.prog} --help")
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """As argparse does it, but nothing empty: a path of no name is the current folder.
+        """Parse as argparse does, but refuse empty arguments: an empty path would mean the current folder.
 
         Raises:
             UsageError: An argument is empty.
@@ -180,7 +180,7 @@ class _HelpAll(argparse.Action):
 
 
 def _options(parser: argparse.ArgumentParser) -> list[str]:
-    """All options of a parser and of its commands."""
+    """Return all options of a parser and of its subcommands."""
     found = list(parser._option_string_actions)
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
@@ -190,21 +190,21 @@ def _options(parser: argparse.ArgumentParser) -> list[str]:
 
 
 class Terminated(KeyboardInterrupt):
-    """The process was asked to end by SIGTERM or SIGHUP; it does so as after Ctrl-C."""
+    """Request to end the process by SIGTERM or SIGHUP; it unwinds the stack like Ctrl-C."""
 
 
 def run_command(command: Callable[[], int], failures: type[WarpArError] | tuple[type[WarpArError], ...] = ()) -> int:
-    """Run a command; what a user can cause is one line, and a signal ends it in order.
+    """Run a command; print errors that a user can cause as one line, and clean up after a signal.
 
     Args:
-        command: Returns the exit code.
-        failures: Errors that mean a failure while running, not wrong usage.
+        command: Function that runs the command and returns its exit code.
+        failures: Errors of the running command, which have another exit code than wrong usage.
 
     Returns:
         The exit code.
     """
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # a terminal that cannot show a letter gets its number
+        if isinstance(stream, io.TextIOWrapper):  # a terminal that cannot show a character gets its code point
             stream.reconfigure(errors="backslashreplace")
     try:
         with ended_by_signals():
@@ -241,11 +241,11 @@ def run_command(command: Callable[[], int], failures: type[WarpArError] | tuple[
 
 
 _NO_MEMORY: Final = re.compile("(?i)failed to (allocate|map)|(insufficient|cannot allocate) memory|start new thread")
-"""Words of what has no error of its own for it: Warp, OpenCV, the loader of libraries, Python's threads."""
+"""Messages about exhausted memory by Warp, OpenCV, the dynamic linker and Python's threads, which have no own error."""
 
 
 def _folder_is_gone() -> bool:
-    """Return True if the folder that this process runs in was deleted."""
+    """Return True if the working folder of this process was deleted."""
     try:
         os.getcwd()
     except FileNotFoundError:
@@ -254,24 +254,25 @@ def _folder_is_gone() -> bool:
 
 
 def _drop_output() -> None:
-    """Let what is still to be printed go nowhere: Python would try again at its end, and complain."""
+    """Discard unprinted output: at exit Python would try to print it again, and fail with a message."""
     with contextlib.suppress(AttributeError, OSError, ValueError), open(os.devnull, "wb") as nowhere:
         os.dup2(nowhere.fileno(), sys.stdout.fileno())
 
 
 _GRACE: Final = 20.0
-"""Seconds after SIGTERM or SIGHUP at which a process ends that has not unwound by itself."""
+"""Seconds after SIGTERM or SIGHUP after which the process is ended, if it has not unwound by then."""
 _SOON: Final = 0.001
-"""Seconds after which a signal that a callback swallowed is sent again."""
+"""Seconds after which a signal is sent again if a callback swallowed its exception."""
 
 
 @contextlib.contextmanager
 def ended_by_signals() -> Iterator[None]:
-    """Have SIGTERM and SIGHUP unwind the stack as Ctrl-C does, so that files are closed and folders removed.
+    """Have SIGTERM and SIGHUP unwind the stack as Ctrl-C does, so that files are closed and temporary folders removed.
 
-    Once: who is ending already is not interrupted by the next of them. A signal that arrives where Python drops what is
-    raised, in a finaliser or as native code calls back, is sent again, Ctrl-C too. One that comes as Python takes a
-    lock may leave it taken, and whoever waits for it never ends: after ``_GRACE`` the process ends all the same.
+    Only the first signal unwinds; later ones do not interrupt the clean-up. Python drops exceptions that are raised in
+    finalisers and in callbacks from native code. A signal that arrives there, Ctrl-C included, is sent again. A signal
+    that arrives while Python acquires a lock may leave the lock taken, and the clean-up may then wait for it forever:
+    the process ends ``_GRACE`` seconds after the signal at the latest.
     """
     ending, hook = False, sys.unraisablehook
     last = signal.SIGTERM
@@ -281,7 +282,7 @@ def ended_by_signals() -> Iterator[None]:
         nonlocal ending, last
         if not ending:
             ending, last = True, signal.Signals(number)
-            # Not by the class `Thread`: that takes locks, and this runs wherever a signal has come.
+            # Without the class `Thread`, which acquires locks: the signal may have interrupted any code.
             _thread.start_new_thread(_give_up, (unwound, number))
             raise Terminated
 
@@ -302,7 +303,7 @@ def ended_by_signals() -> Iterator[None]:
             yield
         except BaseException:
             ending = True
-            with contextlib.suppress(SinkError):  # what came first is told
+            with contextlib.suppress(SinkError):  # the first error is reported
                 close_open_sinks()
             raise
         finally:
@@ -317,7 +318,7 @@ def _give_up(unwound: Any, number: int) -> None:
 
 
 def _send(number: int) -> None:
-    """Send a signal to the main thread once it has gone on."""
+    """Send a signal to the main thread after a short delay, so that it can leave the callback."""
     time.sleep(_SOON)
     if hasattr(signal, "pthread_kill"):
         signal.pthread_kill(threading.main_thread().ident or 0, number)

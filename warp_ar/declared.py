@@ -1,4 +1,4 @@
-"""Checks of what callers give, by the types that parameters and fields declare; floats are finite numbers."""
+"""Checks of arguments and fields against their declared types; floats must be finite."""
 
 from __future__ import annotations
 
@@ -35,17 +35,17 @@ _PLAIN: Final[dict[Any, tuple[str, Callable[[Any], bool]]]] = {
     Path: ("a path", lambda value: isinstance(value, os.PathLike)),
     os.PathLike: ("a path", lambda value: isinstance(value, os.PathLike)),
 }
-"""Words for types, and who is of them."""
+"""Descriptions of types for messages, each with its check."""
 
 
 def _parts(hint: Any) -> tuple[Any, tuple[Any, ...]]:
-    """Return what a type is of, and its arguments."""
+    """Return a type's origin and its type arguments."""
     origin = typing.get_origin(hint) or hint
     return (None if origin is type(None) else origin), typing.get_args(hint)
 
 
 def fits(value: Any, hint: Any) -> bool:
-    """Return whether a value is of a type as it is declared."""
+    """Return True if a value has the declared type."""
     origin, parts = _parts(hint)
     if origin in _PLAIN:
         return _PLAIN[origin][1](value)
@@ -63,7 +63,7 @@ def fits(value: Any, hint: Any) -> bool:
 
 
 def words_for(hint: Any) -> str:
-    """Return the words for a type in messages."""
+    """Return the description of a type for messages."""
     origin, parts = _parts(hint)
     if origin in _PLAIN:
         return _PLAIN[origin][0]
@@ -78,7 +78,7 @@ def words_for(hint: Any) -> str:
 
 
 def show(value: object) -> str:
-    """Return a value as messages show it."""
+    """Return a value as text for messages."""
     text = " ".join(repr(value).split())
     return text if len(text) <= 80 else f"{text[:60]}..."
 
@@ -93,7 +93,7 @@ def check_fields(item: object) -> None:
     """Check the fields of a dataclass.
 
     Raises:
-        UsageError: One is of another type than it is declared.
+        UsageError: A field has another type than declared.
     """
     kind: Any = type(item)
     for name, hint in _hints_of(kind).items():
@@ -106,7 +106,7 @@ def _check(name: str, value: object, hint: Any) -> None:
 
 
 def checked(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """Have a function raise ``UsageError`` for an argument of another type than it declares."""
+    """Wrap a function to raise ``UsageError`` for an argument of another type than declared."""
     signature = inspect.signature(function)
 
     @functools.wraps(function)

@@ -1,4 +1,4 @@
-"""Choosing and starting the device that kernels run on."""
+"""Selection and start of the device that kernels run on."""
 
 from __future__ import annotations
 
@@ -22,51 +22,52 @@ from warp_ar.errors import UsageError, say
 _ARENA_MAX = -8
 """``M_ARENA_MAX`` of glibc's ``malloc.h``."""
 CPU_COMPILER_FLAGS: Final = "-march=native"
-"""Flags of Clang for every kernel: LLVM's own bound of inlining, 225, instead of Warp's 9,000.
+"""Compiler flags of all CPU kernels: with them Clang uses LLVM's inlining threshold, 225, instead of Warp's 9,000.
 
-``desk`` at ``medium`` then compiles in 38 s of processor time, and a frame takes as long as with other bounds, within
-what repeated runs differ by.
+``desk`` at ``medium`` then compiles in 38 s of processor time. The time of a frame is the same as with other
+thresholds, within the spread of repeated runs.
 """
 _CUDA = threading.RLock()
 _TRANSLATION = threading.RLock()
 ASK_EVERY = 1e-4
-"""Seconds between two looks at an event that is waited for."""
+"""Seconds between two polls of an event."""
 LONGEST_ASKING = 0.25
-"""Seconds after which CUDA itself is made to wait."""
+"""Seconds of polling after which CUDA's own wait is called."""
 _STARTED: list[int] = []
-"""The process in which Warp was started, if it was."""
+"""Process id in which Warp was started; empty before that."""
 _OPENING: list[threading.Thread] = []
-"""The thread that makes a device's context, if one does."""
+"""Thread that is creating a CUDA context; empty if there is none."""
 
 
 def usable_cores() -> int:
-    """Cores of the host that this process may use."""
+    """Return the number of the host's cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def exclusive(device: Any) -> contextlib.AbstractContextManager[Any]:
-    """Keeps other threads off a CUDA device for as long as it is entered; on CPU it does nothing.
+    """Return a lock that keeps other threads off a CUDA device while it is held; on CPU it does nothing.
 
-    Warp's current stream, current device and running capture belong to the process, not to the thread: what one thread
-    allocates or launches while another captures would end up in that graph, or break it. Not meant are launches and
-    copies on a stream that they name.
+    Warp's current stream, current device and running capture belong to the process, not to the thread. If one thread
+    captures a graph, allocations and launches of another would become part of that graph or break it. Launches and
+    copies that name their stream do not need the lock.
     """
     return _CUDA if device.is_cuda else contextlib.nullcontext()
 
 
 @contextlib.contextmanager
 def translating(device: Any) -> Iterator[None]:
-    """Held by who declares kernels or launches them for the first time; to be entered before ``exclusive``."""
+    """Lock for declaring kernels or launching them for the first time; acquire it before ``exclusive``."""
     with compiling(), exclusive(device):
         yield
 
 
 @contextlib.contextmanager
 def compiling() -> Iterator[None]:
-    """Held by who has kernels compiled, in threads of its own: nobody else translates, frames go on.
+    """Lock for compiling kernels in several threads: no other thread translates kernels meanwhile; frames go on.
 
-    Python 3.11 collects garbage inside its parser; a finalizer lets another thread parse, and then both parsers end in
-    "AST constructor recursion depth mismatch" (CPython's issue 106905). Until it is released nothing is collected.
+    Python 3.11 may collect garbage while its parser runs. A finaliser then lets another thread parse, and both parsers
+    fail with "AST constructor recursion depth mismatch" (CPython issue 106905). While the lock is held, garbage
+    collection is off.
     """
     with _TRANSLATION:
         collects = gc.isenabled()
@@ -79,7 +80,7 @@ def compiling() -> Iterator[None]:
 
 
 class _Captures:
-    """Turns of those who capture and those who wait for events: CUDA allows one or the other."""
+    """Mutual exclusion of threads that capture a graph and threads that wait for events: CUDA does not allow both."""
 
     def __init__(self) -> None:
         self.changed = threading.Condition()
@@ -92,7 +93,7 @@ _CAPTURES = _Captures()
 
 @contextlib.contextmanager
 def capturing() -> Iterator[None]:
-    """Held around the capture of a graph: no thread waits for an event meanwhile, which CUDA forbids."""
+    """Context for capturing a graph: no thread may wait for an event meanwhile, which CUDA forbids."""
     now = _CAPTURES
     with now.changed:
         now.changed.wait_for(lambda: not now.waiting and not now.capturing)
@@ -107,7 +108,7 @@ def capturing() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _asking() -> Iterator[None]:
-    """Held around what CUDA forbids while a graph is captured."""
+    """Context for calls that CUDA forbids while a graph is captured."""
     now = _CAPTURES
     with now.changed:
         now.changed.wait_for(lambda: not now.capturing)
@@ -121,19 +122,19 @@ def _asking() -> Iterator[None]:
 
 
 def wait_for(event: Any) -> None:
-    """Wait until an event that has been recorded has come to pass on its CUDA device.
+    """Wait until a recorded event is complete on its CUDA device.
 
-    CUDA's own way keeps a core busy for as long as it waits: with 16 cameras on 16 cores, for 2.4 of a frame's 8 ms.
+    The event is polled: CUDA's own wait keeps a core busy. With 16 cameras on 16 cores it took 2.4 of a frame's 8 ms.
 
     Raises:
-        RuntimeError: What was launched has failed.
+        RuntimeError: The launched work has failed.
     """
     stop = time.perf_counter() + LONGEST_ASKING
     while True:
         with _asking():
             if event.is_complete:
                 return
-            if time.perf_counter() > stop:  # an event that never comes is not complete either: this says why
+            if time.perf_counter() > stop:  # an event of failed work never completes; CUDA's own wait raises its error
                 wp.synchronize_event(event)
                 return
         time.sleep(ASK_EVERY)
@@ -141,9 +142,9 @@ def wait_for(event: Any) -> None:
 
 @contextlib.contextmanager
 def _native_stderr_silenced() -> Iterator[None]:
-    """Keep what native code prints to stderr off the terminal.
+    """Suppress the output of native code to stderr.
 
-    Without an NVIDIA driver Warp's start warns there, past its own log level.
+    Without an NVIDIA driver, Warp's start prints a warning there regardless of its log level.
     """
     sys.stderr.flush()
     saved = os.dup(2)
@@ -157,7 +158,7 @@ def _native_stderr_silenced() -> Iterator[None]:
 
 
 def start_warp() -> None:
-    """Initialise Warp quietly, with the flags of Clang that this package's kernels take; again it does nothing.
+    """Initialise Warp quietly, with this package's compiler flags; further calls do nothing.
 
     Raises:
         UsageError: This process is a fork of one that has started Warp.
@@ -176,7 +177,7 @@ def start_warp() -> None:
 
 
 def _init_warp() -> None:
-    """Initialise Warp; where its cache of kernels cannot be written, kernels go to a temporary folder."""
+    """Initialise Warp; if its kernel cache is not writable, put kernels into a temporary folder."""
     if not os.environ.get("WARP_CACHE_PATH", "unset"):
         del os.environ["WARP_CACHE_PATH"]  # Warp would take an empty one for the current folder
     with _native_stderr_silenced():
@@ -189,16 +190,16 @@ def _init_warp() -> None:
             problem = error
         folder = tempfile.mkdtemp(prefix="warp_ar_kernels_")
         atexit.register(shutil.rmtree, folder, ignore_errors=True)
-        os.environ["WARP_CACHE_PATH"] = wp.config.kernel_cache_dir = folder  # of processes that this one starts, too
+        os.environ["WARP_CACHE_PATH"] = wp.config.kernel_cache_dir = folder  # in child processes, too
         wp.init()
     say(f"the cache of kernels cannot be written ({problem}); kernels of this run are kept in {folder} until it ends")
 
 
 def open_ahead(name: str) -> None:
-    """Have a CUDA device's context made beside what this thread imports; ``resolve_device`` waits for it.
+    """Create a CUDA device's context on a thread while this one imports modules; ``resolve_device`` waits for it.
 
     Args:
-        name: As for ``resolve_device``; where it is no CUDA device of this machine, nothing is done.
+        name: As for ``resolve_device``. If it is no CUDA device of this machine, nothing is done.
     """
     known = [str(device) for device in wp.get_devices() if device.is_cuda]
     wanted = "cuda:0" if name in ("auto", "cuda") else name
@@ -206,7 +207,7 @@ def open_ahead(name: str) -> None:
         return
 
     def open_context() -> None:
-        with contextlib.suppress(RuntimeError):  # who uses the device first meets it too, and says it
+        with contextlib.suppress(RuntimeError):  # the first use of the device fails with the same error and reports it
             _ = wp.get_device(wanted).context
 
     _OPENING.append(threading.Thread(target=open_context, name="warp_ar-open"))
@@ -214,10 +215,10 @@ def open_ahead(name: str) -> None:
 
 
 def resolve_device(name: str = "auto") -> Any:
-    """Warp device for ``name``: ``auto`` (CUDA where present, else CPU), ``cpu``, ``cuda`` or ``cuda:N``.
+    """Return the Warp device for ``name``: ``auto`` (CUDA where present, else CPU), ``cpu``, ``cuda`` or ``cuda:N``.
 
     Raises:
-        UsageError: The name is no device of this machine, or this process is a fork of one that has started Warp.
+        UsageError: This machine has no such device, or this process is a fork of one that has started Warp.
     """
     start_warp()
     for thread in _OPENING:
@@ -232,10 +233,10 @@ def resolve_device(name: str = "auto") -> Any:
 
 
 def release_memory() -> None:
-    """Hand memory that has been freed back to the system.
+    """Return freed memory to the system.
 
-    glibc keeps what lies below the newest allocation of each thread's arena: 500 pipelines, built one after another on
-    a thread of their own, left 2.3 GB with it that nothing used. Other C libraries have no such call, and no such need.
+    glibc keeps freed memory below the newest allocation of each thread's arena: after 500 pipelines, built one after
+    another on one thread, 2.3 GB of unused memory were left. Other C libraries neither have this call nor need it.
     """
     if sys.platform == "linux":
         trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
@@ -244,10 +245,10 @@ def release_memory() -> None:
 
 
 def bound_arenas(count: int = 2) -> None:
-    """Have glibc serve all threads from so many arenas; to be called before there are many threads.
+    """Limit the number of glibc's memory arenas for all threads; to be called before many threads are started.
 
-    Each keeps its own freed memory: over 100 changes of quality a page grew by 21 of 315 MB with one for every thread,
-    by 4 with one for all.
+    Each arena keeps its own freed memory. Over 100 changes of quality a page grew by 21 of 315 MB with an arena per
+    thread, and by 4 MB with one arena for all.
     """
     if sys.platform == "linux":
         mallopt = getattr(ctypes.CDLL(None), "mallopt", None)

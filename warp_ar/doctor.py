@@ -1,4 +1,4 @@
-"""``python -m warp_ar.doctor my_desk``: what is wrong with a set-up, what it spoils, and what to do about it."""
+"""``python -m warp_ar.doctor my_desk``: finds faults of a set-up, their effects and their remedies."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ from warp_ar.sources.sources import source_of
 DEVICES = Path("/dev")
 """Folder in which the system lists capture devices."""
 FEW_SIDES = 5
-"""Directions from which a table must be seen to tell whether it mirrors."""
+"""Directions from which a table must be seen to measure its reflection."""
 APART = 4.0
-"""Degrees between these."""
+"""Least angle between these directions, degrees."""
 MISLEADING = ("units.", "source.", "camera.", "marker.", "ball.outside", "ball.unfound", "ball.place", "ball.radius")
-"""Beginnings of names of findings with which pictures do not say what a table mirrors."""
+"""Prefixes of the names of findings that make measurements of the table's reflection unreliable."""
 STEP = 0.5
-"""Seconds from one direction to the next, as light is gathered: longer than the light of the last one counts."""
+"""Seconds between two directions on the clock that gathers light; light of the last direction no longer counts then."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,15 +45,15 @@ class TablePolish:
     """Reflection of the scene's table, estimated from frames."""
 
     values: dict[str, float]
-    """Rounded values for ``[proxy.material]``."""
+    """Rounded values of the keys of ``[proxy.material]``."""
     proxy: int
-    """Number of the ``[[proxy]]``."""
+    """Index of the ``[[proxy]]``."""
     lines: tuple[str, ...]
-    """The same for people."""
+    """The result in words, one string per line."""
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """The command's options."""
+    """Return the parser of the command's options."""
     parser = Parser(
         prog="python -m warp_ar.doctor",
         description="Say what is wrong with a set-up: units, camera, card, mirror ball, light, and this machine. "
@@ -70,8 +70,8 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def check_machine() -> tuple[list[str], list[Finding]]:
-    """Return this machine's parts, one line each, and its faults."""
-    # Here, for it loads Warp.
+    """Return a description of this machine, one line per part, and the faults found."""
+    # Imported here: it loads Warp.
     with importing():
         import av
         import warp as wp
@@ -102,7 +102,7 @@ def check_machine() -> tuple[list[str], list[Finding]]:
 
 
 def check_access(scene: Scene, source: str | int | Path | None) -> list[Finding]:
-    """Check that the capture device of the frames is there and may be opened; on Linux, which lists them."""
+    """Return findings about the capture device: it must exist and be accessible. Only Linux lists devices."""
     index = source_of(scene, source)
     if isinstance(index, str) and index.isdecimal():
         index = int(index)
@@ -121,15 +121,15 @@ def check_access(scene: Scene, source: str | int | Path | None) -> list[Finding]
 
 
 def look_for_polish(scene: Scene, look: Look, tell: Callable[[str], object] | None = None) -> TablePolish | None:
-    """Measure how a table mirrors its surroundings; return the words and the keys to write.
+    """Measure the reflection of a table from frames; return the result in words and the keys to write.
 
-    Args:
+    scene: A scene with a card, a mirror ball and a plane.
         scene: With a card, a mirror ball and a plane.
-        look: Its frames.
-        tell: Told, for people, what is looked at.
+        look: Frames of the scene.
+        tell: Function that receives a line about the measurement in progress, for people.
 
     Returns:
-        None where they do not tell that it does, or the scene says it already.
+        None if the frames show no reflection, or the scene has the keys already.
     """
     planes = [index for index, proxy in enumerate(scene.proxies) if proxy.shape == "plane"]
     asked = scene.probes and scene.has_marker and planes and not any(proxy.material for proxy in scene.proxies)
@@ -158,7 +158,7 @@ def look_for_polish(scene: Scene, look: Look, tell: Callable[[str], object] | No
 
 
 def _sides(views: Sequence[tuple[Any, Pose]]) -> list[tuple[Any, Pose]]:
-    """Views whose directions differ."""
+    """Return the views whose directions differ by ``APART`` or more."""
     found: list[tuple[Any, Pose]] = []
     for image, pose in views:
         ahead = pose.rotation[2]
@@ -168,7 +168,7 @@ def _sides(views: Sequence[tuple[Any, Pose]]) -> list[tuple[Any, Pose]]:
 
 
 def _gather_light(scene: Scene, views: list[tuple[Any, Pose]], tell: Callable[[str], object] | None) -> Any:
-    """The environment as the ball shows it, nothing recovered."""
+    """Return the environment that the ball shows, without recovered light."""
     with importing():
         import numpy as np
 
@@ -187,7 +187,7 @@ def _gather_light(scene: Scene, views: list[tuple[Any, Pose]], tell: Callable[[s
 
 
 def _write_polish(scene: Scene, polish: TablePolish | None, misled: bool) -> None:
-    """Write what frames tell of the table into the scene file; where nothing is written, say why."""
+    """Write the table's measured reflection into the scene file; if nothing is written, print the reason."""
     if polish is not None and scene.path is not None:
         amend_scene(scene.path, "proxy", {"material": polish.values}, index=polish.proxy)
         print(f"{printable(scene.path)}: its [[proxy]] has them now")
@@ -211,7 +211,7 @@ def _run(options: argparse.Namespace) -> int:
     access = check_access(scene, options.source)
     polish = None
     with Console(stderr=True).status("looking at the frames") as status:
-        # What may not be opened is not tried: its own message would say less.
+        # A device without access is not opened: the error of opening it would say less.
         given = None if access else source
         checked, look = check_and_look(scene, given, frames=options.frames, tell=status.update)
         found = worst_first([*found, *access, *checked])

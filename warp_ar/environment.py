@@ -1,4 +1,4 @@
-"""``python -m warp_ar.environment FILE --output OTHER``: an environment in the axes and format of another program."""
+"""``python -m warp_ar.environment FILE --output OTHER``: converts an environment to other axes and formats."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ Radiance = npt.NDArray[np.float32]
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """The command's options."""
+    """Return the parser of the command's options."""
     parser = Parser(
         prog="python -m warp_ar.environment",
         description="Write an environment in the axes and format of another program.",
@@ -74,11 +74,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def convert(options: argparse.Namespace) -> int:
-    """Read, turn and write.
+    """Read an environment, rotate it and write it.
 
     Raises:
         SinkError: A file cannot be read or written.
-        UsageError: The output is no environment by its ending, or options do not fit each other.
+        UsageError: The output has no ending of an environment, or options do not fit each other.
     """
     output: Path = options.output
     if options.size is not None and options.layout != "cube":
@@ -106,7 +106,7 @@ def convert(options: argparse.Namespace) -> int:
 
 
 def _scaled(radiance: Radiance, info: EnvironmentInfo) -> tuple[Radiance, EnvironmentInfo]:
-    """An environment under which a grey card has 0.18, and what that makes of its levels."""
+    """Return the environment scaled so that a grey card under it has radiance 0.18, and its info with scaled levels."""
     scale = grey_card_scale(radiance)
     say(f"the light is multiplied by {scale:.6g}")
     luminance = info.luminance_of_one()

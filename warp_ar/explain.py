@@ -1,6 +1,6 @@
-"""``python -m warp_ar.explain SCENE`` prints which stages a scene calls for, and why the others are left out.
+"""``python -m warp_ar.explain SCENE``: prints the stages that a scene needs, and why the others are left out.
 
-No frame is run for it.
+No frame is rendered.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from warp_ar.stages.request import Request
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """The command's options."""
+    """Return the parser of the command's options."""
     parser = Parser(
         prog="python -m warp_ar.explain", description="Say which stages a scene calls for, and why others are left out."
     )
@@ -46,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def explain(options: argparse.Namespace) -> int:
-    """Print what is asked for."""
+    """Print the plan, or the tables that the options name."""
     if options.numerics:
         print_numerics()
         return EXIT_DONE
@@ -59,7 +59,7 @@ def explain(options: argparse.Namespace) -> int:
 
 
 def print_numerics() -> None:
-    """Print the error model: per stage its precision, expected and measured worst error, and rows of hard cases."""
+    """Print the error model: precision, expected and largest measured error and hard cases of each stage."""
     table = Table("stage", "precision", "expected worst error", "measured", "hard cases")
     for stage in STAGES:
         numbers = stage.numerics

@@ -1,4 +1,4 @@
-"""``python -m warp_ar.export SCENE --output shot.usda``: the shot for other programs: camera, surfaces, lights."""
+"""``python -m warp_ar.export SCENE --output shot.usda``: exports camera, surfaces and lights of a shot."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SUFFIXES = (*USD_SUFFIXES, GLTF_SUFFIX, TRACK_SUFFIX)
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """The command's options."""
+    """Return the parser of the command's options."""
     parser = Parser(
         prog="python -m warp_ar.export",
         description="Write a scene and its camera's path as USD, glTF, or OpenTrackIO (.jsonl).",
@@ -54,7 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def export(options: argparse.Namespace) -> int:
-    """Track the frames, take the light of the last one, write.
+    """Track the marker in all frames, take the light of the last frame, and write the shot.
 
     Raises:
         SinkError: The output cannot be written.
@@ -98,12 +98,12 @@ def export(options: argparse.Namespace) -> int:
 
 
 def environment_names(scene: Scene) -> tuple[str, ...]:
-    """Return the endings of environments' files: of the first mirror ball, and of each other one in turn."""
+    """Return the endings of the environments' files: of the first mirror ball, then of each further one."""
     return ("environment", *(f"environment_{ball}" for ball in range(1, len(scene.probes))))
 
 
 def _clear_stale(output: Path, balls: int) -> None:
-    """Remove what an earlier export of more mirror balls wrote of those that this one does not have."""
+    """Remove environment files that an earlier export of more mirror balls wrote and this one does not write."""
     for path in output.parent.glob(f"{glob.escape(output.stem)}_environment_[1-9]*.exr"):
         number = path.stem.removeprefix(f"{output.stem}_environment_")
         if number.isdecimal() and int(number) >= balls and is_signed(path):
@@ -112,7 +112,7 @@ def _clear_stale(output: Path, balls: int) -> None:
 
 
 def _read_shot(options: argparse.Namespace, scene: Any) -> tuple[Shot, tuple[Any, ...]]:
-    """The camera's way, and the environments of the last frame that shows them."""
+    """Return the camera's path and the environments of the last frame that shows them."""
     with importing():
         from warp_ar.session import Session  # loads Warp
 

@@ -1,7 +1,7 @@
-"""Pictures of linear light: OpenEXR and Radiance files read; OpenEXRs written whole, or not at all.
+"""Linear pictures: reads OpenEXR and Radiance files, and writes complete OpenEXR files or none.
 
-OpenEXR writes through a buffer whose last part reaches the disk when the file is closed, and does not look at what
-became of it: on a full disk a file may lack its end without a word. Here the end is looked at.
+OpenEXR buffers its output, writes the last part when the file is closed, and ignores errors of that write. On a full
+disk a file may thus be cut off without an error, so the end of each written file is checked here.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from warp_ar.signals import AP0, AP1, P3_D65, REC_709, REC_2020, are_primaries, 
 from warp_ar.signature import PROGRAM
 
 LARGEST = 65504.0
-"""Largest half float: what an infinite value is read as."""
+"""Largest half float; infinite values are replaced by it."""
 _HDR_HEAD = 1 << 16
-"""Bytes within which a Radiance picture has its size; its header tells all programs that it went through."""
+"""Bytes within which the size of a Radiance picture must stand; its header lists all programs that processed it."""
 _MAGIC = b"\x76\x2f\x31\x01"
 _SPACES = {
     "lin_rec709_scene": REC_709,
@@ -37,11 +37,11 @@ _SPACES = {
     "lin_ap0_scene": AP0,
     "lin_ap1_scene": AP1,
 }
-"""Primaries by the attribute ``colorInteropID`` (ASWF, Color Interop Forum)."""
+"""Primaries by the value of the attribute ``colorInteropID`` (ASWF, Color Interop Forum)."""
 
 
 def exr_problem(path: pathlib.Path, error: BaseException) -> str:
-    """Why OpenEXR could not read a file that is there, in words."""
+    """Return the reason for which OpenEXR could not read an existing file."""
     try:
         with path.open("rb") as stream:
             start = stream.read(len(_MAGIC))
@@ -52,14 +52,14 @@ def exr_problem(path: pathlib.Path, error: BaseException) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class LinearPicture:
-    """Linear light from a file."""
+    """Linear radiance from a file."""
 
     color: npt.NDArray[np.float32]
-    """RGB in Rec. 709's primaries and white, (height, width, 3); finite, with the negative values of the file."""
+    """Finite RGB with the primaries and white of Rec. 709, (height, width, 3); negative values are kept."""
     header: Mapping[str, Any]
-    """Attributes of an OpenEXR; empty for Radiance's format."""
+    """Attributes of an OpenEXR file; empty for a Radiance file."""
     others: Mapping[str, npt.NDArray[np.float32]]
-    """Other channels of an OpenEXR by name, (height, width), finite."""
+    """Other channels of an OpenEXR file by name, (height, width), finite."""
 
 
 def read_linear_picture(path: pathlib.Path, error: type[WarpArError], label: str) -> LinearPicture:
@@ -94,10 +94,10 @@ def read_linear_picture(path: pathlib.Path, error: type[WarpArError], label: str
 
 
 def read_exr_header(path: pathlib.Path, error: type[WarpArError], label: str) -> dict[str, Any]:
-    """Read the attributes of an OpenEXR's picture; arguments as `read_linear_picture`.
+    """Return the attributes of an OpenEXR picture; arguments as for `read_linear_picture`.
 
     Raises:
-        WarpArError: As ``error``: there is no such file, it is too large or cannot be read.
+        WarpArError: As ``error``: the file does not exist, is too large or cannot be read.
     """
     return _picture_part(path, error, label, header_only=True)[0]
 
@@ -105,7 +105,7 @@ def read_exr_header(path: pathlib.Path, error: type[WarpArError], label: str) ->
 def _picture_part(
     path: pathlib.Path, error: type[WarpArError], label: str, **how: bool
 ) -> tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]:
-    """Attributes and channels of an OpenEXR's first part that has R, G and B, or Y; of the first where none has."""
+    """Return attributes and channels of an OpenEXR's first part with R, G and B, or Y, else of its first part."""
     if not is_file(path):
         raise error(f"there is no file {label}")
     try:
@@ -122,7 +122,7 @@ def _picture_part(
         raise error(f"{label} cannot be read as OpenEXR: {exr_problem(path, problem)}") from problem
     if len(headers) > 1:
         shown = [str(header.get("name")) for header in headers]
-        every = path.with_stem("*")  # said once of a folder of frames
+        every = path.with_stem("*")  # one message for a folder of frames
         say_once(f"{every} has the parts {', '.join(shown)}; {shown[number]} is taken")
     if headers[number].get("type") in (OpenEXR.deepscanline, OpenEXR.deeptile):
         raise error(f"{label} is a deep OpenEXR; save it flat, with one value of each channel for a pixel")
@@ -131,12 +131,12 @@ def _picture_part(
 
 @functools.cache
 def say_once(text: str) -> None:
-    """Print a line to stderr, the first time that it is to be said."""
+    """Print a line to stderr unless it was printed before."""
     say(text)
 
 
 def _read_exr(path: pathlib.Path, error: type[WarpArError], label: str) -> LinearPicture:
-    _picture_part(path, error, label, header_only=True)  # looks at sizes before pixels are read
+    _picture_part(path, error, label, header_only=True)  # checks sizes before pixels are read
     header, channels = _picture_part(path, error, label, separate_channels=True)
     names = "RGB" if {"R", "G", "B"} <= channels.keys() else "YYY"
     mixed = bool({"RY", "BY"} & channels.keys()) or {"X", "Z"} <= channels.keys()  # chroma, CIE XYZ
@@ -176,7 +176,7 @@ def _read_hdr(path: pathlib.Path, error: type[WarpArError], label: str) -> Linea
         raise error(f"{label}: the Radiance picture holds CIE XYZ; save it as RGB (FORMAT=32-bit_rle_rgbe)")
     lines, length = int(size[3]), int(size[6])
     check_size(length, lines, error, label)
-    # OpenCV reads no other order of pixels than this one.
+    # OpenCV reads this order of pixels only.
     plain = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y %d +X %d\n" % (lines, length)
     picture = cv2.imdecode(np.frombuffer(plain + data[size.end() :], np.uint8), cv2.IMREAD_UNCHANGED)
     if picture is None or picture.ndim != 3 or picture.dtype != np.float32:
@@ -186,7 +186,7 @@ def _read_hdr(path: pathlib.Path, error: type[WarpArError], label: str) -> Linea
     picture = picture[:: 1 if signs[b"Y"] == b"-" else -1, :: 1 if signs[b"X"] == b"+" else -1, ::-1]
 
     def numbers(key: str, count: int) -> npt.NDArray[np.float64]:
-        """Return the numbers of all lines of a key, (lines, count)."""
+        """Return the numbers of all header lines with a key, (lines, count)."""
         said = re.findall(rf"(?m)^{key}[ \t]*=(.*)$", head)
         try:
             return np.array([line.split() for line in said], np.float64).reshape(len(said), count)
@@ -213,7 +213,7 @@ def _read_hdr(path: pathlib.Path, error: type[WarpArError], label: str) -> Linea
 def _in_rec_709(
     color: npt.NDArray[Any], chromaticities: Any, error: type[WarpArError], label: str
 ) -> npt.NDArray[np.float32]:
-    """Return colours of a file's primaries in those of Rec. 709, finite where they were."""
+    """Return colours converted from a file's primaries to Rec. 709; finite colours stay finite."""
     if chromaticities is None:
         return np.ascontiguousarray(color, np.float32)
     source: Any = tuple(map(float, chromaticities))
@@ -225,14 +225,14 @@ def _in_rec_709(
 
 
 def _size_of(window: Any) -> tuple[int, int]:
-    """Return width and height of a window: its first and its last pixel are inside."""
+    """Return width and height of a window, whose first and last pixels are inclusive."""
     first, last = (np.asarray(corner, np.int64) for corner in window)
     width, height = (int(side) for side in last - first + 1)
     return width, height
 
 
 def _in_window(picture: npt.NDArray[np.float32], data: Any, display: Any) -> npt.NDArray[np.float32]:
-    """Return the part of a picture of the data window that lies in the display window, with 0 around it."""
+    """Return the display window's part of a picture that covers the data window; pixels without data are 0."""
     left, top = (int(side) for side in np.asarray(data[0], np.int64) - np.asarray(display[0], np.int64))
     width, height = _size_of(display)
     rows, columns = picture.shape[:2]
@@ -246,37 +246,37 @@ def _in_window(picture: npt.NDArray[np.float32], data: Any, display: Any) -> npt
 
 
 def exr_header(**attributes: Any) -> dict[str, Any]:
-    """Return the header of a signed picture of rows, packed without loss, with further attributes."""
+    """Return a header for a losslessly compressed scanline picture with the program's signature and more attributes."""
     kind = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     return {**kind, "software": PROGRAM, **attributes}
 
 
 def store_exr(path: pathlib.Path, image: OpenEXR.File) -> None:
-    """Write a picture as `write_exr`, under its name when it is whole.
+    """Write a picture with `write_exr` under a temporary name, then rename it.
 
     Raises:
-        SinkError: It cannot be written.
+        SinkError: The file cannot be written.
     """
     store(path, functools.partial(write_exr, image=image))
 
 
 def write_exr(path: pathlib.Path, image: OpenEXR.File) -> None:
-    """Write a picture of rows, or several, and read it again.
+    """Write a scanline picture of one or more parts, and read it again to check it.
 
     Args:
-        path: The file, which is replaced.
-        image: What it is to hold; its parts are of the type ``OpenEXR.scanlineimage``.
+        path: The file; an existing one is replaced.
+        image: The picture; its parts have the type ``OpenEXR.scanlineimage``.
 
     Raises:
-        OSError: Not all of it could be written.
-        RuntimeError: OpenEXR cannot write this.
+        OSError: The file could not be written completely.
+        RuntimeError: OpenEXR cannot write this picture.
     """
     image.write(str(path))
     size = path.stat().st_size
     with path.open("ab", buffering=0) as stream:
-        # Where the end did not fit, one byte more does not either, and the system says why.
+        # If the end of the file did not fit, one more byte does not either, and this write raises the system's error.
         stream.write(b"\0")
         stream.truncate(size)
-    with OpenEXR.File(str(path)) as written:  # parts that lack their end are not among its parts
+    with OpenEXR.File(str(path)) as written:  # parts that lack their end are not listed
         if len(written.parts) != len(image.parts):
             raise OSError(errno.EIO, os.strerror(errno.EIO))

@@ -1,8 +1,8 @@
-"""Files of anyone's making: what may be read, how much of it, and how a file is written so that it is always whole.
+"""Files: kinds and sizes that may be read, and writing that leaves a complete file or none.
 
-Only regular files are read: a named pipe or a device would keep a reader waiting, or never end. Sizes are limited
-before anything is decoded, by the numbers of `Limits`, each of which an environment variable sets. What is written
-appears under its name only when it is whole.
+Only regular files are read: a named pipe or a device could block the reader or never end. Sizes are checked against
+`Limits` before anything is decoded; an environment variable sets each limit. A written file appears under its name only
+when it is complete.
 """
 
 from __future__ import annotations
@@ -37,36 +37,36 @@ _MANY_DOTS: Final = re.compile(rf"(?m)(?:^|[\[{{,])[ \t]*{_PART}(?:[ \t]*\.[ \t]
 
 @dataclasses.dataclass(frozen=True)
 class Limits:
-    """Largest sizes of files; each field has the environment variable ``WARP_AR_MAX_`` and its name in capitals."""
+    """Largest sizes of files. The environment variable of a field is ``WARP_AR_MAX_`` and its name in capitals."""
 
     picture_pixels: int = 1 << 26
-    """Pixels of a frame, a texture, a video's frame or an environment, by the file's header."""
+    """Pixels of a frame, a texture, a video's frame or an environment, as the file's header states them."""
     picture_bytes: int = 1 << 29
     """Bytes of a picture's or an environment's file."""
     text_bytes: int = 1 << 22
     """Bytes of a scene, a calibration, a response, a list of exposures or an OBJ's material library."""
     mesh_bytes: int = 1 << 28
-    """Bytes of a mesh's file, and of each buffer that it names."""
+    """Bytes of a mesh file, and of each buffer file that it names."""
     mesh_elements: int = 20_000_000
-    """Vertices, or faces, of a mesh, by the file's header where it has one."""
+    """Vertices, or faces, of a mesh, as the file's header states them where it does."""
     scene_entries: int = 2000
     """Tables of one section of a scene: objects, proxies, lights or mirror balls."""
     run_bytes: int = 1 << 30
-    """Bytes of what a run of the farm keeps of itself, each file."""
+    """Bytes of each file that a run of the farm keeps about its progress."""
     nesting: int = 64
     """Levels of brackets, tags or indentation in a file."""
 
 
 def variable_of(name: str) -> str:
-    """Environment variable that sets a field of `Limits`."""
+    """Return the environment variable that sets a field of `Limits`."""
     return f"WARP_AR_MAX_{name.upper()}"
 
 
 def limits() -> Limits:
-    """The limits that hold.
+    """Return the limits in effect.
 
     Raises:
-        UsageError: An environment variable is no whole number above 0.
+        UsageError: An environment variable is not an integer above 0.
     """
     given = {}
     for field in dataclasses.fields(Limits):
@@ -81,16 +81,16 @@ def limits() -> Limits:
 
 
 def too_much(label: str, amount: int, what: str, name: str) -> str:
-    """Words for a file that is beyond the limit ``name``."""
+    """Return the message for a file that exceeds the limit ``name``."""
     most = getattr(limits(), name)
     return f"{label} has {amount:,} {what}; at most {most:,} are read (set {variable_of(name)} for more)"
 
 
 def check_size(width: int, height: int, error: type[WarpArError], label: str) -> None:
-    """Check the size in pixels that the header of a picture promises.
+    """Check the size in pixels that a picture's header states.
 
     Raises:
-        WarpArError: As ``error``: it is empty, or too large to be read.
+        WarpArError: As ``error``: the picture is empty or too large.
     """
     if width < 1 or height < 1:
         raise error(f"{label} cannot be read: its header promises {width}x{height} pixels")
@@ -99,19 +99,19 @@ def check_size(width: int, height: int, error: type[WarpArError], label: str) ->
 
 
 def kind_of(path: str | os.PathLike[str]) -> str:
-    """Return the kind of thing that a path leads to.
+    """Return the kind of file that a path leads to.
 
     Returns:
-        "file", "folder", "nothing", or words for what is none of them: "a named pipe", "a device", "a socket".
+        "file", "folder", "nothing", or a description of another kind: "a named pipe", "a device", "a socket".
 
     Raises:
-        OSError: The path cannot be looked at, for example because it is too long.
+        OSError: The path cannot be examined, for example because it is too long.
     """
     try:
         mode = os.stat(path).st_mode
     except (FileNotFoundError, NotADirectoryError):
         return "nothing"
-    except ValueError as error:  # a zero byte, a half of a pair
+    except ValueError as error:  # a zero byte, an unpaired surrogate
         raise OSError(f"the name cannot be one: {reason(error)}") from error
     if stat.S_ISREG(mode):
         return "file"
@@ -121,7 +121,7 @@ def kind_of(path: str | os.PathLike[str]) -> str:
 
 
 def is_file(path: str | os.PathLike[str], kind: str = "file") -> bool:
-    """Tell whether a path leads to a regular file; a path that cannot be one does not."""
+    """Return True if a path leads to a regular file; False also for an invalid path."""
     try:
         return kind_of(path) == kind
     except OSError:
@@ -129,21 +129,21 @@ def is_file(path: str | os.PathLike[str], kind: str = "file") -> bool:
 
 
 def is_folder(path: str | os.PathLike[str]) -> bool:
-    """Tell whether a path leads to a folder; a path that cannot be one does not."""
+    """Return True if a path leads to a folder; False also for an invalid path."""
     return is_file(path, "folder")
 
 
 def read_bytes(path: str | os.PathLike[str], limit: str, error: type[WarpArError], label: str | None = None) -> bytes:
-    """All of a regular file.
+    """Return the content of a regular file.
 
     Args:
         path: The file.
-        limit: Field of `Limits` that it must keep to, in bytes.
-        error: What to raise.
-        label: What messages call the file; its path if left out.
+        limit: Field of `Limits` with the largest size in bytes.
+        error: Class of the error to raise.
+        label: Name of the file in messages; None: its path.
 
     Raises:
-        WarpArError: As ``error``: there is no such file, it is no regular one, too large, or cannot be read.
+        WarpArError: As ``error``: the file does not exist, is not regular, is too large, or cannot be read.
     """
     label = str(path) if label is None else label
     most = getattr(limits(), limit)
@@ -153,7 +153,7 @@ def read_bytes(path: str | os.PathLike[str], limit: str, error: type[WarpArError
             raise error(f"{label} is not there")
         if kind != "file":
             raise error(f"{label} is {'a folder' if kind == 'folder' else kind}; a regular file is needed")
-        # Should a pipe take the file's place in between, opening it does not wait either.
+        # Non-blocking: the file may be replaced by a pipe before it is opened.
         flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
         with os.fdopen(os.open(path, flags), "rb", buffering=0) as stream:
             size = os.fstat(stream.fileno()).st_size
@@ -173,10 +173,10 @@ def read_bytes(path: str | os.PathLike[str], limit: str, error: type[WarpArError
 def read_text(
     path: str | os.PathLike[str], error: type[WarpArError], label: str | None = None, expected: str = "text"
 ) -> str:
-    """All of a regular file in UTF-8; arguments and errors as `read_bytes`, ``expected`` names its format.
+    """Return the text of a regular UTF-8 file; arguments as for `read_bytes`, ``expected`` names the format.
 
     Raises:
-        WarpArError: As ``error``: it cannot be read, is too large, or is no text in UTF-8.
+        WarpArError: As ``error``: the file cannot be read, is too large, or is not UTF-8.
     """
     data = read_bytes(path, "text_bytes", error, label)
     try:
@@ -187,13 +187,13 @@ def read_text(
 
 
 def bracket_depth(text: str) -> int:
-    """Most square and curly brackets that are open at once; those within quotes count, so it is never too low."""
+    """Return an upper bound of the nesting of square and curly brackets; brackets within quotes count too."""
     steps = _BRACKETS[np.frombuffer(text.encode("utf-8", "replace"), np.uint8)]
     return int(np.cumsum(steps[steps != 0], dtype=np.int64).max(initial=0))
 
 
 def indentation_depth(text: str) -> int:
-    """Most levels of a block of YAML: each deeper column, and each dash on a line, is one."""
+    """Return the deepest indentation of a YAML text in levels: each deeper column and each dash on a line is one."""
     columns: list[int] = []
     deepest = 0
     for line in text.splitlines():
@@ -211,7 +211,7 @@ def indentation_depth(text: str) -> int:
 
 
 def tag_depth(text: str) -> int:
-    """Most tags of XML that are open at once."""
+    """Return the largest number of XML tags that are open at once."""
     depth = deepest = 0
     for match in re.finditer(r"<(/?)[A-Za-z_][^<>]*?(/?)>", text):
         depth += 0 if match[2] else -1 if match[1] else 1
@@ -220,10 +220,10 @@ def tag_depth(text: str) -> int:
 
 
 def parse_json(text: str, label: str, error: type[WarpArError]) -> Any:
-    """JSON of anyone's making.
+    """Return the parsed JSON of an untrusted text.
 
     Raises:
-        WarpArError: As ``error``: it is damaged, or nested too deeply.
+        WarpArError: As ``error``: the text is damaged or nested too deeply.
     """
     check_depth(bracket_depth(text), label, error)
     try:
@@ -233,11 +233,11 @@ def parse_json(text: str, label: str, error: type[WarpArError]) -> Any:
 
 
 def parse_toml(text: str, label: str, error: type[WarpArError]) -> dict[str, Any]:
-    """TOML of anyone's making.
+    """Return the parsed TOML of an untrusted text.
 
     Raises:
-        WarpArError: As ``error``: it is damaged, nested too deeply, or has a dotted key of many parts, each of which is
-            a table in a table: TOML's reader takes long.
+        WarpArError: As ``error``: the text is damaged or nested too deeply, or a dotted key has too many parts. Each
+            part is a nested table, and the parser's time grows with their number.
     """
     check_depth(bracket_depth(text), label, error)
     if match := _MANY_DOTS.search(text):
@@ -252,10 +252,10 @@ def parse_toml(text: str, label: str, error: type[WarpArError]) -> dict[str, Any
 
 
 def check_depth(depth: int, label: str, error: type[WarpArError]) -> None:
-    """Check that a text is not nested too deeply for its reader.
+    """Check the nesting depth of a text against the limit.
 
     Raises:
-        WarpArError: As ``error``: it is.
+        WarpArError: As ``error``: the text is nested too deeply.
     """
     if depth > limits().nesting:
         raise error(too_much(f"{label}: it", depth, "levels of nesting", "nesting"))
@@ -268,23 +268,23 @@ def write_whole(
     suffix: str = "",
     keep_links: bool = False,
 ) -> None:
-    """Write a file aside and give it its name when it is whole; what stood there stays until then.
+    """Write a file under a temporary name and rename it when it is complete; an existing file stays until then.
 
     Args:
-        path: The file; a symbolic link is followed. The mode of a file that stood there is kept.
-        write: Its bytes, or a function that writes them to the path that it is given.
-        suffix: Ending of that path, for libraries that choose the format by it.
-        keep_links: Whether other hard links of the file get the new content too; for a user's own file that is amended.
+        path: The file. A symbolic link is followed; the mode of an existing file is kept.
+        write: The content, or a function that writes it to the temporary path that it receives.
+        suffix: Ending of the temporary path, for libraries that choose the format by it.
+        keep_links: Whether other hard links of the file get the new content too, for a user's file that is amended.
 
     Raises:
-        OSError: It cannot be written; nothing has changed.
+        OSError: The file cannot be written; the existing one is unchanged.
     """
     path = pathlib.Path(os.path.realpath(path))
     kind = kind_of(path)
     if kind not in ("file", "nothing"):
         raise OSError(f"it is {'a folder' if kind == 'folder' else kind}, not a file")
     part = name_aside(path, suffix)
-    # The name is known before the file is there: a signal between the two leaves nothing.
+    # The name is chosen before the file exists, so that a signal in between leaves no file.
     try:
         with os.fdopen(create_new(part), "wb") as stream:
             if not callable(write):
@@ -293,7 +293,7 @@ def write_whole(
             write(part)
         before = os.stat(path) if kind == "file" else None
         if before is not None and keep_links and before.st_nlink > 1:
-            path.write_bytes(part.read_bytes())  # the copy aside has shown that there is room
+            path.write_bytes(part.read_bytes())  # writing the temporary file has shown that the disk has room
             part.unlink()
             return
         if before is not None:
@@ -308,36 +308,36 @@ def write_whole(
 def store(
     path: pathlib.Path, write: bytes | Callable[[pathlib.Path], object], *, suffix: str = "", label: str | None = None
 ) -> None:
-    """Write a file as `write_whole` does, and name it where that fails.
+    """Write a file with `write_whole`; name the file in the error.
 
     Raises:
-        SinkError: It cannot be written; nothing has changed.
+        SinkError: The file cannot be written; an existing one is unchanged.
     """
     try:
         write_whole(path, write, suffix=suffix)
-    except (OSError, RuntimeError) as error:  # RuntimeError: OpenEXR's
+    except (OSError, RuntimeError) as error:  # RuntimeError: raised by OpenEXR
         raise SinkError(f"{label or path} cannot be written: {reason(error)}") from error
 
 
 def name_aside(path: pathlib.Path, suffix: str = "") -> pathlib.Path:
-    """Return the path, hidden and of a random name, for a file that is to take another one's name when it is whole.
+    """Return a hidden, random path next to ``path`` for a file that takes that name when it is complete.
 
     Args:
-        path: That name (`take_name`).
-        suffix: Ending of its name until then.
+        path: Final path (see `take_name`).
+        suffix: Ending of the temporary name.
     """
     name = path.name if len(os.fsencode(path.name)) <= 200 else f"{path.stem[:40]}{path.suffix[:8]}"
     return path.with_name(f".{name}.{secrets.token_hex(8)}.part{suffix}")
 
 
 def create_new(path: pathlib.Path) -> int:
-    """Create an empty file where none is; no link there is followed.
+    """Create an empty file where none exists; a link of that name is not followed.
 
     Returns:
-        Its descriptor, open for reading and writing.
+        File descriptor, open for reading and writing.
 
     Raises:
-        OSError: It cannot be created, or something has that name.
+        OSError: The file cannot be created, or the name is taken.
     """
     flags = os.O_RDWR | os.O_CREAT | os.O_EXCL
     for extra in ("O_NOFOLLOW", "O_CLOEXEC", "O_BINARY"):
@@ -346,16 +346,16 @@ def create_new(path: pathlib.Path) -> int:
 
 
 def take_name(part: pathlib.Path, path: pathlib.Path) -> None:
-    """Give a file that was written aside its name; the file that had it is gone.
+    """Rename a complete temporary file to its final path, replacing an existing file.
 
     Raises:
-        OSError: It cannot be renamed.
+        OSError: The file cannot be renamed.
     """
     part.replace(path)
 
 
 def is_same_file(a: pathlib.Path, b: pathlib.Path) -> bool:
-    """Tell whether two paths lead to one file or folder, by whatever links; neither needs to exist."""
+    """Return True if two paths lead to the same file or folder, links resolved; neither needs to exist."""
     try:
         return os.path.realpath(a) == os.path.realpath(b) or (os.path.exists(a) and os.path.samefile(a, b))
     except (OSError, ValueError):

@@ -1,6 +1,6 @@
-"""``python -m warp_ar.init my_desk``: a folder to start from, with a scene, a teapot and the card to print.
+"""``python -m warp_ar.init my_desk``: makes a folder to start from, with a scene, a teapot and the card to print.
 
-The folder runs at once with a guessed camera; what is guessed is said whenever it is run.
+The scene runs at once with a guessed camera; each run prints which values are guessed.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""``python -m warp_ar.keys [SECTION]`` prints the keys of scene files: meaning, unit, default and an example."""
+"""``python -m warp_ar.keys [SECTION]``: prints the keys of scene files with meaning, unit, default and example."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from warp_ar.scene.reference import keys
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """Return the command's options."""
+    """Return the parser of the command's options."""
     parser = Parser(prog="python -m warp_ar.keys", description="Print the keys of scene files, with unit and example.")
     parser.add_argument("section", nargs="?", metavar="SECTION", help="one section, such as camera or object.material")
     return parser

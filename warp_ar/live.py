@@ -85,10 +85,10 @@ def make_parser() -> Parser:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Build everything that ``options`` ask for, then let frames flow until they end.
+    """Build the run that ``options`` describe and light frames until they end.
 
     Raises:
-        UsageError: Options make no sense, or do not fit each other.
+        UsageError: An option has an impossible value, or options do not fit each other.
     """
     if options.list:
         for name, path in bundled_scenes().items():

@@ -1,4 +1,4 @@
-"""``python -m warp_ar.live`` without a page: a source's frames are lit, and what options name is written."""
+"""``python -m warp_ar.live`` without a page: lights the frames of a source and writes the outputs that options name."""
 
 from __future__ import annotations
 
@@ -32,28 +32,28 @@ if TYPE_CHECKING:
     from warp_ar.accuracy.traced_frames import TracedFrames
     from warp_ar.session import Session
 
-# A clip that shows no marker for this many frames is not going to: say so instead of running on.
+# Number of frames after which a clip that has shown no marker is given up.
 MARKER_PATIENCE = 100
 NO_BALL = "no mirror ball was found where [probe] has it"
 
 
 class RunError(WarpArError):
-    """Something failed after frames had begun to flow."""
+    """Failure after the first frame was begun."""
 
 
 def _check_places(options: argparse.Namespace, scene: Scene) -> None:
-    """See to it that nothing is written over a file that is read, or twice."""
+    """Check that no output replaces a file that is read or another output."""
     names = ("output", "report", "save_environment", "save_layers")
     writes = {f"--{name.replace('_', '-')}": path for name in names if (path := getattr(options, name)) is not None}
     check_places(reads_of(scene, options), {option: Path(path) for option, path in writes.items()})
 
 
 def reflectances_told(probes: Sequence[Probe], status: Callable[[], Mapping[str, Any]] | None) -> list[str]:
-    """Return a line for each ball whose reflectance in the frames differs from the scene's.
+    """Return a line for each ball whose measured reflectance differs from the scene's.
 
     Args:
-        probes: The scene's.
-        status: Function that returns the status of recovered light; None where none is recovered.
+        probes: Mirror balls of the scene.
+        status: Function that returns the status of the stage ``recover``; None if the stage does not run.
     """
     told = None if status is None else status().get("ball_reflectance")
     lines = []
@@ -67,15 +67,15 @@ def reflectances_told(probes: Sequence[Probe], status: Callable[[], Mapping[str,
 
 
 def light_clip(options: argparse.Namespace) -> int:
-    """Light a source's frames without a page, and write what options name.
+    """Light a source's frames without a page, and write the outputs that options name.
 
     Raises:
-        UsageError: Options of layers have no folder, or a file is somebody else's.
-        RunError: Something failed after frames had begun to flow.
+        UsageError: Options of layers have no folder, or a file to replace was not written by this program.
+        RunError: Something failed after the first frame was begun.
     """
     scene = load_scene(options.scene)
     _check_places(options, scene)
-    # Here, for they load Warp: the page is to be there before, and errors of a scene are told before.
+    # Imported here because they load Warp: a scene's errors are reported first.
     with importing():
         start_device(options.device)
         import warp_ar.output.report  # noqa: F401
@@ -84,10 +84,10 @@ def light_clip(options: argparse.Namespace) -> int:
 
 
 class _Clip:
-    """One run: a session, the places that its frames go to, and its checks."""
+    """A run to files: the session, its sinks and its checks."""
 
     def __init__(self, options: argparse.Namespace, scene: Scene, stack: contextlib.ExitStack) -> None:
-        """Open all; ``stack`` closes it."""
+        """Open the session and all sinks; ``stack`` closes them."""
         from warp_ar.output.report import RunLog
 
         self.options, self.stack = options, stack
@@ -102,7 +102,7 @@ class _Clip:
                 say(note)
         self.traced: TracedFrames | None = None
         if options.samples is not None:
-            with importing():  # the path tracer's kernels, which no other run declares
+            with importing():  # the path tracer's kernels, which other runs do not declare
                 from warp_ar.accuracy.traced_frames import TracedFrames
             self.traced = TracedFrames(self.session.pipeline, options.samples, options.error)  # type: ignore[arg-type]
             self.session.ahead = False
@@ -116,14 +116,14 @@ class _Clip:
                 say(words)
         self.log = RunLog(self.session.pipeline)
         self.changed = False
-        """True once a frame was changed."""
+        """True once a frame differed from its input."""
         self.views: list[tuple[Any, Any]] = []
-        """Some frames with their poses, by which to look for a ball that the quick check has not seen."""
+        """Some frames with their poses, to search for a ball that the quick check has not seen."""
         self.code: int | None = None
-        """Exit code of a signal that asked the run to end."""
+        """Exit code of the signal that asked the run to end; None if there was none."""
 
     def _open_side_files(self) -> tuple[str, ...]:
-        """Open the files beside the pictures; return the outputs that the pipeline must give."""
+        """Open the outputs other than pictures; return the pipeline outputs that they need."""
         from warp_ar.engine.layers import RADIANCE
         from warp_ar.output.layer_file import SideFiles, parse_layers
 
@@ -143,7 +143,7 @@ class _Clip:
         if options.coding != "8bit":
             outputs.append(RADIANCE)
         if options.report is not None:
-            # A file that cannot be written fails now, not after an hour of frames.
+            # A report that cannot be written fails here, before the first frame.
             self.replaced.append(check_replaceable(options.report, overwrite=options.overwrite))
             make_folder(options.report.parent)
             outputs.append("pose")
@@ -163,13 +163,13 @@ class _Clip:
         try:
             return are_balls_missing(self.session.scene, self.options.source)
         except WarpArError:
-            return False  # the run meets it too, and says it
+            return False  # the run itself meets the same error and reports it
 
     def _leave_balls_out(self) -> None:
-        """Go on by the card's light where the scene has mirror balls that are not there.
+        """Continue with the light estimated from the card if the scene's mirror balls are not in the frames.
 
         Raises:
-            RunError: Neither ball nor card is seen.
+            RunError: The frames show neither the balls nor the card.
         """
         self.session.close()
         scene = dataclasses.replace(self.session.scene, probes=())
@@ -181,7 +181,7 @@ class _Clip:
         self.notes["balls_missing"] = f"{NO_BALL}; the card's light is used instead"
 
     def _report_balls(self, scene: Scene) -> dict[str, Any]:
-        """Say how far from where the scene has them the mirror balls were found; return that for the report."""
+        """Print how far the mirror balls are from their places in the scene; return the distances for the report."""
         session, found = self.session, []
         balls = zip(session.ball_fits, scene.probes, session.scene.probes, strict=False)
         for index, (fit, before, after) in enumerate(balls):
@@ -193,7 +193,7 @@ class _Clip:
         return {"balls": found} if found else {}
 
     def _compile(self) -> None:
-        """Have the kernels ready, with a bar where some must be compiled."""
+        """Load all kernels, with a progress bar if some must be compiled."""
         words = TextColumn("compiling kernels, once for this kind of scene")
         bar = Progress(words, BarColumn(), MofNCompleteColumn(), disable=self.options.headless)
         task = bar.add_task("compile")
@@ -224,13 +224,13 @@ class _Clip:
         )
 
     def _open_camera(self) -> Sink:
-        """Open the virtual camera, if one is asked for."""
+        """Open the virtual camera if the options name one."""
         from warp_ar.output.virtual_camera import VirtualCameraSink
 
         if (device := self.options.virtual_camera) is None:
             return NullSink()
         source, size = self.session.source, self.session.pipeline.size
-        # A clip's frames are shown at its rate; a camera's come at theirs.
+        # Frames of a clip are shown at its rate, frames of a live camera as they come.
         camera = VirtualCameraSink(device or None, fps=source.fps, size=size, paced=not source.live)
         say(f"frames go to {camera.description}")
         return camera
@@ -238,7 +238,7 @@ class _Clip:
     # ---------------------------------------------------------------------------------------------------------- frames
 
     def run(self) -> int:
-        """Light all frames, write the report and say what became of it; return the exit code."""
+        """Light all frames, write the report and print the summary; return the exit code."""
         try:
             with handling(self._stop, "SIGINT", "SIGTERM", "SIGHUP"), self.side, self.sink, self.camera:
                 self._light_frames()
@@ -262,13 +262,13 @@ class _Clip:
         return EXIT_DONE if self.code is None else self.code
 
     def _stop(self, number: int, _: object) -> None:
-        """Note the first signal; a second one stops at once."""
+        """Record the first signal; end at once at a second one."""
         if self.code is not None:
             raise KeyboardInterrupt
         self.code = EXIT_INTERRUPTED if number == signal.SIGINT else EXIT_TERMINATED
 
     def _light_frames(self) -> None:
-        """Let frames flow until they end, or until a signal asks to stop."""
+        """Light frames until they end or a signal asks to stop."""
         options, session, log = self.options, self.session, self.log
         source = session.source
         total = options.frames
@@ -283,7 +283,7 @@ class _Clip:
                 if self.traced is not None:
                     image = self.traced(frame, result)
                 self.changed = self.changed or bool((result.image != frame.image).any())
-                # The first, second, fourth, eighth, ...: all parts of a run, in few frames.
+                # Keep frames 1, 2, 4, 8, ...: few frames from all parts of a run.
                 if not self.ball_seen and result.pose is not None and (log.count + 1).bit_count() == 1:
                     self.views = [*self.views, (frame.image.copy(), result.pose)][-4:]
                 start = time.perf_counter()
@@ -299,7 +299,7 @@ class _Clip:
                     return
 
     def _check_marker(self, *, live: bool) -> None:
-        """Complain where no frame so far showed the marker: an error for a clip, a note for a camera."""
+        """Report that no frame so far showed the marker: as an error for a clip, as a note for a camera."""
         log, marker = self.log, self.session.scene.marker
         if not log.never_posed or log.count == 0:
             return
@@ -315,10 +315,10 @@ class _Clip:
         say(message)
 
     def _check(self) -> None:
-        """Complain about a run that showed no marker, no ball, or changed nothing, though its scene calls for it.
+        """Check that the run showed the marker and the ball, and changed frames, where its scene calls for it.
 
         Raises:
-            RunError: It did.
+            RunError: It did not.
         """
         from warp_ar.checks.checkup import ball_is_seen
 
@@ -341,13 +341,13 @@ class _Clip:
     # ------------------------------------------------------------------------------------------------------------- end
 
     def _count(self) -> str:
-        """Return how many frames there are of a run that failed."""
+        """Return the number of frames of a failed run in words."""
         bare = isinstance(self.sink, NullSink)
         count, how = (self.log.count, "lit") if bare else (self.sink.written, "written")
         return f"{counted(count, 'frame')} {'was' if count == 1 else 'were'} {how}{self.side.written}"
 
     def _write_report(self) -> str:
-        """Write the report if one is asked for; return the words of a failure."""
+        """Write the report if the options name one; return the message of a failure."""
         if (path := self.options.report) is None:
             return ""
         text = json.dumps({"program": PROGRAM, **self.log.report(), **self.notes}, indent=1)
@@ -358,7 +358,7 @@ class _Clip:
         return ""
 
     def _tell_end(self) -> None:
-        """Say in five lines at most what ran, where the frames are, what is wrong and what cost most."""
+        """Print the summary in at most five lines: frames, outputs, faults and the most expensive stages."""
         from warp_ar.output.report import print_plan, stage_names
 
         pipeline, log = self.session.pipeline, self.log
@@ -380,7 +380,7 @@ class _Clip:
 
 
 def _choice(status: Mapping[str, Any]) -> str:
-    """Return a budget's choice in words."""
+    """Return the settings that a budget has chosen, in words."""
     if "settings" not in status:
         return f"{AUTO}: no marker was seen, so nothing was chosen"
     if not status["changes"]:

@@ -1,4 +1,4 @@
-"""Page of ``python -m warp_ar.live``: its scene, its address, and serving it until somebody ends it."""
+"""Page of ``python -m warp_ar.live``: its scene, its address, and its server, which runs until it is interrupted."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ if TYPE_CHECKING:
 DEFAULT_PORT = 8720
 PORT_TRIES = 20
 CHECKING_S = 10.0
-"""Seconds that a page which ends by itself waits for the check of its scene."""
+"""Longest wait, in seconds, for the check of the scene when the page ends by itself."""
 
 
 def _page_scene(options: argparse.Namespace) -> Scene:
     """Return the scene of a page.
 
     Raises:
-        UsageError: An option is for files only, or has an impossible value.
+        UsageError: An option applies to runs to files only, or has an impossible value.
     """
     for name in ("save_environment", "save_layers", "report", "samples", "error"):
         if getattr(options, name) is not None:
@@ -48,7 +48,7 @@ def _page_scene(options: argparse.Namespace) -> Scene:
     light = None if options.light == "card" else options.light
     if options.calibration is None and light is None:
         return load_scene(options.scene)
-    from warp_ar.session import chosen_scene  # loads Warp, for which the page does not wait elsewhere
+    from warp_ar.session import chosen_scene  # loads Warp; other pages do not wait for that
 
     return chosen_scene(options.scene, options.source, options.calibration, light, options.light_axes)
 
@@ -70,15 +70,15 @@ def _page_address(options: argparse.Namespace) -> Address:
 
 
 def _make_page_host(options: argparse.Namespace, scene: Scene, checking: threading.Thread, **callbacks: Any) -> Any:
-    """Return the host of a page that is served already, on its own thread: it loads Warp and all that uses it."""
+    """Return a page's host, which loads Warp on its own thread while the page is already served."""
     from warp_ar.device import bound_arenas
 
     start_device(options.device)
     from warp_ar.viewer.host import Host
 
-    checking.start()  # not beside the imports: Python 3.11's parser is not safe in two threads
+    checking.start()  # not during the imports: Python 3.11's parser is not thread-safe
     bound_arenas()
-    # Imports stay: looking through them for garbage would hold up a frame for a tenth of a second.
+    # Imported modules are exempt from garbage collection, which would delay a frame by a tenth of a second.
     gc.collect()
     gc.freeze()
     host = Host(
@@ -97,7 +97,7 @@ def _make_page_host(options: argparse.Namespace, scene: Scene, checking: threadi
 
 
 def _say_no_camera(options: argparse.Namespace, text: str) -> None:
-    """Say how another camera than that of this machine comes to the page, which goes on."""
+    """Print how to connect a camera other than this machine's; the page goes on."""
     from warp_ar.viewer.address import LOOPBACK
 
     say(f'{text}; the page goes on without: press "My camera" there for the camera of the browser\'s machine')
@@ -108,8 +108,8 @@ def _say_no_camera(options: argparse.Namespace, text: str) -> None:
 
 
 def serve_page(options: argparse.Namespace) -> int:
-    """Serve the page until Ctrl-C, or until ``--frames`` have been lit."""
-    # Here, for what only writes files should not wait for a web server to load.
+    """Serve the page until Ctrl-C or until ``--frames`` frames have been lit."""
+    # Imported here: runs to files do not wait for the web server to load.
     with importing():
         import segno
 
@@ -118,7 +118,7 @@ def serve_page(options: argparse.Namespace) -> int:
 
     scene = _page_scene(options)
     address = _page_address(options)
-    # Beside the page, which does not wait for it.
+    # The check runs concurrently with the page.
     checking = threading.Thread(target=say_quick_check, args=(options, scene), daemon=True)
 
     def ready(address: Address) -> None:
@@ -130,11 +130,11 @@ def serve_page(options: argparse.Namespace) -> int:
         if not options.no_browser and options.host in LOOPBACK and _has_display():
             webbrowser.open(address.url)
 
-    # A shell that starts this in the background has it ignore the signal; here it is the only way to end.
+    # A shell starts background processes with SIGINT ignored; here it is the only way to end.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     server = Server(functools.partial(_make_page_host, options, scene, checking), address)
     code, before = EXIT_DONE, tempfile.tempdir
-    # All temporary folders of this run, Warp's own for each thread that compiles among them.
+    # Parent of all temporary folders of this run, including those of Warp's compiling threads.
     tempfile.tempdir = folder = tempfile.mkdtemp(prefix="warp_ar_page_")
     try:
         asyncio.run(server.serve(ready, tries=PORT_TRIES if options.port is None else 1))
@@ -148,14 +148,14 @@ def serve_page(options: argparse.Namespace) -> int:
     finally:
         tempfile.tempdir = before
         shutil.rmtree(folder, ignore_errors=True)
-        gc.unfreeze()  # whoever called goes on with a collector that sees all
+        gc.unfreeze()  # restore garbage collection of all objects for the caller
     interrupted = code in (EXIT_INTERRUPTED, EXIT_TERMINATED)
     if checking.ident is not None:
         checking.join(0.0 if interrupted else CHECKING_S)
     if not server.ended or interrupted or checking.is_alive():
-        # A frame of the reference, a kernel that is compiled, or the check of the scene takes seconds and cannot be
-        # stopped, and Python would wait for its thread, or end it within native code, which aborts. All files are
-        # closed by now, and temporary folders gone.
+        # A reference frame, a kernel's compilation or the check of the scene takes seconds and cannot be interrupted.
+        # Python would wait for its thread, or end it within native code, which aborts the process. All files are closed
+        # and temporary folders removed by now.
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)

@@ -1,4 +1,4 @@
-"""Start of a page and of a run to files: a quick check of the set-up, and the device."""
+"""Start of a page or a run to files: a quick check of the scene, and the device."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ from warp_ar.errors import WarpArError, say
 from warp_ar.scene import Scene, bundled_scenes
 
 ALWAYS: Final = ("camera.guessed", "object.outside")
-"""Findings that are said beside the worst."""
+"""Findings that are always printed, besides the worst one."""
 
 
 def say_quick_check(options: argparse.Namespace, scene: Scene) -> tuple[bool, str]:
-    """Say in one line each what is guessed, what lies outside the picture, and the worst of what else is wrong.
+    """Check the scene quickly; print guessed values, objects outside the picture and the worst other finding.
 
-    Frames of a capture device are left to the run itself: a device is not opened twice.
+    A capture device is not checked: it cannot be opened twice, and the run needs it.
 
     Returns:
-        True if a mirror ball was seen where the scene has one, and the worst finding in words.
+        True if the frames show a mirror ball of the scene; and the text of the worst finding, empty without one.
     """
     from warp_ar.checks.checkup import quick_check
 
     try:
         findings, ball_seen = quick_check(scene, options.source)
     except WarpArError:
-        return False, ""  # the run meets it too, and says it
-    # What the run itself cannot start with, it says itself.
+        return False, ""  # the run meets the same error and reports it
+    # The run itself reports findings that prevent its start.
     told = ("source.", "camera.aspect")
     found = [finding for finding in findings if not finding.name.startswith(told)]
     worst = [finding for finding in found if finding.name not in ALWAYS][:1]
@@ -38,7 +38,7 @@ def say_quick_check(options: argparse.Namespace, scene: Scene) -> tuple[bool, st
 
 
 def start_device(name: str) -> None:
-    """Start Warp, and make a CUDA device's context beside the imports that follow.
+    """Start Warp, and create a CUDA device's context during the imports that follow.
 
     Args:
         name: As for ``resolve_device``.

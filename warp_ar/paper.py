@@ -1,7 +1,7 @@
-"""``python -m warp_ar.paper [FIGURE ...]`` makes the paper's figures again, and compares readings of its open text.
+"""``python -m warp_ar.paper [FIGURE ...]``: reproduces the paper's figures, and compares readings of its text.
 
-FIGURE is 1 or 3 to 9, or ``readings``; without any all are made. Each figure is a picture, a table of numbers and a
-plot, from bundled clips, the preset ``paper`` beside ours and the truth.
+FIGURE is 1 or 3 to 9, or ``readings``; without any, all are made. Each figure is a picture, a table of numbers and a
+plot. It compares the preset ``paper``, our presets and the ground truth on bundled clips.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ except ImportError as error:
 
 READINGS = "readings"
 QUALITY = 88
-"""WebP's quality."""
+"""Quality setting of WebP."""
 ENDINGS = (".webp", ".svg", "a.svg", "b.svg")
-"""Endings of a figure's files: its picture, and one plot or two."""
+"""Endings of a figure's files: the picture, then one plot or two."""
 PAGE = "figures.md"
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """The command's options."""
+    """Return the parser of the command's options."""
     parser = Parser(prog="python -m warp_ar.paper", description="Make the paper's figures again, beside ours.")
     add = parser.add_argument
     names = ", ".join(map(str, FIGURES))
@@ -56,10 +56,10 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def asked_figures(names: Sequence[str]) -> list[str]:
-    """Names of figures, checked.
+    """Return the names of figures, checked; all of them if none is given.
 
     Raises:
-        UsageError: There is no figure of that name.
+        UsageError: A name is unknown.
     """
     known = [*map(str, FIGURES), READINGS]
     for name in names:
@@ -69,20 +69,20 @@ def asked_figures(names: Sequence[str]) -> list[str]:
 
 
 def as_markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table in Markdown."""
+    """Return a table in Markdown."""
     lines = [head, ["---", *["--:"] * (len(head) - 1)], *rows]
     return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
 
 
 def encode_webp(picture: npt.NDArray[Any]) -> bytes:
-    """A WebP with this program's signature of an RGB picture, uint8 (height, width, 3)."""
+    """Return a signed WebP of an RGB picture, uint8 (height, width, 3)."""
     data = io.BytesIO()
     Image.fromarray(picture).save(data, "WEBP", quality=QUALITY, exif=software_exif())
     return data.getvalue()
 
 
 def write_figure(figure: PaperFigure, out: OwnFiles, folder: str) -> str:
-    """Write a figure's picture and plots; returns its section of the Markdown page, which links into ``folder``."""
+    """Write a figure's picture and plots; return its section of the Markdown page, which links into ``folder``."""
     name = f"figure{figure.number}"
     out.write(f"{name}.webp", encode_webp(figure.picture))
     parts = [f"## Figure {figure.number}: {figure.title}", figure.text, f"![{figure.title}]({folder}/{name}.webp)"]
@@ -96,7 +96,7 @@ def write_figure(figure: PaperFigure, out: OwnFiles, folder: str) -> str:
 
 
 def reading_rows(context: Context) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """The table of readings."""
+    """Return the head and the rows of the table that compares readings of the paper."""
     found = compare_readings(context)
     head = ("section", "open", "reading", *(f"`{scene}`" for scene in READING_SCENES))
     rows = [
@@ -112,10 +112,10 @@ def reading_rows(context: Context) -> tuple[tuple[str, ...], list[tuple[str, ...
 
 
 def make_all(options: argparse.Namespace) -> int:
-    """Make, print and write what was asked for.
+    """Make the requested figures, print their tables and write the files.
 
     Raises:
-        UsageError: An option makes no sense, or a library is missing.
+        UsageError: An option has an impossible value, or a library is missing.
     """
     names = asked_figures(options.figures)
     require_plots()

@@ -1,4 +1,4 @@
-"""From photographs of a mirror ball, without a marker, to captured light."""
+"""Capture of light from photographs of a mirror ball, without a marker."""
 
 from __future__ import annotations
 
@@ -38,47 +38,47 @@ Image = NDArray[np.uint8]
 RGB = tuple[float, float, float]
 
 PIXELS: Final = "pixels"
-"""In the place of exposures: what the pictures themselves tell."""
+"""Value of ``exposures``: estimate the exposures from the pictures themselves."""
 HEIGHTS = 128, 2048
-"""Rows of the environment, at least and at most, where they follow the ball."""
+"""Least and largest number of rows of the environment if it is chosen by the ball's size."""
 WINDOW = 1.25
-"""Half side, in radii, of the part of a photograph that is unwrapped."""
+"""Half the side, in radii of the ball, of the part of a photograph that is unwrapped."""
 NEAR = 0.08
-"""Share of the radius by which the ball lies elsewhere in another photograph of a bracket, at most."""
+"""Largest displacement of the ball between photographs of a bracket, in radii."""
 SHIFTED = 0.05
-"""Share of the radius from which on a photograph's shift is doubted."""
+"""Displacement of the ball, in radii, from which a note is given."""
 BRACKET_ERROR = 0.05
-"""Relative error of merged radiance: what a response that was estimated or assumed leaves."""
+"""Relative error of merged radiance with an estimated or assumed response."""
 GUESS = 0.85
-"""Reflectance of a ball that nothing tells: a silvered ornament's."""
+"""Reflectance of a ball if nothing measures it: that of a silvered ornament."""
 LEAST_CLIPPED = 0.05
-"""Share of the irradiance that must clip for light that is lacking to be looked for there."""
+"""Share of the irradiance that clipped texels must have for missing light to be estimated there."""
 SEEN = 0.25
-"""Mean confidence from which a part of the map was seen."""
+"""Mean confidence from which a part of the map counts as seen."""
 LEAST_SAID = 0.005
-"""Share of the light from which it is said that it was added."""
+"""Share of added light from which a note reports it."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Capture:
-    """Captured light, and how it came about."""
+    """Captured light with the ball, camera and notes that it was found with."""
 
     light: Light
-    """The light, in axes whose z is up where the camera was level."""
+    """The light; its z axis points up if the camera was level."""
     outline: BallOutline
-    """The ball in the photograph that was shown."""
+    """Outline of the ball in the shown photograph."""
     shown: Path
-    """That photograph."""
+    """Path of the shown photograph: the light is in its camera values."""
     camera: Camera
-    """Camera of that photograph."""
+    """Camera of the shown photograph."""
     picture: Image
-    """That photograph, uint8 RGB, upright."""
+    """Pixels of the shown photograph, uint8 RGB, upright."""
     support: Support | None
-    """The plane that the ball stands on, where it was asked for."""
+    """Plane that the ball stands on; None without ``support``."""
     notes: tuple[str, ...]
-    """Notes for the user, a line each."""
+    """Notes for the user, one string per line."""
     response: Array | None = None
-    """Linear value of each code, (256, 3), where it was estimated from the bracket."""
+    """Linear value of each code, (256, 3), if it was estimated from the bracket; else None."""
 
 
 @checked
@@ -97,28 +97,29 @@ def capture_light(
     height: int | None = None,
     raises: bool = True,
 ) -> Capture:
-    """Capture the light that a mirror ball shows in one photograph or a bracket of them.
+    """Capture the light that a mirror ball shows in one photograph or in a bracket of exposures.
 
     Args:
-        paths: Photographs of the ball, from one place, at one or more exposures.
-        ball: Column, row and radius in pixels of a rough circle around the ball in the shown photograph; None: look
-            for it.
-        circle: The same of a circle that is exact, in the place of a rough one.
-        exposures: Seconds of each photograph, instead of what EXIF or names say; ``pixels``: by the pictures alone,
-            under ``transfer``.
-        shown: Which photograph's camera values the light is in; None: the one whose ball is best exposed.
-        transfer: Response that is tried first.
-        focal_35mm: Focal length for a full frame in millimetres, of the picture as it is; None: by EXIF.
-        support: Finds the plane that the ball stands on, whose axes the light then has; None: a level camera's.
-        reflectance: Of the ball; None: by what it mirrors of the support's plane, else ``GUESS``.
+        paths: Photographs of the ball from one viewpoint, at one or more exposures.
+        ball: Column, row and radius in pixels of an approximate circle around the ball in the shown photograph; None:
+            the ball is searched for.
+        circle: Column, row and radius of the exact circle, instead of ``ball``.
+        exposures: Exposure time of each photograph in seconds, instead of EXIF's or the file names'; ``pixels``:
+            estimated from the pictures with the response ``transfer``.
+        shown: Index of the photograph whose camera values the light uses; None: the one with the best exposed ball.
+        transfer: Camera response that is tried first.
+        focal_35mm: Focal length of the picture as it is, in millimetres for a full frame; None: from EXIF.
+        support: Function that finds the plane that the ball stands on. The light uses the plane's axes; None: the axes
+            of a level camera.
+        reflectance: Reflectance of the ball; None: measured by its reflection of the support's plane, else ``GUESS``.
         device: ``auto``, ``cpu`` or ``cuda:N``.
-        height: Rows of the map; None: as many as the ball's pixels tell.
-        raises: Whether what clips in a single photograph is raised by what nearly every place lacks
-            (``light/least_missing.py``).
+        height: Rows of the map; None: chosen by the ball's size in pixels.
+        raises: Whether clipped light of a single photograph is raised by the least amount that the clipping prior
+            expects (``light/least_missing.py``).
 
     Raises:
         SourceError: A photograph cannot be read.
-        UsageError: Exposures contradict each other, or no ball is found.
+        UsageError: Exposures contradict each other, or no ball was found.
     """
     if not paths:
         raise UsageError("no photographs; expected one or more of a mirror ball")
@@ -166,13 +167,13 @@ def capture_light(
 
 
 def _rows_of(radius: float) -> int:
-    """Return the rows of a map as fine as a ball of so many pixels: at its middle one of them mirrors 2 / radius."""
+    """Return the rows of a map that resolves the ball's centre, where one of its pixels spans 2 / radius radians."""
     rows = 1 << math.floor(math.log2(0.5 * math.pi * radius))
     return min(max(rows, HEIGHTS[0]), HEIGHTS[1])
 
 
 def _ball_reflectance(table: Table | None, given: float | None) -> tuple[RGB, str]:
-    """Return what the ball reflects, and what is to be said of it."""
+    """Return the ball's reflectance and a note about its origin."""
     told = None if table is None else table.reflectance_of_ball()
     if told is None and given is None:
         how = "give --reflectance" + ", --contact or --rectangle" * (table is None)
@@ -191,7 +192,7 @@ def _ball_reflectance(table: Table | None, given: float | None) -> tuple[RGB, st
 
 
 def _best_exposed(photos: Sequence[Photograph]) -> int:
-    """The photograph with the most pixels between dark and clipping, in its middle."""
+    """Return the index of the photograph whose middle has the most pixels that are neither dark nor clipped."""
 
     def share(photo: Photograph) -> float:
         h, w = photo.image.shape[:2]
@@ -202,11 +203,11 @@ def _best_exposed(photos: Sequence[Photograph]) -> int:
 
 
 def _camera_of(photo: Photograph, transfer: str, focal_35mm: float | None) -> tuple[Camera, list[str]]:
-    """The photograph's camera, and what is to be said of it."""
+    """Return the photograph's camera and notes about it."""
     info = photo.info
     width, height = info.width, info.height
     if focal_35mm is not None:
-        # Of the picture as it is, cut or not: who gives it has the angle of view in mind.
+        # For the picture as it is, cropped or not: the user states the focal length for its angle of view.
         focal = focal_35mm / FULL_FRAME_DIAGONAL * math.hypot(width, height)
         return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2, transfer=transfer), []
     camera = info.camera(transfer)
@@ -221,10 +222,11 @@ def _camera_of(photo: Photograph, transfer: str, focal_35mm: float | None) -> tu
 def _find_outline(
     photos: Sequence[Photograph], reference: Photograph, camera: Camera, ball: Sequence[float] | None
 ) -> tuple[BallOutline, Photograph | None]:
-    """The ball in the shown photograph; where that is none of the best exposed, near where that one has it.
+    """Return the ball's outline in the shown photograph, found by its place in the best exposed one.
 
     Returns:
-        The outline, and the photograph whose outline it is where the shown one shows none.
+        The outline; and the best exposed photograph if the outline is taken from it, because the shown one shows no
+            rim, else None.
     """
     clearest = photos[_best_exposed(photos)]
     if ball is not None or clearest is reference:
@@ -234,7 +236,8 @@ def _find_outline(
     try:
         own, taken_from = find_ball(reference.image, camera, rough, NEAR), None
     except UsageError:
-        # Too dark or too bright to see a rim: it is laid over the others by what it mirrors.
+        # The rim is not visible because the photograph is too dark or too bright: it is aligned by its reflections
+        # instead.
         x, y, z = map(float, sphere_of_circle(camera, *rough))
         larger = rough[2] / seen.radius
         (major, minor), (dx, dy, dr) = seen.axes, seen.deviation
@@ -250,7 +253,7 @@ def _find_outline(
 
 
 def _same_place(circle: Circle, of: Image, other: Image) -> Circle:
-    """Return the place of a ball in a picture of another size: cut differently around it, at about the same share."""
+    """Return a ball's circle in a picture of another crop or size, at about the same relative place."""
     sy, sx = other.shape[0] / of.shape[0], other.shape[1] / of.shape[1]
     return (circle[0] + 0.5) * sx - 0.5, (circle[1] + 0.5) * sy - 0.5, circle[2] * math.sqrt(sx * sy)
 
@@ -265,7 +268,7 @@ def _describe_outline(outline: BallOutline) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class _Bracket:
-    """Photographs to merge, longest exposure first."""
+    """Photographs to merge, the longest exposure first."""
 
     photos: tuple[Photograph, ...]
     circles: tuple[Circle, ...]
@@ -281,7 +284,7 @@ def _merge_plan(
     transfer: str,
     given: Sequence[float] | Literal["pixels"] | None,
 ) -> _Bracket:
-    """Return the photographs to merge, the place of the ball in them, and their exposures."""
+    """Return the photographs to merge, each with its ball's place and its exposure."""
     circle = (*outline.center, outline.radius)
     if len(photos) == 1:
         note = f"one photograph tells no response: {transfer} is taken; by a phone's, darks may be 3 times darker"
@@ -291,7 +294,7 @@ def _merge_plan(
         claims = {"given": given, "exif": exposures_by_exif(photos), "names": exposures_by_name(photos)}
     told = [photo.info.exposure is not None for photo in photos]
     untold = [photo for photo, tells in zip(photos, told, strict=True) if any(told) and not tells]
-    # Brightness tells the order even where claims contradict each other.
+    # Sort by brightness, which gives the order even if stated exposures contradict each other.
     order = sorted(range(len(photos)), key=lambda k: -float(photos[k].image[::8, ::8].mean()))
     chosen = [photos[k] for k in order]
     known = next((claim for claim in claims.values() if claim is not None), None)
@@ -331,14 +334,14 @@ def _shift_notes(photos: Sequence[Photograph], aligned: Aligned, rough: Sequence
 
 @dataclasses.dataclass(frozen=True)
 class _Maps:
-    """Merged map of all photographs."""
+    """Merged maps of all photographs."""
 
     radiance: Map
     """(height, 2 height, 3), in camera values."""
     confidence: Map
     """(height, 2 height)."""
     clipped: Map
-    """Share that clips in every exposure, of the radiance's shape."""
+    """Share of each texel, by channel, that is clipped in every exposure; shape of ``radiance``."""
     notes: tuple[str, ...]
     """Notes for the user."""
 
@@ -353,7 +356,7 @@ def _unwrap(
     device: str,
     height: int,
 ) -> _Maps:
-    """The merged map of all photographs, by the pipeline that lights frames."""
+    """Unwrap all photographs with the pipeline's kernels and return the merged maps."""
     index = bracket.photos.index(reference)
     own = bracket.circles[index]
     half = math.ceil(WINDOW * own[2])
@@ -396,7 +399,7 @@ def _unwrap(
 
 
 def _make_light(maps: _Maps, bracket: _Bracket, table: Table | None, raises: bool) -> tuple[Light, list[str]]:
-    """Return the light of a map, with what clips raised as far as that is known, and what is to be said of it."""
+    """Return the light of a map, with clipped radiance raised where an estimate exists, and notes about it."""
     single, radiance, clipped = len(bracket.photos) == 1, maps.radiance, maps.clipped
     if raises and single:
         radiance = _raised(radiance, maps.confidence, clipped)
@@ -421,7 +424,7 @@ def _make_light(maps: _Maps, bracket: _Bracket, table: Table | None, raises: boo
 
 
 def _bounded(radiance: Map, clipped: Map, table: Table, raises: bool) -> tuple[Map, list[str]]:
-    """Return a map that is bright enough for the table to be no whiter than ``WHITEST``, and what is to be said."""
+    """Return a map so bright that the table's albedo is at most ``WHITEST``, and notes about it."""
     whole, bounds = irradiance_above(radiance), irradiance_above(radiance * clipped).mean()
     lacking = table.reflectance_under(whole) / WHITEST
     if lacking <= 1.0:
@@ -437,7 +440,7 @@ def _bounded(radiance: Map, clipped: Map, table: Table, raises: bool) -> tuple[M
 
 
 def _raised(radiance: Map, confidence: Map, clipped: Map) -> Map:
-    """A map with what clips raised by what nearly every place lacks, (height, 2 height, 3)."""
+    """Return the map with clipped radiance raised by the least amount that is expected, (height, 2 height, 3)."""
     height, width = radiance.shape[:2]
     rows, columns = cell_shape(height, width)
 
@@ -460,9 +463,10 @@ def _place(
     sphere: Array,
     turn: Array,
 ) -> tuple[Image, Pose]:
-    """The window of a photograph about its ball, and the pose that puts the ball there.
+    """Return a photograph's window around its ball, and the pose that puts the ball there.
 
-    Shifts of a photograph against the shown one become shifts of the ball before the camera: no pixel is resampled.
+    A photograph's displacement against the shown one becomes a displacement of the ball before the camera, so that no
+    pixel is resampled.
     """
     x0, y0, side = window
     x, y, radius = bracket.circles[k]

@@ -1,4 +1,4 @@
-"""Pictures of anyone's making: their size is read from the header, and limited, before anything is decoded."""
+"""Decoding of untrusted pictures: the size in the header is checked before anything is decoded."""
 
 from __future__ import annotations
 
@@ -23,36 +23,36 @@ from warp_ar.signals import ADOBE_RGB, P3_D65, REC_709, REC_2020, Chromaticities
 from warp_ar.srgb import decode_srgb, encode_srgb
 
 FORMATS = "PNG, JPEG, BMP, TIFF, WebP, GIF or PNM"
-"""Formats that are read: those whose headers are known here."""
+"""Readable formats: the formats whose headers this module parses."""
 
 RAW = frozenset({".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"})
-"""Raw photographs, by their names' endings."""
+"""Endings of raw photographs."""
 HEIF = frozenset({".heic", ".heif", ".hif", ".avif"})
-"""Pictures of phones that nothing here decodes, by their names' endings."""
+"""Endings of phone pictures that cannot be decoded here."""
 _BRANDS = (b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1", b"avif")
 
 _PRIMARIES = {1: REC_709, 9: REC_2020, 12: P3_D65}
 _CURVES = {1: 0.0, 4: 2.2, 5: 2.8, 6: 0.0, 8: 1.0, 13: 0.0, 14: 0.0, 15: 0.0}
-"""Primaries and gammas (0: sRGB's curve, as for videos) of a PNG's cICP by their numbers in ITU-T H.273."""
+"""Primaries and gammas (0: sRGB's curve, as for videos) by their numbers in a PNG's cICP chunk (ITU-T H.273)."""
 
 Size = tuple[int, int]
 
 _HEAD = 1 << 16
-"""Bytes within which a photograph has its EXIF."""
+"""Bytes at a photograph's start within which EXIF is searched for."""
 _SAME_GAMMA = 0.02
-"""Share by which a gamma may differ from sRGB's 1/2.2 and is taken for it."""
+"""Relative difference from sRGB's 1/2.2 up to which a gamma counts as sRGB's."""
 
-# OpenCV 5.0 leaves TIFFs of more than 8 bits undecoded, or their channels in the other order, where it is to give RGB;
-# as they lie, it gives those of three channels in the other order, and black of one bit as white.
+# OpenCV 5.0 does not decode TIFFs of more than 8 bits if it is asked for RGB, or swaps their channels. If it is asked
+# for the file's own layout, it swaps the order of three channels and inverts 1-bit pictures.
 _TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
 
 def foreign_words(suffix: str, data: bytes = b"") -> str:
-    """Why a photograph cannot be read, and what to do about it; empty if it is of none of the kinds known for that.
+    """Return why a photograph cannot be read and the remedy; empty if it is not of a known unreadable kind.
 
     Args:
-        suffix: Its name's ending, in lower case.
-        data: Its first bytes: phones' pictures are renamed to .jpg as they are.
+        suffix: Ending of its name, in lower case.
+        data: First bytes of the file: phone pictures are often renamed to .jpg without conversion.
     """
     if suffix in HEIF or (data[4:8] == b"ftyp" and data[8:12] in _BRANDS):
         return (
@@ -65,9 +65,9 @@ def foreign_words(suffix: str, data: bytes = b"") -> str:
 
 
 def picture_size(data: bytes) -> Size | None:
-    """(width, height) in pixels that a picture's header promises; None if it is of no known format or cut off.
+    """Return (width, height) in pixels from a picture's header; None if the format is unknown or the header cut off.
 
-    Of a TIFF the larger of the picture and its tiles, which is what its reader makes room for.
+    For a TIFF, the larger of the picture and its tiles: its reader allocates the larger.
     """
     for start, read in _READERS.items():
         if data.startswith(start):
@@ -94,8 +94,8 @@ def decode_picture(data: bytes, flags: int, error: type[WarpArError], label: str
     Args:
         data: The whole file.
         flags: OpenCV's for ``imdecode``.
-        error: What to raise.
-        label: What messages call the picture.
+        error: Class of the error to raise.
+        label: Name of the picture in messages.
 
     Returns:
         OpenCV's array: (height, width) or (height, width, channels).
@@ -126,21 +126,21 @@ def decode_picture(data: bytes, flags: int, error: type[WarpArError], label: str
 
 
 def _in_color(picture: npt.NDArray[Any], data: bytes, flags: int) -> npt.NDArray[Any]:
-    """Return a picture that is asked for in RGB in sRGB, by the ICC profile of its file."""
+    """Return a decoded picture converted to sRGB by the ICC profile of its file, if RGB was requested."""
     if not flags & cv2.IMREAD_COLOR_RGB or flags < 0 or picture.ndim != 3 or picture.dtype.kind != "u":
         return picture
     return in_srgb(picture, data)
 
 
 def in_srgb(picture: npt.NDArray[Any], data: bytes) -> npt.NDArray[Any]:
-    """Return a picture in sRGB, by what its file says of its codes.
+    """Return a picture converted to sRGB from the colour space that its file states.
 
-    That is an ICC profile; else EXIF's mark of Adobe RGB, R03, which cameras write without a profile; else a PNG's
-    gamma and chromaticities. Without any it is sRGB already.
+    The colour space is that of the ICC profile; else Adobe RGB if EXIF marks it (R03), as cameras do without a profile;
+    else that of a PNG's gamma and chromaticities. Without any of them the picture is taken for sRGB.
 
     Args:
         picture: RGB, (height, width, 3), uint8 or uint16.
-        data: The file.
+        data: Content of the file.
     """
     try:
         with PIL.Image.open(io.BytesIO(data)) as header:
@@ -158,18 +158,18 @@ def in_srgb(picture: npt.NDArray[Any], data: bytes) -> npt.NDArray[Any]:
     gamma, primaries = said.get("gamma"), tuple(said.get("chromaticity", ()))
     if gamma is None or "srgb" in said or abs(gamma * 2.2 - 1.0) < _SAME_GAMMA:
         return picture
-    primaries = (*primaries[2:], *primaries[:2])  # a PNG names white first
+    primaries = (*primaries[2:], *primaries[:2])  # PNG stores white first
     known = len(primaries) == 8 and are_primaries(primaries)
     return _srgb_of(picture, 1.0 / gamma if gamma > 0.0 else 1.0, primaries if known else REC_709)
 
 
 def _cicp(data: bytes) -> re.Match[bytes] | None:
-    """Return a PNG's chunk of coding-independent code points: bytes of primaries and transfer."""
+    """Return the bytes of primaries and transfer in a PNG's cICP chunk (coding-independent code points)."""
     return re.search(b"\0\0\0\x04cICP(.)(.)", data[:_HEAD], re.DOTALL) if data.startswith(b"\x89PNG") else None
 
 
 def _srgb_of(picture: npt.NDArray[Any], gamma: float, primaries: Chromaticities) -> npt.NDArray[Any]:
-    """Return codes of sRGB of those whose power ``gamma``, or sRGB's curve (0), is light of other primaries."""
+    """Return the sRGB codes of a picture in other primaries and with a power ``gamma``; 0: with sRGB's own curve."""
     most = float(np.iinfo(picture.dtype).max)
     codes = np.arange(most + 1) / most
     light = codes**gamma if gamma else decode_srgb(codes)
@@ -178,15 +178,14 @@ def _srgb_of(picture: npt.NDArray[Any], gamma: float, primaries: Chromaticities)
 
 
 def srgb_by_profile(picture: npt.NDArray[Any], profile: bytes) -> npt.NDArray[Any]:
-    """Return the codes of sRGB of a picture whose codes an ICC profile explains.
+    """Return a picture converted to sRGB by its ICC profile.
 
-    Profiles of sRGB itself, of other spaces than RGB and grey (OpenCV has converted those), and damaged ones change
-    nothing.
-    Codes of 16 bits are converted by their upper 8, to within one code of 8 bits.
+    A picture is unchanged if its profile is damaged, is sRGB itself, or is of a space other than RGB and grey, which
+    OpenCV has already converted. Codes of 16 bits are converted by their upper 8 bits, to within one 8-bit code.
 
     Args:
         picture: RGB, (height, width, 3), uint8 or uint16.
-        profile: The file's.
+        profile: The ICC profile in the file.
     """
     try:
         source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
@@ -209,12 +208,12 @@ def srgb_by_profile(picture: npt.NDArray[Any], profile: bytes) -> npt.NDArray[An
 
 
 def _read_tiff(data: bytes, orientation: int, flags: int, error: type[WarpArError], label: str) -> npt.NDArray[Any]:
-    """Return a TIFF in planes, of floats or with transparency, which OpenCV reads wrong or not at all; upright."""
+    """Return a TIFF in planes, of floats or with transparency, upright; OpenCV reads these wrongly or not at all."""
     with tempfile.TemporaryDirectory() as folder:
-        path = os.path.join(folder, "picture.tif")  # OpenImageIO's Python reads files alone
+        path = os.path.join(folder, "picture.tif")  # the Python interface of OpenImageIO reads files only
         with open(path, "wb") as file:
             file.write(data)
-        import OpenImageIO  # here: at the end of any process that has loaded it, it reports what it leaks
+        import OpenImageIO  # here: a process that has loaded it prints a report of leaks when it ends
 
         config = OpenImageIO.ImageSpec()
         config["oiio:UnassociatedAlpha"] = 1
@@ -240,14 +239,14 @@ def _read_tiff(data: bytes, orientation: int, flags: int, error: type[WarpArErro
 
 
 def check_picture(data: bytes, error: type[WarpArError], label: str) -> None:
-    """Check by its header whether a picture may be decoded.
+    """Check a picture's header before it is decoded.
 
     Raises:
-        WarpArError: As ``error``: it is none, too large, or cut off.
+        WarpArError: As ``error``: the data are no picture, too large, or cut off.
     """
     if not data:
         raise error(f"{label} is empty (0 bytes); an image is needed")
-    # libpng would refuse a file without its last chunk too, but writes to stderr when it does.
+    # libpng would also refuse a file without its last chunk, but prints to stderr then.
     if data.startswith(b"\x89PNG") and b"IEND\xaeB`\x82" not in data:
         raise error(f"{label} is cut off after {len(data)} bytes; copy the whole file")
     coding = _cicp(data)
@@ -268,7 +267,7 @@ def _png(data: bytes) -> Size:
 
 
 def _tiff_tags(data: bytes) -> dict[int, int]:
-    """Return the first value of those tags of a TIFF's first picture that are whole numbers."""
+    """Return the first value of each integer tag of a TIFF's first picture."""
     order = "<" if data[:2] == b"II" else ">"
     big = struct.unpack_from(order + "H", data, 2)[0] == 43
     start = struct.unpack_from(order + ("Q" if big else "I"), data, 8 if big else 4)[0]
@@ -295,7 +294,7 @@ def _tiff(data: bytes) -> Size | None:
 
 
 def _by_pillow(data: bytes) -> Size:
-    """Return the size by Pillow's reader of the format, itself: ``Image.open`` has a limit of its own."""
+    """Return the size by the format's own reader in Pillow, because ``Image.open`` has its own limit of size."""
     kind = next(kind for start, kind in _PILLOW.items() if data.startswith(start))
     with kind(io.BytesIO(data)) as header:
         return int(header.width), int(header.height)

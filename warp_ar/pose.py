@@ -1,4 +1,4 @@
-"""``python -m warp_ar.pose PLATE``: where the camera of a photograph stood, and a scene of it under captured light."""
+"""``python -m warp_ar.pose PLATE``: finds a photograph's camera pose, and writes a scene of it in captured light."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from warp_ar.scene import Camera, CapturedLight, dumps_scene
 from warp_ar.scene.exif import FULL_FRAME_DIAGONAL
 
 HARDLY_KNOWN = 1.2
-"""Ratio of the focal lengths that fit, from which on the best one is doubted."""
+"""Ratio of the largest to the least focal length that fits, above which the focal length counts as uncertain."""
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """The command's options."""
+    """Return the parser of the command's options."""
     parser = Parser(
         prog="python -m warp_ar.pose",
         description="Find where a photograph's camera stood, by a rectangle or known points; write a scene with two "
@@ -64,7 +64,7 @@ def _check(options: argparse.Namespace) -> None:
 
 
 def find_camera(plate: Photograph, options: argparse.Namespace) -> tuple[Camera, Support]:
-    """Return the camera of a plate and the plane z = 0 before it; say how well they are known."""
+    """Return the camera of a plate and the plane z = 0 with its pose; print both with their accuracy."""
 
     def find(camera: Camera) -> Support:
         if options.rectangle is not None:
@@ -92,7 +92,7 @@ def find_camera(plate: Photograph, options: argparse.Namespace) -> tuple[Camera,
 
 
 def place(options: argparse.Namespace) -> int:
-    """Find the camera, bring the light to the plate's exposure, and write the scene."""
+    """Find the camera's pose, scale the light to the plate's exposure, and write the scene."""
     _check(options)
     plate, light = read_photograph(options.plate), Light.load(options.light)
     camera, support = find_camera(plate, options)

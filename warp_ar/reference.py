@@ -1,7 +1,7 @@
-"""``python -m warp_ar.reference SCENE``: one frame by path tracing, with the standard error of every pixel.
+"""``python -m warp_ar.reference SCENE``: path-traces one frame, with the standard error of every pixel.
 
-The frames before it run through the pipeline, which finds the light; then paths are followed from the frame's camera
-until enough are. ``--compare`` shows what the pipeline's own picture of that frame lacks.
+The pipeline lights the frames before it to find the light. Then the path tracer adds samples until the requested number
+or error is reached. ``--compare`` shows the difference between the pipeline's picture and the reference.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ from warp_ar.session import chosen_scene
 from warp_ar.signature import encode_png
 
 STEP = 8
-"""Samples per pixel between two reports of progress."""
+"""Samples per pixel between two progress reports."""
 MAGNIFIED = 8
-"""Factor on differences that are shown."""
+"""Factor by which shown differences are magnified."""
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """The command's options."""
+    """Return the parser of the command's options."""
     parser = Parser(
         prog="python -m warp_ar.reference",
         description="Path-trace one frame in the light that the pipeline finds, with standard errors.",
@@ -75,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def trace(options: argparse.Namespace) -> int:
-    """Find the light, follow paths, write what is asked for."""
+    """Find the light, trace paths, and write the requested files."""
     scene = chosen_scene(options.scene, options.source, options.calibration, options.light, options.light_axes)
     if options.save_light is not None:
         _check_axes(scene)
@@ -105,14 +105,14 @@ def trace(options: argparse.Namespace) -> int:
 
 
 def _check_axes(scene: Scene) -> None:
-    """Complain where a saved light, in the scene's axes and values, would be turned or scaled again when it is read."""
+    """Warn if reading the saved light, in the scene's axes and values, would rotate or scale it again."""
     given = scene.captured
     if given is not None and (given.rotate != (0.0, 0.0, 0.0) or given.scale != 1.0):
         raise UsageError("--save-light: [light] has scale or rotate, which would be applied again; leave them out")
 
 
 def places_found(light: Light) -> str:
-    """Name the emitters of a light that have a distance, in one line."""
+    """Return one line about the emitters of a light that have a distance."""
     found = [
         f"{emitter.distance:.2f} m toward {', '.join(f'{value:.2f}' for value in emitter.direction)}"
         for emitter in light.emitters
@@ -122,7 +122,7 @@ def places_found(light: Light) -> str:
 
 
 def _write_all(options: argparse.Namespace, known: KnownFrame, picture: TracedPicture) -> None:
-    """All files that are asked for."""
+    """Write all requested files."""
     if options.output is not None:
         write_picture(options.output, picture)
     if options.compare is not None:
@@ -139,7 +139,7 @@ def _size(text: str) -> tuple[int, int]:
 def render(
     tracer: PathTracer, samples: int, error: float | None, console: Console, pictures: list[TracedPicture]
 ) -> None:
-    """Follow paths, showing how far that is; the newest picture is the last of ``pictures``."""
+    """Trace paths with a progress display; each new picture is appended to ``pictures``."""
     text = TextColumn("{task.description}")
     with Progress(text, BarColumn(), TimeRemainingColumn(), console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task("reflectance", total=samples)
@@ -149,13 +149,13 @@ def render(
             shown = f"{picture.samples} samples, error {picture.relative_error:.2%}"
             total = samples
             if error is not None and picture.relative_error > error:
-                # The error falls with the root of the samples.
+                # The error falls with the square root of the number of samples.
                 total = min(samples, round(picture.samples * (picture.relative_error / error) ** 2))
             bar.update(task, completed=picture.samples, description=shown, total=total)
 
 
 def summary(known: KnownFrame, picture: TracedPicture, device: str) -> str:
-    """Summarise the run in one line."""
+    """Return a summary of the run in one line."""
     height, width = picture.image.shape[:2]
     difference = _lit_at(known, picture) - picture.image
     rms = float(np.sqrt((difference**2).mean()))
@@ -167,20 +167,20 @@ def summary(known: KnownFrame, picture: TracedPicture, device: str) -> str:
 
 
 def side_by_side(known: KnownFrame, picture: TracedPicture) -> npt.NDArray[np.uint8]:
-    """The pipeline's picture, the reference, and grey plus their difference, magnified, (H, 3 W, 3)."""
+    """Return the pipeline's picture, the reference and their magnified difference on grey, (H, 3 W, 3)."""
     lit = _lit_at(known, picture)
     parts = lit, picture.image.astype(np.float64), 127.5 + MAGNIFIED * (lit - picture.image)
     return np.clip(np.round(np.concatenate(parts, axis=1)), 0, 255).astype(np.uint8)
 
 
 def _lit_at(known: KnownFrame, picture: TracedPicture) -> npt.NDArray[np.float64]:
-    """The pipeline's picture at the size of the reference."""
+    """Return the pipeline's picture, resized to the reference."""
     size = picture.image.shape[1::-1]
     return np.asarray(cv2.resize(known.lit.astype(np.float64), size, interpolation=cv2.INTER_AREA))
 
 
 def write_picture(path: Path, picture: TracedPicture) -> None:
-    """Write a picture as the ending of ``path`` says; EXR has channels R, G, B and error.R, error.G, error.B.
+    """Write a picture in the format of ``path``'s ending; an EXR has channels R, G, B and error.R, error.G, error.B.
 
     Raises:
         SinkError: The file cannot be written.

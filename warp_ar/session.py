@@ -1,4 +1,4 @@
-"""A source and a pipeline that fit each other: the common case in one call."""
+"""Session: a frame source and a pipeline that fits it, opened in one call."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ from warp_ar.tracking.markers import tell_upright
 from warp_ar.tracking.tracking import given_pose, tell_missing_poses
 
 BY_CARD = "card"
-"""Word for light that the card and other surfaces tell of."""
+"""Value of ``light``: estimate the light from the card and other known surfaces."""
 CARD_FRAMES = 24
-"""Frames in which the marker is looked for."""
+"""Number of frames in which the marker is searched for."""
 
 
 def calibrated(scene: Scene, calibration: str | Path, source: str | int | Path | None = None) -> Scene:
-    """Return the scene with its camera by a calibration file, or for ``exif`` by the source's first picture.
+    """Return the scene with its camera from a calibration file or, for ``exif``, from the source's first picture.
 
     Raises:
-        SceneError: The calibration or the EXIF cannot be used.
+        SceneError: The calibration file or the EXIF cannot be used.
         UsageError: The source has no EXIF.
     """
     transfer = scene.camera.transfer
@@ -56,12 +56,12 @@ def calibrated(scene: Scene, calibration: str | Path, source: str | int | Path |
 
 
 def with_light(scene: Scene, light: str | Path, axes: str | None = None) -> Scene:
-    """Return the scene lit by a captured light instead of what a mirror ball in its frames shows.
+    """Return the scene with a captured light in place of the light from mirror balls in its frames.
 
     Args:
         scene: The scene.
         light: Latlong OpenEXR or Radiance HDR.
-        axes: Axes of that file; None: as it says, else by the convention of its format.
+        axes: Axes of the light file; None: those that the file states, else the convention of its format.
 
     Raises:
         SceneError: The file cannot be used.
@@ -72,14 +72,14 @@ def with_light(scene: Scene, light: str | Path, axes: str | None = None) -> Scen
 
 
 def lit_by_card(scene: Scene, source: Source) -> tuple[Scene, str]:
-    """Return the scene lit by what its card and other surfaces show of the light, and a line that says how surely.
+    """Return the scene with light estimated from its card and other surfaces, and a line with the estimate's accuracy.
 
     Args:
         scene: The scene.
-        source: Its frames; those of a device are gone afterwards.
+        source: Frames of the scene; a capture device's frames that are read here are not delivered again.
 
     Raises:
-        UsageError: The first frames do not show the marker well.
+        UsageError: The first frames do not show the marker clearly.
     """
     scene = dataclasses.replace(scene, camera=scene.camera.scaled_to(*source.size))
     views = posed_frames(source, scene.marker, scene.camera, CARD_FRAMES) if scene.has_marker else []
@@ -100,7 +100,7 @@ def chosen_scene(
     light: str | Path | None,
     light_axes: str | None,
 ) -> Scene:
-    """Return the scene with the camera and the light that are given instead of its own."""
+    """Return the scene with its camera and light replaced by those that are given."""
     scene = scene if isinstance(scene, Scene) else load_scene(scene)
     if calibration is not None:
         scene = calibrated(scene, calibration, source)
@@ -108,19 +108,20 @@ def chosen_scene(
 
 
 class Session(Closing):
-    """Opens a scene's source and lights its frames one after another.
+    """Opens a scene's frame source and lights its frames one after another.
 
-    Iterating gives ``(frame, result)`` pairs. Use it in a ``with`` statement, so that devices and threads are let go.
+    Iterating yields ``(frame, result)`` pairs. Use a session in a ``with`` statement, which closes its source and
+    threads.
     """
 
     ahead = True
-    """True if frames may be begun before the one ahead of them is handed out, where that is possible."""
+    """True if a frame may be submitted before the previous result is yielded, where source and device allow it."""
     decode_ms = 0.0
-    """Milliseconds that the source took for its last frame."""
+    """Time of decoding the source's last frame, milliseconds."""
     ball_fits: tuple[BallFit | None, ...] = ()
-    """Fits of the mirror balls by ``refine_ball``; None for one that it did not find."""
+    """Fit of each mirror ball by ``refine_ball``; None for a ball that was not found."""
     notes: tuple[str, ...] = ()
-    """Exposures that are not merged, frames without a pose, upright of a marker: a line each."""
+    """Notes, a line each: exposures not merged, frames without a pose, orientation of a marker, card light."""
 
     @checked
     def __init__(
@@ -138,26 +139,26 @@ class Session(Closing):
         loop: bool = False,
         refine_ball: bool = False,
     ) -> None:
-        """Open everything.
+        """Open the source and build the pipeline.
 
         Args:
             scene: A scene, a scene file or a bundled scene's name.
-            source: Frames instead of the scene's own: a folder, a picture, a video file, a capture device's index, or
-                the URL of a camera's stream.
-            calibration: OpenCV calibration file instead of the scene's camera numbers, or ``exif``: by the EXIF of the
-                first picture.
-            light: Captured light instead of what a mirror ball shows: a latlong OpenEXR or Radiance HDR. Or ``card``:
-                what the card and other surfaces of the first frame tell of it, to second order (``notes`` has the
-                interval).
-            light_axes: Axes of that file, ``z-up``, ``blender``, ``y-up`` or ``opengl``; None: as it says, else y-up of
-                an OpenEXR and blender of an HDR.
+            source: Frames to use in place of the scene's own: a folder, a picture, a video file, a capture device's
+                index, or the URL of a camera's stream.
+            calibration: OpenCV calibration file that replaces the scene's camera, or ``exif`` for a camera from the
+                first picture's EXIF.
+            light: Captured light that replaces the light from mirror balls: a latlong OpenEXR or Radiance HDR. Or
+                ``card``: light estimated from the card and other surfaces in the first frames, to second order of
+                spherical harmonics; ``notes`` states the interval of its error.
+            light_axes: Axes of the light file, ``z-up``, ``blender``, ``y-up`` or ``opengl``; None: those that the file
+                states, else y-up for OpenEXR and blender for HDR.
             device: ``auto``, ``cpu`` or ``cuda:N``.
-            quality: A preset's name, a value of one's own, or ``auto``: the least error within a budget.
-            budget_ms: Milliseconds per frame for ``auto``; None means 33.
-            outputs: Parts of the results: ``image``, ``environment``, ``pose``, layers of ``warp_ar.LAYERS``.
+            quality: A preset's name, a ``Quality``, or ``auto``: the least error within a budget.
+            budget_ms: Time budget of a frame for ``auto``, milliseconds; None means 33.
+            outputs: Parts of the results: ``image``, ``environment``, ``pose``, and layers of ``warp_ar.LAYERS``.
             loop: Start a clip again when it ends.
-            refine_ball: Look for the mirror balls first, in the source's first frames, which takes some seconds; what
-                was found is in ``ball_fits``.
+            refine_ball: Whether to measure the mirror balls' places in the source's first frames, which takes some
+                seconds; ``ball_fits`` has the results.
 
         Raises:
             SceneError: The scene or the calibration cannot be used.
@@ -182,7 +183,7 @@ class Session(Closing):
             given: dict[str, Any] = {"size": size, "outputs": outputs, "exposures": exposures, "shown": shown}
             if quality == AUTO:
                 budget = DEFAULT_BUDGET_MS if budget_ms is None else budget_ms
-                # A budget is kept by frames that do not wait, of recordings too.
+                # A budget needs frames that do not wait for estimates, also in recordings.
                 given["estimates"] = "real_time" if self.source.live else "delayed"
                 self.pipeline = AutoPipeline(scene, budget_ms=budget, device=device, **given)
             else:
@@ -194,7 +195,7 @@ class Session(Closing):
             raise
 
     def _open(self, scene: Scene, **given: Any) -> Pipeline:
-        """Open the pipeline of a fixed quality."""
+        """Return a pipeline of a fixed quality."""
         source = self.source
         linear = source.deep != "" and not given["exposures"]
         if source.deep == "light":
@@ -204,46 +205,47 @@ class Session(Closing):
 
     @property
     def scene(self) -> Scene:
-        """Scene that frames are lit by."""
+        """Scene by which frames are lit."""
         return self.pipeline.scene
 
     def _new_frame(self) -> npt.NDArray[np.uint8]:
-        """Return memory in which the source writes a frame, so that it need not be copied to be sent."""
+        """Return memory into which the source writes a frame, so that it is sent to the device without a copy."""
         assert isinstance(self.pipeline, Pipeline)
         return self.pipeline.new_frame()
 
     def close(self) -> None:
-        """Let the source and the pipeline's threads go."""
+        """Close the source, and end the pipeline's threads."""
         try:
             self.source.close()
         finally:
             self.pipeline.close()
 
     def change(self, *, scene: Scene | None = None, quality: str | Quality | None = None) -> None:
-        """Light the frames to come with another scene or quality, as ``Pipeline.change`` does; the source goes on.
+        """Change scene or quality from the next frame on, as ``Pipeline.change`` does; the source goes on.
 
         Args:
-            scene: The next scene; None leaves it.
-            quality: A preset's name or a value; None leaves it.
+            scene: The next scene; None keeps the current one.
+            quality: A preset's name or a ``Quality``; None keeps the current one.
 
         Raises:
-            UsageError: The session keeps to a budget, or as ``Pipeline.change``.
-            SceneError: As ``Pipeline.change``.
+            UsageError: The session's quality is ``auto``, or as for ``Pipeline.change``.
+            SceneError: As for ``Pipeline.change``.
         """
         if not isinstance(self.pipeline, Pipeline):
             raise UsageError(f"a session of quality {AUTO!r} chooses for itself; open another one")
         self.pipeline.change(scene, quality=quality)
 
     def warm_up(self, progress: Progress | None = None) -> None:
-        """Compile and load what the frames need; left out, the first frame does it.
+        """Compile and load the kernels that frames need; without this call the first frame does it.
 
         Args:
-            progress: Called with how many of how many modules are compiled, first with 0, if any must be.
+            progress: Receives the numbers of compiled modules and of all modules to compile, first 0; not called if
+                none is.
         """
         self.pipeline.warm_up(progress)
 
     def _frames(self) -> Iterator[Frame]:
-        """Yield the source's frames, and note the time that each was waited for."""
+        """Yield the source's frames and measure the time of decoding each."""
         frames = iter(self.source)
         while True:
             start = time.perf_counter()
@@ -254,7 +256,7 @@ class Session(Closing):
             yield frame
 
     def _known_of(self, frame: Frame) -> dict[str, Any]:
-        """Return the arguments of a pipeline's call besides the picture."""
+        """Return the keyword arguments of a pipeline's call for a frame."""
         pose = given_pose(self.pipeline.scene.pose, frame)
         return {"time_seconds": frame.time, "exposure_time": frame.exposure_time, "pose": pose}
 
@@ -262,14 +264,15 @@ class Session(Closing):
         pipeline, live = self.pipeline, self.source.live
         on_cpu = pipeline.device.is_cpu
         kept = on_cpu or set(pipeline.plan.request.outputs) <= {"image", "pose"}
-        called = live and on_cpu  # which is to have no copy of the frame
+        called = live and on_cpu  # a call, unlike ``submit``, needs no copy of the frame
         if not self.ahead or called or not kept or not isinstance(pipeline, Pipeline):
             for frame in self._frames():
                 yield frame, self.pipeline(frame.deepest, **self._known_of(frame))
             return
-        # One frame ahead of what is handed out: the next is decoded and its marker found while this one is rendered,
-        # and reading a picture does not hold up the next frame. The first is handed out at once: somebody waits for it.
-        # So is each of a camera's: they are submitted because the picture then comes into memory that it stays in.
+        # Results are yielded one frame late: the next frame is decoded and its marker found while this one is
+        # rendered, and reading a picture does not delay the next frame. Frames of a live camera are yielded at once.
+        # They are submitted all the same, because the picture then stays in the memory to which it is copied from the
+        # device.
         ready: list[tuple[Frame, Result]] = []
         ahead = 0
         try:

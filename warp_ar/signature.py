@@ -1,8 +1,8 @@
-"""Signature of the files that this program writes, by which it knows them again.
+"""Signature in the files that this program writes, by which it recognises them.
 
-A PNG says it in its text, an OpenEXR and an HDR in their headers, a WebP in its EXIF, a video in its comment, a report
-or a calibration in its first key, a page, a chart or a text in a comment at its start, a response in its first line, a
-glTF as its generator, a USD among its own data.
+Its place by format: PNG, a text chunk; OpenEXR and HDR, the header; WebP, EXIF; video, the comment; report and
+calibration, the first key; page, chart and text, a comment at the start; response, the first line; glTF, the generator;
+USD, the layer's custom data.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ import PIL.Image
 from warp_ar.files import kind_of
 
 PROGRAM = "warp_ar"
-"""Name by which this program signs what it writes."""
+"""Name of this program in signatures."""
 
 _HEAD = 4096
-"""Bytes at the start of a file in which its signature stands, but for videos."""
+"""Bytes at the start of a file within which the signature stands, except in videos."""
 
 _NAME = PROGRAM.encode()
 _MARKS = {
@@ -36,31 +36,31 @@ _MARKS = {
     b"#?RADIANCE\n": b"#?RADIANCE\nSOFTWARE=" + _NAME + b"\n",
     b"\x76\x2f\x31\x01": b"software\0string\0" + struct.pack("<I", len(PROGRAM)) + _NAME,
 }
-"""First bytes of a format, and the signature in its head."""
+"""First bytes of each format, and the signature in its head."""
 
-# What stands before it in text: JSON's first key (OpenCV's JSON and YAML say their version first), a comment.
+# Text before the signature: JSON's first key (OpenCV's JSON and YAML begin with their version), or a comment.
 _LEADS = rb"""\s*\{\s*"program":\s*"|%YAML[: ][\d.]+\s*(?:---\s*)?program: "?|""" + (
     rb"""<\?xml version="1.0"\?>\s*<opencv_storage>\s*<program>"?|# |(?:<!doctype html>\s*)?<!-- """
 )
 COMMENT = f"<!-- {PROGRAM} -->"
-"""Start of a chart or a text in Markdown, and behind the document type of a page."""
+"""Comment at the start of a chart or a Markdown text, and after the document type of a page."""
 _SOFTWARE_TAG = 0x0131
-"""EXIF's tag of the software."""
+"""EXIF tag of the software's name."""
 
 
 def sign_png(data: bytes) -> bytes:
-    """A PNG with the signature as its ``Software``, behind the header, which takes 33 bytes."""
+    """Return a PNG with the signature as its ``Software`` text, inserted after the header of 33 bytes."""
     body = b"tEXtSoftware\0" + _NAME
     chunk = struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body))
     return data[:33] + chunk + data[33:]
 
 
 def encode_png(picture: npt.NDArray[Any], options: Sequence[int] = ()) -> bytes:
-    """A signed PNG of 8 or 16 bits.
+    """Return a signed PNG of 8 or 16 bits.
 
     Args:
         picture: Grey (height, width), RGB or RGBA (height, width, 3 or 4).
-        options: OpenCV's, for its encoder.
+        options: Options of OpenCV's encoder.
     """
     if picture.ndim == 3:
         picture = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR if picture.shape[2] == 3 else cv2.COLOR_RGBA2BGRA)
@@ -70,14 +70,14 @@ def encode_png(picture: npt.NDArray[Any], options: Sequence[int] = ()) -> bytes:
 
 
 def software_exif() -> bytes:
-    """EXIF with the signature as its ``Software``, for a WebP."""
+    """Return EXIF data with the signature as ``Software``, for a WebP."""
     exif = PIL.Image.Exif()
     exif[_SOFTWARE_TAG] = PROGRAM
     return exif.tobytes()
 
 
 def _is_signed_crate(path: str | os.PathLike[str]) -> bool:
-    """Tell whether a USD in binary has the signature among its own data; where USD is not installed nothing tells."""
+    """Return True if a binary USD has the signature in its custom data; False if USD is not installed."""
     try:
         from pxr import Sdf, Tf
     except ImportError:
@@ -90,7 +90,7 @@ def _is_signed_crate(path: str | os.PathLike[str]) -> bool:
 
 
 def is_signed(path: str | os.PathLike[str]) -> bool:
-    """Tell whether this program wrote a file; one that cannot be read, it did not."""
+    """Return True if this program wrote a file; False also if it cannot be read."""
     try:
         if kind_of(path) != "file":
             return False

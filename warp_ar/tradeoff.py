@@ -1,7 +1,7 @@
-"""``python -m warp_ar.tradeoff [SCENE ...]`` shows what accuracy costs: errors and milliseconds of every method.
+"""``python -m warp_ar.tradeoff [SCENE ...]``: measures error and time in milliseconds of every method.
 
-Every setting of a scene is turned through its methods, all others staying on ``high``; then presets run as a whole,
-with our choices for the paper's time and for the paper's error. ``warp_ar.accuracy.measure`` says how.
+Each setting of a scene is varied through its methods while all others stay at ``high``. Then whole presets are
+measured, and our choices for the paper's time and for the paper's error. See ``warp_ar.accuracy.measure``.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ from warp_ar.stages.quality import PRESETS
 
 DEFAULT_FRAMES = 12
 SETTLED = 24
-"""Frames within which the light settles: errors of shorter runs say what a recording begins with."""
+"""Frames within which the light settles; shorter runs measure the errors at a recording's start."""
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """The command's options."""
+    """Return the parser of the command's options."""
     parser = Parser(
         prog="python -m warp_ar.tradeoff",
         description="Measure what accuracy costs: errors and milliseconds of every method.",
@@ -67,10 +67,10 @@ def _words(text: str) -> list[str]:
 
 
 def check(options: argparse.Namespace) -> None:
-    """Refuse options that make no sense, before anything is measured.
+    """Check the options before anything is measured.
 
     Raises:
-        UsageError: One makes no sense, or does not fit another.
+        UsageError: An option has an impossible value, or does not fit another.
     """
     if options.presets and options.stage is not None:
         raise UsageError(f"--presets --stage {options.stage}: expected one of both")
@@ -87,10 +87,10 @@ def check(options: argparse.Namespace) -> None:
 
 
 def chosen_settings(case: Case, options: argparse.Namespace) -> tuple[Setting, ...]:
-    """Return the settings of a case that the options ask for."""
+    """Return the settings of a case that the options select."""
     if options.presets:
         return ()
-    # A copy of a case whose virtual lights have a size is there for the shadows of those alone.
+    # The copy of a case with area lights serves to measure their shadows only.
     name = "light_shadow" if case.name.endswith(SIZED) else options.stage
     if options.stage not in (None, name):
         return ()
@@ -98,10 +98,10 @@ def chosen_settings(case: Case, options: argparse.Namespace) -> tuple[Setting, .
 
 
 def asked_cases(options: argparse.Namespace, console: Console) -> list[tuple[Case, tuple[Setting, ...]]]:
-    """Return every case that the options ask for, and what is turned in each.
+    """Return each case that the options select, with the settings to vary in it.
 
     Raises:
-        UsageError: There is nothing to turn in any.
+        UsageError: No case has a setting to vary.
     """
     asked: list[tuple[Case, tuple[Setting, ...]]] = []
     for case in open_cases(options.scenes, options.truth, options.frames, options.shrink, options.versions):
@@ -116,10 +116,10 @@ def asked_cases(options: argparse.Namespace, console: Console) -> list[tuple[Cas
 
 
 def tradeoff(options: argparse.Namespace) -> int:
-    """Measure, print and write.
+    """Measure, print and write the results.
 
     Raises:
-        UsageError: Options make no sense, or the device is not there.
+        UsageError: An option has an impossible value, or the device does not exist.
     """
     check(options)
     device = resolve_device(options.device)
