@@ -1,4 +1,4 @@
-"""Checks of what callers give a pipeline: one line says what is wrong and what would be right."""
+"""Checks of a pipeline's arguments; each error is one line that names the fault and the remedy."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def check_number(name: str, value: object, above: float = -math.inf) -> None:
     """Check an argument that is a number of seconds.
 
     Raises:
-        UsageError: It is no finite number, or not above the bound.
+        UsageError: The value is no finite number, or not above the bound.
     """
     if not fits(value, float) or value <= above:  # type: ignore[operator]
         right = "a finite number of seconds" if above == -math.inf else f"a finite number of seconds above {above:g}"
@@ -29,10 +29,10 @@ def check_number(name: str, value: object, above: float = -math.inf) -> None:
 
 
 def check_scene(scene: object) -> None:
-    """Check a scene that a program may have made.
+    """Check a scene that may have been built by a program.
 
     Raises:
-        UsageError: It is no scene, or a part of it is something else.
+        UsageError: It is no ``Scene``, or a part of it has another type.
     """
     if not isinstance(scene, Scene):
         raise UsageError(f"scene is {type(scene).__name__}; expected a Scene, such as load_scene returns")
@@ -40,11 +40,11 @@ def check_scene(scene: object) -> None:
 
 
 def read_scene(scene: Scene | str | os.PathLike[str]) -> Scene:
-    """Return the scene that was given, checked.
+    """Return the given scene, or the scene read from a file or by a bundled name, checked.
 
     Raises:
-        SceneError: It cannot be read.
-        UsageError: A part of it is something else.
+        SceneError: The scene cannot be read.
+        UsageError: A part of the scene has another type.
     """
     read = scene if isinstance(scene, Scene) else load_scene(scene if isinstance(scene, str) else pathlib.Path(scene))
     check_fields(read)
@@ -52,10 +52,10 @@ def read_scene(scene: Scene | str | os.PathLike[str]) -> Scene:
 
 
 def check_methods(quality: Quality) -> None:
-    """Check the methods of a quality of one's own.
+    """Check the method names of a ``Quality``.
 
     Raises:
-        UsageError: There is no such stage or method.
+        UsageError: A stage or method does not exist.
     """
     shared = {"area_light": tuple(AREA_SAMPLES), "light_shadow": ("hard", "soft")}
     known = {stage.name: ("default", *stage.methods) for stage in STAGES} | shared
@@ -66,10 +66,10 @@ def check_methods(quality: Quality) -> None:
 
 
 def check_frames(exposures: Sequence[float], outputs: tuple[str, ...], linear: bool) -> tuple[str, ...]:
-    """The outputs, expanded, of frames that can be lit.
+    """Check the arguments that describe frames; return the outputs with ``radiance`` expanded to its layers.
 
     Raises:
-        UsageError: An exposure is none, an output is unknown, or frames of several exposures are linear.
+        UsageError: An exposure is invalid, an output is unknown, or linear frames have several exposures.
     """
     for exposure in exposures:
         check_number("exposures", exposure, above=0.0)

@@ -1,8 +1,8 @@
-"""Native threads that run a frame's passes on CPU; the tables that they read, and Python's part in a frame.
+"""Native threads that run a frame's passes on CPU, their tables, and calls back into Python.
 
-``kernels/bands.py`` has what the threads do. Here launches are packed into its tables, once, and each frame is told
-which rows of which passes are due. What only Python can do is called from there: steps on the host, and the decision
-whether a stage is due where that depends on what a stage before it found.
+``kernels/bands.py`` describes the threads' algorithm. This module packs all launches into its tables once; for each
+frame it enters the rows of the passes to run. Steps that need Python are called back: work on the host, and the
+decision whether to run a stage if it depends on the result of an earlier stage.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _Table = npt.NDArray[np.int64]
 
 
 class _Packed:
-    """A launch as its entry point takes it."""
+    """Recorded launch, with the arguments of its compiled entry point."""
 
     def __init__(self, launch: wp.Launch) -> None:
         names = [argument.label for argument in launch.kernel.adj.args]
@@ -41,15 +41,15 @@ class _Packed:
             setattr(self.arguments, name, value)
         self.bounds = launch.bounds
         self.entry = ctypes.cast(launch.hooks.forward, ctypes.c_void_p).value or 0
-        self.launch = launch  # keeps arrays and the loaded module
+        self.launch = launch  # keeps the arrays and the loaded module alive
 
     def call(self) -> None:
-        """Run it on this thread; others may run Python meanwhile."""
+        """Run the launch on this thread, without holding Python's lock."""
         _Entry(self.entry)(ctypes.addressof(self.bounds), ctypes.addressof(self.arguments))
 
 
 class _System:
-    """Functions of the operating system: a semaphore, a clock, a way to let others run."""
+    """Functions of the operating system: semaphore, clock, and yielding the processor."""
 
     def __init__(self) -> None:
         self.clock_id = 1
@@ -84,12 +84,12 @@ class _System:
         return ctypes.addressof(memory)
 
     def addresses(self) -> list[int]:
-        """Of wait, post, let others run, and the clock."""
+        """Return the addresses of the functions wait, post, yield and clock."""
         return [ctypes.cast(function, ctypes.c_void_p).value or 0 for function in self.functions]
 
 
 class Crew:
-    """The threads of one scheduler, and the tables of its passes."""
+    """Threads of one scheduler, and the tables of its passes."""
 
     def __init__(
         self,
@@ -102,19 +102,20 @@ class Crew:
         decide: Callable[[Stage], object],
         finish: Callable[[Stage], None],
     ) -> None:
-        """Pack everything; the threads begin with the first frame.
+        """Pack all passes; the threads start with the first frame.
 
         Args:
-            steps: Stages and their passes, in order.
-            notes: What each pass launches, by its ``id``; a pass that is not there is Python's.
-            readers: Names of the stages that read what each stage writes.
-            threads: That take rows, the caller's included.
-            bands_per_pass: Equal bands of each pass; None means by need.
-            decide: Called as a stage begins for which ``ask`` was said: is to call ``begin`` or leave it.
-            finish: Called as a stage ends for which ``begin`` was told so.
+            steps: Stages with their passes, in order.
+            notes: Recorded launches of each pass, by its ``id``; a pass without an entry is run by Python.
+            readers: Names of the stages that read the output of each stage.
+            threads: Number of threads that process rows, including the caller's.
+            bands_per_pass: Number of equal bands of each pass; None: chosen by the rows and threads.
+            decide: Called when the inputs of a stage marked by ``ask`` are ready; it calls ``begin`` if the stage is to
+                run.
+            finish: Called at the end of a stage that was begun with ``tell``.
 
         Raises:
-            ValueError: There are more stages than native threads run.
+            ValueError: There are more stages than the native tables hold.
         """
         self._decide, self._finish = decide, finish
         self._error: BaseException | None = None
@@ -188,12 +189,12 @@ class Crew:
         )
 
     def _pack(self, step: Pass, notes: list[Note]) -> list[dict[str, int]] | None:
-        """Rows of the call table for a pass; None if it must be launched from Python."""
+        """Return the rows of the call table for a pass; None if it must be launched from Python."""
         rows = []
         for note in notes:
             banded = note.rows is not None
             if step.rows is not None and note.rows != (0, step.rows) and note.arrays is None:
-                return None  # within a pass that is split, a launch over other rows
+                return None  # a launch over other rows than those of its split pass
             if note.arrays is not None:
                 target, source = note.arrays
                 if not (target.is_contiguous and source.is_contiguous and target.shape == source.shape):
@@ -256,8 +257,8 @@ class Crew:
         self._caller = self._serve(1)
         self._helpers = [self._serve(0) for _ in range(self._count - 1)]
         self._end = weakref.finalize(self, _stop, self._state, self._system, self._count)
-        # Not where Python ends: threads that woke up then would be unwound through native code, which aborts. Asleep
-        # they end with the process.
+        # Not at Python's exit: threads that are woken then would be unwound through native code, which aborts the
+        # process. Sleeping threads end with the process.
         self._end.atexit = False
 
     def _serve(self, caller: int) -> _Packed:
@@ -266,10 +267,10 @@ class Crew:
         return _Packed(wp.launch(bands.serve_kernel, 1, inputs, [out], device="cpu", record_cmd=True))
 
     def _call_back(self, number: int) -> int:
-        """A step of Python's, on whichever thread; 1 if it failed."""
+        """Run a step in Python on the calling thread; return 1 if it failed, else 0."""
         try:
             self._host_steps[number]()
-        except BaseException as error:  # handed to the thread that asked for the frame
+        except BaseException as error:  # raised again on the thread that runs the frame
             self._error = error
             return 1
         return 0
@@ -277,22 +278,22 @@ class Crew:
     # ---- one frame ------------------------------------------------------------------------------------------------
 
     def reset(self) -> None:
-        """Begin to say what a frame is: nothing is due yet."""
+        """Start the description of a frame: no pass runs."""
         self._start[:] = 0
         self._stop[:] = 0
         self._time[:] = 0
 
     def ask(self, stage: Stage) -> None:
-        """Have ``decide`` called for a stage when what it reads is there."""
+        """Have ``decide`` called for a stage when its inputs are ready."""
         self._stop[self._first[self._places[stage.name]]] = 1
 
     def begin(self, stage: Stage, due: Sequence[tuple[Pass, Rows]], *, tell: bool) -> None:
-        """Say which rows of which passes of a stage are due.
+        """Enter the rows of the passes that a stage runs in this frame.
 
         Args:
-            stage: That is due.
-            due: Its passes, with their rows; (0, 1) of those that have none.
-            tell: Whether ``finish`` is to be called in the end.
+            stage: Stage to run.
+            due: Passes to run, each with its rows; (0, 1) for a pass without rows.
+            tell: Whether ``finish`` is called at the stage's end.
         """
         for step, (start, stop) in due:
             row = self._rows[id(step)]
@@ -300,17 +301,18 @@ class Crew:
         self._stop[self._last[self._places[stage.name]] - 1] = int(tell)
 
     def run(self) -> Mapping[str, float]:
-        """Run the frame; this thread works too. Returns nanoseconds of all threads by stage.
+        """Run the frame, with this thread as one of the threads; return nanoseconds of all threads by stage.
 
         Raises:
-            BaseException: The first that a step of Python's raised; what was under way is done.
+            BaseException: First error of a step in Python; work in progress has ended.
         """
         self._stages[:] = self._unbegun
         self._state[0, self._open] = len(self._names)
         self._state[0, self._has_failed] = 0
         if len(self._threads) < len(self._helpers):
-            # A crew may be collected without having been closed: what a thread reads until it has returned is its own
-            # to keep. The callback, which would keep the crew, is called during frames alone.
+            # A crew may be garbage collected without having been closed, so each thread holds all data that it reads
+            # until it returns. It does not hold the callback, which refers to the crew and is called only during
+            # frames.
             read = (self._state, self._stages, self._passes, self._calls, self._readers, self._system)
             self._threads = [threading.Thread(target=_serve, args=(one, read), daemon=True) for one in self._helpers]
             for thread in self._threads:
@@ -327,7 +329,7 @@ class Crew:
         return dict(zip(self._names, times.tolist(), strict=True))
 
     def close(self) -> None:
-        """Let the threads end, and go of all that the tables refer to: of the scheduler, and so of this, too."""
+        """End the threads, and release the references of the tables to the scheduler, which refers to this crew."""
         self._end()
         for thread in self._threads:
             thread.join()
@@ -335,11 +337,11 @@ class Crew:
 
 
 def _serve(helper: _Packed, read: tuple[Any, ...]) -> None:
-    """A thread's life.
+    """Run one native thread until it is stopped.
 
     Args:
         helper: The launch of ``serve_kernel``.
-        read: All that it reads besides, held until it returns.
+        read: Data that the thread reads, held until it returns.
     """
     helper.call()
     del read

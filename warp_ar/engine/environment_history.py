@@ -1,4 +1,4 @@
-"""The environment that is remembered from frame to frame, and from one pipeline to the next."""
+"""Memory of the environment's light from frame to frame, and from one pipeline to the next."""
 
 from __future__ import annotations
 
@@ -14,37 +14,37 @@ from warp_ar.kernels.structs import struct_values
 from warp_ar.stages.base import Arrays
 
 KEPT_ARRAYS = ("others_kept_radiance", "others_filled")
-"""Remembered radiance of mirror balls after the first; stages carry it over."""
+"""Arrays with the remembered radiance of the mirror balls after the first; stages carry them over."""
 LIGHT_ARRAYS = ("environment_radiance", "environment_confidence", "environment_clipped")
 """Arrays of the environment that are remembered."""
 SCALED_ARRAYS = ("environment_radiance", "filled_radiance", "recover_recovered", *KEPT_ARRAYS)
-"""Remembered radiance; the filled map is, while something covers a ball."""
+"""Arrays of radiance that persist between frames (the filled map while something covers a ball)."""
 
 
 class CarriedLight:
-    """Memory of the light that a pipeline has seen, if it has seen any."""
+    """Light that a pipeline has seen, with a mark whether there is any."""
 
     def __init__(self, arrays: Arrays, *, wanted: bool) -> None:
-        """``wanted``: the environment is one of the outputs."""
+        """Take the pipeline's arrays; ``wanted``: the environment is one of the outputs."""
         self._arrays, self._wanted = arrays, wanted
         self.known = False
-        """True if the arrays hold light; else the next frame starts anew."""
+        """True if the arrays hold light; otherwise the next frame starts without any."""
 
     @property
     def environment(self) -> Any:
-        """The environment as an output: None where it was not asked for or not seen yet."""
+        """Return the environment for the results; None if it is no output or has not been seen yet."""
         return self._arrays["environment"] if self.known and self._wanted else None
 
     @property
     def others(self) -> Any:
-        """Those of the mirror balls after the first, (P - 1, rows, columns); None where one map is all."""
+        """Return the environments of the mirror balls after the first, (P - 1, rows, columns); None for one map."""
         return self._arrays.get("others_environment") if self.environment is not None else None
 
     def scale(self, ratio: npt.NDArray[np.float64]) -> None:
-        """Turn remembered radiance into the camera values of a camera whose gain has changed.
+        """Scale remembered radiance to the camera values of a changed camera gain.
 
         Args:
-            ratio: Of the gain to that before, RGB.
+            ratio: New gain over old gain, RGB.
         """
         arrays = self._arrays
         captured = ("environment",) if "environment" in arrays and SCALED_ARRAYS[0] not in arrays else ()
@@ -62,7 +62,7 @@ class CarriedLight:
             emitters.assign(records)
 
     def take_over(self, other: CarriedLight) -> None:
-        """Go on from what another pipeline remembers, at the size of this one's arrays."""
+        """Continue with another pipeline's light, resampled to the size of this pipeline's arrays."""
         mine, theirs = self._arrays, other._arrays
         kept = [name for name in LIGHT_ARRAYS if name in mine and name in theirs]
         if not other.known or not kept:
@@ -84,7 +84,7 @@ def resample_light(
     clipped: npt.NDArray[np.float32],
     shape: tuple[int, int],
 ) -> tuple[npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any]]:
-    """The remembered light at another size: means weighted by confidence.
+    """Return the remembered light at another size, by means weighted with confidence.
 
     Args:
         radiance: Latlong (h, w, 3), camera values.
@@ -93,7 +93,7 @@ def resample_light(
         shape: Rows and columns of the new maps.
 
     Returns:
-        The same three at that size.
+        Radiance, confidence and clipped shares at the new size.
     """
 
     def resize(values: npt.NDArray[Any]) -> npt.NDArray[Any]:

@@ -1,7 +1,7 @@
-"""Values that change per frame, in one small block of memory: camera, virtual lights, virtual objects, proxies.
+"""Values that change per frame, in one block of memory: camera, virtual lights, virtual objects, proxies.
 
-The block is written on the host and uploaded in one copy, so a captured CUDA graph sees new values without being
-captured again. The copy is asynchronous, out of pinned memory that is not written again before it is over.
+The host writes the block and uploads it in one copy, so that a captured CUDA graph reads new values without a new
+capture. The copy is asynchronous, from pinned memory that is not overwritten before the copy is done.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from warp_ar.device import wait_for
 from warp_ar.kernels.structs import FrameParams, Light, Shape, struct_dtype
 
 _ALIGNMENT = 16
-_SLOTS = 4  # uploads that may be under way
+_SLOTS = 4  # uploads that may be in progress
 
 
 class FrameBlock:
-    """Typed host views over one buffer, and the device arrays that alias its upload."""
+    """Typed host views of one buffer, and device arrays that alias its uploaded copy."""
 
     def __init__(self, device: Any, lights: int, objects: int, proxies: int = 0) -> None:
         """Allocate the block.
@@ -60,15 +60,15 @@ class FrameBlock:
             self._device[name] = wp.array(ptr=pointer, dtype=struct, shape=(count,), device=device)
 
     def host(self, name: str) -> Any:
-        """Writable NumPy structured view of ``params``, ``lights``, ``objects`` or ``proxies``."""
+        """Return a writable NumPy structured view of ``params``, ``lights``, ``objects`` or ``proxies``."""
         return self._host[name]
 
     def device_array(self, name: str) -> Any:
-        """Warp array of ``params``, ``lights``, ``objects`` or ``proxies``; filled by ``upload``."""
+        """Return the Warp array of ``params``, ``lights``, ``objects`` or ``proxies``, which ``upload`` fills."""
         return self._device[name]
 
     def upload(self) -> None:
-        """Copy the host's values to the device; on CPU they are the same memory."""
+        """Copy the host's values to the device; on CPU both are the same memory."""
         if not self._pinned:
             return
         buffer, view, done = self._pinned[self._uploads % _SLOTS]

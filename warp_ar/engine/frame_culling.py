@@ -1,10 +1,11 @@
-"""Stages that can change a pixel of this frame, and the reasons why the others cannot.
+"""Selection of the stages that can change a pixel of the current frame, and the reasons against the others.
 
-A plan knows the scene, not the frame: a light may have no power, an object be out of view. Before a frame a stage is
-asked whether what it writes is as if it did nothing (``Stage.idle``), from the outputs back: what such a stage reads is
-not needed for its sake. Its arrays must say so too: in the first idle frame it runs once more, to clear what it wrote
-before, and rests from then on. A stage that no running stage reads rests as well; what it wrote keeps its version, so
-that it runs again in the frame that needs it if anything that it reads has changed meanwhile.
+A plan depends on the scene, not on the frame: in a frame a light may have no power, or an object may be out of view.
+Before a frame, each stage states whether its output has no effect (``Stage.idle``). Stages are examined from the
+outputs backwards, because the inputs of an idle stage are not needed for it. The arrays of an idle stage must hold its
+neutral output: in its first idle frame the stage runs once more to clear them, and then it rests. A stage whose output
+no running stage reads rests as well. Its arrays keep their version, so it runs again in the next frame that needs it if
+its inputs have changed meanwhile.
 """
 
 from __future__ import annotations
@@ -15,34 +16,34 @@ from warp_ar.stages.base import Reach, Stage
 
 
 class Demand:
-    """Walks a plan's stages before every frame; remembers whose arrays are clear."""
+    """Examines a plan's stages before every frame; remembers the stages whose arrays are clear."""
 
     def __init__(self, stages: Sequence[Stage], outputs: Collection[str]) -> None:
         """Prepare.
 
         Args:
-            stages: In the order in which they run.
+            stages: Stages of the plan, in the order in which they run.
             outputs: Resources that the caller wants in every frame.
         """
         self._stages, self._outputs = stages, outputs
         self._clear: set[str] = set()
         self._last: tuple[Reach, Mapping[str, str]] | None = None
-        """Result of the last frame, which holds for the next one of the same reach."""
+        """Reach and result of the last frame, valid for the next with the same reach; None after clearing."""
 
     def forget(self) -> None:
-        """Take it that no stage's arrays are clear."""
+        """Forget which stages' arrays are clear."""
         self._clear.clear()
         self._last = None
 
     def look(self, reach: Reach) -> tuple[Mapping[str, str], Collection[str]]:
-        """Look at one frame.
+        """Return the stages that rest in a frame and those that clear their arrays.
 
         Args:
-            reach: What of the frame virtual objects and lights can reach.
+            reach: Parts of the frame that virtual objects and lights can reach.
 
         Returns:
-            Reasons of the stages that rest, by name, and names of those that run to clear their arrays. The reasons are
-            the same object for as long as they are the same.
+            Reasons of the resting stages, by name; and names of the stages that run to clear their arrays. The mapping
+            of reasons is the same object until a reason changes.
         """
         if self._last is not None and self._last[0] == reach:
             return self._last[1], frozenset()
@@ -63,6 +64,6 @@ class Demand:
                 self._clear.add(name)
                 clearing.add(name)
             wanted |= set(stage.reads_for(reach))
-        # What is cleared in this frame rests in the next.
+        # Stages that clear their arrays in this frame rest in the next.
         self._last = None if clearing else (reach, resting)
         return resting, clearing

@@ -1,8 +1,8 @@
-"""Frames of other libraries, used where they lie: whatever has ``__dlpack__`` or ``__cuda_array_interface__``.
+"""Frames in the memory of other libraries: objects with ``__dlpack__`` or ``__cuda_array_interface__``.
 
-A frame on the pipeline's CUDA device is read there. Its producer's stream is waited for on the device, by the protocol:
-DLPack's producer is told the stream that will read, the other protocol names the stream that wrote. The frame is kept
-until the kernels have read it, so that its owner's allocator does not give its memory away meanwhile.
+A frame on the pipeline's CUDA device is read in place. The device waits for the producer's stream as the protocol
+states: a DLPack producer is told the reading stream, and ``__cuda_array_interface__`` names the writing stream. The
+frame is referenced until the kernels have read it, so that its owner does not reuse the memory meanwhile.
 
 References:
     Python array API standard, ``__dlpack__``; Numba, CUDA Array Interface, version 3.
@@ -21,20 +21,20 @@ from warp_ar.device import exclusive
 from warp_ar.errors import UsageError, reason
 
 HOST = (1, 3)
-"""DLPack's kinds of device whose memory the host reads: the host, and what CUDA has pinned of it."""
+"""DLPack device types that the host can read: CPU, and memory pinned by CUDA."""
 
 CUDA = (2, 13)
-"""CUDA, and memory that it manages."""
+"""DLPack device types of CUDA memory and of memory managed by CUDA."""
 
 
 def adopt_frame(image: Any, size: tuple[int, int], device: Any) -> npt.NDArray[np.uint8] | Any:
-    """A frame of any kind as what the pipeline reads.
+    """Return a frame of any supported kind as an array that the pipeline can read.
 
     Args:
         image: uint8 RGB (height, width, 3) of NumPy or with ``__dlpack__`` or ``__cuda_array_interface__``, or a Warp
             array (height, width) of ``wp.vec3ub``.
         size: Width and height.
-        device: Of the pipeline.
+        device: Device of the pipeline.
 
     Returns:
         A contiguous NumPy array, or a Warp array of ``wp.vec3ub`` on the device that refers to the frame's memory.
@@ -110,7 +110,7 @@ def _from_cuda(image: Any, size: tuple[int, int], device: Any, kind: str) -> Any
 def _check_strides(
     kind: str, dtype: np.dtype[Any], shape: tuple[int, ...], strides: tuple[int, ...] | None, size: tuple[int, int]
 ) -> None:
-    """Raise unless a device's array holds a frame whose pixels are three bytes side by side."""
+    """Check that a device array holds a frame with three adjacent bytes per pixel; raise UsageError otherwise."""
     expected = (size[1], size[0], 3)
     if tuple(shape) != expected or dtype != np.uint8:
         raise UsageError(f"frame is {kind} {dtype} {tuple(shape)}; expected uint8 RGB {expected}")
@@ -119,14 +119,14 @@ def _check_strides(
 
 
 class Borrowed:
-    """Frames of others that kernels still read."""
+    """References to frames of other libraries that kernels are still reading."""
 
     def __init__(self, device: Any) -> None:
         self._device = device
         self._kept: collections.deque[tuple[Any, Any]] = collections.deque()
 
     def keep(self, frame: Any) -> None:
-        """Keep a frame until what has been launched so far is done, and let go those that are done with."""
+        """Hold a frame until the work launched so far is done, and release frames whose work is done."""
         if not self._device.is_cuda:
             return
         with exclusive(self._device):

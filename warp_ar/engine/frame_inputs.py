@@ -36,39 +36,39 @@ from warp_ar.tracking.drift import ExposureDrift
 from warp_ar.tracking.tracking import Places
 
 _CLOCK = struct.Struct("<2f2i")
-"""Layout of the frame's values ``time``, ``time_step``, ``frame_index`` and ``environment_reset``."""
+"""Layout of the frame constants ``time``, ``time_step``, ``frame_index`` and ``environment_reset``."""
 _ALL_RECTS = ("object", "light", "direct", "shadow", "ball")
-"""Rectangles in their order in the frame's values."""
+"""Names of the screen rectangles, in their order in the frame constants."""
 RECTS = ("object", "light", "shadow", "ball")
-"""Parts of the screen to whose rows passes keep; the frame's values hold them whole."""
+"""Screen rectangles that limit the rows of passes; the frame constants hold them with their columns."""
 
 
 @dataclasses.dataclass(slots=True)
 class SeenFrame:
-    """A frame that has been looked at, not rendered."""
+    """A frame whose pose has been found, before it is rendered."""
 
     image: Any
-    """The given image, or a private copy."""
+    """Image of the caller, or a copy of it."""
     slot: Slot | None
-    """Memory that it is sent to the device from, if copying it there has begun."""
+    """Slot from which it is sent to the device, if its transfer has begun."""
     pose: Pose | None
     lost: bool
     index: int
     time: float
-    """Seconds, by the caller's clock."""
+    """Time of the frame on the caller's clock, seconds."""
     seconds: float
-    """Since the first frame."""
+    """Seconds since the first frame."""
     step: float
-    """Seconds since the frame before that was lit."""
+    """Seconds since the previous lit frame."""
     timings: dict[str, StageTiming]
     places: Places = dataclasses.field(default_factory=dict)
-    """Places of the markers that something rides on."""
+    """Poses of the markers to which objects, lights or other parts of the scene are attached."""
     plate: Plate | None = None
-    """The frame at its full depth."""
+    """Frame at its full bit depth; None for 8-bit frames."""
 
 
 class FrameInputs:
-    """Owns the inputs of stages and writes them before a frame is rendered; says which of them changed."""
+    """Owner of the stages' inputs: writes them before a frame is rendered, and marks those that changed."""
 
     def __init__(
         self,
@@ -81,16 +81,17 @@ class FrameInputs:
         watches_ball: bool = False,
         linear: bool = False,
     ) -> None:
-        """Allocate, and add to ``arrays`` what stages read.
+        """Allocate the inputs and add them to ``arrays``.
 
         Args:
-            scene: What to show.
-            camera: Of the frames.
-            arrays: Of the pipeline, empty.
+            scene: Scene to show.
+            camera: Camera of the frames.
+            arrays: Arrays of the pipeline, empty.
             device: Warp device, the current one.
-            follows_gain: Whether a drift of the camera's exposure and white balance is looked for.
-            watches_ball: Whether frames in which something covers a ball are told, and what balls reflect.
-            linear: Whether some stage reads frames as linear radiance.
+            follows_gain: Whether to follow a drift of the camera's exposure and white balance.
+            watches_ball: Whether to detect frames in which something covers a ball, and to estimate the balls'
+                reflectance.
+            linear: Whether a stage reads frames as linear radiance.
         """
         shape = (camera.height, camera.width)
         self._camera, self._arrays = camera, arrays
@@ -103,7 +104,7 @@ class FrameInputs:
         self.host_scene.write_proxies(self.block.host("proxies"))
         self.block.upload()
         self.frame = wp.zeros(shape, dtype=wp.vec3ub, device=device)
-        """The picture that stages read."""
+        """Picture that stages read."""
         self.transfers = None if device.is_cpu else Transfers(shape, device)
         self._host_frame = self.frame.numpy() if self.transfers is None else None
         self._linear_frame = wp.zeros(shape if linear else (0, 0), dtype=wp.vec3, device=device)
@@ -111,27 +112,27 @@ class FrameInputs:
         self.decode = decode_table(camera.transfer)
         """Linear value of each code, (256, 3)."""
         self.saturation = SaturationLevels()
-        """Saturation codes of the channels, estimated from the frames so far."""
+        """Codes at which the channels saturate, estimated from the frames so far."""
         self._drift = ExposureDrift(scene, camera) if follows_gain and scene.has_marker else None
         watches_ball = watches_ball and scene.has_marker and bool(scene.probes)
         self._cover = BallCover(scene, camera) if watches_ball else None
         self._reflectance = ReflectanceWatch(scene, camera, self.decode) if watches_ball else None
         self._coming: Slot | None = None
         self.covered = False
-        """True if something covers a ball in the frame: it then tells nothing of the light."""
+        """True if something covers a ball in this frame, which then does not update the light."""
         self._saturation_is_known = False
         self._encoded = 0.0, self.saturation.levels.copy()
         self._bent = 0.0
         self._probes = scene.probes
         self.rects: dict[str, Rect] = dict.fromkeys(RECTS, (0, shape[0], 0, shape[1]))
         self._written_rects: dict[str, Rect] = dict.fromkeys(_ALL_RECTS, EMPTY)
-        # Views of every field, (1, ...): NumPy takes longer to find a field than to write it.
+        # Views of every field, (1, ...): looking a field up by name takes NumPy longer than writing it.
         values = self.block.host("params")
         self._params = {name: values[name] for name in values.dtype.names}
         self._all_rects = values.view(np.uint8)[values.dtype.fields[f"{_ALL_RECTS[0]}_rect"][1] :].view(np.int32)
         self._clock = values.view(np.uint8)[values.dtype.fields["time"][1] :].data
         self._looked_at: tuple[Any, ...] | None = None
-        """Pose and contents at the last writing of rectangles."""
+        """Pose and outlines for which the rectangles were last computed."""
         self._shines = True
         self._add(scene, device)
         self._params["focal"][0] = (camera.fx, camera.fy)
@@ -140,7 +141,7 @@ class FrameInputs:
         self.write_exposure(scene)
 
     def _add(self, scene: Scene, device: Any) -> None:
-        """Name the arrays, those that stand for an input and those that all stages share."""
+        """Add the arrays of the inputs, and those that all stages share."""
         add, params = self._arrays.add, self._params
         for name in INPUTS:
             add(name, {"frame": self.frame, "linear_frame": self._linear_frame}.get(name))
@@ -165,21 +166,21 @@ class FrameInputs:
 
     @property
     def told_reflectance(self) -> tuple[scenes.RGB, ...] | None:
-        """Reflectance of the balls estimated from frames; None while the scene's is in use."""
+        """Reflectance of the balls estimated from frames; None while the scene's values are used."""
         told = self._reflectance
         return None if told is None or not told.is_told else told.values
 
     @property
     def gain(self) -> npt.NDArray[np.float64]:
-        """Camera's factor on radiance against the first frame, RGB: 1 unless its exposure drifts."""
+        """Camera's gain relative to the first frame, RGB; 1 if its exposure does not drift."""
         return np.ones(3) if self._drift is None else self._drift.gain
 
     def look(self, frame: SeenFrame) -> tuple[npt.NDArray[np.float64] | None, bool]:
-        """Look whether the camera's gain drifts and what balls reflect, if the frame is on the host.
+        """Update the estimates of the camera's gain and of the balls' reflectance, if the frame is on the host.
 
         Returns:
-            Ratio of the gain to that of the frame before, RGB, None where it is the same; and whether the tone curve,
-            or a ball's reflectance, is taken for another one: light of former frames is of no use then.
+            Ratio of the gain to the previous one, RGB, None if unchanged; and True if the estimated tone curve or a
+            ball's reflectance changed, which invalidates the light of former frames.
         """
         if frame.pose is None or isinstance(frame.image, wp.array):
             return None, False
@@ -187,7 +188,7 @@ class FrameInputs:
         return ratio, self._note_reflectance(frame, frame.pose) or is_bent
 
     def _look_for_drift(self, frame: SeenFrame, pose: Pose) -> tuple[npt.NDArray[np.float64] | None, bool]:
-        """As ``look``, of the camera alone."""
+        """Update the estimate of the camera's gain and tone curve; returns as ``look``."""
         if self._drift is None:
             return None, False
         gain, contrast = self._drift.gain, self._drift.contrast
@@ -201,13 +202,13 @@ class FrameInputs:
         return np.asarray(self._drift.gain / gain), is_bent
 
     def continue_from(self, other: FrameInputs) -> None:
-        """Take over another pipeline's estimates of saturation, gain, tone curve, covered balls and reflectance."""
+        """Copy another pipeline's estimates of saturation, gain, tone curve, ball covering and reflectance."""
         if self._camera == other._camera and not self._saturation_is_known:
             self.saturation = copy.deepcopy(other.saturation)
             self._saturation_is_known = other._saturation_is_known
             self._write_decode()
         if self._cover is not None and other._cover is not None and self._cover.watches == other._cover.watches:
-            self._cover = copy.copy(other._cover)  # it replaces what it remembers, and changes nothing of it
+            self._cover = copy.copy(other._cover)  # shallow: members are replaced, not modified
         mine, yours = self._reflectance, other._reflectance
         if mine is not None and yours is not None and mine.watches == yours.watches:
             self._reflectance = copy.deepcopy(yours)
@@ -220,7 +221,7 @@ class FrameInputs:
             self._write_decode()
 
     def forget_drift(self) -> None:
-        """Take the next frame for the camera's first."""
+        """Restart the estimate of the gain: the next frame is its first."""
         if self._drift is None:
             return
         is_bent = self._drift.contrast != 0.0
@@ -230,7 +231,7 @@ class FrameInputs:
             self._write_decode()
 
     def _write_decode(self) -> None:
-        """Update the decoding table from the camera's estimates so far."""
+        """Write the decoding table for the camera's current estimates."""
         contrast, levels = 0.0 if self._drift is None else self._drift.contrast, self.saturation.levels
         self._arrays["decode"].assign(camera_table(self._camera.transfer, levels, contrast))
         if contrast != self._encoded[0] or (contrast != 0.0 and (levels != self._encoded[1]).any()):
@@ -239,23 +240,23 @@ class FrameInputs:
         self._have_lights_shine()
 
     def _have_lights_shine(self) -> None:
-        """Have virtual lights follow the camera: their 1 is where it saturates, and it drifts as its gain does."""
+        """Scale virtual lights to the camera: their unit is its saturation level, and follows its gain."""
         levels, codes = self.saturation.levels, np.arange(256)
         white = max(float(np.interp(levels[c], codes, self.decode[:, c])) for c in range(3))
         self.host_scene.set_gain(white * self.gain)
 
     def close(self) -> None:
-        """Let go of what frames are sent by."""
+        """Free the buffers of transfers."""
         if self.transfers is not None:
             self.transfers.close()
 
     def update(self, scene: Scene, *, placed: bool, exposed: bool) -> None:
-        """Take the numbers of another scene from the next frame on.
+        """Use the numbers of another scene from the next frame on.
 
         Args:
-            scene: With the same skeleton.
+            scene: Scene with the same skeleton.
             placed: Whether objects or lights differ.
-            exposed: Whether the exposure does.
+            exposed: Whether the exposure differs.
         """
         if exposed:
             self.write_exposure(scene)
@@ -265,23 +266,23 @@ class FrameInputs:
             self._arrays.touch("objects")
 
     def write_exposure(self, scene: Scene) -> None:
-        """Write the scale of the exposure; ``auto`` finds its own."""
+        """Write the scale of the exposure; ``auto`` computes it on the device."""
         scale = scene.exposure.scale
         self._params["exposure_scale"][0] = 1.0 if isinstance(scale, str) else scale
         self._arrays.touch("exposure")
 
     def write(self, frame: SeenFrame, *, reset: bool) -> None:
-        """Make ``frame`` the one that stages read: its values, then its picture, which the device must ``receive``.
+        """Write the inputs for ``frame``: its constants, then its picture, which ``receive`` copies on the device.
 
         Args:
-            frame: A frame whose marker is not lost.
-            reset: Whether what was accumulated of the environment is to be forgotten.
+            frame: Frame with a tracked or held marker.
+            reset: Whether the accumulated environment is discarded.
         """
-        self._coming = None  # of a frame that failed before it was received
+        self._coming = None  # left by a frame that failed before it was received
         touched = ["clock", *self._place_probes(frame)]
         self.covered = self._is_covered(frame, reset=reset)
         if not self.covered:
-            self._note_saturation(frame)  # before lights are written, which shine by it
+            self._note_saturation(frame)  # before the lights are written, whose unit depends on it
         touched += self._place(frame)
         if (frame.pose is not None and self._move(frame.pose)) or self._arrays.version("pose") == 0:
             touched.append("pose")
@@ -295,13 +296,13 @@ class FrameInputs:
             self._arrays.touch(name)
 
     def fix_saturation(self, levels: npt.NDArray[np.float64]) -> None:
-        """Take codes at which channels saturate, (3,), as known: frames are no longer asked."""
+        """Set the codes at which channels saturate, (3,); they are no longer estimated from frames."""
         self.saturation.levels = np.asarray(levels, np.float64)
         self._saturation_is_known = True
         self._write_decode()
 
     def _is_covered(self, frame: SeenFrame, *, reset: bool) -> bool:
-        """Return whether something covers a ball, if the frame is on the host and light of former frames is known."""
+        """Return True if something covers a ball; False if the frame is not on the host."""
         if self._cover is None or frame.pose is None or isinstance(frame.image, wp.array):
             return False
         if reset:
@@ -312,19 +313,19 @@ class FrameInputs:
         return self._cover.observe(frame.image, discs, frame.pose, frame.seconds, self.gain, frame.plate)
 
     def _note_reflectance(self, frame: SeenFrame, pose: Pose) -> bool:
-        """Look what balls reflect; whether they are taken to reflect something else from now on."""
+        """Update the estimate of the balls' reflectance; return True if the values in use changed."""
         if self._reflectance is None or not self._reflectance.observe(frame.image, pose, self._probes):
             return False
         self._write_probes()
         return True
 
     def _write_probes(self) -> None:
-        """Write the balls' places and estimated reflectance."""
+        """Write the balls' places and their estimated reflectance."""
         told = None if self._reflectance is None else self._reflectance.values
         self._arrays["probes"].assign(_probe_values(self._probes, told))
 
     def _note_saturation(self, frame: SeenFrame) -> None:
-        """Look where channels saturate, if the frame is on the host and shows a ball."""
+        """Update the estimate of the saturation codes, if the frame is on the host and shows a ball."""
         if self._saturation_is_known or not self._probes or frame.pose is None or isinstance(frame.image, wp.array):
             return
         if frame.index >= WATCHED and frame.index % PERIOD:
@@ -335,7 +336,7 @@ class FrameInputs:
             self._write_decode()
 
     def _place_probes(self, frame: SeenFrame) -> Iterable[str]:
-        """Move balls to where their markers are now; gives the inputs that changed."""
+        """Move balls to the poses of their markers; yield the names of changed inputs."""
         scene = self.host_scene
         if frame.pose is not None and scene.place_probes(frame.pose, frame.places):
             self._probes = scene.probes
@@ -343,12 +344,12 @@ class FrameInputs:
             yield "pose"
 
     def _place(self, frame: SeenFrame) -> Iterable[str]:
-        """Move lights and objects to where they are now; gives the inputs that changed."""
+        """Move lights, objects and proxies to their poses in this frame; yield the names of changed inputs."""
         scene, block, places = self.host_scene, self.block, frame.places
         lights = scene.write_lights(block.host("lights"), frame.seconds, places)
         objects = scene.write_objects(block.host("objects"), frame.seconds, places)
         if scene.write_proxies(block.host("proxies"), places):
-            yield "pose"  # all that asks where the receiver is asks where the camera is
+            yield "pose"  # every stage that reads the receiver's place also reads the camera's pose
         if lights or frame.index == 0:
             self._shines = scene.has_area_lights or bool(block.host("lights")["intensity"].any())
             yield "lights"
@@ -356,7 +357,7 @@ class FrameInputs:
             yield "objects"
 
     def _move(self, pose: Pose) -> bool:
-        """Put the camera at ``pose``, find what virtual objects and lights can reach; whether it moved."""
+        """Write the camera's pose and the rectangles of virtual objects and lights; return True if the camera moved."""
         outlines = self._outlines()
         looked_at = (pose.rotation.tobytes(), pose.translation.tobytes(), *outlines.values())
         if looked_at == self._looked_at:
@@ -374,7 +375,7 @@ class FrameInputs:
         return before != (position.tobytes(), rotation.tobytes())
 
     def _outlines(self) -> dict[str, Outline]:
-        """Return the outlines on the screen that a frame needs; ``light`` only if it is more than the directly lit."""
+        """Return the outlines to project onto the screen; ``light`` only if bounced light extends ``direct``."""
         scene, arrays = self.host_scene, self._arrays
         outlines = {"object": scene.object_outline(), "direct": scene.light_outline()}
         if "relight_bounced" in arrays:
@@ -386,7 +387,7 @@ class FrameInputs:
         return outlines
 
     def _rows(self, name: str) -> Rows:
-        """Rows of one of ``RECTS`` in this frame."""
+        """Return the rows of one of ``RECTS`` in this frame."""
         return self.rects[name][:2]
 
     def reach(self) -> Reach:
@@ -408,7 +409,7 @@ class FrameInputs:
         return decode_deep(plate.picture, self._bent_table)
 
     def _take_plate(self, frame: SeenFrame) -> bool:
-        """Send the frame's radiance to where stages read it; False if none does."""
+        """Write the frame's linear radiance for the stages; return False if no stage reads it."""
         if frame.plate is None or not self._linear_frame.size:
             return False
         self._linear_frame.assign(self.radiance(frame.plate))
@@ -416,15 +417,15 @@ class FrameInputs:
         return True
 
     def receive(self) -> None:
-        """Have what is launched from now on see the picture that was written, where it is on its way to the device."""
+        """Copy an uploaded picture into the stages' array, ahead of the kernels launched from now on."""
         slot, self._coming = self._coming, None
         if slot is not None and self.transfers is not None:
             self.transfers.receive(slot, self.frame)
 
     def _take_picture(self, frame: SeenFrame) -> bool:
-        """Copy the picture; False if it is the one that is there: then nothing that reads it needs to run."""
+        """Copy the picture; return False if it equals the previous one, so that its readers need not run."""
         if frame.slot is not None:
-            self._coming = frame.slot  # received as late as can be: it is on its way meanwhile
+            self._coming = frame.slot  # received as late as possible, so that the transfer overlaps with other work
         elif isinstance(frame.image, wp.array):
             wp.copy(self.frame, frame.image)
         else:
@@ -436,7 +437,7 @@ class FrameInputs:
 
 
 def _probe_values(probes: Sequence[scenes.Probe], reflectances: Sequence[scenes.RGB] | None = None) -> npt.NDArray[Any]:
-    """Records of balls; None: they reflect what the scene says."""
+    """Return records of the balls; ``reflectances`` None: those of the scene."""
     values = np.zeros(len(probes), struct_dtype(Probe))
     told = [probe.reflectance for probe in probes] if reflectances is None else reflectances
     for value, probe, reflectance in zip(values, probes, told, strict=True):

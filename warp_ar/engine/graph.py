@@ -1,6 +1,6 @@
-"""From what is asked for to the stages that must run, in order, and why the others do not.
+"""Planning: from a request to the stages that must run, in order, with a reason for each that does not.
 
-Planning is pure Python: it reads the scene and the quality and touches neither Warp nor a frame.
+Planning is pure Python: it reads the scene and the quality, and uses neither Warp nor a frame.
 """
 
 from __future__ import annotations
@@ -13,38 +13,38 @@ from warp_ar.stages.base import LeftOut, Stage, Wiring
 from warp_ar.stages.features import Features, find_features
 from warp_ar.stages.request import Request
 
-# What the pipeline itself provides for every frame.
+# Resources that the pipeline itself provides for every frame.
 INPUTS = ("frame", "linear_frame", "pose", "lights", "objects", "exposure", "clock", "short_frames", "captured_light")
 
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """The stages of a request, in the order in which they run."""
+    """Stages of a request, in the order in which they run."""
 
     features: Features
-    """Features that the request calls for."""
+    """Features of the request."""
     stages: tuple[tuple[type[Stage], Wiring], ...]
     left_out: tuple[tuple[str, str], ...]
-    """(stage, reason) of every stage that does not run."""
+    """Pairs (stage, reason) of the stages that do not run."""
     inputs: tuple[str, ...]
-    """The pipeline's own inputs that some stage or output needs."""
+    """Inputs from the pipeline that a stage or an output needs."""
 
     @property
     def request(self) -> Request:
-        """Request that the plan was made for."""
+        """Request from which the plan was made."""
         return self.features.request
 
     def needs(self, name: str) -> bool:
-        """Return whether some stage reads the input ``name`` or the caller asked for it."""
+        """Return True if a stage reads the input ``name``, or it is an output."""
         return name in self.inputs
 
 
 @checked
 def make_plan(request: Request) -> Plan:
-    """Wire in the stages that the request calls for, then walk back from the outputs and drop what nothing consumes.
+    """Wire the stages that the request needs, then drop those whose outputs are not used, from the outputs backwards.
 
     Raises:
-        ValueError: An output that nothing produces was asked for, or a stage reads what no earlier stage writes.
+        ValueError: No stage produces an output, or a stage reads a resource that no earlier stage writes.
     """
     features = find_features(request)
     wired: list[tuple[type[Stage], Wiring]] = []
@@ -56,7 +56,7 @@ def make_plan(request: Request) -> Plan:
         else:
             wired.append((stage, wiring))
 
-    # ``image`` without a producer is the frame itself.
+    # Without a stage that writes ``image``, the output is the input frame.
     produced = {name for _, wiring in wired for name in wiring.writes}
     wanted = {("frame" if name == "image" and name not in produced else name) for name in request.resources}
     unknown = wanted - produced - set(INPUTS)

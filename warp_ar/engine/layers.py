@@ -1,4 +1,4 @@
-"""The layers among a pipeline's outputs: on the device, copied to the host, and those of a lost frame."""
+"""Layers of the picture among a pipeline's outputs: on the device, on the host, and without a marker."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from warp_ar.stages.base import Arrays
 from warp_ar.stages.request import LAYERS, PICTURE_LAYERS, Request
 
 RADIANCE = "radiance"
-"""Asks for the five layers that the picture is composed of, so that ``Result.radiance`` is there."""
+"""Output that requests the five layers of the picture, so that ``Result.radiance`` is available."""
 OUTPUTS = ("image", "environment", "pose", RADIANCE)
-"""Outputs of results beside layers."""
+"""Outputs that are not layers."""
 
 _COMPONENTS = {"objects": 4, "coverage": 8, "motion": 2, "ids": 0, "depth": 0}
-"""Numbers per pixel of those layers that have not three; 0: the pixel is the number."""
+"""Components per pixel of the layers that do not have three; 0: a scalar array."""
 
 
 def check_outputs(outputs: Sequence[str]) -> None:
     """Check the names of outputs.
 
-    Raises:
+    UsageError: No output has that name.
         UsageError: There is no output of that name.
     """
     known = (*OUTPUTS, *LAYERS)
@@ -41,19 +41,19 @@ def check_outputs(outputs: Sequence[str]) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class LayerArrays:
-    """The layers of one frame where they lie, valid until the next is rendered."""
+    """Layers of one frame in the pipeline's memory, valid until the next frame is rendered."""
 
     arrays: Mapping[str, Any]
     """Warp arrays or NumPy arrays, by the layers' names."""
     scale: Any = None
-    """(1,) array of the exposure's scale; None: it is 1."""
+    """Array (1,) of the exposure's scale; None: the scale is 1."""
 
     def with_plate(self, radiance: npt.NDArray[np.float32], clip: npt.NDArray[np.float32]) -> LayerArrays:
-        """With the plate at its full depth; where that clips too, what was guessed of it stays.
+        """Return the layers with the plate at its full bit depth; clipped pixels keep the estimate of the plate layer.
 
         Args:
-            radiance: (height, width, 3).
-            clip: From which on each channel clips, (3,).
+            radiance: Plate at full depth, (height, width, 3).
+            clip: Radiance at which each channel clips, (3,).
         """
         if "plate" not in self.arrays:
             return self
@@ -69,7 +69,7 @@ class LayerArrays:
 
 
 def copied(array: Any) -> npt.NDArray[Any]:
-    """A copy of one's own of a Warp array, or of one of the host."""
+    """Return a host copy of a Warp or NumPy array."""
     if not isinstance(array, wp.array):
         return np.array(array)
     with exclusive(array.device):
@@ -77,16 +77,16 @@ def copied(array: Any) -> npt.NDArray[Any]:
 
 
 def expand_outputs(outputs: Sequence[str]) -> tuple[str, ...]:
-    """Outputs with the layers that ``radiance`` is composed of in its place."""
+    """Return the outputs with ``radiance`` replaced by the five layers of the picture."""
     wanted = [name for output in outputs for name in (PICTURE_LAYERS if output == RADIANCE else (output,))]
     return tuple(dict.fromkeys(wanted))
 
 
 def compose_layers(layers: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[np.float32]:
-    """Linear radiance of the picture, (height, width, 3), of its five layers; scaled by the exposure it is encoded."""
+    """Return the picture's linear radiance, (height, width, 3), from five layers, before the exposure's scale."""
     physical = layers["plate"] * layers["shadow_ratio"] + layers["added_light"] + layers["mirror_ball"]
     objects = layers["objects"]
-    # A plate in wide primaries may be negative where nothing is laid over it; there it stays as it is.
+    # A plate in wide primaries may be negative; pixels that nothing is laid over keep that value.
     laid = (layers["shadow_ratio"] != 1.0) | (layers["added_light"] != 0.0) | (layers["mirror_ball"] != 0.0)
     physical = np.where(laid, np.maximum(physical, 0.0), physical)
     picture: npt.NDArray[np.float32] = (1.0 - objects[..., 3:]) * physical + objects[..., :3]
@@ -94,18 +94,18 @@ def compose_layers(layers: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[np.flo
 
 
 def layer_arrays(request: Request, arrays: Arrays) -> LayerArrays:
-    """The layers that a request asks for, of its pipeline's arrays."""
+    """Return the requested layers from the pipeline's arrays."""
     found = {name: arrays[LAYERS[name].resource] for name in request.outputs if name in LAYERS}
     return LayerArrays(found, arrays["expose_scale"] if found and "expose_scale" in arrays else None)
 
 
 def neutral_layers(request: Request, frame: Any, decode: npt.NDArray[np.float32]) -> LayerArrays:
-    """Layers of a frame over which nothing is laid, such as one whose marker is lost.
+    """Return the layers of a frame without virtual content, such as one whose marker is lost.
 
     Args:
-        request: Names the layers.
+        request: Request with the names of the layers.
         frame: The frame, uint8 RGB (height, width, 3), or a Warp array of it.
-        decode: (256, 3) linear value of each code.
+        decode: Linear value of each code, (256, 3).
     """
     width, height = request.size
     found: dict[str, Any] = {}

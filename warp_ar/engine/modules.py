@@ -1,6 +1,7 @@
-"""Compiling and loading the modules of a plan side by side, with word of how far it is.
+"""Parallel compiling and loading of a plan's modules, with progress.
 
-Warp translates Python in one thread at a time; its compilers, Clang and NVRTC, run beside each other and beside that.
+Warp translates Python in one thread at a time. Its compilers, Clang and NVRTC, run in parallel with each other and with
+the translation.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ Progress = Callable[[int, int], None]
 """Receives the number of compiled modules and of all that must be compiled, first 0; not called if none must be."""
 
 _Variant = tuple[Any, str, int | None]
-"""A module, the name of its device, and the size of its blocks; None means the usual one."""
+"""Module, name of its device, and block size; None means the usual size."""
 
 
 def load_modules(
@@ -39,21 +40,21 @@ def load_modules(
         kernels: Kernels of a plan, in the order of its stages.
         device: Warp device.
         progress: Called on the caller's thread after each module that was compiled.
-        blocks: Kernels that CUDA runs in blocks of another size than its usual one, and that size.
+        blocks: Kernels that CUDA runs with another block size than the usual one, each with that size.
     """
     found: dict[_Variant, None] = dict.fromkeys((kernel.module, str(device), None) for kernel in kernels)
     found |= dict.fromkeys((kernel.module, str(device), size) for kernel, size in blocks)
     with compiling():
         missing = [variant for variant in found if not _is_cached(variant)]
         if missing:
-            # The last stages have the longest kernels: begun last, one of them would keep one thread busy alone.
+            # The last stages have the longest kernels. If they were started last, one would run alone on one thread.
             _compile(missing[::-1], progress)
         for variant in found:
             _load(variant)
 
 
 def _compile(variants: list[_Variant], progress: Progress | None) -> None:
-    """Compile modules into the cache, as many at a time as there are cores."""
+    """Compile modules into the cache, in as many threads as there are cores."""
     if progress is not None:
         progress(0, len(variants))
     pool = _compilers(os.getpid())
@@ -72,48 +73,48 @@ def _compile(variants: list[_Variant], progress: Progress | None) -> None:
                 progress(done, len(variants))
     finally:
         for job in jobs:
-            job.cancel()  # an interrupt does not wait for the others
+            job.cancel()  # after an interrupt, do not wait for the others
 
 
 @functools.cache
 def _compilers(process: int) -> ThreadPoolExecutor:
-    """Return the threads that compile in this process, kept because each parses Warp's headers for over a second."""
+    """Return this process's compiling threads; they are kept because each parses Warp's headers for over a second."""
     return ThreadPoolExecutor(usable_cores(), "warp_ar-compile")
 
 
 def _compile_one(variant: _Variant) -> None:
     module, device, size = variant
     if device != "cpu" and size is None:
-        wp.compile_aot_module(module, device=device)  # without the device's lock: frames of others go on
+        wp.compile_aot_module(module, device=device)  # without the device's lock, so that other pipelines' frames go on
     else:
         _load(variant)
 
 
 def _load(variant: _Variant) -> None:
-    """Load a module; what a damaged file of the cache holds is compiled again."""
+    """Load a module; if its cached file is damaged, compile it again."""
     module, device, size = variant
     with exclusive(wp.get_device(device)):
         try:
             wp.load_module(module, device=device, block_dim=size)
         except Exception:
-            # Warp raises what the loader said, of no common class: the file may be truncated, empty or noise.
+            # Warp raises the loader's error, of no common class: the file may be truncated, empty or random bytes.
             if not _folder_of(variant).exists():
                 raise
             folder = _folder_of(variant)
             shutil.rmtree(folder, ignore_errors=True)
             with contextlib.suppress(OSError):
-                folder.unlink()  # there may be a file in the folder's place
+                folder.unlink()  # a file may have the folder's name
             if folder.exists():
                 raise
             wp.load_module(module, device=device, block_dim=size)
 
 
 def _folder_of(variant: _Variant) -> Path:
-    """Folder of the cache in which a module's files lie."""
+    """Return the cache folder of a module's files."""
     module, device, size = variant
     return Path(wp.config.kernel_cache_dir, module.get_module_identifier(1 if device == "cpu" else size))
 
 
 def _is_cached(variant: _Variant) -> bool:
-    """Return whether the cache has a module's files; asking hashes the module, which loading needs anyway."""
+    """Return True if the cache has a module's files; this hashes the module, which loading needs anyway."""
     return bool(wp.config.cache_kernels) and _folder_of(variant).is_dir()

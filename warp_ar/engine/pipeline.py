@@ -1,4 +1,4 @@
-"""The library's face: a scene, a device and a quality make a pipeline; call it with frames."""
+"""Pipeline: built from a scene, a device and a quality, and called with frames."""
 
 from __future__ import annotations
 
@@ -50,20 +50,20 @@ from warp_ar.tracking.tracking import OwnMarkers, Places, Track, Tracker, TrackS
 __all__ = ["DEFAULT_FRAME_INTERVAL", "TRACK", "Pipeline", "Result", "resolve_quality"]
 
 AHEAD = 2
-"""Submitted frames that may wait for being rendered."""
+"""Submitted frames that may wait to be rendered."""
 
 DEFAULT_FRAME_INTERVAL = 1.0 / 30.0
-"""Seconds between frames whose caller gives no time."""
+"""Seconds between frames for which the caller gives no time."""
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
 
 def resolve_quality(quality: str | Quality) -> Quality:
-    """Quality value for a preset's name.
+    """Return the ``Quality`` for a preset's name, or the given ``Quality``, checked.
 
     Raises:
-        UsageError: No preset has that name, or a value of one's own names a method that is none.
+        UsageError: No preset has that name, or a ``Quality`` names an unknown method.
     """
     if isinstance(quality, Quality):
         check_methods(quality)
@@ -76,18 +76,18 @@ def resolve_quality(quality: str | Quality) -> Quality:
 
 
 def _has_places(scene: Scene) -> bool:
-    """Return whether a scene's captured light says where its emitters are."""
+    """Return True if the scene's captured light has emitters with known distances."""
     return scene.captured is not None and has_places(scene.captured.file)
 
 
 def cannot_run(quality: Quality, error: BaseException) -> UsageError:
-    """Return the error to raise where a pipeline cannot be built, such as on a device whose memory is full."""
+    """Return the error for a pipeline that cannot be built, for example because the device's memory is full."""
     reason = (str(error).splitlines() or [type(error).__name__])[0]
     return UsageError(f"quality {quality.name!r} cannot run here: {reason}; choose a cheaper one")
 
 
 def _in_turn(method: Callable[Concatenate[Pipeline, _P], _R]) -> Callable[Concatenate[Pipeline, _P], _R]:
-    """Have threads that call methods of one pipeline take turns."""
+    """Wrap a method so that only one thread at a time runs the methods of one pipeline."""
 
     @functools.wraps(method)
     def call(self: Pipeline, /, *arguments: _P.args, **named: _P.kwargs) -> _R:
@@ -98,13 +98,13 @@ def _in_turn(method: Callable[Concatenate[Pipeline, _P], _R]) -> Callable[Concat
 
 
 class Pipeline(Closing):
-    """Lights frames: call it with one frame after another of one camera.
+    """Lights the frames of one camera, one per call.
 
-    Arrays are allocated here, never while frames run.
+    Arrays are allocated by the constructor, never while frames run.
     """
 
     bracket: BracketPlan
-    """Exposures that are merged, and the one that is shown."""
+    """Exposures that are merged, and the exposure that is shown."""
 
     @checked
     def __init__(
@@ -125,36 +125,39 @@ class Pipeline(Closing):
         culling: bool = True,
         linear: bool = False,
     ) -> None:
-        """Plan, allocate and build.
+        """Plan the stages, allocate their arrays and build their passes.
 
         Args:
-            scene: What to show: a scene, a scene file, or a bundled scene's name.
+            scene: A scene, a scene file, or a bundled scene's name.
             device: ``auto``, ``cpu`` or ``cuda:N``.
-            quality: A preset's name or a value of one's own.
-            size: Width and height of the frames; None means the scene's. Another must scale the scene's camera exactly.
-            outputs: What results shall hold: ``image``, ``environment``, ``pose``, ``radiance`` (the picture before it
-                is encoded in 8 bits), and layers by the names of ``warp_ar.LAYERS``, such as ``depth``; what none of
-                them needs does not run.
-            exposures: Exposure times in seconds between which the frames alternate. Frames of one are lit and shown;
-                the others tell what clips in it, and what is too dark.
-            shown: Which: seconds; None means the longest.
-            bands: Bands of rows per CPU pass; None means one per core.
-            profile: On CUDA wait for every frame and time each stage on the device.
-            estimates: When light that is estimated from a frame takes effect: ``synchronous``: in that frame, which
-                waits for it; ``delayed``: a fixed time later, the same in every run; ``real_time``, for live cameras:
-                as soon as a process beside the frames has it. No frame waits then, and pictures of two runs may differ
-                for some frames.
-            emitters: Whether ``take_light`` will say where the emitters of the scene's captured light are.
-            follows_camera: Whether a drift of the camera's exposure and white balance, and its tone curve, are told
-                from frames one after another; None: if the scene says that the camera meters by itself. Light that
-                dims on all surfaces alike is then taken for a drift.
-            culling: Whether stages that can change no pixel of a frame are left out of it; pictures are the same.
-            linear: Whether frames have more than 8 bits: uint16 codes, or linear radiance as floats. Mirror balls and
-                surfaces are read, and the plate among the layers kept, at that depth; markers are found in 8 bits.
+            quality: A preset's name or a ``Quality``.
+            size: Width and height of the frames in pixels; None means the scene's. Another size must scale its camera
+                exactly.
+            outputs: Parts of the results: ``image``, ``environment``, ``pose``, ``radiance`` (the picture before it is
+                encoded in 8 bits), and layers by the names of ``warp_ar.LAYERS``, such as ``depth``. Stages that no
+                output needs do not run.
+            exposures: Exposure times in seconds between which the frames alternate. Frames of one exposure are lit and
+                shown; the others measure light that is clipped or too dark in it.
+            shown: Exposure time in seconds of the frames that are shown; None means the longest.
+            bands: Bands of rows per CPU pass; None means one or two per core.
+            profile: On CUDA, wait for every frame and time each stage on the device.
+            estimates: Frame in which light estimated from a frame takes effect. ``synchronous``: the same frame, which
+                waits for the estimate. ``delayed``: a fixed time later, the same in every run. ``real_time``, for live
+                cameras: as soon as a separate process has computed it; no frame waits, and pictures of two runs may
+                differ for some frames.
+            emitters: Whether ``take_light`` will pass the positions of the captured light's emitters.
+            follows_camera: Whether to estimate drifts of the camera's exposure and white balance, and its tone curve,
+                from successive frames; None: if the scene declares an automatic exposure. Light that dims equally on
+                all surfaces is then taken for a drift.
+            culling: Whether stages that can change no pixel of a frame are left out of it; pictures are the same either
+                way.
+            linear: Whether frames have more than 8 bits: uint16 codes, or linear radiance as floats. Mirror balls,
+                surfaces and the layer ``plate`` use the full depth; markers are found in 8 bits.
 
         Raises:
-            UsageError: An argument that cannot be used.
-            SceneError: The scene cannot be used, one of its numbers is not finite, or its camera does not fit ``size``.
+            UsageError: An argument cannot be used.
+            SceneError: The scene cannot be used, has a number that is not finite, or has a camera that does not fit
+                ``size``.
         """
         scene = read_scene(scene)
         outputs = check_frames(exposures, outputs, linear)
@@ -179,15 +182,16 @@ class Pipeline(Closing):
         self._build(Arrays(), {})
 
     def _follows_gain(self) -> bool:
-        """Return whether a drift of the camera's gain is followed."""
+        """Return True if drifts of the camera's gain are followed."""
         follows = self._follows_camera
         if follows is None:
             follows = self.scene.source is not None and self.scene.source.metering == "automatic"
-        # Frames of several exposures tell their gain themselves; the paper takes all as the camera saw it.
+        # With several exposures the frames' exposure times give the gain; the paper takes frames as the camera saw
+        # them.
         return follows and self.quality.method("recover") != "clipped" and not self.plan.request.exposures
 
     def _start_over(self) -> None:
-        """Begin without a frame."""
+        """Reset the state to that before the first frame."""
         self._begun = 0
         self._start_time: float | None = None
         self._last_time = 0.0
@@ -197,11 +201,11 @@ class Pipeline(Closing):
         self._ahead: collections.deque[Future[Rendered]] = collections.deque()
 
     def _build(self, arrays: Arrays, spare: Mapping[str, Any]) -> None:
-        """Allocate what the plan calls for, and wire its stages.
+        """Allocate the plan's arrays and wire its stages.
 
         Args:
-            arrays: Takes what is allocated.
-            spare: Arrays of before that may be written anew.
+            arrays: Receives the new arrays.
+            spare: Former arrays that may be overwritten.
         """
         with translating(self.device), wp.ScopedDevice(self.device):
             self._allocate(arrays, spare)
@@ -210,7 +214,7 @@ class Pipeline(Closing):
         tracked = self.plan.needs("pose") and self.scene.pose is None
         self._tracker = Tracker(self.scene.marker, self.camera) if tracked else None
         self._own_markers = OwnMarkers(self.scene, self.camera)
-        self._index = 0  # of frames that these arrays have seen
+        self._index = 0  # index of the next frame of these arrays
         self._borrowed = Borrowed(self.device)
         self._arrays = arrays
         self._light = CarriedLight(self._arrays, wanted="environment" in self.plan.request.outputs)
@@ -229,13 +233,13 @@ class Pipeline(Closing):
         request = self.plan.request
         waits = self._running["profile"] or request.asks_for_layers or request.estimates == "synchronous"
         self._launches_here = self.inputs.transfers is not None and "image" in self._arrays and not waits
-        """True if the caller's thread launches submitted frames: that waits for nothing on the device."""
+        """True if the caller's thread launches submitted frames, which does not wait for the device."""
         short = self.plan.needs("short_frames")
         self._short = ShortFrames(self.plan.features, self._arrays, self.device) if short else None
 
     @_in_turn
     def close(self) -> None:
-        """Stop the worker threads; arrays go when the last result that refers to them does."""
+        """Stop the worker threads. Arrays are freed with the last result that refers to them."""
         if self._closed or os.getpid() != self._process:
             return  # a fork has neither the threads nor the device
         self._closed = True
@@ -255,28 +259,28 @@ class Pipeline(Closing):
 
     @property
     def scheduler(self) -> Scheduler:
-        """Scheduler that runs the stages and times them."""
+        """Scheduler that runs and times the stages."""
         return self._scheduler
 
     @property
     def arrays(self) -> Arrays:
-        """Every named array of the pipeline, on its device."""
+        """All arrays of the pipeline by name, on its device."""
         return self._arrays
 
     @_in_turn
     def update(self, scene: Scene) -> None:
-        """Show another scene from the next frame on, if it differs in numbers alone; nothing is allocated or compiled.
+        """Use another scene that differs in numbers only, from the next frame on; nothing is allocated or compiled.
 
-        Positions, sizes, colours, intensities, the values of materials and the scale of the exposure are numbers. For
-        what adds or drops a stage, an array or a kernel there is ``change``.
+        Positions, sizes, colours, intensities, values of materials and the exposure's scale are numbers. Changes that
+        add or remove a stage, an array or a kernel need ``change``.
 
         Args:
             scene: The new scene; its camera is scaled as it was in the constructor.
 
         Raises:
-            UpdateError: More than numbers differs; the message names it, and nothing has changed.
+            UpdateError: Something other than numbers differs; the message names it, and nothing has changed.
             SceneError: The scene's camera does not fit the size of the frames, or a number is not finite.
-            UsageError: The pipeline is closed, or another process's.
+            UsageError: The pipeline is closed, or belongs to another process.
         """
         scene = self._check_next(scene)
         if name := "camera" if self.camera != scene.camera else difference(self.scene, scene):
@@ -291,7 +295,7 @@ class Pipeline(Closing):
         self.scene, self.plan = scene, plan
 
     def _check_next(self, scene: Scene) -> Scene:
-        """Return a scene that is to be shown next, at the size of the frames, with all that was submitted rendered."""
+        """Finish submitted frames; return the next scene with its camera scaled to the size of the frames."""
         self._check_usable()
         check_scene(scene)
         self._finish()
@@ -299,19 +303,18 @@ class Pipeline(Closing):
 
     @_in_turn
     def change(self, scene: Scene | None = None, *, quality: str | Quality | None = None) -> None:
-        """Show another scene, at another quality, from the next frame on; light, clock and track of the marker go on.
+        """Change scene or quality from the next frame on; light, clock and the marker's track continue.
 
-        What ``update`` can do is done so. For all else arrays are made anew, and kernels of kinds that no pipeline of
-        this machine has had are compiled by the next frame, or by ``warm_up``; ``PipelineSwitcher`` does both beside
-        the frames.
+        Changes that ``update`` can make are made by it. For others, arrays are allocated anew, and kernels that are not
+        in this machine's cache are compiled by the next frame or by ``warm_up``. ``PipelineSwitcher`` does both
+        concurrently with the frames.
 
         Args:
-            scene: The next scene; None leaves it.
-            quality: A preset's name or a value; None leaves it.
+            scene: The next scene; None keeps the current one.
+            quality: A preset's name or a ``Quality``; None keeps the current one.
 
         Raises:
-            UsageError: ``scene`` is no scene, or the quality is none or cannot run here. What is refused changes
-                nothing.
+            UsageError: ``scene`` is no scene, or the quality is unknown or cannot run here; nothing has changed.
             SceneError: The scene's camera does not fit the frames, or a file that it names cannot be used.
         """
         scene = self._check_next(self.scene if scene is None else scene)
@@ -324,11 +327,11 @@ class Pipeline(Closing):
         before = copy.copy(self)
         self.scene, self.camera, self.quality, self.plan = scene, scene.camera, quality, plan
         try:
-            # Memory that is new to the process takes long to fill.
+            # Memory that is new to the process takes long to fill, so former arrays are reused.
             self._build(Arrays(self._scheduler.constants()), self._scheduler.spare())
         except BaseException as error:
             vars(self).update(vars(before))
-            self._scheduler.forget()  # what was spare may have been written
+            self._scheduler.forget()  # the former arrays may have been overwritten
             if isinstance(error, RuntimeError | MemoryError) and not isinstance(error, WarpArError):
                 raise cannot_run(quality, error) from error
             raise
@@ -338,18 +341,18 @@ class Pipeline(Closing):
         before._scheduler.let_go()
 
     def warm_up(self, progress: Progress | None = None) -> None:
-        """Load every kernel, so that the first frame takes no longer than others; may run beside another pipeline.
+        """Load every kernel, so that the first frame takes no longer than others; other pipelines may run meanwhile.
 
         Args:
-            progress: Called with how many of how many modules are compiled, first with 0, if any must be: kernels are
-                compiled once for a kind of scene and kept. On the caller's thread.
+            progress: Receives the numbers of compiled modules and of all modules to compile, first 0, on the caller's
+                thread; not called if all are in the cache.
         """
         self._check_usable()
         self._scheduler.warm_up(progress)
 
     @_in_turn
     def continue_from(self, other: Pipeline) -> None:
-        """Go on where another pipeline stopped: its clock and, where they fit, its track and its light."""
+        """Continue from another pipeline: take over its clock and, where they fit, the marker's track and the light."""
         self._check_usable()
         self._finish()
         other._finish()
@@ -359,7 +362,7 @@ class Pipeline(Closing):
 
     @property
     def objects(self) -> SceneObjects:
-        """Virtual objects by name or number: ``pipeline.objects["lamp"].world_from_object = matrix``."""
+        """Virtual objects by name or index: ``pipeline.objects["lamp"].world_from_object = matrix``."""
         return SceneObjects(lambda: self.scene.objects, self._edit_objects)
 
     @_in_turn
@@ -381,25 +384,24 @@ class Pipeline(Closing):
 
     @_in_turn
     def restart(self, *, saturation: npt.NDArray[np.float64] | None = None) -> None:
-        """Take the next frame for one of a clip that starts at 0 seconds, as if no other had been lit before it.
+        """Treat the next frame as the first of a clip that starts at 0 seconds, independent of all earlier frames.
 
-        Pictures of a part of a clip then are those that the whole clip gives, and do not depend on what the pipeline
-        was used for before. That needs a light that is given: an environment that is gathered over frames is not. So
-        are the poses, where the next frame is not the clip's first.
+        The pictures of a part of a clip are then those that the whole clip gives. This needs a given light: an
+        environment accumulated over frames depends on earlier frames. If the part does not start with the clip's first
+        frame, the poses must be given as well.
 
         Args:
-            saturation: Codes at which the camera's channels saturate, (3,), where they are known; they then hold for
-                all frames to come.
+            saturation: Codes at which the camera's channels saturate, (3,), if known; they apply to all later frames.
 
         Raises:
-            UsageError: The scene's light is that of a mirror ball in the frames.
+            UsageError: The scene's light comes from a mirror ball in the frames.
         """
         self._check_usable()
         self._finish()
         if self.plan.features.observed:
             raise UsageError("restart needs a captured light: a mirror ball's is gathered over the frames before")
         self._begun, self._start_time, self._last_time = 0, 0.0, 0.0
-        self._lit_time = math.inf  # no frame came before
+        self._lit_time = math.inf  # no previous frame
         self._shown = None
         if self._tracker is not None:
             self._tracker.reset()
@@ -410,29 +412,29 @@ class Pipeline(Closing):
 
     @_in_turn
     def start_clock(self, seconds: float) -> None:
-        """Have animations begin at a time before the first frame; left out, they begin with it.
+        """Start animations at a time before the first frame; without this call they start with it.
 
         Args:
-            seconds: On the clock of ``time_seconds``.
+            seconds: Start time on the clock of ``time_seconds``.
 
         Raises:
-            UsageError: A frame has been lit, the pipeline is closed, or the time is not finite.
+            UsageError: A frame has been lit already, the pipeline is closed, or the time is not finite.
         """
         self._check_usable()
         check_number("seconds", seconds)
         if self._begun:
             raise UsageError("start_clock comes before the first frame")
         self._start_time = self._last_time = seconds
-        self._lit_time = math.inf  # no frame came before
+        self._lit_time = math.inf  # no previous frame
 
     @_in_turn
     def take_light(self, radiance: npt.NDArray[np.float32], emitters: npt.NDArray[Any] | None = None) -> None:
-        """Light the frames to come by another environment than the captured one that the scene names.
+        """Light the next frames with another environment in place of the captured light that the scene names.
 
         Args:
-            radiance: Linear RGB in the scene's axes, float32 (height, 2 height, 3), of the quality's
-                ``environment_height``; it is kept, not copied.
-            emitters: Where its emitters are: the array ``emitters`` of a pipeline that found them, copied.
+            radiance: Linear RGB in the scene's axes, float32 (height, 2 height, 3), with the quality's
+                ``environment_height``; it is referenced, not copied.
+            emitters: Emitters with positions: the array ``emitters`` of a pipeline that found them; it is copied.
 
         Raises:
             UsageError: The scene names no captured light, or the map has another size.
@@ -457,31 +459,31 @@ class Pipeline(Closing):
         """Light one frame.
 
         Args:
-            image: uint8 RGB (height, width, 3) of NumPy or of whatever has ``__dlpack__`` or
+            image: uint8 RGB (height, width, 3) of NumPy or of an object with ``__dlpack__`` or
                 ``__cuda_array_interface__`` (torch, JAX, CuPy), or a Warp array (height, width) of ``wp.vec3ub``. It
-                lies on the host or on the pipeline's device, where it is read without a copy to the host unless the
-                marker must be found; on a CUDA device it must stay as it is until it has been rendered. A pipeline of
-                ``linear`` frames takes uint16 codes, linear floats and a `Plate` too.
-            time_seconds: When the frame was taken; frames without a time are taken to come 30 times a second.
-            pose: ``camera_from_world`` where it is known from elsewhere, or what a tracker of the caller's told of the
-                frame; the marker is then not looked for.
-            exposure_time: Seconds; None means that of the frames that are shown.
+                lies on the host or on the pipeline's device. On the device it is copied to the host only if the marker
+                must be found, and must not change until it has been rendered. A pipeline with ``linear`` also takes
+                uint16 codes, linear floats and a `Plate`.
+            time_seconds: Time at which the frame was taken; without times, frames come 30 times a second.
+            pose: Known pose ``camera_from_world``, or the result of the caller's tracker; the marker is then not
+                searched for.
+            exposure_time: Exposure time in seconds; None means the exposure of the frames that are shown.
 
         Raises:
-            UsageError: The image has another size or type, a number is not finite, the pipeline is closed, or it is
-                another process's.
+            UsageError: The image has another size or type, a number is not finite, or the pipeline is closed or belongs
+                to another process.
         """
         return self._begin(image, time_seconds, pose, exposure_time, ahead=False)
 
     def new_frame(self) -> Image:
-        """Memory for a frame to ``submit``, for a source to write the frame into.
+        """Return memory into which a source can write a frame to ``submit``.
 
-        On CUDA it is pinned: the frame is sent from there, where any other is copied to such memory first. Once it has
-        been submitted it must stay as it is; ask for another for the next frame. It is given again when nobody refers
-        to it any more. Who holds more than 512 MB of them gets ordinary memory.
+        On CUDA the memory is pinned and the frame is sent from it; other frames are first copied to pinned memory. A
+        submitted frame must not be changed; request new memory for the next frame. Memory is reused when nothing refers
+        to it any more. Beyond 512 MB in use, ordinary memory is returned.
 
         Returns:
-            uint8 (height, width, 3), of any values; also of a pipeline that has been closed meanwhile.
+            uint8 (height, width, 3), of any values; also after the pipeline has been closed.
         """
         if self.inputs.transfers is not None:
             return self.inputs.transfers.new_frame()
@@ -496,14 +498,13 @@ class Pipeline(Closing):
         pose: Pose | Track | None = None,
         exposure_time: float | None = None,
     ) -> Result:
-        """Light one frame without waiting for it; arguments as those of a call.
+        """Light one frame without waiting for it; the arguments are those of a call.
 
-        This thread looks for the marker. On CUDA it sends and launches the frame, and its picture is sent ahead; on CPU
-        another thread renders it. With the next frame submitted before this one's image is read, tracking, both ways
-        over the bus and the kernels run side by side. The device's own
-        arrays of a result still hold only until the next frame is rendered.
-        An image that may not be written (``flags.writeable``) is taken to stay as it is, and not copied on CPU; on CUDA
-        one that ``new_frame`` gave is not.
+        This thread finds the marker. On CUDA it also sends and launches the frame, and the picture's transfer back is
+        started; on CPU another thread renders the frame. If the next frame is submitted before this result's image is
+        read, tracking, both transfers and the kernels overlap. Device arrays of a result are valid until the next frame
+        is rendered. An image that is not writable (``flags.writeable``) is assumed not to change: on CPU it is not
+        copied. On CUDA an image from ``new_frame`` is not copied.
         """
         return self._begin(image, time_seconds, pose, exposure_time, ahead=True)
 
@@ -516,7 +517,7 @@ class Pipeline(Closing):
         *,
         ahead: bool,
     ) -> Result:
-        """Look at a frame and have it rendered, by this thread or, if ``ahead``, by another where it is the host's."""
+        """Find a frame's pose and render it: on this thread or, if ``ahead`` and on CPU, on another one."""
         self._check_usable()
         if time_seconds is not None:
             check_number("time_seconds", time_seconds)
@@ -533,7 +534,7 @@ class Pipeline(Closing):
         return result
 
     def _take_depth(self, image: Any) -> tuple[Plate | None, Any]:
-        """Return the part of a frame beyond 8 bits, None if there is none, and its 8-bit codes."""
+        """Return the frame at full depth, None if it has 8 bits, and its 8-bit codes."""
         if not self.plan.request.linear:
             if isinstance(image, np.ndarray) and image.dtype != np.uint8 and image.dtype.kind in "uf":
                 width, height = self.size
@@ -557,7 +558,7 @@ class Pipeline(Closing):
         ahead: bool,
         plate: Plate | None = None,
     ) -> Result:
-        """Have a frame rendered whose arguments are in order."""
+        """Render a frame with checked arguments."""
         host_image = image if isinstance(image, np.ndarray) else None
         if pose is None:
             pose = given_pose(self.scene.pose, self._begun)
@@ -578,21 +579,21 @@ class Pipeline(Closing):
         return Result(frame.pose, state, (self._keep(rendered) if ahead else rendered).at_once())
 
     def _send(self, frame: SeenFrame) -> SeenFrame:
-        """Send a frame to the device, unless it is already there."""
+        """Start a frame's transfer to the device, unless it is there already."""
         if self.inputs.transfers is None or frame.lost or isinstance(frame.image, wp.array):
             return frame
         frame.slot = self.inputs.transfers.upload(frame.image)
         return frame
 
     def _hand_over(self, frame: SeenFrame) -> Future[Rendered]:
-        """Have a frame of the host rendered: on CUDA launched by this thread, on CPU by another."""
+        """Render a host frame asynchronously: launched by this thread on CUDA, run by another one on CPU."""
         while len(self._ahead) >= AHEAD:
             self._ahead.popleft().result()
         frame = self._send(frame)
         if frame.lost or not self._launches_here:
-            # The caller may write its picture anew before it is rendered, unless nobody may.
+            # The caller may overwrite the image before it is rendered, unless the image is not writable.
             if frame.slot is not None and "image" in self._arrays:
-                frame.image = frame.slot.host  # no other comes there before this one is rendered: see ``AHEAD``
+                frame.image = frame.slot.host  # the slot is not reused before this frame is rendered: see ``AHEAD``
             elif frame.image.flags.writeable:
                 frame.image = frame.image.copy()
 
@@ -608,12 +609,12 @@ class Pipeline(Closing):
         return self._ahead[-1]
 
     def _finish(self) -> None:
-        """Wait until all that was submitted is rendered."""
+        """Wait until all submitted frames are rendered."""
         while self._ahead:
             self._ahead.popleft().result()
 
     def _keep(self, rendered: Rendered) -> Rendered:
-        """Have the picture outlast the next frame; the light as well, on CPU and where no picture is made."""
+        """Start the picture's transfer to the host, or copy the light, so that they outlast the next frame."""
         lit, transfers = rendered.image_array, self.inputs.transfers
         if rendered.layers is not None:
             rendered = dataclasses.replace(rendered, layers=rendered.layers.to_host())
@@ -626,7 +627,7 @@ class Pipeline(Closing):
     def _track(
         self, image: Any, now: float, pose: Pose | Track | None, timings: dict[str, StageTiming]
     ) -> tuple[Pose | None, TrackState | None]:
-        """Find the marker, unless the pose is known or nothing needs it."""
+        """Find the marker, unless the pose is known or not needed."""
         if isinstance(pose, Track):
             return pose.pose, pose.state
         if self._tracker is None or pose is not None:
@@ -641,7 +642,7 @@ class Pipeline(Closing):
         return track.pose, track.state
 
     def _find_own_markers(self, image: Any, now: float, pose: Pose | None, timings: dict[str, StageTiming]) -> Places:
-        """Find the markers that something rides on."""
+        """Find the markers to which objects, lights or other parts of the scene are attached."""
         if not self._own_markers:
             return {}
         if isinstance(image, wp.array):
@@ -656,7 +657,7 @@ class Pipeline(Closing):
     def _look(
         self, image: Any, now: float, given: Pose | Track | None, plate: Plate | None
     ) -> tuple[SeenFrame, TrackState | None]:
-        """Find the marker, go on with the clock."""
+        """Find the marker and advance the clock."""
         timings: dict[str, StageTiming] = {}
         pose, state = self._track(image, now, given, timings)
         lost = pose is None and (self._tracker is not None or isinstance(given, Track))
@@ -682,7 +683,7 @@ class Pipeline(Closing):
                 self.inputs.write(frame, reset=not self._light.known)
                 timings = {**timings, **self._scheduler.run(self.inputs.receive)}
             self._light.known = True
-        # A lost marker says nothing about where objects are: the frame passes as it came, the last light is kept.
+        # Without a marker the objects' places are unknown: the frame passes unlit, and the last light is kept.
         self._shown = frame.image if frame.lost or "image" not in self._arrays else self._arrays["image"]
         layers = self._layers_of(frame.image if frame.lost else None)
         if layers is not None and frame.plate is not None:
@@ -702,7 +703,7 @@ class Pipeline(Closing):
         )
 
     def _layers_of(self, unlit: Any = None) -> LayerArrays | None:
-        """The layers that were asked for; those of a frame that passes as it came are neutral."""
+        """Return the requested layers; neutral ones for a frame that passes unlit."""
         request = self.plan.request
         if not request.asks_for_layers:
             return None
@@ -713,7 +714,7 @@ class Pipeline(Closing):
     def _take_short(
         self, image: Any, host_image: Image | None, exposure: int | None, now: float, given: Pose | Track | None
     ) -> Result:
-        """Let a frame of another exposure tell of the light, unless that was left out; the picture stays."""
+        """Measure light from a frame of another exposure, unless the plan has no ``bracket``; the picture stays."""
         timings: dict[str, StageTiming] = {}
         bright: Any = image
         if self._shown is None or (self._tracker is not None and given is None):

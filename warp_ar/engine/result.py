@@ -24,7 +24,7 @@ from warp_ar.stages.request import PICTURE_LAYERS
 from warp_ar.tracking.tracking import TrackState
 
 TRACK = "track"
-"""Name of the host's own stage in reports: the marker's pose."""
+"""Name under which reports list the tracking of the marker, which runs on the host."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,37 +35,37 @@ class Rendered:
     environment_array: Any
     stages: Mapping[str, StageTiming]
     render_ms: float = 0.0
-    """Milliseconds of the host: to run the stages on CPU, to launch them on CUDA."""
+    """Milliseconds that the host took to run the stages (CPU) or to launch them (CUDA)."""
     layers: LayerArrays | None = None
-    """The layers that were asked for, on the device or kept; None: none were."""
+    """Requested layers, in the pipeline's memory or copied; None if none was requested."""
     image: Picture | Image | None = None
-    """The picture, or that it is on its way to the host, where it was sent ahead."""
+    """Host picture, or its transfer to the host in progress; None if it was not sent ahead."""
     environment: npt.NDArray[np.float32] | None = None
-    """The environment where it was kept."""
+    """Host copy of the environment, if one was made."""
     others_array: Any = None
-    """Those of the mirror balls after the first, where the light is interpolated."""
+    """Environments of the mirror balls after the first, if light is interpolated between balls."""
     others: npt.NDArray[np.float32] | None = None
-    """The same where they were kept."""
+    """Host copy of ``others_array``, if one was made."""
     emitters_array: Any = None
-    """Emitters of the environment with their places, records of ``Emitter``; None: the quality does not find them."""
+    """Emitters of the environment with positions, records of ``Emitter``; None: the quality does not find them."""
     emitters: npt.NDArray[Any] | None = None
-    """The same where they were kept."""
+    """Host copy of ``emitters_array``, if one was made."""
 
     def with_light_kept(self) -> Rendered:
-        """The same with arrays of its own for all that is known of the light."""
+        """Return this output with host copies of the environments and the emitters."""
         light, others = (None if one is None else copied(one) for one in (self.environment_array, self.others_array))
         emitters = None if self.emitters_array is None else struct_values(self.emitters_array)
         return dataclasses.replace(self, environment=light, others=others, emitters=emitters)
 
     def at_once(self) -> Future[Rendered]:
-        """The same as something that nobody needs to wait for."""
+        """Return this output as a completed future."""
         future: Future[Rendered] = Future()
         future.set_result(self)
         return future
 
 
 def done_at_once(work: Callable[[], Rendered]) -> Future[Rendered]:
-    """A future of what this thread does now; an error is left to who asks for the result."""
+    """Run ``work`` on this thread and return its outcome as a future; an error is raised when the result is read."""
     future: Future[Rendered] = Future()
     try:
         future.set_result(work())
@@ -76,38 +76,38 @@ def done_at_once(work: Callable[[], Rendered]) -> Future[Rendered]:
 
 @dataclasses.dataclass(frozen=True)
 class Result:
-    """Result of one frame; of a submitted one, all but the pose waits until it has been rendered."""
+    """Result of one frame. For a submitted frame, every attribute but ``pose`` and ``state`` waits for rendering."""
 
     pose: Pose | None
-    """Pose from marker to camera; None while the marker is lost or if nothing needed it."""
+    """Pose ``camera_from_world``; None while the marker is lost, or if no stage or output needs it."""
     state: TrackState | None
-    """Tracked, held or lost; None when nothing needed the pose."""
+    """State of the marker's track, tracked, held or lost; None if no stage or output needs the pose."""
     _rendered: Future[Rendered]
     shown: bool = True
-    """False for a frame of another exposure than the shown ones: it only measured light, and the picture is the
-    previous one."""
+    """False for a frame of another exposure than the shown one: it only measures light, and ``image`` is the previous
+    picture."""
 
     @property
     def image_array(self) -> Any:
-        """The lit frame, (height, width) of 8-bit RGB, on the pipeline's device; valid until the next call."""
+        """Lit frame on the pipeline's device, (height, width) of ``wp.vec3ub``; valid until the next call."""
         return self._rendered.result().image_array
 
     @property
     def environment_array(self) -> Any:
-        """The environment, latlong linear RGB (rows, columns), or None if it was not asked for or not seen yet."""
+        """Environment, latlong linear RGB (rows, columns); None if it is no output or has not been seen yet."""
         return self._rendered.result().environment_array
 
     @property
     def stages(self) -> Mapping[str, StageTiming]:
-        """Milliseconds of every stage of the plan, and whether it was skipped."""
+        """Time in milliseconds of every stage of the plan, and whether it was skipped."""
         return self._rendered.result().stages
 
     @property
     def steps(self) -> Mapping[str, float]:
-        """Milliseconds of the steps of the frame's way, which overlap those of other frames.
+        """Time in milliseconds of each step of the frame; steps overlap with those of other frames.
 
-        ``track`` and ``render`` (on CUDA: launching) on the host; of a frame that was submitted on CUDA also
-        ``upload``, ``kernels`` and ``download``, on the device.
+        Host steps are ``track`` and ``render`` (on CUDA: launching the kernels). A frame submitted on CUDA also has the
+        device steps ``upload``, ``kernels`` and ``download``.
         """
         rendered = self._rendered.result()
         tracking = rendered.stages.get(TRACK)
@@ -117,7 +117,7 @@ class Result:
 
     @functools.cached_property
     def image(self) -> Image:
-        """The lit frame as a NumPy array of its own, uint8 RGB (height, width, 3)."""
+        """Lit frame as an independent NumPy array, uint8 RGB (height, width, 3)."""
         rendered = self._rendered.result()
         if rendered.image is not None:
             return rendered.image.result() if isinstance(rendered.image, Picture) else rendered.image
@@ -125,7 +125,7 @@ class Result:
 
     @functools.cached_property
     def environment(self) -> npt.NDArray[np.float32] | None:
-        """The environment as a NumPy array of its own, float32 RGB (rows, columns, 3); of several balls the first's."""
+        """Environment as an independent NumPy array, float32 RGB (rows, columns, 3), of the first ball."""
         rendered = self._rendered.result()
         if rendered.environment is not None or rendered.environment_array is None:
             return rendered.environment
@@ -133,9 +133,9 @@ class Result:
 
     @functools.cached_property
     def environments(self) -> tuple[npt.NDArray[np.float32], ...]:
-        """The environment at every mirror ball whose light is interpolated, as ``environment``, which is the first.
+        """Environment at each mirror ball between which light is interpolated; the first one is ``environment``.
 
-        One where there is one map, none where it was not asked for or not seen yet.
+        The tuple has one map if light is not interpolated, and is empty if there is no ``environment``.
         """
         rendered = self._rendered.result()
         others = rendered.others
@@ -145,9 +145,9 @@ class Result:
 
     @functools.cached_property
     def emitters(self) -> npt.NDArray[Any] | None:
-        """Emitters of the environment with their places, an array of its own: what ``Pipeline.take_light`` takes.
+        """Emitters of the environment with their positions, as an independent array for ``Pipeline.take_light``.
 
-        None where the environment was not asked for or not seen yet, or the quality does not find their places.
+        None if the environment is no output or has not been seen yet, or if the quality does not find the positions.
         """
         rendered = self._rendered.result()
         if rendered.emitters is not None or rendered.emitters_array is None:
@@ -158,7 +158,7 @@ class Result:
 
     @property
     def layer_arrays(self) -> Mapping[str, Any]:
-        """The layers that were asked for, by name, where they lie; on the device valid until the next call."""
+        """Requested layers by name, in the pipeline's memory; on the device valid until the next call."""
         layers = self._rendered.result().layers
         return {} if layers is None else layers.arrays
 
@@ -169,17 +169,17 @@ class Result:
 
     @property
     def layers(self) -> Mapping[str, npt.NDArray[Any]]:
-        """The layers that were asked for as NumPy arrays of their own, by the names of ``warp_ar.LAYERS``.
+        """Requested layers as independent NumPy arrays, by the names of ``warp_ar.LAYERS``.
 
-        float32 (height, width[, components]); ``ids`` int32. Read them before the next call, as ``image``.
+        Arrays are float32 (height, width[, components]); ``ids`` is int32. Read them before the next call.
         """
         return self._host_layers.arrays
 
     @functools.cached_property
     def radiance(self) -> npt.NDArray[np.float32]:
-        """The lit frame as linear radiance, float32 RGB (height, width, 3), exposure and all, before it is encoded.
+        """Lit frame as linear radiance, float32 RGB (height, width, 3), scaled by the exposure and not yet encoded.
 
-        It is composed on the host of the layers, at the depth that the frame came with.
+        It is composed of the layers on the host, at the bit depth of the input frame.
 
         Raises:
             UsageError: ``radiance`` is not among the outputs.
@@ -190,12 +190,12 @@ class Result:
 
     @property
     def exposure_scale(self) -> float:
-        """Factor on the radiance of the layers' composition in the picture; known where a layer was asked for."""
+        """Factor from the radiance of the layers to the picture's; available if a layer was requested."""
         scale = self._host_layers.scale
         return 1.0 if scale is None else float(scale[0])
 
     def _picture(self) -> Any:
-        """The lit frame where it lies: on the device, or on the host if it was sent ahead or passed as it came."""
+        """Return the lit frame on the device, or on the host if it was sent ahead or passed through unlit."""
         rendered = self._rendered.result()
         if rendered.image is not None or not isinstance(rendered.image_array, wp.array):
             return self.image
@@ -209,19 +209,19 @@ class Result:
         dl_device: tuple[int, int] | None = None,
         copy: bool | None = None,
     ) -> Any:
-        """The lit frame for ``torch.from_dlpack(result)`` and the like: uint8 RGB (height, width, 3), without a copy.
+        """Export the lit frame by DLPack, uncopied, for ``torch.from_dlpack(result)``: uint8 RGB (height, width, 3).
 
-        It lies on the pipeline's device and is overwritten by the next call: clone what is to last. Of a frame that was
-        submitted, as a ``Session`` does, it is the picture that was sent to the host, which lasts.
+        The picture lies on the pipeline's device, and the next call overwrites it: clone it to keep it. For a submitted
+        frame, as in a ``Session``, it is the host's picture, which is not overwritten.
 
         Args:
-            stream: The consumer's, by the protocol: it waits on the device for the kernels.
-            max_version: Of DLPack that the consumer reads.
-            dl_device: Where the consumer wants it; only where it lies can it have it.
-            copy: Whether it must be a copy.
+            stream: Stream of the consumer, which waits on the device for the kernels, as the protocol states.
+            max_version: Largest DLPack version that the consumer reads.
+            dl_device: Device that the consumer requests; it must be the picture's.
+            copy: True if the consumer requests a copy, which is refused.
 
         Raises:
-            BufferError: The consumer wants a copy, or the picture on another device.
+            BufferError: The consumer requests a copy, or another device.
         """
         picture = self._picture()
         if not isinstance(picture, wp.array):
@@ -232,15 +232,15 @@ class Result:
             return picture.__dlpack__(stream=stream)
 
     def __dlpack_device__(self) -> tuple[int, int]:
-        """DLPack's kind and number of the device that holds what ``__dlpack__`` gives."""
+        """Return DLPack's device type and number of the picture's memory."""
         kind, number = self._picture().__dlpack_device__()
         return int(kind), int(number)
 
     @property
     def __cuda_array_interface__(self) -> dict[str, Any]:
-        """As ``__dlpack__``, for those who read this protocol; absent where the picture is not on a CUDA device.
+        """Lit frame by the CUDA Array Interface, as by ``__dlpack__``; absent if the picture is not on a CUDA device.
 
-        It names Warp's stream, which a reader of version 3 waits for.
+        It names Warp's stream, for which a reader of version 3 waits.
         """
         picture = self._picture()
         if not isinstance(picture, wp.array):
@@ -249,7 +249,7 @@ class Result:
         return interface | {"version": 3, "stream": picture.device.stream.cuda_stream or 1}
 
     def _repr_png_(self) -> bytes:
-        """The lit frame as PNG: what a notebook shows of a result."""
+        """Return the lit frame as PNG, which notebooks display."""
         done, data = cv2.imencode(".png", cv2.cvtColor(self.image, cv2.COLOR_RGB2BGR))
         assert done
         return bytes(data)

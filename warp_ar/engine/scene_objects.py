@@ -1,4 +1,4 @@
-"""Virtual objects of a running pipeline by their names: placed, painted, added and removed between two frames."""
+"""Access to the virtual objects of a running pipeline by name: to move, paint, add and remove them between frames."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from warp_ar.scene.messages import nearest
 from warp_ar.scene.node_animation import NodeTrack
 
 Edit: TypeAlias = Callable[[tuple[Object, ...]], Sequence[Object]]
-"""Function from the objects of a scene to those that are shown next."""
+"""Function from the scene's current objects to the objects of the next frame."""
 
 
 class SceneObjects:
-    """The objects of a pipeline's scene; each edit holds from the next frame on, and is done as ``Pipeline.change``."""
+    """Objects of a pipeline's scene. Each edit takes effect with the next frame, as by ``Pipeline.change``."""
 
     def __init__(self, objects: Callable[[], tuple[Object, ...]], edit: Callable[[Edit], None]) -> None:
-        """Take how to read the objects, and how to have them edited."""
+        """Take a function that returns the objects and one that edits them."""
         self._objects, self._edit = objects, edit
 
     def __len__(self) -> int:
@@ -35,24 +35,24 @@ class SceneObjects:
         return (self[item.name or index] for index, item in enumerate(self._objects()))
 
     def __contains__(self, name: object) -> bool:
-        """Return whether an object has that name."""
+        """Return True if an object has that name."""
         return name is not None and any(item.name == name for item in self._objects())
 
     def __getitem__(self, key: str | int) -> SceneObject:
-        """Return the object of a name, or of a number in the scene, from 0 on.
+        """Return an object by its name or its index in the scene.
 
         Raises:
-            UsageError: There is none, or several have the name.
+            UsageError: No object, or more than one, has that name, or the index is out of range.
         """
         find(self._objects(), key)
         return SceneObject(self._objects, self._edit, key)
 
     def add(self, item: Object) -> SceneObject:
-        """Add an object, as the last one.
+        """Append an object and return it.
 
         Raises:
-            UsageError: ``item`` is no object, or there is one of its name.
-            SceneError: A number is not finite, or its file cannot be used; nothing has changed then.
+            UsageError: ``item`` is no object, or its name is taken.
+            SceneError: A number is not finite, or a file cannot be used; the scene is unchanged.
         """
         if not isinstance(item, Object):
             raise UsageError(f"add: {type(item).__name__} given; expected an Object, or AreaLight(...).as_object()")
@@ -62,10 +62,10 @@ class SceneObjects:
         return self[item.name or len(self) - 1]
 
     def remove(self, key: str | int) -> None:
-        """Remove an object by its name or number; those after it move up.
+        """Remove an object by its name or index; later objects move up.
 
         Raises:
-            UsageError: There is none, or several have the name.
+            UsageError: No object, or more than one, has that name, or the index is out of range.
         """
 
         def without(items: tuple[Object, ...]) -> Sequence[Object]:
@@ -76,20 +76,20 @@ class SceneObjects:
 
 
 class SceneObject:
-    """One object, found by its name or number whenever it is asked for something."""
+    """Reference to one object, which is looked up by name or index at each access."""
 
-    __slots__ = ("_edit", "_key", "_objects")  # so that a name that is mistyped is no new attribute
+    __slots__ = ("_edit", "_key", "_objects")  # a misspelt attribute is an error
 
     def __init__(self, objects: Callable[[], tuple[Object, ...]], edit: Callable[[Edit], None], key: str | int) -> None:
-        """Take how to read and edit the objects, and which is meant."""
+        """Take functions that return and edit the objects, and the key of this one."""
         self._objects, self._edit, self._key = objects, edit, key
 
     @property
     def value(self) -> Object:
-        """The object as it is in the scene; may be set to another, of any fields.
+        """Description of the object in the scene; it can be replaced by any other ``Object``.
 
         Raises:
-            UsageError: What it is set to is no object, or another one has its name.
+            UsageError: The new value is no object, or its name is taken by another one.
         """
         items = self._objects()
         return items[find(items, self._key)]
@@ -112,10 +112,10 @@ class SceneObject:
 
     @property
     def world_from_object(self) -> npt.NDArray[np.float64]:
-        """Place, turn and one scale, (4, 4), metres, before any animation; in its marker's frame where it has one.
+        """Pose and uniform scale before animation, (4, 4), metres, in the frame of the object's own marker if any.
 
         Raises:
-            SceneError: What it is set to is no such matrix (``object_at``).
+            SceneError: The new value is no such matrix (``object_at``).
         """
         item, matrix = self.value, np.eye(4)
         rotation, matrix[:3, 3] = dataclasses.replace(item, animate=None).pose_at(0.0)
@@ -127,11 +127,11 @@ class SceneObject:
         self._replace(lambda item: object_at(item, matrix))
 
     def place(self, translation: Any, quaternion: Any = (0.0, 0.0, 0.0, 1.0), scale: float = 1.0) -> None:
-        """Put it somewhere, as glTF's nodes are.
+        """Place the object by translation, rotation and scale, as in a glTF node.
 
         Args:
-            translation: Metres, (3,).
-            quaternion: Its turn, x, y, z, w, of any length but 0.
+            translation: Position in metres, (3,).
+            quaternion: Rotation as x, y, z, w, of any length but 0.
             scale: Factor on all lengths.
 
         Raises:
@@ -148,7 +148,7 @@ class SceneObject:
 
     @property
     def material(self) -> Material:
-        """Material of the scene; another value of the same model without other pictures changes numbers alone."""
+        """Material in the scene. A new value of the same model with the same textures changes numbers only."""
         return self.value.material
 
     @material.setter
@@ -157,10 +157,10 @@ class SceneObject:
 
 
 def find(items: Sequence[Object], key: str | int) -> int:
-    """Return the number of the object that a name or number means.
+    """Return the index of the object with a name or index.
 
     Raises:
-        UsageError: There is none, or several have the name.
+        UsageError: No object, or more than one, has that name, or the index is out of range.
     """
     if isinstance(key, numbers.Integral) and not isinstance(key, bool) and 0 <= key < len(items):
         return int(key)

@@ -1,10 +1,10 @@
-"""Runs a plan: skips what has not changed, splits CPU passes into bands of rows, times every stage.
+"""Execution of a plan: skips stages with unchanged inputs, splits CPU passes into bands of rows, times every stage.
 
-On CUDA the stages that must run are captured once as a graph and replayed; a different set of stages is a different
-graph. In the graph a stage waits only for those whose output it reads, and for those that it runs after, so that
-short kernels, which leave most of the device idle, run beside others. On CPU it is the same: native threads (see
-``crew``) take rows of whatever stage has its inputs, the first in order first, so that nobody waits for a pass that
-cannot be split, or for the last rows of one that can.
+On CUDA the stages that must run are captured once as a graph and replayed; each set of stages has its own graph. In the
+graph a stage waits only for the stages whose output it reads and for those that it runs after. So short kernels, which
+leave most of the device idle, run concurrently with others. On CPU, native threads (see ``crew``) take rows of any
+stage whose inputs are ready, in the order of the plan. So no thread waits for a pass that cannot be split, or for the
+last rows of one that can.
 """
 
 from __future__ import annotations
@@ -29,20 +29,20 @@ from warp_ar.kernels.launch import Note, noting
 from warp_ar.stages.base import Arrays, ArraySpec, Pass, Reach, Rows, Stage
 
 Step = tuple[Stage, list[Pass]]
-"""A stage and those of its passes that are launched."""
+"""A stage and its passes that are launched."""
 
 
 @dataclasses.dataclass(frozen=True)
 class StageTiming:
-    """Work of one stage in one frame."""
+    """Time of one stage in one frame."""
 
     milliseconds: float
-    """On CPU the frame's time in proportion to that of the stage's bands. On CUDA, unless the pipeline profiles, an
-    equal share of the host's launch time."""
+    """On CPU the frame's time in proportion to the stage's share of all threads' time. On CUDA, unless the pipeline
+    profiles, an equal share of the host's launch time."""
     skipped: bool
-    """True: nothing that it reads had changed, or it was left out of this frame."""
+    """True if the stage's inputs were unchanged, or it was left out of this frame."""
     left_out: str | None = None
-    """Why it could change no pixel of this frame; None where that was not so."""
+    """Reason that the stage could change no pixel of this frame; None if it could."""
 
 
 SKIPPED = StageTiming(0.0, True)
@@ -62,16 +62,16 @@ class Scheduler:
         culling: bool = True,
         spare: Mapping[str, Any] | None = None,
     ) -> None:
-        """Allocate what the stages declared and build their passes.
+        """Allocate the arrays that the stages declare, and build their passes.
 
         Args:
-            plan: What runs.
-            arrays: Resources; the pipeline's inputs must be there already.
+            plan: Stages to run.
+            arrays: Resources by name; the pipeline's inputs must be present.
             device: Warp device.
             bands: Bands per CPU pass; None means one or two per core that this process may use.
-            profile: On CUDA wait for every frame and time each stage on the device; stages then run one by one.
+            profile: On CUDA, wait for every frame and time each stage on the device; stages then run one by one.
             culling: Whether stages that can change no pixel of a frame are left out of it.
-            spare: Arrays that are taken instead of new ones where name, shape and type are the same.
+            spare: Arrays to reuse instead of new ones of the same name, shape and type.
         """
         self.plan = plan
         self.arrays = arrays
@@ -80,7 +80,7 @@ class Scheduler:
         self.bands = bands
         self._threads = min(cores, bands or cores)
         if bands is not None and bands > 1:
-            self._threads = max(self._threads, 2)  # so that bands run side by side on one core, too
+            self._threads = max(self._threads, 2)  # so that bands run concurrently on one core, too
         self._crew: Crew | None = None
         self._ran: set[str] = set()
         self._prepared = False
@@ -95,24 +95,24 @@ class Scheduler:
         self._streams: list[Any] = []
         self._marks: dict[tuple[int, ...], tuple[Any, Any]] | None = {} if profile and not self._on_cpu else None
         self.clock = time.perf_counter
-        """Seconds by which stages are timed on the host."""
+        """Clock, in seconds, that times stages on the host."""
         self._build(spare or {})
         self._culling = culling
         self._demand = Demand([stage for stage, _ in self._stages], plan.request.resources)
         self._unneeded: Mapping[str, str] = {}
-        """Why stages can change no pixel of this frame."""
+        """Reasons of the stages that can change no pixel of this frame."""
         self._passes = {stage.name: passes for stage, passes in self._stages}
         self._readers = _find_readers([stage for stage, _ in self._stages])
-        # Stages that decide per frame what they do: their passes are part of a frame's pattern.
+        # Stages that choose their passes per frame: their passes are part of the frame's pattern.
         self._late = {stage.name for stage, _ in self._stages if type(stage).changed is not Stage.changed}
-        """Stages that may find that they changed nothing: their readers then rest."""
+        """Stages that may report unchanged output after a run, so that their readers rest."""
         self._changing = {stage.name for stage, passes in self._stages if any(step.enabled for step in passes)}
         self._beginning = {stage.name for stage, _ in self._stages if type(stage).begin is not Stage.begin}
         self._versions = {stage.name: arrays.versions_of(stage.wiring.reads) for stage, _ in self._stages}
         self._left_out: dict[str, StageTiming] = {}
 
     def _build(self, spare: Mapping[str, Any]) -> None:
-        """Allocate the arrays of the plan's stages, and build their passes."""
+        """Allocate the arrays of the plan's stages and build their passes."""
         with wp.ScopedDevice(self.device), translating(self.device):
             for kind, wiring in self.plan.stages:
                 stage = kind(self.plan.features, wiring)
@@ -124,14 +124,14 @@ class Scheduler:
                 self._first_launches += notes
 
     def _array(self, spec: ArraySpec, spare: Any) -> Any:
-        """Return an array with what it holds at first: the spare one, if it fits."""
+        """Return an array with its initial values: the spare array if it fits, else a new one."""
         if spare is None or (spare.shape, spare.dtype) != (spec.shape, spec.dtype):
             return wp.full(spec.shape, spec.fill, dtype=spec.dtype, device=self.device)
         spare.fill_(spec.fill)
         return spare
 
     def launch_first(self, notes: Iterable[Note]) -> None:
-        """Have something launched once before the first frame, beside what the stages ask for."""
+        """Add launches to run once before the first frame, before those of the stages."""
         self._first_launches += notes
 
     def close(self) -> None:
@@ -143,10 +143,10 @@ class Scheduler:
             stage.close()
 
     def let_go(self) -> None:
-        """Free the arrays of one that is closed, now; it cannot be used again.
+        """Free the arrays of a closed scheduler at once; it cannot be used again.
 
-        Its arrays and stages refer to each other, so they would wait for the garbage collector, which counts objects:
-        these are few, of many megabytes. Results that refer to arrays keep those.
+        Arrays and stages refer to each other and would wait for the garbage collector, which counts objects: these are
+        few, but hold many megabytes. Arrays that results refer to stay.
         """
         with exclusive(self.device):
             self.arrays.clear()
@@ -154,7 +154,7 @@ class Scheduler:
                 vars(owner).clear()
 
     def stage(self, name: str) -> Stage | None:
-        """The stage of that name, where it is part of the plan."""
+        """Return the stage of that name; None if it is not part of the plan."""
         return next((stage for stage, _ in self._stages if stage.name == name), None)
 
     def forget(self) -> None:
@@ -162,7 +162,7 @@ class Scheduler:
         self._seen.clear()
 
     def restart(self) -> None:
-        """Make every stage run again in the next frame, from what it remembers at first: nothing."""
+        """Make every stage run again in the next frame, with its remembered state cleared."""
         self.forget()
         with wp.ScopedDevice(self.device), exclusive(self.device):
             for stage, _ in self._stages:
@@ -171,7 +171,7 @@ class Scheduler:
                     self.arrays.touch(name)
 
     def continue_from(self, other: Scheduler) -> None:
-        """Let stages go on from what the same stages of another plan remember, where it fits."""
+        """Copy the remembered state of the same stages of another plan, where it fits."""
         others = {stage.name: stage for stage, _ in other._stages}
         for stage, _ in self._stages:
             if stage.name not in others or others[stage.name] is stage:
@@ -184,11 +184,11 @@ class Scheduler:
                 stage.resume(others[stage.name])
 
     def constants(self) -> dict[Any, Any]:
-        """Return the tables that the next pipeline may share: those that have been filled."""
+        """Return the filled tables, which the next pipeline may share."""
         return self.arrays.constants if self._prepared else {}
 
     def spare(self) -> dict[str, Any]:
-        """Return the arrays that neither a result nor the next pipeline needs; none on CUDA, which has its own pool."""
+        """Return arrays that neither a result nor the next pipeline needs; none on CUDA, which has a memory pool."""
         if not self._on_cpu:
             return {}
         needed = {*self.plan.request.resources, *LIGHT_ARRAYS}
@@ -196,14 +196,15 @@ class Scheduler:
         return {name: array for name, array in self.arrays.items() if name in self._fills and name not in needed}
 
     def _remembered(self, stage: Stage) -> list[str]:
-        """Arrays of a stage that carry over; a method need not have all of them."""
+        """Return the names of a stage's arrays with remembered state; a method need not have all of them."""
         return [name for name in stage.remembers if name in self.arrays]
 
     def prepare(self, progress: Progress | None = None) -> None:
-        """Compile and load every kernel, side by side, and have the stages' tables made; nothing on a second call.
+        """Compile and load every kernel in parallel, and compute the stages' tables; a second call does nothing.
 
         Args:
-            progress: Told how many of how many modules are compiled, if any must be.
+            progress: Receives the numbers of compiled modules and of all modules to compile, first 0; not called if
+                none is.
         """
         if self._prepared:
             return
@@ -216,11 +217,11 @@ class Scheduler:
                     if not step.on_host:
                         with noting() as noted:
                             step.launch(None if step.rows is None else (0, step.rows))
-                        if noted:  # else it did its work by other means, as it will in each frame
+                        if noted:  # else it did its work without a launch, as it will in each frame
                             notes[id(step)] = noted
         found = [*(note for each in notes.values() for note in each), *self._first_launches]
         launched = [(note.kernel, note.block_dim) for note in found if note.kernel is not None]
-        # A launch takes its module as compiled unasked; on CUDA blocks of another size do not.
+        # A launch loads its module with the module's own block size; other block sizes on CUDA must be named.
         blocks = [one for one in launched if not self._on_cpu and one[1] != one[0].module.options["block_dim"]]
         kernels = [one[0] for one in launched if one not in blocks]
         own = [serve_kernel] if self._threads > 1 and self._on_cpu else []
@@ -242,9 +243,9 @@ class Scheduler:
         self._prepared = True
 
     def warm_up(self, progress: Progress | None = None) -> None:
-        """Have every kernel compiled and loaded; on CUDA launch everything once, on whatever the arrays hold.
+        """Compile and load every kernel; on CUDA launch everything once, on the arrays' current values.
 
-        The host's own steps are left out. On CUDA it runs on a stream of its own, and frames of others come between
+        Steps on the host are left out. On CUDA it runs on a separate stream, and other pipelines' frames run between
         its steps.
 
         Args:
@@ -269,21 +270,21 @@ class Scheduler:
             wp.synchronize_stream(stream)
 
     def run(self, receive: Callable[[], None] | None = None) -> Mapping[str, StageTiming]:
-        """Run the stages that this frame needs and whose inputs changed since they ran; returns the time of each.
+        """Run the stages that this frame needs and whose inputs have changed; return the time of each.
 
         Args:
-            receive: Called on CUDA before anything is launched, once it is known what will be.
+            receive: Called on CUDA when the stages to run are known, before anything is launched.
         """
         self.prepare()
         self._look()
         if not self._on_cpu:
             return self._run_captured(receive)
         if self._crew is None or sys.gettrace() is not None:
-            return self._run_eager()  # under a debugger launchers are called, so that their breakpoints are hit
+            return self._run_eager()  # under a debugger launchers are called, so that it stops at their breakpoints
         return self._run_side_by_side(self._crew)
 
     def _look(self) -> None:
-        """Find out what this frame needs."""
+        """Find the stages that this frame does not need, and let them rest."""
         reach = self.arrays["reach"]() if "reach" in self.arrays else Reach()
         before, (self._unneeded, clearing) = self._unneeded, self._demand.look(reach)
         if self._unneeded is not before:
@@ -300,7 +301,7 @@ class Scheduler:
         return self._left_out.get(stage.name, SKIPPED)
 
     def _due(self, stage: Stage) -> Any:
-        """Versions of what ``stage`` reads, or None if it has already seen them or this frame does not need it."""
+        """Return the versions of the stage's inputs; None if they are unchanged or the stage is not needed."""
         name = stage.name
         if self._culling and name in self._unneeded:
             return None
@@ -308,7 +309,7 @@ class Scheduler:
         return None if self._seen.get(name) == versions else versions
 
     def _begin(self, stage: Stage, passes: list[Pass]) -> list[Pass]:
-        """Passes of a stage that take part in this frame."""
+        """Return the passes of a stage that take part in this frame."""
         if stage.name in self._beginning and stage.name not in self._unneeded:
             stage.begin()
         if stage.name not in self._changing:
@@ -320,13 +321,13 @@ class Scheduler:
             self.arrays.touch_all(stage.wiring.writes)
             return
         if stage.name in self._unneeded:
-            return  # what readers may miss is decided in frames that have readers, whether others are left out or not
+            return  # whether readers may rest is decided only in frames that have readers, with or without culling
         for name in stage.wiring.writes:
             if stage.changed(name) or self.arrays.version(name) == 0:
                 self.arrays.touch(name)
 
     def _run_eager(self) -> dict[str, StageTiming]:
-        """Stage after stage, on this thread: on CPU."""
+        """Run one stage after another on this thread, on CPU."""
         timings: dict[str, StageTiming] = {}
         for stage, passes in self._stages:
             versions = self._due(stage)
@@ -342,9 +343,9 @@ class Scheduler:
         return timings
 
     def _run_side_by_side(self, crew: Crew) -> dict[str, StageTiming]:
-        """Native threads take bands of rows; whether a stage is due is decided before they begin, where that is known.
+        """Run stages on native threads by bands of rows; decide beforehand which stages run, where that is known.
 
-        It is not where a stage that comes before says only in the end whether it changed anything.
+        For readers of a stage that reports only at its end whether its output changed, it is decided later.
         """
         start = self.clock()
         crew.reset()
@@ -359,7 +360,7 @@ class Scheduler:
         try:
             times = crew.run()
         except BaseException:
-            self.forget()  # some of what was to be done was not
+            self.forget()  # part of the work may not have been done
             raise
         whole = (self.clock() - start) * 1e3
         busy = sum(times.values()) or 1.0
@@ -371,7 +372,7 @@ class Scheduler:
         return timings
 
     def _enter(self, stage: Stage) -> bool:
-        """Tell the crew what is due of a stage; False if nothing is."""
+        """Enter a stage's passes and rows in the crew's tables; return False if the stage does not run."""
         versions = self._due(stage)
         if versions is None:
             return False
@@ -386,7 +387,7 @@ class Scheduler:
         return True
 
     def _rows_of(self, step: Pass) -> Rows:
-        """Rows of a pass in this frame; (0, 1) where it has none."""
+        """Return the rows of a pass in this frame; (0, 1) if it has no rows."""
         if step.rows is None:
             return (0, 1)
         return step.extent() if step.extent is not None else (0, step.rows)
@@ -451,7 +452,7 @@ class Scheduler:
             wp.capture_launch(graph, stream=self._stream)
             return
         with exclusive(self.device), wp.ScopedStream(self._stream, sync_enter=False):
-            # Launched once outside the capture: that loads every module, which a capture must not do.
+            # The first launch is outside a capture: it loads every module, which a capture must not do.
             self._launch_in_turn(segment.part)
             with capturing(), wp.ScopedCapture(device=self.device) as capture:
                 if self._marks is None:
@@ -461,7 +462,7 @@ class Scheduler:
         self._graphs[segment.key] = capture.graph
 
     def _launch_in_turn(self, part: list[Step]) -> None:
-        """Launch stages one after another; if profiling, between two marks each."""
+        """Launch stages one after another; when profiling, each between two events."""
         for _stage, steps in part:
             if self._marks is not None:
                 begin, end = self._marks.setdefault(_ids(steps), _make_marks(self.device))
@@ -472,7 +473,7 @@ class Scheduler:
                 wp.record_event(end)
 
     def _launch_side_by_side(self, part: list[Step]) -> None:
-        """Launch each stage on a stream of its own, whose passes wait for the writers of what they read."""
+        """Launch each stage on its own stream; its passes wait for the writers of their inputs."""
         stream = self._stream
         begun = stream.record_event()
         written: dict[str, Any] = {}
@@ -495,12 +496,12 @@ class Scheduler:
 
 @dataclasses.dataclass(frozen=True)
 class Segment:
-    """A stretch of a frame: on the host, or captured as one graph."""
+    """Stages of a frame that run on the host, or that are captured together as one graph."""
 
     on_host: bool
     part: list[Step]
     key: tuple[int, ...]
-    """Of its passes."""
+    """Ids of its passes."""
 
 
 def _make_marks(device: Any) -> tuple[Any, Any]:
@@ -512,7 +513,7 @@ def _ids(steps: list[Pass]) -> tuple[int, ...]:
 
 
 def _in_launch_order(part: list[Step]) -> list[Step]:
-    """Stages in the order of their launch: after those that they run after, but before those that read them."""
+    """Return the stages in launch order: after the stages that they run after, but before their own readers."""
     ordered = list(part)
     for step in part:
         stage = step[0]
@@ -528,7 +529,7 @@ def _in_launch_order(part: list[Step]) -> list[Step]:
 
 
 def _segments(due: list[Step]) -> list[Segment]:
-    """Stages in order, cut into stretches that are captured as one and stretches that run on the host."""
+    """Return the stages in order, cut into segments that are captured together and segments on the host."""
     steps = [(step.on_host, stage, step) for stage, passes in due for step in passes]
     steps.sort(key=lambda one: not one[2].beforehand)
     parts = [
@@ -539,7 +540,7 @@ def _segments(due: list[Step]) -> list[Segment]:
 
 
 def _find_readers(stages: list[Stage]) -> dict[str, list[str]]:
-    """Stages that read what each stage writes."""
+    """Return, for each stage, the names of the stages that read its output."""
     return {
         stage.name: [
             later.name for later in stages[index + 1 :] if not set(stage.wiring.writes).isdisjoint(later.wiring.reads)

@@ -1,8 +1,8 @@
-"""Frames of other exposures than the one that is shown: what they say of the environment, and nothing else of them.
+"""Frames of exposures other than the shown one: they only contribute to the environment.
 
-A source that alternates between exposures gives pictures that must not be shown in turn: they would flicker. The
-longest exposure, or the one that was chosen, is the reference: its frames are lit and shown, and all radiance is in its
-camera values. From the others the ball is unwrapped; stage ``bracket`` merges what they say.
+If a source alternates between exposures, showing all frames would flicker. The reference is the longest exposure or the
+chosen one: only its frames are lit and shown, and all radiance is in its camera values. The ball is unwrapped from the
+other frames, and the stage ``bracket`` merges the maps.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from warp_ar.stages.shared.probe_maps import UNWRAPPED
 from warp_ar.stages.unwrap import Unwrap
 
 KEPT_SECONDS = 3.0
-"""Seconds for which a frame of another exposure is believed: the light may have changed since."""
+"""Seconds for which a frame of another exposure is used: the light may change afterwards."""
 
 
 class ShortFrames:
-    """Takes frames of every exposure but the reference's."""
+    """Unwraps frames of every exposure except the reference."""
 
     def __init__(self, features: Features, arrays: Arrays, device: Any) -> None:
-        """Allocate and build.
+        """Allocate arrays, and build the passes of ``unwrap``.
 
         Args:
-            features: Of the plan; its stages hold ``bracket``.
-            arrays: Of the pipeline.
+            features: Features of the plan, whose stages include ``bracket``.
+            arrays: Arrays of the pipeline.
             device: Warp device.
         """
         self._ratios = features.request.exposures
@@ -60,11 +60,11 @@ class ShortFrames:
         """Unwrap one frame.
 
         Args:
-            image: As a pipeline takes it.
-            index: Which exposure.
+            image: Frame, in a form that a pipeline takes.
+            index: Index of its exposure.
             pose: ``camera_from_world``.
-            params: The pipeline's own, of which only the pose is another.
-            now: Seconds.
+            params: Frame constants of the pipeline; only the pose is replaced.
+            now: Time of the frame, seconds.
         """
         values = params.copy()
         inverse = pose.inverse()
@@ -82,11 +82,11 @@ class ShortFrames:
         self._arrays.touch("short_frames")
 
     def refresh(self, now: float) -> bool:
-        """Say which exposures are to be believed, before the reference's frame of time ``now``.
+        """Mark the exposures that are recent enough to merge with the reference frame of time ``now``.
 
         Returns:
-            Whether one has come in that was not there before: what was accumulated until then had clipped without it,
-            and is no mean to start from.
+            True if more exposures are merged than before. The environment accumulated so far was clipped without the
+            new exposure, and the running mean must not start from it.
         """
         recent = [abs(now - taken) < KEPT_SECONDS for taken in self._taken]
         told = tuple(index == self._reference or new for index, new in enumerate(recent))
@@ -101,6 +101,6 @@ class ShortFrames:
         return self._merged > before
 
     def resume(self, other: ShortFrames) -> None:
-        """Go on from what another pipeline was given; its arrays have been copied where they fit."""
+        """Continue with the exposures that another pipeline has received; its arrays have been copied if they fit."""
         if self._ratios == other._ratios:
             self._taken, self._merged = list(other._taken), other._merged

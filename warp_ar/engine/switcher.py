@@ -1,8 +1,8 @@
-"""One way from one pipeline to another while frames run: built beside the running one, swapped in between two frames.
+"""Change from one pipeline to another while frames run: the new one is built on a thread and swapped in between frames.
 
-Whoever lights frames says what it wants (``want``) and, before each frame, goes over to it if it is there (``take``).
-What differs from the running pipeline in numbers alone is written into that one; all else is built on a thread of its
-own. A new pipeline takes over the light, the clock and the track of the marker.
+The caller requests a target (``want``) and, before each frame, switches to it if its pipeline is ready (``take``). If
+the target differs from the running pipeline in numbers only, they are written into that pipeline. Any other target is
+built on a separate thread. A new pipeline takes over the light, the clock and the marker's track.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from warp_ar.sources.exposures import plan_bracket
 from warp_ar.stages.quality import Quality
 
 Prepare: TypeAlias = Callable[[Pipeline], Any]
-"""Function that prepares a new pipeline on the builder's thread, before it lights a frame; its result goes to
+"""Function that prepares a new pipeline on the builder's thread, before it lights a frame; its result is passed to
 ``Admit``.
 """
 
 Admit: TypeAlias = Callable[[Pipeline, Any], bool]
-"""Function that says, on the thread that lights frames, whether a pipeline that was just built may light them."""
+"""Function that decides, on the thread that lights frames, whether a newly built pipeline may light them."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Target:
-    """Description of the pipeline to build. Targets are compared by identity: make one only when something changed."""
+    """Description of a pipeline to build. Targets are compared by identity: make a new one only for a change."""
 
     scene: Scene
     quality: Quality
@@ -41,7 +41,7 @@ class Target:
     exposures: tuple[float, ...] = ()
     """Exposure times in seconds between which the frames alternate."""
     shown: float | None = None
-    """That of the frames that are shown; None means the longest."""
+    """Exposure time in seconds of the frames that are shown; None means the longest."""
 
     def __post_init__(self) -> None:
         """Check the types of all values."""
@@ -49,25 +49,25 @@ class Target:
 
 
 class PipelineSwitcher:
-    """Holds the pipeline that lights the next frame. One thread calls it; another builds."""
+    """Holder of the pipeline that lights the next frame. One thread calls it; another thread builds pipelines."""
 
     @checked
     def __init__(self, *, builder: ThreadPoolExecutor | None = None, keep: int = 0, **arguments: Any) -> None:
         """Start without a pipeline.
 
         Args:
-            builder: Thread that builds; None makes one that ends with the switcher.
-            keep: Pipelines that have lit frames and are kept for coming back to them.
-            **arguments: For every ``Pipeline``: ``device``, ``bands``, ``estimates``.
+            builder: Thread pool that builds; None makes one that ends with the switcher.
+            keep: Number of former pipelines that are kept, to return to them without building.
+            **arguments: Arguments of every ``Pipeline``: ``device``, ``bands``, ``estimates``.
 
         Raises:
-            UsageError: ``keep`` is below 0, or an argument of another type.
+            UsageError: ``keep`` is below 0, or an argument has another type.
         """
         if keep < 0:
             raise UsageError(f"keep = {keep}: expected a number of pipelines, 0 or more")
         self._own_builder = ThreadPoolExecutor(1, "warp-ar-build") if builder is None else None
         self._builder = builder or self._own_builder
-        # On CUDA only a pipeline that profiles knows what each stage takes.
+        # On CUDA only a profiling pipeline measures the time of each stage.
         self._keep, self._arguments = keep, {"profile": True, **arguments}
         self._kept: list[Pipeline] = []
         self._wanted: Target | None = None
@@ -77,25 +77,25 @@ class PipelineSwitcher:
         self._building: Future[tuple[Pipeline, Any]] | None = None
         self._built_for: Target | None = None
         self.pipeline: Pipeline | None = None
-        """Pipeline that lights the next frame; None until something was taken."""
+        """Pipeline that lights the next frame; None before the first ``take`` of a built pipeline."""
         self.swaps = 0
-        """Number of times that another pipeline has taken over, the first included."""
+        """Number of switches to another pipeline, the first included."""
 
     @property
     def busy(self) -> bool:
-        """Return whether a pipeline is being built."""
+        """Return True while a pipeline is being built."""
         return self._building is not None
 
     @checked
     def want(self, target: Target, prepare: Prepare = Pipeline.warm_up) -> bool:
-        """Say what the next frames shall be lit by; the same target again changes nothing.
+        """Request the target for the next frames; requesting the same target again changes nothing.
 
         Args:
-            target: What to build for.
-            prepare: Run on the builder's thread; the default loads every kernel.
+            target: Description of the pipeline.
+            prepare: Function that prepares a new pipeline on the builder's thread; the default loads every kernel.
 
         Returns:
-            Whether a pipeline for it is there, so that the next ``take`` goes over to it.
+            True if no pipeline has to be built, so that the next ``take`` switches to the target.
         """
         self._prepare = prepare
         if target is not self._wanted and target is not self._refused:
@@ -105,26 +105,27 @@ class PipelineSwitcher:
         return self._building is None
 
     def take(self, admit: Admit | None = None) -> Pipeline | None:
-        """Go over to what is wanted, if it is there.
+        """Switch to the requested target if its pipeline is ready.
 
         Args:
-            admit: Asked about a pipeline that was just built; if refused, what ran before stays wanted.
+            admit: Called for a newly built pipeline; if it returns False, the previous target becomes the requested one
+                again.
 
         Returns:
-            The pipeline for the next frame; None before the first is built.
+            The pipeline for the next frame; None before the first one is built.
 
         Raises:
-            WarpArError: The wanted pipeline cannot be built; the one before stays, and stays wanted.
+            WarpArError: The requested pipeline cannot be built; the previous one stays in use.
         """
         if self._building is not None and self._building.done():
             building, self._building = self._building, None
             try:
                 built = building.result()
-            except Exception:  # one that is no WarpArError, too: it would be built again before each frame
+            except Exception:  # not only WarpArError: otherwise the pipeline would be built again before each frame
                 if self._built_for is self._wanted:
                     self._refused, self._wanted = self._wanted, self._shown
                     raise
-                # Something else is wanted by now, of which that says nothing.
+                # Another target is requested by now; this failure does not concern it.
             else:
                 self._take_built(*built, admit)
         if self._wanted is not self._shown and self._building is None:
@@ -136,9 +137,9 @@ class PipelineSwitcher:
         return self.pipeline
 
     def _take_built(self, pipeline: Pipeline, prepared: Any, admit: Admit | None) -> None:
-        """Go over to a pipeline that was just built, or let it go."""
+        """Switch to a newly built pipeline, or dispose of it if it is no longer requested or not admitted."""
         if self._wanted is None or not _fits(pipeline, self._wanted):
-            self._dispose(pipeline)  # something else is wanted by now
+            self._dispose(pipeline)  # another target is requested by now
         elif admit is not None and not admit(pipeline, prepared):
             self._dispose(pipeline)
             self._refused, self._wanted = self._wanted, self._shown
@@ -146,30 +147,30 @@ class PipelineSwitcher:
             self._go_over(pipeline)
 
     def shows(self, target: Target) -> bool:
-        """Return whether the next frame is lit as a target asks for."""
+        """Return True if the next frame is lit as the target describes."""
         return self._shown is target
 
     def follow(self, target: Target, *, prepare: Prepare = Pipeline.warm_up) -> Pipeline | None:
-        """``want`` and ``take`` in one.
+        """Call ``want`` and ``take``.
 
         Args:
-            target: What frames are to be lit by.
-            prepare: Makes a new pipeline ready, on the thread that builds it.
+            target: Description of the pipeline for the next frames.
+            prepare: Function that prepares a new pipeline on the builder's thread.
 
         Returns:
-            What lights the next frame: the pipeline before, while the new one is built; None while there is none.
+            The pipeline for the next frame: the previous one while the new one is built; None if there is none.
 
         Raises:
-            WarpArError: As ``take``.
+            WarpArError: As for ``take``.
         """
         self.want(target, prepare)
         return self.take()
 
     def open(self, target: Target) -> Pipeline:
-        """Build the first pipeline on this thread, its kernels still to be loaded by the first frame.
+        """Build the first pipeline on this thread; its kernels are loaded by the first frame.
 
         Raises:
-            WarpArError: It cannot be built.
+            WarpArError: The pipeline cannot be built.
         """
         pipeline = self._build(target, lambda _: None)[0]
         self._wanted = target
@@ -177,9 +178,9 @@ class PipelineSwitcher:
         return pipeline
 
     def _ready(self) -> Pipeline | None:
-        """A pipeline that is there and does what is wanted."""
+        """Return a running or kept pipeline that fits the requested target; None if there is none."""
         assert self._wanted is not None
-        # The latest first.
+        # Latest first.
         known = [pipeline for pipeline in (self.pipeline, *reversed(self._kept)) if pipeline is not None]
         return next((pipeline for pipeline in known if _fits(pipeline, self._wanted)), None)
 
@@ -207,12 +208,12 @@ class PipelineSwitcher:
                 pipeline.close()
             if isinstance(error, WarpArError):
                 raise
-            raise cannot_run(target.quality, error) from error  # and what runs goes on
+            raise cannot_run(target.quality, error) from error  # the running pipeline goes on
 
     def _go_over(self, pipeline: Pipeline) -> None:
         before = self.pipeline
         if before is not None and pipeline is not before:
-            pipeline.continue_from(before)  # first: it tells of a frame that failed, and the one before then stays
+            pipeline.continue_from(before)  # first: an error of a failed frame keeps the previous pipeline
         self._shown = self._wanted
         if pipeline is before:
             return
@@ -226,15 +227,15 @@ class PipelineSwitcher:
                 self._dispose(self._kept.pop(0))
 
     def _dispose(self, pipeline: Pipeline) -> None:
-        """Let a pipeline go, on the builder's thread: frames do not wait for it."""
+        """Close a pipeline on the builder's thread, so that frames do not wait for it."""
         assert self._builder is not None
         self._builder.submit(let_go, pipeline)
 
     def close(self, *, wait: bool = True) -> None:
-        """Let every pipeline go. It can be used again, unless its builder was its own.
+        """Close every pipeline. The switcher can be used again, unless the builder was its own.
 
         Args:
-            wait: Wait for what is being built; else it goes as soon as it is.
+            wait: Whether to wait for a build in progress; otherwise its pipeline is closed when it is done.
         """
         building, self._building = self._building, None
         if building is not None:
@@ -254,7 +255,7 @@ class PipelineSwitcher:
 
 
 def _fits(pipeline: Pipeline, target: Target) -> bool:
-    """Return whether a pipeline does what a target asks for, with its numbers changed where that is enough."""
+    """Return True if a pipeline fits a target, after an update of its numbers if that is sufficient."""
     request = pipeline.plan.request
     camera = target.scene.camera
     size = (camera.width, camera.height) if target.size is None else target.size
@@ -269,7 +270,7 @@ def _fits(pipeline: Pipeline, target: Target) -> bool:
 
 
 def let_go(pipeline: Pipeline) -> None:
-    """Close a pipeline and free its arrays now; it cannot be used again."""
+    """Close a pipeline and free its arrays at once; it cannot be used again."""
     device, scheduler = pipeline.device, pipeline.scheduler
     pipeline.close()
     scheduler.let_go()

@@ -1,12 +1,11 @@
-"""Frames to a CUDA device and pictures back, beside the kernels: pinned memory, and a stream for each direction.
+"""Asynchronous transfers of frames to a CUDA device and of pictures back, by pinned memory and two streams.
 
-A frame goes into pinned memory (host), to the device (copy engine), through the kernels, and back into pinned memory
-(copy engine). Each of ``SLOTS`` slots has buffers for the first two and the last step, so that the host fills one, the
-engines move a second and the kernels work on a third. Kernels read and write arrays of their own, at addresses that a
-captured graph may keep; they are copied to and from the slots on the device, which takes a hundredth of the way over
-the bus. A picture stays in the pinned memory that it came into until nobody refers to it any more: to copy it again
-takes the host longer than all the rest. So it is with frames: who writes them where ``new_frame`` says, as a
-``Session`` does, has no copy to wait for.
+A frame passes through pinned host memory, a transfer to the device, the kernels, and a transfer back to pinned memory.
+Each of ``SLOTS`` slots has buffers for the first two steps and the last, so that the host fills one slot while the copy
+engines transfer a second and the kernels work on a third. Kernels use arrays of their own, whose addresses a captured
+graph may keep; the copies between these and the slots on the device take a hundredth of the time of the bus. A picture
+stays in its pinned memory until nothing refers to it: another copy would take the host longer than all other steps.
+Frames need no copy either if the source writes them into the memory of ``new_frame``, as a ``Session`` does.
 """
 
 from __future__ import annotations
@@ -25,21 +24,21 @@ from warp_ar.device import exclusive, wait_for
 Image = npt.NDArray[np.uint8]
 
 SLOTS = 3
-"""Frames under way at once; the host waits before it begins one more."""
+"""Frames in progress at once; the host waits before it begins one more."""
 
 KEPT = 8
-"""Pictures in pinned memory at once; who keeps more gets those in ordinary memory, for which the host waits."""
+"""Pictures in pinned memory at once; further ones use ordinary memory, for which the host waits."""
 
 FRAME_BYTES = 1 << 29
-"""Largest total of bytes of pinned frames by ``new_frame``; more are in ordinary memory, which is copied before the
-transfer."""
+"""Largest total size in bytes of pinned frames by ``new_frame``; further frames use ordinary memory, which is copied
+before the transfer."""
 
 MARKED = 16
-"""Frames whose times on the device are remembered."""
+"""Number of frames whose times on the device are kept."""
 
 
 class Marks:
-    """When a frame took which step on its way to the kernels; streams wait for the same events that tell the times."""
+    """CUDA events of one frame's steps; streams wait for the same events that measure the times."""
 
     def __init__(self, device: Any) -> None:
         self.frame = -1
@@ -47,46 +46,46 @@ class Marks:
 
 
 class Slot:
-    """Buffers of one frame under way."""
+    """Buffers of one frame in progress."""
 
     marks: Marks
     """Events of the last uploaded frame."""
 
     def __init__(self, shape: tuple[int, int], device: Any) -> None:
         self.own = Pinned(shape)
-        """Memory for a frame that lies elsewhere."""
+        """Pinned memory for a frame whose own memory is not pinned."""
         self.source = self.own
-        """Array that is sent."""
+        """Array from which the frame is sent."""
         self.given: Image | None = None
-        """The caller's picture, while it is sent from where it lies."""
+        """Caller's picture, while it is sent from its own memory."""
         self.frame = wp.zeros(shape, dtype=wp.vec3ub, device=device)
         self.image = wp.zeros(shape, dtype=wp.vec3ub, device=device)
         self.consumed = wp.Event(device)
         self.downloaded: Any = None
-        """Event after the last picture from here, or from a later slot."""
+        """Event after the last download from this slot or a later one."""
 
     @property
     def host(self) -> Image:
-        """The picture that is sent."""
+        """Picture that is being sent."""
         return self.source.host if self.given is None else self.given
 
 
 class Pinned:
-    """Memory of the host that the device reads and writes beside what the host does."""
+    """Host memory that the device reads and writes asynchronously."""
 
     def __init__(self, shape: tuple[int, int], *, pinned: bool = True) -> None:
         self.array = wp.empty(shape, dtype=wp.vec3ub, device="cpu", pinned=pinned)
         self.host: Image = self.array.numpy()
 
     def lend(self, free: collections.deque[Any]) -> Image:
-        """The memory as an array; when nobody refers to it any more this is among those that are free again."""
+        """Return the memory as an array; once nothing refers to the array, this object is appended to ``free``."""
         holder = _Holder(self.host)
         weakref.finalize(holder, free.append, self)
         return np.asarray(holder)
 
 
 class Buffer(Pinned):
-    """Memory of the host that a picture comes into, and when it was rendered and was there."""
+    """Host memory for a downloaded picture, with the events of its rendering and its arrival."""
 
     def __init__(self, shape: tuple[int, int], device: Any, *, pinned: bool) -> None:
         super().__init__(shape, pinned=pinned)
@@ -94,7 +93,7 @@ class Buffer(Pinned):
 
 
 class _Holder:
-    """Owner of one piece of memory that several arrays refer to: it goes when the last of them does."""
+    """Owner of memory that several arrays refer to; it is collected with the last of them."""
 
     def __init__(self, host: Image) -> None:
         self.__array_interface__ = host.__array_interface__
@@ -119,27 +118,27 @@ class Transfers:
         self._up, self._down = wp.Stream(device), wp.Stream(device)
         self._slots = [Slot(shape, device) for _ in range(SLOTS)]
         for stream in (self._up, self._down):
-            stream.wait_stream(self._compute)  # which clears the slots: a frame must not come before that
+            stream.wait_stream(self._compute)  # the compute stream clears the slots, which must precede the first frame
         self._uploads = self._downloads = 0
         self._marks = [Marks(device) for _ in range(MARKED)]
         self._marking = self._marks[0]
         self._free = collections.deque(Buffer(shape, device, pinned=True) for _ in range(SLOTS))
         self._buffers = SLOTS
         self._frames: dict[int, Pinned] = {}
-        """Memory that ``new_frame`` has given, by its address."""
+        """Memory from ``new_frame``, by its address."""
         self._free_frames: collections.deque[Pinned] = collections.deque()
 
     def close(self) -> None:
-        """Let what is on its way to the host arrive before the slots that it lies in go."""
+        """Wait for transfers to the host before their slots are freed."""
         for slot in self._slots:
             if slot.downloaded is not None:
                 wait_for(slot.downloaded)
 
     def new_frame(self) -> Image:
-        """Memory for a frame that is sent from where it lies: it must stay as it is once it has been begun.
+        """Return memory for a frame that is sent without a copy; it must not be changed after it has been submitted.
 
         Returns:
-            uint8 (height, width, 3), of any values; when nobody refers to it any more it is given again.
+            uint8 (height, width, 3), of any values. The memory is reused when nothing refers to it any more.
         """
         try:
             memory = self._free_frames.popleft()
@@ -152,12 +151,12 @@ class Transfers:
         return memory.lend(self._free_frames)
 
     def upload(self, image: Image) -> Slot:
-        """Send a host picture on its way; when this returns, the caller may write it anew.
+        """Start the transfer of a host picture; the caller may overwrite the picture when this returns.
 
-        A picture that ``new_frame`` gave is sent from where it lies, and is held until it has been sent.
+        A picture in memory of ``new_frame`` is sent from there, and is referenced until it has been sent.
 
         Returns:
-            What to ``receive`` it from, before ``SLOTS`` more are sent.
+            Slot to pass to ``receive``, before ``SLOTS`` more pictures are sent.
         """
         slot = self._slots[self._uploads % SLOTS]
         if self._uploads >= SLOTS:
@@ -176,7 +175,7 @@ class Transfers:
         return slot
 
     def receive(self, slot: Slot, frame_out: Any) -> None:
-        """Have kernels that are launched from now on see a picture that was sent in ``frame_out``."""
+        """Copy an uploaded picture into ``frame_out`` on the kernels' stream, before later kernels."""
         self._compute.wait_event(slot.marks.arrived)
         self._compute.record_event(slot.marks.started)
         self._marking = slot.marks
@@ -184,7 +183,7 @@ class Transfers:
         self._compute.record_event(slot.consumed)
 
     def download(self, image: Any) -> Picture:
-        """Send the device's picture to the host as soon as the kernels launched so far have written it."""
+        """Start the transfer of the device's picture to the host, after the kernels launched so far."""
         slot = self._slots[self._downloads % SLOTS]
         self._downloads += 1
         if not self._free and self._buffers < KEPT:
@@ -197,9 +196,10 @@ class Transfers:
             buffer = Buffer(self._shape, self._device, pinned=False)
             kept: Image = buffer.host
         else:
-            # The next picture is sent there on the same stream, so after this one even if nobody waited for it.
+            # The next picture is sent to this memory on the same stream, so after this one even if nothing waited for
+            # it.
             kept = buffer.lend(self._free)
-        with exclusive(self._device):  # kernels of other pipelines may be captured on the same stream
+        with exclusive(self._device):  # other pipelines may be capturing on the same stream
             if slot.downloaded is not None:
                 self._compute.wait_event(slot.downloaded)
             wp.copy(slot.image, image, stream=self._compute)
@@ -212,20 +212,20 @@ class Transfers:
 
 
 class Picture:
-    """A picture on its way to the host."""
+    """Picture in transfer to the host."""
 
     def __init__(self, image: Image, buffer: Buffer, marks: Marks) -> None:
-        """``image`` is there once the buffer is done; ``marks`` are of the frame that it was made of."""
+        """Take the host array, which is complete when ``buffer`` is done, and the ``marks`` of its frame."""
         self._image, self._rendered, self._done = image, buffer.rendered, buffer.done
         self._marks, self._frame = marks, marks.frame
 
     def result(self) -> Image:
-        """Wait for the picture; the array is the caller's for as long as anything refers to it."""
+        """Wait for the picture and return it; its memory is not reused while anything refers to it."""
         wait_for(self._done)
         return self._image
 
     def steps(self) -> dict[str, float]:
-        """Milliseconds of its steps on the device; none where ``MARKED`` later frames have overwritten them."""
+        """Return milliseconds of its steps on the device; empty if ``MARKED`` later frames have reused the events."""
         wait_for(self._done)
         marks = self._marks
         if marks.frame != self._frame:
