@@ -1,6 +1,7 @@
 """The stages, in the order in which they may run.
 
-They are imported when ``STAGES`` is first asked for: presets and words of this layer can be read without loading Warp.
+They are imported when ``STAGES`` is first read, so that presets and descriptions of this layer are available without
+Warp.
 """
 
 from __future__ import annotations
@@ -39,10 +40,10 @@ _ORDER = (
     "coverage.Coverage",
     "motion.Motion",
 )
-"""Module and class of every stage: a new one is registered here."""
+"""Module and class of every stage; new stages are registered here."""
 
 STAGES: tuple[type[Stage], ...]
-"""Every stage's class."""
+"""Classes of all stages."""
 
 
 def __getattr__(name: str) -> Any:

@@ -1,4 +1,4 @@
-"""The light of successive frames becomes the light of the environment."""
+"""Stage ``accumulate``: the environment as a running mean of the light in successive frames."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from warp_ar.stages.shared.probe_maps import KEPT, OTHERS, UNWRAPPED, find_view,
 
 
 class Accumulate(Stage):
-    """Running mean over time, keyed to confidence; follows real changes faster than noise."""
+    """Averages light over time, weighted by confidence; follows real changes faster than noise."""
 
     name: ClassVar[str] = "accumulate"
     summary: ClassVar[str] = "steadies the light over time and remembers what is out of sight"
@@ -39,7 +39,7 @@ class Accumulate(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Needs a mirror ball."""
+        """Return the wiring for a scene with a mirror ball."""
         if not features.observed:
             return LeftOut(unobserved(features))
         seen = "merged" if features.merged else "probe"
@@ -51,7 +51,7 @@ class Accumulate(Stage):
         )
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """The accumulated maps, and the change of each cell."""
+        """Return the accumulated maps, and the change of each cell."""
         height = self.request.quality.environment_height
         shape = (height, 2 * height)
         others = self.features.others
@@ -68,7 +68,7 @@ class Accumulate(Stage):
         }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """Change first, then the mean; neither of a frame in which something covers a ball."""
+        """Return passes for the change, then for the mean; both are off in frames in which something covers a ball."""
         height = self.request.quality.environment_height
         view = find_view(arrays, self.wiring.reads[0].removesuffix("_radiance"))
         environment, change, params = find_view(arrays, "environment"), arrays["accumulate_change"], arrays["params"]
@@ -80,7 +80,7 @@ class Accumulate(Stage):
             ]
 
         passes = follow(view, environment, change)
-        if self.features.others:  # how far each ball is to be trusted, and the same for each after the first
+        if self.features.others:  # weights of the balls, and the same passes for each further ball
             seen = arrays["probes_seen"], arrays["probes"], params, arrays["probe_places"]
             passes.append(Pass(lambda rows: update_places(*seen)))
         others = (other_views(self.features, arrays, name) for name in (OTHERS, KEPT))

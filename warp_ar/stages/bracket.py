@@ -1,4 +1,4 @@
-"""Frames of several exposures tell of light that the longest one clips."""
+"""Stage ``bracket``: merges frames of several exposures, of which the longest clips bright light."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from warp_ar.stages.shared.probe_maps import UNWRAPPED, find_view
 
 
 class Bracket(Stage):
-    """The latest frame of every exposure, merged; frames of shorter exposures come in through ``ShortFrames``."""
+    """Merges the latest frame of every exposure; frames of other exposures are unwrapped by ``ShortFrames``."""
 
     name: ClassVar[str] = "bracket"
     summary: ClassVar[str] = "merges alternating exposures: clipped pixels come from the shorter one"
@@ -33,7 +33,7 @@ class Bracket(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Needs a mirror ball, and a source whose frames alternate between exposures."""
+        """Return the wiring for a mirror ball and a source whose frames alternate between exposures."""
         if not features.observed:
             return LeftOut(unobserved(features))
         if len(features.request.exposures) < 2:
@@ -45,7 +45,7 @@ class Bracket(Stage):
         )
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """The maps of all exposures, what clips nearby, and the merged map."""
+        """Return the maps of all exposures, the clipped share near each texel, and the merged map."""
         height = self.request.quality.environment_height
         count = len(self.request.exposures)
         types = dict(zip(UNWRAPPED, (wp.vec3, wp.float32, wp.vec3), strict=True))
@@ -57,7 +57,7 @@ class Bracket(Stage):
         }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """The reference joins the others; what clips nearby; their mean."""
+        """Return passes that store the reference's map, find clipping near each texel, and average the exposures."""
         height = self.request.quality.environment_height
         reference = self.request.exposures.index(1.0)
         stack = filled(kernels.ExposureStack(), **{part: arrays[f"bracket_{part}"] for part in (*UNWRAPPED, "spread")})

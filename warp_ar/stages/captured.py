@@ -1,4 +1,4 @@
-"""The environment from a file instead of from a ball in the frames."""
+"""Stage ``captured``: the environment from a file in place of a mirror ball in the frames."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from warp_ar.stages.shared.host_copies import HostCopies
 
 
 class Captured(Stage):
-    """The light of a file, at the quality's size and in the scene's axes; it runs once."""
+    """Loads the light of a file, at the quality's size and in the scene's axes; runs once."""
 
     name: ClassVar[str] = "captured"
     summary: ClassVar[str] = "reads the environment from a file"
@@ -36,13 +36,13 @@ class Captured(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Needs a file."""
+        """Return the wiring for a scene that names a light file."""
         if features.request.scene.captured is None:
             return LeftOut("the scene names no captured light")
         return Wiring(("captured_light",), ("environment", "emitters") if features.emitters else ("environment",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """The map, and its emitters where their places are given."""
+        """Return the map, and its emitters if their positions are given."""
         height = self.request.quality.environment_height
         specs = {"environment": ArraySpec((height, 2 * height), wp.vec3)}
         if self.features.emitters:
@@ -50,7 +50,7 @@ class Captured(Stage):
         return specs
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """Copy what was read; reading it is done here, once."""
+        """Read the file and return the pass that copies it to the device."""
         spec = self.request.scene.captured
         assert spec is not None
         light = Light.load(spec.file, spec.axes)
@@ -69,27 +69,27 @@ class Captured(Stage):
             values = {"environment": self._radiance}
             if self.features.emitters:
                 values["emitters"] = self._emitters
-            # Pinned, so that the host does not wait until the device has rendered the frame before.
+            # Pinned memory, so that the host does not wait until the device has rendered the previous frame.
             copies.send(values)
 
         return [Pass(copy, on_host=True)]
 
     def resume(self, other: Stage) -> None:
-        """Go on with a map that stands for that of the same file."""
+        """Keep a map that was given in place of the same file."""
         assert isinstance(other, Captured)
         before, now = other.request.scene.captured, self.request.scene.captured
         if before == now and other._radiance.shape == self._radiance.shape:
             self._radiance, self._emitters = other._radiance, other._emitters
 
     def replace(self, radiance: npt.NDArray[np.float32], emitters: npt.NDArray[Any] | None = None) -> None:
-        """Light the frames to come by another map, at the quality's size and in the scene's axes.
+        """Light the next frames with another map, at the quality's size and in the scene's axes.
 
         Args:
-            radiance: Linear RGB, float32 (height, 2 height, 3); it is not copied.
-            emitters: Records of ``Emitter``, as many as ``Recover`` writes; None: none are known.
+            radiance: Linear RGB, float32 (height, 2 height, 3); it is referenced, not copied.
+            emitters: Records of ``Emitter``, as many as ``Recover`` writes; None: no positions are known.
 
         Raises:
-            UsageError: It is of another size.
+            UsageError: The map has another size.
         """
         if radiance.shape != self._radiance.shape:
             raise UsageError(f"light is {radiance.shape}; this pipeline's environment is {self._radiance.shape}")

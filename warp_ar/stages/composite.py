@@ -1,4 +1,4 @@
-"""The picture at the camera's own exposure."""
+"""Stage ``composite``: the picture at the camera's own exposure."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Composite(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Left out where nothing is laid over the frame, and where the exposure stage does it in its own pass."""
+        """Return the wiring; left out if nothing is laid over the frame, or if ``expose`` composes the picture."""
         layers = features.layers
         if features.exposed:
             return LeftOut("the exposure stage composes what it exposes")
@@ -38,10 +38,10 @@ class Composite(Stage):
         return Wiring(("frame", *layers), ("image",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """The picture."""
+        """Return the picture."""
         return {"image": ArraySpec(self.shape, wp.vec3ub)}
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """One pass over all pixels."""
+        """Return one pass over all pixels."""
         given = (arrays[name] for name in ("params", "frame", "decode", "encode"))
         return [over_rows(self.height, composite.composite, *given, layers_of(arrays), arrays["image"])]

@@ -1,4 +1,4 @@
-"""Surfaces that share a pixel, and the part of it that each covers."""
+"""Stage ``coverage``: the surfaces that share a pixel, and the share of the pixel that each covers."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from warp_ar.stages.shared.lighting import trace_variant
 
 
 class Coverage(Stage):
-    """Counts the samples of pixels along edges by the surface that they show."""
+    """Counts the samples of edge pixels by the surface that they show."""
 
     name: ClassVar[str] = "coverage"
     summary: ClassVar[str] = "share of each pixel that objects, proxies and balls cover"
@@ -29,15 +29,15 @@ class Coverage(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Left out by the graph where it is not asked for."""
+        """Return the wiring; the graph leaves the stage out if it is not requested."""
         return Wiring(("pose", "objects", "surface_ids"), ("coverage",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """Four numbers of surfaces and their shares per pixel."""
+        """Return the array of up to four surfaces with their shares per pixel."""
         return {"coverage": ArraySpec(self.shape, vec8)}
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """One pass over all pixels."""
+        """Return one pass over all pixels."""
         config = trace_variant(trace_config(self.request.scene), device)
         given = (arrays[name] for name in ("params", "rays", "ray_scene", "probes", "surface_ids", "coverage"))
         return [over_rows(self.height, count_coverage, config, self.request.quality.edge_samples, *given)]

@@ -1,4 +1,4 @@
-"""Radiance of the camera's clipped pixels."""
+"""Stage ``declip``: estimated radiance of the camera's clipped pixels."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ class Declip(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Reads the ball's light too where the exposure's method asks for it."""
+        """Return the wiring, with the ball's light if the exposure's method uses it."""
         reads = ("frame", "pose", "environment") if features.declipped_by_ball else ("frame",)
         return Wiring(reads, ("declipped",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """The frame's radiance near what clips, tiles that say where that is, and a pyramid of hues."""
+        """Return the frame's radiance near clipped pixels, the tiles that contain them, and a pyramid of hues."""
         tiles = ArraySpec(declip.tile_shape(*self.shape), wp.int32)
         return {
             "declipped": ArraySpec(self.shape, wp.vec3),
@@ -47,7 +47,7 @@ class Declip(Stage):
         }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """Twice up and down the pyramid: for pixels that clip in some channels, then for those that clip in all."""
+        """Return passes down and up the pyramid, for partly clipped pixels, then for fully clipped ones."""
         ball = self.features.declipped_by_ball
         kinds = trace_variant(trace_config(self.request.scene), device).proxies
         config = declip.DeclipConfig(ball, kinds if ball else ())

@@ -1,4 +1,4 @@
-"""The environment as samples, for shadows and reflections."""
+"""Stage ``environment_samples``: samples of the environment for shadows and reflections."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from warp_ar.stages.shared.settled import settled_environment
 
 
 class EnvironmentSamples(Stage):
-    """Draws directions by the light that comes from them, anew whenever the environment changes."""
+    """Draws directions in proportion to their light, again whenever the environment changes."""
 
     name: ClassVar[str] = "environment_samples"
     summary: ClassVar[str] = "directions sampled by the environment's light on the receiver"
@@ -38,7 +38,7 @@ class EnvironmentSamples(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Read the environment, write samples."""
+        """Return the wiring: reads the environment, writes samples."""
         if not features.environment:
             return LeftOut(NO_BALL)
         emitters = ("emitters",) if features.emitters else ()
@@ -47,7 +47,7 @@ class EnvironmentSamples(Stage):
         return Wiring(("environment", *emitters, *others, *placed), ("environment_samples",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """The samples, and the sums that are inverted to draw them; for the reference a small map's texels as well."""
+        """Return the samples, and the cumulative sums that are inverted to draw them; for the reference also texels."""
         height = self.request.quality.environment_height
         count = sample_count(self.features)
         specs = {
@@ -59,7 +59,7 @@ class EnvironmentSamples(Stage):
         }
         if not lists_texels(self.features):
             return specs
-        # A smaller environment leaves the rest without measure.
+        # For a smaller environment the remaining samples have weight 0.
         texels = REFERENCE_SIZE[0] * REFERENCE_SIZE[1] * sample_slots(self.features)
         return {
             **specs,
@@ -72,7 +72,7 @@ class EnvironmentSamples(Stage):
         }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """Sum, then invert; and list the texels of a small map. Of several balls one after the other."""
+        """Return passes that sum and invert, and for the reference list the texels of a small map; ball after ball."""
         emitters = arrays["emitters"] if self.features.emitters else None
         passes = self._draw(arrays, 0, settled_environment(arrays, device), emitters)
         for ball in range(self.features.others):
@@ -81,7 +81,7 @@ class EnvironmentSamples(Stage):
         return passes
 
     def _draw(self, arrays: Arrays, ball: int, environment: Any, emitters: Any) -> list[Pass]:
-        """Passes from one map of the environment to its samples; maps take turns with the sums."""
+        """Return the passes from one map of the environment to its samples; maps share the sums in turn."""
         samples = arrays["environment_samples"]
         cumulative, sums = arrays["environment_samples_cumulative"], arrays["environment_samples_rows"]
         out = arrays["environment_samples_directions"], arrays["environment_samples_flux"], samples

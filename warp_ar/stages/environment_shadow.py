@@ -1,4 +1,4 @@
-"""Shadows of virtual objects in the environment, on the receiver."""
+"""Stage ``environment_shadow``: shadows that virtual objects cast on the receiver in the environment's light."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from warp_ar.stages.shared.picture import GrowingRows, find_picture, frame_reads
 
 
 def find_stride(method: Method, rows: int) -> int:
-    """Pixels from one estimate to the next, growing as the root of the frame's rows."""
+    """Return the pixels between neighbouring estimates, which grow with the square root of the frame's rows."""
     return int(cell_stride(method.stride, rows, slowly=True))
 
 
 def shadow_cells(features: Features) -> tuple[int, int]:
-    """Rows and columns of cells, one estimate each."""
+    """Return the rows and columns of cells, with one estimate each."""
     size, method = features.request.size, METHODS[EnvironmentShadow.method_for(features)]
     rows, columns = cell_shape(size, find_stride(method, size[1]))
     return rows, columns
@@ -53,7 +53,7 @@ def shadow_config(features: Features, device: Any) -> EnvironmentShadowConfig:
 
 
 class EnvironmentShadow(Stage):
-    """A factor on the frame: the environment with the virtual objects over that without them."""
+    """Computes the shadow ratio, a factor on the frame: irradiance with virtual objects over irradiance without."""
 
     name: ClassVar[str] = "environment_shadow"
     methods: ClassVar[Mapping[str, str]] = {
@@ -76,7 +76,7 @@ class EnvironmentShadow(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Needs something that throws a shadow, something that it falls on, and light."""
+        """Return the wiring for a scene with light, objects that cast shadows, and a receiver."""
         scene, quality = features.request.scene, features.request.quality
         if not scene.objects:
             return LeftOut(base.NO_OBJECT)
@@ -98,7 +98,7 @@ class EnvironmentShadow(Stage):
         return None if reach.shadows else "no virtual object is near anything in the picture"
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """The ratio, and the estimates that it is averaged from."""
+        """Return the ratio, and the estimates that are averaged."""
         cells = shadow_cells(self.features)
         specs = {
             "shadow_ratio": ArraySpec(self.shape, wp.vec3, wp.vec3(1.0, 1.0, 1.0)),
@@ -112,7 +112,7 @@ class EnvironmentShadow(Stage):
         return specs
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """Estimates, then their mean."""
+        """Return passes for the estimates, then for their means."""
         config = shadow_config(self.features, device)
         queue = None
         if not device.is_cpu:
@@ -133,7 +133,7 @@ class EnvironmentShadow(Stage):
 
         def cell_rows() -> Rows:
             start, stop = shadow_rows()
-            reach = config.side  # the filter looks beyond the rows that it writes
+            reach = config.side  # the filter reads beyond the rows that it writes
             return max(start // stride - reach, 0), min(-(-stop // stride) + reach, count)
 
         own = config, *given, cells
@@ -148,7 +148,7 @@ class EnvironmentShadow(Stage):
         ]
 
     def _cells(self, arrays: Arrays) -> ShadowCells:
-        """The stage's own arrays as its kernels read and write them."""
+        """Return the stage's arrays as its kernels read and write them."""
         names = "ratio", "bounced", "surface", "shaded", "filtered", "changed"
         stride = find_stride(METHODS[self.method], self.height)
         return filled(ShadowCells(), stride=stride, **{name: arrays[f"{self.name}_{name}"] for name in names})

@@ -1,4 +1,4 @@
-"""The picture at another exposure."""
+"""Stage ``expose``: the picture at another exposure."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from warp_ar.stages.shared.picture import box_reads, clipped_evidence, frame_rea
 
 
 class Expose(Stage):
-    """Composes the picture and scales its light, over-exposed regions by what they are guessed to have been."""
+    """Composes the picture and scales its radiance, with estimates for over-exposed regions."""
 
     name: ClassVar[str] = "expose"
     methods: ClassVar[Mapping[str, str]] = {
@@ -37,7 +37,7 @@ class Expose(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Reads the layers, and what its method knows of clipped pixels."""
+        """Return the wiring: the layers, and the evidence that the method uses for clipped pixels."""
         scale = features.request.scene.exposure.scale
         if not features.exposed:
             return LeftOut("exposure is 1" if scale == 1.0 else "exposure is auto and no virtual light falls")
@@ -50,7 +50,7 @@ class Expose(Stage):
         return Wiring(tuple(reads), ("image",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """The picture, the scale, the table of codes; for ``auto`` the counts."""
+        """Return the picture, the scale and the table of codes; for ``auto`` also the histogram."""
         specs = {
             "image": ArraySpec(self.shape, wp.vec3ub),
             "expose_scale": ArraySpec((1,), wp.float32),
@@ -62,7 +62,7 @@ class Expose(Stage):
         return specs
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """The scale, the codes, the picture."""
+        """Return passes for the scale, the codes and the picture."""
         params, decode, encode = (arrays[name] for name in ("params", "decode", "encode"))
         picture = make_picture(arrays["frame"], decode, None, arrays["linear_frame"])
         scale, codes = arrays["expose_scale"], arrays["expose_codes"]

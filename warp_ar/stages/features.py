@@ -1,7 +1,7 @@
-"""Features that a request calls for, found once before any stage is wired.
+"""Features of a request, derived once before any stage is wired.
 
-Stages ask here instead of asking each other: whether light is recovered, which layers are laid over the frame, which
-forms of the environment exist. Nobody asks here whether a stage has readers: the graph finds that out.
+Stages read features instead of each other: whether light is recovered, which layers are laid over the frame, which
+forms of the environment exist. Whether a stage has readers is not a feature; the graph finds it.
 """
 
 from __future__ import annotations
@@ -28,79 +28,79 @@ from warp_ar.stages.quality import Quality
 from warp_ar.stages.request import Request
 
 FLAT = "flat"
-"""Method of ``relight`` that needs nothing of the environment."""
+"""Method of ``relight`` that does not use the environment."""
 NEAR = ("few_rays", "one_bounce")
-"""Methods of ``shade`` that know what surrounds objects at close range."""
+"""Methods of ``shade`` that include the close surroundings of objects."""
 MEASURED = ("reflectance", "bounce", "brute_force")
-"""Methods of ``relight`` that take the receiver's reflectance from the environment's irradiance."""
+"""Methods of ``relight`` that derive the receiver's reflectance from the environment's irradiance."""
 LOCAL = ("bounce", "brute_force")
-"""Methods of ``relight`` that know which part of the environment reaches a point, and what lit surfaces send on."""
+"""Methods of ``relight`` that compute ambient visibility, and light that lit surfaces reflect."""
 
 
 AREA_SAMPLES: Mapping[str, int] = MappingProxyType(
     {"point": POINT_SAMPLES, "coarse": 8, "fine": 32, "brute_force": 256}
 )
-"""Samples of what emits, per point, by method of ``area_light``."""
+"""Samples of emitting objects per lit point, by method of ``area_light``."""
 AREA_CELLS: Mapping[str, tuple[int, int]] = MappingProxyType({"coarse": (16, 8), "fine": (32, 6)})
-"""The same per cell of the receiver, and pixels per cell; by other methods each pixel asks."""
+"""Samples of emitting objects per cell of the receiver, and pixels per cell; other methods sample at each pixel."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Features:
-    """Frozen answers for one request."""
+    """Frozen features of one request."""
 
     request: Request
-    """Request that they answer."""
+    """Request from which they are derived."""
     environment: bool
-    """The environment is known."""
+    """True if there is an environment."""
     observed: bool
-    """A mirror ball in the frames shows it; else it comes from a file."""
+    """True if the environment comes from a mirror ball in the frames; otherwise it comes from a file."""
     recovered: bool
-    """Light that clips in the ball is put back."""
+    """True if light that clips in the ball is recovered."""
     emitters: bool
-    """Emitters of the environment are known by their places: there is a resource ``emitters``."""
+    """True if the positions of the environment's emitters are known, in the resource ``emitters``."""
     merged: bool
-    """Frames of several exposures are merged."""
+    """True if frames of several exposures are merged."""
     layers: tuple[str, ...]
     """Resources that are laid over the frame: of ``virtual``, ``added_light``, ``shadow_ratio``, ``mirror_ball``,
-    ``reflected``; the last holds the one before."""
+    ``reflected``; the last includes ``mirror_ball``."""
     exposed: bool
-    """The picture is shown at another exposure than the camera's."""
+    """True if the picture is shown at another exposure than the camera's."""
     boxed: bool
-    """Darkening looks at the means of a pixel's surroundings."""
+    """True if a shorter exposure uses the mean of a pixel's surroundings."""
     declipped: bool
-    """Radiance above clipping is estimated, which a shorter exposure shows."""
+    """True if radiance above clipping is estimated, which a shorter exposure shows."""
     declipped_by_ball: bool
-    """The ball's light, with its energy put back, says more of that radiance."""
+    """True if that estimate also uses the ball's light, with its recovered energy."""
     relight_method: str
-    """The quality's method of ``relight``; ``flat`` where no ball tells anything of the environment."""
+    """The quality's method of ``relight``; ``flat`` without an environment."""
     ambient_visibility: bool
-    """Relighting asks which part of the environment reaches the receiver."""
+    """True if relighting computes the part of the environment that reaches the receiver."""
     bounced: bool
-    """Proxies that virtual light falls on light each other."""
+    """True if proxies reflect virtual light onto each other."""
     soft_lights: bool
-    """Virtual lights with a size cast soft shadows."""
+    """True if virtual lights with a size cast soft shadows."""
     area_samples: int
-    """Samples of objects that emit, per point that they light; 0: none does."""
+    """Samples of emitting objects per point that they light; 0: none emits."""
     area_cells: bool
-    """Cells of the receiver know what these send there."""
+    """True if light of emitting objects is computed in cells of the receiver."""
     others: int
-    """Mirror balls after the first whose light is interpolated with the first one's, on objects and on the receiver;
-    0: one map is all."""
+    """Number of mirror balls after the first whose light is interpolated with the first ball's, on objects and on the
+    receiver; 0: one map lights all."""
     near_field: str
-    """Method of ``shade`` by which objects show what surrounds them at close range, themselves included; empty: none.
+    """Method of ``shade`` for the close surroundings of objects, including their own parts; empty: none.
 
-    Meshes with materials of their files have parts that shade each other: wherever the environment casts shadows, in
-    all presets but ``paper``, they do so by ``few_rays`` at least.
+    Meshes with materials from their files have parts that shade each other. If the environment casts shadows, in all
+    presets but ``paper``, they use ``few_rays`` at least.
     """
     irradiance: Literal["irradiance_sh", "irradiance_map"]
-    """Resource that holds the environment's irradiance."""
+    """Resource with the environment's irradiance."""
     distant: DistantLightConfig
     """Forms of the environment that the objects reflect."""
 
     @property
     def balls(self) -> str:
-        """Mirror balls that light objects, of several, in words; empty where there is one or none."""
+        """Description of how several mirror balls light objects; empty with one ball or none."""
         scene = self.request.scene
         count = len(scene.probes)
         if count < 2 or not self.observed or not (scene.objects or self.others):
@@ -115,7 +115,7 @@ class Features:
 
     @property
     def _first_alone(self) -> str:
-        """Names of results that only the first ball's light enters."""
+        """Names of results that use only the first ball's light."""
         names = ["the light of a path-traced reference"]
         if self.lit and self.relight_method not in (FLAT, *MEASURED):
             names.append("the key light of receivers")
@@ -125,42 +125,42 @@ class Features:
 
     @property
     def others_with_irradiance(self) -> int:
-        """Balls after the first whose irradiance is asked for."""
+        """Number of balls after the first whose irradiance is needed."""
         measured = self.lit and self.relight_method in MEASURED
         return self.others if self.distant.diffuse != "none" or measured else 0
 
     @property
     def exposure_method(self) -> str:
-        """Form of the exposure's kernel: a method that looks at boxes, or a name of its own."""
+        """Variant of the exposure's kernel: a method that uses boxes, ``declipped`` or ``plain``."""
         if self.boxed:
             return self.request.quality.method("expose")
         return "declipped" if self.declipped else "plain"
 
     @property
     def shadowed(self) -> bool:
-        """Virtual objects change the environment on the receiver."""
+        """True if virtual objects change the environment's light on the receiver."""
         return "shadow_ratio" in self.layers
 
     @property
     def lit(self) -> bool:
-        """Virtual light falls on the receiver."""
+        """True if virtual light falls on the receiver."""
         return "added_light" in self.layers
 
     @property
     def near_names(self) -> tuple[str, ...]:
-        """Resources of what surrounds the objects, those that their materials show."""
+        """Resources of the near field that the objects' materials reflect."""
         diffuse = () if self.distant.diffuse == "none" else ("near_irradiance",)
         return (*diffuse, "near_reflected") if self.distant.specular else diffuse
 
 
 def find_features(request: Request) -> Features:
-    """Answer for ``request``; pure Python, nothing of Warp is touched."""
+    """Return the features of ``request``, in pure Python, without Warp."""
     scene, quality = request.scene, request.quality
     environment = has_environment(scene)
     observed = environment and scene.captured is None
     bracketed = observed and quality.method("recover") not in ("default", "clipped")
-    # Without a card or anything else that is modelled, nothing tells what clipped light does.
-    # What lies around a ball that is moved is another each time.
+    # Without a card or another modelled surface nothing measures clipped light.
+    # The surroundings of a ball that moves change with its place.
     still = all(probe.marker is None for probe in scene.probes)
     recovered = bracketed and still and (scene.has_marker or bool(scene.proxies))
     layers = _find_layers(scene, quality)
@@ -219,14 +219,14 @@ def _near_method(scene: Scene, quality: Quality) -> str:
 
 
 def has_environment(scene: Scene) -> bool:
-    """Return whether a mirror ball or a file tells of the environment."""
+    """Return True if a mirror ball or a file gives the environment."""
     return bool(scene.probes) or scene.captured is not None
 
 
 def interpolates(scene: Scene, quality: Quality) -> bool:
-    """Return whether the light of several balls is interpolated: something is lit by it, by no sphere map's method.
+    """Return True if the light of several balls is interpolated, for objects or receivers of measured reflectance.
 
-    That are objects, and receivers whose reflectance is measured by it. A sphere map is a texture of one ball.
+    Methods of the sphere map, which is a texture of one ball, do not interpolate.
     """
     measured = bool(scene.proxies) and sheds_light(scene) and quality.method("relight") in MEASURED
     ways = ((stage, quality.method(stage)) for stage in ("unwrap", "irradiance", "prefilter"))
@@ -235,12 +235,12 @@ def interpolates(scene: Scene, quality: Quality) -> bool:
 
 
 def sheds_light(scene: Scene) -> bool:
-    """Return whether any virtual light exists: one that is nothing else, or an object that emits."""
+    """Return True if the scene has a virtual light or an object that emits."""
     return bool(scene.lights) or any(map(emits_light, scene.objects))
 
 
 def area_method(quality: Quality) -> str:
-    """Return the method by which light of objects that emit is found."""
+    """Return the method for the light of emitting objects."""
     method = quality.method("area_light")
     return method if method in AREA_SAMPLES else "coarse"
 
@@ -271,7 +271,7 @@ def _find_forms(
 ) -> DistantLightConfig:
     materials = scene_materials(scene)
     environment = has_environment(scene)
-    # Shadows ask how much light the receiver has.
+    # Shadows need the irradiance of the receiver.
     diffuse = "shadow_ratio" in layers or any(map(reflects_diffusely, materials))
     return DistantLightConfig(
         trace=trace_config(scene),

@@ -1,4 +1,4 @@
-"""Directions that no ball shows, filled in from the camera's picture and from confident neighbours."""
+"""Stage ``fill``: fills directions that no ball shows, from the camera's picture and from confident neighbours."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from warp_ar.stages.shared.probe_maps import KEPT, other_names
 
 
 class Fill(Stage):
-    """The complete map: what everything downstream reads, or what ``recover`` starts from."""
+    """Completes the map, for all later stages or as the input of ``recover``."""
 
     name: ClassVar[str] = "fill"
     summary: ClassVar[str] = (
@@ -37,7 +37,7 @@ class Fill(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Needs a mirror ball."""
+        """Return the wiring for a scene with a mirror ball."""
         if not features.observed:
             return LeftOut(unobserved(features))
         written = "filled_radiance" if features.recovered else "environment"
@@ -47,7 +47,7 @@ class Fill(Stage):
         return Wiring(reads, (written, *others))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """The map, the fill pyramid, and what readers have seen."""
+        """Return the map, the fill pyramid, and the map as its readers last saw it."""
         height = self.request.quality.environment_height
         shape = (height, 2 * height)
         return {
@@ -59,12 +59,13 @@ class Fill(Stage):
         }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """Down the pyramid, up again, and on CPU, where reading costs nothing, the change since readers last ran."""
+        """Return passes down and up the pyramid and, on CPU, one that measures the change since readers last ran."""
         self._arrays = arrays
         self._on_cpu = device.is_cpu
         self._is_filled = self._holds = False
         height = self.request.quality.environment_height
-        # What one exposure gives is no more than this. Of merged ones, lamps are spread into the unseen no further.
+        # One exposure gives no larger values. With merged exposures the limit keeps lamps from being spread into unseen
+        # directions.
         most = math.inf
         if self.features.merged:
             most = 1.0 / max(min(min(probe.reflectance) for probe in self.request.scene.probes), 1e-3)
@@ -84,7 +85,7 @@ class Fill(Stage):
     def _complete(
         arrays: Arrays, ball: int, known: tuple[Any, ...], most: float, proxies: tuple[int, ...]
     ) -> list[Pass]:
-        """Return the passes that complete the map of one ball; balls take turns with the pyramid."""
+        """Return the passes that complete the map of one ball; balls share the pyramid in turn."""
         radiance, confidence, filled = known
         shape = height, _ = radiance.shape
         levels = arrays["fill_levels"]
@@ -97,14 +98,14 @@ class Fill(Stage):
         ]
 
     def begin(self) -> None:
-        """Keep the last map where something covers a ball: it covers what the frame shows behind it as well."""
+        """Keep the last map if something covers a ball, because it also covers the frame's view behind the ball."""
         self._holds = self._is_filled and self._arrays["ball_covered"]()
         self._is_filled = True
 
     def changed(self, name: str) -> bool:
-        """Return whether some texel moved by more than ``CHANGE_FLOOR + CHANGE_SHARE * value`` since readers last ran.
+        """Return True if some texel moved by more than ``CHANGE_FLOOR + CHANGE_SHARE * value`` since readers last ran.
 
-        On CUDA always: to know it there, the host would have to wait for the device. So for the balls after the first.
+        On CUDA it is always True, because the host would have to wait for the device; likewise for further balls.
         """
         if not self._on_cpu or name != self.wiring.writes[0]:
             return True

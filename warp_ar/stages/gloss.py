@@ -1,4 +1,4 @@
-"""Reflections of virtual content in polished receivers."""
+"""Stage ``gloss``: reflections of virtual content in polished receivers."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SAMPLES: Mapping[str, int] = {"single": 4, "smooth": 16, "brute_force": 256}
 
 
 class Gloss(Stage):
-    """Virtual objects and lights, mirrored in receivers that have a material."""
+    """Computes reflections of virtual objects and lights in receivers with a material."""
 
     name: ClassVar[str] = "gloss"
     summary: ClassVar[str] = "reflections of virtual objects and lights in polished receivers"
@@ -42,7 +42,7 @@ class Gloss(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Reads what the objects are lit by, and the layers that a receiver mirrors."""
+        """Return the wiring, with the resources that light the objects and the layers that a receiver reflects."""
         if not features.request.scene.has_gloss:
             return LeftOut("no proxy has a material: the receiver is matt")
         if not features.environment:
@@ -55,11 +55,11 @@ class Gloss(Stage):
         return Wiring(tuple(sorted(reads)), ("reflected",))
 
     def idle(self, reach: Reach) -> str | None:
-        """A receiver may show what is out of the picture itself."""
+        """Return a reason if no receiver with a material is in the picture; reflected content may lie outside it."""
         return None if reach.balls else "no receiver with a material is in the picture"
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """The change, before and after averaging, and how proxies mirror."""
+        """Return the change of radiance before and after averaging, and the reflection parameters of proxies."""
         return {
             "reflected": ArraySpec(self.shape, wp.vec3),
             "gloss_change": ArraySpec(self.shape, wp.vec3),
@@ -68,7 +68,7 @@ class Gloss(Stage):
         }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """Reflections of each pixel, then means over neighbours, in rows of receivers with a material and of balls."""
+        """Return passes for reflections, then for means over neighbours, over the rows of receivers and balls."""
         config = self._config(device)
         arrays["gloss_surfaces"].assign(self._surfaces())
         sight, layers = gloss.Sight(), gloss.GlossLayers()
@@ -101,7 +101,7 @@ class Gloss(Stage):
         )
 
     def _surfaces(self) -> Any:
-        """Records of ``Gloss``, one for each proxy."""
+        """Return records of ``Gloss``, one for each proxy."""
         proxies = self.request.scene.proxies
         records = np.zeros(len(proxies), struct_dtype(gloss.Gloss))
         for record, proxy in zip(records, proxies, strict=True):

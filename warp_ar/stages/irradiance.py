@@ -1,4 +1,4 @@
-"""The irradiance of every orientation from the environment."""
+"""Stage ``irradiance``: irradiance from the environment for every surface normal."""
 
 from __future__ import annotations
 
@@ -43,13 +43,13 @@ class Irradiance(Stage):
 
     @classmethod
     def method_for(cls, features: Features) -> str:
-        """Spherical harmonics in the place of the paper's, where light from a file leaves no ball to look up."""
+        """Return the quality's method, but spherical harmonics instead of the paper's if the light is from a file."""
         method = super().method_for(features)
         return "sh2" if method == "sphere_mip" and not features.observed else method
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Read the environment, write irradiance in the form of the method."""
+        """Return the wiring: reads the environment, writes irradiance in the method's form."""
         if not features.environment:
             return LeftOut(NO_BALL)
         by_texture = cls.method_for(features) == "sphere_mip"
@@ -59,7 +59,7 @@ class Irradiance(Stage):
         return Wiring(reads, (features.irradiance,))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """Irradiance, and sums on the way to it."""
+        """Return irradiance and its partial sums."""
         specs, others = self._first(), self.features.others_with_irradiance
         if others:
             form = specs[self.features.irradiance]
@@ -85,7 +85,7 @@ class Irradiance(Stage):
         return min(CLUSTERS[0], height), min(CLUSTERS[1], 2 * height)
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """Launches of the method, and the tables that they need."""
+        """Return the launches of the method, with the tables that they need."""
         if self.method == "sphere_mip":
             level = int(math.log2(sphere_map.SIZE // sphere_map.DIFFUSE_SIZE))
             known, out = (arrays["params"], arrays["sphere_map"], level, MAP_SIZE), arrays["irradiance_map"].flatten()
@@ -98,7 +98,7 @@ class Irradiance(Stage):
         return passes
 
     def _filter(self, arrays: Arrays, environment: Any, target: Any) -> list[Pass]:
-        """Passes from one map of the environment to its irradiance; maps take turns with the sums."""
+        """Return the passes from one map of the environment to its irradiance; maps share the sums in turn."""
         if self.method == "sh2":
             tables = irradiance.make_sh_tables(*environment.shape, environment.device)
             sums = arrays["irradiance_row_sums"]

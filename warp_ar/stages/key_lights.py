@@ -1,4 +1,4 @@
-"""Direction from which most of the environment's light comes."""
+"""Stage ``key_lights``: the dominant direction of the environment's light."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from warp_ar.stages.shared.settled import settled_environment
 
 
 class KeyLights(Stage):
-    """Dominant direction, and how far it dominates."""
+    """Computes the dominant direction and its directionality."""
 
     name: ClassVar[str] = "key_lights"
     summary: ClassVar[str] = "finds the environment's dominant direction and its directionality"
@@ -31,19 +31,19 @@ class KeyLights(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Needs a mirror ball."""
+        """Return the wiring for a scene with a mirror ball."""
         if not features.environment:
             return LeftOut(NO_BALL)
         return Wiring(("environment",), ("key_lights",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """The light and the sums on the way to it."""
+        """Return the light and its partial sums."""
         return {
             "key_lights": ArraySpec((1,), KeyLight),
             "key_lights_sums": ArraySpec((self.request.quality.environment_height,), wp.vec4),
         }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """Two launches, of one row a thread and of one thread."""
+        """Return two launches: with one row per thread, and with one thread."""
         known = settled_environment(arrays, device), arrays["key_lights_sums"], arrays["key_lights"]
         return [Pass(lambda rows: key_lights.find_key_light(*known))]

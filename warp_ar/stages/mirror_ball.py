@@ -1,4 +1,4 @@
-"""Reflections of virtual content in mirror balls."""
+"""Stage ``mirror_ball``: reflections of virtual content in mirror balls."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ from warp_ar.stages.shared.lighting import (
 from warp_ar.stages.shared.picture import GrowingRows, frame_reads
 
 SIDES: Mapping[str, int] = {"single": 1, "smooth": 2, "brute_force": 8}
-"""Roots of rays per pixel, by method; cheapest first, after ``none``."""
+"""Square roots of the rays per pixel, by method; cheapest first, after ``none``."""
 
 
 def mirror_config(features: Features) -> mirror_ball.MirrorBallConfig:
-    """Return the configuration that a request's scene calls for."""
+    """Return the configuration that a request's scene needs."""
     layers = features.layers
     shading = mirrored_shading(features) if "virtual" in layers else None
     lit = "added_light" in layers
@@ -47,7 +47,7 @@ def mirror_config(features: Features) -> mirror_ball.MirrorBallConfig:
 
 
 def mirror_variant(features: Features, device: Any) -> mirror_ball.MirrorBallConfig:
-    """Return the configuration to compile: where scenes share it, one without objects or lights finds none."""
+    """Return the configuration to compile; on a device with shared kernels it includes objects and lights."""
     if not shares_kernels(device):
         return mirror_config(features)
     return mirror_ball.MirrorBallConfig(
@@ -59,12 +59,12 @@ def mirror_variant(features: Features, device: Any) -> mirror_ball.MirrorBallCon
 
 
 def mirrored_relighting(features: Features) -> RelightConfig:
-    """Return the response of the receiver that a ball shows: cells of the frame say nothing about it."""
+    """Return the configuration for relighting the receiver in reflections, without cells of the frame."""
     return dataclasses.replace(relight_config(features), ambient_visibility=False, bounced=False, area_cells=False)
 
 
 def _reads(features: Features, *, lit: bool) -> set[str]:
-    """Return the resources by which objects and, if ``lit``, the receiver are lit."""
+    """Return the resources that light the objects and, if ``lit``, the receiver."""
     reads = {"pose", *frame_reads(features)}
     if "virtual" in features.layers:
         reads |= {"objects", *distant_light_reads(features)}
@@ -77,7 +77,7 @@ def _reads(features: Features, *, lit: bool) -> set[str]:
 
 
 class MirrorBall(Stage):
-    """Virtual objects, light and shadow as the mirror balls of the frame show them."""
+    """Computes reflections of virtual objects, light and shadow in the frame's mirror balls."""
 
     name: ClassVar[str] = "mirror_ball"
     methods: ClassVar[Mapping[str, str]] = {
@@ -100,7 +100,7 @@ class MirrorBall(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Reads what the objects and the receiver are lit by."""
+        """Return the wiring, with the resources that light the objects and the receiver."""
         quality = features.request.quality
         if not features.request.scene.probes:
             return LeftOut("the scene has no mirror ball")
@@ -111,25 +111,25 @@ class MirrorBall(Stage):
         return Wiring(tuple(sorted(_reads(features, lit=features.lit))), ("mirror_ball",))
 
     def idle(self, reach: Reach) -> str | None:
-        """A ball may show what is out of the picture itself."""
+        """Return a reason if no ball is in the picture; reflected content may lie outside it."""
         if not reach.balls:
             return "no mirror ball is in the picture"
         dark = not reach.falls and not self.request.scene.objects
         return "virtual light falls on nothing" if dark else None
 
     def reads_for(self, reach: Reach) -> tuple[str, ...]:
-        """The response of the receiver matters only where virtual light falls on it."""
+        """Return the inputs; those for the receiver's response only if virtual light falls on it."""
         if reach.falls:
             return self.wiring.reads
         unlit = _reads(self.features, lit=False)
         return tuple(name for name in self.wiring.reads if name in unlit)
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """The change."""
+        """Return the change of radiance."""
         return {"mirror_ball": ArraySpec(self.shape, wp.vec3)}
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """One pass over the rows in which a ball can be."""
+        """Return one pass over the rows in which a ball can be."""
         config = mirror_config(self.features)
         variant = mirror_variant(self.features, device)
         reads = self.wiring.reads

@@ -1,4 +1,4 @@
-"""Motion of each pixel's surface since the frame before."""
+"""Stage ``motion``: motion of each pixel's surface since the previous frame."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from warp_ar.stages.features import Features
 
 
 class Motion(Stage):
-    """Projects each pixel's point by the camera of this frame and by that of the frame before."""
+    """Projects each pixel's point by the cameras of this frame and of the previous one."""
 
     name: ClassVar[str] = "motion"
     summary: ClassVar[str] = "motion of each pixel's surface since the frame before, in pixels"
@@ -30,11 +30,11 @@ class Motion(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Left out by the graph where it is not asked for; runs in every frame, for the clock does."""
+        """Return the wiring; left out by the graph if not requested. The clock makes it run in every frame."""
         return Wiring(("pose", "objects", "clock", "surface_ids", "position"), ("motion",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """The motion, and the frame before."""
+        """Return the motion, and the previous frame's camera and objects."""
         count = max(1, len(object_shapes(self.request.scene)))
         return {
             "motion": ArraySpec(self.shape, wp.vec2),
@@ -43,7 +43,7 @@ class Motion(Stage):
         }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """One pass over all pixels, then what the next frame needs of this one."""
+        """Return one pass over all pixels, and one that stores this frame's camera and objects."""
         params, scene = arrays["params"], arrays["ray_scene"]
         before, objects = arrays["motion_params"], arrays["motion_objects"]
         surfaces = arrays["surface_ids"], arrays["position"], arrays["motion"]

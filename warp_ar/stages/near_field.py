@@ -1,4 +1,4 @@
-"""Surroundings of virtual objects at close range."""
+"""Stage ``near_field``: light from the close surroundings of virtual objects."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ from warp_ar.stages.shared.lighting import (
 from warp_ar.stages.shared.picture import find_picture, find_visible, frame_reads
 
 SIDE = 4
-"""Pixels along a tile."""
+"""Pixels along one side of a tile."""
 
 
 @dataclasses.dataclass(frozen=True)
 class RayCounts:
-    """Rays of a pixel."""
+    """Rays per pixel."""
 
     samples: int
     """Rays toward the environment."""
     lobe: int
     """Rays into a glossy lobe."""
     mirror: int
-    """Rays of a mirror, a square number."""
+    """Rays of a mirror; a square number."""
     known: bool
-    """True if samples estimate only the difference from the known irradiance of the environment."""
+    """True if samples estimate only the difference from the environment's irradiance, which is known."""
 
 
 RAYS: Mapping[str, RayCounts] = MappingProxyType(
@@ -50,7 +50,7 @@ RAYS: Mapping[str, RayCounts] = MappingProxyType(
 
 
 def lobe_widths(material: MeshMaterial) -> tuple[float, float]:
-    """Return the least and largest lobe width alpha of a material, as ``kernels.near_field`` defines it."""
+    """Return the least and the largest lobe width alpha of a material, as ``kernels.near_field`` defines it."""
     surface = material.surface
     match surface:
         case MetallicRoughnessMaterial():
@@ -69,7 +69,7 @@ def near_field_config(features: Features, device: Any) -> near_field.NearFieldCo
     materials = scene_materials(features.request.scene)
     widths = [width for item in materials if reflects_glossily(item) for width in lobe_widths(item)]
     sharp = [width < near_field.SHARP_ALPHA for width in widths]
-    # The forms themselves stay the scene's: they are what the kernel writes.
+    # The forms of light are always the scene's, because the kernel writes them.
     forms, variant = features.distant, distant_variant(features, device)
     return near_field.NearFieldConfig(
         dataclasses.replace(variant, diffuse=forms.diffuse, specular=forms.specular),
@@ -79,13 +79,13 @@ def near_field_config(features: Features, device: Any) -> near_field.NearFieldCo
         SIDE,
         "shadow_ratio" in layers,
         "added_light" in layers,
-        # Of several balls each has a part of the samples only: they say what differs.
+        # With several balls each has a part of the samples, enough only for the difference from the known irradiance.
         rays.known or features.others > 0,
     )
 
 
 class NearField(Stage):
-    """Light that reaches objects past each other, and what they mirror of the receiver and of each other."""
+    """Estimates light between objects, and their reflections of the receiver and of each other."""
 
     name: ClassVar[str] = "near_field"
     summary: ClassVar[str] = "receiver and other objects as virtual objects reflect them"
@@ -100,7 +100,7 @@ class NearField(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Needs objects and an environment that lights them."""
+        """Return the wiring for a scene with objects and an environment that lights them."""
         if not features.request.scene.objects:
             return LeftOut(base.NO_OBJECT)
         if not features.environment:
@@ -113,11 +113,11 @@ class NearField(Stage):
         return Wiring(tuple(reads), features.near_names)
 
     def idle(self, reach: Reach) -> str | None:
-        """Without an object in the picture nothing shows its surroundings."""
+        """Return a reason if no object is in the picture."""
         return None if reach.objects else base.OUT_OF_PICTURE
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """Irradiance and what is mirrored, before and after averaging."""
+        """Return irradiance and reflected radiance, before and after averaging."""
         config = self.features.distant
         specs = {}
         if config.diffuse != "none":
@@ -129,7 +129,7 @@ class NearField(Stage):
         return specs
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """Estimates, then their mean."""
+        """Return passes for the estimates, then for their means."""
         config = near_field_config(self.features, device)
         params, scene, visible = arrays["params"], arrays["ray_scene"], find_visible(arrays)
         picture, layers = find_picture(arrays), near_field.ReceiverLayers()
@@ -155,7 +155,7 @@ class NearField(Stage):
         ]
 
     def _shrink(self, params: Any, picture: Any, layers: Any) -> list[Pass]:
-        """Levels of the frame, where an object mirrors it."""
+        """Return passes for the frame's mip levels, if an object reflects the frame."""
         if not self.features.distant.specular:
             return []
         rows = frame_levels.level_size(*self.shape, 1)[0]

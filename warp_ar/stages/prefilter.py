@@ -1,4 +1,4 @@
-"""The environment as glossy materials reflect it, from mirror to matt."""
+"""Stage ``prefilter``: the environment filtered for glossy materials, from mirror to matt."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from warp_ar.stages.shared.settled import settled_environment
 
 
 def glossy_materials(scene: Scene) -> list[Material]:
-    """Materials of virtual objects that reflect more than diffusely."""
+    """Return the materials of virtual objects with more than diffuse reflection."""
     return [material.surface for material in scene_materials(scene) if reflects_glossily(material)]
 
 
 def scene_lobe(scene: Scene) -> Lobe:
-    """Phong where no glossy material has another lobe, else GGX: exponents then take the width that is nearest."""
+    """Return the common lobe: Phong if all glossy materials have it, else GGX, with the nearest widths."""
     kinds = {type(material) for material in glossy_materials(scene)} - {MirrorMaterial}
     return "phong" if kinds == {PhongMaterial} else "ggx"
 
@@ -69,7 +69,7 @@ class Prefilter(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Read the environment, write the levels."""
+        """Return the wiring: reads the environment, writes the levels."""
         if not features.environment:
             return LeftOut(NO_BALL)
         by_texture = cls.method_for(features) == "sphere_mip"
@@ -87,11 +87,11 @@ class Prefilter(Stage):
         scene = self.request.scene
         mirrors = all(isinstance(material, MirrorMaterial) for material in glossy_materials(scene))
         mirrors &= not scene.has_gloss
-        # Light that objects reflect onto the receiver is read as a wide lobe of every material.
+        # Light that objects reflect onto the receiver uses a wide lobe for every material.
         return mirrors and not self.features.shadowed
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """Levels, and the pyramid that the levels are made from."""
+        """Return the levels, and the pyramid from which they are filtered."""
         height = self.request.quality.environment_height
         specs = {"prefilter_levels": ArraySpec((lobe_texels(height),), wp.vec3)}
         if others := self._others(self.features):
@@ -105,7 +105,7 @@ class Prefilter(Stage):
         return specs
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """Launches of the method; weights and samples are made here, once."""
+        """Return the launches of the method; weights and samples are computed here, once."""
         if self.method == "sphere_mip":
             return self._look_up(arrays)
         passes = self._filter(arrays, settled_environment(arrays, device), arrays["prefilter_levels"])
@@ -114,7 +114,7 @@ class Prefilter(Stage):
         return passes
 
     def _filter(self, arrays: Arrays, environment: Any, levels: Any) -> list[Pass]:
-        """Passes from one map of the environment to its levels; maps take turns with the pyramid."""
+        """Return the passes from one map of the environment to its levels; maps share the pyramid in turn."""
         height, device = self.request.quality.environment_height, environment.device
         lobe = scene_lobe(self.request.scene)
         if self._mirrors_only:
@@ -140,7 +140,7 @@ class Prefilter(Stage):
         ]
 
     def _look_up(self, arrays: Arrays) -> list[Pass]:
-        """Every lobe's directions in a level of the sphere map; mirrors alone need no more than the first."""
+        """Return passes that look up every lobe's directions in a sphere map level; only the first for mirrors."""
         height = self.request.quality.environment_height
         lobes = lobe_count(height)
         known, out = (arrays["params"], arrays["sphere_map"]), arrays["prefilter_levels"]

@@ -13,12 +13,12 @@ from warp_ar.errors import UsageError
 
 @dataclasses.dataclass(frozen=True)
 class Quality:
-    """The method of every stage and the sizes that go with it. Equal values share plans and compiled kernels."""
+    """Method of every stage, and the sizes of maps and samples. Equal values share plans and compiled kernels."""
 
     name: str
     """Name of the preset, or ``custom``."""
     methods: tuple[tuple[str, str], ...]
-    """(stage, method) pairs, sorted by stage; stages that have only one method need not be named."""
+    """Pairs (stage, method), sorted by stage; a stage with only one method need not be named."""
     environment_height: int
     """Rows of the latlong environment; it has twice as many columns."""
     edge_samples: int
@@ -28,7 +28,7 @@ class Quality:
         """Check all values.
 
         Raises:
-            UsageError: A value is of another type, or a size cannot be. Names of methods are checked by a pipeline.
+            UsageError: A value has another type, or a size is impossible. A pipeline checks the names of methods.
         """
         check_fields(self)
         if not 4 <= self.environment_height <= 4096:
@@ -37,11 +37,11 @@ class Quality:
             raise UsageError(f"Quality: edge_samples = {self.edge_samples}: expected a square number, such as 4")
 
     def method(self, stage: str) -> str:
-        """Method of ``stage``; a stage that is not named has its only method, ``default``."""
+        """Return the method of ``stage``; ``default`` if the stage is not named."""
         return dict(self.methods).get(stage, "default")
 
     def with_methods(self, **methods: str) -> Quality:
-        """The same quality with some stages on other methods."""
+        """Return this quality with other methods for the named stages."""
         merged = {**dict(self.methods), **methods}
         return dataclasses.replace(self, name="custom", methods=tuple(sorted(merged.items())))
 
@@ -61,7 +61,7 @@ _METHODS: Mapping[str, tuple[str, str, str, str, str]] = {
     "mirror_ball": ("none", "none", "single", "smooth", "brute_force"),
     "shade": ("environment", "environment", "few_rays", "one_bounce", "one_bounce"),
 }
-"""Method of each stage by preset; empty: its default."""
+"""Method of each stage by preset; empty: the stage's default."""
 
 
 def _preset(index: int) -> Quality:
@@ -72,10 +72,10 @@ def _preset(index: int) -> Quality:
 PRESETS: Mapping[str, Quality] = MappingProxyType({name: _preset(index) for index, name in enumerate(_NAMES)})
 DEFAULT_PRESET = "medium"
 AUTO = "auto"
-"""Name of the quality that is chosen to keep to a budget."""
+"""Name of the quality that adapts its methods to a time budget."""
 DEFAULT_BUDGET_MS = 33.0
-"""Milliseconds per frame of that budget, where none is given: thirty frames per second."""
+"""Default budget in milliseconds per frame: thirty frames per second."""
 BUDGETS: Mapping[str, float] = MappingProxyType({"low": 1e3 / 30.0, "medium": 50.0, "high": 250.0})
-"""Milliseconds that a whole frame of a bundled scene, 640x480 on two CPU cores, may take at a preset; docs/accuracy.md
-marks those that take more. ``paper`` is the paper's method, ``reference`` the last methods that end within a lifetime:
-neither has a budget."""
+"""Milliseconds that a preset may take for a whole frame of a bundled scene, 640x480 on two CPU cores; docs/accuracy.md
+marks those that take more. Two presets have no budget: ``paper`` is the paper's method, and ``reference`` the most
+accurate methods that finish in practical time."""

@@ -1,4 +1,4 @@
-"""Light that clipping lost in the ball is put back, by what the card and other surfaces show of it."""
+"""Stage ``recover``: estimates light that clips in the ball from its effect on the card and other surfaces."""
 
 from __future__ import annotations
 
@@ -33,42 +33,42 @@ from warp_ar.stages.shared.lighting import trace_variant
 from warp_ar.stages.shared.probe_maps import KEPT
 
 EVERY_FRAME = 3
-"""Frames at a stream's start that are each estimated from: clips of a few frames get all that recovery can do."""
+"""Number of frames at a stream's start from each of which an estimate is made, for clips of a few frames."""
 EVERY_SECONDS = 0.2
-"""Time between later estimates, which are at least ``EVERY_FRAME`` frames apart: light follows as fast as a lamp is
-switched."""
+"""Seconds between later estimates, which are at least ``EVERY_FRAME`` frames apart, so that the light follows the
+switching of a lamp."""
 LATENCY = 0.1
-"""Seconds, by the frames' clock, after which an estimate takes effect that is solved for beside the frames. It is
-fixed, so that the same frames give the same pictures; a frame waits for an estimate that is late, but in real time."""
+"""Seconds on the frames' clock after which an estimate that was computed asynchronously takes effect. The time is
+fixed, so that the same frames give the same pictures; except in real time, a frame waits for a late estimate."""
 REST = 3.0
-"""In real time: least time between two estimates, over that which the last one took."""
+"""Least time between two estimates in real time, over the duration of the last one."""
 CARD_STEP = 2
-"""Stride over the card's points, which come first, in every frame's look at the card."""
+"""Stride over the card's points (the first points) when the card is observed in every frame."""
 WHEN = ("now", "asked", "then")
-"""Frame of the current, pending and active estimate."""
+"""Names for the frames of the current state, of the pending estimate and of the active one."""
 MOST_EMITTERS = CONFIG.search.candidates * len(CONFIG.search.distances)
 
 
 @dataclasses.dataclass
 class _Progress:
-    """State of the estimates from frame to frame, on the host."""
+    """Host state of the estimates from frame to frame."""
 
     solver: recovery.Recovery
     estimate: Estimate | None = None
-    """Active estimate."""
+    """Estimate in use."""
     pending: Future[_Solved] | None = None
-    """Estimate that is being solved for."""
+    """Estimate in computation."""
     took: float = 0.0
-    """Seconds that the last one took."""
+    """Duration of the last estimate, seconds."""
     frames: int = 0
     waited: int = 0
     """Frames since the last estimate was begun."""
     last: float = 0.0
-    """Time at which that was, seconds."""
+    """Time at which the last estimate was begun, seconds."""
     failed: str = ""
-    """Reason that the last one could not be solved for; empty where it could."""
+    """Error of the last estimate; empty if it succeeded."""
     rested: bool = False
-    """True where nothing has read the environment since."""
+    """True if nothing has read the environment since the last estimate."""
     gain: npt.NDArray[np.float64] = dataclasses.field(default_factory=lambda: np.ones(3))
     """Gain of the camera when the last estimate was begun."""
 
@@ -78,20 +78,20 @@ class _Solved:
     """Result of one estimate."""
 
     estimate: Estimate | None
-    """None where the last one still holds."""
+    """New estimate; None if the previous one still holds."""
     cells: npt.NDArray[Any]
-    """Records of ``Cell`` that it was estimated from."""
+    """Records of ``Cell`` from which it was made."""
     solver: recovery.Recovery
-    """Solver with what it learnt."""
+    """Solver with its updated state."""
     seconds: float
-    """Time that it took."""
+    """Duration of the computation."""
 
 
 class Recover(Stage):
-    """Estimates what clipped texels lack from surfaces that the same light falls on.
+    """Estimates the missing radiance of clipped texels from surfaces that receive the same light.
 
-    It comes after filling, not before: what the surfaces receive depends on the whole environment, the part behind the
-    ball included, and an emitter's recovered energy must not be spread into the unseen by filling.
+    It runs after ``fill``: the light on the surfaces depends on the whole environment, including the part behind the
+    ball, and filling must not spread an emitter's recovered energy into unseen directions.
     """
 
     name: ClassVar[str] = "recover"
@@ -118,7 +118,7 @@ class Recover(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Needs a mirror ball and a method that does something."""
+        """Return the wiring for a scene with a mirror ball and a method other than ``clipped``."""
         if not features.observed:
             return LeftOut(unobserved(features))
         if not features.recovered:
@@ -133,7 +133,7 @@ class Recover(Stage):
         return Wiring((*reads, "others_filled", *kept, "probe_places"), (*writes, *others))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """The map, the two sides of the equations, and what readers have seen."""
+        """Return the map, the arrays of the equations, and the map as its readers last saw it."""
         height, others = self.request.quality.environment_height, self.features.others
         shape, most = (height, 2 * height), (CONFIG.search.most,)
         cells = cell_shape(*shape)
@@ -164,7 +164,7 @@ class Recover(Stage):
         }
         if self.features.emitters:
             specs["emitters"] = ArraySpec(most, Emitter)
-        if others:  # balls take turns with what is not written
+        if others:  # balls share scratch arrays in turn
             specs["others_environment"] = ArraySpec((others, *shape), wp.vec3)
             specs["recover_others_missing"] = ArraySpec(shape, wp.vec3)
             specs["recover_sent"] = ArraySpec(cells, wp.vec3)
@@ -173,7 +173,7 @@ class Recover(Stage):
         return specs
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """Both sides of the equations on the device, their solution on the host beside it, its effect on the map."""
+        """Return passes that set up the equations on the device, solve them on the host, and apply the solution."""
         self._proxies = trace_variant(trace_config(self.request.scene), device).proxies
         self._arrays, self._on_cpu = arrays, bool(device.is_cpu)
         arrays["recover_points"].assign(self._surfaces.points)
@@ -190,7 +190,7 @@ class Recover(Stage):
         self._camera = HostCopies({"params": arrays["params"]}, device)
         self._effects = copies("recovered", "cells", "found", "share", "level")
         self._places, self._received = copies("emitters"), copies("emitter_transfer")
-        # Streams of its own: beside frames, and beside their capture.
+        # Separate streams, concurrent with the frames and their capture.
         self._stream: Any = None
         self._frames_stream: Any = None
         if not self._on_cpu:
@@ -224,12 +224,12 @@ class Recover(Stage):
         return passes
 
     def _launch(self, launcher: Any, *names: str) -> Any:
-        """Return what calls a launcher with named arrays, on a band of rows."""
+        """Return a function of a band of rows that calls a launcher with named arrays."""
         given = [self._arrays[name] for name in names]
         return lambda rows: launcher(*given, rows=rows)
 
     def _equations(self, height: int, rows: int) -> list[Pass]:
-        """Return the passes that find what cells lack, and both sides of the equations where an estimate is begun."""
+        """Return the passes that find clipped cells and, in frames that begin an estimate, set up the equations."""
         points = len(self._surfaces.points)
 
         def asked(launcher: Any, *names: str, rows: int) -> Pass:
@@ -237,7 +237,7 @@ class Recover(Stage):
             return Pass(self._launch(launcher, *names), rows=rows, enabled=lambda: self._asks)
 
         weigh = self._launch(weigh_boundaries, "environment_clipped", "params", "probes", "recover_missing")
-        # What clips is known before the map is filled.
+        # Clipped texels are known before the map is filled.
         passes = [Pass(weigh, rows=height, reads=("environment_clipped", "pose"))]
         if self._proxies:
             names = "environment_clipped", "probes", "ray_scene", "recover_missing"
@@ -264,9 +264,9 @@ class Recover(Stage):
         ]
 
     def _card_points(self) -> int:
-        """Number of points by which the light's level is followed, on the card; 0 where it is not.
+        """Return the number of card points by which the light's level is followed; 0 if it is not followed.
 
-        Where a camera meters by itself its own gain is told by the same points.
+        If the camera has automatic exposure, its gain is estimated from the same points.
         """
         source = self.request.scene.source
         if source is not None and source.metering == "automatic":
@@ -275,7 +275,7 @@ class Recover(Stage):
         return int(np.count_nonzero((kinds == Kind.CARD) | (kinds == Kind.INK))) // CARD_STEP
 
     def _new_solver(self) -> recovery.Recovery:
-        """Make one that has learnt nothing yet."""
+        """Return a solver without any learnt state."""
         scene = self.request.scene
         ball = scene.probes[0]
         return recovery.Recovery(
@@ -283,7 +283,7 @@ class Recover(Stage):
         )
 
     def _relocate(self, ball: int) -> list[Pass]:
-        """Put what was recovered in the first ball's map into that of another as it sees it."""
+        """Return passes that transfer recovered radiance from the first ball's map to another's, with parallax."""
         arrays, places, height = self._arrays, self._arrays["probe_places"], self.request.quality.environment_height
         emitters = arrays["emitters"] if self.features.emitters else None
         first, out = (arrays["environment"], arrays["filled_radiance"]), arrays["others_environment"][ball]
@@ -333,11 +333,11 @@ class Recover(Stage):
         apply_level(arrays["recover_recovered"], found, arrays["recover_level"], arrays["recover_levelled"], shown)
 
     def host_kernels(self) -> tuple[Any, ...]:
-        """Of the solver: irradiance from emitters, at whatever places it tries."""
+        """Return the solver's kernels: irradiance from emitters at trial positions."""
         return (kernels.make_trace_emitters_kernel(self._proxies),) if self.method == "shading" else ()
 
     def begin(self) -> None:
-        """Decide whether an estimate is begun in this frame, and whether one takes effect."""
+        """Decide whether this frame begins an estimate, and whether one takes effect."""
         now, seconds, covered = self._progress, self._arrays["seconds"](), self._arrays["ball_covered"]()
         now.frames += 1
         now.waited += 1
@@ -349,7 +349,7 @@ class Recover(Stage):
             interval = max(interval, (1.0 + REST) * now.took)
         self._asks = now.frames <= EVERY_FRAME or (since > interval and (rested or now.waited >= EVERY_FRAME))
         if self._real_time:
-            # Solved for here, beside the frames, an estimate would hold the interpreter's lock.
+            # Computed in this process, concurrently with the frames, an estimate would hold Python's lock.
             waits = now.frames > EVERY_FRAME and solving.PROCESS.starting
             self._asks = self._asks and not waits and (now.pending is None or self._arrives)
         self._asks = self._asks and not covered
@@ -358,12 +358,12 @@ class Recover(Stage):
         self._follows = self._card > 0 and not covered
 
     def rest(self) -> None:
-        """Begin no estimate, and let none take effect; the first frame that needs one begins it at once."""
+        """Begin no estimate and apply none; the first frame that needs an estimate begins it at once."""
         self._asks = self._arrives = self._follows = self._news = False
         self._progress.rested = True
 
     def _ask(self, rows: Rows | None) -> None:
-        """Begin to solve, and wait for it where it takes effect at once."""
+        """Begin to solve; wait for the solution if it takes effect at once."""
         if self._worker is None:
             self._worker = ThreadPoolExecutor(1, "warp_ar-recover")
         for side in (self._looks, self._camera):
@@ -371,14 +371,14 @@ class Recover(Stage):
         now, waits = self._progress, self.request.estimates == "synchronous"
         now.gain = self._arrays["gain"]()
         at_once = waits or now.frames <= EVERY_FRAME
-        # On CUDA, and in real time, frames are bound by the interpreter's lock, which a solution in this process holds.
-        # On CPU frames take all cores. What is found is the same to the bit.
+        # On CUDA and in real time, Python's lock limits the frame rate, and a solution in this process would hold it.
+        # On CPU the frames use all cores. The solution is bit-identical in either process.
         beside = self._real_time or not (waits or self._on_cpu)
         if beside:
             solving.PROCESS.prepare()
-        # Where a frame waits, a process that is there already is used; to start one takes longer than most clips.
+        # If a frame waits, a running solver process is used; starting one takes longer than most clips.
         beside = solving.PROCESS.ready if waits else beside and not at_once
-        # On CPU the frame's values are no copy: the next frame writes where the camera is, beside the worker.
+        # On CPU the frame constants are not copied: the next frame overwrites the camera's place during the solution.
         camera = self._camera_place() if self._on_cpu else None
         now.pending = self._worker.submit(self._solve, now.solver, beside, camera)
         if at_once:
@@ -386,26 +386,26 @@ class Recover(Stage):
 
     @property
     def _real_time(self) -> bool:
-        """True where no frame waits for an estimate."""
+        """True if frames never wait for an estimate."""
         return self.request.estimates == "real_time"
 
     def _camera_place(self) -> npt.NDArray[np.float64]:
-        """Return the camera's place when the equations were written, metres, (3,)."""
+        """Return the camera's position when the equations were set up, metres, (3,)."""
         return np.asarray(self._camera.fetched()["params"]["camera_position"][0], np.float64).copy()
 
     def _solve(self, solver: recovery.Recovery, beside: bool, camera: npt.NDArray[np.float64] | None) -> _Solved:
-        """Solve, in the worker; or, if ``beside``, in a process beside it.
+        """Solve on the worker thread or, if ``beside``, in a separate process.
 
-        Nothing writes the equations before this is done: it takes effect before the next begins.
+        The equations are not overwritten before this is done: the estimate takes effect before the next one begins.
 
         Args:
-            solver: What was learnt so far.
-            beside: Whether the process solves.
-            camera: Where the camera stands, if that is known already.
+            solver: Solver with its state so far.
+            beside: Whether to solve in the separate process.
+            camera: Camera position, if it was read already; None: read it from the frame constants.
 
         Raises:
             LinAlgError: The equations have no solution.
-            FloatingPointError: It is not finite.
+            FloatingPointError: The solution is not finite.
         """
         begin, (cells, observations) = time.perf_counter(), self._looks.fetched().values()
         estimate = None
@@ -422,7 +422,7 @@ class Recover(Stage):
         return _Solved(estimate, cells, solver, time.perf_counter() - begin)
 
     def _trace(self, emitters: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
-        """Irradiance from emitters, (n, q); in the worker."""
+        """Return the irradiance from emitters, (n, q); runs on the worker thread."""
         arrays, count, points = self._arrays, len(emitters), len(self._surfaces.points)
         places = np.zeros((MOST_EMITTERS, 4), np.float32)
         places[:count] = emitters
@@ -442,7 +442,7 @@ class Recover(Stage):
         return np.array(flat.reshape(points, count), np.float64)
 
     def _take(self, rows: Rows | None) -> None:
-        """Let what was solved for take effect; where that has failed, the light stays, and the solver begins anew."""
+        """Apply a finished estimate; after a failure the light stays, and the solver starts anew."""
         now = self._progress
         assert now.pending is not None
         pending, now.pending, now.failed = now.pending, None, ""
@@ -456,7 +456,7 @@ class Recover(Stage):
         if estimate is None:
             return
         now.estimate = estimate
-        # In camera values of the frame that it was begun in; the camera's gain may have changed since.
+        # The estimate is in camera values of the frame that began it; the camera's gain may have changed since.
         ratio = (self._arrays["gain"]() / now.gain).astype(np.float32)
         records = np.zeros(CONFIG.search.most, struct_dtype(Emitter))
         for record, emitter in zip(records, estimate.emitters, strict=False):
@@ -476,12 +476,12 @@ class Recover(Stage):
                 wp.copy(then, asked, stream=self._frames_stream)
 
     def close(self) -> None:
-        """See the worker end: what it solves, the arrays that go now are its, and another stage may wait for it."""
+        """Wait for the worker, which uses the arrays that are freed next, and for which another stage may wait."""
         if self._worker is not None:
             self._worker.shutdown()
 
     def resume(self, other: Stage) -> None:
-        """Keep the emitters that were found, and when; on another method, or on another receiver, look anew."""
+        """Keep the known emitters and the estimate's times; search anew with another method or another receiver."""
         if not isinstance(other, Recover) or other.method != self.method:
             return
         mine, yours = self.request.scene, other.request.scene
@@ -489,7 +489,7 @@ class Recover(Stage):
             self._progress = dataclasses.replace(other._progress)
 
     def changed(self, name: str) -> bool:
-        """As ``Fill.changed``; emitters change where an estimate takes effect."""
+        """Return as ``Fill.changed``; emitters change when an estimate takes effect."""
         if name == "emitters":
             return self._news
         if name != "environment" or not self._on_cpu:
@@ -500,7 +500,7 @@ class Recover(Stage):
         return True
 
     def status(self) -> Mapping[str, Any]:
-        """Return what the last estimate rests on, for reports, and why none was made since; see ``_take``."""
+        """Return the evidence of the last estimate for reports, and the error of a later failed one (see ``_take``)."""
         estimate, failed = self._progress.estimate, self._progress.failed
         reason: dict[str, Any] = {"failed": failed} if failed else {}
         told = self._arrays["ball_reflectance"]()

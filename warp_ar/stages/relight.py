@@ -1,4 +1,4 @@
-"""Virtual light on the receiver."""
+"""Stage ``relight``: virtual light on the receiver."""
 
 from __future__ import annotations
 
@@ -25,24 +25,24 @@ from warp_ar.stages.shared.picture import GrowingRows
 
 @dataclasses.dataclass(frozen=True)
 class Grain:
-    """Resolution at which cells of the receiver are estimated."""
+    """Resolution of the receiver's cells."""
 
     samples: int
     """Samples of the environment for ambient visibility."""
     ambient: int
-    """Pixels per cell of ambient visibility, in frames of ``STRIDE_ROWS`` rows; 1 is every pixel of any frame."""
+    """Pixels per cell of ambient visibility, in frames of ``STRIDE_ROWS`` rows; 1: a cell per pixel of any frame."""
     bounced: int
-    """The same, of bounced light."""
+    """Pixels per cell of bounced light, likewise."""
     patch: int
-    """The same, of what sends it."""
+    """Pixels per patch that reflects bounced light, likewise."""
 
 
 GRAINS: Mapping[str, Grain] = MappingProxyType({"bounce": Grain(128, 4, 8, 16), "brute_force": Grain(SAMPLES, 1, 1, 4)})
-"""By method of ``features.LOCAL``: else these are ``reflectance``."""
+"""Resolutions by method of ``features.LOCAL``, whose methods otherwise equal ``reflectance``."""
 
 
 class Relight(Stage):
-    """Adds what virtual lights send to the proxies, shadowed, to the receiver in the frame."""
+    """Adds the shadowed light of virtual lights on the proxies to the receiver in the frame."""
 
     name: ClassVar[str] = "relight"
     methods: ClassVar[Mapping[str, str]] = {
@@ -66,12 +66,12 @@ class Relight(Stage):
 
     @classmethod
     def method_for(cls, features: Features) -> str:
-        """``flat`` where no ball tells anything of the environment."""
+        """Return the quality's method; ``flat`` without an environment."""
         return features.relight_method
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Reads what its method needs to know of the environment and the receiver."""
+        """Return the wiring, with the resources of the environment and the receiver that the method uses."""
         if not sheds_light(features.request.scene):
             return LeftOut("the scene has no virtual light")
         if not features.lit:
@@ -79,17 +79,17 @@ class Relight(Stage):
         return Wiring(relight_reads(features), ("added_light",))
 
     def runs_after(self) -> tuple[str, ...]:
-        """Only the picture waits for both; what objects mirror of the receiver waits for this alone longer."""
+        """Return the stages to run before: with a near field, which waits longest for this stage, there are none."""
         return () if self.features.near_field else ("environment_shadow",)
 
     def idle(self, reach: Reach) -> str | None:
-        """Without power, or out of the picture, light adds nothing."""
+        """Return a reason if no light has power, or none falls on the receiver in the picture."""
         if not reach.shines:
             return "no virtual light has any power"
         return None if reach.light else "virtual light falls on nothing in the picture"
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """The added radiance, and cells of what it is made from."""
+        """Return the added radiance, and the cells from which it is computed."""
         specs = {"added_light": ArraySpec(self.shape, wp.vec3)}
         if self.request.quality.edge_samples > 1:
             specs["relight_visibility"] = ArraySpec(self.shape, wp.int32)
@@ -113,7 +113,7 @@ class Relight(Stage):
         return specs
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """Cells, then one pass over the rows that light can reach."""
+        """Return passes for the cells, then one over the rows that light can reach."""
         config = relight_variant(relight_config(self.features), self.features, device)
         receiver = find_receiver(config, self.features, arrays, self.wiring.reads, make_cells(self.features, arrays))
         inputs = arrays["params"], arrays["ray_scene"], arrays["light_array"], receiver
@@ -128,14 +128,14 @@ class Relight(Stage):
         return passes
 
     def _cell_passes(self, config: RelightConfig, inputs: tuple[Any, Any, Any, Receiver], arrays: Arrays) -> list[Pass]:
-        """Ambient visibility and bounced light of cells, where the method knows them."""
+        """Return passes for ambient visibility and bounced light of cells, if the method uses them."""
         params, scene, _, receiver = inputs
         cells, light_rows = receiver.cells, arrays["light_rows"]
         place = _keep_planes(config, self.request)
         passes: list[Pass] = []
 
         def rows_of(size: int, count: int, margin: int) -> Callable[[], Rows]:
-            """Rows of cells that pixels in the light's rows look up; what stands in the others is never read."""
+            """Return a function of the cells' rows that the light's pixels read; other rows are never read."""
 
             def extent() -> Rows:
                 start, stop = light_rows()
@@ -176,7 +176,7 @@ class Relight(Stage):
 
 
 def _keep_planes(config: RelightConfig, request: Request) -> RelightConfig:
-    """Keep the kinds of proxies where all are planes: cells then leave out most of their rays."""
+    """Keep the proxies' kinds if all are planes: most rays of the cells can then be left out."""
     proxies = trace_config(request.scene).proxies
     if not set(proxies) <= {int(PLANE)}:
         return config
@@ -197,7 +197,7 @@ def _cells(request: Request, pixels: int) -> tuple[int, int]:
 
 
 def make_cells(features: Features, arrays: Arrays) -> ReceiverCells:
-    """The cells of a request as kernels read them."""
+    """Return the cells of a request as kernels read them."""
     cells = ReceiverCells()
     if features.relight_method in GRAINS:
         grain, request = _grain(features), features.request

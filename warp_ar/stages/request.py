@@ -1,4 +1,4 @@
-"""Requests: the input of a plan."""
+"""Request: the input of a plan."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from warp_ar.stages.quality import Quality
 
 @dataclasses.dataclass(frozen=True)
 class Layer:
-    """A layer of the picture, or what is known of each of its pixels, that can be asked for by name."""
+    """Layer of the picture, or a property of each pixel, that can be requested by name."""
 
     resource: str
-    """Array that holds it."""
+    """Name of its array."""
     neutral: float | None
-    """Its value where it changes or says nothing; None: the frame itself."""
+    """Value where the layer has no content; None: the frame itself."""
     summary: str
     """Meaning and unit."""
 
@@ -40,14 +40,14 @@ LAYERS: Mapping[str, Layer] = MappingProxyType(
         "motion": Layer("motion", 0.0, "pixels that the surface has moved since the frame before: x right, y down"),
     }
 )
-"""Every layer, by the name by which ``outputs`` ask for it; one that a scene does not call for is neutral."""
+"""Layers by their names in ``outputs``; a layer that a scene does not need has its neutral value."""
 PICTURE_LAYERS = ("plate", "objects", "shadow_ratio", "added_light", "mirror_ball")
-"""Those that make the picture."""
+"""Layers of which the picture is composed."""
 
 
 Estimates: TypeAlias = Literal["synchronous", "delayed", "real_time"]
-"""When light that is estimated from a frame takes effect: in that frame, which waits for it; a fixed time later; or as
-soon as a process beside the frames has it, so that no frame waits and pictures of two runs may differ by when it is."""
+"""Frame in which light estimated from a frame takes effect: the same frame, which waits for it; a fixed time later; or
+as soon as a separate process has it, so that no frame waits and pictures of two runs may differ."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,30 +57,30 @@ class Request:
     scene: Scene
     """Scene to show."""
     quality: Quality
-    """The method of every stage, and its numbers."""
+    """Method of every stage, and sizes."""
     size: tuple[int, int]
     """Width and height of the frames in pixels."""
     outputs: tuple[str, ...] = ("image",)
-    """Names of what the caller wants: ``image``, ``environment``, ``pose``, and any of ``LAYERS``."""
+    """Names of the requested outputs: ``image``, ``environment``, ``pose``, and any of ``LAYERS``."""
     exposures: tuple[float, ...] = ()
-    """Exposures between which frames alternate, longest first, over the one that is shown; empty: only one."""
+    """Exposures of alternating frames relative to the shown one, longest first; empty: there is only one."""
     estimates: Estimates = "delayed"
-    """When light that is estimated from a frame takes effect."""
+    """Frame in which light estimated from a frame takes effect."""
     emitters: bool = False
-    """True if a captured light comes with its emitters' places, as ``Pipeline.take_light`` gives them."""
+    """True if a captured light has positions of its emitters, as passed to ``Pipeline.take_light``."""
     linear: bool = False
-    """True if frames come as linear radiance too, of more than 8 bits."""
+    """True if frames also come as linear radiance of more than 8 bits."""
 
     @property
     def resources(self) -> tuple[str, ...]:
-        """Resources that hold the outputs."""
+        """Resources with the outputs."""
         return tuple(LAYERS[name].resource if name in LAYERS else name for name in self.outputs)
 
     @property
     def asks_for_layers(self) -> bool:
-        """True if a layer is one of the outputs."""
+        """True if a layer is requested."""
         return not LAYERS.keys().isdisjoint(self.outputs)
 
     def asks_for(self, resource: str) -> bool:
-        """Return whether a resource is one of the outputs."""
+        """Return True if a resource is requested."""
         return resource in self.resources

@@ -1,4 +1,4 @@
-"""The layers of the picture apart, for whoever composes it elsewhere."""
+"""Stage ``separate``: separate layers of the picture, for composition in another program."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ SOURCES: Mapping[str, str] = {
     "added_light": "added_light",
     "mirror_ball": "mirror_ball",
 }
-"""Resource that a layer is taken from: ``objects`` names the objects' records there; ``reflected`` holds
-``mirror_ball`` where receivers mirror too."""
+"""Resource from which each layer is taken. ``objects`` refers to the records of virtual objects; if receivers reflect
+too, ``reflected`` includes ``mirror_ball``."""
 
 
 class Separate(Stage):
-    """Writes the layers that are asked for, neutral where they do not reach."""
+    """Writes the requested layers, with their neutral value where nothing virtual reaches."""
 
     name: ClassVar[str] = "separate"
     summary: ClassVar[str] = "requested layers of the picture, and the frame as linear radiance"
@@ -39,7 +39,7 @@ class Separate(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Reads only what the layers that are asked for are made of."""
+        """Return the wiring, with only the resources of the requested layers."""
         asked = [name for name in PICTURE_LAYERS if features.request.asks_for(LAYERS[name].resource)]
         if not asked:
             return LeftOut(NOT_ASKED)
@@ -48,21 +48,21 @@ class Separate(Stage):
         reads += ["reflected"] * ("mirror_ball" in asked and "reflected" in features.layers)
         if "plate" in asked:
             reads.append("frame")
-            # The guess of clipped pixels depends on the exposure's scale.
+            # The estimate for clipped pixels depends on the exposure's scale.
             reads += ["image"] if features.exposed else []
             reads += box_reads(features)
             reads += ["declipped"] if features.declipped else []
         return Wiring(tuple(reads), tuple(LAYERS[name].resource for name in asked))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """The layers that are asked for."""
+        """Return the requested layers."""
         return {
             name: ArraySpec(self.shape, wp.vec4 if name == LAYERS["objects"].resource else wp.vec3)
             for name in self.wiring.writes
         }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """One pass over all pixels."""
+        """Return one pass over all pixels."""
         features, reads = self.features, self.wiring.reads
         asked = {name: LAYERS[name].resource for name in PICTURE_LAYERS if LAYERS[name].resource in self.wiring.writes}
         out = filled(SeparateLayers(), **{name: arrays[resource] for name, resource in asked.items()})

@@ -1,4 +1,4 @@
-"""Virtual objects lit by the environment and by virtual lights."""
+"""Stage ``shade``: virtual objects lit by the environment and by virtual lights."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from warp_ar.stages.shared.picture import GrowingRows, find_visible
 
 
 class Shade(Stage):
-    """Radiance and coverage of virtual objects, with smooth edges."""
+    """Computes radiance and coverage of virtual objects, with antialiased edges."""
 
     name: ClassVar[str] = "shade"
     methods: ClassVar[Mapping[str, str]] = {
@@ -46,7 +46,7 @@ class Shade(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Reads only the forms of light that its materials reflect."""
+        """Return the wiring, with only the forms of light that the scene's materials reflect."""
         if not features.request.scene.objects:
             return LeftOut(base.NO_OBJECT)
         config = shade_config(features)
@@ -59,18 +59,18 @@ class Shade(Stage):
         return Wiring(tuple(reads), ("virtual",))
 
     def idle(self, reach: Reach) -> str | None:
-        """Without an object in the picture nothing is covered."""
+        """Return a reason if no object is in the picture."""
         return None if reach.objects else base.OUT_OF_PICTURE
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """The shaded objects and lists of edges."""
+        """Return the shaded objects and the edge lists."""
         return {
             "virtual": ArraySpec(self.shape, wp.vec4),
             **edge_arrays(self.request, self.name),
         }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """One pass over the rows where objects are or were."""
+        """Return one pass over the rows in which objects are or were."""
         config = shade_config(self.features)
         variant = shade_variant(config, self.features, device)
         lists = make_edge_lists(arrays, device, self.name)

@@ -1,4 +1,4 @@
-"""The mirror ball's part of the frame as a texture with mip levels, as the paper has it."""
+"""Stage ``sphere_map``: the mirror ball's part of the frame as a texture with mip levels, as in the paper."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from warp_ar.stages.shared.picture import frame_reads
 
 
 class SphereMap(Stage):
-    """Copies the square around the ball, and halves it level by level."""
+    """Copies the square around the ball and halves it level by level."""
 
     name: ClassVar[str] = "sphere_map"
     summary: ClassVar[str] = "the ball's square of the frame as a texture with mip levels (the paper)"
@@ -29,17 +29,17 @@ class SphereMap(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Needs a mirror ball."""
+        """Return the wiring for a scene with a mirror ball."""
         if not features.observed:
             return LeftOut(unobserved(features))
         return Wiring((*frame_reads(features), "pose"), ("sphere_map",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """All levels, one after another."""
+        """Return all levels in one array."""
         return {"sphere_map": ArraySpec((sphere_map.map_texels(),), wp.vec3)}
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """The ball's square, then its levels."""
+        """Return passes for the ball's square, then for its mip levels."""
         texture = arrays["sphere_map"]
         known = (arrays[name] for name in ("params", "probes", "frame", "decode", "linear_frame"))
         return [

@@ -1,4 +1,4 @@
-"""Summed-area table of the frame's intensity."""
+"""Stage ``summed_area``: summed-area table of the frame's intensity."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from warp_ar.stages.shared.picture import SUMMED, SUMMED_CUT, box_reads, frame_r
 
 
 class SummedArea(Stage):
-    """Sums the frame's intensity so that any box's mean costs four look-ups."""
+    """Sums the frame's intensity, so that the mean of any box needs four look-ups."""
 
     name: ClassVar[str] = "summed_area"
     summary: ClassVar[str] = "summed-area table of the frame: means over boxes of any size"
@@ -29,20 +29,20 @@ class SummedArea(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Read the frame; deeper frames also get a table of the residual below 8 bits."""
+        """Return the wiring; deeper frames have a second table, of the residual below 8 bits."""
         if SUMMED_CUT in box_reads(features):
             return Wiring(frame_reads(features), (SUMMED, SUMMED_CUT))
         return Wiring(("frame",), (SUMMED,))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """The table; where there are two, also the frame that the second one sums."""
+        """Return the table; with two tables also the frame of residuals."""
         specs = {name: ArraySpec(self.shape, wp.uint32) for name in self.wiring.writes}
         if SUMMED_CUT in specs:
             specs["summed_area_cut_frame"] = ArraySpec(self.shape, wp.vec3ub)
         return specs
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """Along rows, then down columns; the same for what 8 bits cut off."""
+        """Return passes along rows, then down columns, for each table."""
         frame = arrays["frame"]
         passes = self._sum(frame, arrays[SUMMED])
         if SUMMED_CUT not in self.wiring.writes:
@@ -52,7 +52,7 @@ class SummedArea(Stage):
         return [*passes, *self._sum(cut, arrays[SUMMED_CUT])]
 
     def _sum(self, frame: wp.array, table: wp.array) -> list[Pass]:
-        """Passes that write the table of one frame."""
+        """Return the passes that write the table of one frame."""
         groups = summed_area.column_groups(self.shape[1])
         return [
             over_rows(self.height, summed_area.sum_rows, frame, table),

@@ -1,4 +1,4 @@
-"""The modelled surface that each pixel shows."""
+"""Stage ``surfaces``: the modelled surface that each pixel shows."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from warp_ar.stages.shared.picture import find_visible
 
 
 class Surfaces(Stage):
-    """Finds number, depth, normal and place of the surface at every pixel's centre."""
+    """Finds id, depth, normal and position of the surface at every pixel's centre."""
 
     name: ClassVar[str] = "surfaces"
     summary: ClassVar[str] = "depth, normal and position of each pixel's object, proxy or ball"
@@ -34,12 +34,12 @@ class Surfaces(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Left out by the graph where nothing is asked for that it tells."""
+        """Return the wiring; the graph leaves the stage out if none of its outputs is requested."""
         hits = ("hit_object", "hits") if features.request.scene.objects else ()
         return Wiring(("pose", "objects", *hits), ("surface_ids", "depth", "normals", "position"))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """One surface per pixel."""
+        """Return one surface per pixel."""
         return {
             "surface_ids": ArraySpec(self.shape, wp.int32, -1),
             "depth": ArraySpec(self.shape, wp.float32),
@@ -48,7 +48,7 @@ class Surfaces(Stage):
         }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """One pass over all pixels."""
+        """Return one pass over all pixels."""
         config = trace_variant(trace_config(self.request.scene), device)
         inputs = tuple(arrays[name] for name in ("params", "rays", "ray_scene", "probes"))
         visible = find_visible(arrays) if "hits" in self.wiring.reads else VisibleObjects()

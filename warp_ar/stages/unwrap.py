@@ -1,4 +1,4 @@
-"""The mirror ball in the frame becomes a map of the light that arrives at it."""
+"""Stage ``unwrap``: the mirror ball in the frame as a latlong map of the light that arrives at it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from warp_ar.stages.shared.probe_maps import OTHERS, find_view, other_maps, othe
 
 
 class Unwrap(Stage):
-    """Light of the current frame, with how far each direction can be trusted and how much of it clips."""
+    """Computes the light of the current frame, with confidence and clipped share of each direction."""
 
     name: ClassVar[str] = "unwrap"
     methods: ClassVar[Mapping[str, str]] = {
@@ -42,16 +42,16 @@ class Unwrap(Stage):
 
     @classmethod
     def method_for(cls, features: Features) -> str:
-        """The exact one where the quality names none.
+        """Return the quality's method, or the exact one if the quality names none.
 
-        Exact too for frames of several exposures: the sphere map is a texture of one.
+        Frames of several exposures use the exact one too: the sphere map is a texture of one frame.
         """
         method = super().method_for(features)
         return method if method in cls.methods and not features.merged else "area"
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Needs a mirror ball."""
+        """Return the wiring for a scene with a mirror ball."""
         if not features.observed:
             return LeftOut(unobserved(features))
         by_texture = cls.method_for(features) == "sphere_map"
@@ -62,7 +62,7 @@ class Unwrap(Stage):
         return Wiring((*frames, "pose", *texture), (*written, *other_names(features, OTHERS), *seen))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """The map, and where its texels' corners are seen."""
+        """Return the map, and the image positions of its texels' corners."""
         height = self.request.quality.environment_height
         width = 2 * height
         specs = {
@@ -78,7 +78,7 @@ class Unwrap(Stage):
         return specs
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """Corners first, then texels between them; or texels looked up in the sphere map."""
+        """Return passes for corners, then texels; or one that looks the texels up in the sphere map."""
         if self.method == "sphere_map":
             return self._look_up(arrays)
         kinds = trace_variant(trace_config(self.request.scene), device).proxies
@@ -98,7 +98,7 @@ class Unwrap(Stage):
         return passes
 
     def _look_up(self, arrays: Arrays) -> list[Pass]:
-        """Every direction's place in the sphere map."""
+        """Return the pass that looks every direction up in the sphere map."""
         height = self.request.quality.environment_height
         shape = height, 2 * height
         params, texture, out = arrays["params"], arrays["sphere_map"], arrays["probe_radiance"].flatten()

@@ -1,4 +1,4 @@
-"""Virtual object that each pixel sees."""
+"""Stage ``visibility``: the virtual object that each pixel shows."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from warp_ar.stages.shared.picture import GrowingRows, find_visible
 
 
 class Visibility(Stage):
-    """Traces primary rays, only where virtual objects can be on screen."""
+    """Traces primary rays where virtual objects can be in the picture."""
 
     name: ClassVar[str] = "visibility"
     summary: ClassVar[str] = "traces the virtual object that each pixel sees, behind proxies"
@@ -32,21 +32,21 @@ class Visibility(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Left out of scenes without virtual objects."""
+        """Return the wiring for a scene with virtual objects."""
         if not features.request.scene.objects:
             return LeftOut(base.NO_OBJECT)
         return Wiring(reads=("pose", "objects"), writes=("hit_object", "hits"))
 
     def idle(self, reach: Reach) -> str | None:
-        """Without an object in the picture no pixel sees one."""
+        """Return a reason if no object is in the picture."""
         return None if reach.objects else base.OUT_OF_PICTURE
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """One hit per pixel."""
+        """Return one hit per pixel."""
         return {"hit_object": ArraySpec(self.shape, wp.int32, -1), "hits": ArraySpec(self.shape, Hit, Hit())}
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """One pass over the rows where objects are or were."""
+        """Return one pass over the rows in which objects are or were."""
         config = trace_variant(trace_config(self.request.scene), device)
         inputs = [arrays[name] for name in ("params", "rays", "ray_scene")]
         extent = GrowingRows(arrays["object_rows"])

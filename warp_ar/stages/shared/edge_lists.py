@@ -1,4 +1,4 @@
-"""Scratch arrays of stages that sample edges on their own."""
+"""Scratch arrays of stages that resample edge pixels."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from warp_ar.stages.base import Arrays, ArraySpec
 from warp_ar.stages.request import Request
 
 LISTED_SHARE = 16
-"""Edges that can be listed: one pixel in so many."""
+"""Pixels per edge that a list can hold."""
 LISTED_LEAST = 1 << 12
-"""The same at least, if there are as many pixels: in a small picture most pixels may be edges."""
+"""Least capacity of a list, limited by the number of pixels: in a small picture most pixels may be edges."""
 
 
 def edge_arrays(request: Request, stage: str) -> Mapping[str, ArraySpec]:
-    """Arrays of ``make_edge_lists``; none where a pixel has one sample."""
+    """Return the arrays of ``make_edge_lists``; none if a pixel has one sample."""
     samples = request.quality.edge_samples
     if samples == 1:
         return {}
@@ -32,7 +32,7 @@ def edge_arrays(request: Request, stage: str) -> Mapping[str, ArraySpec]:
 
 
 def make_edge_lists(arrays: Arrays, device: Any, stage: str) -> EdgeLists | None:
-    """The lists of a stage on CUDA; on CPU, and where a pixel has one sample, None."""
+    """Return a stage's edge lists on CUDA; None on CPU or if a pixel has one sample."""
     if device.is_cpu or f"{stage}_edges" not in arrays:
         return None
     return EdgeLists.of(*(arrays[f"{stage}_{name}"] for name in ("edge_count", "edges", "edge_samples")))

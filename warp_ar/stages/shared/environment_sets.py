@@ -1,4 +1,4 @@
-"""Sets of samples that stand for the environment, and methods of ``environment_shadow`` in numbers."""
+"""Sample sets of the environment, and the sample counts of the methods of ``environment_shadow``."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from typing import Final, Literal
 from warp_ar.stages.features import Features
 
 REFERENCE_SIZE: Final = (32, 64)
-"""Texels of the map that the reference sums over."""
+"""Rows and columns of the map over which the reference sums."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Method:
-    """Rays per estimate, and estimates per frame."""
+    """Number of rays per estimate and of estimates per frame."""
 
     count: int
     """Samples of the environment per estimate."""
     side: int
-    """Estimates along a tile."""
+    """Estimates along one side of a tile."""
     stride: int
-    """Pixels from one estimate to the next in frames of ``STRIDE_ROWS`` rows."""
+    """Pixels between neighbouring estimates, in frames of ``STRIDE_ROWS`` rows."""
     bounce: Literal["estimated", "traced"]
-    """Method by which light from objects onto the receiver is found."""
+    """Method for light that objects reflect onto the receiver."""
     secondary: float = 1.0
-    """Share of the rays that look for it: light that takes rays to find is smooth, and half of them find it."""
+    """Share of the rays that search for light reflected by objects; it is smooth, so that half of them suffice."""
 
 
 METHODS: Mapping[str, Method] = {
@@ -33,31 +33,31 @@ METHODS: Mapping[str, Method] = {
     "bounce": Method(64, 4, 2, "traced", 0.5),
     "brute_force": Method(REFERENCE_SIZE[0] * REFERENCE_SIZE[1], 1, 1, "traced"),
 }
-"""Cheapest first, after ``none``."""
+"""Methods, cheapest first, after ``none``."""
 
 
 SAMPLES = 1024
-"""Of all sets together, at least: what an 8-bit picture of their mean can tell apart, four times over."""
+"""Least number of samples of all sets together: four times the 8-bit steps of the mean over the sets."""
 
 
 def lists_texels(features: Features) -> bool:
-    """Return whether the reference asks for every texel of the environment, beside samples that follow its light."""
+    """Return True if the reference samples every texel of the environment, besides samples by its light."""
     return features.request.quality.method("environment_shadow") == "brute_force"
 
 
 def sample_count(features: Features) -> int:
-    """Samples of all sets together: as many as one tile of shadows asks for."""
+    """Return the number of samples of all sets: as many as one tile of shadow estimates uses."""
     method = METHODS.get(features.request.quality.method("environment_shadow"))
     return SAMPLES if method is None or lists_texels(features) else max(SAMPLES, method.count * method.side**2)
 
 
 def sample_slots(features: Features) -> int:
-    """Samples of which each of the balls whose light is interpolated has one or two."""
+    """Return the number of subsets of the samples; each ball with interpolated light has one or two of them."""
     return 1 << features.others.bit_length()
 
 
 def sample_names(features: Features) -> tuple[str, str, str]:
-    """Arrays that shadows read: directions, flux, samples."""
+    """Return the names of the arrays that shadows read: directions, flux, samples."""
     listed = "environment_samples_texel_directions", "environment_samples_texel_flux", "environment_samples_texels"
     return (
         listed

@@ -1,7 +1,7 @@
-"""Copies of a device's arrays on the host, for work there beside the frames.
+"""Host copies of device arrays, for work on the host concurrent with the frames.
 
-On CUDA they are pinned and filled by a stream of their own, so that neither the kernels nor the host wait. On CPU the
-arrays are on the host already: who reads them here must know that nothing writes them meanwhile.
+On CUDA the copies are pinned and filled on a separate stream, so that neither the kernels nor the host wait. On CPU the
+arrays are host memory already: a caller that reads them here must be sure that nothing writes them meanwhile.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from warp_ar.device import wait_for
 
 
 class HostCopies:
-    """The host's side of some device arrays: fetched from there, or sent there."""
+    """Host copies of some device arrays, which are fetched or sent."""
 
     def __init__(self, arrays: Mapping[str, Any], device: Any) -> None:
-        """Allocate.
+        """Allocate the host copies.
 
         Args:
             arrays: Warp arrays on ``device``, contiguous.
@@ -38,12 +38,12 @@ class HostCopies:
         self._views: dict[str, npt.NDArray[Any]] = {name: host.numpy() for name, host in self._hosts.items()}
 
     def fetch(self, stream: Any, after: Any, count: int | None = None) -> None:
-        """Begin to copy from the device on ``stream``, as objects stand when ``after``'s work so far is done.
+        """Start a copy from the device on ``stream``, of the values after the work so far on the stream ``after``.
 
         Args:
-            stream: Copies.
-            after: Writes the arrays; it is not held up.
-            count: Elements of each array to copy; None means all.
+            stream: Stream that copies.
+            after: Stream that writes the arrays; it does not wait for the copy.
+            count: Number of elements of each array to copy; None means all.
         """
         if self._done is None:
             return
@@ -54,13 +54,13 @@ class HostCopies:
         stream.record_event(self._done)
 
     def fetched(self) -> Mapping[str, npt.NDArray[Any]]:
-        """The host's arrays once ``fetch`` is done; the next one overwrites them."""
+        """Wait for ``fetch`` and return the host arrays, which the next fetch overwrites."""
         if self._done is not None:
             wait_for(self._done)
         return self._views
 
     def send(self, values: Mapping[str, npt.NDArray[Any]], stream: Any = None) -> None:
-        """Begin to copy ``values`` to the device on a stream; None: that of the frames."""
+        """Start a copy of ``values`` to the device on a stream; None: the stream of the frames."""
         if self._done is not None and self._used:
             wait_for(self._done)
         for name, value in values.items():

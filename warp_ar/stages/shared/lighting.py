@@ -1,4 +1,4 @@
-"""Light as stages hand it to their kernels, and the variants of kernels that they compile."""
+"""Environment light as kernels read it, and the kernel variants that stages compile."""
 
 from __future__ import annotations
 
@@ -22,31 +22,31 @@ from warp_ar.stages.shared.picture import find_picture, frame_reads
 
 
 def shares_kernels(device: Any) -> bool:
-    """Return whether kernels on ``device`` are those of any scene: on CPU, where variants cost more than they save."""
+    """Return True if kernels on ``device`` serve any scene: on CPU, where variants cost more than they save."""
     return bool(device.is_cpu)
 
 
 def trace_variant(config: TraceConfig, device: Any) -> TraceConfig:
-    """Kinds of shape to compile in."""
+    """Return the shape kinds to compile."""
     return config.general() if shares_kernels(device) else config
 
 
 def distant_variant(features: Features, device: Any) -> DistantLightConfig:
-    """Shapes, materials and forms of light to compile in."""
+    """Return the shapes, materials and forms of the environment to compile."""
     if not shares_kernels(device):
         return features.distant
     return features.distant.general(_form(features))
 
 
 def shade_variant(config: ShadeConfig, features: Features, device: Any) -> ShadeConfig:
-    """As ``distant_variant``, and kinds of virtual light."""
+    """Return the variant as ``distant_variant``, with the kinds of virtual light."""
     if not shares_kernels(device):
         return config
     return config.general(_form(features), soft=_asks_soft(features))
 
 
 def relight_variant(config: RelightConfig, features: Features, device: Any) -> RelightConfig:
-    """Shapes and shadows to compile in."""
+    """Return the shapes and shadows to compile."""
     if not shares_kernels(device):
         return config
     return config.general(soft=_asks_soft(features))
@@ -60,12 +60,12 @@ def _asks_soft(features: Features) -> bool:
     return features.request.quality.method("light_shadow") == "soft"
 
 
-# Roughness by cosine; bilinear between them, the table stays within 1e-3 of the integral.
+# Roughness by cosine. With bilinear interpolation the table is within 1e-3 of the integral.
 DFG_SIZE = 32
 
 
 def distant_light_reads(features: Features) -> tuple[str, ...]:
-    """Resources that hold the forms of the environment that objects reflect."""
+    """Return the resources with the forms of the environment that objects reflect."""
     config = features.distant
     diffuse = () if config.diffuse == "none" else (f"irradiance_{config.diffuse}",)
     specular = ("prefilter_levels",) if config.specular else ()
@@ -74,7 +74,7 @@ def distant_light_reads(features: Features) -> tuple[str, ...]:
 
 
 def _other_reads(features: Features) -> tuple[str, ...]:
-    """The same of the balls after the first, and the places of all."""
+    """Return the resources with these forms for the balls after the first, and the places of all balls."""
     config = features.distant
     if not config.several or (config.diffuse == "none" and not config.specular):
         return ()
@@ -84,14 +84,14 @@ def _other_reads(features: Features) -> tuple[str, ...]:
 
 
 def _make_dfg() -> Any:
-    """The table of what metallic-roughness reflects, on the current device."""
+    """Return the table of directional albedo for metallic-roughness materials, on the current device."""
     table = wp.empty((DFG_SIZE, DFG_SIZE), dtype=wp.vec2)
     integrate_dfg(table)
     return table
 
 
 def make_distant_light(features: Features, arrays: Arrays) -> DistantLight:
-    """The environment as kernels of a stage read it."""
+    """Return the environment as the kernels of a stage read it."""
     config, names = features.distant, _other_reads(features)
     form = f"irradiance_{config.diffuse}"
     return filled(
@@ -107,7 +107,7 @@ def make_distant_light(features: Features, arrays: Arrays) -> DistantLight:
 
 
 def make_other_balls(features: Features, arrays: Arrays, names: Iterable[str]) -> OtherBalls:
-    """The light at the balls after the first, as far as these resources hold it."""
+    """Return the light at the balls after the first, from the named resources."""
     fields = {
         "probe_places": "places",
         "others_irradiance": features.irradiance,
@@ -121,7 +121,7 @@ def make_other_balls(features: Features, arrays: Arrays, names: Iterable[str]) -
 def find_receiver(
     config: RelightConfig, features: Features, arrays: Arrays, reads: Sequence[str], cells: ReceiverCells | None = None
 ) -> Receiver:
-    """The receiver as kernels read it, for a stage that reads these resources."""
+    """Return the receiver as kernels read it, for a stage that reads the named resources."""
     names = {"key_lights": "key_lights", "irradiance": features.irradiance, "emitters": "emitters"}
     known = {word: arrays[name] for word, name in names.items() if name in reads}
     others = make_other_balls(features, arrays, reads)
@@ -129,7 +129,7 @@ def find_receiver(
 
 
 def shade_config(features: Features) -> ShadeConfig:
-    """Return the configuration that shading a request's objects calls for."""
+    """Return the shading configuration that a request's objects need."""
     return ShadeConfig(
         distant=features.distant,
         lights=tuple(sorted({light_kind(light) for light in features.request.scene.lights})),
@@ -141,12 +141,12 @@ def shade_config(features: Features) -> ShadeConfig:
 
 
 def mirrored_shading(features: Features) -> ShadeConfig:
-    """The same in what balls and receivers mirror: without what surrounds the objects at close range."""
+    """Return the shading configuration of objects in reflections: without the near field."""
     return dataclasses.replace(shade_config(features), near_field=False, edge_samples=1)
 
 
 def relight_reads(features: Features) -> tuple[str, ...]:
-    """Return the resources that the method of ``relight`` reads of the environment and the receiver."""
+    """Return the resources of the environment and the receiver that the method of ``relight`` reads."""
     method = features.relight_method
     reads = ["pose", "lights", "objects"]
     measured = method in MEASURED
@@ -163,7 +163,7 @@ def relight_reads(features: Features) -> tuple[str, ...]:
 
 
 def relight_config(features: Features) -> RelightConfig:
-    """Return the configuration that relighting a request's receiver calls for."""
+    """Return the configuration that relighting a request's receiver needs."""
     method = features.relight_method
     return RelightConfig(
         "reflectance" if method in LOCAL else method,

@@ -1,4 +1,4 @@
-"""The environment as its readers last heard of it."""
+"""Copy of the environment whose contents change only with its version."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from typing import Any
 from warp_ar.stages.base import Arrays
 
 PUBLISHED = ("recover_published", "fill_published")
-"""Copies that the stage which writes ``environment`` makes on CPU whenever it says that it changed; the last first."""
+"""Copies that the writer of ``environment`` makes on CPU when it reports a change; the later stage's first."""
 
 
 def settled_environment(arrays: Arrays, device: Any) -> Any:
-    """The map that filters read: its contents change with the version of ``environment``, and only then.
+    """Return the map for filters: its contents change only with the version of ``environment``.
 
-    On CPU ``environment`` itself also moves within the tolerance that its readers are spared. A filter that rested
-    while nobody read it must give what it would have given then, not what it makes of a map that has moved on since. On
-    CUDA every new map is a new version.
+    On CPU ``environment`` itself also changes within the tolerance of which readers are not notified. A filter that
+    rested while nothing read it must give the result that it would have given then, and not that of a map that has
+    changed since. On CUDA every new map has a new version.
     """
     if device.is_cpu:
         for name in PUBLISHED:
