@@ -1,4 +1,4 @@
-"""Scene files and what they describe; how rays meet a scene; geometry and materials from files."""
+"""Scene files and their contents, intersection of rays with a scene, and geometry and materials from files."""
 
 from warp_ar.scene.calibration_file import load_calibration
 from warp_ar.scene.description import (

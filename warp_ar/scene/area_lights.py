@@ -1,7 +1,8 @@
-"""Objects that emit, as a table from which kernels draw places on them; see ``kernels/rays/area_lights.py``.
+"""Table of emitting objects, from which kernels sample points on them; see ``kernels/rays/area_lights.py``.
 
-A triangle's share of the table is its area times its mean emission. Where a picture says the emission, a twentieth of
-the shares goes by area alone: what the few places that are looked at here miss is still found, seldom.
+A triangle's probability is proportional to its area times its mean emission. Where a picture gives the emission, the
+share ``BY_AREA`` of the probability is proportional to area alone: bright texels that the few samples of the picture
+miss are then still sampled now and then.
 """
 
 from __future__ import annotations
@@ -23,12 +24,12 @@ from warp_ar.scene.textures import linear_texture, load_emission
 FloatArray = npt.NDArray[np.float64]
 
 BY_AREA: Final = 0.05
-"""Part of the shares that goes by area alone, where emission varies."""
+"""Share of the probability that is proportional to area alone, where emission varies within triangles."""
 _LUMINANCE: Final = np.array([0.2126, 0.7152, 0.0722])
 _GRID: Final = 6
-"""Places along a triangle's edge at which pictures are read."""
+"""Samples along a triangle's edge at which emission pictures are read."""
 _LARGEST: Final = 256
-"""Pixels along a picture's longer side, at most: the mean of a triangle asks for no more."""
+"""Largest size of a picture's longer side, pixels; enough for the mean over a triangle."""
 
 
 class AreaTable(NamedTuple):
@@ -37,18 +38,18 @@ class AreaTable(NamedTuple):
     lights: npt.NDArray[Any]
     """Records of ``structs.AreaLight``, one per object that emits."""
     faces: npt.NDArray[np.int32]
-    """Object, triangle (-1: a sphere), and whether only its front emits, (n, 3)."""
+    """Object index, triangle index (-1: a sphere), and 1 if only the front emits, (n, 3)."""
     shares: npt.NDArray[np.float32]
-    """Cumulative shares of the emitted power by face, (n,); the last is 1."""
+    """Cumulative distribution of emitted power over the rows of ``faces``, (n,); the last value is 1."""
 
 
 def emits(material: MeshMaterial) -> bool:
-    """Return whether a material sends out light of its own."""
+    """Return True if a material emits light."""
     return material.unlit or any(material.emission)
 
 
 def emits_light(item: Object) -> bool:
-    """Return whether an object is a light.
+    """Return True if an object emits light.
 
     Raises:
         SceneError: Its mesh cannot be read.
@@ -57,11 +58,11 @@ def emits_light(item: Object) -> bool:
 
 
 def make_area_table(objects: Sequence[Object], meshes: Sequence[Mesh | None]) -> AreaTable:
-    """The table of a scene's objects; empty where none emits.
+    """Return the table of a scene's emitting objects; it is empty if no object emits.
 
     Args:
-        objects: All of the scene.
-        meshes: What rays meet of each, None for a sphere.
+        objects: All virtual objects of the scene.
+        meshes: Mesh that rays intersect for each object, None for a sphere.
     """
     dtype = structs.struct_dtype(structs.AreaLight)
     lights: list[Any] = []
@@ -94,7 +95,7 @@ def make_area_table(objects: Sequence[Object], meshes: Sequence[Mesh | None]) ->
 
 
 def _varies(item: Object) -> bool:
-    """Return whether emission varies within triangles."""
+    """Return True if emission varies within a triangle of an object."""
     if isinstance(item.material, EmissiveMaterial):
         return item.material.image is not None
     return any(
@@ -104,7 +105,7 @@ def _varies(item: Object) -> bool:
 
 
 def _faces_of(item: Object, mesh: Mesh | None) -> tuple[Any, ...]:
-    """Areas (local), normals, mean emission, whether only the front emits, and numbers of an object's triangles."""
+    """Return areas (object space), normals, mean emission, front-only flags and indices of an object's triangles."""
     materials = materials_of(item).materials
     if mesh is None:
         area = 4.0 * np.pi * item.radius**2
@@ -134,7 +135,7 @@ def _constant(material: MeshMaterial) -> RGB:
 
 
 def _picture_means(item: Object, mesh: Mesh, material: MeshMaterial, mine: npt.NDArray[Any]) -> Any:
-    """Mean value of the picture that says what triangles emit, (m, 3); 1 where none does."""
+    """Return the mean value of the emission picture over each triangle, (m, 3); 1 where a triangle has no picture."""
     use = material.base if material.unlit else material.emissive
     if isinstance(item.material, EmissiveMaterial) and item.material.image is not None:
         picture, use = load_emission(item.material.image)[0], TextureUse(0, wrap=("clamp", "clamp"))

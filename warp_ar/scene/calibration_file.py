@@ -1,4 +1,4 @@
-"""Camera calibrations as OpenCV, ROS and the usual scripts write them."""
+"""Readers of camera calibrations in the formats of OpenCV, ROS, Kalibr, COLMAP and common scripts."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from warp_ar.files import bracket_depth, check_depth, indentation_depth, is_file
 from warp_ar.scene.description import Camera
 from warp_ar.scene.messages import LARGEST, MOST_PIXELS, SMALLEST, show_value
 
-# Keys as OpenCV's, ROS's, ArUco's and the usual Python scripts write them, but for case and underscores.
+# Names of keys in OpenCV, ROS, ArUco and common Python scripts, compared without case and underscores.
 _WIDTH: Final = ("image_width", "width", "w")
 _HEIGHT: Final = ("image_height", "height", "h")
 _SIZE: Final = ("image_size", "calib_image_dimensions", "resolution")
@@ -30,7 +30,7 @@ _DISTORTION: Final = (
 _TERMS: Final = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _MODEL: Final = ("distortion_model", "camera_model", "model", "camera_type", "projection_model")
 _NOT_UNDERSTOOD: Final = "dist|coef|radial|tangential|skew|^(xi|s[1-4]|tau[xy]?|mirrorparameters)$"
-"""Keys that would change where points are seen, unless they are 0."""
+"""Pattern of unsupported keys that change the projection; such a key is accepted only if its value is 0."""
 _PINHOLES: Final = (
     *("plumb_bob", "rational_polynomial", "radtan", "pinhole", "opencv", "perspective", "brown_conrady", "none", ""),
     *("simple_pinhole", "simple_radial", "radial", "full_opencv", "radial_tangential"),
@@ -50,11 +50,11 @@ _COLMAP: Final = {
     "OPENCV_FISHEYE": "fl_x fl_y cx cy k1 k2 k3 k4",
     "FULL_OPENCV": "fl_x fl_y cx cy k1 k2 p1 p2 k3 k4 k5 k6",
 }
-"""Parameters of COLMAP's models, in the order of its lists."""
+"""Parameters of COLMAP's camera models, in the order of its files."""
 WIDEST: Final = 80.0
-"""Degrees from the axis to which a fisheye's picture is followed; a pinhole's rays end at 90."""
+"""Largest angle from the axis, degrees, up to which a fisheye lens is converted; a pinhole's rays end at 90."""
 FISHEYE_ERROR: Final = 0.25
-"""Pixels by which the rational model may miss a fisheye's anywhere in the picture."""
+"""Largest error in pixels of the rational model that replaces a fisheye model, anywhere in the picture."""
 _EXPECTED: Final = "OpenCV's YAML, JSON or XML"
 
 
@@ -67,7 +67,7 @@ def load_calibration(path: str | Path, transfer: str | Path = "srgb") -> Camera:
 
     Args:
         path: The file.
-        transfer: Encoding of the camera's values, which such files do not hold.
+        transfer: Encoding of the camera's values, because calibration files do not state it.
 
     Raises:
         SceneError: Damaged; missing keys; several cameras; skew; other models; other keys of distortion; cameras of
@@ -104,7 +104,7 @@ def load_calibration(path: str | Path, transfer: str | Path = "srgb") -> Camera:
     for model in (str(tree[key]) for key in map(_plain_key, _MODEL) if key in tree):
         plain = re.sub("[- ]", "_", model.lower().removeprefix("distortion."))
         fisheye |= plain in _FISHEYES
-        unbent = plain == "inverse_brown_conrady" and not any(numbers(*_DISTORTION) or ())  # as a RealSense says
+        unbent = plain == "inverse_brown_conrady" and not any(numbers(*_DISTORTION) or ())  # RealSense: undistorted
         if plain not in (*_FISHEYES, *_PINHOLES) and not unbent:
             expected = ", ".join(filter(None, (*_PINHOLES, *_FISHEYES)))
             raise SceneError(f"{path}: camera model {model!r} is not understood; expected {expected}")
@@ -112,7 +112,7 @@ def load_calibration(path: str | Path, transfer: str | Path = "srgb") -> Camera:
     singles = [value for names in _SINGLE for value in numbers(*names) or []]
     if k is None or len(k) == 4:
         fx, fy, cx, cy = k or (singles if len(singles) == 4 else [math.nan] * 4)
-        middle = 0.5 if k is None and "flx" in tree else 0.0  # COLMAP's pixel centres lie at halves, so NeRF's do
+        middle = 0.5 if k is None and "flx" in tree else 0.0  # COLMAP puts pixel centres at halves, and so does NeRF
         k = None if math.isnan(fx) else [fx, 0.0, cx - middle, 0.0, fy, cy - middle, 0.0, 0.0, 1.0]
     if k is None or len(k) != 9 or not all(map(math.isfinite, k)):
         fail(_MATRIX[0], k, "expected a 3x3 matrix of finite numbers")
@@ -148,10 +148,10 @@ def load_calibration(path: str | Path, transfer: str | Path = "srgb") -> Camera:
 def _read_out(
     path: Path, tree: dict[str, Any], axis: str, side: int, focal: float, middle: float
 ) -> tuple[int, float, float]:
-    """Return side, focal length and middle along an axis of the pixels that ROS's camera_info says are read out.
+    """Return side, focal length and principal point along one axis, all in the pixels that ROS's camera_info delivers.
 
-    A region of interest of the sensor's pixels, then bins of them: pixel u of the sensor is (u + 1/2 - offset) / bin -
-    1/2 of the picture. Zeros say neither.
+    The camera reads out a region of interest of the sensor and then averages bins: column u of the sensor is column (u
+    + 1/2 - offset) / bin - 1/2 of the picture. An offset or bin of 0 means that there is none.
     """
     told = tree.get("roi")
     roi = told if isinstance(told, dict) else {}
@@ -168,11 +168,11 @@ def _read_out(
 def rational_of_fisheye(
     width: int, height: int, matrix: npt.NDArray[np.float64], terms: Sequence[float]
 ) -> tuple[float, ...]:
-    """Return OpenCV's k1 k2 p1 p2 k3 k4 k5 k6 that project as a fisheye does, over the whole picture.
+    """Return k1 k2 p1 p2 k3 k4 k5 k6 of OpenCV's rational model that approximates a fisheye in the whole picture.
 
-    A fisheye [KB06] puts a point at the angle t from the axis at f (t + k1 t^3 + k2 t^5 + k3 t^7 + k4 t^9). With r =
-    tan t, the radial factor (t + ...) / r is fitted by (1 + a1 r^2 + a2 r^4 + a3 r^6) / (1 + b1 r^2 + b2 r^4 + b3 r^6):
-    atan(r) / r has Pade approximants that converge for all r.
+    A fisheye model [KB06] projects a point at the angle t from the axis to the radius f (t + k1 t^3 + k2 t^5 + k3 t^7 +
+    k4 t^9). With r = tan t, the radial factor (t + ...) / r is fitted by (1 + a1 r^2 + a2 r^4 + a3 r^6) / (1 + b1 r^2 +
+    b2 r^4 + b3 r^6): atan(r) / r has Pade approximants that converge for all r.
 
     References:
         [KB06] J. Kannala and S. Brandt. A generic camera model and calibration method for conventional, wide-angle, and
@@ -185,19 +185,19 @@ def rational_of_fisheye(
         terms: k1 k2 k3 k4 of the fisheye.
 
     Raises:
-        SceneError: The picture looks farther from the axis than ``WIDEST`` (the message has a crop that does not), the
-            terms fold it over, or no rational model meets it within ``FISHEYE_ERROR``.
+        SceneError: The picture reaches farther from the axis than ``WIDEST`` (the message names a crop that does not),
+            the radius does not grow everywhere with the angle, or no rational model is within ``FISHEYE_ERROR`` of it.
     """
     corners = np.array([[x, y] for x in (-0.5, width - 0.5) for y in (-0.5, height - 0.5)])
     farthest = float(np.linalg.norm((corners - matrix[:2, 2]) / (matrix[0, 0], matrix[1, 1]), axis=1).max())
     theta = np.linspace(0.0, math.pi, 4001)[1:]
     turned = theta * (1.0 + sum(term * theta ** (2 * n + 2) for n, term in enumerate(terms)))
-    rising = int(np.argmin(np.append(np.diff(turned), -1.0) > 0.0)) + 1  # from there on the terms fold the picture over
+    rising = int(np.argmin(np.append(np.diff(turned), -1.0) > 0.0)) + 1  # the radius decreases beyond this angle
     theta, turned = theta[:rising], turned[:rising]
     count = int(np.searchsorted(turned, farthest)) + 1
     if count > rising or theta[count - 1] > math.radians(WIDEST):
         reach = f"{math.degrees(theta[min(count, rising) - 1]):.0f} degrees" + " and more" * (count > rising)
-        share = float(np.interp(math.radians(WIDEST - 2.0), theta, turned)) / farthest  # the fit is worst at the rim
+        share = float(np.interp(math.radians(WIDEST - 2.0), theta, turned)) / farthest  # largest at the border
         raise SceneError(
             f"the fisheye's picture reaches {reach} from its axis; expected {WIDEST:g} at most, which a pinhole can "
             f"follow: crop frames and calibration to {int(share * width)}x{int(share * height)} around the principal "
@@ -208,7 +208,7 @@ def rational_of_fisheye(
     wanted, square = turned / radius, radius**2
     powers = np.stack([square, square**2, square**3], 1)
     weight = np.ones(len(theta))
-    for _ in range(20):  # of the linearised equation, reweighted by its denominator
+    for _ in range(20):  # residuals of the linearised equation, weighted by the denominator
         rows = np.concatenate([powers, -wanted[:, None] * powers], 1) * (weight * radius)[:, None]
         scale = np.abs(rows).max(0)
         found = np.linalg.lstsq(rows / scale, (wanted - 1.0) * weight * radius, rcond=1e-15)[0] / scale
@@ -222,7 +222,7 @@ def rational_of_fisheye(
 
 
 def _read_tree(path: Path) -> dict[str, Any]:
-    """Return the keys of a calibration with numbers, texts, lists and maps."""
+    """Return the keys and values of a calibration file as numbers, texts, lists and maps."""
     text = read_text(path, SceneError, expected=_EXPECTED)
     cameras: dict[str, Any] = {}
     for line in text.splitlines() if path.suffix.lower() == ".txt" else ():
@@ -244,7 +244,7 @@ def _read_tree(path: Path) -> dict[str, Any]:
 
 
 def _by_opencv(path: Path, text: str) -> dict[str, Any]:
-    """Return what OpenCV reads, whose parsers call themselves at every level, and crash from some depth on."""
+    """Parse a calibration with OpenCV; deep nesting is refused first, because its recursive parsers crash on it."""
     start = text.lstrip()[:1]
     depth = tag_depth(text) if start == "<" else bracket_depth(text)
     if start not in ("<", "{", "["):
@@ -253,13 +253,13 @@ def _by_opencv(path: Path, text: str) -> dict[str, Any]:
     wrong = f"{path}: the calibration cannot be read; expected {_EXPECTED}"
     if "\0" in text or not start:
         raise SceneError(wrong)
-    if start not in "<{[%":  # Python's YAML does not indent lists, which OpenCV asks for
+    if start not in "<{[%":  # Python's YAML does not indent lists, but OpenCV requires it
         text = re.sub(r"(?m)^( *)- (?=[-+.\d\[])", r"\1 - ", text)
     try:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         tree = _plain(storage.root()) if storage.isOpened() else None
         storage.release()
-    except (cv2.error, SystemError) as error:  # SystemError: how its constructor reports a file that does not parse
+    except (cv2.error, SystemError) as error:  # OpenCV's constructor reports an unreadable file as SystemError
         raise SceneError(wrong) from error
     if not isinstance(tree, dict):
         raise SceneError(wrong)
@@ -267,7 +267,7 @@ def _by_opencv(path: Path, text: str) -> dict[str, Any]:
 
 
 def _plain(node: Any) -> Any:
-    """Return a node as maps, lists, numbers and texts."""
+    """Return an OpenCV file node as maps, lists, numbers and texts."""
     if node.isMap():
         return {key: _plain(node.getNode(key)) for key in node.keys()}  # noqa: SIM118
     if node.isSeq():
@@ -280,7 +280,10 @@ def _plain_key(key: str) -> str:
 
 
 def _flatten(value: Any) -> list[float]:
-    """Numbers of a matrix, of a map with ``data`` (ROS), of nested lists, or a single one; NaN for what is none."""
+    """Return the numbers of a matrix, a map with ``data`` (ROS), nested lists or a single value.
+
+    Other values become NaN.
+    """
     if isinstance(value, dict):
         return _flatten(value.get("data", ""))
     if isinstance(value, list):

@@ -1,7 +1,7 @@
-"""Parts of a scene: frozen dataclasses, one per section of a scene file.
+"""Frozen dataclasses of a scene, one per section of a scene file.
 
-Metres, degrees, linear RGB. The world is the marker's frame: origin at the marker's (or board's) centre, x right, y up
-the printed page, z out of the page.
+Units are metres and degrees; colours are linear RGB. The world frame is the marker's frame: origin at the centre of the
+marker or board, x to the right and y up on the printed page, z out of the page.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from warp_ar.scene.messages import MOST_PIXELS, SMALLEST
 FloatMatrix: TypeAlias = npt.NDArray[np.float64]
 
 SCHEMA: Final = 1
-"""The version of the format that this program reads."""
+"""Version of the scene file format that this program reads."""
 ORIGIN: Final[Vec3] = (0.0, 0.0, 0.0)
 NO_DISTORTION: Final = (0.0, 0.0, 0.0, 0.0, 0.0)
 SILVERED: Final = (0.85, 0.85, 0.85)
-"""Reflectance of a silvered ornament."""
+"""Reflectance of a silvered Christmas ball, linear RGB."""
 Size: TypeAlias = Annotated[tuple[float, ...], Key("metres", "[0.2, 0.1]", sizes=(), required=True)]
 MeshFile: TypeAlias = Annotated[Path | None, Key("metres inside", '"table.ply"', right="a mesh", required=True)]
 Intensity: TypeAlias = Annotated[float, Key("camera values", "2.2", low=0.0)]
@@ -42,7 +42,7 @@ Focal: TypeAlias = Annotated[float, Key("pixels", "640.0", low=SMALLEST)]
 
 @dataclasses.dataclass(frozen=True)
 class Camera(Checked):
-    """OpenCV's pinhole camera; pixel centres lie at integers."""
+    """Pinhole camera with OpenCV's lens distortion; pixel centres have integer coordinates."""
 
     width: Annotated[int, Key("pixels", "640", low=1, high=MOST_PIXELS)]
     """Width of the picture, pixels."""
@@ -66,33 +66,34 @@ class Camera(Checked):
 
     @classmethod
     def guessed(cls, width: int, height: int, field_of_view: float, transfer: str | Path = "srgb") -> Camera:
-        """A camera of which only the field of view is guessed.
+        """Return a camera of which only the field of view is given, with square pixels and a central principal point.
 
         Args:
             width: Width of the picture in pixels.
             height: Height of the picture in pixels.
-            field_of_view: Horizontal, degrees.
-            transfer: How its values were encoded.
+            field_of_view: Horizontal field of view in degrees.
+            transfer: Encoding of its values.
         """
         focal = 0.5 * width / math.tan(math.radians(0.5 * field_of_view))
         center = (0.5 * (width - 1), 0.5 * (height - 1))
         return cls(width, height, focal, focal, *center, transfer=transfer, field_of_view=field_of_view)
 
     def matrix(self) -> FloatMatrix:
-        """Camera matrix K, (3, 3), in pixels."""
+        """Return the camera matrix K, (3, 3), in pixels."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def scaled_to(self, width: int, height: int) -> Camera:
-        """The same camera with its picture resampled to another size.
+        """Return the camera for the same picture resampled to another size.
 
-        A pixel centre at x covers [x, x + 1) after a shift of one half, so cx' = (cx + 0.5) s - 0.5.
+        A pixel centre has integer coordinates, so the pixel's area begins at x - 1/2. Scaling by s therefore gives cx'
+        = (cx + 0.5) s - 0.5.
 
         Args:
             width: New width in pixels.
             height: New height in pixels.
 
         Raises:
-            SceneError: The new size has another aspect ratio, so that part of the picture would have been cut away.
+            SceneError: The new size has another aspect ratio: it is a crop, not a resampling.
         """
         if (width, height) == (self.width, self.height):
             return self
@@ -144,7 +145,7 @@ class SourceSpec(Checked):
 
 @dataclasses.dataclass(frozen=True)
 class CharucoBoard:
-    """Chessboard with markers in its white squares: ``"charuco 5x7 0.04 0.03"``."""
+    """Chessboard with a marker in each white square, written ``"charuco 5x7 0.04 0.03"`` in a scene file."""
 
     columns: int
     """Squares along x."""
@@ -155,16 +156,17 @@ class CharucoBoard:
     marker_length: float
     """Side of a marker in metres."""
     legacy: bool = False
-    """Layout of OpenCV before 4.6, as calib.io prints it: a board of an even number of rows begins with a marker."""
+    """True for the layout of OpenCV before 4.6, which calib.io prints: a board with an even number of rows begins with
+    a marker."""
 
     @property
     def marker_count(self) -> int:
-        """Number of markers, with the dictionary's ids from 0."""
+        """Return the number of markers; their ids are 0, 1, 2, ..."""
         return self.columns * self.rows // 2
 
     @property
     def size(self) -> tuple[float, float]:
-        """Width and height of the whole board in metres; the world's origin is its centre."""
+        """Return width and height of the whole board in metres; the world's origin is its centre."""
         return self.columns * self.square_length, self.rows * self.square_length
 
     def __str__(self) -> str:
@@ -174,7 +176,7 @@ class CharucoBoard:
 
 @dataclasses.dataclass(frozen=True)
 class GridBoard:
-    """Grid of markers with gaps: ``"grid 4x3 0.04 0.01"``."""
+    """Grid of markers with gaps between them, written ``"grid 4x3 0.04 0.01"`` in a scene file."""
 
     columns: int
     """Markers along x."""
@@ -187,12 +189,12 @@ class GridBoard:
 
     @property
     def marker_count(self) -> int:
-        """Number of markers, with the dictionary's ids from 0."""
+        """Return the number of markers; their ids are 0, 1, 2, ..."""
         return self.columns * self.rows
 
     @property
     def size(self) -> tuple[float, float]:
-        """Width and height from outer edge to outer edge in metres; the world's origin is the centre."""
+        """Return width and height between outer marker edges in metres; the world's origin is the centre."""
         pitch = self.marker_length + self.separation
         return self.columns * pitch - self.separation, self.rows * pitch - self.separation
 
@@ -202,27 +204,27 @@ class GridBoard:
 
 Board: TypeAlias = CharucoBoard | GridBoard
 SIDES: Final = {"plane": 2, "rect": 2, "box": 3}
-"""Numbers of ``size``, by shape."""
+"""Number of values that ``size`` needs, by shape."""
 
 
 def _check_sides(item: Proxy | Object | AreaLight, shape: str) -> None:
-    """Check the lengths of a shape that has some; more than it has are not looked at."""
+    """Check that ``size`` has as many positive lengths as a shape needs; further values are ignored."""
     count = SIDES.get(shape, 0)
     if len(item.size) < count or any(length < SMALLEST for length in item.size[:count]):  # NaN passes
         fail(item, "size", f"expected {count} lengths above 0, metres")
 
 
 INTRINSICS: Final = ("width", "height", "fx", "fy", "cx", "cy", "distortion")
-"""Keys of a camera's numbers."""
+"""Keys of ``[camera]`` that give the calibration as numbers."""
 
 
 TURNS: Final = (0, 90, 180, 270)
-"""Degrees by which a marker's print may be turned."""
+"""Allowed values of ``Marker.turn``, degrees."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Marker(Checked):
-    """The printed marker, or board of markers, that the world is fixed to."""
+    """Printed marker or board of markers whose frame is the world frame."""
 
     dictionary: Annotated[str, Key("-", '"DICT_APRILTAG_36h11"')] = "DICT_4X4_50"
     """OpenCV's name of the ArUco or AprilTag dictionary."""
@@ -242,7 +244,7 @@ class Marker(Checked):
         """Check all values."""
         if self.turn not in TURNS:
             fail(self, "turn", "expected 0, 90, 180 or 270 degrees")
-        if self.board is None:  # which has its own size
+        if self.board is None:  # a board has a size of its own
             super().__post_init__()
 
 
@@ -268,7 +270,7 @@ class Probe(Checked):
 
 @dataclasses.dataclass(frozen=True)
 class ProxyMaterial(Checked):
-    """Mirroring of a proxy's surface, beside its diffuse part; glTF's rough dielectric."""
+    """Specular reflection of a proxy, in addition to its diffuse reflection: glTF's rough dielectric."""
 
     roughness: Share = 0.1
     """glTF's roughness: 0 (mirror) to 1 (matt); a polished table has about 0.1."""
@@ -282,7 +284,7 @@ class ProxyMaterial(Checked):
 
 @dataclasses.dataclass(frozen=True)
 class Proxy(Checked):
-    """Simplified physical geometry: receives virtual light and shadow, and hides what is behind it."""
+    """Simplified physical geometry: it receives virtual light and shadow, and hides virtual objects behind it."""
 
     USES: ClassVar = {"plane": ("size",), "box": ("size",), "mesh": ("file",)}
 
@@ -311,10 +313,10 @@ class Proxy(Checked):
 
 @dataclasses.dataclass(frozen=True)
 class Animation(Checked):
-    """Motion of an object or a light; nothing moves by default.
+    """Motion of an object or light; the default is no motion.
 
-    At t seconds a body stands at R(t) (at - pivot) + pivot + sway sin(2 pi t / period), turned by R(t): ``turn`` t
-    degrees about the fixed x, then y, then z axis.
+    At t seconds the body's origin is at R(t) (at - pivot) + pivot + sway sin(2 pi t / period), and the body is rotated
+    by R(t). R(t) rotates by the angles ``turn`` t degrees about the fixed x, then y, then z axis.
     """
 
     turn: Annotated[Vec3, Key("degrees per second", "[0.0, 0.0, 30.0]")] = ORIGIN
@@ -327,11 +329,11 @@ class Animation(Checked):
     """Duration of one swing, seconds."""
 
     def rotation_at(self, seconds: float) -> FloatMatrix:
-        """R(t), (3, 3)."""
+        """Return the rotation R(t), (3, 3)."""
         return rotation_matrix([rate * seconds for rate in self.turn])
 
     def position_at(self, seconds: float, at: Vec3) -> FloatMatrix:
-        """Return the place of a body that starts at ``at``, (3,) in metres."""
+        """Return the position of a body at a time, (3,) in metres; ``at`` is its position without motion."""
         pivot = np.array(at if self.pivot is None else self.pivot)
         swing = np.array(self.sway) * math.sin(2.0 * math.pi * (seconds / self.period))
         position: FloatMatrix = self.rotation_at(seconds) @ (np.array(at) - pivot) + pivot + swing
@@ -343,7 +345,7 @@ Motion: TypeAlias = Annotated[Animation | None, Key("-", "{ sway = [0.05, 0.0, 0
 
 @dataclasses.dataclass(frozen=True)
 class Play(Checked):
-    """Playing of an animation of a glTF file's nodes."""
+    """Playback of a node animation of a glTF file."""
 
     animation: Annotated[str | int, Key("-", '"Open"')] = 0
     """Name of the animation, or its number from 0."""
@@ -359,7 +361,7 @@ class Play(Checked):
     """True to hold the pose of the start."""
 
     def time_at(self, seconds: float, duration: float) -> float:
-        """Time of the animation, ``seconds`` after the first frame; ``duration`` is that of its last key."""
+        """Return the animation's time ``seconds`` after the first frame; ``duration`` is the time of its last key."""
         passed = self.offset
         if not self.paused:
             passed += max((seconds - self.start) * self.speed, 0.0)
@@ -370,7 +372,10 @@ class Play(Checked):
 
 @dataclasses.dataclass(frozen=True)
 class Object(Checked):
-    """A virtual object; a point p of its shape stands at R (scale p) + at. Fields unused by its shape are zero."""
+    """Virtual object.
+
+    A point p of its shape is at R (scale p) + at in the world. Fields that its shape does not use are zero.
+    """
 
     USES: ClassVar = {
         "mesh": ("file",),
@@ -414,7 +419,7 @@ class Object(Checked):
     name: ObjectName = None
     """Name in Python: ``pipeline.objects["lamp"]``."""
     mesh: Mesh | None = dataclasses.field(default=None, repr=False)
-    """A mesh in memory instead of a file, as ``object_from_trimesh`` gives; a scene file cannot say it."""
+    """Mesh in memory instead of a file, as ``object_from_trimesh`` sets it; a scene file has no key for it."""
 
     def __post_init__(self) -> None:
         """Check all values."""
@@ -426,7 +431,7 @@ class Object(Checked):
         _check_sides(self, self.shape)
 
     def pose_at(self, seconds: float) -> tuple[FloatMatrix, FloatMatrix]:
-        """Rotation R (3, 3) and position (3,) in metres, ``seconds`` after the first frame."""
+        """Return the rotation R, (3, 3), and the position, (3,) in metres, ``seconds`` after the first frame."""
         rotation = rotation_matrix(self.rotate)
         if self.animate is None:
             return rotation, np.array(self.at)
@@ -435,10 +440,10 @@ class Object(Checked):
 
 @dataclasses.dataclass(frozen=True)
 class Light(Checked):
-    """A virtual light.
+    """Virtual light without visible surface.
 
-    A white Lambertian surface that faces a point light of intensity I at distance d has linear camera value
-    I / (pi (a + b d + c d^2)) with attenuation (a, b, c); one that faces a directional light has I / pi.
+    A white Lambertian surface that faces a point light of intensity I at distance d has linear camera value I / (pi (a
+    + b d + c d^2)) with attenuation (a, b, c); a surface that faces a directional light has I / pi.
     """
 
     USES: ClassVar = {
@@ -486,9 +491,9 @@ class Light(Checked):
             fail(self, "attenuation", f"is zero everywhere; {right}")
 
     def pose_at(self, seconds: float) -> tuple[FloatMatrix, FloatMatrix]:
-        """Position (3,) in metres and unit direction (3,) that the light travels, ``seconds`` after the first frame.
+        """Return position and unit direction of the light's rays, (3,) each, ``seconds`` after the first frame.
 
-        A point light has no direction and gets -z. So does a spot light that passes through its target.
+        The direction is -z for a point light, and for a spot light whose position coincides with its target.
         """
         position, direction = np.array(self.at), np.array(self.direction or (0.0, 0.0, -1.0))
         if self.animate is not None:
@@ -502,7 +507,7 @@ class Light(Checked):
 
 @dataclasses.dataclass(frozen=True)
 class AreaLight(Checked):
-    """A virtual light with an extent, which the picture shows: an object that emits."""
+    """Virtual light with a visible emitting surface."""
 
     USES: ClassVar = {
         "rect": ("at", "rotate", "size", "image", "two_sided", "name"),
@@ -544,7 +549,7 @@ class AreaLight(Checked):
         _check_sides(self, self.kind)
 
     def as_object(self) -> Object:
-        """The object that it is in a ``Scene``."""
+        """Return the emissive object that represents this light in a ``Scene``."""
         return Object(
             self.kind,
             radius=self.radius,
@@ -560,12 +565,13 @@ class AreaLight(Checked):
 
 
 LATLONG_AXES: Final = ("z-up", "blender", "y-up", "opengl")
-"""Axes of latlong maps; ``z-up`` is this program's own. ``light.latlong_axes`` says what they mean."""
+"""Names of axis conventions of latlong maps; ``z-up`` is the one used internally. ``light.latlong_axes`` defines
+them."""
 
 
 @dataclasses.dataclass(frozen=True)
 class CapturedLight(Checked):
-    """Light of the environment from a file instead of from a mirror ball in the frames."""
+    """Light of the environment, read from a file instead of from a mirror ball in the frames."""
 
     file: Annotated[Path, Key("-", '"light.exr"', right="a captured light (OpenEXR or HDR)")]
     """Latlong OpenEXR or Radiance HDR, by ``warp_ar.capture`` or another program."""
@@ -580,7 +586,7 @@ class CapturedLight(Checked):
 
 @dataclasses.dataclass(frozen=True)
 class PoseKeys:
-    """Keys of a file by which a ``PoseSpec`` is said, in one of four ways."""
+    """Keys of ``[pose]``, which give a ``PoseSpec`` in one of four ways."""
 
     R: Annotated[tuple[float, ...] | None, Key("-", "[1, 0, 0, 0, 0, -1, 0, 1, 0]", sizes=(9,))] = None
     """Rotation of camera_from_world, row by row; camera axes x right, y down, z forward."""
@@ -600,17 +606,19 @@ class PoseKeys:
 
 @dataclasses.dataclass(frozen=True)
 class PoseSpec:
-    """Pose of the camera, instead of what a marker says; ``camera_from_world``: x_camera = R x_world + t.
+    """Given poses of the camera, used instead of tracking a marker.
 
-    Axes of the camera are those of OpenCV and COLMAP: x right, y down, z forward.
+    ``camera_from_world`` maps x_world to R x_world + t.
+
+    The camera's axes are those of OpenCV and COLMAP: x right, y down, z forward.
     """
 
     poses: tuple[tuple[tuple[float, ...], Vec3], ...]
-    """(R as 9 numbers row by row, t in metres) of every frame, or one for all."""
+    """Pose of every frame, or a single pose for all frames: (R as 9 numbers row by row, t in metres)."""
     file: Path | None = None
-    """File that they were read from."""
+    """File that the poses were read from."""
     names: tuple[str, ...] = ()
-    """Names of the pictures that they are of; empty where the file has none."""
+    """File names of the pictures that the poses belong to; empty if the file has no names."""
 
     def __post_init__(self) -> None:
         """Check that all numbers are finite."""
@@ -619,7 +627,7 @@ class PoseSpec:
 
     @functools.cached_property
     def _places(self) -> dict[str, list[int]]:
-        """Numbers of the poses by the last part of their names, and by that without its suffix."""
+        """Map each picture's file name, with and without suffix, to the indices of its poses."""
         found: dict[str, list[int]] = {}
         for index, name in enumerate(map(PurePosixPath, self.names)):
             found.setdefault(f"/{name.name}", []).append(index)
@@ -627,7 +635,10 @@ class PoseSpec:
         return found
 
     def _index_of(self, name: str) -> int | None:
-        """Number of the pose of a picture: the one whose path agrees with most of its own, from the end on."""
+        """Return the index of the pose whose name shares the most trailing path components with a picture's path.
+
+        Return None if no pose, or more than one, fits best.
+        """
         path = PurePosixPath(name)
         indices = self._places.get(f"/{path.name}") or self._places.get(path.stem, [])
         folders = path.parts[-2::-1]
@@ -642,11 +653,11 @@ class PoseSpec:
         return best[-1]
 
     def at(self, index: int, name: str = "") -> tuple[FloatMatrix, FloatMatrix] | None:
-        """R (3, 3) and t (3,) of a frame; None where it has none.
+        """Return R, (3, 3), and t, (3,) in metres, of a frame; None if there is no pose for it.
 
         Args:
-            index: Of the frame in its clip, which counts where frames or poses have no names.
-            name: Path of its picture.
+            index: Index of the frame in its clip; used where frames or poses have no names.
+            name: Path of the frame's picture.
         """
         if name and self.names:
             place = self._index_of(name)
@@ -668,38 +679,38 @@ class Exposure(Checked):
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """All that a scene file says."""
+    """Complete contents of a scene file: camera, world marker, mirror balls, proxies, virtual objects and lights."""
 
     camera: Camera
-    """The camera that the frames come from."""
+    """Camera that took the frames."""
     schema: int = SCHEMA
     """Version of the format."""
     name: str = "scene"
-    """Name to show; the file's own if left out."""
+    """Display name; if omitted, the name of the scene file."""
     source: SourceSpec | None = None
-    """Source of frames, if the file says."""
+    """Source of frames, or None."""
     marker: Marker = Marker()
-    """Marker that fixes the world."""
+    """Printed marker or board whose frame is the world frame."""
     probes: tuple[Probe, ...] = ()
-    """Mirror balls that show the environment."""
+    """Mirror balls that reflect the environment."""
     proxies: tuple[Proxy, ...] = ()
-    """The physical objects that are modelled."""
+    """Modelled physical geometry."""
     objects: tuple[Object, ...] = ()
-    """Virtual objects; those that emit are lights."""
+    """Virtual objects; emissive ones act as lights."""
     lights: tuple[Light, ...] = ()
-    """Virtual lights that the picture does not show."""
+    """Virtual lights without visible surface."""
     captured: CapturedLight | None = None
-    """Light of the environment from a file; mirror balls are then objects like others."""
+    """Environment light from a file, or None. With a file, mirror balls are ordinary physical objects."""
     pose: PoseSpec | None = None
-    """Pose of the camera, if no marker tells."""
+    """Given poses of the camera, or None if the marker is tracked."""
     has_marker: bool = True
-    """True if a printed card lies at the origin; not where the file gives a pose and no marker."""
+    """True if a printed marker lies at the origin; False if the file gives poses and no marker."""
     exposure: Exposure = Exposure()
     """Simulated exposure."""
     path: Path | None = dataclasses.field(default=None, compare=False)
-    """The file that the scene was read from."""
+    """File that the scene was read from, or None."""
 
     @property
     def has_gloss(self) -> bool:
-        """Return whether a receiver mirrors what is virtual."""
+        """Return True if any proxy reflects virtual objects specularly."""
         return any(proxy.material is not None for proxy in self.proxies)

@@ -1,4 +1,4 @@
-"""Exposure and camera by a photograph's EXIF."""
+"""Exposure and focal length from a photograph's EXIF."""
 
 from __future__ import annotations
 
@@ -20,19 +20,20 @@ from warp_ar.pictures import check_picture, picture_size
 from warp_ar.scene.description import Camera
 
 FULL_FRAME_DIAGONAL: Final = math.hypot(36.0, 24.0)
-"""Millimetres: a focal length "in 35 mm film" gives the same angle across this diagonal."""
+"""Diagonal of 35 mm film in millimetres; a focal length "in 35 mm film" refers to the angle across this diagonal."""
 SENSOR_SHAPES: Final = (1.0, 4 / 3, 3 / 2, 16 / 9, 5 / 4, 18 / 9, 19.5 / 9, 20 / 9)
-"""Ratios of sides that cameras have; a picture of another one has been cut."""
+"""Aspect ratios of camera sensors; a picture with another ratio has been cropped."""
 SHAPE_TOLERANCE: Final = 0.012
-"""Relative: cameras round sides to multiples of 16."""
+"""Relative tolerance of aspect ratios, because cameras round sides to multiples of 16."""
 AGREEING: Final = 0.15
-"""Logarithm within which two focal lengths agree: the 35 mm equivalent is a whole number, and rounds by diagonals."""
+"""Largest difference of the logarithms of two focal lengths that agree. The 35 mm equivalent is rounded to a whole
+number, and cameras differ in which diagonal they use."""
 LEAST_SIDE: Final = 400
-"""Pixels along the shorter side below which a picture is a cut-out or a thumbnail."""
+"""Shorter side in pixels below which a picture is taken for a crop or a thumbnail."""
 _TURNED: Final = (5, 6, 7, 8)
 """EXIF orientations that exchange width and height."""
 
-# What Pillow has been seen to raise on damaged files; it does not document it.
+# Exceptions that Pillow was observed to raise on damaged files; it documents none.
 _READING_ERRORS: Final = (
     *(OSError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, MemoryError, SyntaxError),
     *(struct.error, Image.DecompressionBombError),
@@ -41,35 +42,41 @@ _READING_ERRORS: Final = (
 
 @dataclasses.dataclass(frozen=True)
 class PhotoInfo:
-    """EXIF of one photograph; None where it does not say."""
+    """EXIF data of one photograph; a field is None if its tag is missing."""
 
     width: int
     """Upright width in pixels."""
     height: int
     """Upright height in pixels."""
     seconds: float | None = None
-    """Exposure time."""
+    """Exposure time, seconds."""
     iso: float | None = None
-    """Sensitivity."""
+    """ISO sensitivity."""
     f_number: float | None = None
-    """Focal length over aperture."""
+    """f-number: focal length divided by aperture diameter."""
     focal_35mm: float | None = None
-    """Focal length in millimetres of a full-frame camera with the same view."""
+    """35 mm equivalent of the focal length, millimetres."""
     focal_pixels: float | None = None
-    """Focal length, pixels, from the sensor's resolution; None without it."""
+    """Focal length in pixels by the sensor's resolution; None if EXIF does not state the resolution."""
     model: str = ""
     """Name of the camera."""
 
     @property
     def exposure(self) -> float | None:
-        """T ISO / (100 N^2), seconds at ISO 100 and f/1: what the picture's brightness is proportional to."""
+        """Return T ISO / (100 N^2), the exposure in seconds at ISO 100 and f/1.
+
+        The picture's brightness is proportional to it.
+        """
         if self.seconds is None:
             return None
         return self.seconds * (self.iso or 100.0) / 100.0 / (self.f_number or 1.0) ** 2
 
     @property
     def is_whole(self) -> bool:
-        """Return whether the picture has the shape of a sensor: a cut-out's focal length in pixels is not known."""
+        """Return True if the picture has a sensor's aspect ratio.
+
+        A cropped picture's focal length in pixels is unknown.
+        """
         if min(self.width, self.height) < LEAST_SIDE:
             return False
         shape = max(self.width, self.height) / min(self.width, self.height)
@@ -77,23 +84,23 @@ class PhotoInfo:
 
     @property
     def by_35mm(self) -> float | None:
-        """Focal length in pixels by the equivalent for 35 mm film, across the diagonal."""
+        """Return the focal length in pixels by the 35 mm equivalent, which refers to the picture's diagonal."""
         if self.focal_35mm is None:
             return None
         return self.focal_35mm / FULL_FRAME_DIAGONAL * math.hypot(self.width, self.height)
 
     def focal_length(self) -> float | None:
-        """Focal length in pixels, None where EXIF does not tell or the picture was cut."""
+        """Return the focal length in pixels; None if EXIF does not give it or the picture was cropped."""
         if not self.is_whole:
             return None
         return self.by_35mm if self.focal_pixels is None or self.contradiction else self.focal_pixels
 
     @property
     def contradiction(self) -> str:
-        """Words on two tags that give different focal lengths; empty where they agree.
+        """Return a description of two tags that give different focal lengths; empty if they agree.
 
-        Programs that resize pictures rewrite the size that the sensor's resolution refers to; the equivalent for 35 mm
-        film does not depend on it.
+        Programs that resize pictures rewrite the size to which the sensor's resolution refers. The 35 mm equivalent
+        does not depend on that size.
         """
         film, pixels = self.by_35mm, self.focal_pixels
         if film is None or pixels is None or abs(math.log(film / pixels)) < AGREEING:
@@ -104,7 +111,7 @@ class PhotoInfo:
         )
 
     def camera(self, transfer: str | Path = "srgb") -> Camera | None:
-        """Pinhole camera with the axis through the picture's middle; None where the focal length is not known."""
+        """Return a pinhole camera with a central principal point; None if the focal length is unknown."""
         focal = self.focal_length()
         if focal is None:
             return None
@@ -113,7 +120,7 @@ class PhotoInfo:
 
 
 def read_exif(path: str | Path) -> PhotoInfo:
-    """EXIF of a photograph; pictures without any give their size alone.
+    """Read the EXIF data of a photograph; without EXIF only its size is set.
 
     Follows:
         orientation, exposure time, ISO, f-number; focal length by FocalPlaneXResolution or the 35 mm equivalent.
@@ -129,7 +136,7 @@ def read_exif(path: str | Path) -> PhotoInfo:
     check_picture(data, SceneError, f"{path}: the photograph")
     try:
         with Image.open(io.BytesIO(data)) as picture:
-            width, height = picture_size(data) or picture.size  # Pillow's own is that of a TIFF turned upright
+            width, height = picture_size(data) or picture.size  # Pillow turns TIFFs upright by itself
             first = picture.getexif()
             tags = {**first, **first.get_ifd(ExifTags.IFD.Exif)}
     except _READING_ERRORS as error:
@@ -156,10 +163,10 @@ def read_exif(path: str | Path) -> PhotoInfo:
 
 
 def camera_by_exif(path: Path, transfer: str | Path = "srgb") -> Camera:
-    """Camera of a photograph, or of the first one in a folder.
+    """Return the camera of a photograph, or of the first photograph in a folder.
 
     Raises:
-        SceneError: It has no focal length, or was cut.
+        SceneError: EXIF gives no focal length, or the picture was cropped.
     """
     if path.is_dir():
         endings = (".jpg", ".jpeg", ".tif", ".tiff", ".png")
@@ -179,7 +186,7 @@ def camera_by_exif(path: Path, transfer: str | Path = "srgb") -> Camera:
 
 
 def _number(tags: Mapping[int, Any], tag: int) -> float | None:
-    """First value of a tag as a number above 0."""
+    """Return the first value of a tag if it is a positive number, else None."""
     value = tags.get(tag)
     try:
         number = float(value[0] if isinstance(value, tuple) else value)  # type: ignore[arg-type]
@@ -189,7 +196,10 @@ def _number(tags: Mapping[int, Any], tag: int) -> float | None:
 
 
 def exposure_in_name(path: str | Path) -> float | None:
-    """Seconds that a file's name seems to tell: the last number n of ``d1_25.jpg`` or ``probe 1-4.png`` as 1 / n."""
+    """Return the exposure time in seconds that a file's name suggests.
+
+    It is 1 / n for the last number n of ``d1_25.jpg`` or ``probe 1-4.png``.
+    """
     numbers = re.findall(r"\d+", Path(path).stem)
     value = int(numbers[-1]) if numbers else 0
     return 1.0 / value if 1 <= value <= 100_000 else None

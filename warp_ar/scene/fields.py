@@ -1,8 +1,10 @@
-"""Keys of scene files: one declaration beside each field, by which files are read, checked, written and explained.
+"""Declarations of scene file keys.
 
-A dataclass of a section annotates its fields, ``radius: Annotated[float, Key("metres", "0.03", low=SMALLEST)]``. What a
-value is (a number, a list, a word, a path, a table) follows from the type. Constructors check what they are given by
-these declarations; readers of files let them, and say of what they refuse in which file and at which key it stands.
+Each stands at its dataclass field and drives reading, checking, writing and documentation.
+
+A section's dataclass annotates its fields, for example ``radius: Annotated[float, Key("metres", "0.03",
+low=SMALLEST)]``. The type decides the form of the value: a number, list, word, path or table. Constructors check their
+arguments against these declarations. Readers of files rely on that check and add the file and the key to its error.
 """
 
 from __future__ import annotations
@@ -21,57 +23,57 @@ from warp_ar.errors import SceneError
 from warp_ar.scene.messages import LARGEST, SMALLEST, nearest
 
 MOST: Final = 10**9
-"""Largest whole number without another bound."""
+"""Largest whole number that is accepted where no other bound is given."""
 _UNITS: Final = ("metres", "degrees", "pixels", "seconds", "frames per second")
-"""Units that messages name; the others are ranges, which are said anyway."""
+"""Units that error messages name; the other units are ranges, which the messages state anyway."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Key:
-    """A key of a scene file."""
+    """Declaration of a scene file key."""
 
     unit: str = "-"
-    """Unit of its value; a dash where it has none."""
+    """Unit of the value; a dash if it has none."""
     example: str = ""
-    """A value as TOML."""
+    """Example of a value, as TOML."""
     low: float = -LARGEST
-    """Least value of each number; ``SMALLEST`` reads "above 0"."""
+    """Smallest allowed value of each number; error messages show ``SMALLEST`` as "above 0"."""
     high: float = LARGEST
     """Largest value of each number."""
     sizes: tuple[int, ...] = (3,)
-    """Numbers of a list; empty: as many as the section's kind has, by ``sides``."""
+    """Allowed lengths of a list; empty: the length depends on the section's kind, by ``sides``."""
     right: str = ""
-    """Words for a text, or for what lies at a path."""
+    """Description of a valid text, or of the file expected at a path, for error messages."""
     words: tuple[str, ...] = ()
-    """Words that a text may be."""
+    """Allowed words of a text."""
     required: bool = False
-    """True if a file must give it wherever the section's kind uses it, though the field has a default."""
+    """True if a file must give the key wherever the section's kind uses it, even though the field has a default."""
     grey: bool = False
-    """True if one number may stand for a list of equal ones."""
+    """True if one number may replace a list of equal numbers."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Field:
-    """A field of a dataclass with its key."""
+    """Field of a dataclass together with its key."""
 
     name: str
     key: Key
     form: str
     """Form of the value: number, integer, flag, text, word, path, vector, color or table."""
     default: Any
-    """``dataclasses.MISSING`` where there is none."""
+    """Default value; ``dataclasses.MISSING`` if there is none."""
     words: tuple[str, ...] = ()
-    """Words that are allowed."""
+    """Allowed words."""
     optional: bool = False
     """True if the value may be None."""
     kinds: tuple[Any, ...] = ()
-    """Types of which a value may be, where it is no number, list or word."""
+    """Allowed types of a value that is no number, list or word."""
 
     def admit(self, value: Any) -> Any:
-        """Return a value as the field holds it: plain numbers, tuples in place of lists, paths in place of texts.
+        """Return a value in the form that the field stores: plain numbers, tuples for lists, paths for texts.
 
         Raises:
-            ValueError: It cannot be; the message says what would be right.
+            ValueError: The value is not allowed; the message describes allowed values.
         """
         if (value is None and self.optional) or (isinstance(value, str) and value in self.words):
             return value
@@ -92,10 +94,10 @@ class Field:
         raise ValueError(self._right(value))
 
     def _is_right(self, value: Any) -> bool:
-        """Return whether a number is within the key's bounds; one that is not finite is not."""
+        """Return True if a number is finite and within the key's bounds."""
         kinds: Any = (numbers.Integral, np.integer) if self.form == "integer" else (numbers.Real, np.generic)
         low, high = self._bounds()
-        # Compared before it is converted: an integer may be too large for a float.
+        # Compare before converting: an integer may be too large for a float.
         return isinstance(value, kinds) and not isinstance(value, bool) and bool(low <= value <= high)
 
     def _bounds(self) -> tuple[float, float]:
@@ -105,7 +107,7 @@ class Field:
         return low, high
 
     def _right(self, value: Any) -> str:
-        """Return words for what would be right in the place of a value."""
+        """Return a description of allowed values, for error messages."""
         key, words = self.key, " or ".join(f'"{word}"' for word in self.words)
         match self.form:
             case "word" if len(self.words) < 8:
@@ -136,7 +138,7 @@ _KNOWN: Final[dict[Any, dict[str, Field]]] = {}
 
 
 def fields_of(kind: Any) -> dict[str, Field]:
-    """Return the fields of a dataclass that are keys of a scene file, by name."""
+    """Return the fields of a dataclass that are scene file keys, by name."""
     if kind not in _KNOWN:
         hints = typing.get_type_hints(kind, include_extras=True)
         declared = {name: typing.get_args(hint) for name, hint in hints.items() if typing.get_origin(hint) is Annotated}
@@ -146,7 +148,7 @@ def fields_of(kind: Any) -> dict[str, Field]:
 
 
 def _field(name: str, default: Any, hint: Any, key: Key) -> Field:
-    """Return a field by its type and its key."""
+    """Return the ``Field`` of a dataclass field with its type and key."""
     parts = typing.get_args(hint) if typing.get_origin(hint) in (types.UnionType, typing.Union) else (hint,)
     words = key.words or sum((typing.get_args(part) for part in parts if typing.get_origin(part) is Literal), ())
     own = [part for part in parts if part is not type(None) and typing.get_origin(part) is not Literal]
@@ -160,23 +162,23 @@ def _field(name: str, default: Any, hint: Any, key: Key) -> Field:
 
 
 class FieldError(SceneError):
-    """A value of a dataclass cannot be."""
+    """Invalid value of a dataclass field."""
 
     key: str
-    """The field."""
+    """Name of the field."""
     right: str
-    """Words for what would be right."""
+    """Description of allowed values."""
 
 
 class Checked:
-    """A dataclass that checks what it is given against the keys of its fields.
+    """Base of dataclasses that check their values against the keys of their fields.
 
     Raises:
-        FieldError: A value cannot be.
+        FieldError: A value is not allowed.
     """
 
     USES: ClassVar[dict[str, tuple[str, ...]]] = {}
-    """Keys that only some kinds of it use, by the kind, which is its first field."""
+    """Keys that only some kinds of the section use, by kind; the kind is the dataclass's first field."""
 
     def __post_init__(self) -> None:
         """Check all values."""
@@ -194,12 +196,12 @@ class Checked:
 
 
 def not_used(uses: dict[str, tuple[str, ...]], kind: str) -> set[str]:
-    """Return the keys that other kinds use, but not this one."""
+    """Return the keys that a kind does not use but another kind does."""
     return {key for keys in uses.values() for key in keys} - set(uses[kind])
 
 
 def fail(item: object, key: str, right: str) -> NoReturn:
-    """Raise the error that names class, field, value and what would be right.
+    """Raise an error that names class, field, value and allowed values.
 
     Raises:
         FieldError: Always.

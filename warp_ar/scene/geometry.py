@@ -1,7 +1,7 @@
 """Triangle meshes, their vertex normals, and rotations.
 
-A mesh is in its own coordinates as a file has them, in metres. glTF says that +Y is up: such a mesh is turned to +Z
-when it is read, so that it stands on the receiver. The other formats say nothing, and are left as they are.
+A mesh stays in its file's coordinates, in metres. glTF defines +Y as up, so its meshes are rotated to +Z up when they
+are read. The other formats define no up axis and are not rotated.
 
 References:
     [TW98] Thuermer and Wuethrich, "Computing Vertex Normals from Polygonal Facets", J. of Graphics Tools 3(1), 1998.
@@ -23,14 +23,14 @@ FloatArray = npt.NDArray[np.float32]
 IntArray = npt.NDArray[np.int32]
 ByteArray = npt.NDArray[np.uint8]
 
-# A triangle whose doubled area is below this share of its longest edge squared has no direction worth the name: float32
-# vertices on one line come out at 1e-16 in float64, and the thinnest sliver that float32 can hold on purpose at 1e-7.
+# A triangle whose doubled area is below this share of its longest edge squared has no reliable normal: float32 vertices
+# on one line give 1e-16 in float64, and the thinnest sliver that float32 can represent gives 1e-7.
 _ZERO_AREA: Final = 1e-12
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles with unit vertex normals and, where the file has them, texture coordinates and a texture."""
+    """Triangle mesh with unit vertex normals and, if the file has them, texture coordinates, colours and materials."""
 
     vertices: FloatArray
     """Positions in metres, (n, 3)."""
@@ -39,25 +39,27 @@ class Mesh:
     normals: FloatArray
     """Unit vertex normals, (n, 3)."""
     uvs: FloatArray | None = None
-    """Texture coordinates, (n, 2): u to the right, v up the picture, (0, 0) at its bottom left corner; they repeat."""
+    """Texture coordinates, (n, 2): u to the right and v up in the picture, (0, 0) at its bottom left corner,
+    repeating."""
     uvs_second: FloatArray | None = None
     """Second set of texture coordinates, (n, 2)."""
     colors: FloatArray | None = None
-    """Factor of the base colour and of alpha, (n, 4), linear."""
+    """Factor of base colour and alpha at each vertex, (n, 4), linear."""
     tangents: FloatArray | None = None
-    """Directions in which u grows, (n, 4): a unit vector across the normal, and 1 or -1 for the side of v."""
+    """Tangents, (n, 4): unit vector in the direction of growing u, perpendicular to the normal, and 1 or -1 for the
+    sign of the bitangent."""
     triangle_materials: IntArray | None = None
-    """Index into ``materials`` of each triangle, (m,); None: all the first."""
+    """Index into ``materials`` of each triangle, (m,); None: all triangles have the first material."""
     materials: tuple[MeshMaterial, ...] = ()
-    """The file's own; none: it says nothing of how it looks."""
+    """Materials of the file; empty if the file has none."""
     images: tuple[ByteArray, ...] = ()
-    """Pictures that the materials name, each (h, w, 4) RGBA, row 0 at the top (v = 1)."""
+    """Pictures that the materials refer to, each (h, w, 4) RGBA, row 0 at the top (v = 1)."""
     notes: tuple[str, ...] = ()
-    """Parts of the file that are not shown, by name."""
+    """Names of contents of the file that are not shown."""
 
     @property
     def texture(self) -> ByteArray | None:
-        """Base colour of the first material that has a picture of it, (h, w, 3) RGB, sRGB-encoded."""
+        """Return the base colour picture of the first material that has one, (h, w, 3) RGB, sRGB-encoded."""
         for material in self.materials:
             if material.base is not None:
                 return self.images[material.base.image][..., :3]
@@ -65,18 +67,18 @@ class Mesh:
 
     @property
     def bounds(self) -> FloatArray:
-        """Lowest and highest corner of the axis-aligned box around the vertices in metres, (2, 3)."""
+        """Return the lowest and highest corner of the vertices' axis-aligned bounding box in metres, (2, 3)."""
         return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
 
 
 def rotation_matrix(rotate: Sequence[float]) -> npt.NDArray[np.float64]:
-    """Rotation about the fixed x, then the fixed y, then the fixed z axis: R = Rz Ry Rx.
+    """Return the rotation about the fixed x, then the fixed y, then the fixed z axis: R = Rz Ry Rx.
 
     Args:
         rotate: Angles about x, y and z in degrees.
 
     Returns:
-        The matrix R, (3, 3); a point p turns to R p.
+        The matrix R, (3, 3), which maps a point p to R p.
     """
     (cx, sx), (cy, sy), (cz, sz) = ((math.cos(a), math.sin(a)) for a in map(math.radians, rotate))
     return np.array(
@@ -89,7 +91,7 @@ def rotation_matrix(rotate: Sequence[float]) -> npt.NDArray[np.float64]:
 
 
 def quaternion_matrix(quaternion: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Rotation of a unit quaternion, x first, (3, 3)."""
+    """Return the rotation matrix, (3, 3), of a unit quaternion (x, y, z, w)."""
     x, y, z, w = quaternion
     return np.array(
         [
@@ -101,7 +103,7 @@ def quaternion_matrix(quaternion: npt.NDArray[np.float64]) -> npt.NDArray[np.flo
 
 
 def make_mesh(vertices: Any, faces: Any, normals: Any, uvs: Any = None, **others: Any) -> Mesh:
-    """A mesh of single-precision arrays that lie tightly in memory; ``others`` are further fields of ``Mesh``."""
+    """Return a mesh with contiguous single-precision arrays; ``others`` are further fields of ``Mesh``."""
 
     def single(values: Any) -> FloatArray | None:
         return None if values is None else np.ascontiguousarray(values, dtype=np.float32)
@@ -120,11 +122,12 @@ def make_mesh(vertices: Any, faces: Any, normals: Any, uvs: Any = None, **others
 
 
 def smooth_normals(vertices: npt.ArrayLike, faces: npt.ArrayLike) -> FloatArray:
-    """Vertex normals as the mean of the adjacent faces' normals, weighted by the corners' angles [TW98].
+    """Return vertex normals: means of the adjacent faces' normals, weighted by the faces' angles at the vertex [TW98].
 
-    Angles, unlike areas, do not depend on how a face is cut into triangles. Vertices at one position share one normal,
-    so that no seam of the texture shows in the shading. Triangles without area have no say. Where the faces around a
-    vertex cancel (a sheet with two sides), it takes the normal of one of them; a vertex of no face gets +z.
+    Unlike area weights, angle weights do not depend on how a polygon is cut into triangles. Vertices at the same
+    position share one normal, so texture seams do not show in the shading. Triangles without area are ignored. Where
+    the normals around a vertex cancel (a two-sided sheet), the vertex takes the normal of one face; a vertex without
+    faces gets +z.
 
     Args:
         vertices: Positions, (n, 3).
@@ -147,7 +150,7 @@ def smooth_normals(vertices: npt.ArrayLike, faces: npt.ArrayLike) -> FloatArray:
 
 
 def _face_normals(vertices: npt.ArrayLike, corners: npt.NDArray[np.int64]) -> tuple[Any, Any, Any]:
-    """Unit normals of triangles (0 of those without area), angles at their corners, and which have area."""
+    """Return unit normals of triangles (0 without area), corner angles, and a mask of triangles with area."""
     sides = np.asarray(vertices, dtype=np.float64)[corners]
     edges = np.roll(sides, -1, axis=1) - sides
     cross = np.cross(edges[:, 0], -edges[:, 2])
@@ -159,18 +162,21 @@ def _face_normals(vertices: npt.ArrayLike, corners: npt.NDArray[np.int64]) -> tu
 
 
 def _sums(group: npt.NDArray[np.int64], values: npt.NDArray[Any], count: int) -> npt.NDArray[np.float64]:
-    """Sums of vectors, (n, 3), of each of ``count`` groups."""
+    """Return the sum of vectors in each of ``count`` groups, (count, 3)."""
     return np.stack([np.bincount(group, values[:, axis], count) for axis in range(3)], axis=-1)
 
 
 def _unit_or(vectors: npt.NDArray[Any], fallback: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Vectors of length 1; others where they are too short for a direction: a sum of angles of 1e-6 is rounding."""
+    """Return the vectors normalized.
+
+    A vector shorter than 1e-6, which is rounding error, is replaced by its fallback.
+    """
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     return np.where(length > 1e-6, vectors / np.maximum(length, 1e-6), fallback)
 
 
 def _places(points: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
-    """Number of each point's position, the same for points at one position, (n,)."""
+    """Return an index for each point, (n,), that is equal for points at equal positions."""
     order = np.lexsort(points.T)
     fresh = np.any(np.diff(points[order], axis=0, prepend=np.nan) != 0.0, axis=1)
     place = np.empty(len(points), dtype=np.int64)
@@ -181,11 +187,11 @@ def _places(points: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
 def creased_normals(
     vertices: npt.ArrayLike, faces: npt.ArrayLike, crease: float
 ) -> tuple[npt.NDArray[np.int64], FloatArray]:
-    """Normals that are smooth but for edges where the surface turns by more than an angle.
+    """Return normals that are smooth except at edges where the surface turns by more than ``crease``.
 
-    The corners that meet at a position are joined across every edge that turns less; each group takes the mean of its
-    triangles' normals, weighted by the corners' angles as in :func:`smooth_normals`. A box comes out flat, a ball
-    round, a cylinder's rim sharp.
+    Corners at one position are joined across every edge that turns less than ``crease``. Each group of joined corners
+    takes the mean of its triangles' normals, weighted as in :func:`smooth_normals`. A box becomes flat, a ball smooth,
+    and a cylinder's rim sharp.
 
     Args:
         vertices: Positions, (n, 3).
@@ -193,7 +199,7 @@ def creased_normals(
         crease: Angle in degrees from which on an edge is sharp.
 
     Returns:
-        The vertex that each corner was, (3 m,), and its unit normal, (3 m, 3); corner k of face f is 3 f + k.
+        Original vertex of each corner, (3 m,), and unit normal of each corner, (3 m, 3); corner k of face f is 3 f + k.
     """
     corners = np.asarray(faces, dtype=np.int64)
     unit, angle, _ = _face_normals(vertices, corners)
@@ -204,7 +210,7 @@ def creased_normals(
     same = (ends[order][1:] == ends[order][:-1]).all(axis=1)
     first, second = order[:-1][same], order[1:][same]
     smooth = (unit[first // 3] * unit[second // 3]).sum(axis=1) > math.cos(math.radians(crease))
-    # Two triangles that are wound alike run along their edge in opposite ways.
+    # Two triangles of the same winding traverse their common edge in opposite directions.
     first, second = first[smooth], second[smooth]
     forward = place.ravel()[first] != place.ravel()[second]
 
@@ -223,7 +229,7 @@ def creased_normals(
 
 
 def _joined(count: int, first: npt.NDArray[np.int64], second: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Least member of the group that each of ``count`` items is in, where pairs belong together."""
+    """Return the smallest member of each item's group, (count,); the pairs ``first``, ``second`` share a group."""
     label = np.arange(count)
     while True:
         lowest = np.minimum(label[first], label[second])
@@ -241,11 +247,12 @@ def _joined(count: int, first: npt.NDArray[np.int64], second: npt.NDArray[np.int
 def tangent_frames(
     vertices: npt.ArrayLike, faces: npt.ArrayLike, normals: npt.ArrayLike, uvs: npt.ArrayLike
 ) -> tuple[npt.NDArray[np.int64], FloatArray]:
-    """Tangents for normal maps where a file has none: where u grows, averaged over a vertex's triangles by angle.
+    """Return tangents for normal maps: directions of growing u, averaged at each vertex by angle.
 
     With edges p1, p2 and their differences of texture coordinates (u1, v1), (u2, v2), the surface's derivative by u is
-    (v2 p1 - v1 p2) / (u1 v2 - u2 v1). A vertex whose triangles carry the picture and its mirror image has a frame for
-    each. A triangle whose texture coordinates span no area has no say; a vertex of none takes any direction.
+    (v2 p1 - v1 p2) / (u1 v2 - u2 v1). A vertex between triangles with the picture and its mirror image gets one frame
+    for each. Triangles whose texture coordinates span no area are ignored; a vertex that has only such triangles gets
+    an arbitrary tangent.
 
     Args:
         vertices: Positions, (n, 3).
@@ -254,7 +261,7 @@ def tangent_frames(
         uvs: Texture coordinates, (n, 2), v up.
 
     Returns:
-        The vertex that each corner was, (3 m,), and its frame as ``Mesh.tangents`` has it, (3 m, 4).
+        Original vertex of each corner, (3 m,), and tangent of each corner in the form of ``Mesh.tangents``, (3 m, 4).
     """
     points, texture = np.asarray(vertices, dtype=np.float64), np.asarray(uvs, dtype=np.float64)
     corners = np.asarray(faces, dtype=np.int64)

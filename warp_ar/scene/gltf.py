@@ -1,10 +1,10 @@
-"""glTF 2.0 and GLB: nodes, meshes, primitives, materials, pictures and animations.
+"""Reader of glTF 2.0 and GLB: nodes, meshes, primitives, materials, pictures and animations.
 
-Read here and not through trimesh, which drops samplers, texture transforms, the second set of texture coordinates,
-vertex colours beside a texture, and the strength of emission.
+trimesh is not used, because it drops samplers, texture transforms, the second set of texture coordinates, vertex
+colours of textured meshes, and the strength of emission.
 
 References:
-    Khronos, glTF 2.0 specification; 3.8 and 3.9 have materials, appendix A what is said of skins and morph targets.
+    Khronos, glTF 2.0 specification; sections 3.8 and 3.9 (materials), appendix A (skins and morph targets).
     KHR_texture_transform, KHR_materials_emissive_strength, KHR_materials_unlit, EXT_texture_webp.
 """
 
@@ -38,23 +38,23 @@ SUPPORTED: Final = (
     "KHR_texture_transform",
     "EXT_texture_webp",
 )
-"""Extensions that are followed."""
+"""Supported extensions."""
 
 _WRAPS: Final[dict[int, Wrap]] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 _NEAREST: Final = 9728
 _BRIGHTEST: Final = 1e6
-"""Largest radiance that a material may send out: exposure and encoding keep their digits."""
+"""Largest emitted radiance of a material; larger values would cost the exposure's and the encoding's precision."""
 
 
 class GltfMaterials:
-    """Reads the materials of one file, each once."""
+    """Reader of the materials of one file; each is read once."""
 
     def __init__(self, file: GltfFile, take_image: Callable[[int], int]) -> None:
-        """Read nothing yet.
+        """Store the file; read no material yet.
 
         Args:
             file: The file.
-            take_image: Gives the number in ``Mesh.images`` of an image of the file.
+            take_image: Function from an image index of the file to its index in ``Mesh.images``.
         """
         self._file, self._take_image = file, take_image
         self._materials, self._textures, self._samplers, self._images = (
@@ -63,10 +63,10 @@ class GltfMaterials:
         self._known: dict[int, MeshMaterial] = {}
 
     def read(self, index: object) -> MeshMaterial:
-        """A material by its number, as the file has it; None is glTF's default.
+        """Return the material with an index of the file; None gives glTF's default material.
 
         Raises:
-            SceneError: There is none, or it names a texture that is not there, or a factor is no number.
+            SceneError: The material or one of its textures does not exist, or a factor is no number.
         """
         if index is None:
             return self._material({}, "")
@@ -141,9 +141,9 @@ class GltfMaterials:
         )
 
     def _transform(self, item: dict[str, Any], label: str) -> tuple[float, ...]:
-        """KHR_texture_transform for coordinates whose v points up.
+        """Return the rows of KHR_texture_transform for texture coordinates whose v points up.
 
-        glTF's v runs down, and (u', v') = T R S (u, v). With w = 1 - v the rows are those of u' and 1 - v'.
+        glTF's v points down, and (u', v') = T R S (u, v). With w = 1 - v, the rows give u' and 1 - v'.
         """
         if not item:
             return IDENTITY
@@ -157,9 +157,9 @@ class GltfMaterials:
 
 
 _WEIGHTS: Final = "weights"
-"""Path of a channel that moves morph targets."""
+"""Target path of channels that animate morph weights."""
 _SHORTEST: Final = 1e-12
-"""Length of a quaternion that still is a direction."""
+"""Length below which a quaternion has no direction."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -167,18 +167,18 @@ class GltfAnimation:
     """One animation of a file."""
 
     samplers: Mapping[int, Mapping[str, Sampler]]
-    """Samplers by node, then by the animated property."""
+    """Samplers by node index, then by animated property."""
     weights: Mapping[int, Sampler]
-    """Samplers of morph weights, by the mesh's node."""
+    """Samplers of morph weights, by the index of the mesh's node."""
     duration: float
     """Time of the last key, in seconds."""
 
 
 def animation_names(file: GltfFile) -> list[str]:
-    """Names of a file's animations, by number; empty where one has none.
+    """Return the names of a file's animations in file order; an unnamed animation has an empty name.
 
     Raises:
-        SceneError: They are no list of objects.
+        SceneError: The file's ``animations`` is no list of objects.
     """
     return [str(item.get("name", ""))[:60] for item in file.objects("animations")]
 
@@ -206,7 +206,7 @@ def read_animation(file: GltfFile, wanted: str | int) -> GltfAnimation:
         if not isinstance(prop, str) or prop not in (*WIDTHS, _WEIGHTS):
             file.source.note(f"animated {str(prop)[:30]}")
             continue
-        if target.get("node") is None:  # said by an extension, if at all
+        if target.get("node") is None:  # an extension may name the target instead
             continue
         node = file.index(target["node"], count, f"{label} moves node")
         index = file.index(channel.get("sampler"), len(samplers), f"{label} has a channel of sampler")
@@ -261,37 +261,37 @@ Array = npt.NDArray[np.float64]
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _UP: Final = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
-"""Rotation from +Y up to +Z up."""
+"""Transform from +Y up to +Z up, (4, 4)."""
 _SAME_COLOR: Final = 2
-"""Codes by which profiles of sRGB itself change a picture."""
+"""Largest change of 8-bit codes by an ICC profile that counts as sRGB itself."""
 _MOST_IMAGES: Final = 4
-"""Largest number of pixels of all pictures together, in pictures of the largest size."""
+"""Most pixels of all pictures of a file together, as a multiple of the largest picture."""
 _MOST_PLACES: Final = 20_000
-"""Nodes of a file, and primitives that they place, at most."""
+"""Most nodes of a file, and most placed primitives."""
 _COMPRESSED: Final = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
 
 
 Bending: TypeAlias = Callable[[float], MeshPart | None]
-"""Function that gives a part at a time of the animation, with the same faces."""
+"""Function from the animation's time in seconds to a deformed part with the same faces, or None."""
 _Bones: TypeAlias = Callable[[float], Array]
-"""Function that gives the transform of each vertex at a time, (n, 4, 4), to +Z up."""
+"""Function from the animation's time in seconds to the transform of each vertex, (n, 4, 4), including +Z up."""
 
 
 @dataclasses.dataclass
 class GltfContents:
-    """Contents of a file, in its world turned to +Z up."""
+    """Contents of a glTF file in its world, rotated to +Z up."""
 
     placed: list[tuple[int, MeshPart, Bending | None]]
-    """Triangles, a part for each primitive and place: the number of the anchor that it hangs on, and in whose
-    coordinates it is (-1: in the world); the part; and its bending (None: it is rigid)."""
+    """Primitives, one entry for each place: index of the anchor in whose coordinates the triangles are (-1: the world),
+    the triangles, and their deformation by skins or morph targets (None: rigid)."""
     anchors: tuple[Anchor, ...] = ()
-    """Nodes that the animation moves."""
+    """Animated nodes."""
     duration: float = 0.0
     """Duration of the animation, seconds."""
 
     @property
     def parts(self) -> list[MeshPart]:
-        """Return all triangles."""
+        """Return the triangles of all primitives."""
         return [part for _, part, _ in self.placed]
 
 
@@ -308,9 +308,9 @@ def load_gltf(source: MeshSource, *, animation: str | int | None = None, memory:
 
     Args:
         source: The file.
-        animation: Name or number of the animation that is to move it; None: all stands as at the start.
-        memory: Whether it is what trimesh made of a mesh in memory: axes stay, colours of vertices are sRGB-encoded,
-            and where it has no normals, edges of ``CREASE`` degrees are sharp.
+        animation: Name or index of the animation to play; None: the nodes keep the file's static transforms.
+        memory: True if trimesh exported the file from a mesh in memory: axes are not rotated, vertex colours are
+            sRGB-encoded, and without normals, edges that turn by more than ``CREASE`` degrees are sharp.
 
     Raises:
         SceneError: Damaged; meshes compressed by Draco or meshopt.
@@ -320,18 +320,18 @@ def load_gltf(source: MeshSource, *, animation: str | int | None = None, memory:
 
 @dataclasses.dataclass(frozen=True)
 class _Place:
-    """Place of a node."""
+    """Transforms of a node."""
 
     world: Array
-    """In the file's world as it starts, (4, 4)."""
+    """Transform to the file's world at time 0, (4, 4)."""
     below: Array
-    """Below its anchor, or in the world turned to +Z up, (4, 4)."""
+    """Transform to the coordinates of its anchor, or without anchor to the world rotated to +Z up, (4, 4)."""
     carrier: int = -1
-    """Number of the anchor that it hangs on; -1: none."""
+    """Index of the nearest animated node at or above it; -1: none."""
 
 
 class _Reader:
-    """Walks one file."""
+    """Reader of one file's scene graph."""
 
     def __init__(self, source: MeshSource, *, memory: bool) -> None:
         self._source, self._file, self._memory = source, GltfFile(source), memory
@@ -345,7 +345,7 @@ class _Reader:
         self._places: dict[int, _Place] = {}
 
     def contents(self, animation: str | int | None) -> GltfContents:
-        """All that the scene shows."""
+        """Return all contents of the scene."""
         self._look_at_extensions()
         if animation is None and animation_names(self._file):
             self._source.note("animations (an object's key play names one)")
@@ -366,7 +366,7 @@ class _Reader:
         placed = []
         for node, (index, place) in zip(shown, self._places.items(), strict=True):
             if "mesh" in node:
-                # A skinned mesh stands where its joints are, whatever its own node says.
+                # The joints alone place a skinned mesh; its own node's transform is ignored.
                 place = place if "skin" not in node else _Place(place.world, self._up @ place.world)
                 found = self._mesh(node, place.below, moves.weights.get(index))
                 placed += [(place.carrier, part, bend) for part, bend in found]
@@ -379,7 +379,8 @@ class _Reader:
         for name in required:
             if name in _COMPRESSED:
                 self._file.fail(f"it is compressed with {name}; save it without compression")
-        # A file should list all that it uses; what a material has and the list lacks is left out as well.
+        # A file should list all extensions that it uses; extensions of materials that it does not list are noted as
+        # well.
         own = [item.get("extensions") for item in self._file.objects("materials")]
         found = [name for table in own if isinstance(table, dict) for name in table]
         for name in dict.fromkeys(str(name)[:60] for name in [*used, *required, *found]):
@@ -389,7 +390,7 @@ class _Reader:
     # ---- nodes ---------------------------------------------------------------------------------------------------
 
     def _place_nodes(self, moves: GltfAnimation) -> None:
-        """Find where every node of the scene that is shown stands, and what hangs on those that move."""
+        """Compute the transforms of all nodes of the scene, and the animated nodes above them."""
         scenes, count = self._file.objects("scenes"), len(self._nodes)
         below = [
             self._file.indices(node.get("children"), count, f"a child of node {index} is")
@@ -430,11 +431,11 @@ class _Reader:
     def _local(self, node: dict[str, Any], index: int) -> Array:
         if "matrix" in node:
             return self._numbers(node, index, "matrix", *[0.0] * 16).reshape(4, 4).T
-        with np.errstate(invalid="ignore", over="ignore"):  # the caller asks whether it is finite
+        with np.errstate(invalid="ignore", over="ignore"):  # the caller checks that it is finite
             return self._track(node, index).transform_at(0.0)
 
     def _track(self, node: dict[str, Any], index: int) -> NodeTrack:
-        """A node's translation, rotation and scale."""
+        """Return the track of a node's translation, rotation and scale."""
         rotation = self._numbers(node, index, "rotation", 0.0, 0.0, 0.0, 1.0)
         length = float(np.sqrt((rotation * rotation).sum()))
         if not 0.0 < length < np.inf:
@@ -447,13 +448,13 @@ class _Reader:
     def _mesh(
         self, node: dict[str, Any], transform: Array, weights: Sampler | None
     ) -> Iterator[tuple[MeshPart, Bending | None]]:
-        """Yield the primitives of a node at time 0, placed by ``transform`` or their joints, and what bends them."""
+        """Yield a node's primitives at time 0, placed by ``transform`` or joints, each with its deformation."""
         number = node["mesh"]
         for primitive in self._file.objects("primitives", self._meshes[number]):
             if primitive.get("mode", _TRIANGLES) not in (_TRIANGLES, _STRIP, _FAN):
                 self._source.note("points and lines")
                 continue
-            # The same triangles may stand at thousands of nodes.
+            # Thousands of nodes may share the same triangles.
             alike = "weights" not in node
             key = (number, id(primitive))
             if not alike or key not in self._primitives:
@@ -540,7 +541,7 @@ class _Reader:
         vertices: Array,
         normals: Array | None,
     ) -> tuple[Array, Array | None]:
-        """Vertices moved by morph targets at the weights that the file starts with."""
+        """Return vertices and normals displaced by morph targets with the file's initial weights."""
         targets = self._file.objects("targets", primitive)
         weights = node.get("weights", mesh.get("weights"))
         if not targets or not isinstance(weights, list):
@@ -553,7 +554,7 @@ class _Reader:
         return vertices, normals
 
     def _delta(self, target: dict[str, Any], name: str, count: int) -> Array:
-        """Return what a morph target adds to an attribute of so many vertices, (count, 3), zeros without one."""
+        """Return the displacement of an attribute by a morph target, (count, 3); zeros if the target has none."""
         if name not in target:
             return np.zeros((count, 3))
         delta = self._file.array(target[name], f"{name} of a morph target", 3)
@@ -562,7 +563,7 @@ class _Reader:
         return np.asarray(delta, dtype=np.float64)
 
     def _morph(self, primitive: dict[str, Any], part: MeshPart, weights: Sampler) -> Bending | None:
-        """Return a function from a time to the part at its weights; None: it has no morph targets."""
+        """Return a function from a time to the part displaced by its morph targets; None if it has none."""
         targets, attributes = self._file.objects("targets", primitive), primitive["attributes"]
         targets = targets[: weights.at(0.0).size]
         if not targets:
@@ -576,7 +577,7 @@ class _Reader:
         def morph(seconds: float) -> MeshPart:
             weight = weights.at(seconds)[: len(targets)]
             placed = (vertices + np.tensordot(weight, deltas, 1))[where]
-            if normals is None:  # every corner is a vertex of its own
+            if normals is None:  # no vertex is shared between triangles
                 turned = creased_normals(placed, part.faces, 0.0)[1].astype(np.float64)
             else:
                 turned = unit_or((normals + np.tensordot(weight, turns, 1))[where], part.normals)
@@ -585,7 +586,7 @@ class _Reader:
         return morph
 
     def _bones(self, node: dict[str, Any], primitive: dict[str, Any]) -> tuple[_Bones | None, bool]:
-        """Transforms of the vertices by the joints, and whether these move; None: nothing says which joints."""
+        """Return the transforms of the vertices by the joints, and True if the joints move; None without a skin."""
         number = self._file.index(node["skin"], len(self._skins), "a node's skin is")
         skin, attributes = self._skins[number], primitive["attributes"]
         joints = self._file.indices(skin.get("joints"), len(self._nodes), "a joint of a skin is node")
@@ -643,11 +644,11 @@ class _Reader:
 def _bend(
     part: MeshPart, morph: Bending | None, bones: _Bones | None, transform: Array, seconds: float
 ) -> MeshPart | None:
-    """A primitive at a time: bent by its morph targets, then placed by its joints or its node."""
+    """Return a primitive at a time: displaced by its morph targets, then placed by its joints or its node."""
     part = part if morph is None else morph(seconds) or part
     return part.moved(transform) if bones is None else part.bent(bones(seconds))
 
 
 def _upward(uvs: Array | None) -> Array | None:
-    """Texture coordinates with v up the picture; glTF's runs down."""
+    """Return texture coordinates with v pointing up; glTF's v points down."""
     return None if uvs is None else uvs * np.array([1.0, -1.0]) + np.array([0.0, 1.0])

@@ -1,4 +1,4 @@
-"""The JSON and the numbers of a glTF file: every index, count and size is checked before it is used."""
+"""JSON header and binary data of a glTF file; every index, count and size is checked before use."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _WIDTHS: Final = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 
 
 class GltfFile:
-    """A glTF or GLB file."""
+    """Checked access to a glTF or GLB file."""
 
     def __init__(self, source: MeshSource) -> None:
         """Read the header and the buffers.
@@ -36,7 +36,7 @@ class GltfFile:
             source: The file.
 
         Raises:
-            SceneError: Something is missing, too large, or not as glTF has it. So do all methods.
+            SceneError: The file is incomplete, too large, or violates glTF. All methods raise it likewise.
         """
         self.source = source
         path, data = source.path, source.data
@@ -65,43 +65,43 @@ class GltfFile:
         self._known: dict[int, npt.NDArray[Any]] = {}
 
     def fail(self, what: str) -> NoReturn:
-        """Say that the mesh cannot be read.
+        """Raise an error that the mesh cannot be read.
 
         Raises:
-            SceneError: Always, because of ``what``.
+            SceneError: Always; ``what`` is the reason.
         """
         raise SceneError(f"{self.source.path}: the mesh cannot be read: {what}")
 
     # ---- values of the header ------------------------------------------------------------------------------------
 
     def objects(self, key: str, parent: dict[str, Any] | None = None) -> list[dict[str, Any]]:
-        """Return a list of objects of the header, or of an object in it; empty where there is none."""
+        """Return a list of objects of the header, or of ``parent``; empty if the key is missing."""
         value = (self.header if parent is None else parent).get(key, [])
         if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
             self.fail(f"{key} is no list of objects")
         return value
 
     def table(self, parent: dict[str, Any], key: str, label: str) -> dict[str, Any]:
-        """Return an object within another; empty where there is none."""
+        """Return the object under a key of ``parent``; empty if the key is missing."""
         value = parent.get(key)
         if value is not None and not isinstance(value, dict):
             self.fail(f"{label} has {key} {str(value)[:30]!r}, which is no object")
         return value or {}
 
     def index(self, value: object, count: int, what: str) -> int:
-        """Return a number of something of which there are ``count``."""
+        """Return ``value`` if it is an index into ``count`` items."""
         if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < count:
             self.fail(f"{what} {str(value)[:20]}; there are {count}, counted from 0")
         return value
 
     def indices(self, value: object, count: int, what: str) -> list[int]:
-        """Return a list of such numbers; empty where there is none."""
+        """Return ``value`` if it is a list of indices into ``count`` items; empty if it is missing."""
         if value is not None and not isinstance(value, list):
             self.fail(f"{what} {str(value)[:30]!r}; a list of numbers is right")
         return [self.index(entry, count, what) for entry in value or []]
 
     def whole(self, item: dict[str, Any], key: str, label: str) -> int:
-        """Return a whole number from 0 on, which is the default."""
+        """Return a whole number that is not negative; 0 if the key is missing."""
         value = item.get(key, 0)
         if isinstance(value, bool) or not isinstance(value, int) or value < 0:
             self.fail(f"{label} has {key} {str(value)[:20]!r}, no whole number from 0 on")
@@ -110,7 +110,7 @@ class GltfFile:
     def number(
         self, item: dict[str, Any], key: str, default: float, high: float, label: str, *, low: float = 0.0
     ) -> float:
-        """Return a number, brought within its range."""
+        """Return a number, clamped to its range."""
         value = item.get(key, default)
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
             self.fail(f"{label} has {key} {str(value)[:30]!r}, which is no finite number")
@@ -121,7 +121,7 @@ class GltfFile:
     def numbers(
         self, item: dict[str, Any], key: str, default: tuple[float, ...], high: float, label: str, *, low: float = 0.0
     ) -> tuple[float, ...]:
-        """Return as many numbers as the default has."""
+        """Return as many numbers as ``default`` has, each clamped to its range."""
         value = item.get(key, default)
         if not isinstance(value, list | tuple) or len(value) != len(default):
             self.fail(f"{label} has {key} {str(value)[:30]!r}; a list of {len(default)} numbers is right")
@@ -130,7 +130,7 @@ class GltfFile:
     # ---- bytes ---------------------------------------------------------------------------------------------------
 
     def _split_glb(self, data: bytes) -> tuple[bytes, bytes]:
-        """JSON and binary chunk."""
+        """Return the JSON chunk and the binary chunk of a GLB."""
         if len(data) < 20 or data[:4] != b"glTF":
             self.fail("no GLB file, or cut off")
         parts: dict[int, bytes] = {}
@@ -158,7 +158,7 @@ class GltfFile:
             raise SceneError(f"{self.source.path}: the mesh cannot be read: a URI holds no base64 ({error})") from error
 
     def image(self, index: int) -> bytes:
-        """Return the file of a picture that the file holds or names, looked at by its header."""
+        """Return the bytes of an embedded or referenced picture."""
         item = self.objects("images")[index]
         if "bufferView" in item:
             data = bytes(self._view_bytes(item["bufferView"], f"image {index}")[0])
@@ -168,7 +168,7 @@ class GltfFile:
         return data
 
     def _view_bytes(self, number: object, what: str) -> tuple[memoryview, int]:
-        """Return the bytes of a buffer view, and its stride; 0: none."""
+        """Return the bytes of a buffer view and its stride; a stride of 0 means that it gives none."""
         views = self.objects("bufferViews")
         item = views[self.index(number, len(views), f"{what} lies in buffer view")]
         label = f"buffer view {number}"
@@ -181,15 +181,15 @@ class GltfFile:
     # ---- arrays --------------------------------------------------------------------------------------------------
 
     def array(self, index: object, what: str, *widths: int) -> npt.NDArray[Any]:
-        """Return the elements of an accessor: integers as they are unless they are normalized, else float64.
+        """Return the elements of an accessor as float64; integers that are not normalized stay integers.
 
         Args:
-            index: Its number, as the file has it.
-            what: What it is, for messages.
-            widths: Numbers per element that are right.
+            index: Index of the accessor in the file.
+            what: Description of the data, for messages.
+            widths: Allowed numbers of components per element.
 
         Returns:
-            (count, width).
+            Elements, (count, width).
         """
         number = self.index(index, len(self._accessors), f"{what} is accessor")
         if number not in self._known:
@@ -213,12 +213,12 @@ class GltfFile:
         if dtype.kind == "f":
             return values.astype(np.float64)
         if accessor.get("normalized") is True:
-            # Signed ones are symmetric: -128 and -127 are both -1.
+            # Signed integers map symmetrically: both -128 and -127 become -1.
             return np.maximum(values / float(np.iinfo(dtype).max), -1.0)
         return values
 
     def _elements(self, item: dict[str, Any], count: int, dtype: Any, width: int, label: str) -> npt.NDArray[Any]:
-        """Return elements of the buffer view that an accessor names, packed or with a stride."""
+        """Return the elements of an accessor's buffer view, packed or with a stride."""
         data, stride = self._view_bytes(item.get("bufferView"), label)
         offset, size = self.whole(item, "byteOffset", label), dtype.itemsize * width
         stride = stride or size
@@ -232,7 +232,7 @@ class GltfFile:
         return values
 
     def _overlay(self, values: npt.NDArray[Any], sparse: dict[str, Any], label: str) -> npt.NDArray[Any]:
-        """Return elements with a few put in place of others."""
+        """Return the elements with those of a sparse accessor replaced."""
         label = f"the sparse part of {label}"
         where, other = self.table(sparse, "indices", label), self.table(sparse, "values", label)
         count, kind = self.whole(sparse, "count", label), where.get("componentType")

@@ -1,4 +1,7 @@
-"""Kinds of shape, material and light of a scene: what arrays and kernels are made for, but no numbers."""
+"""Kinds of shapes, materials and lights of a scene, which decide the kernels and arrays to make.
+
+Numbers are left out.
+"""
 
 from __future__ import annotations
 
@@ -22,29 +25,32 @@ _MODELS: Final[dict[type, int]] = {
     scenes.MetallicRoughnessMaterial: structs.METALLIC_ROUGHNESS,
     scenes.MirrorMaterial: structs.MIRROR,
 }
-# Planes whose normals have a larger cosine, 2.6 degrees, send each other less than a hundredth of their light.
+# Planes whose normals have a larger cosine (an angle below 2.6 degrees) exchange less than a hundredth of their light.
 _ONE_WAY: Final = 0.999
 
 
 def shape_kind(item: scenes.Object | scenes.Proxy) -> int:
-    """Kind of ``structs.Shape`` that an object or proxy becomes; what has no kind of its own becomes a fine mesh."""
+    """Return the kind of ``structs.Shape`` of an object or proxy.
+
+    Shapes without analytic intersection become meshes.
+    """
     if isinstance(item, scenes.Object) and mesh_key(item) is not None:
         return int(structs.MESH)
     return int(_SHAPES[item.shape])
 
 
 def light_kind(light: scenes.Light) -> int:
-    """Kind of ``structs.Light`` that a light becomes."""
+    """Return the kind of ``structs.Light`` of a light."""
     return int(_LIGHTS[light.kind])
 
 
 def has_sized_lights(scene: scenes.Scene) -> bool:
-    """Return whether any virtual light has a radius, and so a soft shadow."""
+    """Return True if any virtual light has a radius and thus a soft shadow."""
     return any(light.radius > 0.0 for light in scene.lights)
 
 
 def trace_config(scene: scenes.Scene) -> TraceConfig:
-    """Return the kinds of shape that the rays of ``scene`` can meet, and whether triangles must be asked for more."""
+    """Return the kinds of shapes that rays can meet in ``scene``, and if hits need per-triangle data."""
     made_of = [materials_of(item) for item in scene.objects]
     return TraceConfig(
         objects=tuple(sorted({shape_kind(item) for item in scene.objects})),
@@ -55,12 +61,15 @@ def trace_config(scene: scenes.Scene) -> TraceConfig:
 
 
 def material_model(material: MeshMaterial) -> int:
-    """Model of ``structs.Material`` that a material becomes."""
+    """Return the model of ``structs.Material`` of a material."""
     return _MODELS[type(material.surface)]
 
 
 def skeleton(scene: scenes.Scene) -> tuple[tuple[str, Any], ...]:
-    """Return what arrays and kernels are made for, each by its name; scenes that share it differ in numbers alone."""
+    """Return all properties that decide kernels and array sizes, by name.
+
+    Scenes with equal skeletons differ in numbers only.
+    """
     whole = ("camera", "marker", "has_marker", "pose", "captured", "probes", "proxies")
     parts = [(name, getattr(scene, name)) for name in whole]
     parts += [("the number of objects", len(scene.objects)), ("the number of lights", len(scene.lights))]
@@ -81,15 +90,18 @@ def skeleton(scene: scenes.Scene) -> tuple[tuple[str, Any], ...]:
 
 
 def difference(before: scenes.Scene, after: scenes.Scene) -> str:
-    """Return the name of a part by which the skeletons of two scenes differ; empty where they are the same."""
-    pairs = zip(skeleton(before), skeleton(after), strict=False)  # where numbers differ, so does an earlier part
+    """Return the name of the first property in which the skeletons of two scenes differ; empty if they are equal."""
+    pairs = zip(skeleton(before), skeleton(after), strict=False)  # if lengths differ, so does an earlier part
     return next((name for (name, old), (_, new) in pairs if old != new), "")
 
 
 def proxies_face(scene: scenes.Scene) -> bool:
-    """Return whether proxies' light can reach a proxy: not of one plane or box, or planes that look one way."""
+    """Return True if light from one proxy can reach a proxy.
+
+    A single plane or box, and planes with one normal, exchange none.
+    """
     if any(proxy.shape == "mesh" for proxy in scene.proxies):
-        return True  # which may face itself
+        return True  # a mesh may face itself
     normals = [rotation_matrix(proxy.rotate)[:, 2] for proxy in scene.proxies if proxy.shape == "plane"]
     turned = any(float(a @ b) < _ONE_WAY for a in normals for b in normals)
     return len(scene.proxies) > 1 and (len(normals) < len(scene.proxies) or turned)

@@ -1,7 +1,8 @@
-"""Reflection models of virtual objects, as scene files name them, and materials that a mesh file brings.
+"""Reflection models of virtual objects in scene files, and materials of mesh files.
 
-glTF's core material is the model of the latter, one per group of triangles; what OBJ's material libraries and vertex
-colours say is put into the same form. Pictures lie beside the mesh (``Mesh.images``), a material names them by number.
+Materials of mesh files have the form of glTF's core material, one per group of triangles; OBJ's material libraries and
+vertex colours are converted to it. Pictures are stored with the mesh (``Mesh.images``), and a material refers to them
+by index.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from warp_ar.scene.fields import COLOR, LIGHT_COLOR, Checked, Key, Share
 
 RGB: TypeAlias = tuple[float, float, float]
 Color: TypeAlias = RGB | Path
-"""Linear RGB, or the path of a texture (sRGB-encoded picture)."""
+"""Linear RGB, or the path of an sRGB-encoded picture."""
 Tint: TypeAlias = Annotated[Color, COLOR]
 
 
@@ -31,13 +32,13 @@ class PhongMaterial(Checked):
 
     @property
     def base_color(self) -> Color:
-        """Diffuse reflectance, under the other models' name."""
+        """Return the diffuse reflectance, under the name that the other models use."""
         return self.diffuse
 
 
 @dataclasses.dataclass(frozen=True)
 class MetallicRoughnessMaterial(Checked):
-    """glTF's BRDF: GGX with alpha = roughness squared, F0 = 0.04 for what is no metal."""
+    """glTF's BRDF: GGX with alpha = roughness squared, and F0 = 0.04 for non-metals."""
 
     base_color: Tint = (0.8, 0.8, 0.8)
     """Diffuse reflectance of a non-metal or F0 of a metal, linear RGB."""
@@ -65,7 +66,7 @@ class MirrorMaterial(Checked):
 
 @dataclasses.dataclass(frozen=True)
 class EmissiveMaterial(Checked):
-    """Emits alike in all directions and reflects nothing."""
+    """Surface that emits equally in all directions and reflects nothing."""
 
     color: Annotated[RGB, LIGHT_COLOR] = (1.0, 1.0, 1.0)
     """Factor per channel, linear RGB."""
@@ -79,7 +80,7 @@ class EmissiveMaterial(Checked):
 
 @dataclasses.dataclass(frozen=True)
 class FileMaterial:
-    """The materials that the mesh's file brings; matt white where it brings none."""
+    """Materials of the mesh's file; matt white if the file has none."""
 
 
 Material: TypeAlias = (
@@ -103,19 +104,19 @@ Wrap: TypeAlias = Literal["repeat", "clamp", "mirror"]
 """Continuation of a picture beyond its border."""
 
 IDENTITY: Final = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
-"""Unchanged texture coordinates."""
+"""Transform that leaves texture coordinates unchanged."""
 
 
 @dataclasses.dataclass(frozen=True)
 class TextureUse:
-    """A picture, how it is read, and where it lies on the surface."""
+    """Use of a picture as a texture: its sampling and its placement on the surface."""
 
     image: int
     """Index into ``Mesh.images``."""
     uv_set: int = 0
     """Set of texture coordinates: 0 ``Mesh.uvs``, 1 ``Mesh.uvs_second``."""
     transform: tuple[float, ...] = IDENTITY
-    """Rows (a, b, c), (d, e, f): the picture is read at (a u + b v + c, d u + e v + f), v up the picture."""
+    """Rows (a, b, c), (d, e, f): the picture is sampled at (a u + b v + c, d u + e v + f), v pointing up."""
     wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")
     """Continuation beyond the border along u and v."""
     nearest: bool = False
@@ -127,53 +128,53 @@ _CHALK: Final = LambertMaterial()
 
 @dataclasses.dataclass(frozen=True)
 class MeshMaterial:
-    """Appearance of a group of triangles; each texture is multiplied by the constant of its name."""
+    """Appearance of a group of triangles; each texture multiplies the constant of the same name."""
 
     surface: Material = _CHALK
-    """The reflection model and its constants; never ``FileMaterial``."""
+    """Reflection model with its constants; never a ``FileMaterial``."""
     name: str = ""
-    """The file's name for it."""
+    """Name in the file."""
     alpha: Literal["opaque", "mask", "blend"] = "opaque"
-    """Effect of alpha: none; a cut below ``cutoff``; or the share of points that are shown."""
+    """Use of alpha: ignored; a cut-out below ``cutoff``; or the fraction of the surface that is shown."""
     opacity: float = 1.0
     """Constant factor of alpha."""
     cutoff: float = 0.5
-    """Least alpha that a mask shows."""
+    """Smallest alpha that a mask shows."""
     double_sided: bool = True
-    """True if triangles are seen from behind."""
+    """True if the back of triangles is visible."""
     unlit: bool = False
-    """True if the base colour is shown unlit; 1 clips."""
+    """True if the base colour is shown as radiance, without lighting; 1 clips."""
     emission: RGB = (0.0, 0.0, 0.0)
     """Emitted radiance, camera values."""
     base: TextureUse | None = None
-    """RGB, sRGB-encoded, multiplies the first colour; A multiplies ``opacity``."""
+    """Base colour texture: RGB, sRGB-encoded, multiplies the base colour; A multiplies ``opacity``."""
     specular: TextureUse | None = None
-    """RGB, sRGB-encoded, multiplies Phong's specular colour."""
+    """Specular texture: RGB, sRGB-encoded, multiplies Phong's specular colour."""
     metallic_roughness: TextureUse | None = None
-    """Linear: G multiplies roughness, B metallic."""
+    """Linear texture: G multiplies roughness, B multiplies metallic."""
     normal: TextureUse | None = None
-    """Normal in the tangent frame, 0.5 + 0.5 n, linear."""
+    """Normal map in the tangent frame, stored as 0.5 + 0.5 n, linear."""
     normal_scale: float = 1.0
     """Factor of the normal's first two components."""
     occlusion: TextureUse | None = None
-    """Linear R: share of the environment's light that reaches a point."""
+    """Linear texture: R is the share of the environment's light that reaches a point."""
     occlusion_strength: float = 1.0
     """Strength of the occlusion, 0 to 1."""
     emissive: TextureUse | None = None
-    """RGB, sRGB-encoded, multiplies ``emission``."""
+    """Emission texture: RGB, sRGB-encoded, multiplies ``emission``."""
     roughness_span: tuple[float, float] = (1.0, 1.0)
-    """Least and largest factor of the texture on roughness."""
+    """Smallest and largest value of the texture's roughness factor."""
     metallic_span: tuple[float, float] = (1.0, 1.0)
-    """Least and largest factor of the texture on metallic."""
+    """Smallest and largest value of the texture's metallic factor."""
 
     @property
     def textures(self) -> tuple[TextureUse, ...]:
-        """All its textures."""
+        """Return all textures of the material."""
         found = (self.base, self.specular, self.metallic_roughness, self.normal, self.occlusion, self.emissive)
         return tuple(use for use in found if use is not None)
 
     @property
     def plain(self) -> bool:
-        """Return whether the surface's constants alone describe it."""
+        """Return True if the surface's constants alone describe the material."""
         dark = not any(self.emission)
         return not self.textures and self.alpha == "opaque" and self.double_sided and not self.unlit and dark

@@ -1,4 +1,4 @@
-"""Meshes from files and from trimesh, still or moved by an animation of the file."""
+"""Meshes from files and from trimesh, static or moved by an animation of the file."""
 
 from __future__ import annotations
 
@@ -25,29 +25,29 @@ from warp_ar.scene.node_animation import Anchor, MovingMesh, MovingPart, part_tr
 from warp_ar.scene.polygon_files import READERS
 
 MESH_SUFFIXES: Final = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
-"""Mesh files that :func:`load_mesh` reads."""
+"""Suffixes of mesh files that :func:`load_mesh` reads."""
 
 GLTF_SUFFIXES: Final = (".glb", ".gltf")
-"""Those of glTF."""
+"""Suffixes of glTF files."""
 
 _DAMAGES: Final = (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError, MemoryError)
-"""Errors that readers raise on damaged files, beside their own."""
+"""Errors that readers raise on damaged files, in addition to their own."""
 MOST_PARTS: Final = 256
-"""Parts that an animation moves: each is a shape of its own, and a ray asks all of them."""
+"""Largest number of animated parts; each is a shape of its own, and every ray tests all of them."""
 
 
 def load_mesh(path: str | Path) -> Mesh:
     """Read a mesh file: PLY, OBJ with its MTL, glTF or GLB, STL, OFF.
 
-    All parts of a file are joined, placed as its scene graph says; every triangle keeps its material. Vertex normals
-    are the file's. Where it has none they are flat (glTF says so), smooth but for edges that turn more than ``CREASE``
-    (OBJ, STL, OFF), or :func:`smooth_normals` (PLY, the format of scans).
+    All parts of a file are joined, placed by its scene graph; every triangle keeps its material. Vertex normals are
+    those of the file. Without normals they are flat (as glTF requires), smooth except at edges that turn more than
+    ``CREASE`` (OBJ, STL, OFF), or :func:`smooth_normals` (PLY, the format of scans).
 
     Args:
-        path: The file; its suffix tells the format.
+        path: The file; its suffix determines the format.
 
     Returns:
-        The mesh in the file's own units; of glTF turned from +Y up to +Z up, of others in the file's own axes.
+        The mesh in the file's units. glTF is rotated from +Y up to +Z up; other formats keep the file's axes.
 
     Raises:
         SceneError: The file or a texture that it names is missing, damaged or of another format, or the mesh holds no
@@ -58,7 +58,7 @@ def load_mesh(path: str | Path) -> Mesh:
 
 
 def files_beside(path: Path) -> dict[str, bytes]:
-    """The files that a mesh file names (materials, buffers, textures), by the names that it has for them.
+    """Return the contents of the files that a mesh file refers to (materials, buffers, textures), by their names in it.
 
     Raises:
         SceneError: As :func:`load_mesh`.
@@ -82,7 +82,7 @@ def load_moving_mesh(path: Path, animation: str | int) -> MovingMesh:
 
 
 def animations_of(path: Path) -> list[str]:
-    """Names of a glTF file's animations, by number; empty where one has none.
+    """Return the names of a glTF file's animations in file order; an unnamed animation has an empty name.
 
     Raises:
         SceneError: As :func:`load_mesh`.
@@ -93,7 +93,7 @@ def animations_of(path: Path) -> list[str]:
 
 
 def _load(path: Path) -> tuple[Mesh, MeshSource]:
-    """A mesh, and what it was read from."""
+    """Return the mesh of a file and its source."""
     contents, source = _read_file(path)
     with _said_in_words(path):
         return join_parts(source, contents.parts), source
@@ -101,7 +101,7 @@ def _load(path: Path) -> tuple[Mesh, MeshSource]:
 
 @contextlib.contextmanager
 def _said_in_words(path: Path) -> Iterator[None]:
-    """Turn what readers raise on damaged files into a SceneError."""
+    """Turn errors that readers raise on damaged files into a SceneError."""
     try:
         yield
     except SceneError:
@@ -112,14 +112,14 @@ def _said_in_words(path: Path) -> Iterator[None]:
 
 
 def _read_file(path: Path, animation: str | int | None = None) -> tuple[GltfContents, MeshSource]:
-    """Parts of a file, one or more, and what they were read from."""
+    """Return the contents of a file, with at least one part, and its source."""
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
         raise SceneError(f"{path}: unknown mesh format {path.suffix!r}; use one of {', '.join(MESH_SUFFIXES)}")
     if not is_file(path):
         raise SceneError(f"{path}: no such mesh file")
     source = MeshSource(path, read_bytes(path, "mesh_bytes", SceneError))
-    # What is not finite is named when it is looked through.
+    # Values that are not finite are reported by the check of each part.
     with _said_in_words(path), np.errstate(all="ignore"):
         if suffix in GLTF_SUFFIXES:
             contents = load_gltf(source, animation=animation)
@@ -131,7 +131,7 @@ def _read_file(path: Path, animation: str | int | None = None) -> tuple[GltfCont
 
 
 def mesh_from_trimesh(source: Any) -> Mesh:
-    """The mesh of a ``trimesh.Trimesh`` or ``trimesh.Scene`` in memory, with its colours or materials, as GLB has them.
+    """Return the mesh of a ``trimesh.Trimesh`` or ``trimesh.Scene`` in memory, by way of trimesh's GLB export.
 
     Args:
         source: The object; its axes and units stay as they are.
@@ -153,7 +153,7 @@ def mesh_from_trimesh(source: Any) -> Mesh:
                 continue
             mesh = scene.geometry[name].copy(include_cache=True)
             if mesh.visual.kind == "face":
-                mesh.unmerge_vertices()  # GLB has colours of vertices alone
+                mesh.unmerge_vertices()  # GLB stores colours at vertices only
             if isinstance(getattr(mesh.visual, "material", None), trimesh.visual.material.SimpleMaterial):
                 mesh.visual.material = mesh.visual.material.to_pbr()
                 mesh.visual.material.metallicFactor = 0.0
@@ -165,14 +165,14 @@ def mesh_from_trimesh(source: Any) -> Mesh:
 
 
 def moving_mesh(source: MeshSource, contents: GltfContents) -> MovingMesh:
-    """One mesh for all that stands still, and one for every moving node that triangles hang on.
+    """Return one mesh of all static triangles, and one mesh for every animated node that has triangles.
 
     Args:
         source: The file.
-        contents: Of the file, with an animation.
+        contents: Contents of the file, read with an animation.
 
     Raises:
-        SceneError: More than ``MOST_PARTS`` nodes move, or a vertex lies too far off.
+        SceneError: More than ``MOST_PARTS`` nodes move, or a vertex is too far from the origin.
     """
 
     def moves_as(one: tuple[int, MeshPart, Bending | None]) -> tuple[int, bool]:
@@ -198,7 +198,7 @@ def moving_mesh(source: MeshSource, contents: GltfContents) -> MovingMesh:
 
 
 def _with_materials_of(whole: Mesh, mesh: Mesh) -> Mesh:
-    """A mesh that is a part of another one, with all of that one's materials and pictures."""
+    """Return a mesh, which is a part of ``whole``, with all materials and pictures of ``whole``."""
     numbers = None
     if len(whole.materials) > 1:
         own = np.array([whole.materials.index(one) for one in mesh.materials or (MeshMaterial(),)], np.int32)
@@ -208,12 +208,12 @@ def _with_materials_of(whole: Mesh, mesh: Mesh) -> Mesh:
 
 
 def _bent(mesh: Mesh, bends: list[Bending], seconds: float) -> Mesh:
-    """A mesh whose primitives are bent as they are at a time of the animation."""
+    """Return a mesh whose primitives are deformed for a time of the animation."""
     parts = [part for bend in bends if (part := bend(seconds)) is not None]
     vertices, normals = (
         np.concatenate([getattr(part, name) for part in parts]).astype(np.float32) for name in ("vertices", "normals")
     )
-    # A damaged skin may place vertices so far out that their squares overflow single precision.
+    # A damaged skin may place vertices so far away that their squares overflow single precision.
     vertices = np.clip(np.nan_to_num(vertices), -LARGEST, LARGEST)
     tangents = filled(parts, [part.tangents for part in parts], (1.0, 0.0, 0.0, 1.0))
     own = None if tangents is None else tangents.astype(np.float32)
@@ -221,7 +221,7 @@ def _bent(mesh: Mesh, bends: list[Bending], seconds: float) -> Mesh:
 
 
 def _used(anchors: tuple[Anchor, ...], carriers: list[int]) -> tuple[tuple[Anchor, ...], dict[int, int]]:
-    """The anchors that triangles hang on, and those above them; their new numbers by the old."""
+    """Return the anchors that have triangles and their ancestors, and their new indices by the old ones."""
     needed: set[int] = set()
     for carrier in carriers:
         number = carrier
@@ -234,6 +234,6 @@ def _used(anchors: tuple[Anchor, ...], carriers: list[int]) -> tuple[tuple[Ancho
 
 
 def _at_rest(part: MeshPart, transform: npt.NDArray[np.float64]) -> MeshPart:
-    """A part where it stands at time 0; a node may have no size at first: what hangs on it then is a point."""
+    """Return a part at its place at time 0; if its node has zero scale then, the part collapses to a point."""
     point = np.tile(transform[:3, 3], (len(part.vertices), 1))
     return part.moved(transform) or dataclasses.replace(part, vertices=point)

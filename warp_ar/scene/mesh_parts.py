@@ -1,4 +1,4 @@
-"""Parts of a mesh file, checked, placed and joined into one mesh with a material per triangle."""
+"""Parts of a mesh file: checked, placed, and joined into one mesh with a material per triangle."""
 
 from __future__ import annotations
 
@@ -16,19 +16,20 @@ from warp_ar.scene.mesh_source import MeshSource
 Array = npt.NDArray[np.float64]
 
 LARGEST: Final = 1e12
-"""Below this the square of a position, and what a scene's scale may do to it, stay in single precision."""
+"""Bound on coordinates within which the square of a position, also after a scene's scaling, is finite in single
+precision."""
 
 
 @dataclasses.dataclass(frozen=True)
 class MeshPart:
-    """Triangles of one material."""
+    """Triangles that share one material."""
 
     vertices: Array
-    """(n, 3)."""
+    """Positions, (n, 3)."""
     faces: npt.NDArray[np.int64]
-    """(m, 3)."""
+    """Vertex indices, (m, 3)."""
     normals: Array
-    """Unit, (n, 3)."""
+    """Unit normals, (n, 3)."""
     uvs: tuple[Array | None, Array | None] = (None, None)
     """Two sets of texture coordinates, (n, 2), v up."""
     colors: Array | None = None
@@ -36,9 +37,9 @@ class MeshPart:
     tangents: Array | None = None
     """Tangents like ``Mesh.tangents``, (n, 4)."""
     material: MeshMaterial | None = None
-    """None: the file says nothing."""
+    """Material; None if the file gives none."""
     source: npt.NDArray[np.int64] | None = None
-    """Index of the vertex that each was made from, (n,); None: they are the same."""
+    """Index of the file's vertex that each vertex was copied from, (n,); None: the same index."""
 
     @classmethod
     def checked(
@@ -54,18 +55,18 @@ class MeshPart:
         material: MeshMaterial | None = None,
         crease: float | None = None,
     ) -> MeshPart:
-        """A part of numbers from a file.
+        """Return a part made from unchecked numbers of a file.
 
         Args:
             label: The file, for messages.
             vertices: (n, 3).
             faces: (m, 3).
-            normals: (n, 3) of any length; those that are none are computed, all where this is None.
+            normals: (n, 3) of any length; invalid normals, or all if None, are computed.
             uvs: Of (n, 2), as ``uvs``; a set that is not finite is left out.
             colors: As ``colors``.
             tangents: As ``tangents``; left out where they are not finite.
             material: As ``material``.
-            crease: Angle in degrees from which on edges are sharp where normals are computed; None: all are smooth.
+            crease: Angle in degrees above which edges are sharp in computed normals; None: all edges are smooth.
 
         Raises:
             SceneError: A vertex is not finite or a face has an index out of range.
@@ -92,7 +93,7 @@ class MeshPart:
         return cls(vertices, faces, normals, uvs, colors, tangents, material)._with_tangents()
 
     def _taken(self, where: npt.NDArray[np.int64]) -> MeshPart:
-        """The same triangles, each with corners of its own: corner k of face f was vertex ``where[3 f + k]``."""
+        """Return the triangles without shared vertices: corner k of face f copies vertex ``where[3 f + k]``."""
 
         def take(values: Array | None) -> Array | None:
             return None if values is None else values[where]
@@ -109,7 +110,7 @@ class MeshPart:
         )
 
     def _with_tangents(self) -> MeshPart:
-        """With tangents if its material has a normal map, without if not."""
+        """Return the part with tangents if its material has a normal map, else without."""
         use = None if self.material is None else self.material.normal
         uvs = None if use is None else self.uvs[use.uv_set]
         if use is None or uvs is None:
@@ -121,19 +122,19 @@ class MeshPart:
                 side = np.where(self.tangents[:, 3:] < 0.0, -1.0, 1.0)
                 return dataclasses.replace(self, tangents=np.concatenate([across / length, side], axis=1))
         a, b, _, d, e, _ = use.transform
-        # Where the picture is turned, so are the frames: their u is that of the picture.
+        # A rotated picture rotates its tangent frames as well: their u is the picture's u.
         turned = uvs @ np.array([[a, b], [d, e]]).T
         where, frames = tangent_frames(self.vertices, self.faces, self.normals, turned)
         return dataclasses.replace(self._taken(where), tangents=frames.astype(np.float64))
 
     def moved(self, transform: Array) -> MeshPart | None:
-        """The part under a transform (4, 4); None where that makes nothing of it."""
+        """Return the part transformed by a (4, 4) matrix; None if the matrix is singular."""
         linear = transform[:3, :3]
         determinant = float(np.linalg.det(linear))
         if not np.isfinite(determinant) or determinant == 0.0:
             return None
         vertices = self.vertices @ linear.T + transform[:3, 3]
-        # The cofactors are the inverse's transpose but for a factor, and do not overflow where that does.
+        # The cofactor matrix equals the inverse transpose up to a factor, and does not overflow where the inverse does.
         cofactors = np.stack([np.cross(linear[(k + 1) % 3], linear[(k + 2) % 3]) for k in range(3)])
         turned = self.normals @ (cofactors * np.sign(determinant)).T
         normals = unit_or(turned, self.normals)
@@ -145,7 +146,7 @@ class MeshPart:
         return dataclasses.replace(self, vertices=vertices, faces=faces, normals=normals, tangents=tangents)
 
     def bent(self, transforms: Array) -> MeshPart:
-        """The part with a transform (n, 4, 4) for each of the vertices that it was made from."""
+        """Return the part with each original vertex transformed by its own matrix, (n, 4, 4)."""
         if self.source is not None:
             transforms = transforms[self.source]
         linear = transforms[:, :3, :3]
@@ -159,10 +160,10 @@ class MeshPart:
 
 
 def check_indices(label: str, index: npt.NDArray[np.int64], count: int) -> None:
-    """Check that faces name vertices of which there are ``count``.
+    """Check that the vertex indices of faces are below ``count``.
 
     Raises:
-        SceneError: They do not; ``label`` stands in the message.
+        SceneError: An index is out of range; the message begins with ``label``.
     """
     if index.size and not (index.min() >= 0 and index.max() < count):
         wrong = int(index.max() if index.max() >= count else index.min())
@@ -170,7 +171,7 @@ def check_indices(label: str, index: npt.NDArray[np.int64], count: int) -> None:
 
 
 def strip_triangles(indices: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Return the triangles, (m, 3), of strips with an index below 0 between them; all are wound as a strip's first."""
+    """Return the triangles, (m, 3), of strips separated by negative indices, with a strip's own winding."""
     place = np.arange(len(indices))
     start = np.maximum.accumulate(np.where(indices < 0, place + 1, 0))
     odd = ((place - start) % 2 == 1)[:-2]
@@ -180,14 +181,14 @@ def strip_triangles(indices: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
 
 
 def join_parts(source: MeshSource, parts: list[MeshPart]) -> Mesh:
-    """One mesh of all parts.
+    """Return one mesh of all parts.
 
     Args:
-        source: The file, with what materials name.
+        source: The file, with the pictures that materials refer to.
         parts: One or more.
 
     Raises:
-        SceneError: A vertex lies too far off after all transforms.
+        SceneError: A vertex is too far from the origin after all transforms.
     """
     vertices = np.concatenate([part.vertices for part in parts])
     if not (np.abs(vertices) < LARGEST).all():
@@ -216,9 +217,9 @@ def join_parts(source: MeshSource, parts: list[MeshPart]) -> Mesh:
 
 
 def _without_lost(part: MeshPart, source: MeshSource) -> MeshMaterial:
-    """A part's material without textures for which the part has no coordinates."""
+    """Return a part's material without the textures for which the part has no texture coordinates."""
     if part.material is None:
-        # Vertex colours are what the surface reflects, no factor of some other colour.
+        # Vertex colours are the surface's reflectance, not a factor of another colour.
         white = LambertMaterial((1.0, 1.0, 1.0))
         return MeshMaterial() if part.colors is None else MeshMaterial(surface=white)
     material = part.material
@@ -241,7 +242,7 @@ def _with_spans(material: MeshMaterial, images: list[npt.NDArray[np.uint8]]) -> 
 
 
 def filled(parts: list[MeshPart], values: list[Array | None], default: tuple[float, ...]) -> Array | None:
-    """Values of all parts' vertices, the default where a part has none; None where none has."""
+    """Return the values of all parts' vertices, with ``default`` for parts that have none; None if no part has any."""
     if all(value is None for value in values):
         return None
     return np.concatenate(
@@ -259,7 +260,7 @@ def _finite(values: Any, count: int, largest: float) -> Array | None:
 
 
 def unit_or(vectors: Array, other: Array) -> Array:
-    """Vectors (n, 3) of length 1; ``other`` where one has no direction."""
+    """Return vectors (n, 3) normalized; a vector without direction is replaced by that of ``other``."""
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     usable = np.isfinite(length) & (length > 0.0)
     return np.where(usable, vectors / np.where(usable, length, 1.0), other)

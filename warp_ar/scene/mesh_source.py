@@ -1,7 +1,7 @@
-"""A mesh file, and the files that it names, looked at before they are read.
+"""A mesh file and the files that it refers to, checked before they are read.
 
-A material library, a buffer or a texture may be a pipe that never ends, a picture whose header promises more pixels
-than fit into memory, or missing.
+A material library, buffer or texture may be missing, a pipe that never ends, or a picture whose header promises more
+pixels than fit into memory.
 """
 
 from __future__ import annotations
@@ -18,47 +18,47 @@ from warp_ar.files import is_file, limits, read_bytes, too_much
 from warp_ar.scene.textures import decode_rgba
 
 _CONFINED: Final[set[Path]] = set()
-"""Folders of ``confine``."""
+"""Folders registered by ``confine``."""
 
 
 def confine(folder: Path) -> None:
-    """Let mesh files in a folder name files in it only: they are not trusted, and would show what lies elsewhere."""
+    """Let mesh files in a folder refer only to files inside it, because untrusted ones could show other files."""
     _CONFINED.add(folder.resolve())
 
 
 class MeshSource:
-    """A mesh file while it is read: its bytes, files beside it or relative to it, and what they hold so far."""
+    """State while a mesh file is read: its bytes, the files it refers to, and its pictures and notes so far."""
 
     def __init__(self, path: Path, data: bytes = b"") -> None:
-        """Take a file; nothing that it names is read yet.
+        """Store a file; read none of the files that it refers to yet.
 
         Args:
-            path: The file, or what messages call a mesh in memory.
-            data: Its bytes.
+            path: Path of the file, or a name for messages if the mesh is in memory.
+            data: Contents of the file.
         """
         self.path, self.data = path, data
         self.images: list[npt.NDArray[np.uint8]] = []
-        """Pictures that materials name, RGBA."""
+        """Pictures that materials refer to, RGBA."""
         self.notes: list[str] = []
-        """Parts of the file that are not shown, in words."""
+        """Descriptions of contents of the file that are not shown."""
         self.known: dict[str, bytes] = {}
-        """Files that were read, by the names that the mesh file has for them."""
+        """Contents of files that were read, by their names in the mesh file."""
         self._within = next((folder for folder in _CONFINED if path.resolve().is_relative_to(folder)), None)
 
     def note(self, words: str) -> None:
-        """Say of something, once, that it is not shown."""
+        """Note once that a content of the file is not shown."""
         if words not in self.notes:
             self.notes.append(words)
 
     def check_count(self, count: int, size: int = 0) -> None:
-        """Check how many vertices or faces a header promises.
+        """Check the number of vertices or faces that a header promises.
 
         Args:
-            count: Number of them.
-            size: Least number of bytes that each takes.
+            count: Number of vertices or faces.
+            size: Smallest number of bytes per vertex or face.
 
         Raises:
-            SceneError: It is more than may be read, or than the file can hold.
+            SceneError: The number exceeds the limit, or the file is too short for it.
         """
         if count > limits().mesh_elements:
             raise SceneError(too_much(f"{self.path}", count, "vertices or faces", "mesh_elements"))
@@ -67,14 +67,15 @@ class MeshSource:
             raise SceneError(f"{self.path}: its header promises {count:,} elements, and {held}")
 
     def get(self, name: str, limit: str) -> bytes:
-        """Return the bytes of a file by the name that the mesh file has for it.
+        """Return the contents of a file by its name in the mesh file.
 
         Args:
             name: The name.
-            limit: Field of ``files.Limits`` that says how many there may be.
+            limit: Field of ``files.Limits`` with the largest number of bytes.
 
         Raises:
-            SceneError: It is missing, too large or no regular file, or the mesh file may not name it.
+            SceneError: The file is missing, too large, not a regular file, or outside the folder of a confined mesh
+                file.
         """
         if name not in self.known:
             path = self._found(name) or self.path.parent / name.strip()
@@ -84,15 +85,15 @@ class MeshSource:
         return self.known[name]
 
     def picture(self, name: str, *, color: bool = False) -> npt.NDArray[np.uint8]:
-        """Return a picture that it names, RGBA; arguments as those of `decode_rgba`.
+        """Return a referenced picture, RGBA; ``color`` is as in `decode_rgba`.
 
         Raises:
-            SceneError: It is missing, damaged or too large.
+            SceneError: The picture is missing, damaged or too large.
         """
         return decode_rgba(self.get(name, "picture_bytes"), f"{self.path}: {name}, which it names,", color=color)
 
     def has(self, name: str) -> bool:
-        """Return whether there is a file of a name."""
+        """Return True if a file of that name exists."""
         return self._found(name) is not None
 
     def _found(self, name: str) -> Path | None:
@@ -102,5 +103,5 @@ class MeshSource:
         return next((path for path in paths if self._reaches(path) and is_file(path)), None)
 
     def _reaches(self, path: Path) -> bool:
-        """Return whether the file may name another one there."""
+        """Return True if the mesh file is allowed to refer to a path."""
         return self._within is None or path.resolve().is_relative_to(self._within)

@@ -1,4 +1,4 @@
-"""Values and near misses as error messages show them, and the limits of numbers in files."""
+"""Formatting of values and suggestions in error messages, and the range of numbers in files."""
 
 from __future__ import annotations
 
@@ -9,27 +9,27 @@ import re
 from collections.abc import Iterable
 from typing import Any, Final
 
-# Beyond these a square leaves single precision.
+# Bounds within which the square of a number is finite and normal in single precision.
 LARGEST, SMALLEST = 1e18, 1e-18
 MOST_PIXELS: Final = 65536
 
 
 def show_value(value: object) -> str:
-    """A value as a TOML file would have it, on one line and not too long."""
+    """Return a value as TOML, on one line and shortened."""
     try:
         text = json.dumps(value, ensure_ascii=False, default=str)
-    except (ValueError, RecursionError):  # an integer with more digits than Python turns into text
+    except (ValueError, RecursionError):  # an integer with more digits than Python converts to text
         return "a number of thousands of digits"
     return text if len(text) <= 80 else f"{text[:60]}... ({len(text)} characters)"
 
 
 def show_key(key: str) -> str:
-    """A key as a TOML file would have it, on one line and not too long."""
+    """Return a key as TOML, on one line and shortened."""
     return key if re.fullmatch(r"[A-Za-z0-9_-]{1,60}", key) else show_value(key)
 
 
 def is_number(value: Any) -> bool:
-    """Return whether a word or value is a finite number."""
+    """Return True if a word or value is a finite number."""
     try:
         return math.isfinite(float(value))
     except (TypeError, ValueError):
@@ -37,7 +37,7 @@ def is_number(value: Any) -> bool:
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
-    """Return the words after "unknown": the nearest known word, or all of them."""
+    """Return the text after "unknown" in a message: the most similar known word, or all known words."""
     known = list(known)
     close = difflib.get_close_matches(word.lower(), [name.lower() for name in known], n=1, cutoff=0.6)
     if close:

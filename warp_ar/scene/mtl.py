@@ -1,7 +1,7 @@
 """OBJ's material libraries with their PBR extension.
 
-MTL's illumination models are Phong's: Kd is the diffuse colour, Ks and Ns the lobe, which is left out where ``illum``
-is 0 or 1. A library that says Pr or Pm means a metallic-roughness material.
+MTL's illumination models are Phong's: Kd is the diffuse colour, Ks and Ns define the specular lobe, which ``illum`` 0
+and 1 leave out. A material with Pr or Pm becomes a metallic-roughness material.
 
 References:
     Wavefront, "Object Files (.obj), Appendix B1", material library file; the Pr, Pm, norm and map_Ke of the PBR
@@ -35,48 +35,48 @@ from warp_ar.scene.messages import is_number
 ByteArray = npt.NDArray[np.uint8]
 
 _KNOWN: Final = "name|k[adse]|n[si]|d|tr|illum|p[rm]|map_(k[dsen]|d|p[rm])|norm|pcr|anisor|sharpness"
-"""Keys that are shown, and those that say nothing of how a surface looks in this light."""
+"""Pattern of keys that are read, and of keys without effect in this lighting."""
 
 CHALK: Final[RGB] = (0.8, 0.8, 0.8)
-"""Diffuse colour of a material that says none."""
+"""Diffuse colour of a material that defines none."""
 
 _OPTIONS: Final = {
     **dict.fromkeys(("-blendu", "-blendv", "-boost", "-bm", "-cc", "-clamp", "-imfchan", "-texres", "-type"), 1),
     "-mm": 2,
     **dict.fromkeys(("-o", "-s", "-t"), 3),
 }
-"""Options of a map, and how many words follow; of three numbers the last two may be left out."""
+"""Options of a map, and the number of words after each; of three numbers the last two may be omitted."""
 _NOT_FOLLOWED: Final = {
     "-boost": ("sharpness of maps (-boost)", ["0"]),
     "-cc": ("colour correction of maps (-cc)", ["off"]),
     "-mm": ("ranges of maps (-mm)", ["0", "1"]),
     "-t": ("turbulence of maps (-t)", ["0", "0", "0"]),
 }
-"""Options that change a map and are not followed: in words, and as they change nothing."""
+"""Unsupported options that change a map: their description, and the values at which they have no effect."""
 
 
 @dataclasses.dataclass(frozen=True)
 class _Map:
-    """A picture that a library names, and how it lies on the surface."""
+    """Picture that a library refers to, with its placement on the surface."""
 
     picture: ByteArray
     """RGBA."""
     transform: tuple[float, ...]
-    """Transform like ``TextureUse.transform``."""
+    """Transform of texture coordinates, in the form of ``TextureUse.transform``."""
     clamped: bool
-    """True if it does not repeat."""
+    """True if the picture does not repeat."""
     channel: int | None
-    """Channel that a map of one number is in, if the library says."""
+    """Channel from which a scalar map is read; None if the library names none."""
     strength: float
     """Factor of a bump or normal map."""
 
     def values(self) -> ByteArray:
-        """Return the numbers of a map of one number, (h, w): those of green, where nothing is said."""
+        """Return the values of a scalar map, (h, w); the green channel is the default."""
         return self.picture[..., 1 if self.channel is None else self.channel]
 
 
 def parse_library(text: str) -> dict[str, dict[str, Any]]:
-    """Return the materials of an OBJ's library by name: their words by key in lower case."""
+    """Return the materials of an OBJ's library by name, each as its words by lower-case key."""
     found: dict[str, dict[str, Any]] = {}
     values: dict[str, Any] = {}
     for line in re.sub(r"\\[ \t]*\r?\n", " ", text).splitlines():
@@ -91,14 +91,14 @@ def parse_library(text: str) -> dict[str, dict[str, Any]]:
 
 
 def read_library(source: MeshSource, values: dict[str, Any]) -> MeshMaterial:
-    """Return a material of `parse_library`.
+    """Return one material of `parse_library`.
 
     Follows:
         Kd, Ks, Ns, Ke, d, Tr, illum, Pr, Pm; map_Kd, map_Ks, map_Ke, map_d, map_Pr, map_Pm, norm, map_Kn; their -s, -o,
         -clamp, -imfchan; -bm of normal maps.
 
     Args:
-        source: The mesh's file; takes the material's pictures, and what is not shown of it.
+        source: The mesh's file, to which the material's pictures and notes are added.
         values: Words of the material by key.
 
     Raises:
@@ -108,15 +108,15 @@ def read_library(source: MeshSource, values: dict[str, Any]) -> MeshMaterial:
 
 
 class _Library:
-    """Reads one material of a library."""
+    """Reader of one material of a library."""
 
     def __init__(self, source: MeshSource, values: dict[str, Any]) -> None:
         self._source, self._values = source, values
 
     def read(self) -> MeshMaterial:
-        """The material, with the picture of its colour if it has one."""
+        """Return the material, with its base colour picture if it has one."""
         for key, words in self._values.items():
-            nothing = {1.0} if key == "tf" else {0.0}  # lets all light through; no sheen, no clearcoat
+            nothing = {1.0} if key == "tf" else {0.0}  # no effect
             shown = (
                 re.fullmatch(_KNOWN, key)
                 or (key == "map_ka" and "map_kd" in self._values)
@@ -134,7 +134,7 @@ class _Library:
         base = self._use(color if mask is None else self._masked(color, mask))
         maps = self._map("map_pr"), self._map("map_pm")
         specular_map = self._map("map_ks", color=True)
-        # A lobe without an exponent is none: some programs use Ks for numbers of their own.
+        # A specular colour without exponent is ignored: some programs use Ks for other purposes.
         exponent = self._number("ns", 0.0, 0.0, 1e4)
         shiny = (any(specular) and exponent > 0.0) or specular_map is not None
         surface: Material
@@ -145,7 +145,7 @@ class _Library:
         elif shiny and self._number("illum", 2.0, 0.0, 10.0) >= 2.0:
             if specular_map is not None and not any(specular):
                 specular = white
-            # Diffuse and lobe together reflect no more than arrives.
+            # Energy conservation: diffuse and specular reflectance sum to at most 1.
             most = max(a + b for a, b in zip(diffuse, specular, strict=True))
             diffuse, specular = (
                 cast(RGB, tuple(value / max(most, 1.0) for value in color)) for color in (diffuse, specular)
@@ -180,8 +180,8 @@ class _Library:
         return TextureUse(len(self._source.images) - 1, transform=one.transform, wrap=(way, way))
 
     def _masked(self, color: _Map | None, mask: _Map) -> _Map:
-        """The colour's picture with the alpha that ``map_d`` says."""
-        # A picture without alpha says it in its brightness.
+        """Return the colour picture with the alpha of ``map_d``."""
+        # A mask without alpha channel stores alpha as brightness.
         own = mask.channel is None and mask.picture[..., 3].min() < 255
         shown = mask.picture[..., 3] if own else mask.values()
         if color is None:
@@ -189,7 +189,7 @@ class _Library:
         return self._with_channels(color, {3: (mask, shown)})
 
     def _pack(self, roughness: _Map | None, metallic: _Map | None) -> _Map | None:
-        """Two pictures in the channels of one."""
+        """Return the roughness and metallic pictures combined in the channels of one picture."""
         first = roughness or metallic
         if first is None:
             return None
@@ -198,7 +198,7 @@ class _Library:
         return self._with_channels(white, {k: (one, one.values()) for k, one in found.items() if one is not None})
 
     def _with_channels(self, into: _Map, channels: dict[int, tuple[_Map, ByteArray]]) -> _Map:
-        """A picture with other pictures' numbers in its channels."""
+        """Return a picture with some channels replaced by the values of other pictures."""
         picture = into.picture.copy()
         for channel, (one, values) in channels.items():
             if (one.transform, one.clamped) != (into.transform, into.clamped):
@@ -209,7 +209,7 @@ class _Library:
         return dataclasses.replace(into, picture=picture)
 
     def _map(self, key: str, *, color: bool = False) -> _Map | None:
-        """A picture that the library names, in sRGB if it is one of colour."""
+        """Return a picture that the library refers to; in sRGB if it is a colour."""
         words = self._values.get(key)
         if not isinstance(words, list) or not all(isinstance(word, str) for word in words):
             return None
@@ -253,7 +253,10 @@ class _Library:
         return next(iter(self._numbers(key, (1,), low, high)), default)
 
     def _numbers(self, key: str, counts: tuple[int, ...], low: float, high: float) -> list[float]:
-        """Numbers of a key within their range, as many as it may have; empty where it says none."""
+        """Return the numbers of a key, clamped to a range, in one of the allowed counts.
+
+        Return an empty list if the key is missing.
+        """
         value = self._values.get(key, [])
         words = list(value) if isinstance(value, list | tuple) else [value]
         if words[:1] == ["-halo"]:

@@ -1,16 +1,14 @@
-"""Nodes that a file moves: keyframes, the ways between them, and transforms of what hangs on the nodes.
+"""Node animation of a glTF file: keyframes, interpolation, and the transforms of animated parts.
 
-A sampler has times t_k and values v_k. Before the first and after the last key it holds the end's value. Between them,
-with d = t_{k+1} - t_k and s = (t - t_k) / d, glTF 2.0 (appendix C) has three ways:
+A sampler has times t_k and values v_k. Before the first and after the last key it holds that key's value. Between two
+keys, with d = t_{k+1} - t_k and s = (t - t_k) / d, glTF 2.0 (appendix C) defines three interpolations:
 
-- ``STEP``: v_k;
-- ``LINEAR``: (1 - s) v_k + s v_{k+1}; rotations go along the shorter arc, at even speed;
-- ``CUBICSPLINE``, with tangents in a and out b of each key:
-  (2s^3 - 3s^2 + 1) v_k + d (s^3 - 2s^2 + s) b_k + (-2s^3 + 3s^2) v_{k+1} + d (s^3 - s^2) a_{k+1}; rotations are
-  normalized afterwards.
+- ``STEP``: v_k; - ``LINEAR``: (1 - s) v_k + s v_{k+1}; rotations follow the shorter arc at constant angular speed; -
+``CUBICSPLINE``, with tangents in a and out b of each key: (2s^3 - 3s^2 + 1) v_k + d (s^3 - 2s^2 + s) b_k + (-2s^3 +
+3s^2) v_{k+1} + d (s^3 - s^2) a_{k+1}; rotations are normalized afterwards.
 
-A node's transform is T R S. What hangs on one moving node is one ``MovingPart``: a mesh in that node's coordinates,
-which is never built again, but for what skins and morph targets bend: its vertices are those of the frame's time.
+A node's transform is T R S. All triangles below one animated node form one ``MovingPart``: a mesh in that node's
+coordinates. A rigid part's mesh is built once; skins and morph targets compute new vertices for every frame.
 
 References:
     Khronos, glTF 2.0 specification, 3.11 and appendix C.
@@ -29,10 +27,10 @@ from warp_ar.scene.geometry import Mesh, quaternion_matrix
 
 Array = npt.NDArray[np.float64]
 Bend: TypeAlias = Callable[[float], Mesh]
-"""Function that gives a mesh at a time of the animation; only vertices, normals and tangents change."""
+"""Function from the animation's time in seconds to a mesh; only vertices, normals and tangents differ over time."""
 
 WIDTHS: Final[Mapping[str, int]] = {"translation": 3, "rotation": 4, "scale": 3}
-"""Numbers of what a channel moves."""
+"""Number of components of each animated property."""
 INTERPOLATIONS: Final = ("LINEAR", "STEP", "CUBICSPLINE")
 
 
@@ -41,16 +39,17 @@ class Sampler:
     """Keyframes of one property of one node."""
 
     times: Array
-    """Seconds, (n,), not decreasing."""
+    """Times in seconds, (n,), in ascending order."""
     values: Array
-    """(n, w); of ``CUBICSPLINE`` (n, 3, w): tangent in, value, tangent out. For morph targets w is their number."""
+    """Values, (n, w); for ``CUBICSPLINE`` (n, 3, w) with in-tangent, value, out-tangent. For morph targets, w is their
+    number."""
     interpolation: str
     """One of ``INTERPOLATIONS``."""
     turns: bool = False
-    """True if values are quaternions, x first."""
+    """True if values are quaternions (x, y, z, w)."""
 
     def at(self, seconds: float) -> Array:
-        """The value, (w,); a quaternion is a unit one."""
+        """Return the value at a time, (w,); quaternions are normalized."""
         cubic = self.interpolation == "CUBICSPLINE"
         keys = self.values[:, 1] if cubic else self.values
         last = len(self.times) - 1
@@ -63,7 +62,7 @@ class Sampler:
             if cubic:
                 found = self._cubic(k, s, length)
             elif self.turns:
-                from trimesh.transformations import quaternion_slerp  # here, for scenes without animations do without
+                from trimesh.transformations import quaternion_slerp  # seldom needed
 
                 return np.array(quaternion_slerp(_unit(keys[k]), _unit(keys[k + 1]), s))
             else:
@@ -84,26 +83,26 @@ class Sampler:
 
 
 def _unit(quaternion: Array) -> Array:
-    """A quaternion of length 1; no turn where a spline passes through zero."""
+    """Return the quaternion normalized; the identity where a spline passes through zero."""
     length = float(np.linalg.norm(quaternion))
     return quaternion / length if length > 0.0 else np.array([0.0, 0.0, 0.0, 1.0])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class NodeTrack:
-    """Movement of one node in its parent."""
+    """Motion of one node relative to its parent."""
 
     translation: Array
-    """(3,); where no sampler says another."""
+    """Translation, (3,), unless a sampler animates it."""
     rotation: Array
-    """Unit quaternion, x first, likewise."""
+    """Unit quaternion (x, y, z, w), unless a sampler animates it."""
     scale: Array
-    """(3,), likewise."""
+    """Scale, (3,), unless a sampler animates it."""
     samplers: Mapping[str, Sampler]
-    """Samplers by the names of ``WIDTHS``."""
+    """Samplers by property; the names are those of ``WIDTHS``."""
 
     def transform_at(self, seconds: float) -> Array:
-        """``parent_from_node``, (4, 4), at a time of the animation."""
+        """Return ``parent_from_node``, (4, 4), at a time of the animation."""
 
         def now(name: str, still: Array) -> Array:
             return self.samplers[name].at(seconds) if name in self.samplers else still
@@ -116,46 +115,49 @@ class NodeTrack:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Anchor:
-    """A node that moves, below what moves it."""
+    """Animated node, relative to the next animated node above it."""
 
     parent: int
-    """The next moving node above it, by its number; -1: the file's world, turned to +Z up."""
+    """Index of the next animated node above it; -1: none, relative to the file's world rotated to +Z up."""
     offset: Array
-    """From its own parent to there, (4, 4): what lies between stands still."""
+    """Constant transform of the static nodes in between, (4, 4)."""
     track: NodeTrack
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class MovingPart:
-    """Triangles that move as one."""
+    """Triangles that move together."""
 
     mesh: Mesh
-    """In the coordinates of its anchor."""
+    """Mesh in the coordinates of the anchor."""
     anchor: int
-    """Index of its moving node; -1 for a part that stands still in the file's world."""
+    """Index of the animated node; -1 for a static part in the file's world."""
     bend: Bend | None = None
-    """Skin and morph targets of the mesh; None for a rigid part."""
+    """Deformation of the mesh by skin and morph targets; None for a rigid part."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class MovingMesh:
-    """A file's triangles under one of its animations."""
+    """Triangles of a file under one of its animations."""
 
     rest: Mesh
-    """All of them at time 0; its materials and pictures are those of the parts."""
+    """All triangles at time 0; the parts share its materials and pictures."""
     parts: tuple[MovingPart, ...]
     anchors: tuple[Anchor, ...]
-    """Each after its parent."""
+    """Animated nodes, each after its parent."""
     duration: float
     """Time of the last key, in seconds."""
 
     def transforms_at(self, seconds: float) -> Array:
-        """``file_from_part`` of every part, (parts, 4, 4), at a time of the animation; the file's world is +Z up."""
+        """Return ``file_from_part`` of every part, (parts, 4, 4), at a time of the animation.
+
+        The file's world is +Z up.
+        """
         return part_transforms(self.anchors, [part.anchor for part in self.parts], seconds)
 
 
 def part_transforms(anchors: tuple[Anchor, ...], wanted: list[int], seconds: float) -> Array:
-    """``file_from_anchor`` of the wanted anchors, (n, 4, 4)."""
+    """Return ``file_from_anchor`` of the wanted anchors, (n, 4, 4)."""
     found: list[Array] = []
     for anchor in anchors:
         own = anchor.offset @ anchor.track.transform_at(seconds)

@@ -1,7 +1,7 @@
-"""Materials of virtual objects: the scene's, or those of the mesh's file.
+"""Materials of virtual objects, from the scene file or from the mesh file.
 
-An object has one or more ``MeshMaterial``: its own file's, or the scene's alone. Where a scene gives a material to a
-mesh whose file has pictures of its base colour, these multiply the material's first colour, triangle by triangle.
+An object has one or more ``MeshMaterial``: those of its mesh file, or one from the scene. If the scene gives a material
+and the mesh file has base colour pictures, each triangle's picture multiplies the scene material's first colour.
 """
 
 from __future__ import annotations
@@ -37,25 +37,25 @@ _LOG = logging.getLogger(__name__)
 _NO_FILE = (MeshMaterial(),)
 
 _NOT_SIMILAR = 1e-4
-"""Largest relative error of a similarity in single precision or a few digits."""
+"""Largest relative error of a similarity transform in single precision or rounded to a few digits."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ObjectMaterials:
-    """Features of an object's materials that decide which kernels and light its scene calls for."""
+    """Materials of an object, and the features that decide which kernels and light its scene needs."""
 
     materials: tuple[MeshMaterial, ...]
-    """One or more, in the order of ``Mesh.materials``."""
+    """Materials, at least one, in the order of ``Mesh.materials``."""
     detailed: bool
-    """True if kernels must ask the triangle: it has several materials, pictures, colours, alpha or emission."""
+    """True if kernels must read per-triangle data: several materials, pictures, colours, alpha or emission."""
     holed: bool
-    """True if rays may pass through some triangles."""
+    """True if rays may pass through some triangles, by alpha."""
     bumpy: bool
-    """True if a material has a normal map."""
+    """True if any material has a normal map."""
 
 
 def object_from_trimesh(source: Any, **fields: Any) -> Object:
-    """An object of a ``trimesh.Trimesh`` or ``trimesh.Scene`` in memory, with its colours, materials and textures.
+    """Return an object with mesh, materials and textures of a ``trimesh.Trimesh`` or ``trimesh.Scene``.
 
     Args:
         source: The mesh, in metres; its axes stay as they are.
@@ -68,16 +68,17 @@ def object_from_trimesh(source: Any, **fields: Any) -> Object:
 
 
 def object_at(item: Object, world_from_object: Any) -> Object:
-    """An object moved to where a 4x4 matrix puts it: its ``at``, ``rotate`` and ``scale`` are replaced.
+    """Return an object moved to the pose of a 4x4 matrix: its ``at``, ``rotate`` and ``scale`` are replaced.
 
     Args:
         item: The object.
-        world_from_object: Similarity that takes points of the shape, in columns, to the world, in metres.
+        world_from_object: Similarity transform, (4, 4), from the shape's coordinates to the world in metres, for column
+            vectors.
 
     Raises:
-        SceneError: The matrix is no 4x4 of finite numbers, or no rotation, one positive scale and translation.
+        SceneError: The matrix is not 4x4 and finite, or is more than rotation, uniform positive scale and translation.
     """
-    from trimesh.transformations import euler_from_matrix  # here, for scenes from files do without
+    from trimesh.transformations import euler_from_matrix  # imported here, because scenes from files do not need it
 
     try:
         matrix = np.asarray(world_from_object, np.float64)
@@ -107,7 +108,7 @@ def object_at(item: Object, world_from_object: Any) -> Object:
 
 
 def mesh_of(item: Object) -> Mesh | None:
-    """The mesh that an object of shape ``mesh`` shows, at rest if it moves; None for other shapes.
+    """Return the mesh of an object of shape ``mesh``, at time 0 of its animation; None for other shapes.
 
     Raises:
         SceneError: Its file cannot be read.
@@ -122,7 +123,7 @@ def mesh_of(item: Object) -> Mesh | None:
 
 
 def moving_mesh_of(item: Object) -> MovingMesh | None:
-    """Return the animation that an object plays, kept as ``file_mesh`` keeps a mesh; None: its nodes stand still.
+    """Return the animation that an object plays, cached as by ``file_mesh``; None if it plays none.
 
     Raises:
         SceneError: Its file has no such animation, or cannot be read.
@@ -141,7 +142,7 @@ def _read_moving(path: Path, stamp: tuple[int, int], animation: str | int) -> Mo
 
 
 def file_mesh(path: Path) -> Mesh:
-    """The mesh of a file, kept as long as the file is the same; says once what of it is not shown.
+    """Return the mesh of a file, cached until the file changes; prints once which contents are not shown.
 
     Raises:
         SceneError: It cannot be read.
@@ -163,7 +164,7 @@ def _say(path: Path, notes: tuple[str, ...]) -> None:
 
 
 def materials_of(item: Object) -> ObjectMaterials:
-    """Return the materials of an object.
+    """Return the materials of an object and their features.
 
     Raises:
         SceneError: Its mesh cannot be read.
@@ -196,7 +197,7 @@ def materials_of(item: Object) -> ObjectMaterials:
 
 
 def _emissive(item: Object, material: EmissiveMaterial, mesh: Mesh | None) -> MeshMaterial:
-    """Return an emissive material as one of triangles; its picture is the scene's."""
+    """Return an emissive material as a mesh material; its picture comes from the scene."""
     peak = 1.0 if material.image is None else load_emission(material.image)[1]
     red, green, blue = (peak * material.intensity * factor for factor in material.color)
     closed = item.shape in ("sphere", "box", "torus") or (mesh is not None and is_closed(mesh))
@@ -209,7 +210,7 @@ def _emissive(item: Object, material: EmissiveMaterial, mesh: Mesh | None) -> Me
 
 @functools.lru_cache(maxsize=64)
 def is_closed(mesh: Mesh) -> bool:
-    """Return whether nobody outside of a mesh sees a triangle from behind: every edge has its way back."""
+    """Return True if a mesh is closed, so that no back face is visible from outside: every edge has its opposite."""
     corners = mesh.vertices[mesh.faces].reshape(-1, 3)
     _, place = np.unique(corners, axis=0, return_inverse=True)
     faces = place.reshape(-1, 3).astype(np.int64)
@@ -221,7 +222,7 @@ def is_closed(mesh: Mesh) -> bool:
 
 
 def scene_materials(scene: Scene) -> tuple[MeshMaterial, ...]:
-    """Materials of all virtual objects, one after another.
+    """Return the materials of all virtual objects, in their order.
 
     Raises:
         SceneError: A mesh cannot be read.
@@ -230,7 +231,7 @@ def scene_materials(scene: Scene) -> tuple[MeshMaterial, ...]:
 
 
 def is_detailed(scene: Scene) -> bool:
-    """Return whether any object's triangles or points must be asked for what they are made of.
+    """Return True if shading any object needs per-triangle or per-point material data.
 
     Raises:
         SceneError: A mesh cannot be read.
@@ -243,7 +244,7 @@ def _is_black(color: Color) -> bool:
 
 
 def reflects_diffusely(material: MeshMaterial | Material) -> bool:
-    """Return whether a material shows the environment's irradiance."""
+    """Return True if a material reflects the environment's irradiance."""
     surface: Any = material
     least = 1.0
     if isinstance(material, MeshMaterial):
@@ -259,7 +260,7 @@ def reflects_diffusely(material: MeshMaterial | Material) -> bool:
 
 
 def reflects_glossily(material: MeshMaterial | Material) -> bool:
-    """Return whether a material shows the environment's prefiltered light."""
+    """Return True if a material reflects the environment's prefiltered radiance."""
     surface: Any = material
     if isinstance(material, MeshMaterial):
         if material.unlit:

@@ -1,6 +1,6 @@
-"""The shapes that virtual objects are: one each, but for those whose file moves them in several parts.
+"""Shapes of virtual objects: one per object, or one per part if an animation moves its parts separately.
 
-Layers, mattes and exchange files number and name shapes; where nothing is played, these are the objects.
+Layers, mattes and exchange files number and name shapes; without animations these are the objects.
 """
 
 from __future__ import annotations
@@ -22,29 +22,29 @@ Array = npt.NDArray[np.float64]
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ObjectShape:
-    """An object, or a part of one that moves by itself."""
+    """Object, or a separately moving part of one."""
 
     item: Object
     index: int
-    """Number of the object in its scene."""
+    """Index of the object in its scene."""
     moving: MovingMesh | None = None
-    """Animation that the object plays; None: it is one shape."""
+    """Animation that the object plays; None: the object is a single shape."""
     part: int = 0
-    """Number of the part in ``moving``."""
+    """Index of the part in ``moving``."""
 
     @property
     def mesh(self) -> Mesh | None:
-        """Triangles of the part; None where the object is one shape."""
+        """Return the triangles of the part; None if the object is a single shape."""
         return None if self.moving is None else self.moving.parts[self.part].mesh
 
     @property
     def bend(self) -> Bend | None:
-        """Function from a time to the part's triangles; None: they are always the same."""
+        """Return the function from a time to the part's deformed triangles; None if the part is rigid."""
         return None if self.moving is None else self.moving.parts[self.part].bend
 
 
 def object_shapes(scene: Scene) -> tuple[ObjectShape, ...]:
-    """Shapes of a scene's objects, in their order.
+    """Return the shapes of a scene's objects, in their order.
 
     Raises:
         SceneError: A file has no such animation, or is damaged.
@@ -60,44 +60,46 @@ def object_shapes(scene: Scene) -> tuple[ObjectShape, ...]:
 
 
 def part_placements(item: Object, moving: MovingMesh, seconds: float) -> Array:
-    """``world_from_part`` of an object's parts, (parts, 4, 4), in its marker's frame where it has one.
+    """Return ``world_from_part`` of an object's parts, (parts, 4, 4).
+
+    They are relative to the object's own marker if it has one.
 
     Args:
         item: The object.
-        moving: What it plays.
-        seconds: Since the first frame.
+        moving: Animation that the object plays.
+        seconds: Time since the first frame.
     """
     assert item.play is not None
     rotation, position = item.pose_at(seconds)
     own = np.eye(4)
     own[:3, :3], own[:3, 3] = item.scale * rotation, position
-    with np.errstate(over="ignore", invalid="ignore"):  # a chain of large scales; see split_linear
+    with np.errstate(over="ignore", invalid="ignore"):  # products of large scales overflow; see split_linear
         placed: Array = own @ moving.transforms_at(item.play.time_at(seconds, moving.duration))
     return placed
 
 
 @dataclasses.dataclass(frozen=True)
 class Stretch:
-    """A linear map (3, 3) as a record of ``structs.Shape`` holds it: ``scale * rotation``."""
+    """Linear map, (3, 3), factored as ``scale * rotation`` for a record of ``structs.Shape``."""
 
     scale: float
-    """Length of the longest image of a unit vector; 0: the map makes nothing of a shape."""
+    """Length of the longest image of a unit vector; 0 if the map is degenerate."""
     rotation: Array
-    """The map over its scale."""
+    """The linear map divided by ``scale``; not a rotation if ``stretch`` is above 0."""
     inverse: Array
     """Inverse of ``rotation``."""
     stretch: float
-    """Longest over shortest image of a unit vector; 0 for a rotation, whose inverse is its transpose."""
+    """Ratio of the longest to the shortest image of a unit vector; 0 for a rotation, whose inverse is its transpose."""
 
 
 _RIGID = 1e-6
-"""Relative difference of lengths below which single precision calls them equal."""
+"""Largest relative difference of lengths that counts as single-precision rounding."""
 _FLAT = 1e-5
-"""Shortest over longest image of a unit vector, below which a shape has no thickness for rays."""
+"""Ratio of the shortest to the longest image of a unit vector below which a shape is too flat for rays."""
 
 
 def split_linear(linear: Array) -> Stretch:
-    """Tell turns and even scales from all other linear maps, (3, 3)."""
+    """Factor a linear map, (3, 3); rotations with uniform scale are recognized."""
     nothing = Stretch(0.0, np.eye(3), np.eye(3), 0.0)
     if not (np.abs(linear) < LARGEST).all():
         return nothing
@@ -113,16 +115,16 @@ def split_linear(linear: Array) -> Stretch:
 
 
 def shape_label(shape: ObjectShape) -> str:
-    """Words for a shape, as in the name of its matte."""
+    """Return a name for a shape, as used for its matte."""
     name = shape.item.file.stem if shape.item.file else shape.item.shape
     return f"object_{shape.index}_{name}" + (f"_part_{shape.part}" if shape.part else "")
 
 
 def surface_names(scene: Scene) -> tuple[str, ...]:
-    """A name for every surface, in the order of the layer ``ids``: virtual objects, proxies, mirror balls.
+    """Return a unique name for every virtual object, proxy and mirror ball, in the order of the layer ``ids``.
 
-    Letters, digits and underscores, each name once: ``object_0_bunny`` by its file or its shape, ``proxy_1_plane``. Of
-    an object whose file moves it in parts, each part has a name: ``object_0_truck``, ``object_0_truck_part_1``.
+    Names consist of letters, digits and underscores: ``object_0_bunny`` by its file or shape, ``proxy_1_plane``. Each
+    separately moving part has a name of its own: ``object_0_truck``, ``object_0_truck_part_1``.
     """
     objects = map(shape_label, object_shapes(scene))
     proxies = (f"proxy_{k}_{one.file.stem if one.file else one.shape}" for k, one in enumerate(scene.proxies))

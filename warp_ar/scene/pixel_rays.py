@@ -1,4 +1,4 @@
-"""Pixels of points and points of pixels, through the lens of a camera."""
+"""Projection of points to pixels and of pixels to rays, with lens distortion."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from warp_ar.scene.description import Camera
 Float = npt.NDArray[np.float64]
 
 _STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 300, 1e-9)
-"""Strong lenses converge slowly: OpenCV's own 5 steps leave up to 30 pixels on a wide one."""
+"""Termination of the iterative undistortion: OpenCV's default of 5 steps leaves errors up to 30 pixels for strong
+distortion."""
 
 
 def project(camera: Camera, points: Float) -> Float:
-    """Return the pixels, (n, 2), of points in the camera's frame, (n, 3); NaN for points that are not in front of it.
+    """Return the pixels, (n, 2), of points in the camera's frame, (n, 3); NaN for points behind the camera.
 
     Args:
         camera: The camera.
@@ -31,7 +32,7 @@ def project(camera: Camera, points: Float) -> Float:
 
 
 def undistorted(camera: Camera, pixels: npt.ArrayLike) -> Float:
-    """Return the points (x / z, y / z), (n, 2), that pixels (n, 2) look at, lens distortion undone."""
+    """Return the undistorted normalised coordinates (x / z, y / z), (n, 2), of pixels (n, 2)."""
     flat = np.asarray(pixels, np.float64).reshape(-1, 1, 2)
     if not len(flat):
         return np.zeros((0, 2))

@@ -1,7 +1,7 @@
-"""OBJ, PLY, OFF and STL: polygons with all that the file declares of their corners, cut into triangles.
+"""Readers of OBJ, PLY, OFF and STL: polygons with all their attributes, cut into triangles.
 
-Polygons are cut by ear clipping where they are concave, so that areas and winding are kept. Colours are sRGB-encoded,
-in 8 or 16 bits or from 0 to 1. What a file declares and is not shown is named in the mesh's notes.
+Concave polygons are cut by ear clipping, which keeps areas and winding. Colours are sRGB-encoded, with 8 or 16 bits or
+from 0 to 1. Contents of the file that are not shown are named in the mesh's notes.
 
 References:
     Wavefront, "Object Files (.obj)", appendix B1. Turk, "The PLY Polygon File Format" (1994). Geomview manual, OFF.
@@ -28,21 +28,23 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 CREASE: Final = 40.0
-"""Degrees: where a drawing (OBJ, OFF, STL) has no normals, an edge that turns more is sharp."""
+"""Angle in degrees above which an edge is sharp, for files without normals (OBJ, OFF, STL)."""
 FLAT: Final = 1e-12
-"""Share of a polygon's squared size below which a corner has no turn: float64 rounding of its cross product."""
+"""Cross product at a corner, as a share of the polygon's squared size, below which the corner is straight: float64
+rounding."""
 _UNCOLORED: Final = (0.8, 0.8, 0.8, 1.0)
-"""Linear colour of faces without one beside others that have one: that of a mesh without colours."""
+"""Linear colour of faces without colour in a file where other faces have one; the same as that of meshes without
+colours."""
 
 
 @dataclasses.dataclass
 class Corners:
-    """Polygons, one corner after another, and what is said of them and of their vertices."""
+    """Polygons as a list of corners, with the attributes of corners, polygons and vertices."""
 
     vertex: Indices
-    """Vertex of each corner, (n,)."""
+    """Vertex index of each corner, (n,)."""
     lengths: Indices
-    """Corners of each polygon, (p,)."""
+    """Number of corners of each polygon, (p,)."""
     uv: Array | None = None
     """Texture coordinates of each corner, (n, 2)."""
     normal: Array | None = None
@@ -57,10 +59,10 @@ class Corners:
     """Linear RGBA of each vertex, (v, 4)."""
 
     def check(self, source: MeshSource, count: int) -> None:
-        """Check that all corners are among ``count`` vertices, and take what is said of these.
+        """Check that all corners refer to the ``count`` vertices, and spread vertex attributes to the corners.
 
         Raises:
-            SceneError: They are not.
+            SceneError: A vertex index is out of range.
         """
         index = self.vertex
         check_indices(f"{source.path}", index, count)
@@ -75,10 +77,10 @@ def triangles_of(vertices: Array, corners: Corners) -> tuple[Indices, Indices]:
 
     Args:
         vertices: (v, 3).
-        corners: The polygons; those of fewer than three corners have no triangle.
+        corners: The polygons; polygons with fewer than three corners give no triangle.
 
     Returns:
-        Corners of the triangles, (m, 3), by their numbers, and the polygon of each, (m,).
+        Corner indices of the triangles, (m, 3), and the polygon index of each triangle, (m,).
     """
     starts = np.cumsum(corners.lengths) - corners.lengths
     found: list[Indices] = []
@@ -108,19 +110,19 @@ def triangles_of(vertices: Array, corners: Corners) -> tuple[Indices, Indices]:
 
 
 def clip_ears(points: Array) -> Indices:
-    """Cut a polygon by ear clipping: a corner goes whose triangle turns as the polygon and holds no other corner.
+    """Cut a polygon by ear clipping: an ear is a convex corner whose triangle contains no other corner.
 
-    A polygon that crosses itself has corners without an ear; there the next corner goes, whatever it holds.
+    A polygon that intersects itself may have no ear; then the next corner is removed regardless.
 
     Args:
-        points: (n, 3), about in a plane.
+        points: Corners, (n, 3), approximately in a plane.
 
     Returns:
-        Corners of n - 2 triangles, wound as the polygon.
+        Corner indices of n - 2 triangles with the polygon's winding.
     """
     normal = np.cross(points - points[0], np.roll(points, -1, 0) - points[0]).sum(0)
     axis = int(np.argmax(np.abs(normal)))
-    plane = points[:, [(axis + 1) % 3, (axis + 2) % 3]]  # seen from +axis, so that areas have the sign of normal[axis]
+    plane = points[:, [(axis + 1) % 3, (axis + 2) % 3]]  # signed areas have the sign of normal[axis]
     sign = 1.0 if normal[axis] >= 0.0 else -1.0
     least = FLAT * float(np.ptp(plane, 0).max()) ** 2
 
@@ -157,16 +159,16 @@ def part_of(
     crease: float | None = CREASE,
     whole: bool = True,
 ) -> MeshPart | None:
-    """Return triangles of polygons as a part of a mesh; None where there are none.
+    """Return some triangles of polygons as a part of a mesh; None if there are none.
 
     Args:
         source: The file.
         vertices: (v, 3).
         corners: The polygons, checked.
-        cut: Those of `triangles_of` that are of this part.
-        material: The part's.
-        crease: Degrees from which on an edge is sharp where the file has no normals; None: none is.
-        whole: Whether all vertices are of this part.
+        cut: Triangles of this part, in the form of `triangles_of`.
+        material: Material of the part.
+        crease: Angle in degrees above which an edge is sharp if the file has no normals; None: no edge is sharp.
+        whole: True if all vertices belong to this part.
 
     Raises:
         SceneError: A vertex is not finite.
@@ -185,7 +187,7 @@ def part_of(
         rows = np.ascontiguousarray(np.where(np.isfinite(rows), rows, 0.0) + 0.0)
         keys = rows.view(np.dtype((np.void, rows.dtype.itemsize * rows.shape[1]))).ravel()
         _, first, faces = np.unique(keys, return_index=True, return_inverse=True)
-        order = np.argsort(first)  # as they come in the file
+        order = np.argsort(first)  # in the order of the file
         first, faces = first[order], np.argsort(order)[faces]
         where = index[first]
     elif whole:
@@ -215,16 +217,19 @@ def part_of(
 
 
 def parts_of(source: MeshSource, vertices: Array, corners: Corners, **how: Any) -> list[MeshPart]:
-    """Return all triangles of polygons as one part, or none; arguments and errors as those of `part_of`."""
+    """Return all triangles of polygons as a list of one part, or an empty list.
+
+    Arguments and errors are those of `part_of`.
+    """
     corners.check(source, len(vertices))
     part = part_of(source, vertices, corners, triangles_of(vertices, corners), **how)
     return [] if part is None else [part]
 
 
 def linear_rgba(values: Array, largest: float) -> Array:
-    """Return linear RGBA, (n, 4), of sRGB-encoded colours, (n, 3 or 4), of which ``largest`` is white.
+    """Return linear RGBA, (n, 4), of sRGB-encoded colours, (n, 3 or 4); ``largest`` is the code of white.
 
-    Alpha that is nowhere above 1 is of steps of 1, whatever white is.
+    Alpha values that are all at most 1 are taken as 0 to 1, whatever ``largest`` is.
     """
     shown = np.clip(np.nan_to_num(values[:, :3] / largest), 0.0, 1.0)
     alpha = values[:, 3:4] if values.shape[1] > 3 else np.ones((len(values), 1))
@@ -233,7 +238,7 @@ def linear_rgba(values: Array, largest: float) -> Array:
 
 
 def _shown_colors(source: MeshSource, values: Array, largest: float) -> Array:
-    """Return linear RGBA as `linear_rgba`; programs that do not know alpha write 0."""
+    """Return linear RGBA as `linear_rgba`, but opaque if alpha is 0 everywhere, as programs without alpha write it."""
     colors = linear_rgba(values, largest)
     if len(colors) and not colors[:, 3].any():
         source.note("alpha of colours, which is 0 everywhere")
@@ -242,7 +247,7 @@ def _shown_colors(source: MeshSource, values: Array, largest: float) -> Array:
 
 
 def decode_text(data: bytes) -> str:
-    """Return text in UTF-8, with or without a byte-order mark, or else in Latin-1."""
+    """Return bytes decoded as UTF-8, with or without byte-order mark, or else as Latin-1."""
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -254,17 +259,17 @@ _NOT_SHOWN: Final = {
     **dict.fromkeys(("l", "p"), "points and lines"),
     "#MRGB": "colours in ZBrush's comments",
 }
-"""Statements of an OBJ that are named, in words."""
+"""Statements of an OBJ that are not shown, with their description for notes."""
 
 
 class _Obj:
-    """Reads an OBJ line by line."""
+    """Line-by-line reader of an OBJ."""
 
     def __init__(self, source: MeshSource) -> None:
         self._source = source
         self._rows: dict[str, list[list[str]]] = {"v": [], "vt": [], "vn": []}
         self._tokens: list[str] = []
-        self._faces: list[tuple[int, int, int, int, int]] = []  # corners, material, and v, vt, vn before it
+        self._faces: list[tuple[int, int, int, int, int]] = []  # corners, material, counts of v, vt, vn
         self._materials: dict[str, int] = {}
         self._libraries: list[str] = []
         self._smooth = False
@@ -285,7 +290,7 @@ class _Obj:
             self._tokens += words
             self._faces.append((len(words), self._material, v, vt, vn))
         elif key in ("usemtl", "mtllib"):
-            # A name may have a # in it, but not after a blank.
+            # A name may contain #, but not after a blank.
             name = re.sub(r"\s#.*", "", line.strip()[len(key) :]).strip()
             if key == "usemtl":
                 self._material = self._number(name)
@@ -321,7 +326,7 @@ class _Obj:
         return found
 
     def _vertices(self) -> tuple[Array, Array | None]:
-        """Return positions and linear colours: x y z [w] or x y z r g b [a]."""
+        """Return positions and linear colours of vertices, written as x y z [w] or x y z r g b [a]."""
         rows = self._rows["v"]
         if any(len(row) < 3 for row in rows):
             raise SceneError(f"{self._source.path}: a vertex has fewer than 3 numbers")
@@ -344,7 +349,7 @@ class _Obj:
         return corners, faces[:, 1]
 
     def _indices(self) -> Indices:
-        """Return v, vt, vn of each corner as the file counts them, (n, 3); 0 where it has none."""
+        """Return the indices v, vt, vn of each corner as the file counts them, (n, 3); 0 if missing."""
         rows = [[int(number or 0) for number in token.split("/")] for token in self._tokens]
         if any(not 1 <= len(row) <= 3 or row[0] == 0 for row in rows):
             raise SceneError(
@@ -353,7 +358,7 @@ class _Obj:
         return np.array([[*row, 0, 0][:3] for row in rows], np.int64).reshape(-1, 3)
 
     def _attribute(self, key: str, index: Indices, size: int) -> Array | None:
-        """Return values of corners, 0 where a corner has none; None where none has."""
+        """Return the values of an attribute at all corners, 0 where a corner has none; None if no corner has it."""
         rows = self._rows[key]
         if not rows or not len(index) or (index < 0).all():
             return None
@@ -363,7 +368,7 @@ class _Obj:
         return np.where((index >= 0)[:, None], values[np.maximum(index, 0)], 0.0)
 
     def _library(self) -> dict[str, dict[str, Any]]:
-        """Return the materials of all libraries by name; the first of a name counts."""
+        """Return the materials of all libraries by name; the first definition of a name counts."""
         found: dict[str, dict[str, Any]] = {}
         for said in dict.fromkeys(self._libraries):
             for name in [said] if self._source.has(said) else said.split():
@@ -430,7 +435,7 @@ def read_off(source: MeshSource) -> list[MeshPart]:
     extra = [face[1 + int(face[0]) :] for face in faces]
     if any(len(words) >= 3 for words in extra):
         whole = not any(re.search(r"[.eE]", word) for words in extra for word in words[:3])
-        # A face may have no colour, or one without alpha.
+        # A face may have no colour, or a colour without alpha.
         told = np.array([[*words[:4], "nan"][:4] if len(words) >= 3 else ("-1",) * 4 for words in extra], np.float64)
         white = _white(told[:, :3], whole)
         told[:, 3] = np.where(np.isnan(told[:, 3]), white, told[:, 3])
@@ -475,13 +480,13 @@ def read_stl(source: MeshSource) -> list[MeshPart]:
 
 
 def _white(values: Array, whole: bool) -> float:
-    """Return what white is among colours: 255 of whole numbers, else 1, or what fits."""
+    """Return the value of white: 65535 above 255, else 255 for whole numbers or values above 1, else 1."""
     largest = float(np.nanmax(values, initial=0.0))
     return 65535.0 if largest > 255.0 else 255.0 if whole or largest > 1.0 else 1.0
 
 
 _STL_TEXT: Final = 1 << 12
-"""Bytes within which a text has its first facet."""
+"""Number of bytes within which a text STL has its first facet."""
 _PLY_TYPES: Final = {
     **dict.fromkeys(("char", "int8"), "i1"), **dict.fromkeys(("uchar", "uint8"), "u1"),
     **dict.fromkeys(("short", "int16"), "i2"), **dict.fromkeys(("ushort", "uint16"), "u2"),
@@ -497,13 +502,13 @@ _PLY_COLORS: Final = tuple(
 )
 _PLY_UVS: Final = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"), ("texcoord_u", "texcoord_v"))
 _PLY_UNSEEN: Final = frozenset({"confidence", "intensity", "quality", "flags", "texnumber", "curvature", "radius"})
-"""Properties that say nothing of how a surface looks, or are not used on purpose."""
+"""Properties that do not affect the appearance, or are ignored on purpose."""
 _Property = tuple[str, str, str | None]
-"""Name, type, and for a list the type of its length."""
+"""Name, type, and for a list the type of its length (else None)."""
 
 
 class _Ply:
-    """Reader of a PLY, its elements one after another; ValueError where it is damaged."""
+    """Reader of a PLY, element by element; raises ValueError if the file is damaged."""
 
     def __init__(self, source: MeshSource) -> None:
         head, found, body = source.data.partition(b"end_header")
@@ -517,7 +522,7 @@ class _Ply:
             self._declare(line)
         self._data = body[2:] if body.startswith(b"\r\n") else body[1:]
         self.kinds = {name: {key: kind for key, kind, _ in list_} for name, _, list_ in self._elements}
-        if not self._order:  # text: read as if all were doubles
+        if not self._order:  # a text file is read as if all values were doubles
             self._data, self._order = np.array(self._data.split(), np.float64).tobytes(), "="
             self._elements = [
                 (name, count, [(key, "f8", length and "f8") for key, _, length in list_])
@@ -543,7 +548,7 @@ class _Ply:
             self.textures.append(" ".join(words[2:]))
 
     def _element(self, count: int, properties: list[_Property]) -> dict[str, Any]:
-        """Return an element's values by property: arrays, and of lists (values of all rows, length of each row)."""
+        """Return an element's values by property: arrays, and for lists (values of all rows, length of each row)."""
         start = self._at
         first = self._row(properties) if count else [[] for _ in properties]
         fields: list[tuple[str, str, tuple[int]]] = []
@@ -555,7 +560,7 @@ class _Ply:
         table = np.frombuffer(self._data, rows, count if fits else 0, start)
         lists = [column for column, (_, _, length) in enumerate(properties) if length is not None]
         if fits and all((table[f"length {column}"] == len(first[column])).all() for column in lists):
-            self._at = start + table.nbytes  # rows whose lists are alike are one table
+            self._at = start + table.nbytes  # rows with equal list lengths are read as one table
             columns = [
                 (table[f"{column}"].astype(np.float64).ravel(), np.full(count, len(values)))
                 for column, values in enumerate(first)
@@ -572,7 +577,7 @@ class _Ply:
         }
 
     def _row(self, properties: list[_Property]) -> list[list[float]]:
-        """Return the next row, each property as a list."""
+        """Return the next row, each property as a list of values."""
         return [
             self._next(kind, 1 if length is None else int(self._next(length, 1)[0])) for _, kind, length in properties
         ]
@@ -587,26 +592,26 @@ class _Ply:
         return found
 
     def columns(self, element: str, choices: tuple[tuple[str, ...], ...]) -> tuple[Array | None, float]:
-        """Return the columns of the first choice that an element has, and the largest value of their type."""
+        """Return the first of several sets of columns that an element has, and the largest value of their type."""
         values = self.values.get(element, {})
         for names in choices:
             if all(name in values and not isinstance(values[name], tuple) for name in names):
                 taken = np.stack([values[name] for name in names], 1)
                 kind = self.kinds[element][names[0]]
                 if kind == "i2" and taken.max(initial=0.0) <= 255.0:
-                    kind = "u1"  # no 16 bits are meant where none is used
+                    kind = "u1"  # signed 16-bit values up to 255 are taken as 8-bit codes
                 return taken, {"u1": 255.0, "u2": 65535.0, "i2": 32767.0}.get(kind, 1.0)
         return None, 1.0
 
     def colors(self, element: str) -> Array | None:
-        """Return linear RGBA of an element's rows."""
+        """Return the linear RGBA of an element's rows."""
         values, largest = self.columns(element, _PLY_COLORS)
         if values is None:
             return None
         return _shown_colors(self._source, values, largest if largest > 1.0 else _white(values, False))
 
     def unseen(self) -> Iterator[tuple[str, str]]:
-        """Yield the elements and names of the properties of vertices and faces that are not shown."""
+        """Yield element and name of each property of vertices and faces that is not shown."""
         lists = {*_PLY_INDICES, "texcoord"}
         known = {"x", "y", "z", "nx", "ny", "nz", *sum(_PLY_COLORS, ()), *sum(_PLY_UVS, ()), *lists} | _PLY_UNSEEN
         for element in ("vertex", "face"):
@@ -679,4 +684,4 @@ READERS: Final[dict[str, Callable[[MeshSource], list[MeshPart]]]] = {
     ".ply": read_ply,
     ".stl": read_stl,
 }
-"""Readers by ending."""
+"""Readers by suffix."""

@@ -1,4 +1,4 @@
-"""Rigid motions between the world, which is the marker's frame, and a camera."""
+"""Rigid motions between the world frame, which is the marker's frame, and a camera frame."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from warp_ar.errors import UsageError
 Array = NDArray[np.float64]
 
 _NOT_A_ROTATION = 1e-3
-"""Largest difference of R^T R from 1 of a rotation in a few digits."""
+"""Largest deviation of R^T R from the identity, allowing for a rotation rounded to a few digits."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Pose:
-    """A rigid motion; as a tracked pose, ``camera_from_world``: X to R X + t."""
+    """Rigid motion that maps a point X to R X + t; a tracked pose is ``camera_from_world``."""
 
     rotation: Array
     """Rotation matrix R, float64 (3, 3)."""
@@ -29,7 +29,8 @@ class Pose:
         """Check the shapes and numbers.
 
         Raises:
-            UsageError: The rotation is not (3, 3) or no rotation, the translation not (3,), or a number is not finite.
+            UsageError: The rotation is not a (3, 3) rotation matrix, the translation is not (3,), or a number is not
+                finite.
         """
         for name, value, shape in (("rotation", self.rotation, (3, 3)), ("translation", self.translation, (3,))):
             array = np.asarray(value)
@@ -47,21 +48,21 @@ class Pose:
             raise UsageError(f"Pose: rotation {np.round(turned, 4).tolist()}: {right}")
 
     def __eq__(self, other: object) -> bool:
-        """Return whether both are the same to the last bit."""
+        """Return True if all numbers of both poses are equal."""
         return isinstance(other, Pose) and hash(self) == hash(other)
 
     def __hash__(self) -> int:
-        """Return the hash of all numbers."""
+        """Return a hash of rotation and translation."""
         return hash((self.rotation.tobytes(), self.translation.tobytes()))
 
     def inverse(self) -> Pose:
-        """The motion back: from ``camera_from_world`` to ``world_from_camera``."""
+        """Return the inverse motion, for example ``world_from_camera`` of ``camera_from_world``."""
         return Pose(self.rotation.T.copy(), -self.rotation.T @ self.translation)
 
     def after(self, first: Pose) -> Pose:
-        """The motion that does ``first`` and then this one."""
+        """Return the motion that applies ``first`` and then this motion."""
         return Pose(self.rotation @ first.rotation, self.rotation @ first.translation + self.translation)
 
     def apply(self, points: Array) -> Array:
-        """Points (..., 3) mapped by the motion."""
+        """Return points (..., 3) transformed by this motion."""
         return points @ self.rotation.T + self.translation

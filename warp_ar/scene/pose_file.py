@@ -1,4 +1,4 @@
-"""Camera poses from files: COLMAP's images, NeRF's transforms, OpenTrackIO, USD, or JSON of R and t.
+"""Readers of camera poses: COLMAP's images, NeRF's transforms, OpenTrackIO, USD, and JSON with R and t.
 
 References:
     SMPTE RIS-OSVP, "OpenTrackIO" 1.0: transforms in metres, z up, the camera along +y; degrees about z, x, y in turn.
@@ -25,51 +25,54 @@ from warp_ar.scene.geometry import quaternion_matrix, rotation_matrix
 from warp_ar.scene.messages import is_number
 
 RawPose = tuple[tuple[float, ...], Vec3]
-"""R, 9 numbers row by row, and t in metres: ``camera_from_world``, OpenCV's axes."""
+"""``camera_from_world`` with OpenCV's axes: R as 9 numbers row by row, and t in metres."""
 Matrix = npt.NDArray[np.float64]
 
 USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 MOST_FRAMES = 1_000_000
-"""Poses of a file."""
+"""Largest number of poses in a file."""
 TURNED = 1e-3
-"""Largest deviation of R R^T from the unit matrix."""
+"""Largest deviation of R R^T from the identity."""
 _LEVEL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-"""``world_from_camera`` of a level camera that looks along +y, z up."""
+"""Rotation ``world_from_camera`` of a level camera that faces +y, with z up."""
 _Z_FROM_Y_UP = _LEVEL.T
-"""Rotation from a y-up world to a marker's z-up one; x stays."""
+"""Rotation from a y-up world to the z-up world of a marker; x is unchanged."""
 _OPENCV = np.diag([1.0, -1.0, -1.0])
-"""Rotation between OpenCV's and OpenGL's axes of a camera."""
+"""Rotation between OpenCV's and OpenGL's camera axes."""
 
 
 def pose_of_placement(rotation: Matrix, position: Matrix) -> RawPose:
-    """``camera_from_world`` of ``world_from_camera``, OpenCV's axes."""
+    """Return ``camera_from_world`` from the rotation and position of ``world_from_camera``, with OpenCV's axes."""
     inverse = rotation.T
     x, y, z = map(float, -inverse @ position)
     return tuple(map(float, inverse.reshape(-1))), (x, y, z)
 
 
 def pose_of_position(position: Sequence[float], rotate: Sequence[float]) -> RawPose:
-    """``camera_from_world`` of a camera at ``position`` (metres) turned by ``rotate`` (degrees about fixed axes).
+    """Return ``camera_from_world`` of a camera at ``position``, metres, rotated by ``rotate``, degrees.
 
-    Unturned it looks along the world's +y, its x along the world's x, upright: world z is up.
+    With zero rotation the camera faces the world's +y, with its x along the world's x and the world's z up.
     """
     return pose_of_placement(rotation_matrix(rotate) @ _LEVEL, np.array(position, float))
 
 
 def rotation_of_quaternion(w: float, x: float, y: float, z: float) -> tuple[float, ...]:
-    """Rotation matrix, 9 numbers row by row, of a quaternion of any length, w first as COLMAP has it."""
-    n = math.hypot(w, x, y, z)  # squares of tiny numbers would be 0
+    """Return the rotation matrix, 9 numbers row by row, of a quaternion (w, x, y, z) of any length."""
+    n = math.hypot(w, x, y, z)  # normalise first: squares of tiny numbers would underflow to 0
     return tuple(map(float, quaternion_matrix(np.array([x, y, z, w]) / n).reshape(-1)))
 
 
 def check_rotation(rotation: Sequence[float]) -> bool:
-    """Return whether 9 numbers are a rotation matrix."""
+    """Return True if 9 numbers form a rotation matrix."""
     matrix = np.array(rotation, float).reshape(3, 3)
     return bool(np.abs(matrix @ matrix.T - np.eye(3)).max() < TURNED and np.linalg.det(matrix) > 0)
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:
-    """Sorts runs of digits by value; the last part keeps ``f01`` and ``f1`` in one order on every machine."""
+    """Return a sort key that orders runs of digits by value.
+
+    Its last item separates names such as ``f01`` and ``f1``.
+    """
     parts = [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", name) if part]
     return [*parts, (2, 0, name)]
 
@@ -77,9 +80,9 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
 def load_pose_file(path: Path) -> PoseSpec:
     """Read the poses of a clip's frames.
 
-    JSON holds a list of objects with ``R`` (9 numbers or 3 rows) and ``t``, ``camera_from_world`` as OpenCV's
-    ``solvePnP`` gives, and a ``name`` if all have one, or OpenTrackIO samples, which may also stand one on each line of
-    a ``.jsonl``.
+    JSON holds a list of objects with ``R`` (9 numbers or 3 rows) and ``t``, ``camera_from_world`` as returned by
+    OpenCV's ``solvePnP``, and either all or none with a ``name``. Alternatively it holds OpenTrackIO samples, which a
+    ``.jsonl`` file stores one per line.
 
     Follows:
         by pictures' names: COLMAP's images.txt (with or without points) and images.bin, NeRF's transforms.json, JSON
@@ -89,7 +92,7 @@ def load_pose_file(path: Path) -> PoseSpec:
         frames without a pose; NeRF's applied_transform, applied_scale (the world behind them is taken).
 
     Returns:
-        Poses by name, in natural order of the names; else in the file's order.
+        The poses: with names in natural order of the names, else in the file's order.
 
     Raises:
         SceneError: Damaged; Alembic.
@@ -142,11 +145,11 @@ def _read_json(path: Path, text: str) -> list[tuple[str, RawPose]]:
 
 
 def _nerf_pose(label: str, entry: Any) -> tuple[str, RawPose]:
-    """Pose of a frame of NeRF's ``transforms.json``: ``world_from_camera``, OpenGL's axes of the camera."""
+    """Return name and pose of a frame of NeRF's ``transforms.json``, which has OpenGL's camera axes."""
     said = entry if isinstance(entry, dict) else {}
     name, numbers = said.get("file_path"), _finite(said.get("transform_matrix"))
     matrix = numbers.reshape(-1, 4) if len(numbers) in (12, 16) else np.zeros((3, 4))
-    # A matrix may lie there by columns.
+    # The matrix may be stored by columns.
     last = bool((matrix[3:] == (0.0, 0.0, 0.0, 1.0)).all())
     if not isinstance(name, str) or not last or not check_rotation(matrix[:3, :3].ravel().tolist()):
         raise SceneError(f"{label}: expected file_path and transform_matrix, 4 rows of 4 of which the last is 0 0 0 1")
@@ -163,7 +166,7 @@ def _json_pose(label: str, entry: Any) -> RawPose:
 
 
 def _finite(value: Any) -> Matrix:
-    """Return the numbers of nested lists, (n,); none where one is no finite number."""
+    """Return the numbers of nested lists, (n,); an empty array if any is not a finite number."""
     try:
         numbers = np.array(value, float).reshape(-1)
     except (TypeError, ValueError, OverflowError):
@@ -172,7 +175,7 @@ def _finite(value: Any) -> Matrix:
 
 
 def _colmap_pose(label: str, numbers: Sequence[float]) -> RawPose:
-    """Pose of a quaternion and a translation, 7 numbers."""
+    """Return the pose of a quaternion and a translation, 7 numbers."""
     if not all(map(math.isfinite, numbers)) or not 0.0 < math.hypot(*numbers[:4]) < math.inf:
         raise SceneError(f"{label}: expected QW QX QY QZ TX TY TZ, a rotation and a translation")
     w, x, y, z, *shift = numbers
@@ -180,13 +183,13 @@ def _colmap_pose(label: str, numbers: Sequence[float]) -> RawPose:
 
 
 def _read_colmap(path: Path, text: str) -> list[tuple[str, RawPose]]:
-    """Lines ``ID QW QX QY QZ TX TY TZ CAMERA NAME``, each followed by one of points, which some programs leave out."""
+    """Return names and poses of lines ``ID QW QX QY QZ TX TY TZ CAMERA NAME``; a line of 2D points may follow each."""
     found: list[tuple[str, RawPose]] = []
     of_points = False
     for line in text.splitlines():
         words = line.split(maxsplit=9)
         count = len(line.split())
-        # A line of points has triples of numbers.
+        # A line of 2D points consists of triples of numbers.
         named = count >= 10 and not (count % 3 == 0 and all(map(is_number, line.split())))
         if line.lstrip().startswith("#") or (of_points and not named) or (not words and not of_points):
             of_points = of_points and line.lstrip().startswith("#")
@@ -200,7 +203,7 @@ def _read_colmap(path: Path, text: str) -> list[tuple[str, RawPose]]:
 
 
 def _read_colmap_binary(path: Path) -> list[tuple[str, RawPose]]:
-    """Poses of COLMAP's ``images.bin``, by name."""
+    """Return names and poses of COLMAP's ``images.bin``."""
     data = read_bytes(path, "mesh_bytes", SceneError)
     found: list[tuple[str, tuple[float, ...]]] = []
     try:
@@ -213,20 +216,20 @@ def _read_colmap_binary(path: Path) -> list[tuple[str, RawPose]]:
             found.append((data[at + 64 : end].decode("utf-8", "replace"), numbers))
             (points,) = struct.unpack_from("<Q", data, end + 1)
             at = end + 9 + 24 * points
-    except (struct.error, ValueError, OverflowError) as error:  # overflow: more points than any file holds
+    except (struct.error, ValueError, OverflowError) as error:  # overflow: a count larger than any file
         raise SceneError(f"{path}: cut off after {len(data):,} bytes, or no images.bin of COLMAP") from error
     return [(name, _colmap_pose(f"{path}: image {name!r}", numbers)) for name, numbers in found]
 
 
 def read_track(path: Path, samples: Sequence[Any]) -> tuple[RawPose, ...]:
-    """Poses of OpenTrackIO samples, one each.
+    """Return the pose of each OpenTrackIO sample.
 
     Args:
-        path: For messages.
-        samples: JSON objects with ``transforms``, the last relative to those before it.
+        path: Path of the file, for messages.
+        samples: JSON objects with ``transforms``, each relative to the one before it.
 
     Raises:
-        SceneError: A sample is none.
+        SceneError: A sample is invalid.
     """
     return tuple(_read_sample(f"{path}: sample {index}", sample) for index, sample in enumerate(samples))
 
@@ -248,7 +251,7 @@ def _read_sample(label: str, sample: Any) -> RawPose:
 
 
 def rotation_of_track(pan: float, tilt: float, roll: float) -> Matrix:
-    """Rotation of OpenTrackIO's angles in degrees: about z, then the turned x, then the turned y."""
+    """Return the rotation of OpenTrackIO's angles in degrees: about z, then the rotated x, then the rotated y axis."""
     return rotation_matrix((tilt, 0.0, pan)) @ rotation_matrix((0.0, roll, 0.0))
 
 
@@ -262,12 +265,12 @@ def _numbers(label: str, transform: Any, name: str, keys: tuple[str, ...]) -> li
 
 
 def read_usd(path: Path) -> tuple[RawPose, ...]:
-    """Poses of the only camera of a USD file, one per frame from its start to its end.
+    """Return the poses of the only camera of a USD file, one per frame from the stage's start to its end.
 
     Raises:
         SceneError: usd-core is not installed, or the file cannot be used.
     """
-    read_bytes(path, "mesh_bytes", SceneError)  # it is there, regular, and not too large
+    read_bytes(path, "mesh_bytes", SceneError)  # checks that it exists, is a regular file and not too large
     try:
         import pxr.Tf
         import pxr.Usd
@@ -275,7 +278,7 @@ def read_usd(path: Path) -> tuple[RawPose, ...]:
         import pxr.UsdUtils
     except ImportError as error:
         raise SceneError(f'{path}: USD files need usd-core; install it with pip install "warp-ar[exchange]"') from error
-    quiet = pxr.UsdUtils.CoalescingDiagnosticDelegate()  # takes what USD would print while it lives
+    quiet = pxr.UsdUtils.CoalescingDiagnosticDelegate()  # captures USD's messages while it exists
     try:
         stage = pxr.Usd.Stage.Open(str(path), pxr.Usd.Stage.LoadAll)
     except pxr.Tf.ErrorException as error:
@@ -288,7 +291,7 @@ def read_usd(path: Path) -> tuple[RawPose, ...]:
         names = ", ".join(str(prim.GetPath()) for prim in cameras[:4])
         raise SceneError(f"{path}: expected one camera, found {len(cameras)}{f' ({names})' if names else ''}")
     start, end = stage.GetStartTimeCode(), stage.GetEndTimeCode()
-    # Blender says time codes alone, one for each frame: what USD takes for frames then is 24, whatever they are.
+    # Blender writes time codes only, one per frame; USD then reports 24 frames per second, whatever the rate is.
     told = stage.GetFramesPerSecond() if stage.HasAuthoredMetadata("framesPerSecond") else 0.0
     step = stage.GetTimeCodesPerSecond() / (told or stage.GetTimeCodesPerSecond())
     finite = math.isfinite(start) and math.isfinite(end) and math.isfinite(step) and step > 0.0
@@ -306,7 +309,7 @@ def read_usd(path: Path) -> tuple[RawPose, ...]:
 
 
 def _pose_of_usd(label: str, matrix: Matrix, unit: float, up: str) -> RawPose:
-    """Pose of a placement of a camera that looks along -z; scale of its rig does not turn it."""
+    """Return ``camera_from_world`` of the placement of a camera that faces -z; scale in its transform is removed."""
     axes, position = matrix[:3, :3], unit * matrix[:3, 3]
     lengths = np.linalg.norm(axes, axis=0)
     if not np.isfinite(matrix).all() or (lengths == 0.0).any():

@@ -1,4 +1,4 @@
-"""Meshes as rays meet them: which shapes become one, and the BVH that no ray slips through."""
+"""Meshes for ray intersection: which shapes become meshes, and a watertight BVH."""
 
 from __future__ import annotations
 
@@ -20,25 +20,26 @@ from warp_ar.scene.shapes import box_mesh, disk_mesh, rect_mesh, silhouette_tole
 FloatArray = npt.NDArray[np.float64]
 
 BOX_MARGIN: Final = 2.0**-18
-"""Margin of a triangle's box in the BVH, in radii of the mesh; see ``kernels/rays/shapes.py``."""
+"""Margin around a triangle's box in the BVH, relative to the mesh's radius; see ``kernels/rays/shapes.py``."""
 BVH_CONSTRUCTOR: Final = "sah"
-"""Constructor of trees; Warp's default on CUDA builds faster, but rays take 1.2 to 1.5 times as long."""
+"""Warp's BVH constructor. Its default on CUDA builds faster, but rays then take 1.2 to 1.5 times as long."""
 BVH_LEAF_SIZES: Final = {"cpu": 4, "cuda": 1}
-"""Triangles per leaf: on CUDA a ray that tests triangles holds up those beside it that still walk."""
+"""Triangles per BVH leaf: on CUDA, a ray that tests triangles stalls the other threads of its warp."""
 PICTURE_CELLS: Final = 16
-"""Into how many parts along either side a rect is cut whose picture emits: light is looked for where it is bright."""
+"""Number of parts along each side into which a rect with an emissive picture is cut, so that light sampling finds its
+bright parts."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class RayMesh:
-    """A mesh that rays can meet, moved so that the centre of its bounding box is its origin."""
+    """Mesh for ray intersection, translated so that the centre of its bounding box is the origin."""
 
     mesh: Any
-    """``wp.Mesh`` whose corners are not shared: corner k of face f is point 3 f + k."""
+    """``wp.Mesh`` without shared vertices: corner k of face f is point 3 f + k."""
     center: FloatArray
-    """Origin in the coordinates of the source, (3,)."""
+    """Position of its origin in the source's coordinates, (3,)."""
     half: FloatArray
-    """Half sizes of its bounding box, (3,)."""
+    """Half sizes of the bounding box, (3,)."""
     normals: npt.NDArray[np.float32]
     """Unit normal of each corner, (3 m, 3)."""
     uvs: npt.NDArray[np.float32]
@@ -46,11 +47,11 @@ class RayMesh:
 
 
 def make_ray_mesh(mesh: Mesh, device: Any) -> RayMesh:
-    """Build the BVH of a mesh with a margin around every triangle, so that no ray slips through a shared edge.
+    """Build the BVH of a mesh with a margin around every triangle, so that no ray passes through a shared edge.
 
-    The BVH is built over triangles that span the enlarged boxes; then the true corners take their place. Nothing is
-    refitted afterwards, so the boxes keep their margin, and the triangles that rays are tested against are exact.
-    Most meshes stand still in their own space: the tree is built once, so it is the one that is walked fastest.
+    The BVH is built over triangles that span the enlarged boxes; afterwards the exact corners replace theirs. The tree
+    is not refitted, so its boxes keep the margin while rays are tested against exact triangles. Most meshes are rigid:
+    their tree is built once, so traversal speed counts more than build speed.
 
     Args:
         mesh: The triangles.
@@ -70,25 +71,25 @@ def make_ray_mesh(mesh: Mesh, device: Any) -> RayMesh:
 
 
 def _corners(mesh: Mesh, center: FloatArray) -> tuple[npt.NDArray[np.float32], FloatArray, float]:
-    """Corners of the triangles about a centre, (m, 3, 3), half sizes, margin."""
-    # Vertices at one position stay at one position to the last bit: every corner is computed the same way.
+    """Return the corners of the triangles relative to a centre, (m, 3, 3), the half sizes, and the margin."""
+    # Vertices at equal positions stay equal to the last bit, because every corner is computed in the same way.
     corners = (mesh.vertices.astype(np.float64) - center).astype(np.float32)[mesh.faces]
     half = np.abs(corners).reshape(-1, 3).max(axis=0).astype(np.float64)
     return corners, half, float(np.float32(BOX_MARGIN * np.linalg.norm(half)))
 
 
 def _spanning(corners: npt.NDArray[np.float32], margin: float) -> npt.NDArray[np.float32]:
-    """Corners of triangles that span others with their margin, (3 m, 3)."""
+    """Return corners, (3 m, 3), of triangles whose boxes are those of the given triangles plus the margin."""
     low, high = corners.min(axis=1) - np.float32(margin), corners.max(axis=1) + np.float32(margin)
     return np.stack([low, high, corners[:, 0]], axis=1).reshape(-1, 3)
 
 
 def bend_ray_mesh(ray_mesh: RayMesh, mesh: Mesh) -> RayMesh:
-    """Have rays meet a mesh whose vertices are elsewhere now: boxes follow them, trees stay where they are.
+    """Return the ray mesh with moved vertices: the boxes are refitted, the tree's structure is kept.
 
     Args:
-        ray_mesh: What rays have met so far, of which no other scene has a share; its place in memory stays.
-        mesh: With the same faces.
+        ray_mesh: Previous ray mesh, not shared with another scene; its arrays are updated in place.
+        mesh: Mesh with the same faces and new vertices.
     """
     corners, half, margin = _corners(mesh, ray_mesh.center)
     points = ray_mesh.mesh.points
@@ -102,9 +103,9 @@ _SHARED: weakref.WeakKeyDictionary[Mesh, weakref.WeakValueDictionary[str, RayMes
 
 
 def shared_ray_mesh(mesh: Mesh, device: Any) -> RayMesh:
-    """``make_ray_mesh`` of a file's mesh, one for all scenes of a device for as long as any of them holds it.
+    """Return ``make_ray_mesh`` of a file's mesh, shared by all scenes of a device as long as any of them uses it.
 
-    A mesh that a program made itself may change in its hands: each scene has its own of that.
+    A mesh made in memory may be changed by the program, so each scene has a copy of its own.
     """
     by_device = _SHARED.setdefault(mesh, weakref.WeakValueDictionary())
     known = by_device.get(str(device))
@@ -114,11 +115,14 @@ def shared_ray_mesh(mesh: Mesh, device: Any) -> RayMesh:
 
 
 def mesh_key(item: ObjectShape | scenes.Object | scenes.Proxy) -> Any:
-    """Return the key of a mesh: file, part, or a torus's radii and tolerance; None for what rays meet analytically."""
+    """Return the cache key of a mesh: file, part, or a torus's radii and tolerance.
+
+    Return None for shapes that rays intersect analytically.
+    """
     if isinstance(item, ObjectShape):
         if item.mesh is None:
             return mesh_key(item.item)
-        return item.mesh if item.bend is None else (item.index, item.mesh)  # another object's is bent otherwise
+        return item.mesh if item.bend is None else (item.index, item.mesh)  # another object deforms its own copy
     if item.shape == "mesh":
         return item.mesh if isinstance(item, scenes.Object) and item.mesh is not None else item.file
     if not isinstance(item, scenes.Object):
@@ -145,7 +149,7 @@ _MAKERS: Final[dict[str, Any]] = {"rect": rect_mesh, "disk": disk_mesh, "tube": 
 
 
 def make_mesh(key: Any) -> Mesh:
-    """Make the mesh of a ``mesh_key``."""
+    """Return the mesh of a ``mesh_key``."""
     if isinstance(key, Mesh):
         return key
     if isinstance(key, Path):
@@ -156,7 +160,10 @@ def make_mesh(key: Any) -> Mesh:
 
 
 def texture_density(mesh: Mesh) -> npt.NDArray[np.float32]:
-    """Texture coordinates of both sets per unit of length on each triangle, (m, 2): square roots of ratios of areas."""
+    """Return the density of both sets of texture coordinates on each triangle, (m, 2).
+
+    It is the square root of the ratio of the area in texture space to the area in space.
+    """
     corners = mesh.vertices[mesh.faces].astype(np.float64)
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     found = np.zeros((len(mesh.faces), 2))

@@ -1,6 +1,6 @@
-"""A scene as rays meet it: meshes, materials, textures and lights on a device.
+"""Device representation of a scene for ray intersection: meshes, materials, textures and lights.
 
-Positions are metres in the world, angles of the device's records radians, colours linear RGB.
+Positions are in world metres, angles in device records are radians, and colours are linear RGB.
 """
 
 from __future__ import annotations
@@ -46,17 +46,17 @@ _NOWHERE: Final[Mapping[scenes.Marker, Pose | None]] = {}
 _AWAY: Final = (0.0, 0.0, -1e5)
 _BEHIND: Final = -1e3
 _AWAY_SCALE: Final = 1e-6
-"""Scale of shapes whose marker is lost: no ray meets them, and no kernel has to ask."""
+"""Scale of a shape whose marker is lost: no ray hits it, and kernels need no test for it."""
 
 
 class HostScene:
-    """The host's side of a scene: owns what the device's ``RayScene`` points to, and moves what is animated."""
+    """Host side of a scene: owns the arrays of the device's ``RayScene``, and moves animated parts."""
 
     def __init__(self, scene: scenes.Scene, device: Any) -> None:
         """Load the scene's meshes and textures and put them on ``device``.
 
         Raises:
-            SceneError: A mesh or texture cannot be read, or a texture is asked of a mesh without texture coordinates.
+            SceneError: A mesh or texture cannot be read, or a mesh without texture coordinates has a textured material.
         """
         self._meshes: dict[Any, tuple[Mesh, RayMesh, int]] = {}
         self._corners = 0
@@ -68,7 +68,7 @@ class HostScene:
         self._fixed_proxies = self._proxies.copy()
         self._lights = np.zeros(len(scene.lights), structs.struct_dtype(structs.Light))
         self._mirrors: tuple[Outline, Outline] | None = None
-        self._placed = b""  # the objects that the polygons below are of
+        self._placed = b""  # objects whose outlines are the polygons below
         self._outline = NOTHING
         self._receivers: Outline | None = None
         self._gain = np.ones(3)
@@ -94,11 +94,11 @@ class HostScene:
         self._write_area_lights(device)
 
     def set_pixel_spread(self, spread: float) -> None:
-        """Take another angle of a pixel in the picture, radians, than the scene's own camera has."""
+        """Set the angle of a pixel, radians, if it differs from that of the scene's camera."""
         self.ray_scene.pixel_spread = spread
 
     def _write_area_lights(self, device: Any) -> None:
-        """The table of what emits; numbers of a scene with the same ``skeleton`` may change it."""
+        """Write the table of area lights; ``update`` may change its numbers."""
         keys = map(mesh_key, self._shapes)
         meshes = [None if key is None else self._meshes[key][0] for key in keys]
         table = make_area_table([shape.item for shape in self._shapes], meshes)
@@ -116,7 +116,7 @@ class HostScene:
         scene.emitting_shares = wp.array(table.shares, dtype=wp.float32, device=device)
 
     def _add_corners(self, ray_scene: Any, device: Any) -> None:
-        """Add the corners and triangles of all meshes; arrays that no mesh calls for stay empty."""
+        """Upload the corners and triangles of all meshes; arrays that no mesh needs stay empty."""
         meshes = list(self._meshes.values())
         rays = [mesh for _, mesh, _ in meshes]
         ray_scene.vertex_normals = _vectors([mesh.normals for mesh in rays], 3, wp.vec3, device)
@@ -148,13 +148,13 @@ class HostScene:
         ray_scene.triangle_density = _vectors(densities, 2, wp.vec2, device)
 
     def update(self, scene: scenes.Scene) -> None:
-        """Take the numbers of another scene with the same ``skeleton``: poses, sizes, materials, lights."""
+        """Replace the numbers by those of another scene with the same ``skeleton``: poses, sizes, materials, lights."""
         device = self.ray_scene.materials.device
         self.ray_scene.materials.assign(self._take(scene, device))
         self._write_area_lights(device)
 
     def _take(self, scene: scenes.Scene, device: Any) -> npt.NDArray[Any]:
-        """Take the numbers of a scene; returns the records of its materials."""
+        """Store the numbers of a scene, and return the records of its materials."""
         self.scene = scene
         self._shapes = object_shapes(scene)
         self._objects = self._shape_records(self._shapes, device)
@@ -167,7 +167,7 @@ class HostScene:
 
     @property
     def shape_count(self) -> int:
-        """Return the number of records of ``write_objects``: one per object, or per part of one that its file moves."""
+        """Return the number of records of ``write_objects``: one per object, or per separately moving part."""
         return len(self._shapes)
 
     def _place_objects(self) -> None:
@@ -176,7 +176,7 @@ class HostScene:
         starts = np.cumsum([0, *counts])
         self._objects["material"] = [starts[shape.index] for shape in self._shapes]
         self._objects["holed"] = [made_of[shape.index].holed for shape in self._shapes]
-        # Centres in local coordinates: a mesh is stored about the middle of its bounding box, wherever its origin was.
+        # Centres in local coordinates: a mesh is stored relative to the centre of its bounding box.
         self._centers = [
             record["scale"] * self._meshes[key][1].center if key is not None else np.zeros(3)
             for record, key in zip(self._objects, map(mesh_key, self._shapes), strict=True)
@@ -190,7 +190,7 @@ class HostScene:
         return records
 
     def _shape_records(self, shapes: Sequence[ObjectShape | scenes.Proxy], device: Any) -> npt.NDArray[Any]:
-        """Records of ``structs.Shape`` with all that does not move."""
+        """Return records of ``structs.Shape`` with all values that do not move."""
         records = np.zeros(len(shapes), structs.struct_dtype(structs.Shape))
         for record, shape in zip(records, shapes, strict=True):
             item = shape.item if isinstance(shape, ObjectShape) else shape
@@ -212,7 +212,7 @@ class HostScene:
         return records
 
     def _load(self, key: Any, device: Any) -> tuple[Mesh, RayMesh, int]:
-        """Mesh of a file or torus and where its corners start, made once."""
+        """Return the mesh, ray mesh and first corner index of a file or torus, made once."""
         if key not in self._meshes:
             mesh = make_mesh(key)
             shared = isinstance(key, Path) or any(key is shape.mesh for shape in self._shapes)
@@ -222,7 +222,7 @@ class HostScene:
         return self._meshes[key]
 
     def _fill_material(self, record: Any, item: scenes.Object, material: MeshMaterial) -> None:
-        """Write a material of an object into a record of ``structs.Material``."""
+        """Write a material of an object to a record of ``structs.Material``."""
         mesh = mesh_of(item)
         surface = material.surface
         assert not isinstance(surface, scenes.FileMaterial | scenes.EmissiveMaterial)
@@ -259,15 +259,16 @@ class HostScene:
     def write_objects(
         self, records_out: npt.NDArray[Any], seconds: float, places: Mapping[scenes.Marker, Pose | None] = _NOWHERE
     ) -> bool:
-        """Write the virtual objects as they stand ``seconds`` after the first frame.
+        """Write the virtual objects' records for a time.
 
         Args:
             records_out: Records of ``structs.Shape``, ``shape_count`` of them.
             seconds: Time since the first frame.
-            places: ``world_from_marker`` of the markers that something rides on; None where one is lost.
+            places: ``world_from_marker`` of every marker to which parts of the scene are attached; None for a lost
+                marker.
 
         Returns:
-            Whether anything is not where ``records_out`` had it.
+            True if any record differs from its former content.
         """
         placed: dict[int, FloatArray] = {}
         bent = False
@@ -285,7 +286,7 @@ class HostScene:
         return _update(records_out, self._objects) or bent
 
     def _bend(self, record: Any, shape: ObjectShape, seconds: float) -> bool:
-        """Give a part that bends the triangles of a time since the first frame; False: it has them."""
+        """Deform a part for a time since the first frame; return False if its triangles are up to date."""
         if shape.bend is None or shape.moving is None or shape.item.play is None:
             return False
         key, now = mesh_key(shape), shape.item.play.time_at(seconds, shape.moving.duration)
@@ -305,13 +306,13 @@ class HostScene:
         return True
 
     def set_gain(self, gain: npt.NDArray[np.float64]) -> None:
-        """Have lights shine in the camera values of a camera whose gain is another one now, RGB; 1 at first."""
+        """Set the factor on virtual lights: the camera's gain relative to its first frame, RGB; initially 1."""
         self._gain, self._lights_edited = gain, True
 
     def write_proxies(
         self, records_out: npt.NDArray[Any], places: Mapping[scenes.Marker, Pose | None] = _NOWHERE
     ) -> bool:
-        """Write the proxies where their markers have them; arguments and value as ``write_objects``."""
+        """Write the records of proxies at the places of their markers; arguments and value as in ``write_objects``."""
         for record, fixed, item in zip(self._proxies, self._fixed_proxies, self.scene.proxies, strict=True):
             if item.marker is not None:
                 _place(record, item, fixed["rotation"], fixed["position"], places)
@@ -321,11 +322,13 @@ class HostScene:
         return changed
 
     def place_probes(self, pose: Pose, places: Mapping[scenes.Marker, Pose | None] = _NOWHERE) -> bool:
-        """Move ``probes`` to where their markers are, far behind the camera while one is lost; whether any moved.
+        """Move ``probes`` to the places of their markers, far behind the camera while a marker is lost.
+
+        Return True if any moved.
 
         Args:
             pose: ``camera_from_world``.
-            places: As ``write_objects``.
+            places: As in ``write_objects``.
         """
         if all(probe.marker is None for probe in self.scene.probes):
             return False
@@ -346,7 +349,7 @@ class HostScene:
     def write_lights(
         self, records_out: npt.NDArray[Any], seconds: float, places: Mapping[scenes.Marker, Pose | None] = _NOWHERE
     ) -> bool:
-        """Write the virtual lights as they stand ``seconds`` after the first frame; arguments as ``write_objects``."""
+        """Write the virtual lights' records for a time; arguments and value as in ``write_objects``."""
         for record, light in zip(self._lights, self.scene.lights, strict=True):
             if light.animate is None and light.marker is None and seconds != 0.0 and not self._lights_edited:
                 continue
@@ -365,7 +368,7 @@ class HostScene:
         return _update(records_out, self._lights)
 
     def object_outline(self) -> Outline:
-        """Return the outline of virtual objects."""
+        """Return the outline of all virtual objects."""
         placed = self._objects.tobytes()
         if placed != self._placed:
             self._placed = placed
@@ -373,23 +376,26 @@ class HostScene:
         return self._outline
 
     def _receiver_outline(self) -> Outline:
-        """Return the outline of proxies."""
+        """Return the outline of all proxies."""
         if self._receivers is None:
             self._receivers = Outline([face for record in _present(self._proxies) for face in box_faces(record)])
         return self._receivers
 
     def light_outline(self, *, bounced: bool = False) -> Outline:
-        """Return the outline of virtual light and its shadows on proxies; if ``bounced``, with its reflections."""
+        """Return the outline of the regions of proxies that virtual lights illuminate.
+
+        With ``bounced``, the outline also covers the reflections of that light.
+        """
         if self._lit is None:
-            lights = self._lights[self._lights["intensity"].any(axis=1)]  # no other falls anywhere
+            lights = self._lights[self._lights["intensity"].any(axis=1)]  # the others emit nothing
             faces = [box_faces(record) for record in _present(self._proxies)]
             self._lit = Outline([part for light in lights for own in faces for part in lit_faces(light, own)])
             if self.has_area_lights:
-                self._lit = self._receiver_outline()  # what emits may be large: all is taken for lit
+                self._lit = self._receiver_outline()  # emitters may be large: everything counts as lit
         return self._receiver_outline() if bounced and self._lit.polygons else self._lit
 
     def mirror_outline(self, *, receivers: bool = False) -> Outline:
-        """Return the outline of mirror balls, and of ``receivers`` that mirror."""
+        """Return the outline of mirror balls, and with ``receivers`` also of proxies with specular reflection."""
         if not receivers:
             return self._balls
         if self._mirrors is None or self._mirrors[0] is not self._balls:
@@ -398,12 +404,12 @@ class HostScene:
         return self._mirrors[1]
 
     def shadow_outline(self) -> Outline:
-        """Return the outline within which virtual objects can change the environment on proxies."""
+        """Return the outline within which virtual objects can change the environment's light on proxies."""
         return self._receiver_outline() if self.object_outline().polygons else NOTHING
 
 
 def _present(records: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Shapes that are somewhere."""
+    """Return the records of shapes whose marker is not lost."""
     there: npt.NDArray[Any] = records[records["position"][:, 2] > 0.5 * _AWAY[2]]
     return there
 
@@ -415,7 +421,10 @@ def _place(
     position: FloatArray,
     places: Mapping[scenes.Marker, Pose | None],
 ) -> None:
-    """Put a shape where it stands in its marker's frame; out of the way while that is lost."""
+    """Write a shape's placement, given in its marker's frame.
+
+    While the marker is lost, it is shrunk to ``_AWAY_SCALE``.
+    """
     record["scale"] = getattr(item, "scale", 1.0)
     if item.marker is None:
         record["rotation"], record["position"] = rotation, position
@@ -434,7 +443,10 @@ def _place_part(
     center: FloatArray,
     places: Mapping[scenes.Marker, Pose | None],
 ) -> None:
-    """Put a part of an object where ``placement`` (4, 4) has it, its middle at ``center`` in its own coordinates."""
+    """Write the placement (4, 4) of a part of an object.
+
+    ``center`` is the part's mesh centre in its own coordinates.
+    """
     with np.errstate(over="ignore", invalid="ignore"):
         linear, position = placement[:3, :3], placement[:3, :3] @ center + placement[:3, 3]
         if item.marker is not None:
@@ -453,7 +465,7 @@ def _place_part(
 
 
 def _factor(color: scenes.Color) -> tuple[tuple[float, float, float], Path | None]:
-    """Constant factor of a colour, and its picture."""
+    """Return the constant factor and the picture of a colour."""
     return ((1.0, 1.0, 1.0), color) if isinstance(color, Path) else (color, None)
 
 
@@ -462,7 +474,7 @@ def _vectors(parts: Iterable[npt.NDArray[np.float32]], length: int, dtype: Any, 
 
 
 def _update(records_out: npt.NDArray[Any], records: npt.NDArray[Any]) -> bool:
-    # By bytes, those between the fields included: NumPy takes ten times as long to compare records field by field.
+    # Compared as bytes, including padding: NumPy takes ten times as long to compare records field by field.
     if records_out.tobytes() == records.tobytes():
         return False
     records_out.view(np.uint8)[...] = records.view(np.uint8)

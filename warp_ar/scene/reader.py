@@ -1,11 +1,11 @@
-"""Scene files, schema 1: TOML read into frozen dataclasses, with errors that say what would be right.
+"""Reader of scene files, schema 1: TOML into frozen dataclasses, with errors that state allowed values.
 
-Metres, degrees, linear RGB. The world is the marker's frame: origin at the marker's (or board's) centre, x right, y up
-the printed page, z out of the page. Paths are relative to the scene file. What a file leaves out has the default of its
-field; sections other than ``[camera]`` are optional, and ``[marker]`` must be there as soon as anything has a place in
-the world.
+Units are metres and degrees; colours are linear RGB. The world frame is the marker's frame: origin at the centre of the
+marker or board, x to the right and y up on the printed page, z out of the page. Paths are relative to the scene file. A
+missing key has its field's default. All sections except ``[camera]`` are optional, but ``[marker]`` or ``[pose]`` is
+needed as soon as anything is placed in the world.
 
-Constructors check what a program gives them likewise; ``loads_scene(dumps_scene(scene))`` checks a whole scene.
+Constructors apply the same checks to values given in Python; ``loads_scene(dumps_scene(scene))`` checks a whole scene.
 """
 
 from __future__ import annotations
@@ -44,22 +44,22 @@ _T = TypeVar("_T")
 FRAMES: Final = frozenset(
     {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".heic", ".mp4", ".mov", ".mkv", ".avi", ".webm"}
 )
-"""Endings of what is taken for frames, not for a scene."""
+"""Suffixes of pictures and videos, which are taken for frames and not for a scene."""
 FRAMES_GO: Final = "; frames go to --source"
-"""Words for frames that may have been named as a scene."""
+"""Hint in messages if frames were named as a scene."""
 
 
 def bundled_scenes() -> dict[str, Path]:
-    """The scenes that come with the program: name to file, in order of name."""
+    """Return the files of the bundled scenes by name, sorted by name."""
     folder = Path(str(importlib.resources.files("warp_ar.scenes")))
     return {path.stem: path for path in sorted(folder.glob("*.toml"))}
 
 
 def _scene_in(folder: Path) -> Path:
-    """The one scene file of a folder.
+    """Return the only scene file of a folder.
 
     Raises:
-        SceneError: It holds none, or several.
+        SceneError: The folder holds no scene file, or several.
     """
     try:
         found = sorted(path for path in folder.glob("[!.]*.toml") if is_file(path))
@@ -72,7 +72,7 @@ def _scene_in(folder: Path) -> Path:
 
 
 def _desks_beside(path: Path) -> list[str]:
-    """Folders with a scene beside a path that is not there, as one would write them."""
+    """Return the folders with a scene next to a missing path, for suggestions in messages."""
     try:
         beside = sorted(folder for folder in path.parent.iterdir() if is_folder(folder))[:200]
         return [str(folder) for folder in beside if any(folder.glob("[!.]*.toml"))]
@@ -85,13 +85,13 @@ def load_scene(path_or_name: str | Path, files: SceneFiles | None = None) -> Sce
 
     Args:
         path_or_name: A file, a folder that holds one, or the name of a bundled scene.
-        files: Files that it may name, of a scene from outside; all if left out.
+        files: Files that the scene may refer to, if it is untrusted; default: any file.
 
     Raises:
-        SceneError: No such scene, or something in it is wrong; one line names file, key, value and what would be right.
+        SceneError: The scene does not exist or is invalid; one line names file, key, value and allowed values.
     """
     path, bundled = Path(path_or_name), bundled_scenes()
-    # A folder of frames may have a bundled scene's name.
+    # A folder of frames may have the name of a bundled scene.
     if str(path_or_name) and str(path_or_name) not in bundled and is_folder(path):
         path = _scene_in(path)
     if not is_file(path):
@@ -106,7 +106,7 @@ def load_scene(path_or_name: str | Path, files: SceneFiles | None = None) -> Sce
 
 
 def _check_top(top: SceneTable, data: dict[str, Any], label: str) -> None:
-    """Check the keys that every scene file must have."""
+    """Check the keys that are required in every scene file."""
     if "schema" not in top:
         top.fail("schema", f"expected schema = {SCHEMA} at the top of the file")
     if top.data["schema"] is True or top.data["schema"] != SCHEMA:
@@ -117,7 +117,7 @@ def _check_top(top: SceneTable, data: dict[str, Any], label: str) -> None:
 
 
 def _split_lights(lights: Any, label: str) -> tuple[Any, tuple[str, Any] | None]:
-    """Virtual lights, and the captured one with its name in messages, which share a section."""
+    """Return the virtual lights of ``[[light]]``, and the captured light with its name in messages, or None."""
     captured: list[tuple[str, Any]] = []
     if isinstance(lights, dict) and "file" in lights:
         lights, captured = [], [("light", lights)]
@@ -131,14 +131,14 @@ def _split_lights(lights: Any, label: str) -> tuple[Any, tuple[str, Any] | None]
 
 
 class _Sections:
-    """The sections of a scene file, read one by one."""
+    """Reader of a scene file's sections, one by one."""
 
     def __init__(self, data: dict[str, Any], label: str, files: SceneFiles) -> None:
         self.data, self.label, self.files = data, label, files
         self.marker: Marker | None = self.one("marker", fields_of(Marker), sections.read_marker)
 
     def one(self, section: str, keys: Iterable[str], read: Callable[[SceneTable], _T]) -> _T | None:
-        """Return what a section says that stands once; None without it."""
+        """Read a section that occurs at most once; None if it is missing."""
         if section not in self.data:
             return None
         return read(SceneTable(self.label, self.files, section, self.data[section], list(keys)))
@@ -146,7 +146,7 @@ class _Sections:
     def many(
         self, section: str, keys: Iterable[str], read: Callable[[SceneTable], _T], *, single: bool = False
     ) -> tuple[_T, ...]:
-        """Return what a section says that may stand several times; if ``single``, ``[section]`` is one."""
+        """Read a section that may occur several times; with ``single``, ``[section]`` also counts as one."""
         known = list(keys)
 
         def placed(name: str, item: Any) -> _T:
@@ -165,7 +165,7 @@ class _Sections:
         return tuple(placed(f"{section}[{i}]", item) for i, item in enumerate(value))
 
     def check_placed(self) -> None:
-        """Check that what has a place in the world has a world.
+        """Check that a scene with placed parts has a marker or poses.
 
         Raises:
             SceneError: There is neither a marker nor a pose.
@@ -183,9 +183,9 @@ def loads_scene(text: str, path: str | Path | None = None, files: SceneFiles | N
 
     Args:
         text: TOML.
-        path: The file that the text stands for: named in errors, and its folder is where relative paths start. Without
-            it they start at the current folder.
-        files: Files that it may name, of a scene from outside, and the folder where relative paths start.
+        path: Path of the file that contains the text: errors name it, and relative paths start in its folder. Default:
+            the current folder.
+        files: Files that the scene may refer to, if it is untrusted, and the folder where relative paths start.
 
     Raises:
         SceneError: As :func:`load_scene`.
@@ -205,7 +205,7 @@ def loads_scene(text: str, path: str | Path | None = None, files: SceneFiles | N
     objects = read.many("object", fields_of(Object), sections.read_object)
     camera_keys = (*INTRINSICS, "transfer", "calibration", "field_of_view")
     camera = read.one("camera", camera_keys, lambda table: sections.read_camera(table, data.get("source")))
-    assert camera is not None  # ``_check_top`` has asked
+    assert camera is not None  # ``_check_top`` has checked it
     own_light = None
     if captured is not None:
         table = SceneTable(label, files, *captured, list(fields_of(CapturedLight)))

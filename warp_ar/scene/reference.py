@@ -1,7 +1,7 @@
-"""Every key of a scene file with meaning, unit, default and an example that the reader accepts.
+"""List of all keys of scene files with meaning, unit, default and a valid example.
 
-Meanings are the docstrings of the dataclasses' fields; defaults, units and examples are the fields' own. The
-documentation's page of keys is made from this list, and a test reads every example.
+Meanings are the docstrings of the dataclasses' fields. Defaults, units and examples are declared at the fields. The
+documentation's page of keys is generated from this list, and a test reads every example.
 """
 
 from __future__ import annotations
@@ -43,21 +43,21 @@ class Key:
     """One key of a scene file."""
 
     section: str
-    """Section that the key stands in, without brackets; empty at the top of the file."""
+    """Section that contains the key, without brackets; empty for the top of the file."""
     name: str
-    """The key."""
+    """Name of the key."""
     meaning: str
     """Meaning, one or two sentences."""
     unit: str
-    """Unit of its value; a dash where it has none."""
+    """Unit of the value; a dash if it has none."""
     default: str
-    """Value if the key is left out, as TOML; or "required", or "none"."""
+    """Default value as TOML, or "required", or "none"."""
     example: str
-    """A value as TOML."""
+    """Example of a value, as TOML."""
 
     @property
     def description(self) -> str:
-        """Meaning with its unit."""
+        """Return the meaning with the unit, if the meaning does not name it."""
         said = self.unit == "-" or self.unit.split()[0].lower().rstrip(",") in self.meaning.lower()
         return self.meaning if said else f"{self.meaning} ({self.unit})"
 
@@ -67,13 +67,13 @@ class Section:
     """One section of a scene file."""
 
     name: str
-    """Name as in the file, without brackets."""
+    """Name in the file, without brackets."""
     several: bool
-    """True if it is written ``[[name]]`` and may stand there more than once."""
+    """True if the section is written ``[[name]]`` and may occur several times."""
     meaning: str
     """Meaning of the section."""
     kinds: tuple[type[Any], ...]
-    """Dataclasses that it is read into."""
+    """Dataclasses into which the section is read."""
 
 
 SECTIONS: Final[tuple[Section, ...]] = (
@@ -104,7 +104,7 @@ SECTIONS: Final[tuple[Section, ...]] = (
     Section("exposure", False, "A simulated shorter exposure.", (Exposure,)),
 )
 
-# Keys that are no fields of a dataclass: example, unit and meaning.
+# Keys that are not fields of a dataclass: example, unit and meaning.
 _OTHERS: Final[dict[tuple[str, str], tuple[str, str, str]]] = {
     ("camera", "calibration"): (
         '"camera.yml"',
@@ -121,12 +121,15 @@ _OTHERS: Final[dict[tuple[str, str], tuple[str, str, str]]] = {
 
 @functools.cache
 def _classes(module: types.ModuleType) -> dict[str, ast.ClassDef]:
-    """Syntax of a module's classes. To parse a module takes a tenth of a second, and each key asks."""
+    """Return the syntax trees of a module's classes.
+
+    The result is cached, because parsing takes a tenth of a second and every key needs it.
+    """
     return {node.name: node for node in ast.parse(inspect.getsource(module)).body if isinstance(node, ast.ClassDef)}
 
 
 def field_docs(kind: type[Any]) -> dict[str, str]:
-    """Docstrings of a dataclass's fields: the strings that stand below them."""
+    """Return the docstrings of a dataclass's fields: the string literals below them."""
     body = _classes(inspect.getmodule(kind) or description)[kind.__name__].body
     found: dict[str, str] = {}
     for node, below in itertools.pairwise(body):
@@ -155,7 +158,7 @@ def keys() -> Iterator[Key]:
 
 
 def _toml(field: Field) -> str:
-    """Return a field's default as a TOML file has it."""
+    """Return a field's default as TOML."""
     value = field.default
     if field.key.required or value is dataclasses.MISSING:
         return "required"
@@ -165,7 +168,7 @@ def _toml(field: Field) -> str:
 
 
 def as_markdown() -> str:
-    """Return the page of keys: for every section a list of keys with an example each."""
+    """Return the Markdown page of keys: a list for every section, with an example of each key."""
     own = list(keys())
     parts: list[str] = []
     for name in ["", *(section.name for section in SECTIONS)]:

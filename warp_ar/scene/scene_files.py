@@ -1,4 +1,4 @@
-"""The files that a scene may name: the one resolver of paths in scene files."""
+"""Resolver of paths in scene files, which limits the files that an untrusted scene may refer to."""
 
 from __future__ import annotations
 
@@ -10,57 +10,57 @@ from typing import Any
 
 @dataclasses.dataclass(frozen=True)
 class SceneFiles:
-    """Resolver of every path in a scene file, and of the cameras that it may open.
+    """Resolver of all paths in a scene file, and of the capture devices that it may open.
 
-    A scene of the user's own may name any file: ``SceneFiles(folder)``. A scene from outside, such as one dropped onto
-    the live page, may name nothing but the files that came with it and those of the scene that is shown: give both as
-    ``known``, for example ``SceneFiles.of(folder, [*unpacked, *files_of(shown)], cameras)``. `load_scene` and
-    `loads_scene` take it as ``files``; a path that is not among the known files is refused before anything looks at it,
-    and no message says where it would lead.
+    The user's own scene may refer to any file: ``SceneFiles(folder)``. An untrusted scene, for example one dropped onto
+    the live page, may refer only to files that came with it and to files of the scene that is shown. Give both as
+    ``known``, for example ``SceneFiles.of(folder, [*unpacked, *files_of(shown)], cameras)``, and pass the result to
+    `load_scene` or `loads_scene` as ``files``. A path that is not among the known files is refused before the file
+    system is accessed, and no message tells where it points.
     """
 
     folder: Path
     """Folder where relative paths start."""
     known: frozenset[Path] | None = None
-    """Files and folders that may be named, resolved; None: all."""
+    """Allowed files and folders, resolved; None: all."""
     cameras: frozenset[int] | None = None
-    """Indices of capture devices that may be named; None: all."""
+    """Allowed indices of capture devices; None: all."""
 
     names: Mapping[str, Path] = dataclasses.field(default_factory=dict)
-    """Files of a scene from outside that it names by their names alone, wherever they lie."""
+    """Files of an untrusted scene, by file name, wherever they are stored."""
 
     @classmethod
     def of(cls, folder: Path, known: Iterable[Path], cameras: Iterable[int] = ()) -> SceneFiles:
-        """Return the resolver of a scene from outside.
+        """Return the resolver for an untrusted scene.
 
         Args:
             folder: Folder where its relative paths start.
-            known: Files that came with it, and those that the scene that is shown names.
-            cameras: Capture devices that are open already.
+            known: Files that came with the scene, and files of the scene that is shown.
+            cameras: Indices of capture devices that are already open.
         """
         return cls(folder.resolve(), frozenset(path.resolve() for path in known), frozenset(cameras))
 
     def resolve(self, text: str) -> Path | None:
-        """Return the path that a scene names, links followed; None if it must not be named.
+        """Return a path of the scene with links resolved; None if it is not allowed.
 
         Raises:
-            OSError: It cannot be a path; so with RuntimeError and ValueError.
+            OSError: The text is not a valid path; RuntimeError and ValueError are raised for the same reason.
         """
         if text in self.names:
             return self.names[text]
         path = (self.folder / text).resolve()
         if self.known is None:
-            path.exists()  # a name that is too long for the system is refused here
+            path.exists()  # refuses names that are too long for the system
             return path
         return path if path in self.known else None
 
     def has_camera(self, index: int) -> bool:
-        """Return whether a scene may name a capture device."""
+        """Return True if a scene may use a capture device."""
         return self.cameras is None or index in self.cameras
 
 
 def files_of(value: Any) -> Iterator[Path]:
-    """Yield every path that a scene, or a part of one, names."""
+    """Yield every path in a scene or in a part of it."""
     if isinstance(value, Path):
         yield value
     elif isinstance(value, tuple):

@@ -1,8 +1,8 @@
-"""Parts of the screen that objects, lights and shadows can touch.
+"""Screen rectangles that objects, lights and shadows can affect.
 
-Boxes around shapes are clipped by the cones of lights; what is left is a set of convex polygons, an `Outline`, of which
-each frame asks the smallest rectangle of pixels whose rays can meet it. Shadows and light that proxies send on may
-reach all of the proxies: clipped by what reaches them, no bundled scene's rectangle was smaller.
+Boxes around shapes are clipped by the cones of lights. The result is an `Outline`, a set of convex polygons; each frame
+computes the smallest rectangle of pixels whose rays can meet it. Shadows and light reflected by proxies count as
+affecting whole proxies: a tighter bound made no bundled scene's rectangle smaller.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from warp_ar.scene import Pose
 FloatArray = npt.NDArray[np.float64]
 
 Rect = tuple[int, int, int, int]
-"""Part of the screen: row_start, row_stop, column_start, column_stop; all zero where nothing of it is needed."""
+"""Screen rectangle: row_start, row_stop, column_start, column_stop; all zero if empty."""
 EMPTY: Final[Rect] = (0, 0, 0, 0)
 
-# Sides of the pyramid around a spot's cone: 8 sides reach 8 % farther out than the cone at their edges.
+# Number of sides of the pyramid around a spot's cone; with 8 sides, its edges are 8 % farther out than the cone.
 _CONE_SIDES: Final = 8
 
-# From this half angle on a pyramid would be nearly flat; the cone is then taken to reach everything.
+# Half angle above which the pyramid would be nearly flat; such a cone counts as unbounded.
 _WIDE_CONE: Final = math.radians(75.0)
 
-# Faces of a box as (2, 2, 2) corner indices; the first is that of a plane, whose box has no height.
+# Faces of a box as (2, 2, 2) corner indices; the first is the only face of a plane, whose box has no height.
 _FACES: Final = (
     (0, 2, 6, 4),
     (1, 3, 7, 5),
@@ -46,9 +46,9 @@ _CORNERS: Final = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) 
 
 
 def box_faces(record: Any) -> list[FloatArray]:
-    """Faces of the box around a shape in the world, (4, 3) each."""
+    """Return the faces of a shape's bounding box in the world, (4, 3) each."""
     half = np.array(record["extent"], np.float64)
-    # Float32 records are rounded; a part in a million more keeps the box around what the device sees.
+    # Float32 records are rounded; one millionth more makes the box contain the device's shape.
     corners = _CORNERS * (half * (1.0 + 1e-6)) * float(record["scale"])
     corners = corners @ np.array(record["rotation"], np.float64).T + np.array(record["position"], np.float64)
     if record["kind"] == structs.PLANE:
@@ -57,13 +57,13 @@ def box_faces(record: Any) -> list[FloatArray]:
 
 
 def ball_outline(probes: Iterable[scenes.Probe]) -> Outline:
-    """Boxes around mirror balls."""
+    """Return the outline of the bounding boxes of mirror balls."""
     boxes = [np.array(probe.center) + probe.radius * _CORNERS for probe in probes]
     return Outline([box[list(face)] for box in boxes for face in _FACES])
 
 
 def _clip(polygon: FloatArray, normal: FloatArray, offset: float) -> FloatArray:
-    """The part of a convex polygon (n, 3) where normal . p >= offset (Sutherland, Hodgman); empty if there is none."""
+    """Return the part of a convex polygon (n, 3) with normal . p >= offset (Sutherland-Hodgman); it may be empty."""
     height = polygon @ normal - offset
     if (height >= 0.0).all():
         return polygon
@@ -78,10 +78,10 @@ def _clip(polygon: FloatArray, normal: FloatArray, offset: float) -> FloatArray:
 
 
 def lit_faces(light: Any, faces: list[FloatArray]) -> list[FloatArray]:
-    """Parts of a box's faces that a light may reach.
+    """Return the parts of a box's faces that a light may reach.
 
-    A spot's cone is taken as the pyramid around it. For a mesh, whose surface lies inside its box, the parts of the
-    faces inside the pyramid and, if the light is in the box, the light itself span all that can be lit.
+    A spot's cone is replaced by a pyramid around it. A mesh lies inside its box: the convex hull of the clipped faces
+    and, if the light is in the box, of the light's position contains all lit points.
     """
     if light["kind"] != structs.SPOT or light["outer_angle"] >= _WIDE_CONE:
         return faces
@@ -90,7 +90,7 @@ def lit_faces(light: Any, faces: list[FloatArray]) -> list[FloatArray]:
     side = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     side /= np.linalg.norm(side)
     across = np.cross(axis, side)
-    # A plane that touches the cone along a line contains its apex; its normal leans by the half angle toward the axis.
+    # A plane tangent to the cone contains its apex, and its normal is tilted by the half angle toward the axis.
     outer = float(light["outer_angle"]) + 1e-6
     parts = []
     for face in faces:
@@ -112,9 +112,9 @@ def lit_faces(light: Any, faces: list[FloatArray]) -> list[FloatArray]:
 
 @functools.lru_cache(maxsize=8)
 def _ray_bounds(camera: scenes.Camera) -> tuple[npt.NDArray[Any], ...]:
-    """Smallest and largest x / z of each column's rays and y / z of each row's, a pixel's own width included.
+    """Return the bounds of x / z over each pixel column's rays, and of y / z over each row's.
 
-    In ascending order: where a lens bends rows or columns back, a bound is that of all columns to one side.
+    The bounds ascend: where distortion folds rows or columns back, a bound covers all columns to one side.
     """
     if not any(camera.distortion):
         x = (np.arange(camera.width) - camera.cx) / camera.fx
@@ -135,30 +135,30 @@ def _ray_bounds(camera: scenes.Camera) -> tuple[npt.NDArray[Any], ...]:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Outline:
-    """Convex polygons in the world, looked at in every frame from somewhere else."""
+    """Set of convex polygons in the world; each frame computes its screen rectangle."""
 
     polygons: Sequence[FloatArray]
-    """(n, 3) each."""
+    """Polygons, (n, 3) each."""
 
     @functools.cached_property
     def corners(self) -> FloatArray:
-        """Those of all polygons, (n, 3)."""
+        """Return the corners of all polygons, (n, 3)."""
         return np.concatenate(self.polygons)
 
 
 NOTHING: Final = Outline(())
-"""That of no shape."""
+"""Empty outline."""
 
 
 def screen_rects(outlines: Sequence[Outline], pose: Pose, camera: scenes.Camera) -> list[Rect]:
-    """Smallest rectangles of pixels whose rays can meet the convex hulls of outlines, one pixel of margin included.
+    """Return the smallest screen rectangles, with one pixel of margin, whose rays can meet outlines' convex hulls.
 
-    Safe for what reaches behind the camera: polygons are clipped just in front of it. Safe for any distortion: pixels
-    are picked by their undistorted rays, not by distorting the polygons. All at once, because a frame has several, and
-    NumPy takes no longer for all than for one.
+    Polygons that reach behind the camera are clipped in front of it. Lens distortion is handled exactly: pixels are
+    selected by their undistorted rays, not by distorting the polygons. All outlines are processed together, because
+    NumPy takes as long for one as for several.
 
     Args:
-        outlines: What to look at, each by itself.
+        outlines: Outlines; each gets a rectangle of its own.
         pose: ``camera_from_world``.
         camera: The camera of the frames.
     """
@@ -168,7 +168,7 @@ def screen_rects(outlines: Sequence[Outline], pose: Pose, camera: scenes.Camera)
         return rects
     points, starts, places = pose.apply(parts.corners), parts.starts, parts.places
     nearest = points[:, 2].min()
-    # All that is asked of the depth of most frames; where that is not enough, points are looked at.
+    # Depth range that is enough for most frames; else the points are tested one by one.
     if nearest < 2e-6 * (parts.radius + float(np.abs(pose.translation).sum())) and nearest < _nearest(points):
         clipped = {index: _in_front(outlines[index], pose) for index in places}
         left = {index: part for index, part in clipped.items() if len(part)}
@@ -193,21 +193,21 @@ def screen_rects(outlines: Sequence[Outline], pose: Pose, camera: scenes.Camera)
 
 @dataclasses.dataclass(frozen=True)
 class _Joined:
-    """Several outlines one behind the other."""
+    """Corners of several outlines, concatenated."""
 
     corners: FloatArray
-    """Corners of all, (n, 3)."""
+    """Corners of all outlines, (n, 3)."""
     starts: list[int]
-    """First index of each that has any."""
+    """Index of the first corner of each outline that has any."""
     places: tuple[int, ...]
-    """Indices of these outlines."""
+    """Indices of the outlines that have corners."""
     radius: float
-    """No corner is farther from the origin."""
+    """Largest distance of a corner from the origin."""
 
 
 @functools.lru_cache(maxsize=16)
 def _join(outlines: tuple[Outline, ...]) -> _Joined | None:
-    """Outlines stay the same for many frames, and to join them takes as long as to look at them."""
+    """Return the outlines concatenated; cached, because they stay the same over many frames."""
     parts = {index: outline.corners for index, outline in enumerate(outlines) if outline.polygons}
     if not parts:
         return None
@@ -221,12 +221,12 @@ def _starts(parts: Iterable[FloatArray]) -> list[int]:
 
 
 def _nearest(points: FloatArray) -> float:
-    """Depth from which on points of the camera's space are looked at."""
+    """Return the near plane's depth, in the camera's frame, for clipping."""
     return 1e-6 * max(float(np.abs(points).max()), 1e-12)
 
 
 def _in_front(outline: Outline, pose: Pose) -> FloatArray:
-    """Corners of what is left of an outline, in the camera's space, when what is behind the camera is cut off."""
+    """Return the corners, in the camera's frame, of an outline clipped at the near plane."""
     points = pose.apply(outline.corners)
     near = _nearest(points)
     if points[:, 2].min() >= near:

@@ -1,4 +1,4 @@
-"""Sections of a scene file, read into their dataclasses by the keys that the fields declare; see `fields`."""
+"""Readers of scene file sections into their dataclasses, by the keys declared at the fields; see `fields`."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _T = TypeVar("_T")
 _SOURCES: Final = ("path", "camera", "synthetic")
 _TRANSFERS: Final = '"srgb", "linear", "gamma:2.2" or the path of a measured response'
 _NOMINAL_SIZE: Final = (640, 480)
-"""Pixels of a guessed camera until its frames' size is known."""
+"""Size in pixels of a camera without calibration until the frames' size is known."""
 _BOARDS: Final = (
     '"charuco COLUMNSxROWS SQUARE MARKER" or "grid COLUMNSxROWS MARKER GAP" with lengths in metres, such as '
     '"charuco 5x7 0.04 0.03"'
@@ -54,23 +54,23 @@ class SceneTable(Table):
     """One table of a scene file."""
 
     world: Marker | None = None
-    """The world's marker, if there is one."""
+    """Marker of the world frame, or None."""
 
     def __init__(self, label: str, files: SceneFiles, section: str, data: object, keys: Sequence[str]) -> None:
-        """Check the keys; arguments and errors as those of `Table`, with the resolver of paths for the folder."""
+        """Check the keys; arguments and errors as in `Table`, with a resolver of paths in place of the folder."""
         super().__init__(label, files.folder, section, data, keys)
         self.files = files
 
     def inner(self, key: str, data: object, keys: Sequence[str]) -> Self:
-        """Return a table within this one: the value of a key."""
+        """Return the table under a key of this one."""
         return type(self)(self.label, self.files, self.name(key), data, keys)
 
     def resolve(self, key: str, right: str) -> Path:
-        """Return a path, links followed; whether anything is there is not asked."""
+        """Return a path with links resolved; its existence is not checked."""
         value = self.text(key, right=f"the path of {right}")
         try:
             path = self.files.resolve(value)
-        except (OSError, RuntimeError, ValueError):  # too long, a loop of links, a zero byte
+        except (OSError, RuntimeError, ValueError):  # too long, a loop of links, or a zero byte
             self.fail(key, f"expected the path of {right}; this cannot be one")
         if path is None:
             self.fail(
@@ -81,7 +81,7 @@ class SceneTable(Table):
         return path
 
     def file(self, key: str, right: str) -> Path:
-        """The path of a file that is there."""
+        """Return the path of an existing file."""
         path = self.resolve(key, right)
         if not is_file(path):
             self.fail(key, f"no such file: {path}")
@@ -92,12 +92,12 @@ def read_fields(table: SceneTable, kind: type[_T], **given: Any) -> _T:
     """Read a table into its dataclass, which checks the values.
 
     Args:
-        table: The table; keys that the kind of thing does not use are refused.
+        table: The table; keys that its kind does not use are refused.
         kind: The dataclass.
-        given: Values of fields that are read elsewhere.
+        given: Values of fields that are not read from the table.
 
     Raises:
-        SceneError: A value is missing or cannot be.
+        SceneError: A value is missing or not allowed.
     """
     every = fields_of(kind)
     uses: dict[str, tuple[str, ...]] = getattr(kind, "USES", {})
@@ -121,10 +121,10 @@ def read_fields(table: SceneTable, kind: type[_T], **given: Any) -> _T:
 
 
 def read_value(table: SceneTable, field: Field) -> Any:
-    """Read the value of a key, which must be there.
+    """Read the value of a required key.
 
     Raises:
-        SceneError: It is missing or cannot be.
+        SceneError: The value is missing or not allowed.
     """
     name, kind = field.name, field.kinds[0] if field.kinds else type(None)
     is_text = isinstance(table.data.get(name), str)
@@ -157,7 +157,7 @@ def read_value(table: SceneTable, field: Field) -> Any:
 
 
 def read_camera(table: SceneTable, source: object = None) -> Camera:
-    """Read ``[camera]``; ``source`` is the data of ``[source]``, whose first picture may tell the camera."""
+    """Read ``[camera]``; ``source`` is the data of ``[source]``, whose first picture's EXIF may give the camera."""
     transfer = _read_transfer(table)
     way = next((key for key in ("calibration", "field_of_view") if key in table), None)
     if way is not None:
@@ -206,7 +206,7 @@ def read_source(table: SceneTable) -> SourceSpec:
     if len(given) != 1:
         also = f"{given[0]} is given too; " if given else ""
         table.fail(given[1] if given else "path", f"{also}expected exactly one of path, camera and synthetic")
-    # Whether the path is there is asked when the source is opened: another source may stand in for it.
+    # The path's existence is checked when the source is opened, because another source may replace it.
     path = table.resolve("path", fields_of(SourceSpec)["path"].key.right) if "path" in table else None
     spec = read_fields(table, SourceSpec, path=path)
     if spec.camera is not None and not table.files.has_camera(spec.camera):
@@ -269,7 +269,10 @@ def read_marker(table: SceneTable) -> Marker:
 
 
 def _own_marker(parent: SceneTable) -> Marker:
-    """Return the marker that something rides on: a number, of the world's dictionary and size, or a table."""
+    """Return the marker to which a part of the scene is attached.
+
+    The key holds a number (with the world marker's dictionary and size) or a table.
+    """
     world, value = parent.world, parent.data["marker"]
     if isinstance(value, dict):
         given = {"dictionary": world.dictionary, **value} if world else value
@@ -288,7 +291,7 @@ def _own_marker(parent: SceneTable) -> Marker:
 
 
 def _ids(marker: Marker) -> set[int]:
-    """Return the numbers in its dictionary that a marker or board shows."""
+    """Return the ids, in its dictionary, of a marker or of a board's markers."""
     return {marker.id} if marker.board is None else set(range(marker.board.marker_count))
 
 
@@ -347,7 +350,7 @@ def _check_motion(table: SceneTable) -> None:
 
 
 def read_light(table: SceneTable) -> Light | AreaLight:
-    """Read a ``[[light]]`` that is virtual."""
+    """Read a ``[[light]]`` without ``file``."""
     uses: dict[str, tuple[str, ...]] = {**Light.USES, **AreaLight.USES}
     kind = table.choice("kind", uses)
     table.only("kind", uses)

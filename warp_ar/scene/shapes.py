@@ -1,4 +1,4 @@
-"""Meshes of round and square shapes, with exact normals, as fine as a camera can see."""
+"""Triangle meshes of torus, sphere, box, rect, disk and tube, with exact normals and camera-dependent resolution."""
 
 from __future__ import annotations
 
@@ -12,45 +12,47 @@ import numpy.typing as npt
 from warp_ar.scene.geometry import Mesh, make_mesh
 
 NEAREST: Final = 0.4
-"""Metres from which things on a desk are seen; larger ones from at least their extent, else they do not fit."""
+"""Assumed smallest viewing distance in metres; objects larger than this are viewed from at least their own extent."""
 UNSEEN: Final = 0.1 / 1000.0
-"""Error of a silhouette in pixels that is allowed, over a focal length in pixels."""
+"""Allowed silhouette error: 0.1 pixels, divided by a focal length of 1000 pixels."""
 
 
 def silhouette_tolerance(extent: float) -> float:
-    """Largest gap in metres between a curved surface of a radius and its triangles that a camera cannot see.
+    """Return the largest gap in metres between a curved surface and its triangles that stays invisible.
 
-    A gap g at distance d moves a silhouette by focal g / d pixels.
+    ``extent`` is its radius.
+
+    A gap g at distance d moves the silhouette by focal g / d pixels.
     """
     return UNSEEN * max(NEAREST, extent)
 
 
 def _segments(radius: float, gap: float) -> int:
-    """Segments of a circle whose chords stay within ``gap`` of it.
+    """Return the number of segments of a circle whose chords stay within ``gap`` of it.
 
     The chord of a segment of angle 2 pi / n is farthest from its arc at its middle, by the sagitta r (1 - cos(pi / n));
-    solved for n: n = pi / acos(1 - gap / r). From 24 on, so that the shading of tiny objects stays smooth.
+    solved for n: n = pi / acos(1 - gap / r). At least 24, so that the shading of tiny objects stays smooth.
     """
     return max(24, math.ceil(math.pi / math.acos(1.0 - gap / radius))) if gap < radius else 24
 
 
 def torus_mesh(major_radius: float, minor_radius: float, tolerance: float | None = None) -> Mesh:
-    """Torus around the z axis, centred at the origin.
+    """Return the mesh of a torus around the z axis, centred at the origin.
 
     Args:
         major_radius: Distance of the tube's centre from the axis in metres.
         minor_radius: Radius of the tube in metres.
-        tolerance: Largest gap between triangles and surface in metres; :func:`silhouette_tolerance` of the whole torus
-            if left out. Divide by the scale at which the mesh is used.
+        tolerance: Largest gap between triangles and surface in metres; default: :func:`silhouette_tolerance` of the
+            whole torus. Divide it by the scale at which the mesh is used.
 
     Returns:
         The mesh; u runs around the axis from +x through +y, v around the tube from its outermost circle through +z.
     """
     outer = major_radius + minor_radius
-    gap = 0.5 * (silhouette_tolerance(outer) if tolerance is None else tolerance)  # half for either circle: gaps add up
+    gap = 0.5 * (silhouette_tolerance(outer) if tolerance is None else tolerance)  # half per circle: gaps add up
     columns, rows = _segments(outer, gap), _segments(minor_radius, gap)
     u, v, faces = _grid(columns, rows)
-    # The seam's two copies take one angle, so that they agree to the last bit and no ray slips through.
+    # Both copies of the seam use the same angle, so that they agree to the last bit and no ray passes between them.
     phi, psi = (2 * np.pi) * (u % 1.0), (2 * np.pi) * (v % 1.0)
     normals = np.stack([np.cos(phi) * np.cos(psi), np.sin(phi) * np.cos(psi), np.sin(psi)], axis=-1)
     centers = major_radius * np.stack([np.cos(phi), np.sin(phi), np.zeros_like(phi)], axis=-1)
@@ -58,11 +60,11 @@ def torus_mesh(major_radius: float, minor_radius: float, tolerance: float | None
 
 
 def sphere_mesh(radius: float, tolerance: float | None = None) -> Mesh:
-    """Sphere centred at the origin.
+    """Return the mesh of a sphere centred at the origin.
 
     Args:
         radius: Radius in metres.
-        tolerance: Largest gap between triangles and surface in metres; :func:`silhouette_tolerance` if left out.
+        tolerance: Largest gap between triangles and surface in metres; default: :func:`silhouette_tolerance`.
 
     Returns:
         The mesh; u runs around the z axis from -x through -y, +x and +y as in a latlong map, v from -z to +z.
@@ -71,7 +73,8 @@ def sphere_mesh(radius: float, tolerance: float | None = None) -> Mesh:
     columns = _segments(radius, gap)
     rows = (columns + 1) // 2
     u, v, faces = _grid(columns, rows)
-    # The first and last row are the poles: of the two triangles per cell there, the one with two corners on it goes.
+    # The first and last row are the poles: of the two triangles of a cell there, the one with two corners at the pole
+    # is dropped.
     cell = np.arange(len(faces)) // 2
     first = np.arange(len(faces)) % 2 == 0
     faces = faces[~((cell < columns) & first) & ~((cell >= (rows - 1) * columns) & ~first)]
@@ -82,7 +85,7 @@ def sphere_mesh(radius: float, tolerance: float | None = None) -> Mesh:
 
 
 def box_mesh(size: Sequence[float]) -> Mesh:
-    """Axis-aligned box centred at the origin, with flat faces.
+    """Return the mesh of an axis-aligned box centred at the origin, with flat faces.
 
     Args:
         size: Lengths along x, y and z in metres.
@@ -109,11 +112,11 @@ def box_mesh(size: Sequence[float]) -> Mesh:
 
 
 def rect_mesh(size: Sequence[float], cells: int = 1) -> Mesh:
-    """Rectangle in its own x and y that faces +z, centred at the origin.
+    """Return the mesh of a rectangle in the xy plane that faces +z, centred at the origin.
 
     Args:
         size: Lengths along x and y in metres.
-        cells: Into how many it is cut along either; each is two triangles.
+        cells: Number of cells along each side; each cell is two triangles.
 
     Returns:
         The mesh; u runs along x, v along y.
@@ -124,14 +127,14 @@ def rect_mesh(size: Sequence[float], cells: int = 1) -> Mesh:
 
 
 def disk_mesh(radius: float, tolerance: float | None = None) -> Mesh:
-    """Disk in its own x and y that faces +z, centred at the origin.
+    """Return the mesh of a disk in the xy plane that faces +z, centred at the origin.
 
     Args:
         radius: Radius in metres.
-        tolerance: Largest gap between triangles and circle in metres; :func:`silhouette_tolerance` if left out.
+        tolerance: Largest gap between triangles and circle in metres; default: :func:`silhouette_tolerance`.
 
     Returns:
-        The mesh; texture coordinates span the square around it.
+        The mesh; texture coordinates from 0 to 1 span the square around the disk.
     """
     count = _segments(radius, silhouette_tolerance(radius) if tolerance is None else tolerance)
     phi = 2.0 * np.pi * np.arange(count) / count
@@ -144,12 +147,12 @@ def disk_mesh(radius: float, tolerance: float | None = None) -> Mesh:
 
 
 def tube_mesh(radius: float, length: float, tolerance: float | None = None) -> Mesh:
-    """Side of a cylinder around the z axis, centred at the origin; its ends are open.
+    """Return the mesh of a cylinder's side around the z axis, centred at the origin, with open ends.
 
     Args:
         radius: Radius in metres.
-        length: Along z in metres.
-        tolerance: Largest gap between triangles and cylinder in metres; :func:`silhouette_tolerance` if left out.
+        length: Length along z in metres.
+        tolerance: Largest gap between triangles and cylinder in metres; default: :func:`silhouette_tolerance`.
 
     Returns:
         The mesh; u runs around the axis from +x through +y, v along it.
@@ -166,7 +169,7 @@ def tube_mesh(radius: float, length: float, tolerance: float | None = None) -> M
 
 
 def _grid(columns: int, rows: int) -> tuple[npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any]]:
-    """Parameters u and v of a grid's (rows + 1) x (columns + 1) vertices, and two triangles per cell."""
+    """Return u and v of a grid's (rows + 1) x (columns + 1) vertices, and its faces, two triangles per cell."""
     v, u = np.meshgrid(np.arange(rows + 1) / rows, np.arange(columns + 1) / columns, indexing="ij")
     a = (np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)).ravel()
     b, c, d = a + 1, a + columns + 2, a + columns + 1

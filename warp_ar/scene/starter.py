@@ -1,4 +1,4 @@
-"""Scene files that are written: a new desk's, each key with what it means, and results put into one's own."""
+"""Writing of scene files: a commented file for a new scene, and changed keys in an existing file."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from warp_ar.scene.reader import loads_scene
 from warp_ar.scene.reference import keys
 
 FIELD_OF_VIEW = 60.0
-"""Degrees that are guessed of a camera: between a phone's main camera (65 to 70) and a laptop's (50 to 60)."""
+"""Assumed field of view of an uncalibrated camera, degrees: between a phone's main camera (65 to 70) and a laptop's (50
+to 60)."""
 _WIDTH = 110
 
 
@@ -32,14 +33,14 @@ def starter_scene(
     radius: float,
     mesh: str,
 ) -> str:
-    """Text of a scene file with comments.
+    """Return the text of a commented scene file.
 
     Args:
-        name: Name to show.
-        source: A path, or a capture device's index.
-        marker: The board that is printed.
-        center: Where the ball stands, metres.
-        radius: Its radius, metres.
+        name: Display name.
+        source: Path of the frames, or index of a capture device.
+        marker: The printed board.
+        center: Centre of the ball, metres.
+        radius: Radius of the ball, metres.
         mesh: Path of the object's mesh, relative to the file.
     """
     text = f"""\
@@ -97,13 +98,13 @@ roughness = 0.25
 
 
 def key_comment(section: str, name: str) -> list[str]:
-    """Lines of a comment that says what a key is."""
+    """Return the comment lines that describe a key."""
     (key,) = (one for one in keys() if (one.section, one.name) == (section, name))
     return [f"# {line}" for line in textwrap.wrap(key.description, _WIDTH)]
 
 
 def guesses(scene: Scene) -> list[str]:
-    """List a scene's guesses, one line each, with what measures it."""
+    """Return the assumed values of a scene, one line each, with the command that measures the value."""
     found = []
     if (field := scene.camera.field_of_view) is not None:
         where = "" if scene.path is None else f" --write {scene.path.parent}"
@@ -117,18 +118,18 @@ def guesses(scene: Scene) -> list[str]:
 def amend_scene(
     path: Path, section: str, values: Mapping[str, Any], *, index: int = 0, remove: tuple[str, ...] = ()
 ) -> None:
-    """Set keys of one section of a scene file.
+    """Set keys of one section of a scene file, keeping its comments.
 
     Args:
         path: The file.
-        section: Such as ``probe``; of several of its kind, the one at ``index``.
-        values: Keys with numbers, texts, lists of numbers, or tables.
-        index: Which of several.
-        remove: Keys that the new ones stand for; what a new desk's file says of them goes with them.
+        section: Name of the section, such as ``probe``.
+        values: New values by key: numbers, texts, lists of numbers, or tables.
+        index: Index among several sections of that name.
+        remove: Keys that the new ones replace; their comments in a generated file are removed as well.
 
     Raises:
-        SceneError: The file cannot be read, has no such section, or would no longer be a scene; it is left as it was.
-        SinkError: It cannot be written.
+        SceneError: The file cannot be read, has no such section, or would become invalid; it is then left unchanged.
+        SinkError: The file cannot be written.
     """
     text = read_text(path, SceneError, expected="TOML")
     try:
@@ -159,12 +160,12 @@ def amend_scene(
 
 
 def _append(table: Any, key: str, value: Any) -> None:
-    """Put a key behind a section's last, before the comment that stands above what follows in the file."""
+    """Append a key to a section, before comments that belong to the next section."""
     body = table.value.body
     follows: list[Any] = []
     while body and body[-1][0] is None:
         item = body.pop()[1]
-        if isinstance(item, (Comment, Whitespace)):  # tomlkit leaves a null where a key was
+        if isinstance(item, (Comment, Whitespace)):  # tomlkit leaves an empty item where a key was removed
             follows.insert(0, item)
     if isinstance(value, Mapping):
         given, value = value, tomlkit.inline_table()

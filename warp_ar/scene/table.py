@@ -1,4 +1,4 @@
-"""Tables of a TOML file: checked values, and errors that name file, key, value and what would be right."""
+"""Tables of a TOML file: checked values, and errors that name file, key, value and allowed values."""
 
 from __future__ import annotations
 
@@ -12,23 +12,24 @@ from warp_ar.scene.messages import LARGEST, nearest, show_key, show_value
 
 
 class Table:
-    """One table of a file; a kind of file has a class of its own, with its error."""
+    """Table of a TOML file; each kind of file derives a class with its own error type."""
 
     error: ClassVar[type[WarpArError]] = SceneError
-    """Error that is raised."""
+    """Type of error that is raised."""
 
     def __init__(self, label: str, folder: Path, section: str, data: object, keys: Sequence[str]) -> None:
         """Check the keys.
 
         Args:
-            label: How messages call the file.
-            folder: Where relative paths start.
-            section: The table's name in the file; empty: the file itself.
-            data: The table.
-            keys: All that it may have.
+            label: Name of the file in messages.
+            folder: Folder where relative paths start.
+            section: Name of the table in the file; empty for the top of the file.
+            data: Parsed value of the table.
+            keys: Allowed keys.
 
         Raises:
-            WarpArError: As ``error``: it is no table, or has a key that is none of ``keys``. So do all methods.
+            WarpArError: Of type ``error``: ``data`` is no table, or has a key that is not among ``keys``. All methods
+                raise that type.
         """
         self.label, self.folder, self.section = label, folder, section
         if not isinstance(data, dict):
@@ -39,27 +40,30 @@ class Table:
                 raise self.error(f"{label}: {self.name(key)}: unknown key; {nearest(key, keys)}")
 
     def inner(self, key: str, data: object, keys: Sequence[str]) -> Self:
-        """A table within this one: the value of a key."""
+        """Return the table under a key of this one."""
         return type(self)(self.label, self.folder, self.name(key), data, keys)
 
     def __contains__(self, key: str) -> bool:
         return key in self.data
 
     def name(self, key: str) -> str:
-        """Return the name by which messages call a key."""
+        """Return the name of a key in messages."""
         return f"{self.section}.{show_key(key)}" if self.section else show_key(key)
 
     def fail(self, key: str, right: str) -> NoReturn:
-        """Say what is wrong with a key: its value if it has one, and what would be right.
+        """Raise an error that names a key, its value and the allowed values.
 
         Raises:
-            WarpArError: Always, as ``error``.
+            WarpArError: Always, of type ``error``.
         """
         value = f" = {show_value(self.data[key])}" if key in self.data else " is missing"
         raise self.error(f"{self.label}: {self.name(key)}{value}: {right}")
 
     def only(self, kind: str, uses: dict[str, tuple[str, ...]]) -> None:
-        """Complain about keys that other kinds of this section use, but not the one that key ``kind`` names."""
+        """Raise an error for keys that other kinds of this section use, but not this kind.
+
+        ``kind`` is the key that names it.
+        """
         own = sorted(set(uses[self.data[kind]]))
         for key in self.data:
             if key not in own and any(key in keys for keys in uses.values()):
@@ -67,20 +71,20 @@ class Table:
                 self.fail(key, f"not used with {kind} = {value}; its own keys are {', '.join(own)}")
 
     def admit(self, field: Field) -> Any:
-        """Return the value of a field's key as the field holds it."""
+        """Return the value of a field's key in the form that the field stores."""
         try:
             return field.admit(self.data.get(field.name))
         except ValueError as error:
             self.fail(field.name, str(error))
 
     def _take(self, key: str, form: str, default: Any, words: tuple[str, ...] = (), **how: Any) -> Any:
-        """Return the checked value of a key that is no field; ``how``: as `Key`."""
+        """Return the checked value of a key that is no field; ``how`` are further arguments of `Key`."""
         if default is not None and key not in self.data:
             return default
         return self.admit(Field(key, Key(**how), form, None, words))
 
     def flag(self, key: str, default: bool | None = None) -> bool:
-        """Return whether something is so."""
+        """Return a boolean."""
         value = self.data.get(key, default)
         if not isinstance(value, bool):
             self.fail(key, "expected true or false")
@@ -89,28 +93,31 @@ class Table:
     def number(
         self, key: str, default: float | None = None, *, low: float = -LARGEST, high: float = LARGEST, unit: str = ""
     ) -> float:
-        """A number from ``low`` to ``high``; ``unit`` stands in the message if it is not.
+        """Return a number from ``low`` to ``high``; messages name its ``unit``.
 
         Raises:
-            SceneError: The key is missing and has no default, or its value is no such number.
+            SceneError: The key is missing and has no default, or its value is not allowed.
         """
         return float(self._take(key, "number", default, low=low, high=high, unit=unit))
 
     def integer(self, key: str, default: int | None = None, *, low: int, high: int = MOST) -> int:
-        """A whole number."""
+        """Return a whole number from ``low`` to ``high``."""
         return int(self._take(key, "integer", default, low=low, high=high))
 
     def text(self, key: str, default: str | None = None, *, right: str = "some text") -> str:
-        """Some text."""
+        """Return a text."""
         value = self.data.get(key, default)
         if not isinstance(value, str) or not (value or key not in self.data):
             self.fail(key, f"expected {right}")
         return value
 
     def choice(self, key: str, options: Iterable[str], default: str | None = None) -> str:
-        """One of several words."""
+        """Return one of several words."""
         return str(self._take(key, "word", default, tuple(options)))
 
     def vector(self, key: str, *, sizes: tuple[int, ...] = (3,), low: float = -LARGEST, high: float = LARGEST) -> Any:
-        """A list of numbers from ``low`` to ``high``, as many as one of ``sizes``; errors as those of ``number``."""
+        """Return a list of numbers from ``low`` to ``high`` whose length is one of ``sizes``.
+
+        Errors are those of ``number``.
+        """
         return self._take(key, "vector", None, sizes=sizes, low=low, high=high)

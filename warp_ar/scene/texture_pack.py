@@ -1,8 +1,8 @@
-"""Pictures of materials packed for the device: mip levels, one after another, each picture once.
+"""Packing of material pictures for the device: mip levels of every picture, one after another, each picture once.
 
-A level's texel is the mean of the linear values that it covers. Colours under a mask are weighted by alpha, so that
-what is cut away does not bleed in, and a mask's alpha is scaled level by level until as much of it is there as in the
-picture itself: leaves stay as dense from afar [Cas10].
+A texel of a level is the mean of the linear values that it covers. Colours under an alpha mask are weighted by alpha,
+so that colours of cut-out texels do not bleed in. A mask's alpha is scaled at each level so that the same share of
+texels passes the cutoff as in the full picture: foliage stays as dense at a distance [Cas10].
 
 References:
     [Cas10] Castano, "Computing Alpha Mipmaps", 2010.
@@ -35,15 +35,15 @@ _WRAPS: Final = {"repeat": structs.REPEATED, "clamp": structs.CLAMP, "mirror": s
 
 
 def mip_levels(picture: ByteArray, *, encoded: bool, cutoff: float | None = None) -> list[ByteArray]:
-    """A picture and its smaller copies down to one texel.
+    """Return a picture and its smaller copies down to one texel.
 
     Args:
         picture: (h, w, 4) RGBA.
-        encoded: Whether RGB is sRGB-encoded; alpha never is.
-        cutoff: Of a mask; None: alpha cuts nothing away.
+        encoded: True if RGB is sRGB-encoded; alpha is always linear.
+        cutoff: Alpha cutoff of a mask; None: alpha is no mask.
 
     Returns:
-        Levels, each half as wide and high as the one before, rounded down, at least 1.
+        Levels, each with half the width and height of the one before, rounded down, at least 1.
     """
     levels = [picture]
     height, width = picture.shape[:2]
@@ -70,15 +70,15 @@ def mip_levels(picture: ByteArray, *, encoded: bool, cutoff: float | None = None
 
 
 class TexturePack:
-    """Collects the pictures that a scene's materials name."""
+    """Collector of the pictures that a scene's materials use."""
 
     def __init__(self) -> None:
-        """Nothing yet."""
+        """Start with no pictures."""
         self.records: list[dict[str, Any]] = []
-        """Fields of ``structs.Texture``."""
+        """Fields of ``structs.Texture``, one record per texture."""
         self.texels: list[npt.NDArray[np.uint32]] = []
-        """Texels of the pictures, one array each."""
-        self._kept: list[Any] = []  # pictures, so that their ids stay theirs
+        """Texels of the pictures, one array per picture."""
+        self._kept: list[Any] = []  # pictures are kept, so that their ids stay valid
         self._places: dict[Any, dict[str, Any]] = {}
         self._uses: dict[Any, int] = {}
         self._size = 0
@@ -93,15 +93,15 @@ class TexturePack:
         path: Path | None = None,
         clamp: bool = False,
     ) -> int:
-        """Index of the record of a texture, -1 for none.
+        """Add a texture, and return the index of its record; -1 for none.
 
         Args:
-            use: A picture of a mesh's file.
-            images: The pictures of that file.
-            encoded: Whether RGB is sRGB-encoded.
-            cutoff: As ``mip_levels``.
-            path: A picture of the scene instead, or one to multiply it by.
-            clamp: Whether a picture of the scene goes on beyond its border as at it, instead of anew.
+            use: Texture of a mesh's file.
+            images: Pictures of that file.
+            encoded: True if RGB is sRGB-encoded.
+            cutoff: As in ``mip_levels``.
+            path: Picture of the scene, used in place of the file's or multiplied with it.
+            clamp: True if the scene's picture is clamped at its border instead of repeated.
         """
         if use is None and path is None:
             return -1
@@ -133,7 +133,7 @@ class TexturePack:
 
 
 def _reading(use: TextureUse, place: dict[str, Any]) -> dict[str, Any]:
-    """Fields of a record that say how a picture is read."""
+    """Return the fields of a record that describe sampling: transform, wrapping and filter."""
     a, b, c, d, e, f = use.transform
     area = abs(a * e - b * d) if use.transform != IDENTITY else 1.0
     return {
@@ -148,7 +148,7 @@ def _reading(use: TextureUse, place: dict[str, Any]) -> dict[str, Any]:
 
 
 def _picture(image: ByteArray | None, path: Path | None) -> ByteArray:
-    """Picture of a file, of the scene, or their product in linear light."""
+    """Return the picture of the mesh file or of the scene, or their product in linear light."""
     if path is None:
         assert image is not None
         return image
@@ -165,5 +165,5 @@ def _picture(image: ByteArray | None, path: Path | None) -> ByteArray:
 
 
 def mask_cutoff(material: MeshMaterial) -> float | None:
-    """Return the alpha cutoff for ``mip_levels`` of a material's base colour."""
+    """Return the alpha cutoff of a material's base colour for ``mip_levels``; None if it is no mask."""
     return {"opaque": None, "mask": material.cutoff, "blend": 0.5}[material.alpha]

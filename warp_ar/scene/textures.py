@@ -1,7 +1,7 @@
-"""Pictures of materials: decoded, and the meanings of their codes.
+"""Decoding of material pictures, and the linear values of their codes.
 
-Linear pictures that an emitting surface shows, Radiance and OpenEXR, are kept as sRGB codes of their values over the
-largest one: what is darker than 1 / 6600 of that is black, and steps are 1 % or finer from a twentieth of it on.
+Linear pictures on emitting surfaces (Radiance, OpenEXR) are stored as sRGB codes of their values divided by the largest
+value. Values below 1 / 6600 of it become black; above a twentieth of it, steps are 1 % or finer.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ def _decode_table() -> FloatArray:
 
 
 DECODE: Final = _decode_table()
-"""Value of each linear code, then of each sRGB-encoded one, (512,)."""
+"""Linear value of each code: 256 for linear, then 256 for sRGB-encoded pictures, (512,)."""
 
 
 def linear_texture(texture: ByteArray) -> FloatArray:
-    """Linear RGB of an sRGB-encoded picture, (h, w, 3)."""
+    """Return the linear RGB of an sRGB-encoded picture, (h, w, 3)."""
     linear: FloatArray = DECODE[256:][texture]
     return linear
 
 
 def encode_texture(linear: npt.NDArray[Any], *, encoded: bool) -> ByteArray:
-    """Codes whose values are nearest to linear ones, any shape."""
+    """Return the codes nearest to linear values, any shape."""
     if not encoded:
         return np.asarray(np.round(np.clip(linear, 0.0, 1.0) * 255.0), dtype=np.uint8)
     values = DECODE[256:]
@@ -49,18 +49,18 @@ def encode_texture(linear: npt.NDArray[Any], *, encoded: bool) -> ByteArray:
 
 
 def decode_rgba(data: bytes, label: str, *, color: bool = False) -> ByteArray:
-    """Decode a picture into RGBA of 8 bits, as it lies: whatever its EXIF says, as glTF has it.
+    """Decode a picture to 8-bit RGBA; EXIF orientation is ignored, as glTF requires.
 
     Args:
         data: The whole file.
-        label: What messages call it.
-        color: Whether it is one of colours, which its ICC profile explains; glTF has profiles ignored.
+        label: Name of the picture in messages.
+        color: True to convert colours by the ICC profile; False to ignore it, as glTF requires.
 
     Returns:
-        (h, w, 4); grey becomes RGB, alpha is 255 where there is none.
+        (h, w, 4); grey becomes RGB, missing alpha becomes 255.
 
     Raises:
-        SceneError: It cannot be decoded.
+        SceneError: The picture cannot be decoded.
     """
     picture = decode_picture(data, cv2.IMREAD_UNCHANGED, SceneError, label)
     if picture.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
@@ -82,14 +82,17 @@ def decode_rgba(data: bytes, label: str, *, color: bool = False) -> ByteArray:
 
 
 def _clear_code(data: bytes) -> tuple[int, ...] | None:
-    """Return the grey or the colour that is transparent in a PNG, which OpenCV leaves out; None if there is none."""
+    """Return the grey value or colour that a PNG declares as transparent, which OpenCV ignores.
+
+    Return None if there is none.
+    """
     if not data.startswith(b"\x89PNG") or data[25:26] not in (b"\0", b"\2"):
         return None
     at = data.find(b"tRNS", 33)
     count = 1 if data[25] == 0 else 3
     if at < 0 or at > data.find(b"IDAT") or len(data) < at + 4 + 2 * count:
         return None
-    scale = 255 // ((1 << data[24]) - 1) if data[24] < 8 else 1  # grey of fewer bits was spread over 8
+    scale = 255 // ((1 << data[24]) - 1) if data[24] < 8 else 1  # grey of fewer bits was scaled to 8 bits
     return tuple(scale * code for code in struct.unpack_from(f">{count}H", data, at + 4))
 
 
@@ -117,25 +120,25 @@ RADIANCE_SUFFIXES: Final = (".exr", ".hdr")
 
 
 def file_stamp(path: Path) -> tuple[int, int]:
-    """Return a stamp that differs once a file has changed."""
+    """Return a stamp of a file that differs after the file has changed."""
     try:
         status = path.stat()
     except OSError:
-        return 0, 0  # reading it says what is wrong
+        return 0, 0  # the reader reports the error
     return status.st_mtime_ns, status.st_size
 
 
 def load_emission(path: Path) -> tuple[npt.NDArray[np.uint8], float]:
-    """A picture to emit, kept as long as the file is the same.
+    """Return an emissive picture, cached until the file changes.
 
     Args:
-        path: Linear radiance (Radiance, OpenEXR with R, G and B), or what ``load_texture`` reads.
+        path: Linear picture (Radiance, OpenEXR with R, G and B), or a format of ``load_texture``.
 
     Returns:
-        (h, w, 3) RGB, sRGB-encoded, row 0 at the top, and what its largest code stands for.
+        (h, w, 3) RGB, sRGB-encoded, row 0 at the top, and the radiance of code 255.
 
     Raises:
-        SceneError: The file is missing, no such picture, too large, or holds a value that is not finite or negative.
+        SceneError: The file is missing, not such a picture, too large, or contains a negative or non-finite value.
     """
     return _load(path, file_stamp(path))
 

@@ -1,4 +1,4 @@
-"""A scene as the text of a scene file."""
+"""Conversion of a scene to the text of a scene file."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from warp_ar.scene.materials import MATERIALS
 
 
 def dumps_scene(scene: Scene, folder: str | Path | None = None) -> str:
-    """Write a scene as TOML that :func:`loads_scene` turns into an equal one.
+    """Return a scene as TOML that :func:`loads_scene` reads into an equal scene.
 
     Args:
         scene: The scene.
-        folder: Where the text will be saved: paths to objects inside it are written relative to it, all others, and
-            without it all paths, in full.
+        folder: Folder where the text will be saved. Paths inside it are written relative to it, others as absolute
+            paths. None: all paths are absolute.
 
     Returns:
         The text. A camera read from a calibration file is written as its numbers.
@@ -49,7 +49,7 @@ def dumps_scene(scene: Scene, folder: str | Path | None = None) -> str:
 
 
 def _table(item: Any, base: Path | None, keys: Iterable[str] = ()) -> dict[str, Any]:
-    """Return the keys of a dataclass with their values, without those that its kind does not use; empty for None."""
+    """Return the keys of a dataclass with their values, without keys that its kind does not use; empty for None."""
     if item is None:
         return {}
     if isinstance(item, PoseSpec):
@@ -68,13 +68,13 @@ def _table(item: Any, base: Path | None, keys: Iterable[str] = ()) -> dict[str, 
 
 
 def _value(item: Any, base: Path | None) -> Any:
-    """Return a value as TOML has it; paths inside ``base`` are relative to it."""
+    """Return a value as a TOML value; paths inside ``base`` are relative to it."""
     if isinstance(item, Path):
         return (item.relative_to(base) if base and item.is_relative_to(base) else item).as_posix()
     if isinstance(item, Board):
         return str(item)
     if isinstance(item, tuple):
         return [_value(entry, base) for entry in item]
-    if isinstance(item, Marker):  # only the world's white is measured
+    if isinstance(item, Marker):  # only the world's marker has a measured white
         return {key: value for key, value in _table(item, base).items() if key != "white"}
     return _table(item, base) if dataclasses.is_dataclass(item) else item

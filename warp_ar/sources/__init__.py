@@ -1,1 +1,1 @@
-"""Frames in: image folders, video files, cameras, network streams, generated clips."""
+"""Sources of frames: image folders, video files, cameras, network streams, generated clips."""

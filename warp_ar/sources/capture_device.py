@@ -1,7 +1,7 @@
-"""A camera through OpenCV, which may alternate between exposures.
+"""Camera opened through OpenCV, optionally with alternating exposures.
 
-A device is asked for each of its exposures, and each of its pictures is measured, because devices follow some frames
-late.
+Devices apply a new exposure time several frames late. The brightness of each picture is therefore measured to find out
+which exposure it was taken with.
 """
 
 from __future__ import annotations
@@ -23,29 +23,30 @@ from warp_ar.sources.source import DEFAULT_FPS, LiveSource, check_exposures, che
 Image = npt.NDArray[np.uint8]
 
 BRACKET_SECONDS = 0.4
-"""Seconds between requests for a device's other exposures, during which the picture stands still."""
+"""Seconds between requests for other exposures; meanwhile the displayed picture is not updated."""
 
 SETTLE_FRAMES = 5
-"""Frames after which a device is expected to have taken on its first exposure."""
+"""Number of frames after which a device is expected to use its first exposure."""
 
 MOST_WAIT = 12
-"""Frames within which a device must have taken on another."""
+"""Number of frames within which a device must use a newly requested exposure."""
 
 CLOSE_SECONDS = 3.0
-"""Seconds that closing waits for a picture that is being read: a driver may hang."""
+"""Longest time in seconds that closing waits for a picture being read, because a driver may hang."""
 
 MOST_MISSES = 3
-"""Times in a row that it may fail to."""
+"""Number of consecutive exposure changes that a device may fail to follow."""
 
 LEAST_RATIO = 1.8
-"""Least ratio of neighbouring exposures of a device; closer ones cannot be distinguished by their pictures."""
+"""Smallest ratio of neighbouring exposures; closer exposures cannot be distinguished by brightness."""
 
 
 class _Bracketing:
-    """Asks a device for one exposure after another, and knows which of them a picture was taken with.
+    """Requests one exposure after another from a device, and finds the exposure of each picture.
 
-    A device takes some frames to follow. How bright a picture is, against the last one of the longest exposure, says
-    whether it has: over the pixels that are well exposed there, the ratio of linear values is that of the times.
+    A device takes some frames to change its exposure. The present exposure is found by comparison with the last picture
+    of the longest exposure: over pixels that are well exposed there, the ratio of linear values is the ratio of
+    exposure times.
     """
 
     def __init__(self, capture: Any, exposures: tuple[float, ...], name: str) -> None:
@@ -59,7 +60,7 @@ class _Bracketing:
         self._ask(0)
 
     def _ask(self, index: int) -> None:
-        """Ask for an exposure: drivers of Windows take the logarithm of seconds, others ten-thousandths of one."""
+        """Request an exposure; drivers on Windows expect the logarithm of seconds, others units of 1/10,000 second."""
         seconds = self.exposures[index]
         value = math.log2(seconds) if self._logarithmic else 1e4 * seconds
         if not self._capture.set(cv2.CAP_PROP_EXPOSURE, value):
@@ -69,10 +70,10 @@ class _Bracketing:
         self._asked, self._waited, self._settled = index, 0, False
 
     def label(self, image: Image, now: float) -> float | None:
-        """Exposure of a picture in seconds; None while the device is between two.
+        """Return the exposure of a picture in seconds; None while the device changes between two exposures.
 
         Raises:
-            SourceError: The device does not follow.
+            SourceError: The device does not change its exposure.
         """
         sparse = _DECODE[image[::8, ::8]]
         if not self._settled:
@@ -98,7 +99,7 @@ class _Bracketing:
         return seconds
 
     def _give_up(self, now: float) -> None:
-        """The device is late, or the environment has changed meanwhile: begin anew with the longest exposure."""
+        """Start again with the longest exposure, because the device is late or the environment has changed."""
         self._misses += self._asked != 0
         if self._misses >= MOST_MISSES:
             raise SourceError(
@@ -109,11 +110,11 @@ class _Bracketing:
         self._since, self._reference = now, None
 
     def _shows(self, sparse: npt.NDArray[np.float32]) -> bool:
-        """Return whether a picture is as bright as the exposure that was asked for makes it, rather than another."""
+        """Return True if a picture's brightness fits the requested exposure better than any other exposure."""
         assert self._reference is not None
         well = (self._reference > 0.05) & (self._reference < 0.9)
         if well.sum() < 30:
-            return self._waited > SETTLE_FRAMES  # too dark an environment to tell
+            return self._waited > SETTLE_FRAMES  # too dark to decide
         ratio = float(sparse[well].sum() / self._reference[well].sum())
         if ratio <= 0.0:
             return self._asked == len(self.exposures) - 1
@@ -122,14 +123,14 @@ class _Bracketing:
 
 
 _DECODE = (((np.arange(256) / 255 + 0.055) / 1.055) ** 2.4).astype(np.float32)
-"""About what any camera's codes mean in linear light: ratios of some powers of two need no better."""
+"""Approximate linear value of a camera's codes; the ratios of exposures are large enough for an approximation."""
 
 
 def _open_device(device: Any) -> Any:
-    """OpenCV's capture, without its own words on stderr: what is wrong is said in one line."""
+    """Return OpenCV's capture with its messages on stderr suppressed; errors are reported in one line elsewhere."""
     log: Any = cv2.utils.logging
     level = log.getLogLevel()
-    log.setLogLevel(log.LOG_LEVEL_ERROR)  # it warns of every backend that has no such device
+    log.setLogLevel(log.LOG_LEVEL_ERROR)  # it warns for every backend without such a device
     try:
         return cv2.VideoCapture(device)
     finally:
@@ -137,19 +138,19 @@ def _open_device(device: Any) -> Any:
 
 
 class CaptureDevice(LiveSource):
-    """A camera through OpenCV: a thread reads all the time and keeps the newest frame.
+    """Camera opened through OpenCV; a thread reads continuously and keeps the newest frame.
 
     Args:
         device: Index of the device, or the URL of a stream.
         fps: Rate to ask the device for, in frames per second.
         grace: Seconds without a frame after which the device counts as unplugged.
-        exposures: Exposure times in seconds between which to alternate: mostly the longest, the others now and then.
-        opener: Makes what is like ``cv2.VideoCapture``; another one serves tests and unusual backends.
+        exposures: Exposure times in seconds to alternate between: mostly the longest, the others periodically.
+        opener: Function that returns an object like ``cv2.VideoCapture``, for tests and unusual backends.
 
     Raises:
         SourceError: The device cannot be opened, gives no frame or does not let its exposure be set; while iterating,
-            it has been unplugged, changed its size or does not follow its exposure.
-        UsageError: ``exposures`` are too near each other to be told apart.
+            the device was unplugged, changed its frame size or does not change its exposure.
+        UsageError: ``exposures`` are too close to each other to be distinguished.
     """
 
     def __init__(
@@ -198,7 +199,7 @@ class CaptureDevice(LiveSource):
         self._start_reading()
 
     def _read(self) -> Image | None:
-        """The next frame; None once nothing has come for the time of grace, or when told to stop."""
+        """Return the next frame; None if none came within ``grace`` or the source was closed."""
         deadline = time.monotonic() + self._grace
         while not self._stop.is_set():
             ok, picture = self._capture.read()
@@ -210,7 +211,7 @@ class CaptureDevice(LiveSource):
         return None
 
     def _in_rgb(self, picture: npt.NDArray[Any]) -> Image:
-        """A picture as the capture gives it, in RGB of 8 bits."""
+        """Return a picture of the capture as 8-bit RGB."""
         if picture.dtype == np.uint8 and picture.ndim == 3 and picture.shape[2] == 3:
             return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB, self._memory_for(*picture.shape[:2])), np.uint8)
         return rgb8(picture[..., 2::-1] if picture.ndim == 3 else picture, self._name)
@@ -226,7 +227,7 @@ class CaptureDevice(LiveSource):
             raise SourceError(f"{self._name} gave no frame for {self._grace:g} s; was it unplugged?")
 
     def close(self) -> None:
-        """End the reader and release the device; one whose driver hangs is left to it."""
+        """Stop the reading thread and release the device; if its driver hangs, it is left open."""
         self._stop.set()
         super().close()
         self._thread.join(CLOSE_SECONDS)

@@ -1,10 +1,10 @@
-"""Frames of more than 8 bits: a camera's codes of 16 bits, or linear light, beside the 8-bit frame that is tracked.
+"""Frames with more than 8 bits (16-bit camera codes or linear radiance), and their 8-bit versions.
 
-    8-bit codes    what markers are found in, and means of a pixel's surroundings
-    plate          where the frame becomes light: the mirror ball, surfaces, and the picture's own radiance
+    8-bit codes    marker detection, and averages over a pixel's neighbourhood
+    plate          measurement of radiance: mirror ball, surfaces, and the picture itself
 
-Codes of 16 bits become light by the camera's transfer; linear light is taken as it stands, 1 being where a camera of 8
-bits would clip, Rec. 709 primaries, and may be above.
+16-bit codes are decoded by the camera's transfer. Linear radiance is used as it is, with Rec. 709 primaries; 1 is the
+value at which an 8-bit camera would clip, and values may exceed it.
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ from warp_ar.srgb import encode_srgb
 Radiance = npt.NDArray[np.float32]
 
 CLIP_MARGINS = (1.5, 7.5)
-"""8-bit codes below saturation from which on a channel counts as clipped: by itself, and beside another one that does;
-half a code more than in 8 bits, where codes are rounded."""
+"""Distance below saturation, in 8-bit codes, from which a channel counts as clipped: on its own, and if another channel
+is clipped. It is half a code more than for 8-bit frames, whose codes are rounded."""
 
 _STEPS = 65536
 
 
 @dataclasses.dataclass(frozen=True)
 class Plate:
-    """A frame at its full depth."""
+    """Frame at full bit depth."""
 
     picture: npt.NDArray[Any]
     """(height, width, 3) RGB: uint16 codes of the camera's transfer, or float32 linear radiance."""
     clip: float = math.inf
-    """Radiance from which on a channel of a linear picture counts as clipped."""
+    """Radiance above which a channel of a linear picture counts as clipped."""
     codes: npt.NDArray[np.uint8] | None = None
-    """The 8-bit frame, where a source has made it already."""
+    """The 8-bit frame, if the source has already computed it."""
 
     def radiance(self, transfer: str) -> Radiance:
-        """Linear radiance, float32, an array of its own."""
+        """Return the linear radiance as a new float32 array."""
         if self.picture.dtype == np.uint16:
             return decode_deep(self.picture, deep_table(transfer))
         return np.array(self.picture, np.float32, order="C")
@@ -50,12 +50,12 @@ class Plate:
     def codes_at(
         self, rows: npt.NDArray[np.int64], columns: npt.NDArray[np.int64], transfer: str
     ) -> npt.NDArray[np.float64]:
-        """The camera's codes of some pixels in steps of 8 bits, not rounded, 0 to 255, (..., 3).
+        """Return the camera's codes of some pixels, scaled to 0..255 and not rounded, (..., 3).
 
         Args:
-            rows: Of the pixels, (...).
-            columns: Of the pixels, (...).
-            transfer: The camera's.
+            rows: Rows of the pixels, (...).
+            columns: Columns of the pixels, (...).
+            transfer: Transfer function of the camera.
         """
         pixels = self.picture[rows, columns]
         if pixels.dtype == np.uint16:
@@ -63,11 +63,13 @@ class Plate:
         return np.asarray(255.0 * encode_codes(transfer, pixels))
 
     def clip_levels(self, transfer: str, saturation: npt.ArrayLike = (255, 255, 255)) -> npt.NDArray[np.float32]:
-        """Radiance from which on each channel counts as clipped: by itself, and beside another one that does, (2, 3).
+        """Return the radiance above which each channel counts as clipped, (2, 3).
+
+        The first row is for a channel on its own, the second for a channel next to a clipped one.
 
         Args:
-            transfer: The camera's.
-            saturation: 8-bit codes at which its channels saturate, (3,).
+            transfer: Transfer function of the camera.
+            saturation: 8-bit codes at which the channels saturate, (3,).
         """
         if self.picture.dtype != np.uint16:
             return np.full((2, 3), self.clip, np.float32)
@@ -78,51 +80,54 @@ class Plate:
 
 @functools.lru_cache(4)
 def deep_table(transfer: str) -> Radiance:
-    """Linear value of every 16-bit code, (65536, 3)."""
+    """Return the linear value of every 16-bit code, (65536, 3)."""
     return np.asarray(decode_codes(transfer, np.arange(_STEPS) / (_STEPS - 1.0)), np.float32)
 
 
 def decode_deep(codes: npt.NDArray[np.uint16], table: Radiance) -> Radiance:
-    """Linear value of 16-bit codes, (height, width, 3), by a table of `deep_table`'s shape."""
+    """Return the linear values of 16-bit codes, (height, width, 3), by the table of `deep_table`."""
     return np.stack([table[codes[..., channel], channel] for channel in range(3)], -1)
 
 
 @functools.cache
 def _srgb_steps() -> npt.NDArray[np.uint8]:
-    """8-bit sRGB codes over the square root of light, which keeps dark codes apart."""
+    """Return a table of 8-bit sRGB codes, indexed by the square root of radiance, which resolves dark codes."""
     return np.rint(255.0 * encode_srgb((np.arange(_STEPS) / (_STEPS - 1.0)) ** 2)).astype(np.uint8)
 
 
 def srgb8(radiance: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
-    """8-bit sRGB codes of linear light; NaN and what is below 0 become 0, what is above 1 becomes 255."""
+    """Return 8-bit sRGB codes of linear radiance; NaN and negative values become 0, values above 1 become 255."""
     root = np.sqrt(np.clip(np.nan_to_num(radiance, nan=0.0), 0.0, 1.0))
     return np.asarray(_srgb_steps()[(root * np.float32(_STEPS - 1) + np.float32(0.5)).astype(np.int32)])
 
 
 def finite_light(picture: npt.NDArray[Any]) -> Radiance:
-    """Linear light without what no light is: NaN becomes 0, infinities the largest half float; negatives stay."""
+    """Return linear radiance without NaN (set to 0) and infinity (set to the largest half float).
+
+    Negative values stay.
+    """
     return np.ascontiguousarray(np.nan_to_num(picture, nan=0.0, posinf=65504.0, neginf=0.0), np.float32)
 
 
 def as_plate(image: npt.NDArray[Any], size: tuple[int, int]) -> Plate:
-    """A caller's array as a plate of its own.
+    """Return a copy of a caller's array as a plate.
 
     Args:
         image: RGB (height, width, 3): uint16 codes, or linear float32, float16 or float64.
-        size: Width and height that it must have.
+        size: Required width and height.
 
     Raises:
-        UsageError: It has another size or type.
+        UsageError: The array has another size or type.
     """
     check_plate(image, size)
     return Plate(image.copy() if image.dtype == np.uint16 else finite_light(image))
 
 
 def check_plate(image: npt.NDArray[Any], size: tuple[int, int]) -> None:
-    """Check an array that is to be a plate's picture; arguments as those of `as_plate`.
+    """Check the array of a plate's picture; arguments are those of `as_plate`.
 
     Raises:
-        UsageError: It has another size or type.
+        UsageError: The array has another size or type.
     """
     expected = (size[1], size[0], 3)
     if image.shape != expected or (image.dtype != np.uint16 and image.dtype.kind != "f"):
@@ -132,10 +137,10 @@ def check_plate(image: npt.NDArray[Any], size: tuple[int, int]) -> None:
 
 
 def codes8(plate: Plate, transfer: str) -> npt.NDArray[np.uint8]:
-    """The 8-bit frame of a plate: 16-bit codes rounded, or linear light encoded.
+    """Return the 8-bit frame of a plate: 16-bit codes rounded, or linear radiance encoded.
 
     Raises:
-        UsageError: The light is linear, and the camera's transfer is not sRGB.
+        UsageError: The plate is linear, and the camera's transfer is not sRGB.
     """
     if plate.picture.dtype == np.uint16:
         return np.asarray(((plate.picture.astype(np.uint32) + 128) // 257).astype(np.uint8))
@@ -144,10 +149,10 @@ def codes8(plate: Plate, transfer: str) -> npt.NDArray[np.uint8]:
 
 
 def check_linear(transfer: str) -> None:
-    """Check that linear frames fit the camera's transfer: they are shown as sRGB.
+    """Check that the camera's transfer is sRGB, because linear frames are displayed with it.
 
     Raises:
-        UsageError: It is another one.
+        UsageError: The transfer is another one.
     """
     if transfer != "srgb":
         raise UsageError(

@@ -1,4 +1,4 @@
-"""Exposure times between which the frames of a source alternate."""
+"""Alternating exposure times of a source, and the bracket that is merged from them."""
 
 from __future__ import annotations
 
@@ -15,41 +15,43 @@ import numpy.typing as npt
 from warp_ar.errors import UsageError
 
 WAVERING = 1.1
-"""Ratio within which exposures are one; steps of a third of a stop are 1.26, as rounded by cameras 1.15 and more."""
+"""Largest ratio of exposures that count as equal; steps of a third of a stop are 1.26 (1.15 and more as rounded by
+cameras)."""
 ADAPTING = 1.2
-"""Steps that are smaller than this in the middle, of four exposures or more, are a camera that adapts to the light."""
+"""Median step of four or more exposures below which they count as automatic exposure rather than a bracket."""
 MOST_EXPOSURES = 8
-"""Exposures that are merged at most: what lies between others adds little."""
+"""Largest number of merged exposures; further ones in between add little."""
 
 
 @dataclasses.dataclass(frozen=True)
 class BracketPlan:
-    """Exposures of a source that are merged, and the one that is shown."""
+    """Exposures of a source that are merged, and the exposure that is shown."""
 
     ratios: tuple[float, ...]
-    """Exposures over the shown one, longest first; empty if there is no bracket."""
+    """Exposures relative to the shown one, longest first; empty without a bracket."""
     shown: float
-    """Exposure in seconds of the frames that are lit and shown."""
+    """Exposure time in seconds of the frames that are lit and shown."""
     left_out: tuple[float, ...] = ()
-    """Exposures over the shown one that frames have and that are not merged."""
+    """Exposures of frames that are not merged, relative to the shown one."""
     notes: tuple[str, ...] = ()
-    """Notes of what was merged or left out, a line each."""
+    """Notes on what is merged or left out, one line each."""
 
     @property
     def reference(self) -> int:
-        """Return which of ``ratios`` the shown frames have."""
+        """Return the index in ``ratios`` of the shown exposure."""
         return self.ratios.index(1.0) if self.ratios else 0
 
 
 def plan_bracket(exposures: Sequence[float], shown: float | None = None) -> BracketPlan:
-    """Exposures of a source as a bracket, said what is left out.
+    """Return the bracket of a source's exposures, with notes on exposures that are left out.
 
-    Exposures within ``WAVERING`` of each other count as one. A camera that adapts to the light gives many, one beside
-    the other over a wide range: no bracket. Of more than ``MOST_EXPOSURES`` the most evenly spread are merged.
+    Exposures within the ratio ``WAVERING`` count as equal. Many exposures close to each other over a wide range come
+    from a camera's automatic exposure, and make no bracket. Of more than ``MOST_EXPOSURES``, the most evenly spread are
+    merged.
 
     Args:
-        exposures: Seconds, of all frames or each once.
-        shown: Seconds of the frames to show; the longest if None.
+        exposures: Exposure times in seconds, of all frames or each once.
+        shown: Exposure time in seconds of the frames to show; None: the longest.
 
     Raises:
         UsageError: ``shown`` is none of the exposures.
@@ -90,7 +92,7 @@ def plan_bracket(exposures: Sequence[float], shown: float | None = None) -> Brac
 
 
 def _spread(times: Sequence[float], shown: float) -> list[float]:
-    """The ``MOST_EXPOSURES`` times nearest to even steps from the longest to the shortest, the shown one among them."""
+    """Return ``MOST_EXPOSURES`` times, including the shown one, in roughly geometric steps."""
     logs = [math.log(time) for time in times]
     chosen = {min(range(len(times)), key=lambda k: abs(logs[k] - math.log(shown)))}
     for step in range(MOST_EXPOSURES):
@@ -101,10 +103,12 @@ def _spread(times: Sequence[float], shown: float) -> list[float]:
 
 
 def find_exposure(exposure_time: float | None, plan: BracketPlan) -> int | None:
-    """Return which of a bracket's exposures a frame has: the nearest by ratio; the shown one if it does not tell.
+    """Return the index of a frame's exposure in a bracket: the closest by ratio.
+
+    If the frame states none, return the index of the shown exposure.
 
     Args:
-        exposure_time: Seconds.
+        exposure_time: Exposure time of the frame in seconds, or None.
         plan: The bracket.
 
     Returns:
@@ -119,12 +123,12 @@ def find_exposure(exposure_time: float | None, plan: BracketPlan) -> int | None:
 
 
 def brightened(image: npt.NDArray[np.uint8], decode: npt.NDArray[Any], ratio: float) -> npt.NDArray[np.uint8]:
-    """The picture as the reference's exposure would show it, but for its noise: for tracking, and to look at.
+    """Return the picture as it would look, except for noise, at the reference's exposure; for tracking and display.
 
     Args:
         image: uint8 RGB (height, width, 3).
-        decode: Linear value of each code, (256, 3), not falling.
-        ratio: Its exposure time over the reference's.
+        decode: Linear value of each code, (256, 3), non-decreasing.
+        ratio: Exposure time of the picture divided by the reference's.
     """
     table = np.empty_like(decode, np.uint8)
     for channel in range(3):

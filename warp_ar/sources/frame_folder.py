@@ -1,10 +1,10 @@
-"""A folder of images as frames.
+"""Folder of images as a source of frames.
 
-Pictures of other kinds are brought to 8-bit RGB: grey is repeated, alpha is dropped without blending (a camera's colour
-does not depend on it), 16-bit values v become round(v / 257), so that 65535 is 255. Linear light, of OpenEXRs and of
-TIFFs of floats, is encoded as sRGB, light above 1 as 1; primaries that an OpenEXR names become Rec. 709's. The plate of
-a frame is what it was before. An orientation that an image carries is applied. A folder whose frames alternate between
-exposures says so in its sidecar, ``exposures.json``.
+Every picture is converted to 8-bit RGB. Grey is repeated in three channels. Alpha is dropped without blending, because
+a camera's colour does not depend on it. 16-bit values v become round(v / 257), so that 65535 becomes 255. Linear
+radiance (OpenEXR, TIFF of floats) is encoded as sRGB with values above 1 clipped; primaries that an OpenEXR states are
+converted to Rec. 709. The frame's plate keeps the original depth. The image's orientation tag is applied. A folder with
+alternating exposures lists them in its sidecar, ``exposures.json``.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ Image = npt.NDArray[np.uint8]
 
 LINEAR_SUFFIX = ".exr"
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", LINEAR_SUFFIX})
-"""Endings that `FrameFolder` takes for a frame's; other files in a folder are ignored."""
+"""Suffixes of frames for `FrameFolder`; other files in a folder are ignored."""
 
 SIDECAR = "exposures.json"
-"""Optional file in a frame folder, seconds of exposure: ``{"0000.png": 0.008, ...}`` by file name, or ``[0.016,
-0.001]``, which frames have in turn."""
+"""Name of an optional file in a frame folder with exposure times in seconds: by file name, ``{"0000.png": 0.008,
+...}``, or as a list that repeats over the frames, ``[0.016, 0.001]``."""
 
 
 class FrameFolder(RecordedSource):
@@ -55,10 +55,10 @@ class FrameFolder(RecordedSource):
         path: The folder or image.
         fps: Frames per second; frame n is shown at n / fps.
         loop: Start again at the end.
-        exposures: Exposure times in seconds that images have in turn, instead of what ``exposures.json`` says.
+        exposures: Exposure times in seconds that repeat over the images, instead of those in ``exposures.json``.
 
     Raises:
-        SourceError: The path does not exist, holds no image, its first image or its ``exposures.json`` cannot be used.
+        SourceError: The path does not exist or holds no image, or its first image or its ``exposures.json`` is invalid.
         UsageError: ``fps`` or one of ``exposures`` is not a positive number.
     """
 
@@ -97,7 +97,7 @@ class FrameFolder(RecordedSource):
 
     @property
     def names(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Paths of its pictures in order."""
+        """Return the paths of the pictures in order."""
         return tuple(path.as_posix() for path in self._paths)
 
     def _decode(self) -> Generator[Frame, None, None]:
@@ -109,18 +109,18 @@ class FrameFolder(RecordedSource):
 
 
 def read_image(path: pathlib.Path) -> Image:
-    """8-bit RGB of an image file, as the module's docstring says."""
+    """Return an image file as 8-bit RGB, converted as the module's docstring describes."""
     return read_frame(path)[0]
 
 
 def read_frame(path: pathlib.Path) -> tuple[Image, Plate | None]:
-    """An image file as the module's docstring says.
+    """Return an image file as 8-bit RGB, and its full depth.
 
     Returns:
-        8-bit RGB, (height, width, 3); and where the file has more bits, the picture itself.
+        8-bit RGB, (height, width, 3), and the plate if the file has more than 8 bits, else None.
 
     Raises:
-        SourceError: It cannot be read, is no picture, too large, or holds values of another kind.
+        SourceError: The file cannot be read, is no picture, is too large, or holds values of an unsupported type.
     """
     label = f"frame {path}"
     if path.suffix.lower() == LINEAR_SUFFIX:
@@ -140,7 +140,7 @@ def read_frame(path: pathlib.Path) -> tuple[Image, Plate | None]:
 
 
 def _three_channels(picture: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """(H, W, 3) from grey, RGB or RGBA."""
+    """Return (H, W, 3) from grey, RGB or RGBA."""
     if picture.ndim == 2:
         picture = picture[..., None]
     if picture.shape[2] == 1:
@@ -149,13 +149,13 @@ def _three_channels(picture: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 def rgb8(picture: npt.NDArray[Any], name: str) -> Image:
-    """(H, W, 3) uint8 from grey, RGB or RGBA of 8 or 16 bits.
+    """Return (H, W, 3) uint8 from grey, RGB or RGBA with 8 or 16 bits.
 
     Raises:
-        SourceError: It holds values of another kind; ``name`` stands in the message.
+        SourceError: The picture has another type; the message contains ``name``.
     """
     if picture.dtype == np.uint16:
-        # Rounds v / 257 exactly: 257 is odd, so there are no ties.
+        # Equals round(v / 257) exactly: 257 is odd, so there are no ties.
         picture = ((picture.astype(np.uint32) + 128) // 257).astype(np.uint8)
     if picture.dtype != np.uint8:
         raise SourceError(f"{name} holds {picture.dtype} values; 8- or 16-bit whole numbers are needed")
@@ -163,7 +163,10 @@ def rgb8(picture: npt.NDArray[Any], name: str) -> Image:
 
 
 def _read_exposures(folder: pathlib.Path) -> dict[str, float] | tuple[float, ...]:
-    """Exposures in seconds by file name or in turn, from the folder's sidecar; empty where there is none."""
+    """Return exposure times in seconds from the folder's sidecar, by file name or as a repeating list.
+
+    Return an empty dictionary without sidecar.
+    """
     path = folder / SIDECAR
     if not os.path.lexists(path):
         return {}

@@ -1,8 +1,8 @@
-"""A camera or a phone on the network, by PyAV: RTSP, HTTP (also motion JPEG), and what else FFmpeg's libraries fetch.
+"""Network camera or phone, decoded by PyAV: RTSP, HTTP (including motion JPEG), and other protocols of FFmpeg.
 
-A thread decodes whatever comes as it comes and keeps the newest picture, so that a slow reader lags by one frame and
-not by a queue. A line that breaks is opened again, after a tenth of a second, then twice as long each time; only when
-nothing has come for ``grace`` seconds is the source at its end.
+A thread decodes pictures as they arrive and keeps the newest, so that a slow reader lags by one frame instead of by a
+growing queue. A broken connection is opened again after a tenth of a second, with twice the pause after each failure.
+The source ends only after ``grace`` seconds without a picture.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from warp_ar.sources.video_file import pixel_shape, rgb_from_video, video_stream
 Image = npt.NDArray[np.uint8]
 
 SCHEMES = ("rtsp", "rtsps", "http", "https", "rtmp", "rtmps", "srt", "udp", "tcp")
-"""Schemes of addresses of streams."""
+"""URL schemes of streams."""
 
 GRACE_SECONDS = 15.0
-"""Seconds that a line may be broken."""
+"""Seconds without a picture after which the source ends."""
 OPEN_SECONDS = 5.0
-"""Seconds that one attempt to open it may take, and that it may be silent."""
+"""Timeout in seconds of one connection attempt, and of waiting for data."""
 FIRST_PAUSE = 0.1
 LONGEST_PAUSE = 2.0
-"""Seconds before another attempt."""
+"""Longest pause in seconds before another attempt."""
 
-# What is on the network only: an answer must not name a file of this machine.
+# Network protocols only: a server's answer must not refer to a local file.
 _PROTOCOLS = "rtsp,rtsps,rtp,srtp,udp,tcp,tls,http,https,httpproxy,crypto,rtmp,rtmps,srt"
 _OPTIONS = {
     "protocol_whitelist": _PROTOCOLS,
@@ -43,26 +43,26 @@ _OPTIONS = {
     "max_delay": "200000",
 }
 _RTSP = {
-    # Lost packets of UDP smear the picture that light is read from; some cameras know no other way.
+    # Lost UDP packets would corrupt the picture from which light is estimated; UDP is used only if a camera needs it.
     "rtsp_transport": "tcp+udp",
     "rtsp_flags": "prefer_tcp",
-    "fpsprobesize": "3",  # the rate is in its description: half a second less until the first picture
+    "fpsprobesize": "3",  # the stream's description states the rate: half a second less until the first picture
 }
-# How long a stream is looked at before its first picture is there.
+# Limits on the analysis of a stream before its first picture.
 _PROBING = {"probesize": "500000", "analyzeduration": "1000000"}
 
 
 class NetworkStream(LiveSource):
-    """A stream from the network, opened again when its line breaks.
+    """Stream from the network, which is opened again when its connection breaks.
 
     Args:
-        address: Its URL; one of ``SCHEMES``.
-        fps: Nominal rate, where the stream tells none.
+        address: URL of the stream, with one of ``SCHEMES``.
+        fps: Nominal rate if the stream states none.
         grace: Seconds without a picture after which the source ends.
 
     Raises:
-        SourceError: The stream cannot be opened or gives no picture; while iterating, its line stays broken, or its
-            pictures change their size.
+        SourceError: The stream cannot be opened or gives no picture; while iterating, the connection stays broken, or
+            the pictures change their size.
         UsageError: ``fps`` is not a positive number.
     """
 
@@ -71,7 +71,7 @@ class NetworkStream(LiveSource):
         check_fps(fps)
         self._address, self._grace = address, grace
         self.reconnects = 0
-        """Number of times that the line was opened again."""
+        """Number of times that the connection was opened again."""
         self._ready = threading.Event()
         self._problem = ""
         self._failed: SourceError | None = None
@@ -86,7 +86,7 @@ class NetworkStream(LiveSource):
         self.description = f"{self._name} ({self.size[0]}x{self.size[1]}, {self.fps:g} fps)"
 
     def _run(self) -> None:
-        """Decode until told to stop, opening the line again as often as it breaks."""
+        """Decode pictures until the source is closed, opening the connection again whenever it breaks."""
         last, pause = time.monotonic(), FIRST_PAUSE
         while not self._stop.is_set():
             came, heard = False, time.monotonic()
@@ -99,7 +99,7 @@ class NetworkStream(LiveSource):
                         break
                 self._problem = "the stream ended"
             except (av.FFmpegError, OSError, ValueError) as error:
-                # What FFmpeg calls a wait that was cut short depends on where it was.
+                # FFmpeg's error for an interrupted wait depends on where it waited.
                 silent = time.monotonic() - heard > 0.9 * OPEN_SECONDS
                 self._problem = f"no picture came for {OPEN_SECONDS:g} s" if silent else reason(error)
             if self._stop.is_set():
@@ -125,7 +125,7 @@ class NetworkStream(LiveSource):
         self._newest.put(image, time.monotonic())
 
     def _pictures(self) -> Any:
-        """Pictures of one connection, as they come."""
+        """Yield the pictures of one connection as they arrive."""
         waits = (OPEN_SECONDS, OPEN_SECONDS)
         rtsp = self._address.lower().startswith("rtsp")
         with contextlib.closing(
@@ -136,9 +136,9 @@ class NetworkStream(LiveSource):
             rate = float(stream.average_rate or stream.guessed_rate or 0.0)
             if rate > 0.0 and not self._told_fps:
                 self.fps = rate
-            stream.thread_type = "SLICE"  # threads per frame hold back as many frames
+            stream.thread_type = "SLICE"  # frame threads would delay pictures by their number
             reformatter, last = VideoReformatter(), time.monotonic()
-            # Packets of sound too: where they alone come, nothing else would end the wait for a picture.
+            # Audio packets are read as well: if only they arrive, nothing else would end the wait for a picture.
             for packet in container.demux():
                 if self._stop.is_set():
                     return
@@ -149,20 +149,20 @@ class NetworkStream(LiveSource):
                 try:
                     pictures = packet.decode()
                 except av.InvalidDataError:
-                    continue  # a damaged packet: the next whole picture mends it
+                    continue  # a damaged packet: decoding recovers with the next key frame
                 for picture in pictures:
                     yield rgb_from_video(reformatter, picture, self._memory_for, shape)
                     last = time.monotonic()
 
     def close(self) -> None:
-        """End the reader."""
+        """Stop the reading thread."""
         self._stop.set()
         super().close()
         self._thread.join(2.0 * OPEN_SECONDS)
 
 
 def _without_password(address: str) -> str:
-    """The address for messages: what stands before an @ may be a password."""
+    """Return the address for messages, without the part before @, which may contain a password."""
     scheme, _, rest = address.partition("://")
     place, slash, path = rest.partition("/")
     return f"{scheme}://{place.rpartition('@')[2]}{slash}{path.partition('?')[0]}"

@@ -1,8 +1,8 @@
-"""Base of all sources of frames: a `Frame` in 8-bit RGB at a time, recorded ones decoded ahead.
+"""Base classes of all sources, which yield each `Frame` in 8-bit RGB; recorded sources are decoded ahead.
 
-A recorded source (folder, video, generated) loses no frame and is decoded a few frames ahead on one thread. A live one
-does not wait: it holds one frame, the newest, because a late frame is worth less than none. What names a place that is
-not there, or an impossible rate, is complained about here too.
+A recorded source (folder, video, generated) loses no frame and is decoded a few frames ahead on one thread. A live
+source never makes the camera wait: it keeps only the newest frame, because latency matters more than completeness.
+Missing paths and invalid rates are reported here too.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ from warp_ar.sources.deep_frame import Plate
 Image = npt.NDArray[np.uint8]
 
 DEFAULT_FPS = 30.0
-"""Rate of a folder of frames, or of a device that does not tell, in frames per second."""
+"""Frame rate of a folder of frames, or of a device that states none, in frames per second."""
 
 FRAMES_AHEAD = 4
-"""Frames that a recorded source decodes before they are asked for."""
+"""Number of frames that a recorded source decodes in advance."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Frame:
-    """One picture of a source."""
+    """Picture of a source with its time and exposure."""
 
     index: int
-    """Number of the frame, counted from 0 without gaps; goes on counting where a looped source starts again."""
+    """Index of the frame, counted from 0 without gaps; continues when a looped source starts again."""
 
     time: float
     """Seconds since the source's first frame."""
@@ -52,25 +52,25 @@ class Frame:
     """Encoded colour, uint8 RGB, (height, width, 3), C-contiguous."""
 
     exposure_time: float | None = None
-    """Exposure in seconds, None where the source does not tell."""
+    """Exposure time in seconds; None if the source does not state it."""
 
     plate: Plate | None = None
-    """The picture at its full depth, where it has more than 8 bits and the source was told to keep them."""
+    """Picture at full depth, if it has more than 8 bits and ``keeps_depth`` was set on the source."""
 
     name: str = ""
-    """Path of the frame's file; empty where it has none of its own."""
+    """Path of the frame's file; empty if it has no file of its own."""
 
     begins: int = 0
-    """Index of the first frame of its pass: of a clip that is looped, grows."""
+    """Index of the first frame of the current pass over a looped clip."""
 
     @property
     def deepest(self) -> Plate | Image:
-        """The picture at the depth that is known of it: what a pipeline of ``linear`` frames takes."""
+        """Return the picture at full depth if known, else the 8-bit frame; a pipeline of ``linear`` frames takes it."""
         return self.image if self.plate is None else self.plate
 
 
 class Source(Closing):
-    """Origin of frames: a context manager, and iterable."""
+    """Base of all sources of frames: a context manager and an iterable."""
 
     size: tuple[int, int]
     """(width, height) of every frame, in pixels."""
@@ -79,54 +79,54 @@ class Source(Closing):
     """Nominal rate in frames per second."""
 
     tick: fractions.Fraction | None = None
-    """Seconds that times of its frames are whole multiples of, where a recording tells them; None: ``fps`` tells."""
+    """Unit in seconds of which all frame times are whole multiples, if a recording states it; None: 1 / ``fps``."""
 
     length: int | None
-    """Number of frames in one pass where it is known; a video's is what its header says, or its duration tells."""
+    """Number of frames in one pass, or None; for a video by its header or its duration."""
 
     live: bool
-    """True if frames are lost when nobody takes them in time."""
+    """True if frames are dropped while nobody takes them."""
 
     start: float = 0.0
-    """Time of a live source's first frame, seconds of ``time.monotonic``; its frames' times count from there."""
+    """``time.monotonic`` in seconds of a live source's first frame; times of its frames are relative to it."""
 
     description: str
-    """One line for people."""
+    """Description for users, one line."""
 
     note: str = ""
-    """Note on what is done to its frames that people may not expect, one line; empty: nothing is."""
+    """Note for users on an unexpected conversion of the frames, one line; empty if there is none."""
 
     deep: str = ""
-    """Its pictures have more than 8 bits: ``codes`` of the camera, or linear ``light``; empty: they have not."""
+    """Kind of pictures with more than 8 bits: ``codes`` of the camera or linear ``light``; empty for 8 bits."""
 
     curve: str = ""
-    """Transfer of HDR pictures, ``pq`` or ``hlg``; empty: they are no HDR."""
+    """Transfer of HDR pictures, ``pq`` or ``hlg``; empty for other pictures."""
     keeps_depth: bool = False
-    """True if frames come with their plates; to be set before they are read."""
+    """True if frames include their plates; must be set before reading."""
 
     memory: Callable[[], Image] | None = None
-    """Gives memory, uint8 (height, width, 3), into which whoever reads the frames has them written, such as
-    ``Pipeline.new_frame``; sources that make pictures anew write them there. None: into memory of their own."""
+    """Function that returns memory, uint8 (height, width, 3), for a frame, for example ``Pipeline.new_frame``. Sources
+    that create pictures write them there. None: the source allocates."""
 
     names: tuple[str, ...] = ()
-    """Paths of its frames' files; empty where frames have none of their own."""
+    """Paths of the frames' files; empty if frames have no files of their own."""
 
     exposures: tuple[float, ...] = ()
-    """All exposure times of its frames in seconds, longest first; empty where it does not tell."""
+    """All exposure times of the frames in seconds, longest first; empty if unknown."""
 
     @property
     def dropped(self) -> int:
-        """Frames that were skipped because a newer one had come; 0 unless live."""
+        """Return the number of frames skipped because a newer one had arrived; 0 for recorded sources."""
         return 0
 
     def _memory_for(self, height: int, width: int) -> Image | None:
-        """Return where to write a picture of that size; None: into memory of its own."""
+        """Return memory for a picture of that size; None if the source must allocate it."""
         given = None if self.memory is None else self.memory()
         return given if given is not None and given.shape == (height, width, 3) else None
 
     @abstractmethod
     def __iter__(self) -> Iterator[Frame]:
-        """Frames in order; a recorded source starts from its first frame at every call."""
+        """Iterate over the frames in order; a recorded source starts from its first frame at every call."""
 
     @abstractmethod
     def close(self) -> None:
@@ -134,7 +134,7 @@ class Source(Closing):
 
 
 class RecordedSource(Source):
-    """A source that can be read again from the start: decoded ahead on a thread, looped if asked, no frame lost."""
+    """Source that can be read again from the start, without lost frames; decoded ahead on a thread."""
 
     live = False
 
@@ -148,10 +148,10 @@ class RecordedSource(Source):
 
     @abstractmethod
     def _decode(self) -> Generator[Frame, None, None]:
-        """One pass over the frames, index and time from 0."""
+        """Yield the frames of one pass, with index and time starting at 0."""
 
     def __iter__(self) -> Iterator[Frame]:
-        """Frames in order, decoded ahead on a thread; every call starts from the first.
+        """Iterate over the frames in order, decoded ahead on a thread; every call starts from the first frame.
 
         Raises:
             SourceError: The source is closed; while iterating, a frame cannot be decoded or has another size.
@@ -163,10 +163,10 @@ class RecordedSource(Source):
         return frames
 
     def close(self) -> None:
-        """End every iteration and its thread."""
+        """End all iterations and their threads."""
         self._closed = True
         for frames in list(self._running):
-            # One whose next frame another thread is waiting for cannot be closed by this one: it ends with that frame.
+            # A generator in use by another thread cannot be closed here; it ends with its next frame.
             with contextlib.suppress(ValueError):
                 frames.close()
 
@@ -187,7 +187,7 @@ class RecordedSource(Source):
 
 
 def _ahead(frames: Generator[Frame, None, None]) -> Generator[Frame, None, None]:
-    """Yield what ``frames`` yields, computed up to FRAMES_AHEAD frames early; errors keep their place in the order."""
+    """Yield the items of ``frames``, computed up to FRAMES_AHEAD items early; errors keep their place in the order."""
     pending: collections.deque[Future[Frame | None]] = collections.deque()
     take = functools.partial(next, frames, None)
     with contextlib.closing(frames), ThreadPoolExecutor(1, thread_name_prefix="warp-ar-source") as executor:
@@ -204,9 +204,11 @@ def _ahead(frames: Generator[Frame, None, None]) -> Generator[Frame, None, None]
 
 
 class _Newest:
-    """Slots for one picture, its time and its exposure each: putting replaces what was not taken, and counts that.
+    """Slots for one picture each, with time and exposure.
 
-    Every exposure has a slot of its own: a reader that is slower than the camera must not miss the rare short one.
+    A new picture replaces one that was not taken, which is counted as dropped.
+
+    Every exposure has its own slot, so that a slow reader does not miss the rare short exposures.
     """
 
     def __init__(self) -> None:
@@ -217,7 +219,7 @@ class _Newest:
         self.dropped = 0
 
     def put(self, image: Image, time: float, exposure: float | None = None) -> bool:
-        """Offer a picture; False if the slot is closed."""
+        """Offer a picture; return False if closed."""
         with self._changed:
             if self._closed:
                 return False
@@ -227,14 +229,17 @@ class _Newest:
             return True
 
     def close(self, error: SourceError | None = None) -> None:
-        """Take no more; whoever waits gets what is left, then ``error`` if there is one, else the end."""
+        """Accept no more pictures.
+
+        Waiting readers get the remaining pictures, then ``error`` if given, else the end.
+        """
         with self._changed:
             if not self._closed:
                 self._closed, self._error = True, error
             self._changed.notify_all()
 
     def take(self) -> tuple[Image, float, float | None] | None:
-        """Wait for a picture, of several the oldest; None at the end."""
+        """Wait for a picture and return the oldest one; None at the end."""
         with self._changed:
             self._changed.wait_for(lambda: bool(self._items) or self._closed)
             if self._items:
@@ -246,7 +251,7 @@ class _Newest:
 
 
 class LiveSource(Source):
-    """A source that holds the newest frame and counts those that it replaces."""
+    """Source that keeps the newest frame and counts the frames that it replaces."""
 
     live = True
     length = None
@@ -257,7 +262,7 @@ class LiveSource(Source):
         self._index = 0
 
     def _start_reading(self) -> None:
-        """Have a thread put pictures into ``_newest``."""
+        """Start a thread that puts pictures into ``_newest``."""
         self._thread = threading.Thread(target=self._read_all, name="warp-ar-camera", daemon=True)
         self._thread.start()
 
@@ -266,7 +271,7 @@ class LiveSource(Source):
             self._run()
         except SourceError as error:
             self._end(error)
-        except Exception as error:  # whatever it is, who waits for a picture is told
+        except Exception as error:  # the error, of any type, is passed to the waiting reader
             failed = SourceError(f"{self._name}: {reason(error)}")
             failed.__cause__ = error
             self._end(failed)
@@ -274,18 +279,18 @@ class LiveSource(Source):
             self._end(None)
 
     def _run(self) -> None:
-        """Put pictures into ``_newest`` until told to stop."""
+        """Put pictures into ``_newest`` until the source is closed."""
 
     def _end(self, error: SourceError | None) -> None:
         self._newest.close(error)
 
     @property
     def dropped(self) -> int:
-        """Frames that were skipped because a newer one had come."""
+        """Return the number of frames skipped because a newer one had arrived."""
         return self._newest.dropped
 
     def __iter__(self) -> Iterator[Frame]:
-        """The newest frame each time, waiting for one that has not been seen; ends when the source is closed."""
+        """Iterate over new frames, always taking the newest; ends when the source is closed."""
         while (item := self._newest.take()) is not None:
             image, stamp, exposure = item
             if self._index == 0:
@@ -295,17 +300,17 @@ class LiveSource(Source):
             yield frame
 
     def close(self) -> None:
-        """Take no more; iteration ends after what is left."""
+        """Accept no more frames; iteration ends after those left."""
         self._newest.close()
 
 
 class QueueSource(LiveSource):
-    """Frames that somebody else pushes, such as a web page with a camera.
+    """Source whose frames are pushed by other code, for example from a web page's camera.
 
     Args:
         size: (width, height) of every frame, in pixels.
         fps: Nominal rate in frames per second.
-        description: One line for people.
+        description: Description for users, one line.
     """
 
     def __init__(self, size: tuple[int, int], *, fps: float = DEFAULT_FPS, description: str = "pushed frames") -> None:
@@ -314,17 +319,17 @@ class QueueSource(LiveSource):
         self.size, self.fps, self.description = size, fps, f"{description} ({size[0]}x{size[1]})"
 
     def push(self, image: Image, time: float) -> bool:
-        """Offer a frame from any thread; it replaces one that was not yet taken.
+        """Offer a frame from any thread; it replaces a frame that was not yet taken.
 
         Args:
             image: uint8 RGB, (height, width, 3); must not be changed afterwards.
-            time: Seconds, on any clock that only goes forward.
+            time: Time in seconds on any monotonic clock.
 
         Returns:
-            False if the source is closed and the frame was left aside.
+            False if the source is closed and the frame was ignored.
 
         Raises:
-            SourceError: The image is not of the source's size or kind.
+            SourceError: The image has another size or type than the source.
         """
         if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
             got = f"{image.dtype} {image.shape}"
@@ -334,10 +339,10 @@ class QueueSource(LiveSource):
 
 
 def check_size(image: Image, size: tuple[int, int], name: str, index: int | None) -> None:
-    """Check that a picture is of the (width, height) of those before it.
+    """Check that a picture has the (width, height) of the pictures before it.
 
     Raises:
-        SourceError: It is not.
+        SourceError: The picture has another size.
     """
     height, width = image.shape[:2]
     if (width, height) != size:
@@ -346,10 +351,10 @@ def check_size(image: Image, size: tuple[int, int], name: str, index: int | None
 
 
 def check_fps(fps: float | None) -> None:
-    """Check a rate in frames per second; None is none given.
+    """Check a rate in frames per second; None is accepted.
 
     Raises:
-        UsageError: It is not a positive number.
+        UsageError: The rate is not a positive number.
     """
     if fps is not None and not (math.isfinite(fps) and fps > 0):
         raise UsageError(f"fps is {fps}; it must be a positive number of frames per second")
@@ -366,15 +371,15 @@ def check_exposures(exposures: Sequence[float]) -> None:
 
 
 def distinct(exposures: Iterable[float]) -> tuple[float, ...]:
-    """Every exposure once, longest first."""
+    """Return the distinct exposure times, longest first."""
     return tuple(sorted(set(map(float, exposures)), reverse=True))
 
 
 def existing_path(path: pathlib.Path) -> pathlib.Path:
-    """The path itself, if frames can be read from it.
+    """Return the path if frames can be read from it.
 
     Raises:
-        SourceError: It does not exist (the error names the nearest name that does), cannot be read, or is neither file
+        SourceError: The path does not exist (the message suggests a similar name), cannot be read, or is neither file
             nor folder.
     """
     try:
@@ -382,7 +387,7 @@ def existing_path(path: pathlib.Path) -> pathlib.Path:
             if kind in ("file", "folder"):
                 return path
             raise SourceError(f"{path} is {kind}; frames are read from folders, files and capture devices")
-        # The first part that is missing is the one that was mistyped.
+        # The first missing part of the path is the mistyped one.
         missing = path
         while kind_of(missing.parent) == "nothing":
             missing = missing.parent
@@ -395,10 +400,10 @@ def existing_path(path: pathlib.Path) -> pathlib.Path:
 
 
 def names_in(folder: pathlib.Path) -> list[str]:
-    """Return the names of all that a folder holds, sorted, without hidden files such as macOS's ``._NAME``.
+    """Return the sorted names in a folder, without hidden files such as macOS's ``._NAME``.
 
     Raises:
-        SourceError: It cannot be read.
+        SourceError: The folder cannot be read.
     """
     try:
         return sorted(entry.name for entry in folder.iterdir() if not entry.name.startswith("."))
@@ -407,5 +412,5 @@ def names_in(folder: pathlib.Path) -> list[str]:
 
 
 def nearest_name(name: str, names: Iterable[str]) -> str | None:
-    """The one of ``names`` that ``name`` may have meant; None if none is near."""
+    """Return the one of ``names`` that is most similar to ``name``; None if none is similar."""
     return next(iter(difflib.get_close_matches(name, list(names), 1)), None)

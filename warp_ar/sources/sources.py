@@ -1,10 +1,10 @@
-"""Frames in: image folders, video files, capture devices, generated clips and a queue that others push into.
+"""Opening of sources of frames: image folders, video files, capture devices, streams and generated clips.
 
-Every source yields the same object, a `Frame` in 8-bit RGB, and falls into one of two kinds. A recorded source (folder,
-video, generated) loses no frame and is decoded a few frames ahead on one thread. A live source (device, queue) holds
-one frame, the newest, because a late frame is worth less than none; what it skips is counted in ``dropped``.
+Every source yields a `Frame` in 8-bit RGB. A recorded source (folder, video, generated) loses no frame and is decoded a
+few frames ahead on one thread. A live source (device, stream, queue) keeps only the newest frame, because latency
+matters more than completeness; ``dropped`` counts the skipped frames.
 
-Frames may alternate between exposures, of which only one is shown: the others tell what clips in it.
+Frames may alternate between exposures. Only one exposure is shown; the others provide the light that clips in it.
 """
 
 from __future__ import annotations
@@ -47,15 +47,16 @@ MOST_INDEX = 1023
 def open_source(
     spec: str | int | pathlib.Path, *, fps: float | None = None, loop: bool = False, exposures: Sequence[float] = ()
 ) -> Source:
-    """Open whatever ``spec`` names.
+    """Open the source named by ``spec``.
 
     Args:
         spec: A folder of images, an image, a video file, the index of a capture device (a number, also as text), the
             URL of a camera's stream (``rtsp://...``, ``http://...``), or ``synthetic:NAME``.
-        fps: Frames per second: the rate of a folder (default 30), a new rate for a video's frames, or what is asked of
-            a device.
+        fps: Frames per second: the rate of a folder (default 30), a new rate for a video, or the rate requested from a
+            device.
         loop: Start again at the end, with index and time going on. Without effect on live sources.
-        exposures: Exposure times in seconds that frames have in turn: those of a recording, or to be asked of a device.
+        exposures: Exposure times in seconds that repeat over the frames: those of a recording, or those to request from
+            a device.
 
     Raises:
         SourceError: There is no such source, or it cannot be read.
@@ -87,7 +88,10 @@ def open_source(
 
 
 def source_of(scene: Scene, given: str | int | pathlib.Path | None = None) -> str | int | pathlib.Path | None:
-    """Return the name by which ``open_source`` knows the frames: of those that are given, else of the scene's own."""
+    """Return the argument of ``open_source`` for the given frames, or else for the scene's own.
+
+    Return None if there are neither.
+    """
     if given is not None or scene.source is None:
         return given
     spec = scene.source
@@ -95,11 +99,11 @@ def source_of(scene: Scene, given: str | int | pathlib.Path | None = None) -> st
 
 
 def open_scene_source(scene: Scene, given: str | int | pathlib.Path | None, *, loop: bool) -> Source:
-    """Open the source that is given, or else the scene's own with what the scene says of it.
+    """Open the given source, or else the scene's own source with the scene's settings.
 
     Raises:
-        SourceError: It cannot be opened.
-        UsageError: There is none.
+        SourceError: The source cannot be opened.
+        UsageError: There is neither a given source nor one in the scene.
     """
     if (where := source_of(scene, given)) is None:
         raise UsageError(f"scene {scene.name!r} names no source; give one with --source")

@@ -18,8 +18,8 @@ Image = npt.NDArray[np.uint8]
 class Synthetic(RecordedSource):
     """A generated clip, the same in every run.
 
-    ``checker`` is a sliding checkerboard. ``card`` is a marker seen by a moving camera, with known truth: `pose` and
-    `camera_matrix`; the marker is ``DICT_4X4_50`` number 0, its black square ``MARKER_SIZE`` metres wide.
+    ``checker`` is a sliding checkerboard. ``card`` is a marker seen by a moving camera, with ground truth in `pose` and
+    `camera_matrix`. The marker is ``DICT_4X4_50`` number 0, its black square ``MARKER_SIZE`` metres wide.
 
     Args:
         name: ``card`` or ``checker``.
@@ -56,13 +56,16 @@ class Synthetic(RecordedSource):
 
     @property
     def camera_matrix(self) -> npt.NDArray[np.float64]:
-        """Pinhole matrix of ``card``, (3, 3), in pixels with centres at integers."""
+        """Return the pinhole camera matrix of ``card``, (3, 3), in pixels with centres at integers."""
         width, height = self.size
         focal = 0.9 * width
         return np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
 
     def pose(self, index: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        """(R, t) of ``card``'s frame: marker-frame points X in metres are R X + t in the camera's (x right, y down)."""
+        """Return (R, t) of a frame of ``card``.
+
+        A point X of the marker's frame, in metres, is R X + t in the camera's frame (x right, y down).
+        """
         phase = 2 * math.pi * index / (self.length or 1)
         flip = np.diag([1.0, -1.0, -1.0])
         tilt = cv2.Rodrigues(np.array([math.radians(-35 + 8 * math.sin(phase)), 0.0, 0.0]))[0]
@@ -82,7 +85,8 @@ class Synthetic(RecordedSource):
         world_from_texel = np.array([[metres, 0, -middle * metres], [0, -metres, middle * metres], [0, 0, 1]])
         rotation, translation = self.pose(index)
         pixel_from_world = self.camera_matrix @ np.column_stack([rotation[:, :2], translation])
-        # Drawn twice as large and averaged; a coarse pixel's centre lies half a fine pixel past the even fine one.
+        # Drawn at twice the size and averaged: a coarse pixel's centre is half a fine pixel beyond the even fine
+        # pixel's centre.
         fine_from_pixel = np.array([[scale, 0, (scale - 1) / 2], [0, scale, (scale - 1) / 2], [0, 0, 1]])
         width, height = self.size
         fine = cv2.warpPerspective(

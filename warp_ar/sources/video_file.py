@@ -1,9 +1,9 @@
-"""A video file as frames: those that its container presents, as it presents them.
+"""Video file as a source of frames, with rotation, pixel shape and edit list of its container applied.
 
-Pictures with more than 8 bits, or of HDR, have plates as well. A standard signal of 10 to 16 bits becomes codes of 16
-bits, which the camera's transfer decodes as it does 8-bit ones. A PQ or HLG signal becomes linear light, reference
-white 1, and wide primaries (BT.2020, P3) Rec. 709's. FFmpeg only brings chroma to the pixels' places; what the numbers
-mean is computed here, for its own way to 16-bit RGB is off by four tenths of a percent.
+Pictures with more than 8 bits, and HDR pictures, have plates as well. A standard signal of 10 to 16 bits becomes 16-bit
+codes, decoded by the camera's transfer like 8-bit codes. A PQ or HLG signal becomes linear radiance with reference
+white at 1 and Rec. 709 primaries instead of BT.2020 or P3. FFmpeg only upsamples chroma. Matrix, range and transfer are
+computed here, because FFmpeg's own conversion to 16-bit RGB is off by 0.4 %.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ from warp_ar.srgb import decode_srgb
 
 Image = npt.NDArray[np.uint8]
 Taken: TypeAlias = tuple[Image, float | None, Plate | None]
-"""A picture, its time stamp in seconds, and its plate if that is kept."""
+"""8-bit picture, its time stamp in seconds, and its plate if plates are kept."""
 
-# Containers of video alone: FFmpeg also draws text as a picture, and follows play lists to other files and machines.
+# Containers of video only: FFmpeg also renders text as pictures, and follows play lists to other files and hosts.
 _FORMATS = (
     "mov,mp4,matroska,webm,avi,mpegts,mpeg,mpegvideo,m4v,h264,hevc,av1,obu,ivf,flv,live_flv,asf,ogg,mxf,dv,nut,"
     "mjpeg,mjpeg_2000,gif,apng,yuv4mpegpipe,wtv,rm,vc1,vc1test,swf,r3d,bink,roq,nsv,smk,gxf,wav"
 )
-# FFmpeg converts these to RGB in planes in half the time that it takes for RGB in turn, to the same bits. Of halved
-# chroma in an odd number of rows some codes differ by one.
+# For these formats, FFmpeg converts to planar RGB in half the time of interleaved RGB, with identical results. Only
+# with subsampled chroma and an odd number of rows do some codes differ by one.
 _IN_PLANES = frozenset(
     ("yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p", "nv12", "yuv420p10le", "p010le")
 )
@@ -52,30 +52,30 @@ _LUMA: Final = {
     int(Colorspace.ITU709): (0.2126, 0.0722),
     int(Colorspace.BT2020): (0.2627, 0.0593),
     int(Colorspace.ITU601): (0.299, 0.114),
-    6: (0.299, 0.114),  # SMPTE 170M, the same matrix
+    6: (0.299, 0.114),  # SMPTE 170M has the same matrix
 }
-"""Shares of red and blue in luma."""
+"""Coefficients of red and blue in luma."""
 _WIDE: Final = {
     int(ColorPrimaries.BT2020): REC_2020,
     int(ColorPrimaries.SMPTE432): P3_D65,
 }
 HD_HEIGHT = 720
-"""Rows from which a video that names no colour matrix is BT.709."""
+"""Number of rows from which a video without stated colour matrix counts as BT.709."""
 
-# Nearest-neighbour chroma shifts coloured edges by up to a pixel, and truncated products darken by a level or two.
+# Nearest-neighbour chroma would shift coloured edges by up to a pixel, and truncation would darken by one or two codes.
 TO_RGB = Interpolation.BILINEAR | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
 
 _STEPS = 65536
 
-# Encoders tell the rounding of a size as a pixel's shape: 854x480 for 16:9 has pixels of 1280:1281.
+# Encoders write rounding of the size as a pixel aspect ratio: 854x480 for 16:9 has 1280:1281.
 _NEARLY_SQUARE = 0.005
 
 
 class VideoFile(RecordedSource):
-    """A video file, its first video stream, as its container presents it.
+    """First video stream of a file, presented as its container specifies.
 
-    Colour is converted with the stream's own matrix and range; one that names none is taken as BT.709 from 720 rows up,
-    else BT.601: what players do, and encoders expect. Frame times are counted from the first frame.
+    Colour is converted with the stream's matrix and range. A stream that states none counts as BT.709 from 720 rows up,
+    else as BT.601, as in players and encoders. Frame times are relative to the first frame.
 
     Follows:
         edit lists; display matrix, to quarter turns; variable rates; matrix, range, primaries, transfer (PQ, HLG too);
@@ -86,9 +86,9 @@ class VideoFile(RecordedSource):
 
     Args:
         path: The file.
-        fps: Show frame n at n / fps instead of at its own time.
+        fps: Rate that replaces the frames' own times: frame n is shown at n / fps.
         loop: Start again at the end.
-        exposures: Exposure times in seconds that frames have in turn.
+        exposures: Exposure times in seconds that repeat over the frames.
 
     Raises:
         SourceError: Damaged before its first frame.
@@ -96,7 +96,7 @@ class VideoFile(RecordedSource):
     """
 
     _decoders = 0
-    """Threads of the decoder; 0: one more than there are cores, up to sixteen."""
+    """Number of decoder threads; 0: one more than the number of cores, up to sixteen."""
 
     def __init__(
         self,
@@ -135,7 +135,7 @@ class VideoFile(RecordedSource):
             self.note = f"{self._path} has pixels of {x}:{y}; its frames are resampled to {width}x{height}, square ones"
 
     def _open(self, **how: Any) -> Any:
-        """The file's container; ``how``: more of PyAV's arguments."""
+        """Open the file's container; ``how`` are further arguments of PyAV."""
         try:
             container = av.open(str(self._path), options=_OPTIONS, **how)
         except (av.FFmpegError, OSError, ValueError) as error:
@@ -158,27 +158,27 @@ class VideoFile(RecordedSource):
                     seconds = index / self.fps if self._retimed or index == 0 else previous + 1.0 / self.fps
                 else:
                     first = stamp if first is None else first
-                    # Time never stands still or runs back, whatever a broken recorder wrote.
+                    # Times increase strictly, even if a broken recorder wrote others.
                     seconds = stamp - first if stamp - first > previous else previous + 1.0 / self.fps
                 previous = seconds
                 yield Frame(index, seconds, image, plate=plate)
 
     def _pictures(self, container: Any, first: int | None = None) -> Generator[Taken, None, None]:
-        """Every picture with its time stamp in seconds, and its plate if that is kept.
+        """Yield every picture with its time stamp in seconds, and its plate if plates are kept.
 
-        Whatever precedes damage comes before the error.
+        All pictures before a damaged place are yielded before the error is raised.
 
         Args:
-            container: Of the file.
-            first: Time stamp, in ticks of the stream, from which on pictures are wanted, where the container stands
-                somewhere before it; None: all are, from the start.
+            container: Container of the file.
+            first: Time stamp, in ticks of the stream, of the first wanted picture; the container must be positioned
+                before it. None: all pictures from the start.
         """
         reformatter = VideoReformatter()
         for picture in self._decoded(container, first):
             yield self._taken(reformatter, picture)
 
     def _decoded(self, container: Any, first: int | None) -> Generator[Any, None, None]:
-        """As ``_pictures``, each as its codec has it."""
+        """Yield the pictures of ``_pictures`` as decoded by PyAV."""
         stream = container.streams.video[0]
         stream.thread_type, stream.codec_context.thread_count = "AUTO", self._decoders
         count, packets, damage = 0, 0, ""
@@ -189,7 +189,7 @@ class VideoFile(RecordedSource):
                 packet = next(demuxer, None)
                 if packet is None:
                     break
-                # A transport stream marks every gap so, and is made to go on after it.
+                # A transport stream reports every gap as an error; decoding continues after it.
                 if packet.is_corrupt and container.format.name != "mpegts":
                     damage = "the file is cut off or damaged there"
                     break
@@ -201,13 +201,13 @@ class VideoFile(RecordedSource):
                 if first is None or picture.pts >= first:
                     yield picture
                 count += 1
-        # An MP4's index lists its samples exactly, without those that an edit list makes needless; a file cut between
-        # two of them ends like a whole one.
+        # An MP4's index counts its samples exactly, without those that an edit list removes; a file truncated between
+        # two samples otherwise ends like a complete one.
         promised = min(stream.frames, len(stream.index_entries))
         if not damage and first is None and "mp4" in container.format.name and packets < promised:
             damage = f"the file is cut off: its index promises {promised} frames"
         if damage:
-            # Threads and reordering hold frames back; those before the damage are still good.
+            # Threads and reordering delay frames; those before the damage are still valid.
             with contextlib.suppress(av.FFmpegError):
                 for picture in stream.decode(None):
                     yield picture
@@ -215,7 +215,7 @@ class VideoFile(RecordedSource):
             raise SourceError(f"{self._path}: frame {count} cannot be decoded: {damage}; frames before it are good")
 
     def _taken(self, reformatter: VideoReformatter, picture: Any) -> Taken:
-        """8-bit RGB of a picture, its time stamp, and its plate if that is kept."""
+        """Return 8-bit RGB of a picture, its time stamp in seconds, and its plate if plates are kept."""
         if self.deep != "light":
             plate = plate_from_video(reformatter, picture, self._shape) if self.deep and self.keeps_depth else None
             return rgb_from_video(reformatter, picture, self._memory_for, self._shape), picture.time, plate
@@ -225,10 +225,10 @@ class VideoFile(RecordedSource):
 
 
 def video_stream(container: Any, name: str) -> Any:
-    """Return a container's first stream of pictures, which are kept from becoming too large.
+    """Return a container's first video stream, with limits on the size of its pictures.
 
     Raises:
-        SourceError: There is none that can be read; ``name`` stands in the message.
+        SourceError: There is no readable video stream; the message contains ``name``.
     """
     if not container.streams.video:
         kinds = ", ".join(sorted({stream.type for stream in container.streams})) or "nothing"
@@ -241,12 +241,12 @@ def video_stream(container: Any, name: str) -> Any:
     if width * height > limits().picture_pixels:
         label = f"{name} is {width}x{height}: a frame of it"
         raise SourceError(too_much(label, width * height, "pixels", "picture_pixels"))
-    context.options = {"max_pixels": str(limits().picture_pixels)}  # the size may change on the way
+    context.options = {"max_pixels": str(limits().picture_pixels)}  # the size may change within the stream
     return stream
 
 
 def _frames_shown(stream: Any) -> int:
-    """Return how many frames a header promises, without those that an edit list leaves out; 0 where it is unknown."""
+    """Return the number of frames by the header, without those that an edit list removes; 0 if unknown."""
     left_out = sum(entry.is_discard for entry in stream.index_entries)
     return min(stream.frames, len(stream.index_entries) - left_out) if left_out else int(stream.frames)
 
@@ -257,13 +257,13 @@ def rgb_from_video(
     memory: Callable[[int, int], Image | None] | None = None,
     shape: fractions.Fraction = fractions.Fraction(1),
 ) -> Image:
-    """Return 8-bit RGB of a decoded picture as it is presented, with the picture's own colour matrix and range.
+    """Return 8-bit RGB of a decoded picture with its own colour matrix and range, rotated and with square pixels.
 
     Args:
-        reformatter: The thread's.
-        picture: Of PyAV.
-        memory: Gives memory for a picture of a height and width, or None: it is then made anew.
-        shape: As ``pixel_shape`` has it.
+        reformatter: Reformatter of the current thread.
+        picture: Picture decoded by PyAV.
+        memory: Function from height and width to memory for the result, or to None: a new array is allocated.
+        shape: Pixel aspect ratio, as returned by ``pixel_shape``.
     """
     matrix = None
     if picture.colorspace not in {int(known) for known in Colorspace}:
@@ -281,7 +281,7 @@ def rgb_from_video(
 
 
 def _interleaved(picture: Any, out: Image | None) -> Image:
-    """RGB of a picture that has green, blue and red in planes of their own, in ``out`` or anew."""
+    """Return interleaved RGB of a picture with planar green, blue and red, in ``out`` or a new array."""
     green, blue, red = (
         np.frombuffer(plane, np.uint8).reshape(plane.height, plane.line_size)[:, : plane.width]
         for plane in picture.planes
@@ -290,15 +290,15 @@ def _interleaved(picture: Any, out: Image | None) -> Image:
 
 
 def depth_of(context: Any) -> str:
-    """Return what pictures of a stream are beside 8-bit codes, as ``Source.deep`` says it.
+    """Return the kind of a stream's pictures beyond 8 bits, in the form of ``Source.deep``.
 
     Args:
-        context: PyAV's, of the stream's codec.
+        context: Codec context of the stream, by PyAV.
     """
     components = () if context.format is None else context.format.components
-    bits = components[0].bits if components else 0  # pictures that stay on a decoding unit say nothing of theirs
+    bits = components[0].bits if components else 0  # hardware pictures do not state their software format
     if not 8 <= bits <= 16:
-        return ""  # floats, and what has no picture yet
+        return ""  # float formats, and streams without a picture yet
     if context.color_trc in (ColorTrc.SMPTE2084, ColorTrc.ARIB_STD_B67):
         return "light"
     wide = context.color_primaries in _WIDE
@@ -306,26 +306,26 @@ def depth_of(context: Any) -> str:
 
 
 def curve_of(context: Any) -> str:
-    """Transfer of a stream of HDR, as ``Source.curve`` says it; argument as that of ``depth_of``."""
+    """Return the transfer of an HDR stream, in the form of ``Source.curve``; the argument is as in ``depth_of``."""
     return {int(ColorTrc.SMPTE2084): "pq", int(ColorTrc.ARIB_STD_B67): "hlg"}.get(int(context.color_trc), "")
 
 
 def pixel_shape(stream: Any) -> fractions.Fraction:
-    """Return the width of a stream's pixels over their height; 1 where that is unknown or a rounding away from it."""
+    """Return the width of a stream's pixels divided by their height; 1 if unknown or within rounding of 1."""
     shape = fractions.Fraction(stream.sample_aspect_ratio or 1)
     return shape if shape > 0 and abs(shape - 1) > _NEARLY_SQUARE else fractions.Fraction(1)
 
 
 def square_width(width: int, shape: fractions.Fraction) -> int:
-    """Return the columns of a picture whose pixels have been made square."""
+    """Return the number of columns of a picture after conversion to square pixels."""
     return max(1, round(width * shape))
 
 
 def turn_of(picture: Any) -> tuple[bool, bool, bool]:
-    """Return what brings a decoded picture upright: transpose it, then flip its columns, then its rows.
+    """Return the operations that rotate a decoded picture upright: transpose, then flip columns, then flip rows.
 
-    The display matrix of its container or stream takes (x, y) to (a x + c y, b x + d y); the nearest of the eight that
-    keep pixels is taken.
+    The display matrix of the container or stream maps (x, y) to (a x + c y, b x + d y). The nearest of the eight
+    rotations and reflections that keep pixels is used.
     """
     said = picture.side_data.get(SideDataType.DISPLAYMATRIX)
     if said is None:
@@ -336,12 +336,12 @@ def turn_of(picture: Any) -> tuple[bool, bool, bool]:
 
 
 def presented(image: _Picture, picture: Any, shape: fractions.Fraction) -> _Picture:
-    """Return an image as its container presents it: of square pixels, turned and mirrored by its display matrix.
+    """Return an image with square pixels, rotated and mirrored by its display matrix.
 
     Args:
-        image: Of the decoded picture, (height, width, 3).
-        picture: PyAV's, decoded.
-        shape: As ``pixel_shape`` has it.
+        image: Image of the decoded picture, (height, width, 3).
+        picture: Picture decoded by PyAV.
+        shape: Pixel aspect ratio, as returned by ``pixel_shape``.
     """
     height, width = image.shape[:2]
     if shape != 1:
@@ -355,12 +355,12 @@ def presented(image: _Picture, picture: Any, shape: fractions.Fraction) -> _Pict
 def plate_from_video(
     reformatter: VideoReformatter, picture: Any, shape: fractions.Fraction = fractions.Fraction(1)
 ) -> Plate:
-    """Return the plate of a decoded picture, by the picture's own matrix, range, transfer and primaries.
+    """Return the plate of a decoded picture, by its own matrix, range, transfer and primaries.
 
     Args:
-        reformatter: The thread's.
-        picture: PyAV's.
-        shape: As ``pixel_shape`` has it.
+        reformatter: Reformatter of the current thread.
+        picture: Picture decoded by PyAV.
+        shape: Pixel aspect ratio, as returned by ``pixel_shape``.
     """
     signal = presented(_signal(reformatter, picture), picture, shape)
     transfer, wide = picture.color_trc, _WIDE.get(picture.color_primaries)
@@ -377,19 +377,19 @@ def _last_code() -> int:
 
 
 def _steps(signal: Float) -> npt.NDArray[np.int32]:
-    """Nearest of 65536 steps from 0 to 1; what is beyond is cut."""
+    """Return the nearest of 65536 steps from 0 to 1; values outside are clamped."""
     return (np.clip(signal, 0.0, 1.0) * np.float32(_STEPS - 1) + np.float32(0.5)).astype(np.int32)
 
 
 @functools.cache
 def _light_table(transfer: int) -> Float:
-    """Light of 65536 steps of a signal."""
+    """Return the linear value of each of 65536 steps of a signal."""
     curve = {int(ColorTrc.SMPTE2084): light_of_pq, int(ColorTrc.ARIB_STD_B67): light_of_hlg}.get(transfer, decode_srgb)
     return curve(np.arange(_STEPS) / (_STEPS - 1.0)).astype(np.float32)
 
 
 def _signal(reformatter: VideoReformatter, picture: Any) -> Float:
-    """R'G'B' of a picture, (height, width, 3), 0 to 1 but for what its coding allows beyond."""
+    """Return R'G'B' of a picture, (height, width, 3), nominally 0 to 1 with the excursions that its coding allows."""
     bits = picture.format.components[0].bits
     kind = "gbrp" if picture.format.is_rgb else "yuv444p"
     wanted = kind if bits == 8 else f"{kind}{bits}le"
@@ -403,7 +403,7 @@ def _signal(reformatter: VideoReformatter, picture: Any) -> Float:
 
 
 def _rgb_of_yuv(planes: list[Float], picture: Any, bits: int) -> Float:
-    """R'G'B' of Y'CbCr without subsampling (BT.709-6 and BT.2020-2, quantisation and non-constant luminance)."""
+    """Return R'G'B' of Y'CbCr without subsampling (BT.709-6 and BT.2020-2, quantisation and non-constant luminance)."""
     unit = float(2 ** (bits - 8))
     if picture.color_range == ColorRange.JPEG:
         black, luma, chroma = 0.0, 2.0**bits - 1.0, 2.0**bits - 1.0

@@ -1,1 +1,1 @@
-"""Markers and boards: where they are in a picture, and the pose of the camera."""
+"""Detection of markers and boards, and the camera pose from them."""

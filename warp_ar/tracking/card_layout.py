@@ -1,7 +1,8 @@
-"""The card: one printed sheet that is marker, board for the camera, white and grey reference, and place for the ball.
+"""Layout of the printed card: one sheet with marker board, white and grey reference patches, and a place for the ball.
 
 The sheet's board is the scene's marker: the world's origin is the board's centre, x right, y up the page, z out of it.
-Everything else on the sheet has a place in that frame, so that a scene that uses the sheet knows where its ball stands.
+Everything else on the sheet has a fixed position in that frame, so the position of a scene's ball follows from its
+radius.
 """
 
 from __future__ import annotations
@@ -17,27 +18,28 @@ from warp_ar.scene import CharucoBoard, Marker
 Image = NDArray[np.uint8]
 
 SHEET: Final = Marker(dictionary="DICT_4X4_50", board=CharucoBoard(5, 4, 0.032, 0.024))
-"""The sheet's board: of few and large cells, which a camera of 640 x 480 still reads at arm's length."""
+"""Board of the sheet, with few and large cells that a camera of 640 x 480 resolves at arm's length."""
 BALL_PLACE: Final = (0.0, 0.114)
-"""Place where the ball touches the sheet, metres: behind the board, which it therefore does not hide from the front."""
+"""Point where the ball touches the sheet, metres: behind the board, so that the ball does not hide it from the
+front."""
 RINGS: Final = (0.020, 0.025, 0.030, 0.035, 0.040)
-"""Radii in metres of the rings around that place: a ball hides the ring of its own radius from straight above."""
+"""Radii in metres of the rings around ``BALL_PLACE``; from straight above, a ball hides the ring of its own radius."""
 GREYS: Final = (0.0, 0.25, 0.5, 0.75, 1.0)
-"""Share of each grey patch that is black ink, in dots: its reflectance needs no curve of the printer's."""
+"""Area fraction of black ink dots in each grey patch; its reflectance does not depend on the printer's tone curve."""
 GREY_SIZE: Final = (0.026, 0.010)
 """Width and height of a grey patch, metres."""
 
 _TOP: Final = 0.052
-"""Metres from the top of Letter paper to the ball's place; taller paper has its surplus at both ends."""
+"""Distance in metres from the top of Letter paper to the ball's place; taller paper has equal surplus at both ends."""
 _LETTER_HEIGHT: Final = 0.2794
 _DOTS: Final = 4
-"""Dots of a grey patch are cells of a grid of this many by this many, which repeats."""
+"""Size of the repeating grid whose cells are the dots of a grey patch."""
 _DOT: Final = 0.00025
-"""Side of a dot in metres: far too small for a camera, large enough for ink that spreads."""
+"""Side of a dot in metres: too small for a camera to resolve, large enough for ink that spreads."""
 
 
 def grey_centers() -> NDArray[np.float64]:
-    """Centres of the grey patches in the board's frame, (n, 3) metres, in the order of ``GREYS``."""
+    """Return the centres of the grey patches in the board's frame, (n, 3) metres, in the order of ``GREYS``."""
     assert isinstance(SHEET.board, CharucoBoard)
     pitch, height = SHEET.board.square_length, SHEET.board.size[1]
     x = (np.arange(len(GREYS)) - (len(GREYS) - 1) / 2) * pitch
@@ -45,22 +47,22 @@ def grey_centers() -> NDArray[np.float64]:
 
 
 def ball_center(radius: float) -> tuple[float, float, float]:
-    """Centre in metres of a ball that stands on its place."""
+    """Return the centre in metres of a ball that stands on its place on the sheet."""
     return (*BALL_PLACE, radius)
 
 
 def board_top(height: float) -> float:
-    """Return how far the board's middle lies below the upper edge of paper of a height; metres."""
+    """Return the distance in metres of the board's centre from the upper edge of paper of a height."""
     return _TOP + BALL_PLACE[1] + (height - _LETTER_HEIGHT) / 2
 
 
 def draw_sheet(size: tuple[float, float], pixels_per_metre: float, board: Image) -> Image:
-    """The whole page.
+    """Draw the whole page.
 
     Args:
         size: Width and height of the paper in metres.
         pixels_per_metre: Resolution.
-        board: The board at that resolution, with a white margin on all sides.
+        board: Picture of the board at that resolution, with a white margin on all sides.
 
     Returns:
         uint8 (h, w), 0 or 255.
@@ -70,7 +72,7 @@ def draw_sheet(size: tuple[float, float], pixels_per_metre: float, board: Image)
     origin = np.array([width / 2, board_top(height)])
 
     def pixel(x: float, y: float) -> tuple[int, int]:
-        """Column and row of a point of the board's frame."""
+        """Return column and row of a point of the board's frame."""
         return round((origin[0] + x) * pixels_per_metre), round((origin[1] - y) * pixels_per_metre)
 
     column, row = pixel(0.0, 0.0)
@@ -86,7 +88,7 @@ def draw_sheet(size: tuple[float, float], pixels_per_metre: float, board: Image)
 
 
 def _grey(share: float, shape: tuple[int, int], dot: int) -> Image:
-    """Dots that cover a share of a patch: the cells of a grid that repeats, in an order that spreads them."""
+    """Return a dot pattern that covers a share of a patch: cells of a repeating grid, added in a dispersed order."""
     order = np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]])
     cells = np.where(order < share * _DOTS**2, 0, 255).astype(np.uint8)
     dot = max(dot, 1)
@@ -96,7 +98,7 @@ def _grey(share: float, shape: tuple[int, int], dot: int) -> Image:
 
 
 def _draw_place(page: Image, center: tuple[int, int], pixels_per_metre: float) -> None:
-    """The cross that the ball stands on, and rings to measure it by."""
+    """Draw the cross for the ball and the rings that show its radius."""
     thin = max(1, round(0.00015 * pixels_per_metre))
     for radius in RINGS:
         cv2.circle(page, center, round(radius * pixels_per_metre), 0, thin)
@@ -108,7 +110,7 @@ def _draw_place(page: Image, center: tuple[int, int], pixels_per_metre: float) -
 
 
 def _draw_rulers(page: Image, pixels_per_metre: float) -> None:
-    """A ruler of 100 mm each way, for printers scale both ways apart, and what to do with the sheet."""
+    """Draw a ruler of 100 mm in each direction, because printers scale both separately, and the instructions."""
     mm = pixels_per_metre / 1e3
     thin, left, bottom = max(1, round(0.2 * mm)), round(12 * mm), page.shape[0] - round(12 * mm)
     top = bottom - round(100 * mm)
@@ -129,6 +131,6 @@ def _draw_rulers(page: Image, pixels_per_metre: float) -> None:
 
 
 def _write(page: Image, text: str, place: tuple[int, int], pixels_per_metre: float, height: float) -> None:
-    """Text whose capitals are ``height`` metres high; OpenCV's are 21 pixels at scale 1."""
+    """Write text whose capitals are ``height`` metres high; OpenCV's are 21 pixels at scale 1."""
     scale = height * pixels_per_metre / 21
     cv2.putText(page, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, 0, max(1, round(1.6 * scale)), cv2.LINE_8)

@@ -1,25 +1,26 @@
 """Drift of a camera's exposure and white balance, estimated from still surfaces.
 
-A camera that meters for itself scales the whole picture: every surface, lit or in shadow, becomes brighter by the same
-factor per channel. Light that changes does not: what an emitter reaches follows it, what lies in its shadow does not.
-So points of the card's paper and of the planes around it are looked at in each frame, at their places in the world.
-Each remembers what it showed first. With d_i the change of the logarithm of the radiance of point i since then, per
-channel, and m their median,
+Automatic exposure and white balance scale the whole picture: every surface, lit or in shadow, becomes brighter by the
+same factor per channel. A change of the light does not: surfaces that an emitter reaches change, surfaces in its shadow
+do not. So points on the card's paper and on the planes around it are observed in each frame, at fixed places in the
+world. The first observation of each point is stored. With d_i the change of the logarithm of the radiance of point i
+since then, per channel, and m the median of d_i,
 
-    the gain is exp(m)    where the points agree: a share ``AGREEING`` of |d_i - m| is below ``SPREAD`` |m|,
+    the gain is exp(m)    where the points agree: a share ``AGREEING`` of |d_i - m| is below ``SPREAD`` |m|.
 
-and where card and planes say the same, until a drift is known: then a hand may be over either. A drift must pass
-``LEAST`` before it is believed: the light of a frame whose camera holds still is not touched. Where points disagree,
-because the light changes or something covers them, the last gain holds for a few frames, and the gain is 1 after them.
-Light that dims on all surfaces alike cannot be told from an exposure, and is taken for one: so all this is done only
-where the scene says that the camera meters by itself.
+Until a drift is known, card and planes must also agree with each other; afterwards a hand may cover one of them. A gain
+counts as drift only above ``LEAST``, so that a camera with fixed exposure is not affected. Where points disagree,
+because the light changes or something covers them, the last gain is kept for ``PATIENCE`` frames and then set to 1.
+Light that dims on all surfaces equally cannot be distinguished from a change of exposure and counts as one. Drift is
+therefore estimated only if the scene sets ``metering = "automatic"``.
 
-Paper is at most some ``MOST_PRINT`` times as bright as the ink on it. Where the card looks more so, the camera lays an
-S-shaped curve over its transfer (``without_contrast``); the least contrast that explains the print is taken.
+Paper is at most ``MOST_PRINT`` times as bright as ink on it. If the card appears to have more contrast, the camera
+applies an S-shaped tone curve after its transfer (``without_contrast``). The smallest contrast that explains the print
+is used.
 
-A drift is a bracket as well. Where the camera lays such a curve over its transfer, the middle of the range changes by
-more than its ends: points of different codes then disagree. The contrast is the one under which medians over bins of
-codes agree best, where what they disagree by falls below ``BETTER`` of what it is without.
+A drift also serves as an exposure bracket. Under a tone curve, mid-tones change more than dark and bright tones, so
+points of different codes disagree. The estimated contrast is the one under which the medians over bins of codes agree
+best, if their disagreement is below ``BETTER`` times the disagreement without contrast.
 """
 
 from __future__ import annotations
@@ -43,88 +44,90 @@ Array = NDArray[np.float64]
 GRID = 21
 """Points along each side of a plane."""
 LEAST_POINTS = 24
-"""Points that must be seen again."""
+"""Smallest number of points that must be visible again."""
 LEAST = 0.05
-"""Least logarithm of the gain over all channels that counts as a drift."""
+"""Smallest logarithm of the gain, over all channels, that counts as a drift."""
 AGREEING = 0.7
 """Share of points that must agree."""
 SPREAD = 0.3
-"""Distance that they may lie off the median, as a share of its length."""
+"""Largest deviation from the median, as a share of the median's magnitude."""
 FURTHEST = 0.06
-"""The same at most, logarithm: an emitter that changes far away lights what is near alike, within more."""
+"""Upper bound on that deviation, as a logarithm: a distant emitter that changes affects nearby surfaces almost equally,
+beyond this bound."""
 NOISE = 0.09
-"""The same in a drift that is known: a tone curve, a lens that blurs texture, noise and compression."""
+"""Allowed deviation once a drift is known, as a logarithm: covers tone curve, blurred texture, noise and
+compression."""
 CARD = 0.15
-"""Logarithm by which card and planes may differ: they lie at different places of a tone curve."""
+"""Largest difference of logarithms between card and planes: they lie on different parts of a tone curve."""
 PATIENCE = 4
-"""Frames in a row in which points disagree, after which no drift is known any more."""
+"""Number of consecutive frames with disagreeing points after which the gain is set to 1."""
 DARK, BRIGHT = 12, 250
-"""Codes between which a channel is taken to tell: beyond them are quantisation and clipping."""
+"""Range of codes that are used; outside it are quantisation and clipping."""
 CONTRASTS = np.linspace(0.0, 1.0, 5)
-"""Contrasts that are tried, none first."""
+"""Contrasts that are tried, beginning with none."""
 MOST_PRINT = 30.0
-"""Ratio of paper to ink: print that reflects 3 % on paper that reflects 90 %."""
+"""Largest ratio of paper to ink: 90 % reflectance to 3 %."""
 BINS = (0.2, 0.35, 0.5, 0.65, 0.8)
-"""Codes over 255 that part the bins whose medians are compared."""
+"""Borders, as codes divided by 255, of the bins whose medians are compared."""
 BIN_POINTS = 4
-"""Points of a bin."""
+"""Smallest number of points in a bin."""
 BETTER = 0.85
-"""Ratio of disagreements, with a contrast to without, from which it is believed."""
+"""Largest ratio of the disagreement with contrast to that without, for the contrast to be used."""
 TELLING = 0.08
-"""Logarithm of a channel's gain from which its frame tells of the contrast."""
+"""Smallest logarithm of a channel's gain from which a frame contributes to the contrast estimate."""
 FIRST_LOOKS = 9
-"""Channels of frames that must tell; the contrast is asked for again each time that twice as many have."""
+"""Number of contributing channels before the first estimate; it is repeated whenever their number has doubled."""
 _OFFSETS = np.array([(x, y) for y in (-2, 0, 2) for x in (-2, 0, 2)])
-"""Pixels around a point whose mean it shows."""
+"""Offsets of the pixels around a point that are averaged."""
 
 
 class ExposureDrift:
-    """Follows the camera's gain, frame after frame; 1 until a drift is seen."""
+    """Estimator of the camera's gain over the frames; the gain is 1 until a drift is detected."""
 
     def __init__(self, scene: Scene, camera: Camera) -> None:
         """Choose points.
 
         Args:
-            scene: With a marker.
-            camera: Of the frames.
+            scene: Scene with a marker.
+            camera: Camera of the frames.
         """
         self.watches = (camera, scene.marker, scene.proxies, scene.probes)
-        """Things that frames are of: the same frames tell those that watch the same, the same."""
+        """Inputs that determine the result for given frames; equal values allow one instance to be shared."""
         self._camera = camera
         self._plain = decode_table(camera.transfer).astype(np.float64)
         self._points, self._is_card, self._is_ink = still_points(scene)
         self._first = np.full((len(self._points), 3), np.nan)
         self._first_gain = np.ones_like(self._first)
         self._moving, self._disagreed = False, 0
-        # A measured response is believed.
+        # A measured response needs no contrast estimate.
         name = str(camera.transfer)
         self._asks_contrast = name == "srgb" or name.startswith("gamma:")
         self._disagreements: list[Array] = []
         self._next_looks = FIRST_LOOKS
         self.gain: Array = np.ones(3)
-        """Factor of the camera on radiance, against its first frame, RGB."""
+        """Camera's gain on radiance relative to its first frame, RGB."""
         self.saturation = np.full(3, 255.0)
         """Estimated code at which each channel saturates."""
         self.contrast = 0.0
-        """Contrast of the camera's tone curve, as in ``without_contrast``."""
+        """Contrast of the camera's tone curve, as defined by ``without_contrast``."""
 
     def copied(self) -> Self:
-        """Return what has been seen so far, for another pipeline to go on from; what it sees changes nothing here."""
+        """Return an independent copy with all observations so far, for another pipeline."""
         other = copy.copy(self)
         other._first, other._first_gain = self._first.copy(), self._first_gain.copy()
         other._disagreements = list(self._disagreements)
         return other
 
     def observe(self, image: NDArray[np.uint8], pose: Pose, plate: Plate | None = None) -> bool:
-        """Look at a frame.
+        """Update gain and contrast from a frame.
 
         Args:
             image: uint8 RGB (height, width, 3).
-            plate: The frame at its full depth, read in the place of ``image`` where there is one.
+            plate: The frame at full depth, used instead of ``image`` if given.
             pose: ``camera_from_world``.
 
         Returns:
-            Whether the gain or the contrast is another one now.
+            True if the gain or the contrast has changed.
         """
         codes = codes_around(image, self._camera, pose, self._points, plate)
         before, contrast = self.gain, self.contrast
@@ -145,26 +148,26 @@ class ExposureDrift:
         return bool((before != self.gain).any()) or contrast != self.contrast
 
     def _change(self, codes: Array, contrast: float) -> Array:
-        """Logarithm of what points show over what they showed first, for a camera of gain 1 then, (n, 3).
+        """Return the change of the logarithm of each point's radiance since its first observation, (n, 3).
 
         Args:
-            codes: Of the points now, (n, 3).
-            contrast: That the camera is taken to have.
+            codes: Present codes of the points, (n, 3).
+            contrast: Assumed contrast of the camera.
         """
         change = self._logarithm(codes, contrast) - self._logarithm(self._first, contrast)
         return np.asarray(change + np.log(self._first_gain))
 
     def _logarithm(self, codes: Array, contrast: float) -> Array:
-        """Of the radiance that codes (n, 3) stand for under a contrast, (n, 3)."""
+        """Return the logarithm of the radiance of codes (n, 3) under a contrast, (n, 3)."""
         table = np.log(np.maximum(without_contrast(self._plain, contrast, self.saturation), 1e-6))
         return np.stack([np.interp(codes[:, c], np.arange(256), table[:, c]) for c in range(3)], -1)
 
     def _weigh(self, change: Array, is_card: NDArray[np.bool_]) -> Array | None:
-        """Logarithm of the gain; None where points do not tell.
+        """Return the logarithm of the gain; None if the points disagree.
 
         Args:
-            change: Of the logarithm of radiance since each point was first seen, (k, 3).
-            is_card: Which of them are the card's, (k,).
+            change: Change of the logarithm of radiance since each point's first observation, (k, 3).
+            is_card: True for points of the card, (k,).
         """
         if not np.isfinite(self._first).any():
             return np.zeros(3)
@@ -177,7 +180,7 @@ class ExposureDrift:
         if BIN_POINTS <= is_card.sum() <= len(change) - BIN_POINTS:
             apart = float(np.abs(np.median(change[is_card], axis=0) - np.median(change[~is_card], axis=0)).max())
         if self._moving:
-            # A hand may be over the card, and over as much of the planes as need not agree.
+            # A hand may cover the card and those planes' points that need not agree.
             return middle if off <= NOISE else None
         if off > min(SPREAD * size / np.sqrt(3.0), FURTHEST) or apart > CARD:
             return None if size > LEAST else np.zeros(3)
@@ -185,7 +188,7 @@ class ExposureDrift:
         return middle
 
     def _ask_contrast(self, codes: Array) -> None:
-        """Add what a frame says of the contrast, and where enough have spoken, take the best."""
+        """Add a frame's evidence on the contrast, and choose the best contrast once there is enough."""
         changes = [self._change(codes, float(contrast)) for contrast in CONTRASTS]
         for c in range(3):
             seen = ~np.isnan(changes[0][:, c])
@@ -206,7 +209,7 @@ class ExposureDrift:
             self.contrast = max(self.contrast, float(CONTRASTS[best]))
 
     def _print_contrast(self, codes: Array) -> float:
-        """The least contrast of the camera under which the card's print is no blacker than print is."""
+        """Return the smallest contrast of the camera under which the card's ink is no darker than print."""
         shown = [codes[part & ~np.isnan(codes).any(axis=1)] for part in (self._is_card, self._is_ink)]
         if min(len(part) for part in shown) < BIN_POINTS:
             return 0.0
@@ -221,14 +224,14 @@ class ExposureDrift:
 def codes_around(
     image: NDArray[np.uint8], camera: Camera, pose: Pose, points: Array, plate: Plate | None = None
 ) -> Array:
-    """Mean codes around points, NaN where they are not seen or do not tell, (n, 3).
+    """Return mean codes around points, (n, 3); NaN for points that are not visible or clipped.
 
     Args:
         image: uint8 RGB (height, width, 3).
-        camera: Of the frame.
+        camera: Camera of the frame.
         pose: ``camera_from_world``.
-        points: Metres, (n, 3).
-        plate: The frame at its full depth: its codes are then fractions of 8-bit ones.
+        points: World points in metres, (n, 3).
+        plate: The frame at full depth, if given; its codes are scaled to 0..255 and not rounded.
     """
     result = np.full((len(points), 3), np.nan)
     pixels = project(camera, pose.apply(points))
@@ -248,7 +251,7 @@ def codes_around(
 
 
 def under_boxes(scene: Scene, points: Array) -> NDArray[np.bool_]:
-    """Return which points (n, 3) lie in boxes that stand still, or within a centimetre of one."""
+    """Return a mask of points (n, 3) that lie inside a static box or within a centimetre of one."""
     hidden = np.zeros(len(points), bool)
     for box in scene.proxies:
         if box.shape == "box" and box.marker is None:
@@ -258,7 +261,10 @@ def under_boxes(scene: Scene, points: Array) -> NDArray[np.bool_]:
 
 
 def still_points(scene: Scene) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Points of the card and of planes, not under boxes or beside balls, (n, 3); which are its paper, which its ink."""
+    """Return points on the card and on planes, without those under boxes or near balls, (n, 3).
+
+    Also return masks of the points on paper and of those on ink.
+    """
     cells, white, _, outline = printed_cells(scene.marker)
     low, high = outline.min(axis=0)[:2], outline.max(axis=0)[:2]
     margin = 0.3 * float((high - low).max())

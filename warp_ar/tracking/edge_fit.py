@@ -1,4 +1,4 @@
-"""Poses fitted to a marker's printed edges by Gauss-Newton, in NumPy; the derivation stands in ``tracking``."""
+"""Fitting of poses to a marker's printed edges by Gauss-Newton, in NumPy; the derivation is in ``tracking``."""
 
 from __future__ import annotations
 
@@ -17,83 +17,83 @@ from warp_ar.tracking.markers import Pattern
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Box = tuple[slice, slice]
-"""Rows and columns of a picture."""
+"""Rows and columns of a part of a picture."""
 
 NOISE_FLOOR: Final = 0.03
-"""Pixels: smallest standard deviation that an edge point is ever given credit for (sampling, lens model, print)."""
+"""Smallest standard deviation in pixels that is assumed for an edge point (sampling, lens model, print)."""
 CORRELATED: Final = 2.0
-"""Neighbouring edge points share pixels, so that many of them count as one."""
+"""Number of neighbouring edge points that count as one, because they share pixels."""
 _TAPS: Final = np.linspace(-1.0, 1.0, 9)
-"""Places across an edge at which the picture is read."""
+"""Positions across an edge at which the picture is sampled, relative to the reach."""
 _WEIGHTS: Final = np.array([0.125, *([0.25] * 7), 0.125])
-"""Trapezoid rule over these."""
+"""Weights of the trapezoid rule for these positions."""
 _CLEARANCE: Final = 0.45
-"""Share of the way to the nearest parallel edge that is read."""
+"""Sampled share of the distance to the nearest parallel edge."""
 _MIN_REACH: Final = 1.0
-"""Pixels: an edge that is read less far is not measured; the blur of its neighbours would reach it."""
+"""Smallest reach in pixels; an edge with less is not measured, because neighbouring edges would blur into it."""
 _CONTRAST: Final = 0.3
-"""Least contrast of an edge over the median one's."""
+"""Smallest contrast of an edge, relative to the median contrast."""
 _LEAST_CONTRAST: Final = 1e-4
-"""The same in linear light."""
+"""Smallest contrast of an edge in linear radiance."""
 _MIN_EDGES: Final = 16
-"""Fewest measured edge points for a refinement: nine unknowns, and something left to vote."""
+"""Smallest number of measured edge points: nine unknowns, and redundancy for outlier rejection."""
 _DONE: Final = 0.05
-"""Pixels: a Gauss-Newton step that moves no edge further is the last; it converges fast enough that the next would move
-a tenth of it."""
+"""Largest displacement of an edge in pixels in the last Gauss-Newton step; the next step would be about a tenth of
+it."""
 _PRIOR: Final = np.diag([0.0] * 6 + [1.0] * 3)
-"""The shift of edges is a fraction of a pixel: without that a print without inner edges could not tell it from
-distance."""
+"""Prior on the three shift parameters, which are a fraction of a pixel: without it, a print without inner edges could
+not separate shift from distance."""
 _TUKEY: Final = 4.7
-"""Standard deviations at which an edge counts no more: one that is covered, or under a reflection, must not pull."""
+"""Residual in standard deviations beyond which an edge has weight 0, for example a covered edge or a reflection."""
 _MIN_CELLS: Final = 8
-"""Fewest cells in the picture that tell a pattern."""
+"""Smallest number of visible cells that identify a pattern."""
 _NEAR: Final = 1e-6
-"""Least distance from the camera, metres."""
+"""Smallest distance from the camera, metres."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Fit:
-    """A pose measured in one frame."""
+    """Pose measured in one frame, with its uncertainty."""
 
     pose: Pose
     information: Array
-    """(6, 6): inverse covariance of rotation vector and translation about the pose."""
+    """Inverse covariance, (6, 6), of rotation vector and translation around the pose."""
     error: float
-    """Root mean square residual, pixels."""
+    """Root mean square residual in pixels."""
     support: float
-    """0 to 1: share of the printed edges that agree."""
+    """Share of the printed edges that agree with the pose, 0 to 1."""
     cost: float
-    """Robust mean squared residual, pixels squared."""
+    """Robust mean squared residual in pixels squared."""
     pattern: float
     """Correlation of the cells' brightness with the print."""
     edges: bool = True
-    """True if it rests on edges; else on the detected corners only."""
+    """True if the pose is fitted to edges; False if only to detected corners."""
 
 
 @dataclasses.dataclass(frozen=True)
 class _Solution:
-    """Reweighted least squares of the equations of edges."""
+    """Solution of the edges' equations by reweighted least squares."""
 
     step: Array
-    """Rotation vector and translation, (6,)."""
+    """Update of rotation vector and translation, (6,)."""
     information: Array
-    """(6, 6), the shift of edges eliminated."""
+    """Inverse covariance of the update, (6, 6), with the shift parameters eliminated."""
     residuals: Array
     weights: Array
 
 
 class EdgeFitter:
-    """Fits poses of one print to pictures of one camera; holds the part of a picture that it was shown last, in grey.
+    """Fitter of one print's pose to pictures of one camera; keeps the grey version of the current part of a picture.
 
-    ``gray`` is the whole picture's size; of it only what was shown last means anything.
+    ``gray`` has the size of the whole picture; only the part given to ``show`` is valid.
     """
 
     def __init__(self, pattern: Pattern, camera: Camera) -> None:
-        """Allocate.
+        """Allocate arrays.
 
         Args:
-            pattern: What is printed.
-            camera: Of the pictures.
+            pattern: The printed pattern.
+            camera: Camera of the pictures.
         """
         self._pattern = pattern
         self._matrix = np.asarray(camera.matrix(), float)
@@ -103,14 +103,14 @@ class EdgeFitter:
         self._box: Box = slice(0, camera.height), slice(0, camera.width)
 
     def show(self, image: Image, box: Box) -> Image:
-        """Take a part of a picture as the one to fit to.
+        """Set the part of a picture that is used for fitting.
 
         Args:
             image: uint8 (height, width, 3) RGB, or (height, width) grey.
-            box: The part.
+            box: Rows and columns of the part.
 
         Returns:
-            It in grey; it holds until another is shown.
+            The part in grey; valid until the next call.
         """
         part = self.gray[box]
         if image.ndim == 2:
@@ -121,18 +121,18 @@ class EdgeFitter:
         return part
 
     def project(self, points: Array) -> tuple[Array, Array]:
-        """Pixels (n, 2) of camera points (n, 3), and their derivative (n, 2, 3) by the camera point."""
-        # With no rotation and no translation, OpenCV's derivative by translation is the one by the point.
+        """Return pixels (n, 2) of camera points (n, 3), and their derivatives (n, 2, 3) by these points."""
+        # With identity pose, OpenCV's derivative by the translation equals the derivative by the point.
         zero = np.zeros(3)
         pixels, jacobian = cv2.projectPoints(points, zero, zero, self._matrix, self._distortion)
         return pixels.reshape(-1, 2), np.asarray(jacobian)[:, 3:6].reshape(-1, 2, 3)
 
     def fit(self, pose: Pose, reaches: Sequence[float]) -> Fit | None:
-        """Fit a pose to the edges of the part that was shown; None where too few are seen.
+        """Fit a pose to the edges in the part given to ``show``; None if too few edges are visible.
 
         Args:
-            pose: ``camera_from_world`` to begin with.
-            reaches: Half width of the sampled window in pixels per Gauss-Newton step.
+            pose: Initial ``camera_from_world``.
+            reaches: Half width in pixels of the sampled window, for each Gauss-Newton step.
         """
         solved: _Solution | None = None
         for reach in reaches:
@@ -159,7 +159,10 @@ class EdgeFitter:
         )
 
     def correlate(self, pose: Pose) -> float:
-        """Correlation, -1 to 1, of the brightness at cell centres with the print; 0 where it cannot be seen."""
+        """Return the correlation, -1 to 1, of the brightness at cell centres with the print.
+
+        0 if too few cells are visible.
+        """
         points = pose.apply(self._pattern.cells)
         if points[:, 2].min() <= _NEAR:
             return 0.0
@@ -168,7 +171,7 @@ class EdgeFitter:
         if inside.sum() < _MIN_CELLS:
             return 0.0
         values = self._sample(at[inside])
-        # Lamps' reflections and sparkle must not outvote the print.
+        # Clipping limits the influence of reflections of lamps.
         values = np.clip(values, *np.percentile(values, (5, 95)))
         white = self._pattern.white[inside]
         a, b = values - values.mean(), white - white.mean()
@@ -176,13 +179,13 @@ class EdgeFitter:
         return float(a @ b) / scale if scale > 1e-9 else 0.0
 
     def _holds(self, low: Array, high: Array) -> NDArray[np.bool_]:
-        """Return whether the part that was shown holds what lies between two pixels, (n,)."""
+        """Return a mask, (n,), of pixel pairs whose bounding box lies in the part given to ``show``."""
         rows, columns = self._box
         begins, ends = (columns.start, rows.start), (columns.stop - 1, rows.stop - 1)
         return np.asarray((low >= begins).all(axis=-1) & (high <= ends).all(axis=-1))
 
     def _sample(self, at: Array) -> Array:
-        """Linear light between four pixels, (...,), of places (..., 2) inside the picture."""
+        """Return bilinear samples of linear radiance, (...,), at positions (..., 2) inside the picture."""
         height, width = self.gray.shape
         corner = np.floor(at)
         right, below = (at - corner).astype(np.float32).transpose(-1, *range(at.ndim - 1))
@@ -195,9 +198,9 @@ class EdgeFitter:
         return np.asarray(upper + below * (lower - upper), np.float64)
 
     def _measure(self, pose: Pose, reach: float) -> tuple[Array, Array] | None:
-        """One row of equations, (n, 9), for each edge that is seen, and how far it lies from where it is expected.
+        """Return one equation per visible edge point, (n, 9), and the point's offset in pixels, (n,).
 
-        The nine are rotation vector, translation and the three numbers of the shift of edges.
+        The nine columns are rotation vector, translation and the three shift parameters.
         """
         pattern, turn = self._pattern, pose.rotation.T
         arm = pattern.points @ turn
@@ -218,7 +221,7 @@ class EdgeFitter:
         at, half, arm = at[inside], half[inside], arm[inside]
         normal, pull = toward_white * normal[inside], toward_white * pull[inside]
         values = self._sample(at[:, None] + (half[:, None] * _TAPS)[..., None] * normal[:, None])
-        # Each end's level is the mean of its two outermost samples.
+        # The level at each end is the mean of its two outermost samples.
         black, white = 0.5 * (values[:, 0] + values[:, 1]), 0.5 * (values[:, -2] + values[:, -1])
         contrast = white - black
         seen = contrast > max(_CONTRAST * float(np.median(contrast)), _LEAST_CONTRAST)
@@ -233,7 +236,7 @@ class EdgeFitter:
 
 
 def _solve(design: Array, offsets: Array) -> _Solution | None:
-    """Reweighted least squares; None where there is no solution."""
+    """Return the reweighted least-squares solution; None if there is none."""
     weights = np.ones(len(design))
     for _ in range(3):
         weighted = weights[:, None] * design

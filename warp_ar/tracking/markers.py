@@ -1,6 +1,6 @@
-"""Markers and boards: dictionaries by name, where they are found in a picture, and what is printed.
+"""Markers and boards: dictionaries by name, detection in a picture, and the geometry of the print.
 
-A print is its cells and the borders between black and white.
+The print is described by its cells and by the borders between black and white cells.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 _WINDOWS = (7, 23)
-"""Widths in pixels of the two adaptive thresholds: sharp small markers, and large or blurred ones."""
+"""Widths in pixels of the two adaptive thresholds: for sharp small markers, and for large or blurred markers."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Detection:
-    """One marker found in an image."""
+    """Marker detected in an image."""
 
     id: int
-    """Number in its dictionary."""
+    """Id in its dictionary."""
     corners: NDArray[np.float32]
-    """(4, 2) pixels, clockwise from the marker's own top left."""
+    """Corners, (4, 2) pixels, clockwise from the marker's own top left."""
 
 
 def find_dictionary(name: str) -> Any:
-    """OpenCV's predefined marker dictionary of that name.
+    """Return OpenCV's predefined marker dictionary of a name.
 
     Args:
         name: such as ``"DICT_4X4_50"`` or ``"DICT_APRILTAG_36h11"``.
@@ -51,7 +51,7 @@ def find_dictionary(name: str) -> Any:
 
 
 def tell_upright(scene: Scene) -> str:
-    """Return a line that names the upright of an AprilTag, of which there are two; empty for other markers."""
+    """Return a note on the orientation of an AprilTag, for which two conventions exist; empty for other markers."""
     marker = scene.marker
     if not (scene.has_marker and marker.dictionary.startswith("DICT_APRILTAG_")) or marker.turn or marker.board:
         return ""
@@ -62,7 +62,7 @@ def tell_upright(scene: Scene) -> str:
 
 
 def make_board(marker: Marker) -> Any:
-    """OpenCV's board object for a marker with ``board`` set; its own axes start at the top left, y down.
+    """Return OpenCV's board object for a marker with ``board`` set; its own axes start at the top left, with y down.
 
     Raises:
         UsageError: if the dictionary holds too few markers, or none of that name exists.
@@ -83,35 +83,39 @@ def make_board(marker: Marker) -> Any:
 
 
 class MarkerDetector:
-    """Finds every marker of a dictionary, with sub-pixel corners; mirrored and inverted prints are not accepted."""
+    """Detector of all markers of a dictionary, with sub-pixel corners.
+
+    Mirrored and inverted prints are not accepted.
+    """
 
     def __init__(self, dictionary: str) -> None:
         parameters = cv2.aruco.DetectorParameters()
         parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax = _WINDOWS
         parameters.adaptiveThreshWinSizeStep = _WINDOWS[1] - _WINDOWS[0]
-        # Cells read from their middle, at twice OpenCV's resolution, and markers at the border taken: on a real clip of
-        # six markers and 145 frames, 119 frames show all six, where OpenCV's defaults show 95, and no other marker is
-        # seen.
+        # Settings: bits are read from the middle of cells at twice OpenCV's resolution, and markers at the border are
+        # accepted. On a real clip of 145 frames with six markers, 119 frames show all six (95 with OpenCV's defaults)
+        # and there are no false detections.
         parameters.perspectiveRemovePixelPerCell = 8
         parameters.perspectiveRemoveIgnoredMarginPerCell = 0.3
         parameters.minDistanceToBorder = 0
-        # Against path-traced poses, root mean square per coordinate: 0.65 pixel unrefined, 0.75 by contour lines,
-        # 0.28 by gradients (this one); AprilTag's quads are 0.45 pixel off in x and y. Edges refine the rest.
+        # Root mean square error per coordinate against path-traced poses: 0.65 pixel unrefined, 0.75 by contour lines,
+        # 0.28 by gradients (used here); AprilTag's quads have an offset of 0.45 pixel in x and y. The edge fit refines
+        # this further.
         parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
         self._parameters = parameters
         self._detector = cv2.aruco.ArucoDetector(find_dictionary(dictionary), parameters)
 
     def detect(self, gray: Image, smallest: float = 10.0, *, sharp: bool = False) -> list[Detection]:
-        """Markers in a uint8 (h, w) image, in OpenCV's order.
+        """Return the markers in a uint8 (h, w) image, in OpenCV's order.
 
         Args:
             gray: the image.
-            smallest: mean edge length in pixels of the smallest marker of interest; most time goes into what is
-                smaller.
-            sharp: Whether the narrow threshold alone is tried, which does not see what is blurred: half the time.
+            smallest: mean edge length in pixels of the smallest marker of interest; a larger value saves most of the
+                time.
+            sharp: True to use the narrow threshold only, which takes half the time but misses blurred markers.
         """
         self._parameters.adaptiveThreshWinSizeMax = _WINDOWS[0 if sharp else 1]
-        # OpenCV counts in shares of the longer image side.
+        # OpenCV takes the size relative to the longer image side.
         self._parameters.minMarkerPerimeterRate = 4 * smallest / max(gray.shape)
         self._detector.setDetectorParameters(self._parameters)
         corners, ids, _ = self._detector.detectMarkers(gray)
@@ -125,22 +129,22 @@ class MarkerDetector:
 
 @dataclasses.dataclass(frozen=True)
 class Pattern:
-    """The print as geometry, in the world's frame: m edge points, c cells."""
+    """Geometry of a print in its marker's frame, metres: m edge points, c cells."""
 
     markers: dict[int, Array]
     """Corners (4, 3) of each marker by its id, clockwise from top left."""
     outline: Array
-    """Corners (4, 3) of the whole."""
+    """Outer corners (4, 3) of the whole print."""
     points: Array
     """Points on the borders between black and white, (m, 3)."""
     tangents: Array
     """Unit direction of the border at each point, (m, 3)."""
     normals: Array
-    """Unit direction toward white, (m, 3)."""
+    """Unit direction toward the white side at each point, (m, 3)."""
     clearances: Array
-    """Distance to the nearest parallel border, (m,) metres."""
+    """Distance in metres to the nearest parallel border, (m,)."""
     cells: Array
-    """Centres of cells, (c, 3)."""
+    """Centres of the cells, (c, 3)."""
     white: Array
     """1 where a cell is white, 0 where black, (c,)."""
 
@@ -148,7 +152,10 @@ class Pattern:
 def _cell_edges(
     cells: NDArray[np.bool_], left: float, top: float, size: float, clearance: float
 ) -> list[tuple[float, ...]]:
-    """Borders between cells that differ: rows of middle (x, y), tangent, normal toward white, length, clearance."""
+    """Return a row for each border between black and white cells.
+
+    A row holds middle (x, y), tangent, normal toward white, length and clearance.
+    """
     edges: list[tuple[float, ...]] = []
     for row, column in np.argwhere(cells[:, 1:] != cells[:, :-1]):
         sign = 1.0 if cells[row, column + 1] else -1.0
@@ -160,12 +167,12 @@ def _cell_edges(
 
 
 def _edge_points(edges: Array) -> tuple[Array, Array, Array, Array]:
-    """Points on edges with their tangents and normals, (m, 3) each, and clearances, (m,).
+    """Return points on borders with their tangents and normals, (m, 3) each, and clearances, (m,).
 
     Args:
-        edges: Rows as ``_cell_edges`` gives them, (n, 8).
+        edges: Rows in the form of ``_cell_edges``, (n, 8).
     """
-    # Inner points of an edge only: its ends are corners, where another edge's blur is near.
+    # Only inner points of a border: at its ends, the blur of another border interferes.
     count = int(np.clip(240 // len(edges), 1, 4))
     along = np.linspace(-0.3, 0.3, count) if count > 1 else np.zeros(1)
     edges = np.repeat(edges[:: -(-len(edges) // 300)], count, axis=0)
@@ -177,10 +184,10 @@ def _edge_points(edges: Array) -> tuple[Array, Array, Array, Array]:
 
 @functools.cache
 def pattern_of(marker: Marker) -> Pattern:
-    """Return the print of a marker or board.
+    """Return the geometry of a marker's or board's print.
 
     Raises:
-        UsageError: There is no such marker.
+        UsageError: The marker does not exist.
     """
     size, board, turn = marker.size, marker.board, marker.turn
     book = find_dictionary(marker.dictionary)
@@ -199,7 +206,7 @@ def pattern_of(marker: Marker) -> Pattern:
             for number, corners in zip(np.ravel(printed.getIds()), printed.getObjPoints(), strict=True)
         }
         if isinstance(board, CharucoBoard):
-            # The top left square is black, but for boards of an even number of rows in OpenCV's layout before 4.6.
+            # The top left square is black, except for boards with an even number of rows in OpenCV's layout before 4.6.
             first = int(board.legacy and board.rows % 2 == 0)
             squares = (np.add.outer(np.arange(board.rows), np.arange(board.columns) + first) % 2).astype(bool)
             square = board.square_length
@@ -235,14 +242,14 @@ def pattern_of(marker: Marker) -> Pattern:
 
 
 def printed_cells(marker: Marker) -> tuple[Array, NDArray[np.bool_], float, Array]:
-    """Return the cells of a print.
+    """Return all cells of a print.
 
     Args:
         marker: Marker or board.
 
     Returns:
-        Centres of all cells (c, 3), which of them are white (c,), the side of a cell in metres, and the whole's
-        corners (4, 3).
+        Centres of all cells (c, 3), mask of white cells (c,), side of a cell in metres, and corners of the whole print
+        (4, 3).
     """
     pattern = pattern_of(marker)
     size = marker.size if marker.board is None else marker.board.marker_length

@@ -1,24 +1,25 @@
-"""Marker to pose: detection, refinement on every printed edge, steadying without lag, and a state to trust it by.
+"""Pose from a marker: detection, refinement on all printed edges, smoothing without lag, and a quality measure.
 
 The world is the marker's frame: origin at the centre of the marker or board, x right and y up the printed page, z out
-of it, metres. A pose is ``camera_from_world``: it maps a world point X to the camera point R X + t; the camera looks
-along +z, x right, y down, and pixel centres lie at integers.
+of it, metres. A pose is ``camera_from_world``: it maps a world point X to the camera point R X + t. The camera's axes
+are x right, y down and z forward, and pixel centres have integer coordinates.
 
-Detection gives four corners, good to about 0.3 pixel: 0.25 degrees for a marker of 90 pixels. The printed pattern gives
-far more: every border between a black and a white cell is a line whose place is known. Refinement therefore slides the
-pose until those borders lie where the image has its edges [HS90], by Gauss-Newton with a redescending weight. Along the
-normal of a border the image is sampled in linear light over a window of half width h; the edge of a step from b to w
-lies, whatever its blur, where the area says:
+Detection gives four corners with an error of about 0.3 pixel, which is 0.25 degrees for a marker of 90 pixels. The
+printed pattern contains far more information: every border between a black and a white cell is a line at a known place.
+Refinement therefore moves the pose until those borders coincide with edges in the image [HS90], by Gauss-Newton with a
+redescending weight. Along a border's normal, the image is sampled in linear radiance over a window of half width h. The
+offset e of an edge from black b to white w follows, independent of its blur, from the area:
 
     e = (1 / (w - b)) * integral of (w - I(u)) du over [-h, h], minus h
 
-No derivative is taken, so noise averages out. What shifts all edges the same way, from black to white, is not motion: a
-clipped white, a transfer curve that is not quite known, ink that spreads. A camera that moves smears edges by their
-direction, and so they shift. The shift of an edge with normal n in the picture is n'Sn, the three numbers of S unknown.
+No derivative of the image is taken, so noise averages out. Some effects shift all edges toward white or black and are
+not motion: clipped white, an inaccurate transfer curve, ink that spreads. Motion blur shifts edges depending on their
+direction. The shift of an edge with normal n in the picture is therefore modelled as n'Sn, with the three numbers of
+the symmetric matrix S unknown.
 
-Objects, lights, proxies and mirror balls may ride on markers of their own, each followed as the world's is. What rides
-on one stands where its marker is in the world: with the camera's poses from both, world_from_marker = world_from_camera
-camera_from_marker. Poses that a scene gives belong to the frames that it names.
+Objects, lights, proxies and mirror balls may be attached to markers of their own, which are tracked like the world's
+marker. A marker's pose in the world follows from the camera's poses relative to both: world_from_marker =
+world_from_camera camera_from_marker. Poses that a scene gives apply to the frames that it names.
 
 References:
     [HS90] C. Harris and C. Stennett. RAPID, a video rate object tracker. BMVC 1990.
@@ -52,91 +53,90 @@ Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 _ENVIRONMENT = 0.6
-"""Half width of the search around the last marker, beyond the marker itself, in its own sizes."""
+"""Half width of the search region beyond the last outline of the marker, in marker sizes."""
 
 _CLOSE = 0.25
-"""The same where a sharp marker is looked for first: half the pixels. It takes a marker from the same pixels."""
+"""Half width of the first search region for a sharp marker: half the pixels, with the same detection result."""
 
 _INSIDE = 12.0
-"""Pixels by which all corners of a marker must lie within that part: edges are sampled beyond them."""
+"""Smallest distance in pixels of a marker's corners from the border of that region, because edges are sampled beyond
+them."""
 
 _BEFORE = np.array([3, 0, 1, 2])
-"""The corner before each of a marker's."""
+"""Index of the corner before each corner of a marker."""
 
 _NEAR = 0.5
-"""Distance of a marker from where it is expected, over the least size at which it is, within which no other is looked
-for."""
+"""Largest distance of a detection from its expected place, relative to the smallest expected size, at which no other
+search is made."""
 
 _SHARP_AGAIN = 8
-"""Frames after which a marker that looked blurred is looked for as a sharp one again."""
+"""Number of frames after which a blurred marker is searched for as a sharp one again."""
 
 _REACH = (4.0, 3.0, 2.5, 2.5)
-"""Half width of the sampled window in pixels, per Gauss-Newton step; a cell that is narrower limits it further."""
+"""Half width of the sampled window in pixels, per Gauss-Newton step; narrow cells limit it further."""
 
 _LOST_REACH = (9.0, 6.0, 4.0, 3.0, 2.5)
-"""The same where the pose is only a prediction from earlier frames."""
+"""Half width of the sampled window in pixels if the pose is only predicted from earlier frames."""
 
 _CORNER_NOISE = 0.5
-"""Pixels: standard deviation of a detected corner where edges are too small to refine."""
+"""Standard deviation in pixels of a detected corner, for markers too small for edge refinement."""
 
 _PATTERN = 0.7
-"""Least correlation of the cells' brightness with the printed pattern."""
+"""Smallest correlation of the cells' brightness with the printed pattern."""
 
 _SUPPORT = 0.4
-"""Least share of the printed edges that must agree with a pose: with less, chance and clutter could."""
+"""Smallest share of the printed edges that must agree with a pose, to reject clutter."""
 
 _ENOUGH = 0.7
-"""Share of a board's edges that makes detection needless."""
+"""Share of a board's edges that must agree to skip detection."""
 
 _ALIKE = 3.0
-"""The second pose of a plane is examined when its reprojection error is less than this many times that of the first
-..."""
+"""Ratio of reprojection errors below which the second pose of a plane is examined as well as the first."""
 
 _ALIKE_PIXELS = 0.5
-"""... or less than this many pixels larger."""
+"""Difference of reprojection errors in pixels below which the second pose is examined as well."""
 
 _FLIP_EVIDENCE = 12.0
-"""Log likelihood that must pile up against the current one of the two poses before the other is taken: e^12."""
+"""Accumulated log likelihood that is needed to switch between the two poses of a plane."""
 
 _FRAME_EVIDENCE = 4.0
-"""Most that one frame may add to it, so that one bad frame cannot flip the pose."""
+"""Largest contribution of one frame to that log likelihood, so that a single bad frame cannot switch the pose."""
 
 _SETTLE = 9.0
-"""Squared deviations (in standard deviations, per degree of freedom) at which half of an innovation is believed."""
+"""Squared deviation (in standard deviations, per degree of freedom) at which half of an innovation is applied."""
 
 _FORGET = 0.4
-"""Seconds in which a steadied pose forgets at least 1 - 1/e of what came before."""
+"""Time in seconds in which the smoothed pose forgets at least 1 - 1/e of earlier measurements."""
 
 
 class TrackState(enum.Enum):
-    """Basis of a track's pose."""
+    """Origin of a tracked pose."""
 
     TRACKED = "tracked"
     """The marker was measured in this frame."""
     HELD = "held"
-    """Not measured for a moment: the pose is extrapolated from the last measurements, with a velocity that dies
-    away."""
+    """The marker was not measured for a moment: the pose is extrapolated with a decaying velocity."""
     LOST = "lost"
-    """Not measured for longer than the hold time: no pose."""
+    """The marker was not measured for longer than the hold time: there is no pose."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Track:
-    """Place of the marker in one frame."""
+    """Tracking result of one frame."""
 
     pose: Pose | None
     """``camera_from_world``, or None when lost."""
     state: TrackState
-    """Basis of the pose."""
+    """Origin of the pose."""
     quality: float
-    """0 to 1: the share of the printed edges that support the pose, lowered by its uncertainty (1 degree or 1 % of
-    distance halve it)."""
+    """Share of the printed edges that support the pose, 0 to 1, reduced by its uncertainty (1 degree or 1 % of distance
+    halve it)."""
     corners: NDArray[np.float32] | None
     """Corners of the marker or board in the image under ``pose``, (4, 2) pixels, clockwise from the page's top left;
     None when lost."""
     reprojection_error: float
-    """Root mean square distance in pixels between predicted and measured edges (corners, where too small); infinite if
-    not measured."""
+    """Root mean square distance in pixels between predicted and measured edges (or corners, for small markers);
+    infinite without measurement."""
 
 
 def _rotation(vector: Array) -> Array:
@@ -144,12 +144,12 @@ def _rotation(vector: Array) -> Array:
 
 
 def _log(rotation: Array) -> Array:
-    """Rotation vector of a matrix, of length 0 to pi: no sign to choose, as there would be with a quaternion."""
+    """Return the rotation vector of a matrix, with length 0 to pi; unlike a quaternion it has no ambiguous sign."""
     return np.asarray(cv2.Rodrigues(rotation)[0], float).ravel()
 
 
 def _difference(a: Pose, b: Pose) -> Array:
-    """(6,) rotation vector w and translation d with a = (exp(w) b.R, b.t + d)."""
+    """Return (6,): rotation vector w and translation d such that a = (exp(w) b.R, b.t + d)."""
     return np.concatenate([_log(a.rotation @ b.rotation.T), a.translation - b.translation])
 
 
@@ -158,14 +158,14 @@ def _moved(pose: Pose, step: Array) -> Pose:
 
 
 class Tracker:
-    """Follows one marker or board through a sequence of frames.
+    """Tracker of one marker or board over a sequence of frames.
 
     Args:
-        marker: what to follow.
-        camera: the camera; its transfer curve matters little, for a common shift of all edges is solved for.
+        marker: the marker or board.
+        camera: the camera; its transfer curve matters little, because a common shift of all edges is estimated.
         hold: seconds for which the pose is extrapolated after the last measurement.
-        steady: whether to steady the pose over time. The steadied pose strays from the measured one by no more than
-            about the measurement's own uncertainty: a still marker stands still, a moving one does not lag.
+        steady: True to smooth the pose over time. The smoothed pose deviates from the measured one by about the
+            measurement's uncertainty at most: a static marker does not jitter, a moving one does not lag.
 
     Raises:
         UsageError: if the marker does not exist, an argument is of another type, or ``hold`` below 0.
@@ -185,17 +185,17 @@ class Tracker:
         self.reset()
 
     def reset(self) -> None:
-        """Forget every earlier frame."""
+        """Forget all earlier frames."""
         self._pose: Pose | None = None
         self._velocity = np.zeros(6)
         self._time = -np.inf
         self._quality = 0.0
         self._evidence = 0.0
         self._rival = False
-        self._blurred = 0  # frames in which the marker is not looked for as a sharp one
+        self._blurred = 0  # number of frames in which the search for a sharp marker is skipped
 
     def track(self, image: Image, time: float) -> Track:
-        """Find the marker in the next frame.
+        """Track the marker in the next frame.
 
         Args:
             image: uint8 (height, width, 3) RGB, or (height, width) grey.
@@ -208,7 +208,7 @@ class Tracker:
             h, w = self._shape
             raise UsageError(f"image: {image.dtype} {image.shape} should be uint8 ({h}, {w}, 3), the camera's size")
         if not 0 <= time - self._time <= self._hold:
-            self.reset()  # too long ago to say anything, or a clock that ran backwards
+            self.reset()  # too long ago to predict, or a clock that ran backwards
         guess = self._predict(time)
         fit = self._measure(image, guess)
         if fit is None:
@@ -221,18 +221,21 @@ class Tracker:
         return Track(pose, TrackState.TRACKED, quality, self._outline(pose), fit.error)
 
     def detect(self, image: Image) -> list[Detection]:
-        """The followed markers in a whole picture, uint8 RGB or grey; they depend on the picture, not on the camera."""
+        """Detect this marker, or the markers of this board, in a whole picture (uint8 RGB or grey).
+
+        The result is independent of the camera.
+        """
         return self._detect(image)
 
     def error_of(self, image: Image, found: list[Detection]) -> float:
-        """Return how well the print fits where it was found, whatever earlier frames say.
+        """Return how well the print fits at its detections, without earlier frames.
 
         Args:
-            image: As for ``track``.
-            found: What ``detect`` gave of it, by any tracker of this marker.
+            image: As in ``track``.
+            found: Result of ``detect`` for the image, by any tracker of this marker.
 
         Returns:
-            What ``track`` of a new tracker says: root mean square distance in pixels; infinite where no pose fits.
+            The reprojection error that ``track`` of a new tracker would give, in pixels; infinite if no pose fits.
         """
         self._show(image)
         fit = self._fit_detections(found, None)
@@ -245,7 +248,10 @@ class Tracker:
         return Track(guess, TrackState.HELD, float(np.clip(quality, 0, 1)), self._outline(guess), np.inf)
 
     def _predict(self, time: float) -> Pose | None:
-        """The last pose moved on: the velocity halves over the hold time, so that a lost marker does not fly away."""
+        """Return the last pose extrapolated to a time.
+
+        The velocity halves over the hold time, so that a lost marker stays near.
+        """
         if self._pose is None:
             return None
         elapsed = time - self._time
@@ -257,9 +263,12 @@ class Tracker:
         return self._fitter.project(pose.apply(self._pattern.outline))[0].astype(np.float32)
 
     def _measure(self, image: Image, guess: Pose | None) -> Fit | None:
-        """The pose in this image alone; ``guess`` only says where to look, and which of two like poses to prefer."""
+        """Return the pose measured in this image alone.
+
+        ``guess`` only limits the search and resolves the ambiguity of a plane.
+        """
         if guess is not None:
-            # A board has no second pose to confuse it with, and dozens of markers to decode: its edges come first.
+            # A board has no ambiguous second pose, and decoding its many markers is slow: its edges are tried first.
             if len(self._pattern.markers) > 1:
                 self._show(image, self._around(self._outline(guess)))
                 fit = self._fit_guess(guess)
@@ -267,8 +276,8 @@ class Tracker:
                     return fit
             fit = self._fit_detections(self._find_expected(image, guess), guess)
             if fit is None or not fit.edges:
-                # Perhaps only partly hidden or cut off, so that corners are missing or wrong: its edges may still be
-                # there.
+                # The marker may be partly hidden or cut off, with missing or wrong corners; its edges may still be
+                # visible.
                 self._show(image, self._around(self._outline(guess)))
                 fit = self._fit_guess(guess) or fit
             if fit is not None:
@@ -278,16 +287,16 @@ class Tracker:
         fit = self._fit_detections(found, guess)
         if fit is None or not fit.edges or self._rival or len(self._pattern.markers) > 1:
             return fit
-        # Found as it will be in the next frame, so that a marker that stands still does so from the first frame on.
+        # Measured again as in the next frame, so that a static marker does not move from the first frame to the second.
         return self._fit_detections(self._find_expected(image, fit.pose), fit.pose) or fit
 
     def _show(self, image: Image, box: Box | None = None) -> Image:
-        """A part of the image in grey, all of it where none is named: what is detected in and fitted to."""
+        """Return a part of the image in grey (default: the whole image) as the input of detection and fitting."""
         h, w = self._shape
         return self._fitter.show(image, (slice(0, h), slice(0, w)) if box is None else box)
 
     def _around(self, outline: NDArray[np.float32], environment: float = _ENVIRONMENT) -> Box:
-        """Rows and columns of the image around a marker's outline, never empty."""
+        """Return rows and columns of the image around a marker's outline; never empty."""
         low, high = outline.min(0), outline.max(0)
         environment = environment * float((high - low).max()) + 16
         h, w = self._shape
@@ -295,16 +304,19 @@ class Tracker:
         return slice(int(y0), int(np.ceil(y1))), slice(int(x0), int(np.ceil(x1)))
 
     def _smallest(self, guess: Pose) -> float:
-        """Edge length in pixels below which nothing is a marker where one is expected at ``guess``."""
+        """Return the smallest edge length in pixels of a marker expected at ``guess``."""
         corners = np.concatenate([guess.apply(c) for c in self._pattern.markers.values()])
         pixels = self._fitter.project(corners)[0].reshape(-1, 4, 2)
         sides = pixels - pixels[:, _BEFORE]
         return 0.6 * float(np.sqrt((sides**2).sum(axis=2)).mean(axis=1).min())
 
     def _find_expected(self, image: Image, guess: Pose) -> list[Detection]:
-        """The followed markers where they are expected; one marker first as a sharp one, if it lately was.
+        """Detect the markers where they are expected.
 
-        A marker that the narrow threshold sees, both see in the same place; one that it does not see may be blurred.
+        A single marker that was sharp recently is first searched for as sharp.
+
+        A marker found with the narrow threshold has the same corners as with both; a marker that is not found may be
+        blurred.
         """
         smallest, expected = self._smallest(guess), self._outline(guess)
         if len(self._pattern.markers) == 1 and self._blurred == 0:
@@ -321,7 +333,10 @@ class Tracker:
     def _detect(
         self, image: Image, box: Box | None = None, smallest: float = 10.0, *, sharp: bool = False
     ) -> list[Detection]:
-        """The followed markers in a part of the image, all of it where none is named, in pixels of the whole."""
+        """Detect the markers in a part of the image (default: the whole image).
+
+        Corners are in pixels of the whole image.
+        """
         detected = self._detector.detect(self._show(image, box), max(smallest, 10.0), sharp=sharp)
         origin = np.array((0, 0) if box is None else (box[1].start, box[0].start), np.float32)
         return [Detection(d.id, d.corners + origin) for d in detected if d.id in self._pattern.markers]
@@ -342,7 +357,7 @@ class Tracker:
         return self._preferred(good, guess) if good else None
 
     def _chosen(self, found: list[Detection], guess: Pose | None) -> list[Detection]:
-        """One detection per id: the one nearest to where it is expected, else the largest."""
+        """Return one detection per id: the nearest to its expected place, or without expectation the largest."""
         if len(found) < 2:
             return found
 
@@ -358,18 +373,18 @@ class Tracker:
         return list(best.values())
 
     def _plane_poses(self, points: Array, corners: Array) -> list[tuple[Pose, float]]:
-        """Both poses of a plane [CB14], with reprojection errors in pixels, best first.
+        """Return both poses of a plane [CB14], with reprojection errors in pixels, the better one first.
 
-        Clockwise corners make z point toward the camera in both.
+        With clockwise corners, z points toward the camera in both poses.
         """
-        # With z into the page a marker seen straight on is not turned at all. With z out of it, it is turned by exactly
-        # half a turn, where OpenCV's solver divides 0 by 0 and returns a pose that is 160 pixels off.
+        # With z into the page, a marker seen frontally has the identity rotation. With z out of the page, it is rotated
+        # by exactly half a turn, where OpenCV's solver divides 0 by 0 and returns a pose that is off by 160 pixels.
         facing = np.diag([1.0, -1.0, -1.0])
         try:
             _, rotations, translations, _ = cv2.solvePnPGeneric(
                 points @ facing, corners, self._matrix, self._distortion, flags=cv2.SOLVEPNP_IPPE
             )
-        except cv2.error:  # corners on one line
+        except cv2.error:  # collinear corners
             return []
         poses = []
         for r, t in zip(rotations, translations, strict=True):
@@ -382,7 +397,7 @@ class Tracker:
         return sorted(poses, key=lambda p: p[1])
 
     def _preferred(self, fits: list[Fit], guess: Pose | None) -> Fit:
-        """One of the two poses of a plane: the better in this frame, unless earlier frames speak for the other."""
+        """Return one of the two poses of a plane: the better in this frame, unless earlier frames support the other."""
         if guess is None or len(fits) < 2:
             self._evidence = 0.0
             return min(fits, key=lambda f: f.cost)
@@ -397,12 +412,12 @@ class Tracker:
         return far
 
     def _refined(self, poses: list[Pose], points: Array, corners: Array) -> list[Fit]:
-        """Poses fitted to the edges, or to the corners where the edges are too small to be measured."""
+        """Return poses fitted to the edges, or to the corners if the edges are too small to measure."""
         found = [(pose, self._fitter.fit(pose, _REACH)) for pose in poses]
         return [fit if _holds(fit) else self._fit_corners(pose, points, corners) for pose, fit in found]
 
     def _fit_corners(self, pose: Pose, points: Array, corners: Array) -> Fit:
-        """A pose as corners that were detected have it."""
+        """Return the pose fitted to detected corners."""
         camera = pose.apply(points)
         pixels, jacobian = self._fitter.project(camera)
         residual = pixels - corners
@@ -417,10 +432,11 @@ class Tracker:
         return fit if _holds(fit) else None
 
     def _steadied(self, fit: Fit, guess: Pose | None, time: float) -> Pose:
-        """The measured pose, averaged with the last one as far as both agree within the measurement's own noise.
+        """Return the measured pose, averaged with the last one as far as both agree within the measurement's noise.
 
-        With innovation x of information L, s = x'Lx / 6 is 1 on average where nothing moved. Taking the share s / (s +
-        c) of x leaves c x / (s + c): at most half of sqrt(c) standard deviations, however the camera moves.
+        For an innovation x with information matrix L, s = x'Lx / 6 is 1 on average without motion. Applying the share s
+        / (s + c) of x leaves the error c x / (s + c), which is at most half of sqrt(c) standard deviations for any
+        motion.
         """
         if self._pose is None or guess is None or not self._steady:
             return fit.pose
@@ -430,7 +446,7 @@ class Tracker:
         return _moved(self._pose, share * step)
 
     def _judge(self, fit: Fit) -> float:
-        """Quality from what supports the pose and how well it is determined."""
+        """Return the quality of a pose, by its support and its uncertainty."""
         variances = [max(value, 0.0) for value in _inverse(fit.information).diagonal().tolist()]
         turn = math.degrees(math.sqrt(sum(variances[:3])))
         shift = 100.0 * math.sqrt(sum(variances[3:])) / math.hypot(*fit.pose.translation.tolist())
@@ -439,7 +455,7 @@ class Tracker:
 
 
 def _inverse(information: Array) -> Array:
-    """Covariance of a pose; where some motion of it is not seen at all, of the others."""
+    """Return the covariance of a pose; unobservable motions are left out."""
     with contextlib.suppress(np.linalg.LinAlgError):
         inverse = np.asarray(np.linalg.inv(information), float)
         if inverse.diagonal().min() > 0.0:
@@ -448,7 +464,7 @@ def _inverse(information: Array) -> Array:
 
 
 def _is_inside(corners: NDArray[np.float32], box: Box) -> bool:
-    """Return whether corners lie well within a part of the image."""
+    """Return True if corners lie inside a part of the image with a margin."""
     rows, columns = box
     low, high = corners.min(0), corners.max(0)
     return bool(
@@ -462,9 +478,12 @@ def _holds(fit: Fit | None) -> TypeGuard[Fit]:
 
 
 def _pose_rows(jacobian: Array, arm: Array) -> Array:
-    """Derivative (n, 2, 6) of pixels by a pose's rotation vector and translation; ``arm`` is R X.
+    """Return the derivative (n, 2, 6) of pixels with respect to a pose's rotation vector and translation.
 
-    exp(w) R X + t + d moves by w x RX + d, so a row j of the derivative by the point gives (RX x j, j).
+    ``arm`` is R X.
+
+    exp(w) R X + t + d changes by w x RX + d. A row j of the derivative with respect to the point therefore becomes (RX
+    x j, j).
     """
     x, y, z = arm.T[:, :, None]
     a, b, c = np.moveaxis(jacobian, 2, 0)
@@ -474,38 +493,38 @@ def _pose_rows(jacobian: Array, arm: Array) -> Array:
 
 
 Places = Mapping[Marker, Pose | None]
-"""``world_from_marker`` of each marker, None where it is lost."""
+"""``world_from_marker`` of each marker; None if it is lost."""
 
 
 def own_markers(scene: Scene) -> tuple[Marker, ...]:
-    """Markers that anything of a scene rides on, each once."""
+    """Return the markers to which objects, lights or other parts of a scene are attached, each once."""
     items: tuple[Object | Light | Proxy | Probe, ...] = (*scene.objects, *scene.lights, *scene.proxies, *scene.probes)
     return tuple(dict.fromkeys(item.marker for item in items if item.marker is not None))
 
 
 class OwnMarkers:
-    """Follows every marker that something rides on."""
+    """Trackers of all markers to which parts of a scene are attached."""
 
     def __init__(self, scene: Scene, camera: Camera) -> None:
-        """Follow the markers of a scene.
+        """Create the trackers.
 
         Args:
-            scene: Whose objects, lights, proxies and balls ride on them.
-            camera: Of the frames.
+            scene: Scene whose objects, lights, proxies and balls are attached to markers.
+            camera: Camera of the frames.
         """
         self._trackers = {marker: Tracker(marker, camera) for marker in own_markers(scene)}
 
     def __bool__(self) -> bool:
-        """Return whether there are any."""
+        """Return True if there are any."""
         return bool(self._trackers)
 
     def track(self, image: NDArray[np.uint8], time: float, camera_from_world: Pose | None) -> Places:
-        """Return where the markers are in the world; all are lost where the world is.
+        """Return the markers' poses in the world; all are lost while the world's marker is.
 
         Args:
             image: (h, w, 3) RGB of 8 bits.
             time: Seconds.
-            camera_from_world: By the world's own marker, or known from elsewhere.
+            camera_from_world: Pose by the world's marker or from the scene; None if lost.
         """
         found = {marker: tracker.track(image, time).pose for marker, tracker in self._trackers.items()}
         if camera_from_world is None:
@@ -518,14 +537,14 @@ _NO_POSE = Track(None, TrackState.LOST, 0.0, None, math.inf)
 
 
 def given_pose(spec: PoseSpec | None, frame: Frame | int) -> Pose | Track | None:
-    """Return the pose of a frame.
+    """Return the given pose of a frame.
 
     Args:
         spec: The scene's poses, if it gives any.
-        frame: The frame, or its number where no more is known of it.
+        frame: The frame, or only its index.
 
     Returns:
-        A pose; a lost track where the file has none for the frame; None: the marker tells.
+        The pose; a lost track if the file has no pose for the frame; None if the scene gives no poses.
     """
     if spec is None:
         return None
@@ -534,7 +553,7 @@ def given_pose(spec: PoseSpec | None, frame: Frame | int) -> Pose | Track | None
 
 
 def tell_missing_poses(spec: PoseSpec | None, source: Source) -> str:
-    """Return a line that counts the frames without a pose; empty where each has one, or nobody knows yet."""
+    """Return a line with the number of frames without a pose; empty if all have one or the number is unknown."""
     if spec is None or spec.file is None or source.live:
         return ""
     frames = source.names or ("",) * (source.length or 0)
