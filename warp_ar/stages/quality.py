@@ -31,8 +31,8 @@ class Quality:
             UsageError: A value has another type, or a size is impossible. A pipeline checks the names of methods.
         """
         check_fields(self)
-        if not 4 <= self.environment_height <= 4096:
-            raise UsageError(f"Quality: environment_height = {self.environment_height}: expected 4 to 4096 rows")
+        if not 1 <= self.environment_height <= 4096:
+            raise UsageError(f"Quality: environment_height = {self.environment_height}: expected 1 to 4096 rows")
         if not 1 <= self.edge_samples <= 4096 or math.isqrt(self.edge_samples) ** 2 != self.edge_samples:
             raise UsageError(f"Quality: edge_samples = {self.edge_samples}: expected a square number, such as 4")
 
