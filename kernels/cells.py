@@ -1,4 +1,4 @@
-"""Cells of the frame: blocks of ``stride x stride`` pixels of which one, near the middle, is estimated for all."""
+"""Cells of the frame: blocks of ``stride x stride`` pixels. Each is estimated at one pixel near its middle."""
 
 from __future__ import annotations
 
@@ -9,18 +9,21 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 STRIDE_ROWS = 480
-"""Rows of a frame for which strides are given."""
+"""Rows of the frame to which settings of strides refer."""
 
 
 @wp.func
 def cell_pixel(cell: wp.int32, stride: wp.int32, size: wp.int32) -> wp.int32:
-    """Row or column at which a cell is estimated."""
+    """Return the row or column of the pixel at which a cell is estimated; ``size`` is the frame's."""
     return wp.min(cell * stride + stride / 2, size - 1)
 
 
 @wp.func
 def cell_place(pixel: wp.int32, stride: wp.int32, size: wp.int32) -> wp.float32:
-    """Return the cell estimated at a row or column: whole numbers at ``cell_pixel``, even between, none beyond."""
+    """Return the fractional cell index of a pixel's row or column.
+
+    It is whole at ``cell_pixel``, linear between, and clamped to the first and last cell.
+    """
     last = (size - 1) / stride
     low = wp.clamp((pixel - stride / 2) / stride, 0, last)
     here = cell_pixel(low, stride, size)
@@ -40,10 +43,10 @@ def look_up_cells(
     row: wp.int32,
     col: wp.int32,
 ) -> wp.vec4:
-    """Mean of the cells around a pixel that lie on its surface, weighted as bilinear interpolation does, and 1.
+    """Interpolate cells to a pixel bilinearly, among the cells of the pixel's surface alone.
 
-    Where none of those is on its surface, the mean of others that touch the pixel; zero where no cell around it shows
-    its surface. ``size`` is that of the frame.
+    Return (RGB, 1), or zero if none of the four cells around the pixel lies on its surface ``key``. If only cells of
+    zero bilinear weight do, the result is their mean. ``size`` holds the rows and columns of the frame.
     """
     y = cell_place(row, stride, size[0])
     x = cell_place(col, stride, size[1])
@@ -96,19 +99,19 @@ def any_cell_above_zero(
 
 
 def cell_stride(stride: int, rows: int, *, slowly: bool = False) -> int:
-    """Pixels along a cell of a frame of so many rows; a stride of 1 is every pixel of any frame.
+    """Return the side of a cell in pixels, for a frame of ``rows`` rows.
 
     Args:
-        stride: The same for a frame of ``STRIDE_ROWS`` rows.
-        rows: Of the frame.
-        slowly: Whether cells grow as the root of the rows, so that larger pictures still have finer cells; else as the
-            rows, and their number stays.
+        stride: Side of a cell in a frame of ``STRIDE_ROWS`` rows; 1 means every pixel, in any frame.
+        rows: Rows of the frame.
+        slowly: If True, cells grow with the square root of the rows, so that larger frames have more cells. If False,
+            they grow with the rows, and the number of cells stays the same.
     """
     grown = stride * math.sqrt(rows / STRIDE_ROWS) if slowly else stride * rows / STRIDE_ROWS
     return 1 if stride == 1 else max(1, round(grown))
 
 
 def cell_shape(size: tuple[int, int], stride: int) -> tuple[int, int]:
-    """Rows and columns of the cells of a frame of (width, height)."""
+    """Return the rows and columns of cells in a frame of ``size`` (width, height)."""
     width, height = size
     return -(-height // stride), -(-width // stride)

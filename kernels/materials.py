@@ -1,21 +1,22 @@
 """Reflection of light by surfaces: four models under virtual lights and under the environment.
 
 Directions ``wi`` (to the light), ``wo`` (to the viewer) and ``normal`` are unit and point away from the surface. Every
-model is first reduced to a ``Surface``: a diffuse reflectance and a lobe. Under the environment that is
+model is first reduced to a ``Surface``: a diffuse reflectance and a lobe. Under the environment it reflects
 
     diffuse E(normal) / pi + reflectance L(mirror direction, width of the lobe),
 
-E the irradiance, L the prefiltered environment; under a virtual light it is the reflected radiance per irradiance of a
-surface that *faces* the light, so the cosine is part of it.
+with E the irradiance and L the prefiltered environment. Under a virtual light, models return the reflected radiance
+over the irradiance of a surface that *faces* the light, so the cosine is part of the result.
 
-Phong is used in its radiance form: what is seen is the mean of the incoming radiance, weighted by (n + 1) / (2 pi)
-cos^n around the mirror direction. The weight integrates to 1 at any exponent, so a small far light shades the same
-whether it is part of the environment or a virtual light.
+Phong is used in its radiance form: the reflected radiance is the mean of the incoming radiance, weighted by
+(n + 1) / (2 pi) cos^n around the mirror direction. The weight integrates to 1 at any exponent, so a small distant
+light shades the same as part of the environment and as a virtual light.
 
-Metallic-roughness is glTF's: GGX with alpha = roughness^2, height-correlated Smith visibility, Schlick's Fresnel with
-F0 = 0.04 for what is no metal. Two objects that glTF leaves open are settled by energy: light that scatters more than
-once between the facets is put back (``split_sum``), and the diffuse part gets what the facets let pass, 1 - (their
-directional albedo), rather than 1 - F of one facet. A white surface in a white environment is white, at any roughness.
+Metallic-roughness is glTF's: GGX with alpha = roughness^2, height-correlated Smith visibility, and Schlick's Fresnel
+with F0 = 0.04 for dielectrics. Two choices that glTF leaves open follow from conservation of energy. Light that
+scatters more than once between the facets is added back (``split_sum``). The diffuse part receives the light that the
+facets transmit, 1 - (their directional albedo), rather than 1 - F of one facet. So a white surface in a white
+environment is white at any roughness.
 
 References:
     [LW94] Lafortune, Willems, "Using the Modified Phong Reflectance Model for Physically Based Rendering", CW 197,
@@ -40,38 +41,38 @@ wp.set_module_options({"enable_backward": False})
 
 DIELECTRIC_F0 = wp.constant(wp.float32(0.04))
 
-# Highlights of virtual lights. A light without extent in a mirror is a point without extent: nothing to see, and D(h) =
+# Least alpha of highlights of virtual lights. A point light's image in a mirror is a point, and its D(h) =
 # 1 / (pi alpha^2) has no limit. Half of D's energy lies within tan(theta_h) = alpha, so the highlight is about 4 alpha
-# wide; at 1e-3 that is 4 pixels of a camera with a focal length of 1000 pixels, the narrowest that does not flicker. D
-# stays below 3.2e5.
+# wide. At 1e-3 that is 4 pixels of a camera with a focal length of 1000 pixels, the narrowest width that does not
+# flicker, and D stays below 3.2e5.
 MIN_ALPHA = wp.constant(wp.float32(1.0e-3))
 
-# Smith's visibility grows as 1 / cosine at grazing angles; the light that it weighs falls as the cosine. Below this
-# both are noise.
+# Smith's visibility grows as 1 / cosine at grazing angles, and the light that it weighs falls as the cosine. Below
+# this cosine both are noise.
 MIN_COSINE = wp.constant(wp.float32(1.0e-4))
 
 
 @wp.struct
 class Surface:
-    """A material at one point seen from one direction: textures looked up, energy divided."""
+    """A material at one point seen from one direction, after texture look-ups and division of the energy."""
 
     model: wp.int32
-    diffuse: wp.vec3  # Lambertian reflectance of what the lobe leaves
-    reflectance: wp.vec3  # of the lobe, under light from everywhere
-    # METALLIC_ROUGHNESS: reflectance of a facet, with what light that scatters more than once adds
+    diffuse: wp.vec3  # Lambertian reflectance, of light that the lobe does not reflect
+    reflectance: wp.vec3  # directional albedo of the lobe
+    # METALLIC_ROUGHNESS: reflectance of a facet, times the factor for light that scatters more than once
     f0: wp.vec3  # at normal incidence
     f90: wp.vec3  # at grazing incidence
     shininess: wp.float32  # PHONG
     roughness: wp.float32  # METALLIC_ROUGHNESS; perceptual
-    steady: wp.float32  # METALLIC_ROUGHNESS: share of the lobe that its facets reflect alike from all sides
-    # Only where there are textures, else not set:
-    emission: wp.vec3  # radiance that it sends out itself
-    occlusion: wp.float32  # share of the environment's irradiance that reaches it
+    steady: wp.float32  # METALLIC_ROUGHNESS: share of the lobe that F0 weighs, independent of the angle
+    # Only set where there are textures:
+    emission: wp.vec3  # emitted radiance
+    occlusion: wp.float32  # share of the environment's irradiance that reaches the point
 
 
 @wp.func
 def material_at(scene: RayScene, hit: Hit) -> wp.int32:
-    """Index of the material that a hit has."""
+    """Return the index of the material at a hit."""
     index = scene.objects[hit.shape].material
     if hit.corner >= 0:
         if scene.triangle_materials.shape[0] > 0:
@@ -81,9 +82,10 @@ def material_at(scene: RayScene, hit: Hit) -> wp.int32:
 
 @wp.func
 def surface_point(scene: RayScene, hit: Hit, cos_o: wp.float32, spread: wp.float32) -> SurfacePoint:
-    """Return a hit as pictures see it; ``spread`` is the angle of the ray's cone, whose apex is where the ray starts.
+    """Return the ``SurfacePoint`` of a hit, for texture look-ups.
 
-    The pictures of a sphere and a box are as dense as on their largest circle and their mean side.
+    ``spread`` is the angle of the ray's cone, whose apex is the ray's origin. The density of texture coordinates is
+    taken from a sphere's largest circle and from a box's mean side.
     """
     shape = scene.objects[hit.shape]
     width = spread * hit.t * slant(cos_o)
@@ -104,7 +106,7 @@ def surface_point(scene: RayScene, hit: Hit, cos_o: wp.float32, spread: wp.float
 
 @wp.func
 def roughness_at(scene: RayScene, material: Material, point: SurfacePoint) -> wp.float32:
-    """Roughness of a point, its picture included."""
+    """Return the roughness at a point, times its texture's if there is one."""
     if material.metallic_roughness_texture >= 0:
         return material.roughness * sample_texture(scene, material.metallic_roughness_texture, point)[1]
     return material.roughness
@@ -112,7 +114,7 @@ def roughness_at(scene: RayScene, material: Material, point: SurfacePoint) -> wp
 
 @wp.func
 def emitted_radiance(scene: RayScene, material: Material, point: SurfacePoint) -> wp.vec3:
-    """Return the radiance that a point sends out itself, on a side that does."""
+    """Return the emitted radiance of a point, for a side that emits."""
     if material.unlit != 0:
         base = wp.cw_mul(material.base_color, wp.vec3(point.color[0], point.color[1], point.color[2]))
         if material.base_texture >= 0:
@@ -133,10 +135,10 @@ def mix_metal(
     roughness: wp.float32,
     cos_o: wp.float32,
 ) -> Surface:
-    """A ``METALLIC_ROUGHNESS`` surface seen from the cosine ``cos_o``.
+    """Return a ``METALLIC_ROUGHNESS`` surface seen at the cosine ``cos_o``.
 
-    Metal and dielectric are mixed as they reflect, not as their facets do: each has its own factor for what scatters
-    more than once, or a mixture of two white ones would be darker than either.
+    The reflected light of metal and dielectric is mixed, not the F0 of their facets: each has its own factor for
+    light that scatters more than once. Otherwise a mixture of two white ones would be darker than either.
     """
     out = surface
     one = wp.vec3(1.0, 1.0, 1.0)
@@ -162,8 +164,8 @@ def make_surface(models: tuple[int, ...], textures: bool) -> wp.Function:
     ``spread`` is the angle of the ray's cone.
 
     Args:
-        models: Sorted models that exist.
-        textures: Whether any material has a texture, or is that of a triangle.
+        models: Sorted models of the scene's materials.
+        textures: Whether any material has a texture, or any mesh has a material per triangle.
     """
     label = "_".join(map(str, models))
 
@@ -227,15 +229,16 @@ def make_surface(models: tuple[int, ...], textures: bool) -> wp.Function:
 
 @wp.func
 def rgb(color: wp.vec4) -> wp.vec3:
-    """A colour without its alpha."""
+    """Return a colour without its alpha."""
     return wp.vec3(color[0], color[1], color[2])
 
 
 @wp.func
 def specular_occlusion(occlusion: wp.float32, cos_o: wp.float32, roughness: wp.float32) -> wp.float32:
-    """Share of the reflected environment that reaches a point of which ``occlusion`` of the diffuse one does [LdR14].
+    """Return the share of the environment's light in the lobe that reaches a point [LdR14].
 
-    1 where nothing is hidden and, for a mirror, where it is seen from ahead.
+    ``occlusion`` is the share of the diffuse light that does. The result is 1 where nothing is hidden and, for a
+    mirror, where it is seen from ahead.
     """
     power = wp.pow(2.0, -16.0 * roughness - 1.0)
     return wp.clamp(wp.pow(wp.max(cos_o + occlusion, 0.0), power) - 1.0 + occlusion, 0.0, 1.0)
@@ -243,22 +246,22 @@ def specular_occlusion(occlusion: wp.float32, cos_o: wp.float32, roughness: wp.f
 
 @wp.func
 def reflect(wo: wp.vec3, normal: wp.vec3) -> wp.vec3:
-    """Mirror direction of ``wo``."""
+    """Return the mirror direction of ``wo``."""
     return 2.0 * wp.dot(normal, wo) * normal - wo
 
 
-# A GGX lobe is cut off by the surface and shadowed by its facets: the rougher, the further its mean lies from the
-# mirror direction R toward the normal n, which it reaches at roughness 1, where the lobe is a cosine ([LdR14] 4.9.3).
-# That is the part that F0 weighs. The other, of facets that are met at grazing angles, pulls back toward the horizon:
-# that part of the lobe, 1 - steady, is taken to stay around R. So
+# A GGX lobe is cut off by the surface and shadowed by its facets. The rougher it is, the further its mean lies from the
+# mirror direction R toward the normal n; at roughness 1 the lobe is a cosine around n ([LdR14] 4.9.3). This holds for
+# the part that F0 weighs, ``steady``. The other part, of facets at grazing angles, pulls back toward the horizon and is
+# taken to stay around R. So the axis is, normalised,
 #
-#     | R + steady roughness^3 (n - R) |.
+#     R + steady roughness^3 (n - R).
 #
-# The cube is what integrals over eight rooms say: the best share of the way is 0.01, 0.04, 0.14, 0.45, 0.8 at roughness
-# 0.25, 0.35, 0.5, 0.7, 0.9. Around R alone the error of what is reflected is twice as large at 0.7, five times at 1.
+# The cube fits integrals over eight environments: the best weight of n - R is 0.01, 0.04, 0.14, 0.45, 0.8 at roughness
+# 0.25, 0.35, 0.5, 0.7, 0.9. Around R alone the error of the reflection is twice as large at 0.7, five times at 1.
 @wp.func
 def lobe_axis(surface: Surface, mirror: wp.vec3, normal: wp.vec3) -> wp.vec3:
-    """Direction around which the environment's level of a surface's lobe is read, as derived above; unit."""
+    """Return the direction at which the prefiltered environment is read for a surface's lobe, derived above; unit."""
     if surface.model != METALLIC_ROUGHNESS:
         return mirror
     roughness = surface.roughness
@@ -313,8 +316,8 @@ def schlick(cosine: wp.float32) -> wp.float32:
 def make_reflect_direct(models: tuple[int, ...]) -> wp.Function:
     """``reflect_direct(surface, normal, wo, wi) -> vec3`` for the given models; zero unless the light is in front.
 
-    The result times ``LightSample.irradiance_normal`` is radiance. A mirror would show the light itself, and a light
-    without extent is nothing to see.
+    The result times ``LightSample.irradiance_normal`` is radiance. It is zero for a mirror: the image of a point light
+    has no extent.
     """
     label = "_".join(map(str, models))
 

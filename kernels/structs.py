@@ -1,4 +1,4 @@
-"""Structures that stages share. What may change from frame to frame lives in the arrays of ``FrameBlock``.
+"""Structures that stages share. Values that change from frame to frame stand in the arrays of ``FrameBlock``.
 
 Lengths are metres in the world (marker) frame, angles radians, colours linear RGB.
 """
@@ -31,12 +31,12 @@ PHONG = 1
 METALLIC_ROUGHNESS = 2
 MIRROR = 3
 
-# What alpha does.
+# Alpha modes of a material.
 OPAQUE = 0
 MASKED = 1
 BLENDED = 2
 
-# What lies beyond a picture's border.
+# Continuations of a texture beyond its border.
 REPEATED = wp.constant(0)
 CLAMP = wp.constant(1)
 MIRRORED = wp.constant(2)
@@ -44,7 +44,7 @@ MIRRORED = wp.constant(2)
 
 @wp.struct
 class FrameParams:
-    """Values that change per frame; kernels get an array of one."""
+    """Values that change per frame. Kernels receive an array with one record."""
 
     camera_position: wp.vec3  # world
     world_from_camera: wp.mat33
@@ -56,11 +56,12 @@ class FrameParams:
     time_step: wp.float32  # seconds since the previous frame
     frame_index: wp.int32
     environment_reset: wp.int32  # 1: forget the accumulated environment
-    object_rect: wp.vec4i  # row_start, row_stop, col_start, col_stop: where virtual objects can be on screen
-    light_rect: wp.vec4i  # the same for virtual light and shadow on the physical
-    direct_rect: wp.vec4i  # the part of light_rect that light reaches without a bounce
-    shadow_rect: wp.vec4i  # the same for what virtual objects do to the environment on the physical
-    ball_rect: wp.vec4i  # the same for mirror balls, and for receivers that mirror where there are any
+    # Rectangles of pixels: row_start, row_stop, col_start, col_stop.
+    object_rect: wp.vec4i  # bounds the virtual objects
+    light_rect: wp.vec4i  # bounds virtual light and its shadows on physical surfaces
+    direct_rect: wp.vec4i  # part of light_rect that virtual light reaches without a bounce
+    shadow_rect: wp.vec4i  # bounds environment shadows of virtual objects, and light they bounce, on physical surfaces
+    ball_rect: wp.vec4i  # bounds mirror balls and glossy receivers
 
 
 @wp.struct
@@ -74,14 +75,14 @@ class Probe:
 
 @wp.struct
 class Light:
-    """A virtual light; fields that its kind does not use are zero."""
+    """A virtual light. Fields that do not apply to its kind are zero."""
 
     kind: wp.int32  # POINT, SPOT or DIRECTIONAL
     position: wp.vec3
     direction: wp.vec3  # unit, the way the light travels
     intensity: wp.vec3  # color * intensity: radiant intensity (point, spot) or irradiance (directional), per channel
-    inner_angle: wp.float32  # half angles of a spot
-    outer_angle: wp.float32
+    inner_angle: wp.float32  # half angle of a spot's full intensity
+    outer_angle: wp.float32  # half angle at which a spot's intensity reaches zero
     attenuation: wp.vec3  # falloff = 1 / (x + y d + z d^2); (0, 0, 1) is the inverse square
     radius: wp.float32  # of the emitting sphere (point, spot), metres; 0 is a point
 
@@ -91,9 +92,9 @@ class Shape:
     """A proxy or a virtual object: point_world = rotation (scale point_local) + position."""
 
     kind: wp.int32  # PLANE, BOX, MESH or SPHERE
-    rotation: wp.mat33  # of a stretched MESH any linear map under which no vector grows
-    stretch: wp.float32  # 0: a rotation; else how much longer the longest image of a unit vector is than the shortest
-    inverse: wp.mat33  # of a stretched MESH's ``rotation``; else unused
+    rotation: wp.mat33  # a rotation; for a stretched MESH any linear map that lengthens no vector
+    stretch: wp.float32  # 0 for a rotation; else the ratio of the map's largest to its smallest singular value
+    inverse: wp.mat33  # inverse of ``rotation`` for a stretched MESH; else unused
     position: wp.vec3
     scale: wp.float32
     extent: (
@@ -108,7 +109,7 @@ class Shape:
 
 @wp.struct
 class Material:
-    """One material; a texture index of -1 means that the constant colour holds, else texel times colour."""
+    """One material. A texture's value is multiplied by the constant beside it; index -1 means that there is none."""
 
     model: wp.int32  # LAMBERT, PHONG, METALLIC_ROUGHNESS or MIRROR
     base_color: wp.vec3  # diffuse for PHONG
@@ -118,100 +119,100 @@ class Material:
     shininess: wp.float32  # PHONG exponent
     metallic: wp.float32
     roughness: wp.float32  # perceptual; alpha is its square
-    # What files add; a scene's own material leaves it at zero, and texture indices at -1.
+    # Properties that only model files set. Materials of scene files leave them at zero, and texture indices at -1.
     alpha_mode: wp.int32  # OPAQUE, MASKED or BLENDED
     opacity: wp.float32  # factor of alpha
-    cutoff: wp.float32  # MASKED: alpha from which on there is something
-    single_sided: wp.int32  # 1: not there for rays from behind, but for those that look for light
-    unlit: wp.int32  # 1: shows its base colour as it is
+    cutoff: wp.float32  # MASKED: least alpha of a point that exists
+    single_sided: wp.int32  # 1: rays from behind pass, except shadow rays
+    unlit: wp.int32  # 1: its radiance is its base colour
     emission: wp.vec3  # radiance
     metallic_roughness_texture: wp.int32  # G times roughness, B times metallic
     normal_texture: wp.int32
     normal_scale: wp.float32
-    occlusion_texture: wp.int32  # R
+    occlusion_texture: wp.int32  # in its R channel
     occlusion_strength: wp.float32
     emissive_texture: wp.int32
 
 
 @wp.struct
 class Texture:
-    """One use of a picture: where its texels lie, row 0 is v = 1 (the image's top), and how they are read."""
+    """A texture: the place of its texels and the way to sample them. Row 0 is v = 1, the top of the image."""
 
-    offset: wp.int32  # of level 0; the others follow, each half as wide and high, rounded down, at least 1
+    offset: wp.int32  # first texel of level 0; each next level is half as wide and high, rounded down, at least 1
     width: wp.int32
     height: wp.int32
     levels: wp.int32
-    decode: wp.int32  # where in the table its codes' values start: 0 linear, 256 sRGB
+    decode: wp.int32  # start of its codes' values in ``RayScene.decode_table``: 0 linear, 256 sRGB
     wrap_u: wp.int32  # REPEATED, CLAMP or MIRRORED
     wrap_v: wp.int32
-    nearest: wp.int32  # 1: texels are squares where they are larger than pixels
+    nearest: wp.int32  # 1: texels larger than pixels are shown as squares, without interpolation
     uv_set: wp.int32
-    row_u: wp.vec3  # the picture is read at (row_u, row_v) . (u, v, 1)
-    row_v: wp.vec3
+    row_u: wp.vec3  # first row of the map of texture coordinates: sampled at (row_u, row_v) . (u, v, 1)
+    row_v: wp.vec3  # second row
     size: wp.float32  # texels per texture coordinate, along the transform's longer axis
 
 
 @wp.struct
 class AreaLight:
-    """An object that emits, as a light that is all at one point; see ``kernels/rays/area_lights.py``."""
+    """An emitting object, approximated by a light at one point; see ``kernels/rays/area_lights.py``."""
 
     object: wp.int32
     power: wp.vec3  # integral of radiance over the emitting area, local: m^2 times camera values
-    facing: wp.vec3  # local: mean normal of the area by what it emits, not unit; zero where it is alike all around
+    facing: wp.vec3  # local: mean normal weighted by emission, not unit; zero if it emits to all sides alike
 
 
 @wp.struct
 class RayScene:
-    """All that rays can meet, and what it is made of."""
+    """Shapes that rays can meet, with their materials and textures."""
 
     objects: wp.array[Shape]
     proxies: wp.array[Shape]
     materials: wp.array[Material]
     textures: wp.array[Texture]
     texels: wp.array[wp.uint32]  # RGBA of 8 bits, R lowest
-    decode_table: wp.array[wp.float32]  # (512,) value of a linear code, then of an sRGB-encoded one
-    vertex_normals: wp.array[wp.vec3]  # of each corner, all meshes one after another
+    decode_table: wp.array[wp.float32]  # (512,) values of the 256 linear codes, then of the 256 sRGB codes
+    vertex_normals: wp.array[wp.vec3]  # one per triangle corner, all meshes one after another
     vertex_uvs: wp.array[wp.vec2]
-    # Empty where no object calls for them, else of all meshes.
+    # Given for all meshes if any object uses them, else empty:
     vertex_uvs_second: wp.array[wp.vec2]
     vertex_colors: wp.array[wp.vec4]
     vertex_tangents: wp.array[wp.vec4]
     triangle_materials: wp.array[wp.int32]  # to be added to ``Shape.material``
-    triangle_density: wp.array[wp.vec2]  # texture coordinates of both sets per unit of the mesh
+    triangle_density: wp.array[wp.vec2]  # texture coordinates per unit of length of the mesh, for both sets
     pixel_spread: wp.float32  # angle of a pixel in the picture, radians
-    # Empty where no object emits.
-    area_lights: wp.array[AreaLight]  # the objects that do
-    emitting_faces: wp.array[wp.vec3i]  # object; triangle of its mesh, -1: the whole sphere; 1: only its front emits
-    emitting_shares: wp.array[wp.float32]  # of all that is emitted, by this face and those before it; the last is 1
+    # Empty where no object emits:
+    area_lights: wp.array[AreaLight]  # the emitting objects
+    emitting_faces: wp.array[wp.vec3i]  # object; triangle of its mesh, -1 for a whole sphere; 1: only the front emits
+    emitting_shares: wp.array[wp.float32]  # cumulative shares of the emitted power by face; the last is 1
 
 
 @wp.struct
 class Hit:
-    """Intersection of a ray with the scene, in the world. Normals point out of the shape, from either side."""
+    """Intersection of a ray with the scene, in the world. Normals point out of the shape, even if it is hit inside."""
 
     t: wp.float32
     shape: wp.int32  # index of the object or proxy, -1 for none
     point: wp.vec3
     normal: wp.vec3  # for shading: interpolated where the shape is smooth
-    geometric_normal: wp.vec3  # of the surface that rays meet
+    geometric_normal: wp.vec3  # of the surface itself
     uv: wp.vec2
-    corner: wp.int32  # of the triangle's first corner, among those of all meshes; -1: the shape is no mesh
+    corner: wp.int32  # index of the triangle's first corner among the corners of all meshes; -1: not a mesh
     weights: wp.vec2  # barycentric, of the first and second corner
-    error: wp.float32  # bound on how far rounding may have moved the point off the surface; see offset_origin
+    error: wp.float32  # bound on the distance of the point from the surface by rounding; see offset_origin
 
 
 @wp.struct
 class Picture:
-    """The camera's frame, and where its pixels look."""
+    """The camera's frame and the rays of its pixels, (H, W)."""
 
     frame: wp.array2d[wp.vec3ub]  # RGB
     decode_table: wp.array[wp.vec3]  # (256,) of ``color.decode_table``
     rays: wp.array2d[wp.vec2]  # undistorted (x / z, y / z) of each pixel's centre
-    linear: wp.array2d[wp.vec3]  # linear radiance of a frame of more than 8 bits; empty: the codes are all
+    linear: wp.array2d[wp.vec3]  # linear radiance of a frame of more than 8 bits; empty for one of 8 bits
 
 
 def filled(record: Any, **values: Any) -> Any:
-    """Set the fields of a structure; one that is None stays as it is: empty."""
+    """Set the given fields of a new structure and return it; a field given as None keeps its empty default."""
     for name, value in values.items():
         if value is not None:
             setattr(record, name, value)
@@ -221,21 +222,21 @@ def filled(record: Any, **values: Any) -> Any:
 def make_picture(
     frame: wp.array | None, decode_table: wp.array | None, rays: wp.array | None, linear: wp.array | None = None
 ) -> Picture:
-    """The arrays of a picture together; None for what a kernel does not read."""
+    """Return a ``Picture`` of these arrays; None leaves one out that the kernel does not read."""
     return filled(Picture(), frame=frame, decode_table=decode_table, rays=rays, linear=linear)
 
 
 @wp.struct
 class EnvironmentView:
-    """Observation of the environment, (h, w) each: in one frame, in merged exposures, or over frames."""
+    """Observation of the environment, (h, w) each: of one frame, of merged exposures, or accumulated over frames."""
 
     radiance: wp.array2d[wp.vec3]  # linear; 0 where confidence is 0
-    confidence: wp.array2d[wp.float32]  # 0..1; 0 or NaN: not seen
-    clipped: wp.array2d[wp.vec3]  # share at clipping, per channel
+    confidence: wp.array2d[wp.float32]  # 0..1; 0 or NaN: not observed
+    clipped: wp.array2d[wp.vec3]  # share of clipped samples, per channel
 
 
 def make_environment_view(radiance: wp.array, confidence: wp.array, clipped: wp.array) -> EnvironmentView:
-    """The arrays of a view together."""
+    """Return an ``EnvironmentView`` of these arrays."""
     return filled(EnvironmentView(), radiance=radiance, confidence=confidence, clipped=clipped)
 
 
@@ -249,26 +250,26 @@ class KeyLight:
 
 @wp.struct
 class Emitter:
-    """An emitter of the environment whose light clips in the ball; distant ones are directions."""
+    """An emitter of the environment whose image in the ball is clipped."""
 
-    origin: wp.vec3  # where on the first ball the camera sees it mirrored
-    direction: wp.vec3  # unit, from there, as in the environment; zero where there is no emitter
-    distance: wp.float32  # metres from there, infinite for a distant one
-    power: wp.vec3  # radiance times solid angle from there, beyond what was captured; * distance^2: radiant intensity
+    origin: wp.vec3  # point of the first ball at which the camera sees its reflection
+    direction: wp.vec3  # unit, from the origin, its direction in the environment; zero where there is no emitter
+    distance: wp.float32  # metres from the origin; infinite for a distant emitter
+    power: wp.vec3  # radiance above the captured one, times solid angle from the origin; * distance^2: intensity
 
 
 @functools.cache
 def struct_dtype(struct: Any) -> np.dtype[Any]:
-    """Return NumPy's type of a struct's records.
+    """Return the NumPy dtype of a Warp struct's records.
 
-    NumPy parses text to make one, which Python 3.11 cannot do in two threads at once (CPython's issue 106905): frames
-    take the type that was made when the pipeline was built.
+    NumPy parses text to make a dtype, which Python 3.11 cannot do in two threads at once (CPython's issue 106905).
+    So dtypes are made while the pipeline is built, and frames use the cached ones.
     """
     return np.dtype(struct.numpy_dtype())
 
 
 def struct_values(array: wp.array) -> npt.NDArray[Any]:
-    """Return a copy of an array of structs, as records of ``struct_dtype``; ``wp.array.numpy`` would make the type."""
+    """Copy an array of structs to NumPy records of ``struct_dtype``; ``wp.array.numpy`` would make a new dtype."""
     dtype = struct_dtype(array.dtype)
     size = array.size * dtype.itemsize
     values = wp.array(ptr=array.ptr, dtype=wp.uint8, shape=(size,), device=array.device).numpy()

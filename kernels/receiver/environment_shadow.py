@@ -1,28 +1,30 @@
 """Shadows that virtual objects cast on the receiver under the environment, and the light that they bounce onto it.
 
-What a proxy's pixel becomes is a factor on what the camera sees there [Deb98]: reflectance cancels,
+The result is a factor on the frame's radiance at each pixel of a proxy [Deb98], from which the reflectance cancels:
 
-    ratio = E_with / E_without,   per channel,
+    ratio = E_with / E_without,   per channel.
 
-E the irradiance at the pixel's point, without the virtual objects (the proxies and the mirror balls shadow it: they are
-real and in the picture already) and with them. Both are sums over the same samples of the environment
-(``environment_samples``), so a point that no object shades has a ratio of exactly 1, one that sees nothing but a black
-object 0, and an error of the samples cancels to first order.
+E is the irradiance at the pixel's point, without and with the virtual objects. Proxies and mirror balls hide light in
+both: they are real, and their shadows are in the frame. Both are sums over the same samples of the environment
+(``environment_samples``). So the ratio is exactly 1 where no object hides light, 0 where a point sees only a black
+object, and errors of the samples cancel to first order.
 
-Cells. One pixel of every ``stride x stride`` is estimated. The cells of a tile of ``side x side`` use one set of
-samples each, and every set in turn; ``environment_shadow_filter`` then averages over one tile's worth of cells, so that
-each set counts the same [KH01]. All of it is a function of the frame alone: nothing flickers and nothing lags.
+Cells. The ratio is estimated at one pixel of every ``stride x stride``. The cells of a tile of ``side x side`` use one
+set of samples each, all sets differing. ``environment_shadow_filter`` then averages over as many cells as a tile has,
+so that each set counts the same [KH01]. The result depends on the current frame alone: it does not flicker or lag.
 
-Culling. A sample matters only if its direction meets the bounding sphere of an object; a dot product tells. Only those
-rays are traced, and cells that have none are done.
+Culling. Only rays whose direction meets the bounding sphere of an object, by a dot product, are traced for objects.
+Cells without such samples have a ratio of 1.
 
-The physical. A ray that meets a proxy or a mirror ball, with objects or without them, finds its light: the camera's
-picture of it where that shows it (``traced``), else what the ball saw in its direction; of a ball what it reflects.
+Physical surfaces. If the first surface of a ray is a proxy or a mirror ball, with or without objects, its radiance
+replaces the sample's. For a proxy it is taken from the frame if the camera shows the point (``traced``), else from the
+environment in that direction. For a ball it is the light that the ball reflects.
 
-What objects send back is found by ``environment_shadow_bounce``: as a ray meets one, for a CPU and for sets of any
-size, or afterwards with the same result. Rays that ask trace three more each and are rare: on CUDA they would stall
-their warp. So there rays only stop at objects, several threads sharing a cell's samples; those that ask are queued and
-traced side by side; and sums are added in the order of the samples, with the same bits in every run.
+Light that objects reflect to the receiver is found by ``environment_shadow_bounce``. On a CPU, and for sets of any
+size, this happens as soon as a ray meets an object. These secondary rays are rare and trace three more rays each, so on
+CUDA they would stall their warp. There, several threads share a cell's samples, rays stop at objects, and secondary
+rays are queued and traced in a kernel of their own, with the same result. Sums are added in the order of the samples,
+so every run gives the same bits.
 
 References:
     [Deb98] Debevec 1998, Rendering Synthetic Objects into Real Scenes.
@@ -62,27 +64,27 @@ from warp_ar.kernels.structs import BOX, PLANE, FrameParams, Hit, Picture, RaySc
 wp.set_module_options({"enable_backward": False})
 
 SHADED_TILE = wp.constant(4)
-"""Cells along a tile that notes whether something in it is shaded."""
+"""Cells along the side of a tile for which shading is recorded."""
 CHUNK = wp.constant(64)
-"""Samples that are culled together: the bits of a mask."""
+"""Samples that are culled together, one bit of a mask each."""
 TILE_ROWS, TILE_COLUMNS = wp.constant(4), wp.constant(8)
-"""Cells of a warp, which takes a square of the frame."""
+"""Rows and columns of cells that a CUDA warp computes."""
 QUEUED_REGISTERS = 128
-"""Registers of a CUDA thread where rays are queued: 80 make a frame of ``high`` 3 % slower, all that it takes 4 %."""
+"""Registers of a CUDA thread where rays are queued. With 80 a frame of ``high`` is 3 % slower, without a limit 4 %."""
 MAX_QUEUE = 1 << 24
-"""Rays that may be queued: beyond it the queue takes too much memory, 16 bytes each and more."""
+"""Largest number of queued rays, to bound memory: a ray takes at least 16 bytes."""
 MAX_PARTIALS = 8
-"""Threads of a CUDA device that share a cell's samples at most, each with a partial sum."""
+"""Largest number of CUDA threads that share a cell's samples, each with a partial sum."""
 ENOUGH_THREADS = 1 << 20
-"""Threads from which more make a CUDA device slower: each finds the cell's point and picks its samples anew."""
+"""Number of threads above which a CUDA device gets slower: each finds the cell's point and culls its samples anew."""
 QUEUE_THREADS = 1 << 17
-"""Threads that trace the queue, each what is left of it when the others have theirs."""
+"""Threads that trace the queue; each takes every ``QUEUE_THREADS``-th ray."""
 MIN_IRRADIANCE = wp.constant(wp.float32(1.0e-6))
-"""Irradiance, in camera values, below which a surface is dark and a shadow on it means nothing."""
+"""Irradiance, in camera values, below which a surface is taken to be dark and gets no shadow."""
 MAX_RATIO = wp.constant(wp.float32(4.0))
-"""Largest factor: what objects bounce onto a dark place is bounded, as the picture of it is mostly noise."""
+"""Largest ratio: bounds light that objects bounce onto dark surfaces, where the frame is mostly noise."""
 MAX_RETURN = wp.constant(wp.float32(0.99))
-"""Largest share of its light that the receiver gets back from objects, estimated: what goes to and fro stays finite."""
+"""Largest estimated share of the receiver's light that returns from objects: keeps the interreflection finite."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,13 +100,13 @@ class EnvironmentShadowConfig:
     bounce: Literal["estimated", "traced"]
     """Method by which light from objects onto the receiver is found."""
     secondary: float = 1.0
-    """Share of a set, its first samples, whose rays ask what an object that they meet sends; others stop there."""
+    """Share of a set, its first samples, whose rays find the light of an object that they meet; others stop there."""
     emitters: bool = False
     """True if some samples are emitters at a known distance."""
     partials: int = 1
-    """Partial sums per cell, a thread each: a divisor of count."""
+    """Partial sums per cell, one thread each: a divisor of count."""
     queued: bool = False
-    """True if rays that ask what an object sends are queued, for sets of up to 64 samples."""
+    """True if secondary rays, which find the light of objects, are queued; for sets of up to 64 samples."""
 
     def __post_init__(self) -> None:
         if self.count > CHUNK and self.count % CHUNK:
@@ -124,32 +126,32 @@ class EnvironmentShadowConfig:
 
 @wp.struct
 class ShadowCells:
-    """Estimates of all cells and what the filter makes of them; shaded and changed may be empty."""
+    """Estimates of all cells and their filtered values; shaded and changed may be empty."""
 
-    stride: wp.int32  # pixels from one estimate to the next
-    ratio: wp.array2d[wp.vec4]  # RGB share of the environment that is not hidden, and depth; 1 where no surface is
-    bounced: wp.array2d[wp.vec3]  # what objects send there, relative to the environment
-    surface: wp.array2d[wp.int32]  # number of the surface that the cell shows; -1: none, and ratio holds nothing
-    shaded: wp.array2d[wp.int32]  # per tile: number of the last frame in which something in it was shaded
+    stride: wp.int32  # pixels along a cell
+    ratio: wp.array2d[wp.vec4]  # RGB share of the environment that is not hidden, and depth
+    bounced: wp.array2d[wp.vec3]  # light of objects there, relative to the environment's
+    surface: wp.array2d[wp.int32]  # key of the surface that the cell shows; -1: none, and ratio is not valid
+    shaded: wp.array2d[wp.int32]  # per tile: index of the last frame in which some cell in it was shaded
     filtered: wp.array2d[wp.vec3]  # factor on the frame; written only where a surface is seen
-    changed: wp.array2d[wp.int32]  # per tile: number of the last frame in which some factor in it was not 1
+    changed: wp.array2d[wp.int32]  # per tile: index of the last frame in which some factor in it was not 1
 
 
 @wp.struct
 class ShadowQueue:
-    """Rays that ask what objects send, and partial sums of cells; empty where rays are not queued."""
+    """Queue of secondary rays, and partial sums of cells; empty if rays are not queued."""
 
-    extent: wp.vec2i  # of ``tiled_shape``
-    items: wp.array[wp.int32]  # number of the cell times CHUNK, plus the sample
-    length: wp.array[wp.int32]  # (1,)
-    spans: wp.array3d[wp.vec2i]  # (partials, rows, columns): first ray in the queue and how many; -1: nothing is hidden
-    sums: wp.array3d[wp.vec3]  # (2 partials, rows, columns): light without the objects, and what they hide
-    reflected: wp.array2d[wp.vec3]  # (2, queue): what objects send of the environment, and of the receiver
+    extent: wp.vec2i  # rows and columns of threads, from ``tiled_shape``
+    items: wp.array[wp.int32]  # index of the cell times CHUNK, plus the sample
+    length: wp.array[wp.int32]  # (1,) number of queued rays
+    spans: wp.array3d[wp.vec2i]  # (partials, rows, columns): first queued ray, and count; -1: nothing is hidden
+    sums: wp.array3d[wp.vec3]  # (2 partials, rows, columns): light without objects, and the part that they hide
+    reflected: wp.array2d[wp.vec3]  # (2, queue): light that objects reflect of the environment, and of the receiver
 
 
 @wp.func
 def ratio_of(without: wp.vec3, hidden: wp.vec3, depth: wp.float32) -> wp.vec4:
-    """Share of the environment that is left, and the depth beside it."""
+    """Return the share of the environment that objects do not hide, RGB, and the depth."""
     ratio = wp.vec4(1.0, 1.0, 1.0, depth)
     for channel in range(3):
         if without[channel] > MIN_IRRADIANCE:
@@ -159,7 +161,7 @@ def ratio_of(without: wp.vec3, hidden: wp.vec3, depth: wp.float32) -> wp.vec4:
 
 @wp.func
 def bounced_of(without: wp.vec3, hidden: wp.vec3, sent: wp.vec3, returned: wp.vec3) -> wp.vec3:
-    """Return the light of objects over the environment's; ``returned`` is the part that the receiver must light."""
+    """Return the light of objects over the environment's; ``returned`` is the part that the receiver sent them."""
     ratio = wp.vec3(0.0)
     for channel in range(3):
         if without[channel] > MIN_IRRADIANCE:
@@ -172,7 +174,7 @@ def bounced_of(without: wp.vec3, hidden: wp.vec3, sent: wp.vec3, returned: wp.ve
 
 @wp.func
 def first_of_set(i: wp.int32, j: wp.int32, side: wp.int32, count: wp.int32) -> wp.int32:
-    """First sample of a cell's set; ``count`` are all sets together."""
+    """Return the first sample of a cell's set; ``count`` is the number of samples of all sets."""
     return count / (side * side) * ((i % side) * side + j % side)
 
 
@@ -184,15 +186,16 @@ def can_matter(row: wp.int32, column: wp.int32, margin: wp.int32, rect: wp.vec4i
 
 
 def shaded_shape(rows: int, columns: int) -> tuple[int, int]:
-    """Shape of the arrays that note tiles, for so many cells."""
+    """Return the shape of ``ShadowCells.shaded`` and ``changed`` for so many cells."""
     return -(-rows // int(SHADED_TILE)), -(-columns // int(SHADED_TILE))
 
 
 @wp.func
 def may_be_one_sided(objects: wp.array[Shape]) -> wp.bool:
-    """Return whether the closest hit may pass what hides the environment: triangles that are seen from one side only.
+    """Return whether some triangles may be seen from one side only.
 
-    They throw shadows from both sides, and ``occluded_by_objects`` knows no other.
+    The closest hit of a ray may skip them although they hide the environment: they cast shadows from both sides, as
+    ``occluded_by_objects`` finds them.
     """
     found = wp.bool(False)
     for index in range(objects.shape[0]):
@@ -202,7 +205,7 @@ def may_be_one_sided(objects: wp.array[Shape]) -> wp.bool:
 
 @wp.func
 def cone_threshold(to_center: wp.vec3, radius: wp.float32) -> wp.float32:
-    """Unit directions w with w . to_center above this meet the sphere; from inside, all do."""
+    """Return the value of w . to_center above which a unit direction w meets the sphere; all do from inside."""
     squared = wp.dot(to_center, to_center) - radius * radius
     if squared <= 0.0:
         return -FAR
@@ -211,7 +214,7 @@ def cone_threshold(to_center: wp.vec3, radius: wp.float32) -> wp.float32:
 
 @functools.cache
 def make_mask_cone(count: int, emitters: bool) -> wp.Function:
-    """``mask_cone(sets, first, point, to_center, radius) -> uint64``: samples that point at a sphere."""
+    """``mask_cone(sets, first, point, to_center, radius) -> uint64``: bits of the samples that point at a sphere."""
 
     @wp.func(module="unique")
     def mask_cone(
@@ -221,7 +224,7 @@ def make_mask_cone(count: int, emitters: bool) -> wp.Function:
         threshold = cone_threshold(to_center, radius)
         mask = wp.uint64(0)
         bit = wp.uint64(1)
-        # Its end is no constant: a loop that is unrolled loads all of its samples at once, into as many registers.
+        # The bound is a variable: an unrolled loop would load all samples at once, into as many registers.
         for k in range(first, first + count):
             direction = directions[k]
             if wp.static(emitters):
@@ -236,7 +239,7 @@ def make_mask_cone(count: int, emitters: bool) -> wp.Function:
 
 @wp.struct
 class Physical:
-    """Samples that may meet a proxy or a mirror ball, a bit each."""
+    """Masks of the samples that may meet a proxy or a mirror ball, one bit each."""
 
     proxies: wp.uint64
     balls: wp.uint64
@@ -244,10 +247,10 @@ class Physical:
 
 @functools.cache
 def make_masks(config: EnvironmentShadowConfig, count: int) -> tuple[wp.Function, wp.Function]:
-    """Functions that tell which of ``count`` samples from ``first`` on may meet something, a bit each.
+    """Return two functions that cull ``count`` samples from ``first`` on; masks have one bit per sample.
 
-    ``mask_objects(scene, sets, first, point) -> uint64``, and ``mask_physical(scene, distant, sets, first, point, own)
-    -> Physical``, ``own`` being the proxy that the point is on.
+    ``mask_objects(scene, sets, first, point) -> uint64`` marks samples that may meet an object, ``mask_physical(scene,
+    distant, sets, first, point, own) -> Physical`` those that may meet a proxy other than ``own``, or a ball.
     """
     mask_cone = make_mask_cone(count, config.emitters)
 
@@ -283,18 +286,18 @@ def make_masks(config: EnvironmentShadowConfig, count: int) -> tuple[wp.Function
 
 @wp.struct
 class SampleRay:
-    """From a point of the receiver toward a sample of the environment."""
+    """Ray from a point of the receiver toward a sample of the environment."""
 
     origin: wp.vec3  # set where the ray is traced
     direction: wp.vec3
     distance: wp.float32  # of the sample, metres
-    grown: wp.float32  # the sample's measure as the point sees it, over that from the ball, and what the ball counts
-    cosine: wp.float32  # at the receiver; the point sees the sample if it is above 0
+    grown: wp.float32  # measure seen from the point over measure seen from the ball, times the ball's weight
+    cosine: wp.float32  # at the receiver; above 0 if the sample is before the surface
 
 
 @functools.cache
 def make_aim(emitters: bool, several: bool = False) -> wp.Function:
-    """``aim(sets, places, index, hit) -> SampleRay``: less its origin; ``places`` of the balls, if ``several``."""
+    """``aim(sets, places, index, hit) -> SampleRay``, without origin; ``places`` of the balls, if ``several``."""
 
     @wp.func(module="unique")
     def aim(sets: SampleSets, places: wp.array[wp.vec4], index: wp.int32, hit: Hit) -> SampleRay:
@@ -317,7 +320,7 @@ def make_aim(emitters: bool, several: bool = False) -> wp.Function:
 
 @wp.struct
 class Sender:
-    """Sender of light along a sample's direction where no virtual object stands."""
+    """Radiance along a sample's direction without virtual objects, and its source's distance."""
 
     radiance: wp.vec3
     distance: wp.float32
@@ -327,8 +330,8 @@ class Sender:
 def make_find_sender(config: EnvironmentShadowConfig) -> wp.Function:
     """``find_sender(params, picture, scene, distant, sets, index, ray, by_proxy, by_ball) -> Sender``.
 
-    The sample itself, or the physical before it: a proxy if ``by_proxy``, a mirror ball if
-    ``by_ball``; those that the ray cannot meet need not be asked.
+    It is the sample itself, or a physical surface before it: a proxy is looked for if ``by_proxy``, a mirror ball if
+    ``by_ball``.
     """
     closest_proxy = make_trace(config.distant.trace).closest_proxy
     traced = config.bounce == "traced"
@@ -360,7 +363,7 @@ def make_find_sender(config: EnvironmentShadowConfig) -> wp.Function:
                 if at[0] >= 0.0:
                     sender.radiance = look_up(picture, at[0], at[1])
                 else:
-                    # Where the ball saw it; an emitter right beside it is not its light.
+                    # In the direction in which the ball saw the point. A nearby emitter is not the proxy's light.
                     toward = proxy.point - sets.samples[index].origin
                     from_ball = wp.vec3(0.0)
                     if wp.static(config.distant.several):
@@ -386,12 +389,12 @@ def make_find_sender(config: EnvironmentShadowConfig) -> wp.Function:
     return find_sender
 
 
-# Threads of a warp take cells of one set, so that their rays go the same way, from a square of the frame, so that they
-# meet the same or nothing: TILE_ROWS x TILE_COLUMNS of them, ``side`` apart. The warps that follow take the other sets
-# there, and all threads after those the next partial sum.
+# The threads of a warp compute cells that share a set of samples, so that their rays have the same directions. The
+# cells are close together, so that the rays meet similar surfaces: TILE_ROWS x TILE_COLUMNS cells, ``side`` apart. The
+# next warps compute the cells of the other sets there. After all cells follow those of the next partial sum.
 @wp.func
 def tiled_cell(i: wp.int32, thread: wp.int32, side: wp.int32, extent: wp.vec2i) -> wp.vec3i:
-    """Row and column of the cell of a thread, and its partial sum; ``extent`` is that of ``tiled_shape``."""
+    """Return row and column of a thread's cell, and the index of its partial sum; ``extent`` from ``tiled_shape``."""
     number = i % extent[0] * extent[1] + thread
     lane = number % (TILE_ROWS * TILE_COLUMNS)
     one_of = number / (TILE_ROWS * TILE_COLUMNS) % (side * side)
@@ -403,14 +406,14 @@ def tiled_cell(i: wp.int32, thread: wp.int32, side: wp.int32, extent: wp.vec2i) 
 
 
 def tiled_shape(rows: int, columns: int, side: int) -> tuple[int, int]:
-    """Rows and columns of threads for so many cells: rounded up to whole tiles of ``tiled_cell``."""
+    """Return the rows and columns of threads for so many cells, rounded up to whole tiles of ``tiled_cell``."""
     down, across = side * int(TILE_ROWS), side * int(TILE_COLUMNS)
     return -(-rows // down) * down, -(-columns // across) * across
 
 
 @wp.func
 def queue_rays(found: wp.uint64, begin: wp.int32, size: wp.int32, cell: wp.int32, queue_out: ShadowQueue) -> wp.vec2i:
-    """Queue the rays of a cell whose bits are set, of samples from ``begin`` on; returns the first and how many."""
+    """Queue the rays of a cell whose bits are set, of samples from ``begin`` on; return the first's index and count."""
     count = wp.int32(0)
     for k in range(size):
         if (found & (wp.uint64(1) << wp.uint64(k))) != wp.uint64(0):
@@ -489,12 +492,12 @@ def make_environment_shadow_kernel(config: EnvironmentShadowConfig) -> wp.Kernel
         one_sided = may_be_one_sided(scene.objects)
         reflected = ReflectedLight()
         before = Before()
-        # A set is in the order of its sequence: any first part of it is a smaller set.
+        # A set is a block of a sequence, in order: its first samples are a smaller set.
         first = first_of_set(i, j, side, sets.samples.shape[0])
         begin = partial * size
         virtual_mask = mask_objects(scene, sets, first + begin, point)
         hides_any = virtual_mask != wp.uint64(0)
-        # Variables: not to be unrolled.
+        # Variables, so that loops are not unrolled.
         every = wp.int32(wp.static(config.count // chunk))
         blocks = wp.int32(wp.static(size // chunk))
         for block in range(every):
@@ -509,10 +512,10 @@ def make_environment_shadow_kernel(config: EnvironmentShadowConfig) -> wp.Kernel
             if block > 0:
                 virtual_mask = mask_objects(scene, sets, at, point)
             physical = mask_physical(scene, distant, sets, at, point, own)
-            # Most samples meet nothing: they are but a sum.
+            # Most samples meet nothing: their light is summed without a ray.
             met = virtual_mask | physical.proxies | physical.balls
             bit = wp.uint64(1)
-            samples = wp.int32(wp.static(chunk))  # a variable: unrolled, the kernel would hold its rays many times over
+            samples = wp.int32(wp.static(chunk))  # a variable: an unrolled loop would copy the code of a ray many times
             for k in range(samples):
                 ray = aim(sets, distant.others.places, at + k, hit)
                 if ray.cosine > 0.0:
@@ -571,7 +574,7 @@ def make_environment_shadow_kernel(config: EnvironmentShadowConfig) -> wp.Kernel
 
 
 def _threads(*given: Any) -> tuple[int, int]:
-    """Extent of a launch: the cells', or that of all partial sums where rays are queued."""
+    """Return the shape of a launch: that of the cells, or of all partial sums if rays are queued."""
     cells, queue = given[-2:]
     if queue.spans is None:
         return cells.surface.shape
@@ -582,21 +585,21 @@ shade_environment = row_launcher(make_environment_shadow_kernel, outputs=2, like
 """Estimate the ratio for one pixel of every ``stride x stride``, each with one set of samples.
 
 Args:
-    config: What the scene calls for.
+    config: Features of the scene.
     params: (1,) FrameParams: camera and shadow_rect.
-    picture: (H, W) the camera's frame, which is needed if bounces are traced, and its rays.
+    picture: (H, W) the camera's frame, needed if bounces are traced, and its rays.
     scene: Objects and proxies.
-    distant: The environment; what ``config.distant`` leaves out may be empty.
+    distant: The environment; arrays that ``config.distant`` does not use may be empty.
     sets: config.side^2 sets of config.count samples or more.
-    cells_out: (ceil(H / stride), ceil(W / stride)) cells: ratio, bounced, surface and shaded are written; where rays
-        are queued, not those that something may shade.
-    queue_out: Rays that were not traced, and sums; empty if ``config.queued`` is not set.
+    cells_out: (ceil(H / stride), ceil(W / stride)) cells: ratio, bounced, surface and shaded are written. If rays are
+        queued, ratio and bounced of cells that objects may shade are left to ``reduce_cells_kernel``.
+    queue_out: Secondary rays, and partial sums; empty if ``config.queued`` is not set.
 """
 
 
 @functools.cache
 def make_trace_queue_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
-    """Kernel of what objects send along the queued rays."""
+    """Kernel that finds the light of objects along the queued rays."""
     secondary_count, side = config.secondary_count, config.side
     aim = make_aim(config.emitters, config.distant.several)
     closest_object = make_trace(config.distant.trace).closest_object
@@ -631,7 +634,7 @@ def make_trace_queue_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
             ray = aim(sets, distant.others.places, index, hit)
             ray.origin = offset_origin(hit.point, hit.geometric_normal, ray.direction, hit.error)
             reflected = ReflectedLight()
-            # What is nearer than all that is physical is nearest.
+            # Rays are queued only where an object is nearer than all physical surfaces: no others are traced.
             other = closest_object(scene, ray.origin, ray.direction, FAR)
             if other.shape >= 0:
                 weight = ray.cosine * ray.grown * sets.samples[index].measure
@@ -658,7 +661,7 @@ def reduce_cells_kernel(
     # Out:
     cells_out: ShadowCells,
 ):
-    """Sums in the order of the samples, wherever their threads put them: the same bits in every run."""
+    """Add partial sums in the order of the samples, which does not depend on threads: the same bits in every run."""
     i, j = wp.tid()
     if queue.spans[0, i, j][1] < 0:
         return
@@ -681,7 +684,7 @@ def reduce_cells_kernel(
 
 
 def count_partials(rows: int, columns: int) -> int:
-    """Threads per cell: as many as it takes to fill a CUDA device, up to ``MAX_PARTIALS``, a power of 2."""
+    """Return the threads per cell that fill a CUDA device: a power of 2, up to ``MAX_PARTIALS``."""
     partials = MAX_PARTIALS
     while partials > 1 and partials * rows * columns > ENOUGH_THREADS:
         partials //= 2
@@ -689,7 +692,7 @@ def count_partials(rows: int, columns: int) -> int:
 
 
 def make_queue(config: EnvironmentShadowConfig, rows: int, columns: int, device: wp.DeviceLike) -> ShadowQueue | None:
-    """Scratch for so many cells; None where a cell has more than ``CHUNK`` samples, or too many rays may be queued."""
+    """Allocate a queue for so many cells; None if a cell has more than ``CHUNK`` samples, or the queue is too long."""
     size = rows * columns * config.secondary_count
     if config.count > CHUNK or size > MAX_QUEUE:
         return None
@@ -703,7 +706,7 @@ def make_queue(config: EnvironmentShadowConfig, rows: int, columns: int, device:
 
 
 def shade_by_queue(config: EnvironmentShadowConfig, *given: Any) -> None:
-    """Estimate the ratio as ``shade_environment`` does, with its arguments and the scratch of ``make_queue``."""
+    """Estimate the ratio as ``shade_environment`` does, with the same arguments, by the queue of ``make_queue``."""
     cells, queue = given[-2:]
     device, threads = queue.items.device, min(queue.items.shape[0], QUEUE_THREADS)
     queue.length.zero_()

@@ -1,23 +1,23 @@
-"""Light that virtual objects send to the receiver along a ray that met them: an estimate without a ray, or one by rays.
+"""Light that virtual objects reflect to the receiver, along a ray that met an object.
 
-What a ray meets is not black. Either a ray finds out (``traced``): an object reflects one of its two lobes,
-picked by their reflectance. Its rough lobe gives albedo E(n) / pi, times what a ray into it meets: nothing, 1; an
-object, that object's own colour; the receiver, 1 if a ray from there leaves the scene, else a share of the object's
-reflectance, so that light dies out between an object and the ground that it stands on, the slower the whiter the
-object. Its glossy lobe gives what is in the mirror direction.
+Method ``traced`` sends a further ray into one of the object's two lobes, picked by their reflectance. The diffuse lobe
+gives albedo E(n) / pi, times a factor by the first surface on the ray: 1 for none; for another object, its colour; for
+the receiver, 1 if a ray from there leaves the scene, else a share of the object's reflectance. So light between an
+object and the ground falls off with each reflection, the more slowly the whiter the object. The glossy lobe gives the
+radiance in the mirror direction.
 
-Or it is an estimate without a ray (``estimated``). Both lobes reflect the distant environment, whose part behind the
-cell's own surface is that surface: the receiver. Let h be the share of the light that objects hide, u what they send of
-the environment before the cell's surface, d of the receiver if it were not shaded. The receiver that they see is near
-the cell and shaded as it is, so the ratio r is that of
+Method ``estimated`` needs no further ray. Both lobes reflect the distant environment, in which the receiver replaces
+the half-space behind the cell's own surface. Let h be the share of the cell's light that objects hide, u the light that
+objects reflect of the environment, and d the light that they would reflect of an unshaded receiver. The receiver that
+objects reflect is near the cell and shaded like it, so the ratio r satisfies
 
-    r = 1 - h + u + d r,    r = (1 - h + u) / (1 - d)
+    r = 1 - h + u + d r,    r = (1 - h + u) / (1 - d),
 
-with all the light that goes to and fro between an object and the ground: white objects in a white environment (u + d =
-h) leave it as it is, black ones give 1 - h, and where nothing but the ground is seen (u = 0, h = 1) all is dark.
+which includes all interreflection between object and ground. White objects in a white environment (u + d = h) give 1,
+black objects 1 - h, and a cell that sees only objects which reflect only the ground (u = 0, h = 1) gets 0.
 
-Of either way no receiver is brighter than a white one, E / pi: light that was captured too low would else make it glow
-beside the object that shades it.
+In both methods the receiver is at most as bright as a white one, E / pi. Otherwise an environment that was captured too
+dark would make the receiver glow next to the object.
 """
 
 from __future__ import annotations
@@ -50,25 +50,24 @@ from warp_ar.kernels.structs import SPHERE, FrameParams, Hit, Picture, RayScene,
 wp.set_module_options({"enable_backward": False})
 
 CAUSTIC_ALPHA = wp.constant(wp.float32(0.35))
-"""Least width of an object's lobe as the receiver sees it, near the object.
+"""Least width alpha of an object's lobe for light on the receiver, near the object.
 
-A mirror's image of an emitter on the receiver is too fine for the few rays that look for it: it would come out as
-specks. This blurs it to what they can carry, and keeps its energy. From afar fewer rays meet the object and each stands
-for more of what it shows: the width grows as the distance over the object's size.
+A mirror's caustic on the receiver is too fine for the few rays, and would come out as specks. The wider lobe blurs it
+and keeps its energy. Far from the object fewer rays meet it and each stands for a larger part of it, so the width grows
+with the distance over the object's size.
 """
 MAX_BRIGHTNESS = wp.constant(wp.float32(2.0))
-"""Largest radiance of an object, estimated, over the mean of what its surroundings send to the cell's surface.
+"""Largest estimated radiance of an object, over the mean radiance of the surroundings before the cell's surface.
 
-The sides of objects are dark beside a top that an emitter lights, and few samples show them: a brighter object is
-specks.
+An emitter may light a small part of an object that few samples meet: brighter values would show as specks.
 """
 FURTHER = wp.constant(wp.float32(0.5))
-"""Light of an object close above the receiver, over that in the open: half of what it sees is its own shadow."""
+"""Factor on the light of an object close above the receiver: half of its surroundings is its own shadow."""
 
 
 @wp.func
 def bounding_radius(shape: Shape) -> wp.float32:
-    """Radius of a sphere around a shape's position that holds it, metres."""
+    """Return the radius, metres, of a sphere around a shape's position that encloses it."""
     if shape.kind == SPHERE:
         return shape.scale * shape.extent[0]
     return shape.scale * wp.length(shape.extent)
@@ -76,7 +75,7 @@ def bounding_radius(shape: Shape) -> wp.float32:
 
 @wp.func
 def caustic_alpha(shape: Shape, point: wp.vec3) -> wp.float32:
-    """Least width of the lobe of an object as a point of the receiver sees it."""
+    """Return the least lobe width alpha of an object for light on a point of the receiver."""
     return wp.clamp(CAUSTIC_ALPHA * wp.length(shape.position - point) / bounding_radius(shape), CAUSTIC_ALPHA, 1.0)
 
 
@@ -87,12 +86,12 @@ class Meeting:
     hit: Hit
     direction: wp.vec3
     alpha: wp.float32  # least width of the object's lobe
-    stands_for: wp.float32  # weight of its radiance, which is that of several samples where one ray stands for them
+    stands_for: wp.float32  # weight of its radiance; of all samples that the ray stands for
 
 
 @wp.func
 def meet_object(scene: RayScene, other: Hit, point: wp.vec3, direction: wp.vec3, stands_for: wp.float32) -> Meeting:
-    """Return the meeting of a ray from a point of the receiver with an object."""
+    """Return the ``Meeting`` of a ray from a point of the receiver with an object at the hit ``other``."""
     meeting = Meeting()
     meeting.hit = other
     meeting.direction = direction
@@ -103,10 +102,10 @@ def meet_object(scene: RayScene, other: Hit, point: wp.vec3, direction: wp.vec3,
 
 @wp.struct
 class ReflectedLight:
-    """Light that objects send to a point of the receiver, times its weight."""
+    """Light that objects reflect to a point of the receiver, times its weight."""
 
-    sent: wp.vec3  # of the environment
-    returned: wp.vec3  # of what the receiver sent them
+    sent: wp.vec3  # light of the environment
+    returned: wp.vec3  # light that the receiver sent them
 
 
 @wp.struct
@@ -114,16 +113,16 @@ class Before:
     """Surroundings in front of a cell's surface, for estimates without a ray."""
 
     up: wp.vec3  # the surface's normal, on the side that light comes from
-    from_receiver: wp.vec3  # irradiance that a surface above it has from below
-    most: wp.vec3  # largest radiance of the receiver: of a white one
-    brightest: wp.float32  # largest radiance that an object is believed to have
+    from_receiver: wp.vec3  # irradiance of a surface that faces the receiver
+    most: wp.vec3  # largest radiance of the receiver, that of a white one
+    brightest: wp.float32  # upper bound of an object's radiance
 
 
 @functools.cache
 def make_look_wide(config: DistantLightConfig) -> wp.Function:
-    """``look_wide(environment, point, direction) -> vec3``: the environment around a direction, as few rays carry it.
+    """``look_wide(environment, point, direction) -> vec3``: the environment blurred for few rays.
 
-    Emitters are where the balls saw them.
+    Emitters are in the directions in which the balls show them.
     """
     unplaced = dataclasses.replace(config, emitters=False)
     distant_irradiance, radiance_along = make_distant_irradiance(unplaced), make_radiance_along(unplaced)
@@ -145,10 +144,10 @@ def make_look_wide(config: DistantLightConfig) -> wp.Function:
 
 @functools.cache
 def make_reflect_estimated(config: DistantLightConfig) -> wp.Function:
-    """``reflect_back`` without a further ray: both lobes of the distant environment.
+    """``reflect_back`` without a further ray: both lobes reflect the distant environment.
 
-    The glossy one is no narrower than ``meeting.alpha``. Below ``before.up`` lies the receiver; nothing is believed to
-    be brighter than ``before.brightest``.
+    The glossy lobe has at least the width ``meeting.alpha``. The receiver fills the directions below ``before.up``.
+    Radiance is limited to ``before.brightest``.
     """
     surface_at = make_surface(config.models, config.textures)
     reflected_radiance = make_reflected_radiance(config)
@@ -176,12 +175,12 @@ def make_reflect_estimated(config: DistantLightConfig) -> wp.Function:
         if wp.static(config.textures and config.gathered):
             out.sent += meeting.stands_for * surface.emission
         of_environment = wp.vec3(0.0)
-        of_receiver = wp.vec3(0.0)  # that it would have from a receiver without shadows
+        of_receiver = wp.vec3(0.0)  # light that it would reflect of a receiver without shadows
         if wp.static(config.diffuse != "none"):
             irradiance = distant_irradiance(distant, hit.point, normal)
             if wp.static(config.textures):
                 irradiance *= surface.occlusion
-            # A surface sees (1 - n.up) / 2 of what an even receiver sends to one that faces it.
+            # A uniform receiver gives a surface of normal n the irradiance of one that faces it, times (1 - n.up) / 2.
             seen = 0.5 * (1.0 - wp.dot(normal, before.up))
             received = wp.min(seen * before.from_receiver, irradiance)
             of_receiver = wp.cw_mul(surface.diffuse, wp.min(received, seen * wp.pi * before.most)) / wp.pi
@@ -208,7 +207,7 @@ def make_reflect_estimated(config: DistantLightConfig) -> wp.Function:
 
 @functools.cache
 def make_reflect_traced(config: DistantLightConfig) -> wp.Function:
-    """``reflect_back`` by one ray into one lobe, the glossy one no narrower than ``alpha``: a Monte-Carlo estimate."""
+    """``reflect_back`` by one ray into one lobe, the glossy one at least ``alpha`` wide: a Monte-Carlo estimate."""
     trace = make_trace(config.trace)
     closest_object, closest_proxy = trace.closest_object, trace.closest_proxy
     occluded_by_objects = trace.occluded_by_objects
@@ -266,7 +265,7 @@ def make_reflect_traced(config: DistantLightConfig) -> wp.Function:
         if is_rough and (proxy.shape >= 0 or other.shape < 0):
             received = distant_irradiance(distant, hit.point, normal) / wp.pi
         if proxy.shape >= 0:
-            # Light of the receiver, as far as a ray from there leaves the scene.
+            # Light of the receiver, in full if a ray from there leaves the scene.
             up = proxy.geometric_normal
             if wp.dot(up, wi) > 0.0:
                 up = -up
@@ -297,7 +296,7 @@ def make_reflect_traced(config: DistantLightConfig) -> wp.Function:
 
 @functools.cache
 def make_look_before(config: DistantLightConfig) -> wp.Function:
-    """``look_before(environment, point, normal, direction) -> Before``: of a surface that ``direction`` leaves."""
+    """``look_before(environment, point, normal, direction) -> Before``: for a surface that ``direction`` leaves."""
     distant_irradiance = make_distant_irradiance(dataclasses.replace(config, emitters=False))
 
     @wp.func(module="unique")
@@ -317,7 +316,7 @@ def make_look_before(config: DistantLightConfig) -> wp.Function:
 def make_reflect_back(config: DistantLightConfig, traced: bool) -> wp.Function:
     """``reflect_back(params, picture, scene, distant, meeting, before, seed, so_far) -> ReflectedLight``.
 
-    Adds what an object sends back to what others do: found by another ray if ``traced``, else estimated from what lies
-    ``before`` the receiver.
+    It adds the light that an object reflects to ``so_far``: found by another ray if ``traced``, else estimated from
+    the surroundings ``before`` the receiver.
     """
     return make_reflect_traced(config) if traced else make_reflect_estimated(config)

@@ -1,13 +1,13 @@
-"""The estimates of cells, averaged and spread to pixels.
+"""Filter of the environment shadow's cells, and interpolation to pixels.
 
-A mean over one tile's worth of cells, with the edge cells of a window of ``side + 1`` at half weight, counts each set
-of samples the same and is centred. A window half as wide has half the blur and twice the noise. It takes over where the
+The filter is a mean over a window of ``side + 1`` cells squared, edge cells at half weight, so it is centred and counts
+each set of samples the same. A window half as wide has half the blur and twice the noise; its mean is used where the
 two means differ by more than noise: at contacts and at the edges of an emitter's shadow. Few cells of many samples,
-averaged so, are nearer to the truth than many of few at twice the rays. Cells on another surface do not count; a pixel
-between cells of several surfaces looks for its own.
+filtered so, have a smaller error than many cells of few samples at twice the rays. Cells on other surfaces are left
+out. A pixel between cells of several surfaces interpolates the cells of its own surface.
 
-Tiles of cells in which a ray met an object note the frame's number: elsewhere the ratio is 1, and need not be averaged.
-Nor need it be spread to pixels where it stays within ``NEGLIGIBLE`` of 1; that is made exactly 1.
+Tiles of cells record the index of the frame in which a ray last met an object. In other tiles the ratio is 1 and is not
+filtered. Ratios within ``NEGLIGIBLE`` of 1 are set to exactly 1 and not interpolated to pixels.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from warp_ar.kernels.structs import FrameParams, Probe, RayScene
 wp.set_module_options({"enable_backward": False})
 
 CONTRAST = wp.constant(wp.float32(0.03))
-"""Least difference of a narrow and a wide mean at which the narrow one takes over."""
+"""Least difference of the narrow and the wide mean at which the narrow one is used."""
 NOISE = wp.constant(wp.float32(1.0))
-"""The same, in standard errors of the narrow mean."""
+"""Least difference of the two means at which the narrow one is used, in standard errors of the narrow one."""
 NEGLIGIBLE = wp.constant(wp.float32(1.0 / 512.0))
-"""Change of the environment that no 8-bit picture shows: a quarter of a code at most, taken for none."""
+"""Change of the ratio that is treated as 0: at most a quarter of an 8-bit code."""
 DEPTH_STEP = wp.constant(wp.float32(0.03))
-"""Relative change of depth from which neighbours on a mesh belong to different parts of it."""
+"""Largest relative difference of depth at which neighbours on a mesh count as the same part of it."""
 
 
 @wp.func
 def any_shaded(shaded: wp.array2d[wp.int32], frame_index: wp.int32, rows: wp.vec2i, columns: wp.vec2i) -> wp.bool:
-    """Return whether a tile of cells from the first to the last row and column is noted in this frame."""
+    """Return whether any tile from the first to the last row and column of cells was shaded in this frame."""
     for a in range(wp.max(rows[0], 0) / SHADED_TILE, wp.min(rows[1] / SHADED_TILE + 1, shaded.shape[0])):
         for b in range(wp.max(columns[0], 0) / SHADED_TILE, wp.min(columns[1] / SHADED_TILE + 1, shaded.shape[1])):
             if shaded[a, b] == frame_index:
@@ -46,7 +46,7 @@ def any_shaded(shaded: wp.array2d[wp.int32], frame_index: wp.int32, rows: wp.vec
 
 @wp.func
 def window_weight(offset: wp.int32, reach: wp.int32) -> wp.float32:
-    """Of a cell in a window around another: whole inside, half at its edge, nothing beyond."""
+    """Return the weight of a cell in a window: 1 inside, 1/2 at its edge, 0 beyond."""
     distance = wp.abs(offset)
     if distance < wp.max(reach, 1):
         return 1.0
@@ -61,7 +61,7 @@ def make_filter_ratio_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
     wide, narrow = config.side // 2, config.side // 4
     width = 2 * wide + 1
 
-    # The loops stay loops: written out, with weights that are known, they take compilers seconds and gain nothing.
+    # Loops are not unrolled: that takes seconds of compiling and gains no speed.
     @wp.kernel(module="unique", enable_backward=False, module_options={"max_unroll": 1})
     def filter_ratio_kernel(
         # In:
@@ -70,9 +70,9 @@ def make_filter_ratio_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
         # Out:
         cells_out: ShadowCells,
     ):
-        """Mean over neighbours on the same surface: one tile's worth, or a quarter of it where that differs.
+        """Average neighbours on the same surface over a window of a tile's size, or half as wide where means differ.
 
-        What is hidden decides: what objects bounce is too noisy to tell.
+        The hidden light decides between them: light that objects bounce is too noisy.
         """
         i, j = wp.tid()
         i += row_start
@@ -104,7 +104,7 @@ def make_filter_ratio_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
                 if ni >= 0 and nj >= 0 and ni < surface.shape[0] and nj < surface.shape[1]:
                     if surface[ni, nj] == key:
                         value = ratio[ni, nj]
-                        # A mesh has no faces to tell apart: neighbours much nearer or farther are another part of it.
+                        # A mesh has one key for all its faces: a step of depth tells its parts apart.
                         if key % FACES != MESH_KEY or wp.abs(value[3] - depth) <= DEPTH_STEP * depth:
                             value[3] = 1.0
                             weight = wide_row * window_weight(nj - j, wp.static(wide))
@@ -120,7 +120,7 @@ def make_filter_ratio_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
         mean = left + far_sent / far_left[3]
         if wp.static(wide > 1):
             sharp = wp.vec3(near_left[0], near_left[1], near_left[2]) / near_left[3]
-            # Cells that differ among themselves are noise, or the middle of an edge, where both means agree.
+            # The variance of cells is that of noise, or of the middle of an edge, where both means agree.
             count = near_left[3]
             spread = wp.vec3(squares[0], squares[1], squares[2]) / count - wp.cw_mul(sharp, sharp)
             error = wp.sqrt(wp.max(wp.max(spread), 0.0) / count)
@@ -137,7 +137,7 @@ def make_filter_ratio_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
 
 @wp.func
 def between_surfaces(surface: wp.array2d[wp.int32], row: wp.int32, column: wp.int32) -> wp.vec2i:
-    """The surface of the first of four cells, and 1 where another is on another."""
+    """Return the surface of the first of four cells around a place, and 1 if another cell's differs, else 0."""
     key = surface[wp.clamp(row, 0, surface.shape[0] - 1), wp.clamp(column, 0, surface.shape[1] - 1)]
     mixed = wp.bool(False)
     for corner in range(1, 4):
@@ -149,7 +149,7 @@ def between_surfaces(surface: wp.array2d[wp.int32], row: wp.int32, column: wp.in
 
 @wp.func
 def ratio_between(cells: ShadowCells, key: wp.int32, y: wp.float32, x: wp.float32) -> wp.vec3:
-    """From cells to a pixel between them: bilinear among those on its surface."""
+    """Interpolate the ratio to a pixel, bilinearly among cells on its surface."""
     filtered = cells.filtered
     surface = cells.surface
     row = wp.int32(wp.floor(y))
@@ -165,7 +165,7 @@ def ratio_between(cells: ShadowCells, key: wp.int32, y: wp.float32, x: wp.float3
             total += weight * filtered[ni, nj]
             weights += weight
     if weights == 0.0:
-        # None of the four is on this surface: those around them.
+        # None of the four is on this surface: use the cells around them.
         for a in range(wp.max(row - 1, 0), wp.min(row + 3, surface.shape[0])):
             for b in range(wp.max(column - 1, 0), wp.min(column + 3, surface.shape[1])):
                 if surface[a, b] == key:
@@ -194,7 +194,7 @@ def make_spread_ratio_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
         # Out:
         shadow_ratio_out: wp.array2d[wp.vec3],
     ):
-        """A run of pixels of one row; those between surfaces look for their own."""
+        """Interpolate a run of pixels of one row; pixels between surfaces trace a ray to find their own."""
         i, place = wp.tid()
         rect = params[0].shadow_rect
         begin = place * run
@@ -206,7 +206,7 @@ def make_spread_ratio_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
         y = wp.float32(i - stride / 2) / wp.float32(stride)
         row = wp.int32(wp.floor(y))
         columns = wp.vec2i(begin / stride - 2, stop / stride + 2)  # as far as a pixel looks for its surface
-        # To look costs a thread as much as one pixel does.
+        # This test costs as much as one pixel, so it is made for longer runs alone.
         touched = run == 1 or changed.shape[0] == 0
         if not touched:
             touched = any_shaded(changed, params[0].frame_index, wp.vec2i(row - 1, row + 2), columns)
@@ -229,24 +229,24 @@ def make_spread_ratio_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
 
 
 filter_ratio = row_launcher(make_filter_ratio_kernel, like=lambda params, cells: cells.surface)
-"""Average the estimates over tiles, along surfaces only; exactly 1 where nothing is shaded, or next to nothing.
+"""Average the cells' estimates along surfaces; ratios within ``NEGLIGIBLE`` of 1 become exactly 1.
 
 Args:
-    config: As that of ``shade_environment``.
+    config: Configuration of ``shade_environment``.
     params: (1,) FrameParams: frame_index.
-    cells_out: From ``shade_environment``; filtered and changed are written. Without shaded, every cell is averaged.
+    cells_out: From ``shade_environment``; filtered and changed are written. If shaded is empty, all cells are averaged.
 """
 
 
 spread_ratio = row_launcher(make_spread_ratio_kernel, runs=True)
-"""Give every pixel its ratio.
+"""Interpolate the filtered ratio of cells to every pixel.
 
 Args:
-    config: As that of ``shade_environment``.
+    config: Configuration of ``shade_environment``.
     params: (1,) FrameParams: camera, shadow_rect, frame_index.
     rays: (H, W) undistorted (x / z, y / z) of each pixel's centre.
     scene: Proxies.
     probes: Mirror balls.
-    cells: From ``filter_ratio``. Without changed, every pixel is looked at.
+    cells: From ``filter_ratio``. If changed is empty, all pixels are interpolated.
     shadow_ratio_out: (H, W) factor on the frame; 1 outside the rectangle and where no proxy is seen.
 """

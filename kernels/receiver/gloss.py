@@ -1,29 +1,29 @@
-"""Virtual content in polished receivers: objects, highlights of virtual lights, what of both they hide.
+"""Reflections of virtual objects and highlights of virtual lights in glossy receivers, such as a polished table.
 
-The camera's picture of a polished table holds the real surroundings, mirrored. Were the virtual objects there, they
-would be mirrored too, and hide what the table mirrors behind them. With f the receiver's specular reflection, GGX of
-the roughness that its proxy has, Smith's masking and Schlick's Fresnel over the reflectance F0,
+The camera's frame shows the reflection of the real surroundings. Virtual objects would be reflected too, and would hide
+the reflection of the surfaces behind them. With f the receiver's specular BRDF (GGX of the proxy's roughness, Smith's
+masking, Schlick's Fresnel over the reflectance F0), the change of radiance is
 
     change(x, wo) = integral over wi of  f(wo, wi) cos_i (L_with - L_without)(x, wi)
                     + sum over virtual lights of  f(wo, wi) cos_i E visible.
 
-Half vectors are drawn as they are seen from the camera [DB23], so that a ray weighs F G2 / G1 and no more than 1, and
-f cos_i and the density cancel. Each of a pixel's rays begins at a place of its own in the pixel, and meets first
+Half vectors are drawn from the distribution of visible normals [DB23], so a ray has the weight F G2 / G1, at most 1.
+Rays of a mirror start at different places in the pixel. The first surface that a ray meets decides:
 
-- a virtual object: L_with is its radiance; L_without what the receiver mirrored there: the proxy behind it as the
-  picture shows it, else the environment, filtered as wide as one of the rays is (a narrow lamp would else be found by
-  one ray in a few, and flicker over the pixels);
-- a proxy: what the picture shows there changes by the shadows and the light that the picture has at that point;
+- a virtual object: L_with is its radiance. L_without is the radiance of the proxy behind the object, as the frame
+  shows it, or else the environment, filtered to the width that one ray stands for. (Unfiltered, a narrow lamp would be
+  found by few of the rays, and flicker between pixels.)
+- a proxy: L changes by the shadows and the virtual light of the frame's layers at that point;
 - a mirror ball, or nothing: no change.
 
-The shadows that objects cast on the receiver are a factor on all that the frame shows (``shadow_ratio``), although
-only the diffuse part is shadowed by them: what the receiver mirrors, S = integral of f cos_i L_without, is given back,
+``shadow_ratio`` scales the whole radiance of the frame, although shadows of objects on the receiver reduce its diffuse
+part alone. So the specular part, S = integral of f cos_i L_without, is restored:
 
     change += (1 - shadow_ratio) min(S, frame).
 
-Rays are spared where nothing can change: the ratio is 1, no object's sphere is within ``LOBE_REACH`` of the mirror
-direction, and no other proxy is in it. Where no object is near, one ray tells what is mirrored. The change may be
-negative.
+No rays are traced where nothing can change: the ratio is 1, no object's bounding sphere lies within ``LOBE_REACH`` of
+the mirror direction, and no other proxy lies in that direction. Where no object is near, one ray is traced. The change
+may be negative.
 
 References:
     [DB23] Dupuy, Benyoub 2023, Sampling Visible GGX Normals with Spherical Caps.
@@ -61,7 +61,7 @@ from warp_ar.kernels.structs import FrameParams, Hit, Light, Picture, Probe, Ray
 wp.set_module_options({"enable_backward": False})
 
 LOBE_REACH = wp.constant(wp.float32(14.0))
-"""Tangents of a half vector, over alpha, that are looked at: 0.5 % of GGX's energy lies beyond."""
+"""Largest tangent of a half vector's angle, over alpha, that is considered: 0.5 % of GGX's energy lies beyond."""
 MIRROR_ALPHA = wp.constant(wp.float32(1.0e-3))
 """Lobe width alpha below which a receiver is a mirror, with one direction per pixel."""
 EDGE_SAMPLES = 4
@@ -80,13 +80,13 @@ SMOOTHED = wp.constant(2)
 class Gloss:
     """Mirror reflection of a proxy's surface."""
 
-    reflectance: wp.vec3  # F0: specular reflectance where it is seen from ahead; 0: the proxy is matt
+    reflectance: wp.vec3  # F0, specular reflectance at normal incidence; 0: the proxy is matt
     roughness: wp.float32  # perceptual; alpha is its square
 
 
 @wp.struct
 class GlossLayers:
-    """The layers of the frame that a receiver mirrors, (H, W) each; what is not there is empty."""
+    """Layers of the frame that a glossy receiver reflects, (H, W) each; a layer that the scene lacks is empty."""
 
     shadow_ratio: wp.array2d[wp.vec3]
     added: wp.array2d[wp.vec3]
@@ -105,14 +105,14 @@ class GlossConfig:
     shade: ShadeConfig | None = None
     """Shading of virtual objects; None: there are none."""
     emitters: bool = False
-    """True if emitters of the environment are known by their places."""
+    """True if positions of the environment's emitters are known."""
     faces: bool = False
-    """True if one proxy may mirror another, whose light changes."""
+    """True if one proxy may reflect another one whose radiance changes."""
 
 
 @wp.func
 def may_mirror(scene: RayScene, point: wp.vec3, direction: wp.vec3, reach: wp.float32) -> wp.bool:
-    """Return whether an object's sphere may be within an angle of a ray, ``reach`` in radians."""
+    """Return whether an object's bounding sphere may lie within the angle ``reach``, radians, of a ray."""
     for index in range(scene.objects.shape[0]):
         shape = scene.objects[index]
         # A torus gives its two radii: their sum is no more than this.
@@ -129,7 +129,7 @@ def may_mirror(scene: RayScene, point: wp.vec3, direction: wp.vec3, reach: wp.fl
 
 @wp.struct
 class Sight:
-    """Scene as the camera sees it, and its light."""
+    """The scene, its environment, the camera's frame, and the frame's layers."""
 
     scene: RayScene
     distant: DistantLight
@@ -140,17 +140,17 @@ class Sight:
 
 @wp.struct
 class Reflected:
-    """Light that one ray brings, times its weight."""
+    """Radiance along one reflected ray, times the ray's weight."""
 
-    change: wp.vec3
-    before: wp.vec3  # what the receiver reflected there, where that was asked for
+    change: wp.vec3  # L_with - L_without
+    before: wp.vec3  # L_without, where it was needed
 
 
 @functools.cache
 def make_follow(config: GlossConfig) -> wp.Function:
     """``follow(params, sight, lights, hit, wi, weight, width, asked, turn) -> Reflected``: along one reflected ray.
 
-    ``width`` is the alpha that one ray stands for; ``asked``: what was reflected before is to be known in any case.
+    ``width`` is the lobe width alpha that one ray stands for. If ``asked``, ``Reflected.before`` is always found.
     """
     trace = make_trace(config.trace)
     closest_object, closest_proxy = trace.closest_object, trace.closest_proxy
@@ -216,21 +216,26 @@ def make_follow(config: GlossConfig) -> wp.Function:
     return follow
 
 
-# A sphere of angular radius e is seen by half vectors that lie, in the plane of slopes (tangents from the normal), in
-# an ellipse about the one of its centre, of radii e / 2 and e / (2 cos_d), cos_d between half vector and ray; taken as
-# the circle of the same area, s^2 = e^2 / (4 cos_d). GGX's density of slopes, alpha^2 / (pi (alpha^2 + m^2)^2), is that
-# of points spread evenly over a sphere and projected stereographically onto the plane, m = alpha tan(theta / 2). The
-# projection takes circles to circles, so a circle of radius s at slope m has the share of a cap between
-# 2 atan((m - s) / alpha) and 2 atan((m + s) / alpha) of the sphere. Over the circle's area the mean is
+# A sphere of angular radius e is reflected by half vectors whose slopes (tangents from the normal) lie in an ellipse
+# around the slope of its centre, of radii e / 2 and e / (2 cos_d), cos_d between half vector and ray. The ellipse is
+# replaced by the circle of the same area, s^2 = e^2 / (4 cos_d). GGX's density of slopes,
+# alpha^2 / (pi (alpha^2 + m^2)^2), is that of points spread evenly over a sphere and projected stereographically onto
+# the plane, m = alpha tan(theta / 2). The projection maps circles to circles, so the circle of radius s at slope m has
+# the share of a spherical cap between 2 atan((m - s) / alpha) and 2 atan((m + s) / alpha). Its mean density is that
+# share over the circle's area,
 #
-#     2 alpha^2 / (pi H (H + X)),   X = alpha^2 + m^2 - s^2,   H = sqrt(X^2 + 4 s^2 alpha^2);
+#     2 alpha^2 / (pi H (H + X)),   X = P - s^2,   H = sqrt(X^2 + 4 s^2 alpha^2),   P = alpha^2 + m^2,
 #
-# where X < 0 the product H (H + X) cancels, and 1 / (H + X) is (H - X) / (4 s^2 alpha^2).
+# and over the density at m it is 2 P^2 / (H (H + X)). Where X < 0 the sum H + X cancels; there 1 / (H + X) is
+# computed as (H - X) / (4 s^2 alpha^2).
 @wp.func
 def sphere_over_point(
     normal: wp.vec3, half: wp.vec3, cos_d: wp.float32, roughness: wp.float32, reach: wp.float32
 ) -> wp.float32:
-    """Highlight of a sphere over that of a point in its middle, ``reach`` being its radius over its distance."""
+    """Return the ratio of the highlight of a sphere to that of a point light at its centre.
+
+    ``reach`` is the sphere's radius over its distance.
+    """
     alpha = wp.max(roughness * roughness, MIN_ALPHA)
     cross = wp.cross(normal, half)
     cos_h = wp.max(wp.dot(normal, half), 1.0e-3)
@@ -246,7 +251,7 @@ def sphere_over_point(
 
 @functools.cache
 def make_highlights(config: GlossConfig) -> wp.Function:
-    """``highlights(sight, lights, surface, hit, wo, turn) -> vec3``: radiance that virtual lights add at a hit."""
+    """``highlights(sight, lights, surface, hit, wo, turn) -> vec3``: specular radiance of virtual lights at a hit."""
     sample_light = make_sample_light(config.lights)
     visible_share = make_visible_share(config.trace)
 
@@ -278,9 +283,9 @@ def make_highlights(config: GlossConfig) -> wp.Function:
 
 @wp.struct
 class GlossPoint:
-    """A point of a receiver that mirrors."""
+    """A point of a glossy receiver."""
 
-    hit: Hit  # its shape is -1 where a pixel shows none
+    hit: Hit  # its shape is -1 if the pixel shows no glossy receiver
     wo: wp.vec3
     surface: Gloss
     alpha: wp.float32
@@ -288,7 +293,7 @@ class GlossPoint:
 
 @functools.cache
 def make_see_receiver(config: GlossConfig) -> wp.Function:
-    """``see_receiver(params, sight, gloss, i, j) -> GlossPoint``: what pixel (i, j) shows of receivers that mirror."""
+    """``see_receiver(params, sight, gloss, i, j) -> GlossPoint``: glossy receiver at the centre of pixel (i, j)."""
     closest_proxy = make_trace(config.trace).closest_proxy
 
     @wp.func(module="unique")
@@ -318,18 +323,18 @@ def make_see_receiver(config: GlossConfig) -> wp.Function:
 
 @wp.struct
 class GlossRay:
-    """One of the rays that stand for what a point of a receiver reflects."""
+    """One of the rays that sample the reflection of a receiver's point."""
 
-    hit: Hit  # that it leaves
+    hit: Hit  # point that the ray leaves
     wi: wp.vec3
-    masking: wp.float32  # share of it that other facets let pass; 0: there is no such ray, or it leads onto a facet
-    cos_d: wp.float32  # between the facet's normal and the ray
-    width: wp.float32  # alpha that it stands for
+    masking: wp.float32  # G2 / G1, share of light that other facets do not block; 0: no valid ray
+    cos_d: wp.float32  # cosine between the facet's normal and the ray
+    width: wp.float32  # lobe width alpha that the ray stands for
 
 
 @wp.func
 def draw_facet(ray: GlossRay, u: wp.vec2, wo: wp.vec3, alpha: wp.float32) -> GlossRay:
-    """Aim a ray by one of the facets that the camera sees, of a point of the unit square."""
+    """Aim a ray by a visible facet, drawn from the point ``u`` of the unit square."""
     out = ray
     basis = frame_from_normal(ray.hit.normal)
     local = wp.transpose(basis) * wo
@@ -344,10 +349,10 @@ def draw_facet(ray: GlossRay, u: wp.vec2, wo: wp.vec3, alpha: wp.float32) -> Glo
 
 @functools.cache
 def make_draw_ray(config: GlossConfig) -> wp.Function:
-    """``draw_ray(params, sight, at, pixel, is_near, shift, sample, count) -> GlossRay``: one of ``count``.
+    """``draw_ray(params, sight, at, pixel, is_near, shift, sample, count) -> GlossRay``: one of ``count`` rays.
 
-    Where no object is near, into the middle of the lobe; else of a rough receiver by a facet, its place in the sequence
-    moved by ``shift``, and of a mirror from a place of its own in the pixel.
+    If no object is near, the ray goes in the mirror direction. Otherwise a rough receiver draws a facet, by a point of
+    a Hammersley set moved by ``shift``, and a mirror traces a sample of its own within the pixel.
     """
     closest_proxy = make_trace(config.trace).closest_proxy
     sample_direction = make_sample_direction(EDGE_SAMPLES)
@@ -439,7 +444,7 @@ def make_gloss_kernel(config: GlossConfig) -> wp.Kernel:
             before = wp.vec3(0.0, 0.0, 0.0)
             count = wp.where(at.alpha > MIRROR_ALPHA, wp.static(config.samples), wp.static(EDGE_SAMPLES))
             if not is_near:
-                count = 1  # into the middle of the lobe, which the environment is filtered for
+                count = 1  # in the mirror direction: the environment is prefiltered over the whole lobe
             hashes = pcg3d_hash(wp.uint32(i), wp.uint32(j), wp.uint32(0))
             shift = wp.vec2(uniform_from_bits(hashes[0]), uniform_from_bits(hashes[1]))
             for sample in range(count):
@@ -472,7 +477,7 @@ def smooth_gloss_kernel(
     # Out:
     reflected_out: wp.array2d[wp.vec3],
 ):
-    """Mean over the pixels around on the same rough surface, which have other rays; a mirror's stay as they are."""
+    """Average the change over neighbours on the same rough surface, whose rays differ; mirrors are not averaged."""
     i, j = wp.tid()
     i += row_start
     result = change[i, j]
@@ -492,25 +497,25 @@ def smooth_gloss_kernel(
 
 
 gloss = row_launcher(make_gloss_kernel, outputs=2)
-"""Write what virtual objects and lights change in what the receiver mirrors, pixel by pixel.
+"""Write the change of radiance of glossy receivers by virtual objects and lights, pixel by pixel.
 
 Args:
-    config: What the scene calls for; what it leaves out may be None.
+    config: Features of the scene; arguments that it does not use may be None.
     params: (1,) FrameParams: camera, shadow_rect and ball_rect, beyond which nothing changes.
     sight: The scene, its light and its picture.
     lights: (n,) Light.
     surfaces: (n,) Gloss, one for each proxy.
     change_out: (H, W) vec3, change of linear radiance in camera values.
-    surface_out: (H, W) int32, the rough proxy that a pixel shows, or -1.
+    surface_out: (H, W) int32, index of the rough proxy that a pixel shows, or -1.
 """
 
 
 smooth_gloss = row_launcher(smooth_gloss_kernel)
-"""Write what receivers and mirror balls change, the noise of rough receivers averaged over neighbours.
+"""Write the change of radiance of receivers and mirror balls, averaged over neighbours on rough receivers.
 
 Args:
-    change: (H, W) vec3 of ``gloss``.
-    surface: (H, W) int32 of ``gloss``.
-    mirror_ball: (H, W) vec3 of ``mirror_ball``, which is added; None where there is none.
+    change: (H, W) vec3 from ``gloss``.
+    surface: (H, W) int32 from ``gloss``.
+    mirror_ball: (H, W) vec3 from ``mirror_ball``, which is added; None if there is none.
     reflected_out: (H, W) vec3.
 """

@@ -1,13 +1,13 @@
-"""Virtual content in mirror balls: objects, light on the receiver, shadows.
+"""Reflections of virtual objects, of virtual light and of shadows in mirror balls.
 
-The camera's picture of a ball holds the real environment. Were the virtual objects there, the ball would mirror them
-too. A pixel's ray is reflected at the ball, of reflectance rho, and followed to what it meets first:
+The camera's image of a ball shows the real environment alone. A pixel's ray is reflected at the ball, which has the
+reflectance rho, and followed to the first surface that it meets:
 
-- a virtual object: the ball shows rho times the object's radiance instead of what the camera saw;
-- a proxy: what the camera saw times the shadows that virtual objects cast there under the environment, which are
-  looked up where the picture shows the same point, plus rho times the virtual light that the proxy sends back. What the
-  proxy is made of, the ball's own pixel says: it shows rho times the proxy's radiance;
-- another ball, or nothing: no change. Light is mirrored once.
+- a virtual object: the pixel becomes rho times the object's radiance;
+- a proxy: the frame's radiance is multiplied by the environment shadow of virtual objects, looked up where the frame
+  shows the same point, and rho times the virtual light that the proxy reflects is added. The proxy's reflectance is
+  found from the ball's own pixel, which shows rho times the proxy's radiance;
+- another ball, or nothing: no change. Light is reflected at one ball only.
 
 The result is a change of radiance, to be added to the frame's; it may be negative.
 """
@@ -49,12 +49,12 @@ class MirrorBallConfig:
     relight: RelightConfig | None = None
     """Response of the receiver to virtual light; None: there is no virtual light, or no proxy for it."""
     ratio: bool = False
-    """True if virtual objects shade the receiver under the environment."""
+    """True if virtual objects cast environment shadows on the receiver."""
 
 
 @wp.func
 def nearest_ball(probes: wp.array[Probe], origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.int32:
-    """Number of the first ball that a ray meets before ``t_max``, or -1."""
+    """Return the index of the first ball that a ray meets before ``t_max``, or -1."""
     nearest = wp.int32(-1)
     reach = t_max
     for index in range(probes.shape[0]):
@@ -69,10 +69,10 @@ def nearest_ball(probes: wp.array[Probe], origin: wp.vec3, direction: wp.vec3, t
 class BallRay:
     """A ray from the camera that a mirror ball reflects."""
 
-    ball: wp.int32  # -1: none does
+    ball: wp.int32  # index of the ball; -1 for none
     origin: wp.vec3  # of the reflected ray
     wi: wp.vec3
-    width: wp.float32  # of a pixel on the ball, metres
+    width: wp.float32  # width of the pixel on the ball, metres
 
 
 @functools.cache
@@ -89,7 +89,7 @@ def make_reflect_at_ball(config: MirrorBallConfig) -> wp.Function:
             return out
         probe = probes[ball]
         t = intersect_sphere(probe.radius, origin - probe.center, direction, FAR)
-        # Back onto the ball: what a far camera adds to the error of t ends here.
+        # Projected back onto the ball: removes the error of t, which grows with the camera's distance.
         normal = wp.normalize(origin - probe.center + t * direction)
         if wp.dot(normal, direction) >= 0.0:
             return out  # the camera is inside the ball, or the ray grazes it
@@ -108,7 +108,7 @@ def make_reflect_at_ball(config: MirrorBallConfig) -> wp.Function:
 
 @functools.cache
 def make_mirrored_change(config: MirrorBallConfig) -> wp.Function:
-    """``mirrored_change``: of the radiance of a pixel, by its sample that looks in ``direction``."""
+    """``mirrored_change(...) -> vec3``: change of a pixel's radiance, by one sample with the ray ``direction``."""
     trace = make_trace(config.trace)
     closest_object, closest_proxy = trace.closest_object, trace.closest_proxy
     reflect_at_ball = make_reflect_at_ball(config)
@@ -203,16 +203,16 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
 
 
 mirror_ball = row_launcher(make_mirror_ball_kernel)
-"""Write what virtual objects change in the picture of mirror balls; zero outside ``params[0].ball_rect``.
+"""Write the change of radiance of pixels that show mirror balls; zero outside ``params[0].ball_rect``.
 
 Args:
-    config: What the scene calls for; what it leaves out may be None.
+    config: Features of the scene; arguments that it does not use may be None.
     params: (1,) FrameParams: camera and ball_rect.
     scene: Objects and proxies.
     lights: (n,) Light.
     distant: The environment, as ``shade`` reads it; empty if ``config.shade`` is None.
     receiver: From ``make_receiver``; picture and probes are always needed.
     shadow_ratio: (H, W) vec3 of ``environment_shadow``; needed if ``config.ratio``.
-    side: Rays per pixel are its square, spread as ``shade``'s along edges. A number, not a kernel of its own.
+    side: Square root of the rays per pixel, spread as ``shade`` does along edges; all values share one kernel.
     mirrored_out: (H, W) vec3, change of linear radiance in camera values.
 """

@@ -1,10 +1,10 @@
-"""The receiver: what a point of a physical surface is taken to be, and how it responds to virtual light.
+"""The receiver: the material of a point of a physical surface, and its response to virtual light.
 
 A light of irradiance E_v (facing it) that arrives along wi adds to a pixel's radiance
 
     added = Kd / pi * E_v * response.
 
-What Kd and the response are makes the methods, with N.L = max(normal . wi, 0):
+Methods differ in Kd and in the response, with N.L = max(normal . wi, 0):
 
 ========================  =========================================================  =============================
 method                    Kd                                                         response
@@ -14,9 +14,8 @@ method                    Kd                                                    
 ``reflectance``           what the camera sees over what the environment sends, (2)  N.L
 ========================  =========================================================  =============================
 
-``flat`` is what plain alpha blending of a lit proxy does. The equations stand above the functions that hold them.
-``make_find_matter`` makes what a point is, ``make_respond`` how it responds; ``kernels/receiver/relight.py`` sums
-over lights.
+``flat`` equals plain alpha blending of a lit proxy. Each equation stands above its function. ``make_find_matter`` finds
+the material of a point, ``make_respond`` its response; ``kernels/receiver/relight.py`` sums over lights.
 
 References:
     [DH04] DiVerdi, Hoellerer, "Combining Dynamic Physical and Virtual Illumination in Augmented Reality", 2004.
@@ -87,24 +86,24 @@ class RelightConfig:
     irradiance: Literal["sh", "map"] = "sh"
     """Form of the environment's irradiance, for ``reflectance``."""
     soft: bool = False
-    """True if lights with a radius cast soft shadows; those of mirror balls stay hard."""
+    """True if lights with a radius cast soft shadows; shadows of mirror balls stay hard."""
     emitters: bool = False
-    """True if ``reflectance`` knows emitters of the environment by their places."""
+    """True if ``reflectance`` uses the positions of the environment's emitters."""
     ambient_visibility: bool = False
-    """True if ``reflectance`` knows which part of the environment reaches a point."""
+    """True if ``reflectance`` uses the share of the environment that reaches a point."""
     bounced: bool = False
-    """True if light that lit proxies send to each other is known."""
+    """True if light that lit proxies send to each other is added."""
     edge_samples: int = 1
     """Samples per pixel along the edges of shadows and of proxies: a square number; 1 leaves edges hard."""
     several: bool = False
     """True if the light of several mirror balls is interpolated."""
     area_samples: int = 0
-    """Samples of what emits, per point; ``area_lights.POINT_SAMPLES``: as lights at points; 0: nothing emits."""
+    """Samples of emitting objects, per point; ``area_lights.POINT_SAMPLES``: as point lights; 0: nothing emits."""
     area_cells: bool = False
-    """True if cells of the frame know what emitters send there; else each pixel asks."""
+    """True if light of emitting objects is estimated per cell; False if it is estimated at each pixel."""
 
     def general(self, *, soft: bool) -> RelightConfig:
-        """For any scene in which as much is known of the receiver."""
+        """Return the configuration for any kinds of shape in the scene, with soft shadows if ``soft``."""
         return dataclasses.replace(self, trace=self.trace.general(), soft=soft)
 
     def __post_init__(self) -> None:
@@ -116,7 +115,7 @@ class RelightConfig:
 
 @wp.func
 def shader_response(n_dot_l: wp.float32, multiplicative: wp.float32, alpha: wp.float32) -> wp.float32:
-    """The lerp of [DH04]'s fragment shader as printed; light is not taken away."""
+    """Return the linear interpolation of [DH04]'s fragment shader as printed, at least 0."""
     return wp.max((1.0 - alpha) * n_dot_l + alpha * multiplicative, 0.0)
 
 
@@ -128,10 +127,10 @@ def shader_response(n_dot_l: wp.float32, multiplicative: wp.float32, alpha: wp.f
 #
 #     response = (1 - |alpha|) N.L + |alpha| (m if alpha > 0 else 1 - m).                                          (1)
 #
-# What the text leaves open is a ``Reading``. ``paper`` takes: m in video values, the codes that the shader samples over
-# 255, for no camera's curve is mentioned; the three cases of the text above the printed shader's lerp, (1 - alpha) N.L
-# + alpha m, which gives 2 N.L - m at -1; and alpha as it is, for the remark of section 4.4 that several lights end as
-# plain blending is an observation, not a step of the shader. docs/paper.md says what the other readings give.
+# A ``Reading`` settles what the text leaves open. ``paper`` takes m in video values, the shader's codes over 255,
+# because the paper mentions no camera curve. It prefers the three cases of the text to the printed shader's lerp,
+# (1 - alpha) N.L + alpha m, which gives 2 N.L - m at -1. It does not scale alpha: section 4.4 observes that several
+# lights end as plain blending, but names no step of the shader. docs/paper.md compares the other readings.
 @wp.func
 def text_response(n_dot_l: wp.float32, intensity: wp.float32, alpha: wp.float32) -> wp.float32:
     """Equation (1), [DH04] section 4.2."""
@@ -140,17 +139,17 @@ def text_response(n_dot_l: wp.float32, intensity: wp.float32, alpha: wp.float32)
     return (1.0 - weight) * n_dot_l + weight * multiplicative
 
 
-# Equation (2). The receiver's own reflectance, from what the camera sees and what the environment sends there,
+# Equation (2). The receiver's reflectance, from the radiance L in the frame and the environment's irradiance E there,
 #
 #     rho = pi L / E_environment(normal),                                                                          (2)
 #
-# which is (exactly) right for a Lambertian receiver, whatever its pattern. A prior of ``PRIOR_WEIGHT`` keeps (2) sane
-# where the environment is dark, and no reflectance exceeds 1; a clipped channel gives what its code says, a lower
-# bound. With *cells* (``receiver_cells.py``) E is the part of the environment that boxes and balls let through.
-# What shades the receiver beyond its proxy (relief, clutter) is in (2) as if it were paint.
+# which is exact for a Lambertian receiver with any pattern. A prior of ``PRIOR_WEIGHT`` bounds (2) where the
+# environment is dark, and no reflectance exceeds 1. A clipped channel gives a lower bound. With *cells*
+# (``receiver_cells.py``) E is the light of the environment that boxes and balls do not hide. Shading that the proxy
+# does not model (relief, clutter) is taken for a darker reflectance.
 @wp.func
 def reflectance_of(radiance: wp.float32, irradiance: wp.float32) -> wp.float32:
-    """Equation (2) with its prior, one channel; within 0..1 for whatever comes in."""
+    """Return the reflectance of equation (2) with its prior, for one channel; within 0..1 for any input."""
     rho = (wp.pi * radiance + PRIOR_WEIGHT * DEFAULT_REFLECTANCE) / (wp.max(irradiance, 0.0) + PRIOR_WEIGHT)
     if not rho > 0.0:  # NaN as well
         return 0.0
@@ -159,22 +158,25 @@ def reflectance_of(radiance: wp.float32, irradiance: wp.float32) -> wp.float32:
 
 @wp.struct
 class ReceiverCells:
-    """Results of ``receiver_cells.py`` for cells of the frame, each with the surface that it lies on."""
+    """Light and visibility per cell (a block of pixels) of the receiver, computed by ``receiver_cells.py``.
+
+    Each result has its own stride and the key of the surface on which each of its cells lies.
+    """
 
     ambient_visibility: wp.array2d[wp.vec3]  # share of the environment that reaches a cell
     ambient_surface: wp.array2d[wp.int32]  # ``surface_key`` of the cell, -1 for none
     ambient_stride: wp.int32  # pixels per cell
-    bounced: wp.array2d[wp.vec3]  # irradiance by virtual light that other proxies send there
+    bounced: wp.array2d[wp.vec3]  # irradiance of virtual light that other proxies reflect to a cell
     bounced_surface: wp.array2d[wp.int32]
     bounced_stride: wp.int32
-    area: wp.array2d[wp.vec3]  # irradiance by what emits
+    area: wp.array2d[wp.vec3]  # irradiance of emitting objects
     area_surface: wp.array2d[wp.int32]
     area_stride: wp.int32
 
 
 @wp.struct
 class Receiver:
-    """The receiver and the environment that lights it; what a ``RelightConfig`` leaves out is empty."""
+    """The receiver and the environment that lights it. Arrays that a ``RelightConfig`` does not use are empty."""
 
     picture: Picture
     probes: wp.array[Probe]
@@ -188,7 +190,7 @@ class Receiver:
 
 @wp.func
 def look_up_ambient(scene: RayScene, receiver: Receiver, hit: Hit, row: wp.int32, col: wp.int32) -> wp.vec4:
-    """Ambient visibility of what a pixel shows, and 1; zero where no cell around it knows (``look_up_cells``)."""
+    """Return (ambient visibility, 1) at the point that a pixel shows, as ``look_up_cells`` does; zero if unknown."""
     cells = receiver.cells
     key = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
     size = wp.vec2i(receiver.picture.frame.shape[0], receiver.picture.frame.shape[1])
@@ -197,7 +199,7 @@ def look_up_ambient(scene: RayScene, receiver: Receiver, hit: Hit, row: wp.int32
 
 @wp.func
 def look_up_bounced(scene: RayScene, receiver: Receiver, hit: Hit, row: wp.int32, col: wp.int32) -> wp.vec4:
-    """Irradiance by virtual light that other proxies send to what a pixel shows, and 1; zero where there is none."""
+    """Return (irradiance of bounced virtual light, 1) at the point that a pixel shows; zero if no cell has it."""
     cells = receiver.cells
     key = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
     size = wp.vec2i(receiver.picture.frame.shape[0], receiver.picture.frame.shape[1])
@@ -206,7 +208,7 @@ def look_up_bounced(scene: RayScene, receiver: Receiver, hit: Hit, row: wp.int32
 
 @wp.func
 def look_up_area(scene: RayScene, receiver: Receiver, hit: Hit, row: wp.int32, col: wp.int32) -> wp.vec4:
-    """Irradiance by what emits, at what a pixel shows, and 1; zero where no cell around it knows."""
+    """Return (irradiance of emitting objects, 1) at the point that a pixel shows; zero if no cell has it."""
     cells = receiver.cells
     key = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
     size = wp.vec2i(receiver.picture.rays.shape[0], receiver.picture.rays.shape[1])
@@ -280,7 +282,7 @@ def make_find_matter(config: RelightConfig) -> wp.Function:
 def make_respond(method: str) -> wp.Function:
     """``respond(matter, wi, n_dot_l) -> float32``: a point's response, by one of ``METHODS`` or ``READINGS``.
 
-    The one place where equation (1) meets a light: at points, and on what emits. ``flat`` reads no matter.
+    It applies to virtual lights and to samples of emitting objects alike. ``flat`` does not read ``matter``.
     """
     reading = READINGS.get(method)
 
@@ -311,11 +313,11 @@ def make_receiver(
     others: OtherBalls | None = None,
     cells: ReceiverCells | None = None,
 ) -> Receiver:
-    """Return the receiver as kernels read it; what the method leaves out may be None.
+    """Return the receiver as kernels read it. Arguments that the method does not use may be None.
 
     Args:
         config: Method and forms of light.
-        picture: (H, W) the camera's.
+        picture: (H, W) the camera's frame and rays.
         probes: (p,) Probe, mirror balls, which hide the receiver and throw shadows of virtual light.
         key_lights: (k,) KeyLight, brightest first; needed by the paper's blend.
         irradiance: Irradiance of the environment, nine coefficients or a latlong map as ``config.irradiance`` says;

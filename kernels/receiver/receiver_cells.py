@@ -1,33 +1,36 @@
-"""Light that reaches the receiver beyond one pixel, estimated for cells of the frame for ``relight``.
+"""Light on the receiver that varies slowly over pixels, estimated per cell (block of pixels) of the frame.
 
-**Ambient visibility.** Reflectance is what the camera sees over what the environment sends (``receiver``, equation 3).
-The environment's filtered irradiance knows nothing of what stands in the way: in the shadow of the ball or of a box it
-is too much, and the receiver would be taken for darker than it is. So per cell, over the environment's samples
+``relight`` interpolates the results between cells.
+
+**Ambient visibility.** The receiver's reflectance is its radiance in the frame over the environment's irradiance
+(``receiver``, equation 2). The filtered irradiance ignores occlusion: in the shadow of the ball or of a box it is too
+large, and the reflectance comes out too small. So each cell finds, over samples of the environment
 (``environment_samples``),
 
-    visibility = 1 - sum over hidden ones of measure * cos * (radiance - what hides it) / sum of measure * cos *
-    radiance,
+    visibility = 1 - sum over hidden samples of measure * cos * (radiance - radiance of the occluder)
+                     / sum over all samples of measure * cos * radiance,
 
-which is 1 to the bit where nothing is hidden. Only cells that virtual light falls on are asked: first those that a
-light shines on, then, once it is known what these send on, those that are reached by that.
-What hides light sends some itself: a ball its reflectance times the mean of what its normal faces, a box what the
-camera sees of it there, and where it sees nothing what grey paper would. Planes hide nothing: the ball has seen them
-where the environment has them. A CUDA device has several threads share the samples of a cell; their sums are added in
-one order, so that the same frame gives the same bits.
+which is exactly 1 where nothing is hidden. It is estimated only for cells that virtual light reaches: first those that
+a light shines on, then, once bounced light is known, those that only bounced light reaches. An occluder emits or
+reflects light itself: a ball its reflectance times the mean radiance that its normal faces, a box its radiance in the
+frame or, where the camera does not see it, that of a grey surface. Planes hide nothing: the environment captured by the
+ball contains them. On CUDA several threads share the samples of a cell. Their sums are added in a fixed order, so that
+the same frame gives the same bits.
 
-**Light of emitters.** It is wide and its shadows are soft, so cells ask for it, and pixels interpolate between those of
-their surface (``area_lights``).
+**Light of emitting objects.** It is estimated per cell, because it varies slowly and its shadows are soft
+(``area_lights``).
 
-**Bounced light.** A lit proxy lights the others. Every cell of a coarse grid is a patch: radiance L that virtual light
-adds there (``relight``'s own, direct), and the area A of the surface that its pixels show. Where a virtual object is in
-front the patch lies on that, and sends the light that falls on it by its material's colour to all sides alike. A
-receiver at distance r gets
+**Bounced light.** A lit proxy lights the others. Every cell of a coarse grid is a patch with the radiance L of direct
+virtual light there (as ``relight`` finds it) and the area A of the surface that its pixels show. Where a virtual object
+is in front, the patch lies on the object and reflects light diffusely by its material's colour. The irradiance of a
+point at distance r is
 
     E = sum over patches of  L A cos cos' / (r^2 + A / pi),
 
-which is a disc's form factor on its axis: finite where a box stands on the lit receiver, and pi L for a patch that
-fills the hemisphere. One bounce; what the camera does not show sends nothing, and nothing stands between. Points of one
-flat surface, which rounding puts above or below each other, share a normal: of two the upper one turns its back.
+the form factor of a disc on its axis. It stays finite where a box stands on the lit receiver, and is pi L for a patch
+that fills the hemisphere. There is one bounce. Surfaces that the camera does not see reflect nothing, and occlusion
+between patch and point is ignored. Points of one flat surface do not light each other, although rounding moves them
+off the plane: they share a normal, so one of the two cosines is not positive.
 """
 
 from __future__ import annotations
@@ -62,16 +65,16 @@ from warp_ar.kernels.structs import MIRROR, PHONG, PLANE, FrameParams, Hit, Ligh
 wp.set_module_options({"enable_backward": False})
 
 MIN_IRRADIANCE = wp.constant(wp.float32(1.0e-6))
-"""Irradiance, in camera values, below which a share means nothing."""
+"""Irradiance, in camera values, below which ambient visibility is taken to be 1."""
 NEGLIGIBLE = wp.constant(wp.float32(1.0 / 1024.0))
-"""Bounced light over the environment's that no 8-bit picture shows: an eighth of a code at most, taken for none."""
+"""Ratio of bounced to environment light that is treated as 0: at most an eighth of an 8-bit code."""
 MIN_FACING = wp.constant(wp.float32(0.02))
-"""Least cosine at which the area that pixels show is believed: beyond it a patch would reach over the horizon."""
+"""Least cosine by which the area of a patch is divided: at smaller ones it would reach over the horizon."""
 
 
 @wp.struct
 class Patch:
-    """A piece of a proxy that sends virtual light on."""
+    """A piece of a surface that reflects virtual light diffusely."""
 
     position: wp.vec3
     normal: wp.vec3
@@ -81,7 +84,7 @@ class Patch:
 
 @wp.func
 def visible_shares_of(lost: wp.vec3, whole: wp.vec3) -> wp.vec3:
-    """Part of ``whole`` that is left without ``lost``; within 0..1 for whatever comes in, 1 where nothing is known."""
+    """Return 1 - lost / whole per channel, within 0..1; 1 where ``whole`` is below ``MIN_IRRADIANCE`` or NaN."""
     shares = wp.vec3(1.0, 1.0, 1.0)
     for channel in range(3):
         if whole[channel] > MIN_IRRADIANCE:  # NaN is not
@@ -101,16 +104,16 @@ def meets_ball(away: wp.vec3, radius: wp.float32, direction: wp.vec3) -> wp.bool
 
 @wp.func
 def in_lit_cells(cell_row: wp.int32, cell_col: wp.int32, stride: wp.int32, rect: wp.vec4i) -> wp.bool:
-    """Return whether a pixel of the rectangle may look a cell up."""
+    """Return whether a pixel of the rectangle may read this cell when it interpolates."""
     reach = wp.vec4i(rect[0] - 2 * stride, rect[1] + 2 * stride, rect[2] - 2 * stride, rect[3] + 2 * stride)
     return rect[0] < rect[1] and inside_rect(cell_row * stride, cell_col * stride, reach)
 
 
 @functools.cache
 def make_mean_facing(config: RelightConfig) -> wp.Function:
-    """``mean_facing(receiver, point, normal) -> vec3``: mean radiance, by the cosine, of what lies before a surface.
+    """``mean_facing(receiver, point, normal) -> vec3``: cosine-weighted mean of the environment before a surface.
 
-    Of the environment, emitters where the balls saw them.
+    Emitters keep the directions in which the balls show them.
     """
     irradiance_at = make_irradiance_at(config.irradiance, False, config.several)
 
@@ -128,7 +131,7 @@ def make_mean_facing(config: RelightConfig) -> wp.Function:
 
 @wp.func
 def bound_solids(scene: RayScene) -> wp.vec4:
-    """Middle and radius of one ball around all proxies that can hide light: all but planes."""
+    """Return the centre and radius of a sphere around all proxies that can hide light: all but planes."""
     middle = wp.vec3()
     solid = float(0.0)
     for index in range(scene.proxies.shape[0]):
@@ -149,7 +152,7 @@ class Hider:
     """Obstacle between a point of the receiver and a sample of the environment."""
 
     hides: wp.bool
-    radiance: wp.vec3  # that it sends along the sample's direction
+    radiance: wp.vec3  # of the obstacle, toward the point
 
 
 @functools.cache
@@ -199,7 +202,7 @@ def make_find_hider(config: RelightConfig) -> wp.Function:
 
 @wp.func
 def is_shone_on(lights: wp.array[Light], hit: Hit) -> wp.bool:
-    """Return whether a virtual light shines on a point, were nothing in the way."""
+    """Return whether a virtual light shines on a point, occlusion ignored."""
     for index in range(lights.shape[0]):
         light = sample_light(lights[index], hit.point)
         if wp.dot(hit.geometric_normal, light.wi) > 0.0 and wp.max(light.irradiance_normal) > 0.0:
@@ -310,9 +313,9 @@ def make_area_light_kernel(config: RelightConfig) -> wp.Kernel:
 
 @wp.func
 def sent_share(scene: RayScene, hit: Hit) -> wp.vec3:
-    """Share of light that an object sends on, as if to all sides alike: its colour; of a picture a grey one's.
+    """Return the diffuse reflectance of an object for bounced light: its colour, or grey if it has a texture.
 
-    A mirror sends light to one side only, and is left out.
+    It is 0 for a mirror, which reflects light to one side only.
     """
     material = scene.materials[material_at(scene, hit)]
     if material.model == MIRROR or material.unlit != 0:
@@ -327,7 +330,7 @@ def sent_share(scene: RayScene, hit: Hit) -> wp.vec3:
 
 @functools.cache
 def make_sent_by_object(trace: TraceConfig) -> wp.Function:
-    """``sent_by_object(scene, lights, hit) -> vec3``: radiance by virtual light of an object that shows ``hit``.
+    """``sent_by_object(scene, lights, hit) -> vec3``: diffuse radiance of a virtual object at ``hit``.
 
     Lights count as points: their shadows on objects have no penumbra.
     """
@@ -423,7 +426,7 @@ def list_patches_kernel(
     listed_out: wp.array2d[Patch],
     count_out: wp.array[wp.int32],
 ):
-    """Patches of a row that send light, in their order: sums over them are the same in every run."""
+    """List the patches of a row that reflect light, in their order: sums over them are the same in every run."""
     i = wp.tid() + row_start
     count = int(0)
     for j in range(patches.shape[1]):
@@ -466,7 +469,7 @@ def make_gather_light_kernel(config: RelightConfig) -> wp.Kernel:
             return
         cells_out.bounced_surface[ci, cj] = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
         total = wp.vec3()
-        # Rows that the light reaches: the others may be of an earlier frame.
+        # Only rows in light_rect: the others may hold patches of an earlier frame.
         rect = params[0].light_rect
         for row in range(rect[0] / patch_stride, wp.min((rect[1] - 1) / patch_stride + 1, patches.shape[0])):
             for k in range(count[row]):
@@ -490,7 +493,7 @@ def make_gather_light_kernel(config: RelightConfig) -> wp.Kernel:
 estimate_ambient_visibility = row_launcher(
     make_ambient_visibility_kernel, like=lambda *given: given[-1].ambient_visibility
 )
-"""Estimate which part of the environment reaches the receiver, for cells that virtual lights may shine on.
+"""Estimate the share of the environment that reaches the receiver, for cells on which virtual lights may shine.
 
 Args:
     config: Kinds of shape, form of the environment's irradiance.
@@ -499,9 +502,9 @@ Args:
     lights: (n,) Light.
     receiver: From ``make_receiver``: picture, balls and the environment's irradiance; with the cells of
         ``gather_light`` if ``bounced``.
-    samples: (n,) of the environment. The same for all cells, so there is no noise; the first n of a longer
-        sequence are an aligned block of Sobol's if n is a power of 2.
-    bounced: Whether to add cells that get bounced light to those that were estimated before.
+    samples: (n,) samples of the environment, the same for all cells, so that neighbours do not differ by noise. If n is
+        a power of 2, the first n of a longer sequence are an aligned block of Sobol's sequence.
+    bounced: Whether to estimate the cells that only bounced light reaches, and keep those of the first call.
     cells_out: Cells whose ambient visibility and its surface are written.
 """
 
@@ -510,7 +513,7 @@ estimate_area_light = row_launcher(make_area_light_kernel, like=lambda *given: g
 """Find the irradiance that emitting objects send to the receiver, per cell.
 
 Args:
-    config: Kinds of shape, and samples of what emits per cell.
+    config: Kinds of shape, and samples of emitting objects per cell.
     params: (1,) FrameParams: camera and light_rect.
     scene: Objects and proxies.
     receiver: From ``make_receiver``: picture and balls.
@@ -519,7 +522,7 @@ Args:
 
 
 send_light = row_launcher(make_send_light_kernel)
-"""Find what every patch of the receiver sends on of the virtual light that falls on it.
+"""Find the virtual light that every patch of the receiver reflects.
 
 Args:
     config: As for ``estimate_ambient_visibility``.
@@ -528,31 +531,31 @@ Args:
     lights: (n,) Light.
     receiver: From ``make_receiver``, with the cells of ``estimate_ambient_visibility`` where the config has them.
     stride: Pixels along a patch.
-    patches_out: (ceil(H / stride), ceil(W / stride)) patches; those that send nothing have no area.
+    patches_out: (ceil(H / stride), ceil(W / stride)) patches; those that reflect nothing have area 0.
 """
 
 
 list_patches = row_launcher(list_patches_kernel, outputs=2, like=lambda patches, listed, count: count)
-"""Move the patches that send light to the front of their rows.
+"""Move the patches that reflect light to the front of their rows.
 
 Args:
-    patches: (r, c) of ``send_light``.
+    patches: (r, c) from ``send_light``.
     listed_out: (r, c) patches.
-    count_out: (r,) how many of a row send light.
+    count_out: (r,) number of patches of each row that reflect light.
 """
 
 
 gather_light = row_launcher(make_gather_light_kernel, like=lambda *given: given[-1].bounced)
-"""Sum what patches send to the cells of the receiver.
+"""Sum the irradiance that patches send to each cell of the receiver.
 
 Args:
     config: As for ``estimate_ambient_visibility``.
     params: (1,) FrameParams: camera and light_rect.
     scene: Proxies.
     receiver: From ``make_receiver``: picture, balls and the environment's irradiance.
-    patches: (r, c) of ``list_patches``; only rows that light_rect reaches are read.
-    count: (r,) how many of a row send light.
+    patches: (r, c) from ``list_patches``; only rows in light_rect are read.
+    count: (r,) number of patches of each row that reflect light.
     patch_stride: Pixels along a patch.
     cells_out: Cells whose bounced light and its surface are written; bounced light is 0 where it is less than
-        ``NEGLIGIBLE`` of the environment's.
+        ``NEGLIGIBLE`` times the environment's.
 """

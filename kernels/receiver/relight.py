@@ -1,21 +1,20 @@
-"""Virtual light on the receiver: linear radiance that a virtual light adds to each pixel of the camera's frame.
+"""Virtual light on the receiver: linear radiance that virtual lights add to each pixel of the camera's frame.
 
-Every pixel's ray meets the nearest proxy; the mirror ball, if it is in front, shows no light of its own. A light of
-irradiance E_v (facing it) arrives there along wi, unless a virtual object or a proxy stands between, and adds
+Every pixel's ray is traced to the nearest proxy. Pixels that show a mirror ball get no light here (see
+``mirror_ball``). A light of irradiance E_v (facing it) arrives along wi, unless a virtual object, a proxy or a ball
+hides it, and adds
 
     added = sum over lights of  Kd / pi * E_v * visible * response.
 
-Kd and the response are the receiver's: ``kernels/receiver/receiver.py`` has the methods and their equations.
-
-With *cells* (``kernels/receiver/receiver_cells.py``) a receiver's reflectance knows the part of the environment that
-boxes and
-balls let through, and the irradiance by virtual light that lit proxies send to each other is added to the direct one:
+``kernels/receiver/receiver.py`` defines Kd and the response of each method. With *cells*
+(``kernels/receiver/receiver_cells.py``), Kd takes into account that boxes and balls hide part of the environment, and
+the irradiance of virtual light that lit proxies reflect to each other is added:
 
     added += Kd / pi * E_bounced.
 
-Edges. A light without size has shadows without penumbra. Where a neighbour sees another surface and one of the two is
-lit, or something else hides lights from it, the pixel is traced again with n^2 samples and averaged, as ``shade`` does
-along outlines; what the camera's pixel says of the receiver holds for all of them.
+Edges. Point lights have shadows without penumbra. If a pixel and a neighbour show different surfaces, of which one is
+lit, or if other lights are hidden from them, the pixel is traced again with n^2 samples and averaged, as ``shade`` does
+along outlines. All samples use the frame's radiance at the pixel to find the receiver's reflectance.
 """
 
 from __future__ import annotations
@@ -58,7 +57,7 @@ _INV_PI = wp.constant(wp.float32(1.0 / math.pi))
 _MASKED = 8
 """Largest number of lights with separate shadow bits in the mask that ``relight`` writes for ``smooth_edges``."""
 _LIT = wp.constant(1 << _MASKED)
-"""The bit that tells whether any light arrives; the number of the surface stands above it."""
+"""Bit that is set if any light arrives; the bits above it hold the key of the surface."""
 _SURFACE = wp.constant(_MASKED + 1)
 _NOTHING = wp.constant(-1 << (_MASKED + 1))
 _BALL = wp.constant(-2 << (_MASKED + 1))
@@ -69,12 +68,12 @@ class DirectLighting:
     """Virtual light at a point of the receiver."""
 
     added: wp.vec3  # radiance
-    visibility: wp.int32  # whether any light arrives, and which do not: see ``is_edge``
+    visibility: wp.int32  # bits of the lights that are hidden, and ``_LIT`` if any light arrives
 
 
 @functools.cache
 def make_area_response(config: RelightConfig) -> wp.Function:
-    """``area_response(scene, receiver, hit, matter, turn) -> vec3``: sum of E_v visible response over what emits."""
+    """``area_response(scene, receiver, hit, matter, turn) -> vec3``: sum of E_v visible response over emitters."""
     is_lit, respond = make_shadow(config.trace), make_respond(config.method)
     area_count, area_sample = make_area_count(config.area_samples), make_area_sample(config.area_samples)
 
@@ -104,8 +103,8 @@ def make_area_response(config: RelightConfig) -> wp.Function:
 def make_direct_lighting(config: RelightConfig) -> wp.Function:
     """``direct_lighting(scene, lights, receiver, hit, row, col, mirror, turn) -> DirectLighting``: of virtual light.
 
-    The pixel (row, col) shows the hit: straight where ``mirror`` is zero, else as a mirror ball of that reflectance has
-    it, which says nothing about the hit's surroundings. ``turn`` is for ``visible_share``.
+    The pixel (row, col) shows the hit directly if ``mirror`` is zero. Otherwise it shows the hit reflected in a mirror
+    ball of reflectance ``mirror``; then values of cells are not used. ``turn`` is passed to ``visible_share``.
     """
     is_lit = make_shadow(config.trace)
     visible_share = make_visible_share(config.trace) if config.soft else None
@@ -124,7 +123,7 @@ def make_direct_lighting(config: RelightConfig) -> wp.Function:
         turn: wp.float32,
     ) -> DirectLighting:
         result = DirectLighting()
-        known = bool(False)  # what the receiver is, found only once some light falls here
+        known = bool(False)  # whether ``matter`` was found; it is needed only if light falls here
         matter = Matter()
         matter.kd = wp.vec3(DEFAULT_REFLECTANCE, DEFAULT_REFLECTANCE, DEFAULT_REFLECTANCE)
         added = wp.vec3()
@@ -219,7 +218,7 @@ def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
         ray = receiver.picture.rays[i, j]
         direction = params[0].world_from_camera * wp.vec3(ray[0], ray[1], 1.0)
         hit = closest_proxy(scene, params[0].camera_position, direction, FAR)
-        # A face that is seen from behind is not the surface that the camera sees.
+        # A proxy seen from behind is not a visible surface.
         if hit.shape < 0 or wp.dot(hit.geometric_normal, direction) >= 0.0:
             return
         if meets_probe(receiver.probes, params[0].camera_position, direction, hit.t):
@@ -237,10 +236,10 @@ def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
 
 @wp.func
 def is_edge(visibility: wp.array2d[wp.int32], rect: wp.vec4i, row: wp.int32, column: wp.int32) -> wp.bool:
-    """Return whether virtual light may change within a pixel, or between it and the next one.
+    """Return whether virtual light may have an edge within a pixel or between it and one of its four neighbours.
 
-    That is where something stands before a light without penumbra for one of them alone, or where they see different
-    surfaces and any light arrives. Balls have light of their own, which ``mirror_ball`` adds.
+    That is so if a light without penumbra is hidden from one of the two alone, or if they show different surfaces and
+    light arrives at one. Pixels that show a ball have no edges: ``mirror_ball`` adds their light.
     """
     here = visibility[row, column]
     if here == _BALL:
@@ -261,9 +260,9 @@ def is_edge(visibility: wp.array2d[wp.int32], rect: wp.vec4i, row: wp.int32, col
 
 @functools.cache
 def make_sample_lighting(config: RelightConfig) -> wp.Function:
-    """``sample_lighting(params, scene, lights, receiver, row, col, sample) -> vec4``: a sample's light, and 1.
+    """``sample_lighting(params, scene, lights, receiver, row, col, sample) -> vec4``: (radiance, 1) of a sample.
 
-    Zero where it sees a ball: such a sample does not count.
+    It is zero if the sample shows a ball: such samples are left out of the mean.
     """
     closest_proxy = make_trace(config.trace).closest_proxy
     direct_lighting = make_direct_lighting(config)
@@ -293,7 +292,7 @@ def make_sample_lighting(config: RelightConfig) -> wp.Function:
 
 @functools.cache
 def make_smooth_edges_kernel(config: RelightConfig, *, left: bool = False) -> wp.Kernel:
-    """Kernel that samples edges in place; if ``left``, only where the list did not hold all."""
+    """Kernel that samples edge pixels in place; if ``left``, it does nothing unless the list of edges overflowed."""
     sample_lighting = make_sample_lighting(config)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
@@ -385,9 +384,9 @@ Args:
     params: (1,) FrameParams: camera, light_rect and, if ``config.bounced``, direct_rect.
     scene: Objects and proxies.
     lights: (n,) Light.
-    receiver: Of ``make_receiver``.
+    receiver: From ``make_receiver``.
     added_out: (H, W) linear radiance in camera values.
-    visibility_out: (H, W) which surface a pixel sees and which lights do not; None if ``config.edge_samples`` is 1.
+    visibility_out: (H, W) surface of a pixel and the lights hidden from it; None if ``config.edge_samples`` is 1.
         Only what lies in ``light_rect`` is written.
 """
 

@@ -1,13 +1,14 @@
-"""The modelled surface that each pixel shows: a virtual object, a proxy or a mirror ball; its depth, normal and place.
+"""Geometry layers of the picture: the index, depth, normal and position of the modelled surface in each pixel.
 
-One ray per pixel, through its centre: nothing here is filtered, for a mean of two depths is the depth of neither. The
-depth is along the camera's axis, as depth cameras and OpenEXR's ``Z`` have it. What hides what is as in the picture:
-an object is hidden by proxies alone, and a proxy shows its front.
+A modelled surface is a virtual object, a proxy or a mirror ball. One ray is traced per pixel, through its centre, and
+nothing is filtered: the mean of two depths is the depth of neither surface. Depth is measured along the camera's axis,
+like that of depth cameras and OpenEXR's ``Z``. Visibility is that of the picture: only proxies hide objects, and a
+proxy is seen from its front.
 
-Several surfaces may share a pixel: how much of it each covers is what Cryptomatte keeps of a picture. Within a
-surface a pixel shows that alone. Where one of the eight neighbours shows another, the pixel's samples are traced, the
-same as those by which ``shade`` smooths edges, and counted by surface. The ``RANKS`` that cover most are kept, in
-falling order; what nothing modelled covers is in no rank.
+Coverage is the share of a pixel that each surface covers, as in Cryptomatte. If all eight neighbours show the pixel's
+own surface, it covers the pixel. Otherwise the samples by which ``shade`` smooths edges are traced and counted by
+surface. The ``RANKS`` surfaces with the largest shares are kept, in falling order. The part of a pixel that shows no
+modelled surface is not stored.
 """
 
 from __future__ import annotations
@@ -31,14 +32,14 @@ from warp_ar.kernels.structs import FrameParams, Probe, RayScene, vec8
 wp.set_module_options({"enable_backward": False})
 
 RANKS = 4
-"""Surfaces that a pixel keeps."""
+"""Number of surfaces stored per pixel."""
 
 
 @wp.struct
 class Surface:
     """First surface that a ray from the camera meets."""
 
-    index: wp.int32  # objects, then proxies, then mirror balls; -1: nothing that is modelled
+    index: wp.int32  # counted over objects, then proxies, then mirror balls; -1: no modelled surface
     depth: wp.float32  # metres along the camera's axis, infinite where there is nothing
     normal: wp.vec3  # unit, world, toward the camera; zero where there is nothing
     position: wp.vec3  # world, metres; zero where there is nothing
@@ -58,7 +59,7 @@ class Surfaces:
 def make_physical_surface(config: TraceConfig) -> wp.Function:
     """``physical_surface(scene, balls, origin, direction) -> Surface``: the proxy or ball that a ray meets.
 
-    ``direction`` is as long as its part along the camera's axis is 1.
+    ``direction`` is scaled so that its component along the camera's axis is 1.
     """
     closest_proxy = make_trace(config).closest_proxy
 
@@ -83,7 +84,7 @@ def make_physical_surface(config: TraceConfig) -> wp.Function:
                 surface = Surface()
                 surface.index = -1
                 surface.depth = wp.inf
-                # From behind a proxy hides what is beyond, and is not what the camera sees of it.
+                # A proxy seen from behind hides the surfaces beyond it, and is itself not visible.
                 if wp.dot(hit.geometric_normal, direction) < 0.0:
                     surface.index = objects + hit.shape
                     surface.depth = hit.t
@@ -135,22 +136,22 @@ def make_trace_surfaces_kernel(config: TraceConfig) -> wp.Kernel:
 
 
 trace_surfaces = row_launcher(make_trace_surfaces_kernel, like=lambda params, rays, *_: rays)
-"""Write the surface that every pixel's centre shows.
+"""Write the surface at the centre of every pixel.
 
 Args:
     config: Kinds of shape in ``scene``.
     params: (1,) FrameParams: camera and ``object_rect``.
     rays: (H, W) undistorted x / z and y / z of each pixel centre.
-    scene: What rays meet.
+    scene: Objects and proxies.
     balls: (n,) Probe, the mirror balls.
-    visible: (H, W) as ``trace_pixels`` writes; its arrays are empty in a scene without objects.
+    visible: (H, W) from ``trace_pixels``; its arrays are empty in a scene without objects.
     out: (H, W) arrays, all four.
 """
 
 
 @wp.func
 def add_to_rank(ranks: vec8, found: wp.int32, share: wp.float32) -> vec8:
-    """Count a share of the pixel for a surface: in its rank, else in the first that is free, else in none."""
+    """Add ``share`` to the rank of the surface ``found``, or to the first free rank; drop it if there is none."""
     out = ranks
     taken = bool(found < 0)
     for k in range(wp.static(RANKS)):
@@ -163,7 +164,7 @@ def add_to_rank(ranks: vec8, found: wp.int32, share: wp.float32) -> vec8:
 
 @wp.func
 def sort_ranks(ranks: vec8) -> vec8:
-    """In falling order; few, so the plainest way to sort them. Equal ones keep the order of their samples."""
+    """Sort ranks by falling share with a bubble sort, which suffices for a few; equal ranks keep their order."""
     out = ranks
     for _ in range(wp.static(RANKS - 1)):
         for k in range(wp.static(RANKS - 1)):
@@ -179,7 +180,7 @@ def sort_ranks(ranks: vec8) -> vec8:
 
 @functools.cache
 def make_shown(config: TraceConfig) -> wp.Function:
-    """``shown(scene, balls, origin, direction) -> int32``: number of the surface that a ray meets first, or -1."""
+    """``shown(scene, balls, origin, direction) -> int32``: index of the surface that a camera's ray shows, or -1."""
     closest_visible = make_primary(config)
     physical_surface = make_physical_surface(config)
 
@@ -239,16 +240,15 @@ def make_count_coverage_kernel(config: TraceConfig, edge_samples: int) -> wp.Ker
 
 
 count_coverage = row_launcher(make_count_coverage_kernel, configs=2)
-"""Write what share of every pixel which surface covers.
+"""Write the share of every pixel that each surface covers.
 
 Args:
     config: Kinds of shape in ``scene``.
     edge_samples: Samples of a pixel at an edge, a square number; 1 leaves edges hard.
     params: (1,) FrameParams, the camera.
     rays: (H, W) undistorted x / z and y / z of each pixel centre.
-    scene: What rays meet.
+    scene: Objects and proxies.
     balls: (n,) Probe, the mirror balls.
-    index: (H, W) int32, as ``trace_surfaces`` writes.
-    coverage_out: (H, W) of index and share in turn, ``RANKS`` times, in falling order; index -1 with share 0
-        where there are fewer.
+    index: (H, W) int32, from ``trace_surfaces``.
+    coverage_out: (H, W) vec8: ``RANKS`` pairs of index and share, by falling share; unused pairs hold -1 and 0.
 """
