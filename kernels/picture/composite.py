@@ -1,13 +1,12 @@
-"""The picture: the camera's frame, what virtual light adds to it, and the virtual objects over it.
+"""Composition of the picture: the camera's frame, virtual light on it, and virtual objects over it.
 
     radiance = (1 - alpha) (frame * shadow_ratio + added_light + mirror_ball) + virtual
 
-in linear light; ``virtual`` is premultiplied by its coverage alpha. A pixel that none of these layers changes keeps
-the frame's code bit for bit, whatever the transfer. Layers count only inside their rectangle of ``FrameParams``: what
-an earlier frame left elsewhere is not seen, and not read.
+in linear light; ``virtual`` is premultiplied by its coverage alpha. A pixel that no layer changes keeps the frame's
+code bit for bit, whatever the transfer function. A layer is read only inside its rectangle of ``FrameParams``: values
+elsewhere may be of an earlier frame.
 
-What is drawn ends at the codes where the camera's channels saturate, but no darker than the frame is there: beside its
-lamps, nothing else is as bright.
+Output values end at the codes at which the camera's channels saturate, or at the frame's own code where that is higher.
 """
 
 from __future__ import annotations
@@ -24,9 +23,9 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Layers:
-    """Images that are laid over the frame, (H, W) each; one that a scene does not call for is empty."""
+    """Layers over the frame, (H, W) each; a layer that the scene does not need is empty."""
 
-    objects: wp.array2d[wp.vec4]  # ``virtual``, which C++ keeps for itself: premultiplied linear radiance and coverage
+    objects: wp.array2d[wp.vec4]  # premultiplied linear radiance and coverage; ``virtual`` is a keyword of C++
     added: wp.array2d[wp.vec3]  # linear radiance
     ratio: wp.array2d[wp.vec3]  # factor on the frame's linear radiance
     mirror_ball: wp.array2d[wp.vec3]  # change of linear radiance
@@ -44,9 +43,9 @@ class LayersAt:
 
 @wp.func
 def read_layers(params: wp.array[FrameParams], layers: Layers, row: wp.int32, col: wp.int32) -> LayersAt:
-    """Return the layers at a pixel; one that is not there, or does not reach it, is 0, or a ratio of 1.
+    """Return the layers at a pixel; an empty layer, or one whose rectangle does not hold the pixel, is 0 (a ratio 1).
 
-    All are read before any is looked at: one after another would be as many times the memory's latency.
+    All are read before any value is used, so that their memory latencies overlap.
     """
     at = LayersAt()
     at.ratio = wp.vec3(1.0, 1.0, 1.0)
@@ -63,7 +62,7 @@ def read_layers(params: wp.array[FrameParams], layers: Layers, row: wp.int32, co
 
 @wp.func
 def is_changed(at: LayersAt) -> wp.bool:
-    """Return whether layers touch a pixel; NaN does."""
+    """Return whether layers change a pixel; NaN counts as a change."""
     neutral = at.objects == wp.vec4(0.0, 0.0, 0.0, 0.0) and at.added == wp.vec3(0.0, 0.0, 0.0)
     neutral = neutral and at.ratio == wp.vec3(1.0, 1.0, 1.0) and at.mirror_ball == wp.vec3(0.0, 0.0, 0.0)
     return not neutral
@@ -71,7 +70,7 @@ def is_changed(at: LayersAt) -> wp.bool:
 
 @wp.func
 def compose(radiance: wp.vec3, at: LayersAt) -> wp.vec3:
-    """Lay all layers over the frame's radiance; no more is taken from it than there is."""
+    """Compose all layers over the frame's radiance; changes do not take it below 0."""
     physical = wp.max(wp.cw_mul(radiance, at.ratio) + at.added + at.mirror_ball, wp.vec3(0.0, 0.0, 0.0))
     return (1.0 - at.objects[3]) * physical + wp.vec3(at.objects[0], at.objects[1], at.objects[2])
 
@@ -108,11 +107,11 @@ def make_layers(
     shadow_ratio: wp.array | None = None,
     mirror_ball: wp.array | None = None,
 ) -> Layers:
-    """Return layers as kernels read them; None leaves one empty.
+    """Return ``Layers`` of these arrays; None leaves a layer empty.
 
     Args:
         virtual: (H, W) vec4, premultiplied radiance of virtual objects and their coverage.
-        added_light: (H, W) vec3, radiance that virtual lights add to what is physical.
+        added_light: (H, W) vec3, radiance that virtual lights add to physical surfaces.
         shadow_ratio: (H, W) vec3, factor on the frame's radiance.
         mirror_ball: (H, W) vec3, change of the frame's radiance in the mirror balls.
     """
@@ -128,6 +127,6 @@ Args:
     decode_table: (257,) vec3 of ``color.camera_table``, or (256,) of ``color.decode_table``.
     encode_table: Table of ``color.encode_table``.
     layers: From ``make_layers``.
-    image_out: (H, W) vec3ub, contiguous; values above clipping give the code where the camera saturates or the
-        frame's, whichever is more; NaN gives 0.
+    image_out: (H, W) vec3ub, contiguous; values above clipping give the code at which the camera saturates or the
+        frame's code, whichever is higher; NaN gives 0.
 """

@@ -1,36 +1,36 @@
 """Radiance of clipped pixels: the frame's linear radiance with an estimate wherever a channel clips.
 
-A camera's clipped channel says only "at least 1". Three objects say more, each where it can:
+A clipped channel gives only a lower bound, 1. Three sources give an estimate:
 
-**Hue.** Where some channels clip and others do not, the brightness is known from those that do not, and the missing
-channel follows from the hue c of what is around: with u the channels that did not clip,
+**Hue.** Where some channels are clipped and others are not, the unclipped channels u give the brightness, and the hue c
+of the surroundings gives the clipped channels:
 
     k = sum_u L_u / sum_u c_u,   L_clipped = max(1, k c_clipped).
 
-Hue is carried in from neighbours that do not clip but are bright, for what is dark is lit otherwise: weight ((m -
-1/4) / (3/4))^2 for a largest channel m above 1/4. A second time around, the pixels so completed carry their hue into
-those where all channels clip (the core); there the darkest channel is at least 1, so the others are at least c / min
-c: the edge of a yellow emitter is red at more than 1 long before its blue clips.
+The hue is interpolated from unclipped bright neighbours, with the weight ((m - 1/4) / (3/4))^2 for a largest channel m
+above 1/4: dark neighbours may be lit by other light. In a second pass the completed pixels give their hue to the core,
+the pixels in which all channels are clipped. The darkest channel of the core is at least 1, so the others are at least
+c / min c: red at the edge of a yellow emitter exceeds 1 long before blue clips.
 
-**Depth.** Inward, radiance goes on growing from that edge value e toward a value a, less and less: with q, a smooth
-log2 of the distance to the nearest known pixel (1 at the edge),
+**Depth.** Radiance grows inward from that edge value e toward a value a, ever more slowly. With q, a smooth log2 of the
+distance to the nearest known pixel (1 at the edge),
 
     L = e (a / e)^(1 - 2^(-q / 2)).
 
-Without other knowledge a is one stop above e: near the median of clipped pixels in panoramas seen in perspective and
+Without the ball, a is one stop above e. That is near the median of clipped pixels in panoramas seen in perspective and
 in a mirror ball (a third to half a stop at the edge, 0.4 to 1 beyond two pixels).
 
-**The ball.** Its recovered light (``recover``) knows how much energy clipping took: that is a. A core pixel on the
-ball shows the direction that it mirrors. One on a modelled surface is not an emitter: hue and depth serve. Any other
-looks at something beyond the scene, at an unknown distance: the ball at p sees a point at distance t along the
-pixel's ray o + t d in the direction d + (o - p) / t, so from 1 / t = 0 up the first run of light that clips in the
-ball as well is what the camera sees; its brightest texel counts. Emitters have sharper edges than glow on surfaces:
-there a is approached as 1 - 2^-q. (At once would be too soon: a region's recovered energy is spread evenly over it.)
+**The ball.** The light recovered from the ball (``recover``) gives a. A core pixel that shows the ball takes the light
+from its mirror direction. A core pixel that shows a modelled surface is not an emitter: hue and depth are used. Any
+other shows a point beyond the scene, at an unknown distance t along the pixel's ray o + t d. The ball at p sees this
+point in the direction d + (o - p) / t. With 1 / t growing from 0, the first connected run of directions whose light
+also clips in the ball is taken for the point, and its brightest texel gives a. Emitters have sharper edges than glow on
+surfaces, so there the exponent is 1 - 2^-q. (It is not 1 everywhere, because the recovered energy of a region is spread
+evenly over it.)
 
-**Filling.** Pull and push over a pyramid: a level's sums of weighted values are its children's; downward, what a
-texel does not know to a full weight it takes from the coarser level, bilinearly [GGSC96]. The number of levels
-climbed on the way, a smooth log2 of the distance, comes along. Only tiles in which something clips, and their
-neighbours, take part.
+**Filling.** Push-pull over a pyramid [GGSC96]. Upward, a texel sums the weighted values of its children. Downward, a
+texel of less than full weight is completed from the coarser level, bilinearly. The number of levels climbed, a smooth
+log2 of the distance, is filled along with the hue. Only tiles with clipped pixels, and their neighbours, take part.
 
 References:
     [GGSC96] Gortler, Grzeszczuk, Szeliski, Cohen, "The Lumigraph", SIGGRAPH 1996, section 3.4 (pull-push).
@@ -56,18 +56,18 @@ wp.set_module_options({"enable_backward": False})
 KNEE = wp.constant(wp.float32(250.0))
 """Code above which a channel begins to count as clipped: noise and video codecs scatter around clipping."""
 CLIPPED = wp.constant(wp.float32(254.0))
-"""Code from which it is."""
+"""Code from which a channel counts as fully clipped."""
 TILE_LEVEL = 4
-"""A tile is 2^4 = 16 pixels wide."""
+"""Level of the pyramid whose texels are tiles, 2^4 = 16 pixels wide."""
 _TILE_LEVEL = wp.constant(TILE_LEVEL)
 DARKEST = wp.constant(wp.float32(0.25))
-"""Largest channel below which a pixel's hue says nothing of clipped neighbours: two stops below clipping."""
+"""Value of the largest channel below which a pixel's hue has no weight: two stops below clipping."""
 LEAST_HUE = wp.constant(wp.float32(1.0 / 64.0))
-"""Smallest share of a channel in a hue; bounds what one channel says of another."""
+"""Smallest channel of a hue; bounds the estimate of one channel from another."""
 BRIGHTEST = wp.constant(wp.float32(1.0e4))
 """Upper bound of every estimate."""
 NEAREST = wp.constant(wp.float32(2.0))
-"""Largest parallax: the nearest point is at half the distance between camera and ball."""
+"""Largest distance between camera and ball over t: the nearest point lies at half that distance."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,14 +75,14 @@ class DeclipConfig:
     """Compile-time configuration of the last kernel."""
 
     ball: bool = False
-    """True if the light recovered from the ball is looked up."""
+    """True if the light recovered from the ball is used."""
     proxies: tuple[int, ...] = ()
     """Kinds of proxy in the scene."""
 
 
 @wp.func
 def clipping(code: wp.vec3ub) -> wp.vec3:
-    """Degree to which each channel counts as clipped, 0..1: 1 from ``CLIPPED`` up."""
+    """Return the degree to which each channel counts as clipped, 0..1: 1 from ``CLIPPED`` up."""
     clipped = wp.vec3()
     for channel in range(3):
         clipped[channel] = wp.clamp((wp.float32(code[channel]) - KNEE) / (CLIPPED - KNEE), 0.0, 1.0)
@@ -91,20 +91,20 @@ def clipping(code: wp.vec3ub) -> wp.vec3:
 
 @wp.func
 def half(extent: wp.int32) -> wp.int32:
-    """Rows or columns of the first level."""
+    """Return the rows or columns of the first level, for those of the frame."""
     return (extent + 1) / 2
 
 
 @wp.func
 def hue_weight(radiance: wp.vec3) -> wp.float32:
-    """Weight of an unclipped pixel for its clipped neighbours."""
+    """Return the weight of an unclipped pixel's hue."""
     w = wp.clamp((wp.max(radiance) - DARKEST) / (1.0 - DARKEST), 0.0, 1.0)
     return w * w
 
 
 @wp.func
 def weighted_hue(radiance: wp.vec3) -> wp.vec4:
-    """Hue (mean 1) times weight, and the weight."""
+    """Return the hue (of mean 1) times its weight, and the weight."""
     w = hue_weight(radiance)
     if w == 0.0:
         return wp.vec4()
@@ -120,7 +120,7 @@ def mark_tiles_kernel(
     # Out:
     marked_out: wp.array2d[wp.int32],
 ):
-    """1 where a tile has a clipped channel."""
+    """Write 1 for tiles with a clipped channel, else 0."""
     i, j = wp.tid()
     i += row_start
     found = wp.int32(0)
@@ -139,7 +139,7 @@ def widen_tiles_kernel(
     # Out:
     active_out: wp.array2d[wp.int32],
 ):
-    """1 where a tile or one of its eight neighbours is marked."""
+    """Write 1 for tiles that are marked or have a marked neighbour among eight, else 0."""
     i, j = wp.tid()
     found = wp.int32(0)
     for r in range(wp.max(i - 1, 0), wp.min(i + 2, marked.shape[0])):
@@ -159,7 +159,10 @@ def pull_frame_kernel(
     # Out:
     levels_out: wp.array[wp.vec4],
 ):
-    """First level: hues of pixels that clip in no channel; of a ``completed`` frame, that do not clip in all."""
+    """Write the first level: weighted hues of pixels without a clipped channel.
+
+    If there is a ``completed`` frame, pixels with at least one unclipped channel count as well.
+    """
     i, j = wp.tid()
     i += row_start
     total = wp.vec4()
@@ -188,7 +191,7 @@ def pull_level_kernel(
     # Out (and in: the finer level):
     levels_out: wp.array[wp.vec4],
 ):
-    """Sums of the finer level's texels."""
+    """Sum the texels of the finer level."""
     i, j = wp.tid()
     if to_tile >= 0 and active[i >> to_tile, j >> to_tile] == 0:
         levels_out[offset + i * columns + j] = wp.vec4()
@@ -204,7 +207,7 @@ def pull_level_kernel(
 def sample_coarser(
     levels: wp.array[wp.vec4], offset: wp.int32, rows: wp.int32, columns: wp.int32, i: wp.int32, j: wp.int32
 ) -> wp.vec4:
-    """Filled value of a level, bilinear, at texel (i, j) of the level below it; constant beyond the border."""
+    """Return the filled value of a level, bilinear, at texel (i, j) of the next finer level; clamped at the border."""
     y = wp.clamp(0.5 * wp.float32(i) - 0.25, 0.0, wp.float32(rows - 1))
     x = wp.clamp(0.5 * wp.float32(j) - 0.25, 0.0, wp.float32(columns - 1))
     r = wp.int32(y)
@@ -231,7 +234,7 @@ def push_level_kernel(
     # Out (and in: the coarser level, and the sums that are replaced):
     levels_out: wp.array[wp.vec4],
 ):
-    """From sums to values: hue, and levels climbed; the last level (no coarser rows) is completed by grey."""
+    """Turn sums into values: hue, and levels climbed. The coarsest level (no coarser rows) is completed by grey."""
     i, j = wp.tid()
     if to_tile >= 0 and active[i >> to_tile, j >> to_tile] == 0:
         return
@@ -242,7 +245,7 @@ def push_level_kernel(
         above = sample_coarser(levels_out, coarse_offset, coarse_rows, coarse_columns, i, j)
     known = wp.min(sums[3], 1.0)
     unknown = 1.0 - known
-    # known / weight: 1 up to a weight of 1, so a weight of 0 is no division.
+    # Sums of a weight up to 1 stay as they are, so there is no division by a weight of 0.
     share = wp.where(sums[3] > 1.0, 1.0 / wp.max(sums[3], 1.0), 1.0)
     levels_out[at] = wp.vec4(
         share * sums[0] + unknown * above[0],
@@ -254,7 +257,7 @@ def push_level_kernel(
 
 @wp.func
 def hue_of(filled: wp.vec4) -> wp.vec3:
-    """Hue with no channel near 0."""
+    """Return a hue whose channels are at least ``LEAST_HUE``."""
     return wp.vec3(wp.max(filled[0], LEAST_HUE), wp.max(filled[1], LEAST_HUE), wp.max(filled[2], LEAST_HUE))
 
 
@@ -269,7 +272,7 @@ def complete_kernel(
     # Out:
     declipped_out: wp.array2d[wp.vec3],
 ):
-    """Linear radiance where tiles are active; missing channels by the neighbours' hue."""
+    """Write the linear radiance; in active tiles, estimate clipped channels by the neighbours' hue."""
     i, j = wp.tid()
     i += row_start
     if active[i >> _TILE_LEVEL, j >> _TILE_LEVEL] == 0:
@@ -291,7 +294,7 @@ def complete_kernel(
 
 @functools.cache
 def make_seen_by_ball(config: DeclipConfig) -> wp.Function:
-    """``seen_by_ball(environment, probes, params, scene, ray) -> vec3``: by the recovered light; 0 for none."""
+    """``seen_by_ball(environment, probes, params, scene, ray) -> vec3``: recovered light along a ray, 0 for none."""
     trace = make_trace(TraceConfig(objects=(), proxies=config.proxies))
 
     @wp.func(module="unique")
@@ -316,11 +319,11 @@ def make_seen_by_ball(config: DeclipConfig) -> wp.Function:
             return wp.cw_mul(probes[ball].reflectance, sample_latlong(environment, wi))
         found = wp.vec3()
         best = float(1.0)
-        steps = environment.shape[0] / 2  # even in parallax: neighbours are less than two texels apart
+        steps = environment.shape[0] / 2  # uniform in 1 / t: neighbours are less than two texels apart
         for step in range(steps):
             share = NEAREST * wp.float32(step) / wp.float32(steps)
             radiance = sample_latlong(environment, direction + share * wp.normalize(origin - probes[0].center))
-            # At clipping in the ball's image: 1 / reflectance, in every channel.
+            # Light clips in the ball's image from 1 / reflectance on, in every channel.
             if wp.min(wp.cw_mul(probes[0].reflectance, radiance)) >= 1.0:
                 if wp.max(radiance) > best:
                     best = wp.max(radiance)
@@ -378,7 +381,7 @@ def make_complete_core_kernel(config: DeclipConfig) -> wp.Kernel:
 
 @functools.cache
 def level_shapes(height: int, width: int) -> tuple[tuple[int, int], ...]:
-    """(rows, columns) of the levels, from half the frame's size down to one texel."""
+    """Return (rows, columns) of all levels, from half the frame's size to one texel."""
     shapes = [(-(-height // 2), -(-width // 2))]
     while max(shapes[-1]) > 1:
         rows, columns = shapes[-1]
@@ -387,12 +390,12 @@ def level_shapes(height: int, width: int) -> tuple[tuple[int, int], ...]:
 
 
 def level_texels(height: int, width: int) -> int:
-    """Texels of all levels together."""
+    """Return the number of texels of all levels."""
     return sum(map(math.prod, level_shapes(height, width)))
 
 
 def tile_shape(height: int, width: int) -> tuple[int, int]:
-    """Rows and columns of tiles."""
+    """Return the rows and columns of tiles."""
     side = 1 << TILE_LEVEL
     return -(-height // side), -(-width // side)
 
@@ -407,24 +410,25 @@ def widen_tiles(marked: wp.array, active_out: wp.array) -> None:
 
 
 pull_frame = row_launcher(pull_frame_kernel, like=lambda active, frame, *_: level_shapes(*frame.shape)[0])
-"""Write the first level: weighted hues of the pixels that do not clip.
+"""Write the first level: weighted hues of unclipped pixels.
 
 Args:
-    active: Tiles of ``widen_tiles``; the others give and get nothing.
+    active: Tiles from ``widen_tiles``; others are left out.
     frame: (H, W) vec3ub, RGB.
     decode_table: (256,) vec3 of ``color.decode_table``.
-    completed: (H, W) vec3 of ``complete``, whose pixels that do not clip in all channels count; None: the frame's.
+    completed: (H, W) vec3 from ``complete``; if given, its pixels with at least one unclipped channel count. If None,
+        pixels of the frame without a clipped channel count.
     levels_out: (``level_texels(H, W)``,) vec4: sums of weighted hue, and of weights.
 """
 
 
 def fill_levels(active: wp.array, shape: tuple[int, int], levels_out: wp.array) -> None:
-    """Pull sums up from the first level, and push values down to it.
+    """Sum the first level up to the coarsest, and fill values down to the first.
 
     Args:
-        active: Tiles of ``widen_tiles``.
+        active: Tiles from ``widen_tiles``.
         shape: Height and width of the frame.
-        levels_out: First level: sums of weighted hue, and of weights. Becomes values: hue, and levels climbed.
+        levels_out: In: sums of weighted hue and of weights in the first level. Out: hue, and levels climbed, in all.
     """
     shapes = level_shapes(*shape)
     offsets = [sum(map(math.prod, shapes[:level])) for level in range(len(shapes))]
@@ -441,27 +445,27 @@ def fill_levels(active: wp.array, shape: tuple[int, int], levels_out: wp.array) 
 
 
 complete = row_launcher(complete_kernel)
-"""Write the frame's linear radiance, channels that clip beside others that do not completed by the filled hue.
+"""Write the frame's linear radiance, and estimate clipped channels of pixels with unclipped ones by the filled hue.
 
 Args:
-    active: Tiles of ``widen_tiles``; pixels of others stay as they are.
+    active: Tiles from ``widen_tiles``; other tiles are only decoded.
     frame: (H, W) vec3ub, RGB.
     decode_table: (256,) vec3 of ``color.decode_table``.
-    levels: Filled levels of ``pull_frame`` and ``fill_levels``.
+    levels: Filled levels from ``pull_frame`` and ``fill_levels``.
     declipped_out: (H, W) vec3.
 """
 
 
 complete_core = row_launcher(make_complete_core_kernel)
-"""Write the estimate of pixels that clip in all channels.
+"""Write the estimate of pixels in which all channels are clipped.
 
 Args:
-    config: Whether the ball's light is used, and which kinds of proxy there are.
-    picture: The frame's codes, (H, W), and where its pixels look.
-    levels: Filled levels of ``pull_frame`` of what was completed, and ``fill_levels``.
+    config: Use of the ball's light, and kinds of proxy.
+    picture: (H, W) codes and rays of the frame.
+    levels: Filled levels from ``pull_frame`` of the completed frame, and ``fill_levels``.
     params: (1,) FrameParams; the camera's pose.
     scene: Proxies.
     probes: Balls; ``environment`` is the light at the first.
-    environment: (rows, columns) vec3, with clipped energy put back; None without ``config.ball``.
-    declipped_out: (H, W) vec3; other pixels stay.
+    environment: (rows, columns) vec3, with recovered light; None without ``config.ball``.
+    declipped_out: (H, W) vec3; other pixels are left unchanged.
 """

@@ -1,8 +1,8 @@
-"""Another exposure of the picture: shorter, as if light had been added and the camera had answered; or longer.
+"""Change of the picture's exposure: shorter, as a camera reacts to added light, or longer.
 
-A shorter exposure scales linear light by s < 1. Where the camera clipped, the frame does not say how bright the scene
-was, and scaling the clipped value gives flat grey patches. A pixel counts as clipped when all its channels are: one
-that still has a hue is not far above clipping, and lifting it would leave a bright island in a surface that fades.
+A shorter exposure scales linear light by s < 1. The radiance of clipped pixels is unknown, and scaling their clipped
+value gives flat grey patches. A pixel counts as clipped if all its channels are. A pixel with an unclipped channel is
+not far above clipping; brightening it would leave a bright island in a surface that fades.
 
 Methods:
 ``plain``: scaling alone; a clipped pixel is taken to be just clipped.
@@ -15,39 +15,38 @@ The box grows linearly from 1 pixel at s = 1 to ``max_box`` at s = 0:
 
     size = 1 + (1 - s) (max_box - 1).
 
-The paper gives no formula for the factor, nor the largest box. Taken is: w rises linearly from 0 where the box is half
-bright, as it is at the straight edge of a large region, to 1 where all of it is saturated; the factor goes from s to 1
-with w,
+The paper gives neither a formula for the factor nor the largest box. Here w rises linearly from 0, where half of the
+box is bright (at the straight edge of a large region), to 1, where the whole box is saturated. The factor goes from s
+to 1 with w:
 
     w = clamp(2 a - 1, 0, 1),   factor = s + (1 - s) w.
 
-So s = 1 is the identity, a region smaller than half the box fades like the rest, and where s is less than
-``LEAST_SCALE`` the factor falls to 0 with it. With w = a, the other simple
-reading (``paper_mean``), an edge would stay half bright and nothing would be decimated. It enters gradually from code
-``KNEE`` up, so noise around clipping does not show, and the light is guessed before virtual light is added to it: that
-is known and needs no guess. docs/paper.md compares the readings.
+So s = 1 is the identity, a region smaller than half the box fades like the rest, and below ``LEAST_SCALE`` the factor
+falls to 0 with s. With w = a, the other simple reading (``paper_mean``), an edge would stay half bright and no region
+would be decimated. The factor sets in gradually from code ``KNEE`` up, so that noise around clipping does not show. It
+scales the frame's light before virtual light, which is known, is added. docs/paper.md compares the readings.
 
-A longer exposure, s > 1, is scaled and clipped: what a camera does.
+A longer exposure, s > 1, is scaled and clipped, as in a camera.
 
-``declipped``: each clipped pixel has the radiance that ``declip`` estimates for it, at least what the camera
-shows; s = 1 is the identity.
+``declipped``: each clipped pixel has the radiance that ``declip`` estimates for it, at least the clipped value; s = 1
+is the identity.
 
-Frames of more than 8 bits: means of boxes have what 8 bits cut off (``summed_area.write_cut``). Linear light that clips
-above 1, if anywhere, needs no guess: a pixel of code 255 is what the linear picture says.
+Frames of more than 8 bits: means of boxes include the remainder that 8 bits cut off (``summed_area.write_cut``). A
+linear frame that stores values above 1 needs no estimate: its clipped pixels have their linear radiance.
 
-What is drawn ends where the camera's channels saturate, as all that it sees does: a highlight is no brighter than a
-lamp in the frame.
+Output values end at the codes at which the camera's channels saturate, so that a highlight is no brighter than a lamp
+in the frame.
 
-Pixels that no layer and no guess touches go through a table of 256 codes, made anew for every s.
+Pixels without layers and without an estimate are mapped by a table of 256 codes, computed for each s.
 
-``auto`` keeps highlights of virtual light on the receiver below clipping. Over a grid of pixels that virtual light
-falls on, and whose own code is not clipped (those cannot be helped), the level P is found that all but
-``CLIPPED_SHARE`` of them stay below; the scale aims at
+``auto`` keeps highlights of virtual light on the receiver below clipping. It samples a grid of pixels that virtual
+light reaches and whose own code is not clipped, and finds the level P that all but ``CLIPPED_SHARE`` of them stay
+below. The scale has the target
 
     s* = min(1, max(1 / P, MIN_AUTO_SCALE)),
 
-and follows it over ``AUTO_SECONDS`` (1 - e^(-dt / tau)), the first frame at once. Levels are counted in bins of an
-eighth of a stop, in integers, so their sum does not depend on an order.
+and approaches it exponentially with the time constant ``AUTO_SECONDS``; in the first frame it is set at once. Levels
+are counted in bins of an eighth of a stop, as integers, so their sum does not depend on the order.
 
 References:
     [DH04] DiVerdi, Hoellerer, "Combining Dynamic Physical and Virtual Illumination in Augmented Reality", 2004.
@@ -70,23 +69,23 @@ wp.set_module_options({"enable_backward": False})
 METHODS = ("plain", "paper", "declipped")
 """Cheapest first."""
 BOXES = ("paper", "paper_mean")
-"""Methods that look at a box around clipped pixels, and a reading of the paper that docs/paper.md compares."""
+"""Methods that average a box around clipped pixels: the paper's, and a reading that docs/paper.md compares."""
 
 MAX_BOX = 1.0 / 8.0
 """Side of the largest box in frame heights."""
 LEAST_SCALE = wp.constant(wp.float32(1.0e-3))
-"""Scale below which the paper's factor falls to 0 too: without light there is no picture."""
+"""Scale below which the paper's factor falls to 0 as well: at s = 0 the picture is black."""
 KNEE = wp.constant(wp.float32(250.0))
 """Code from which a pixel's darkest channel begins to count as clipped."""
 
 CLIPPED_SHARE = wp.constant(wp.float32(0.005))
 """Share of the pixels under virtual light that ``auto`` allows to clip."""
 MIN_AUTO_SCALE = wp.constant(wp.float32(1.0 / 16.0))
-"""Darkest that ``auto`` goes."""
+"""Smallest scale that ``auto`` sets."""
 AUTO_SECONDS = wp.constant(wp.float32(0.3))
-"""Time constant of ``auto``."""
+"""Time constant of ``auto``, seconds."""
 AUTO_STRIDE = 4
-"""``auto`` looks at every fourth pixel of every fourth row."""
+"""Distance of the pixels that ``auto`` samples, in rows and columns."""
 LEVELS = 64
 """Bins of ``auto``: bin 0 lies below clipping, bin k from (k - 1) / 8 to k / 8 stops above it, the last one is open."""
 
@@ -96,29 +95,30 @@ _AUTO_STRIDE = wp.constant(AUTO_STRIDE)
 
 @wp.struct
 class ClippedEvidence:
-    """Evidence of the radiance of pixels that clip; what a method does not read may be empty."""
+    """Data from which the radiance of clipped pixels is estimated; arrays that a method does not read may be empty."""
 
-    summed_area: wp.array2d[wp.uint32]  # (H, W) the frame's summed-area table, for methods that look at boxes
-    cut_table: wp.array2d[wp.uint32]  # that of what 8 bits cut off; empty for frames of 8 bits
-    max_box: wp.int32  # pixels: side of the largest box
+    summed_area: wp.array2d[wp.uint32]  # (H, W) the frame's summed-area table, for methods that average boxes
+    cut_table: wp.array2d[wp.uint32]  # (H, W) table of the remainder that 8 bits cut off; empty for frames of 8 bits
+    max_box: wp.int32  # side of the largest box, pixels
     levels: wp.array[wp.vec3]  # (2,) radiance from which channels of a linear frame clip; empty for frames of 8 bits
     declipped: wp.array2d[wp.vec3]  # (H, W) linear radiance with clipped pixels estimated, for ``declipped``
 
 
 @wp.struct
 class Exposure:
-    """A scale, and what it makes of codes."""
+    """An exposure scale, and the codes that it maps codes to."""
 
-    encode_table: wp.array[wp.vec3]  # of ``color.encode_table``
+    encode_table: wp.array[wp.vec3]  # from ``color.encode_table``
     scale: wp.array[wp.float32]  # (1,), not negative
-    codes: wp.array[wp.vec3ub]  # (256,) of ``expose_codes`` for this scale
+    codes: wp.array[wp.vec3ub]  # (256,) from ``expose_codes`` for this scale
 
 
 @wp.func
 def surrounding_mean(clipped: ClippedEvidence, row: wp.int32, col: wp.int32, scale: wp.float32) -> wp.float32:
-    """Mean intensity, 0..255, of the box that a scale in 0..1 calls for.
+    """Return the mean intensity, 0..255, of the box around a pixel for a scale in 0..1.
 
-    A size between two odd numbers takes both their boxes, weighted: centred, and continuous as the scale changes.
+    For a size between two odd numbers the means of both boxes are interpolated, so that the result is centred and
+    changes continuously with the scale.
     """
     reach = 0.5 * (1.0 - scale) * wp.float32(clipped.max_box - 1)
     inner = wp.int32(reach)
@@ -129,20 +129,20 @@ def surrounding_mean(clipped: ClippedEvidence, row: wp.int32, col: wp.int32, sca
 
 @wp.func
 def is_light(clipped: ClippedEvidence) -> wp.bool:
-    """Return whether the frame is linear light that says by itself how bright what is above 1 is."""
+    """Return whether the frame is linear and stores radiance above 1."""
     return clipped.levels.shape[0] > 0 and clipped.levels[0][0] > 1.0
 
 
 @wp.func
 def paper_gain(mean: wp.float32, scale: wp.float32) -> wp.float32:
-    """Factor / s of [DH04] section 4.3 for a box mean in 0..255 and a scale in 0..1."""
+    """Return factor / s of [DH04] section 4.3 for a box mean in 0..255 and a scale in 0..1."""
     w = wp.clamp(2.0 / 255.0 * mean - 1.0, 0.0, 1.0)
     return 1.0 + (1.0 / wp.max(scale, LEAST_SCALE) - 1.0) * w
 
 
 @wp.func
 def paper_mean_gain(mean: wp.float32, scale: wp.float32) -> wp.float32:
-    """The same for the reading w = a."""
+    """Return factor / s for the reading w = a, with arguments as for ``paper_gain``."""
     return 1.0 + (1.0 / wp.max(scale, LEAST_SCALE) - 1.0) * (mean / 255.0)
 
 
@@ -155,7 +155,7 @@ def expose_codes_kernel(
     # Out:
     codes_out: wp.array[wp.vec3ub],
 ):
-    """Code of every code after scaling."""
+    """Write the code of every code after scaling."""
     i = wp.tid()
     codes_out[i] = encode(encode_table, scale[0] * decode_table[i])
 
@@ -167,13 +167,13 @@ def read_scale_kernel(
     # Out:
     scale_out: wp.array[wp.float32],
 ):
-    """The fixed scale; NaN and negative ones are 0."""
+    """Write the fixed scale; NaN and negative scales become 0."""
     scale_out[0] = wp.where(params[0].exposure_scale > 0.0, params[0].exposure_scale, 0.0)
 
 
 @wp.func
 def level_of(peak: wp.float32) -> wp.int32:
-    """Bin of the largest channel of a radiance."""
+    """Return the bin of a radiance, by its largest channel ``peak``."""
     if not peak > 1.0:
         return 0
     return wp.min(wp.int32(wp.log2(wp.min(peak, 1.0e6)) * 8.0) + 1, _LEVELS - 1)
@@ -189,7 +189,7 @@ def count_levels_kernel(
     # Out:
     levels_out: wp.array2d[wp.int32],
 ):
-    """Count, in one sampled row, how many pixels under virtual light fall into each level."""
+    """Count the pixels under virtual light in each level, for one sampled row."""
     strip = row_start + wp.tid()
     for level in range(_LEVELS):
         levels_out[strip, level] = 0
@@ -215,7 +215,7 @@ def adapt_scale_kernel(
     # Out:
     scale_out: wp.array[wp.float32],
 ):
-    """Move the scale toward its aim; a scale of 0 has never been set."""
+    """Move the scale toward its target; a scale of 0 was never set."""
     total = int(0)
     for strip in range(levels.shape[0]):
         for level in range(_LEVELS):
@@ -238,9 +238,9 @@ def adapt_scale_kernel(
 
 @functools.cache
 def make_find_gain(method: str) -> wp.Function:
-    """``find_gain(code, i, j, clipped, s) -> float``: a clipped pixel's guessed radiance over what it shows.
+    """``find_gain(code, i, j, clipped, s) -> float``: estimated radiance of a clipped pixel over its clipped value.
 
-    It is 1 for pixels that do not clip, and on methods that look at no box.
+    It is 1 for unclipped pixels, and for methods that use no box.
     """
     box_gain = paper_mean_gain if method == "paper_mean" else paper_gain
 
@@ -315,7 +315,7 @@ def make_expose_kernel(method: str) -> wp.Kernel:
 
 
 def largest_box(height: int) -> int:
-    """``max_box`` for a frame of ``height`` rows."""
+    """Return ``max_box``, pixels, for a frame of ``height`` rows."""
     return max(1, round(MAX_BOX * height))
 
 
@@ -326,13 +326,13 @@ def make_clipped_evidence(
     cut_table: wp.array | None = None,
     levels: wp.array | None = None,
 ) -> ClippedEvidence:
-    """Return the evidence of the clipped pixels of a frame; None for what the method does not read.
+    """Return the ``ClippedEvidence`` of a frame; None leaves out an array that the method does not read.
 
     Args:
         height: Rows of the frame.
-        summed_area: (H, W) uint32, of ``summed_area.sum_area``.
+        summed_area: (H, W) uint32, from ``summed_area.sum_area``.
         declipped: (H, W) vec3, linear radiance with clipped pixels estimated.
-        cut_table: (H, W) uint32, the table of what 8 bits cut off; None for frames of 8 bits.
+        cut_table: (H, W) uint32, table of the remainder that 8 bits cut off; None for frames of 8 bits.
         levels: (2,) vec3, radiance from which channels of a linear frame clip; None for frames of 8 bits.
     """
     arrays = {"summed_area": summed_area, "declipped": declipped, "cut_table": cut_table, "levels": levels}
@@ -340,12 +340,12 @@ def make_clipped_evidence(
 
 
 def make_exposure(encode_table: wp.array, scale: wp.array, codes: wp.array) -> Exposure:
-    """The arrays of an exposure together.
+    """Return an ``Exposure`` of these arrays.
 
     Args:
-        encode_table: Of ``color.encode_table``.
+        encode_table: From ``color.encode_table``.
         scale: (1,) float32, not negative.
-        codes: (256,) vec3ub, as ``expose_codes`` writes for this scale.
+        codes: (256,) vec3ub, from ``expose_codes`` for this scale.
     """
     return filled(Exposure(), encode_table=encode_table, scale=scale, codes=codes)
 
@@ -356,33 +356,33 @@ def read_scale(params: wp.array, scale_out: wp.array) -> None:
 
 
 count_levels = row_launcher(count_levels_kernel, like=lambda *given: given[-1].shape[:1])
-"""Count how bright the receiver is under virtual light, for ``auto``.
+"""Count pixels under virtual light by their level, for ``auto``.
 
 Args:
     params: (1,) FrameParams.
-    picture: (H, W) the camera's; its rays are not read.
-    layers: From ``make_layers``, virtual light on the receiver among them.
+    picture: (H, W) the camera's frame; rays are not read.
+    layers: From ``make_layers``, including virtual light on the receiver.
     levels_out: (ceil(H / AUTO_STRIDE), LEVELS) int32, one row per sampled row of the frame.
 """
 
 
 def adapt_scale(params: wp.array, levels: wp.array, scale_out: wp.array) -> None:
-    """Move ``scale_out``, (1,) float32, toward what ``levels`` of ``count_levels`` call for; 0 means never set."""
+    """Move ``scale_out``, (1,) float32, toward its target by ``levels`` of ``count_levels``; 0 means never set."""
     launch(adapt_scale_kernel, 1, [params, levels], [scale_out], device=params.device)
 
 
 def expose_codes(decode_table: wp.array, encode_table: wp.array, scale: wp.array, codes_out: wp.array) -> None:
-    """Write the code of every code, (256,) vec3ub, after scaling by ``scale``, (1,) float32."""
+    """Write the table that maps each code to its code after scaling, (256,) vec3ub; ``scale`` is (1,) float32."""
     launch(expose_codes_kernel, 256, [decode_table, encode_table, scale], [codes_out], device=scale.device)
 
 
 expose = row_launcher(make_expose_kernel, runs=True)
-"""Write the picture at another exposure, layers composed.
+"""Compose the layers over the frame and write the picture at another exposure.
 
 Args:
     method: One of ``METHODS``, or of the readings in ``BOXES``.
     params: (1,) FrameParams; its rectangles bound the layers.
-    picture: (H, W) the camera's, contiguous; its rays are not read.
+    picture: (H, W) the camera's frame, contiguous; rays are not read.
     layers: From ``make_layers``.
     clipped: From ``make_clipped_evidence``.
     exposure: From ``make_exposure``.

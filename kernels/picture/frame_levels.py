@@ -1,17 +1,18 @@
-"""The camera's picture in coarser and coarser levels, and look-ups as wide as what a reflected ray stands for.
+"""Mip levels of the camera's frame, and look-ups filtered over the footprint of a reflected ray.
 
-A curved mirror shows many pixels of the frame in one of its own. Were each of its few rays to read one place, fine
-texture of the receiver would become moiré, and flicker as anything moves. So a ray carries how its origin and its
-direction change over the part of the pixel that it stands for [Ige99]. On a surface of normal n at distance t
+One pixel of a curved mirror shows many pixels of the frame. If each of its few rays read a single point, fine texture
+of the receiver would become moiré, and flicker in motion. So a ray carries its differentials: the change of its origin
+O and direction D over the part of the pixel that it stands for [Ige99]. On a surface of normal n at distance t its
+footprint along each of two axes is
 
     dP = dO + t dD + dt D,    dt = -(dO + t dD).n / D.n,
 
-is what it covers along each of two axes, and the camera's projection turns that into A and B in the frame. Of the
-ellipse A A' + B B' the frame is read at up to ``MOST_TAPS`` places along the longer axis, each as wide as the shorter
-one or as the part of the longer one that it stands for, from the two levels nearest to that width.
+which the camera projects to the vectors A and B in the frame. The ellipse of the matrix A A' + B B' is sampled at up to
+``MOST_TAPS`` points along its longer axis. Each sample is as wide as the shorter axis, or as its part of the longer
+axis if that is wider, and is interpolated between the two levels nearest to that width.
 
-Level l has a texel for each 2^l x 2^l pixels, rows and columns rounded up: the mean of those that there are. It holds
-the picture as mirrors show it, with the shadows and the light that are virtual.
+A texel of level l is the mean of 2^l x 2^l pixels, or of those that there are at the border. Levels hold the frame with
+virtual shadows and virtual light, as mirrors reflect it.
 
 References:
     [Ige99] Igehy 1999, Tracing Ray Differentials.
@@ -39,47 +40,47 @@ LEAST_COSINE = wp.constant(wp.float32(0.02))
 
 @wp.struct
 class ReceiverLayers:
-    """Changes of the picture of the receiver by virtual objects and lights; empty where nothing changes."""
+    """Changes of the receiver in the frame by virtual objects and lights; layers that the scene lacks are empty."""
 
     shadow_ratio: wp.array2d[wp.vec3]  # factor on the frame
     added: wp.array2d[wp.vec3]  # radiance of virtual light
-    levels: wp.array[wp.vec3]  # of ``shrink_frame``; empty where nothing mirrors
+    levels: wp.array[wp.vec3]  # from ``shrink_frame`` and ``shrink_level``; empty without mirrors
 
 
 @wp.struct
 class Footprint:
-    """Change of a ray over the part of a pixel that it stands for, along two axes."""
+    """Ray differentials: change of a ray over the part of a pixel that it stands for, along two axes."""
 
-    origin_x: wp.vec3  # metres
+    origin_x: wp.vec3  # change of the origin, metres
     origin_y: wp.vec3
-    turn_x: wp.vec3  # of its unit direction
+    turn_x: wp.vec3  # change of the unit direction
     turn_y: wp.vec3
 
 
 def level_size(height: int, width: int, level: int) -> tuple[int, int]:
-    """Rows and columns of a level."""
+    """Return the rows and columns of a level."""
     return -(-height >> level), -(-width >> level)
 
 
 def level_offset(height: int, width: int, level: int) -> int:
-    """Index of a level's first texel; level 0 is the frame itself."""
+    """Return the index of a level's first texel; level 0 is the frame itself."""
     return sum(rows * columns for rows, columns in (level_size(height, width, one) for one in range(1, level)))
 
 
 def level_texels(height: int, width: int) -> int:
-    """Texels of all levels together."""
+    """Return the number of texels of all levels."""
     return level_offset(height, width, LAST_LEVEL + 1)
 
 
 @wp.func
 def rows_of(extent: wp.int32, level: wp.int32) -> wp.int32:
-    """Rows or columns of a level, of a frame of so many."""
+    """Return the rows or columns of a level, for those of the frame."""
     return (extent + (1 << level) - 1) >> level
 
 
 @wp.func
 def start_of(height: wp.int32, width: wp.int32, level: wp.int32) -> wp.int32:
-    """Index of a level's first texel."""
+    """Return the index of a level's first texel, in kernels."""
     start = wp.int32(0)
     for below in range(1, level):
         start += rows_of(height, below) * rows_of(width, below)
@@ -90,7 +91,7 @@ def start_of(height: wp.int32, width: wp.int32, level: wp.int32) -> wp.int32:
 def composed_radiance(
     params: FrameParams, picture: Picture, layers: ReceiverLayers, i: wp.int32, j: wp.int32
 ) -> wp.vec3:
-    """A pixel with the shadows and the light that are virtual."""
+    """Return a pixel's radiance with virtual shadows and virtual light."""
     radiance = shown_radiance(picture, i, j)
     if layers.shadow_ratio.shape[0] > 0:
         radiance = wp.cw_mul(radiance, layers.shadow_ratio[i, j])
@@ -110,7 +111,7 @@ def shrink_frame_kernel(
     # Out:
     levels_out: wp.array[wp.vec3],
 ):
-    """A texel of level 1."""
+    """Write a texel of level 1."""
     i, j = wp.tid()
     i += row_start
     height = picture.rays.shape[0]
@@ -126,7 +127,7 @@ def shrink_frame_kernel(
 
 @wp.func
 def pixels_of(extent: wp.int32, level: wp.int32, index: wp.int32) -> wp.float32:
-    """Pixels of the frame that a texel of a level covers along one axis; fewer at the far border."""
+    """Return the pixels that a texel of a level covers along one axis; fewer at the last row or column."""
     return wp.float32(wp.min((index + 1) << level, extent) - (index << level))
 
 
@@ -140,7 +141,7 @@ def shrink_level_kernel(
     # Out:
     levels_out: wp.array[wp.vec3],
 ):
-    """A texel of ``level`` from those of the level below that it covers."""
+    """Write a texel of ``level``, the mean of its texels of the next finer level."""
     i, j = wp.tid()
     i += row_start
     start = start_of(height, width, level - 1)
@@ -160,19 +161,19 @@ shrink_frame = row_launcher(shrink_frame_kernel, like=lambda params, picture, *_
 
 Args:
     params: (1,) FrameParams: light_rect, beyond which no virtual light is added.
-    picture: (H, W) the camera's.
-    layers: (H, W) what is virtual on the receiver.
+    picture: (H, W) the camera's frame.
+    layers: (H, W) virtual shadows and virtual light on the receiver.
     levels_out: (level_texels(H, W),) vec3, linear radiance in camera values.
 """
 
 
 shrink_level = row_launcher(shrink_level_kernel, like=lambda height, width, level, _: level_size(height, width, level))
-"""Write one of the levels 2 to ``LAST_LEVEL`` from the one below.
+"""Write one of the levels 2 to ``LAST_LEVEL`` from the next finer level.
 
 Args:
     height: Rows of the frame.
     width: Columns of the frame.
-    level: Which.
+    level: Number of the level.
     levels_out: As in ``shrink_frame``.
 """
 
@@ -181,7 +182,7 @@ Args:
 def sample_frame_level(
     params: FrameParams, picture: Picture, layers: ReceiverLayers, x: wp.float32, y: wp.float32, level: wp.int32
 ) -> wp.vec3:
-    """Bilinear sample of a level; x and y in pixels of the frame, places beyond the border are those at it."""
+    """Sample a level bilinearly at (x, y), pixels of the frame, clamped at the border."""
     height = picture.rays.shape[0]
     width = picture.rays.shape[1]
     rows = rows_of(height, level)
@@ -211,11 +212,11 @@ def sample_frame_level(
 def look_up_level(
     params: FrameParams, picture: Picture, layers: ReceiverLayers, at: wp.vec2, size: wp.float32
 ) -> wp.vec3:
-    """The picture around a place, as wide as ``size`` pixels, blended between two levels."""
+    """Sample the picture over a width of ``size`` pixels around a point, interpolated between two levels."""
     level = wp.clamp(wp.log2(wp.max(size, 1.0)), 0.0, wp.float32(LAST))
     below = wp.min(wp.int32(level), LAST - 1)
     fraction = level - wp.float32(below)
-    # A loop, so that there is one copy of what reads a level: a ray's own code is long enough.
+    # A loop over the two levels, so that the code that reads a level is there once.
     last = wp.where(fraction > 0.0, below + 1, below)
     radiance = wp.vec3(0.0)
     for one in range(below, last + 1):
@@ -226,7 +227,7 @@ def look_up_level(
 
 @wp.func
 def covered_on(origin: wp.vec3, turn: wp.vec3, t: wp.float32, direction: wp.vec3, normal: wp.vec3) -> wp.vec3:
-    """Return the part of a surface that a ray covers at t, along one axis, as derived above."""
+    """Return the footprint dP of a ray on a surface at t, along one axis, as derived above."""
     moved = origin + t * turn
     cosine = wp.dot(direction, normal)
     cosine = wp.where(cosine < 0.0, wp.min(cosine, -LEAST_COSINE), wp.max(cosine, LEAST_COSINE))
@@ -235,7 +236,7 @@ def covered_on(origin: wp.vec3, turn: wp.vec3, t: wp.float32, direction: wp.vec3
 
 @wp.func
 def shown_as(params: FrameParams, from_camera: wp.vec3, change: wp.vec3) -> wp.vec2:
-    """Pixels by which a point moves in the frame with ``change``; without the lens, whose part in it is small."""
+    """Return the shift, in pixels, of a point's projection by ``change``; lens distortion is ignored as small."""
     p = wp.transpose(params.world_from_camera) * from_camera
     d = wp.transpose(params.world_from_camera) * change
     z = wp.max(p[2], 1.0e-6)
@@ -248,17 +249,17 @@ def shown_as(params: FrameParams, from_camera: wp.vec3, change: wp.vec3) -> wp.v
 def look_up_covered(
     params: FrameParams, picture: Picture, layers: ReceiverLayers, at: wp.vec2, a: wp.vec2, b: wp.vec2
 ) -> wp.vec3:
-    """Mean of the picture over the parallelogram of sides ``a`` and ``b``, pixels, around a place in it."""
+    """Average the picture over the ellipse of the vectors ``a`` and ``b``, pixels, around the point ``at``."""
     xx = a[0] * a[0] + b[0] * b[0]
     yy = a[1] * a[1] + b[1] * b[1]
     xy = a[0] * a[1] + b[0] * b[1]
     middle = 0.5 * (xx + yy)
     apart = wp.sqrt(0.25 * (xx - yy) * (xx - yy) + xy * xy)
     longer = wp.sqrt(middle + apart)
-    # What is narrower than a pixel comes out as one place of width 1, which is read from level 0 alone.
+    # A footprint narrower than a pixel gives one sample of width 1, which reads level 0 alone.
     shorter = wp.max(wp.sqrt(wp.max(middle - apart, 0.0)), 1.0)
     taps = wp.clamp(wp.int32(wp.ceil(wp.min(longer / shorter, wp.float32(MOST_TAPS)))), 1, MOST_TAPS)
-    # Along the eigenvector of the larger eigenvalue; of two forms the one that does not cancel.
+    # Eigenvector of the larger eigenvalue; of two forms, the one without cancellation.
     axis = wp.vec2(1.0, 0.0)
     if apart > 0.0:
         axis = wp.where(xx >= yy, wp.vec2(0.5 * (xx - yy) + apart, xy), wp.vec2(xy, 0.5 * (yy - xx) + apart))

@@ -1,10 +1,10 @@
-"""Motion of the surface that a pixel shows since the frame before, in pixels of the picture.
+"""Motion vectors: motion of the surface point in each pixel since the previous frame, in pixels.
 
-    motion = where the camera shows the point now - where the camera before showed where the point was before
+    motion = projection of the point now - projection, by the previous camera, of the point's previous position
 
-x to the right, y down, as the picture's pixels count: ``picture_before[pixel - motion]`` is the same point. Objects
-move as rigid bodies, by ``Shape``; proxies and mirror balls stand still. Both places come from one projection with the
-lens's distortion, so that what does not move has a motion of 0 to the bit.
+with x to the right and y down: ``previous_picture[pixel - motion]`` shows the same point. Objects move as rigid bodies,
+by ``Shape``; proxies and mirror balls do not move. Both projections are computed by the same function, with the lens's
+distortion, so that a point at rest before a camera at rest has a motion of exactly 0.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def point_before(point: wp.vec3, now: Shape, before: Shape) -> wp.vec3:
-    """Return the earlier place of a point of a rigid body, given where the body is and was."""
+    """Return the previous position of a point of a rigid body, given the body's ``Shape`` now and before."""
     if now.position == before.position and now.rotation == before.rotation and now.scale == before.scale:
         return point
     return before.rotation * (before.scale * to_local_point(now, point)) + before.position
@@ -40,7 +40,7 @@ def find_motion_kernel(
     # Out:
     motion_out: wp.array2d[wp.vec2],
 ):
-    """One thread per pixel."""
+    """Find the motion of one pixel."""
     i, j = wp.tid()
     i += row_start
     motion = wp.vec2(0.0, 0.0)
@@ -67,7 +67,7 @@ def remember_kernel(
     params_out: wp.array[FrameParams],
     objects_out: wp.array[Shape],
 ):
-    """One thread per object, one at least."""
+    """Copy one object; the first thread copies the camera, so there is at least one."""
     k = wp.tid()
     if k == 0:
         params_out[0] = params[0]
@@ -76,20 +76,20 @@ def remember_kernel(
 
 
 find_motion = row_launcher(find_motion_kernel)
-"""Write the motion of every pixel; 0 where nothing is modelled, and in the first frame.
+"""Write the motion of every pixel; 0 where no modelled surface is shown, and in the first frame.
 
 Args:
     params: (1,) FrameParams, the camera.
-    params_before: (1,) FrameParams of the frame before, as ``remember`` writes it; zeros before the first.
-    scene: Its objects are where they are now.
-    objects_before: (n,) Shape of the frame before.
-    index: (H, W) int32, as ``trace_surfaces`` writes.
+    params_before: (1,) FrameParams of the previous frame, from ``remember``; zeros before the first.
+    scene: Objects at their current poses.
+    objects_before: (n,) Shape of the previous frame.
+    index: (H, W) int32, from ``trace_surfaces``.
     position: (H, W) vec3, world, metres.
     motion_out: (H, W) vec2, pixels.
 """
 
 
 def remember(params: wp.array, scene: RayScene, params_out: wp.array, objects_out: wp.array) -> None:
-    """Keep camera and objects for the next frame's ``find_motion``."""
+    """Copy camera and objects for ``find_motion`` in the next frame."""
     count = max(1, scene.objects.shape[0])
     launch(remember_kernel, count, [params, scene], [params_out, objects_out], device=params.device)

@@ -1,4 +1,4 @@
-"""Virtual objects that a ray through each pixel's centre meets, whatever hides them: silhouettes for data sets."""
+"""Silhouettes of virtual objects for data sets: all objects on the ray through each pixel's centre, hidden or not."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def trace_object_masks_kernel(
     # Out:
     masks_out: wp.array2d[wp.uint64],
 ):
-    """Every object on its own, whichever is nearest."""
+    """Test one pixel's ray against every object on its own."""
     i, j = wp.tid()
     i += row_start
     mask = wp.uint64(0)
@@ -54,11 +54,11 @@ def trace_object_masks_kernel(
 
 
 trace_object_masks = row_launcher(trace_object_masks_kernel)
-"""Note which objects lie behind each pixel's centre.
+"""Write the set of objects that the ray through each pixel's centre meets.
 
 Args:
-    params: Frame values: camera and object_rect, outside of which no object is.
+    params: (1,) FrameParams: camera and object_rect, outside of which no object is.
     rays: (H, W) undistorted x / z and y / z of each pixel centre.
     scene: At most 64 objects: a pixel has a bit for each.
-    masks_out: (H, W) bit k: the ray meets object k, in front of whatever else.
+    masks_out: (H, W) uint64; bit k is set if the ray meets object k, whether or not another surface hides it.
 """

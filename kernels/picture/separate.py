@@ -1,11 +1,11 @@
-"""The layers of the picture apart: what is laid over the frame, and the frame itself as linear radiance.
+"""Separate layers of the picture: the frame as linear radiance, and the layers that are composed over it.
 
     picture = encode(s ((1 - alpha) max(plate * shadow_ratio + added_light + mirror_ball, 0) + objects))
 
-with the exposure scale s (1 where the scene leaves the camera's exposure) and ``objects`` premultiplied by its coverage
-alpha. These are the numbers from which ``composite`` and ``expose`` make the picture, taken where they take them: a
-layer that does not reach a pixel is neutral there, whatever an earlier frame left in its array. ``plate`` is the frame,
-its clipped pixels as the method of ``expose`` estimates them.
+with the exposure scale s (1 if the scene keeps the camera's exposure) and ``objects`` premultiplied by its coverage
+alpha. These are the values from which ``composite`` and ``expose`` make the picture. A layer is neutral in pixels
+outside its rectangle, where its array may hold values of an earlier frame. ``plate`` is the frame, with clipped pixels
+as the method of ``expose`` estimates them.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class SeparateLayers:
-    """The layers, (H, W) each; one that nobody asked for is empty."""
+    """The layers, (H, W) each; a layer that is not requested is empty."""
 
     plate: wp.array2d[wp.vec3]  # linear radiance
     objects: wp.array2d[wp.vec4]  # premultiplied linear radiance and coverage
@@ -80,11 +80,11 @@ separate_layers = row_launcher(make_separate_layers_kernel, like=lambda params, 
 """Write every layer that has an array in ``out``.
 
 Args:
-    method: How ``expose`` estimates clipped pixels: ``plain`` where it does not run.
+    method: Method by which ``expose`` estimates clipped pixels; ``plain`` if that stage does not run.
     params: (1,) FrameParams; its rectangles bound the layers.
-    picture: (H, W) the camera's; its rays are not read.
+    picture: (H, W) the camera's frame; rays are not read.
     layers: From ``composite.make_layers``.
     clipped: From ``expose.make_clipped_evidence``.
     scale: (1,) float32, the exposure scale; None means 1.
-    out: (H, W) arrays of the layers that are asked for.
+    out: (H, W) arrays of the requested layers.
 """

@@ -1,16 +1,17 @@
 """Summed-area table of a frame's intensity: the sum over any box from four look-ups [Cro84], exact at every size.
 
-The table holds unsigned 32-bit integers and is meant to overflow: additions and subtractions modulo 2^32 undo each
-other, so the sum over a box is exact whenever that sum itself is below 2^32, that is for boxes of up to 2^32 / 255 =
-16.8 million pixels, in a frame of any size. (Float32 sums are wrong by 126 grey levels at 4K.)
+The table holds unsigned 32-bit integers, which may overflow: additions and subtractions modulo 2^32 undo each other.
+So the sum over a box is exact if that sum is below 2^32, that is for boxes of up to 2^32 / 255 = 16.8 million pixels,
+in a frame of any size. (Float32 sums are wrong by 126 grey levels at 4K.)
 
     table[i, j] = sum of intensity[0..i, 0..j] mod 2^32
 
-It is written in two passes: along the rows, a thread each, and then down the columns, a thread for a few neighbours.
+It is written in two passes: along the rows, one thread per row, and then along the columns, one thread for a few
+neighbouring columns.
 
-A frame of more than 8 bits has a second table, in the same way, of what the 8 bits of its intensity cut off
-(``write_cut``), as bytes of 1/64 code around 128: a mean is then the sum of both tables' means, exact to 1/128 code.
-Where nothing was cut off every byte is 128, and the mean is the first table's to the bit.
+A frame of more than 8 bits has a second table of the same kind, of the remainder that 8-bit intensities cut off
+(``write_cut``), stored as bytes in steps of 1/64 code around 128. A mean is then the sum of both tables' means, exact
+to 1/128 code. Where the remainder is 0, every byte is 128, and the mean equals the first table's to the bit.
 
 References:
     [Cro84] Crow, "Summed-area tables for texture mapping", SIGGRAPH 1984.
@@ -26,17 +27,17 @@ from warp_ar.kernels.pixels import cut_luma
 wp.set_module_options({"enable_backward": False})
 
 NOT_CUT = wp.constant(wp.float32(128.0))
-"""Byte of a pixel off which nothing was cut."""
+"""Byte of a pixel whose remainder is 0."""
 CUT_STEPS = wp.constant(wp.float32(64.0))
-"""Steps of such bytes in a code: two codes at most to either side."""
+"""Steps of the byte per code; a remainder of up to two codes to either side fits."""
 
 COLUMNS = wp.constant(4)
-"""Neighbouring columns that one thread sums: whole words of memory, and enough threads for any device."""
+"""Neighbouring columns that one thread sums: memory is read in whole words, and there are enough threads."""
 
 
 @wp.func
 def intensity(code: wp.vec3ub) -> wp.uint32:
-    """Luma of an 8-bit colour with Rec. 709 weights in 256ths; a grey keeps its value, white is 255."""
+    """Return the luma of an 8-bit colour, by Rec. 709 weights in 256ths; a grey keeps its value, white is 255."""
     return (
         wp.uint32(54) * wp.uint32(code[0])
         + wp.uint32(183) * wp.uint32(code[1])
@@ -49,7 +50,7 @@ def intensity(code: wp.vec3ub) -> wp.uint32:
 def box_sum(
     table: wp.array2d[wp.uint32], row_start: wp.int32, row_stop: wp.int32, col_start: wp.int32, col_stop: wp.int32
 ) -> wp.uint32:
-    """Sum over rows [row_start, row_stop) and columns [col_start, col_stop) inside the frame; an empty box gives 0."""
+    """Sum rows [row_start, row_stop) and columns [col_start, col_stop) inside the frame; an empty box gives 0."""
     r0 = wp.max(row_start, 0)
     r1 = wp.min(row_stop, table.shape[0])
     c0 = wp.max(col_start, 0)
@@ -68,9 +69,9 @@ def box_sum(
 
 @wp.func
 def box_mean(table: wp.array2d[wp.uint32], row: wp.int32, col: wp.int32, size: wp.int32) -> wp.float32:
-    """Mean intensity, 0..255, of the part inside the frame of the box of ``size`` x ``size`` pixels around a pixel.
+    """Return the mean intensity, 0..255, of the box of ``size`` x ``size`` pixels around a pixel, cut by the frame.
 
-    An even box reaches one pixel further up and left than down and right.
+    A box of even size reaches one pixel further up and left than down and right.
     """
     r0 = wp.max(row - size / 2, 0)
     c0 = wp.max(col - size / 2, 0)
@@ -84,7 +85,7 @@ def box_mean(table: wp.array2d[wp.uint32], row: wp.int32, col: wp.int32, size: w
 def fine_mean(
     table: wp.array2d[wp.uint32], cut_table: wp.array2d[wp.uint32], row: wp.int32, col: wp.int32, size: wp.int32
 ) -> wp.float32:
-    """``box_mean`` with what 8 bits cut off; ``cut_table`` is empty where nothing was."""
+    """Return ``box_mean`` plus the mean remainder that 8 bits cut off; ``cut_table`` is empty for frames of 8 bits."""
     mean = box_mean(table, row, col, size)
     if cut_table.shape[0] > 0:
         mean += (box_mean(cut_table, row, col, size) - NOT_CUT) / CUT_STEPS
@@ -101,7 +102,7 @@ def write_cut_kernel(
     # Out:
     cut_out: wp.array2d[wp.vec3ub],
 ):
-    """One pixel, as a grey whose ``intensity`` is its code."""
+    """Write one pixel's remainder as a grey, whose ``intensity`` is its code."""
     band_row, column = wp.tid()
     row = row_start + band_row
     steps = wp.round(CUT_STEPS * cut_luma(frame, decode_table, linear, row, column)) + NOT_CUT
@@ -110,13 +111,13 @@ def write_cut_kernel(
 
 
 write_cut = row_launcher(write_cut_kernel)
-"""Write what 8 bits cut off a frame's intensity as a frame of its own, to be summed like one.
+"""Write the remainder that 8 bits cut off a frame's intensity, as a grey frame for a summed-area table of its own.
 
 Args:
     frame: (H, W) vec3ub, RGB codes.
     decode_table: (256,) vec3, linear value of each code.
     linear: (H, W) vec3, linear radiance.
-    cut_out: (H, W) vec3ub, greys: ``NOT_CUT`` and ``CUT_STEPS`` for each code that is cut off.
+    cut_out: (H, W) vec3ub, greys: ``NOT_CUT`` plus ``CUT_STEPS`` times the remainder in codes.
 """
 
 
@@ -128,7 +129,7 @@ def sum_rows_kernel(
     # Out:
     table_out: wp.array2d[wp.uint32],
 ):
-    """Sum one row from its first column on."""
+    """Write the running sums of one row."""
     i = row_start + wp.tid()
     total = wp.uint32(0)
     for j in range(frame.shape[1]):
@@ -143,7 +144,7 @@ def sum_columns_kernel(
     # Out:
     table_out: wp.array2d[wp.uint32],
 ):
-    """Sum a few columns of rows' sums, in place."""
+    """Replace a few columns of the rows' sums by their running sums."""
     first = (row_start + wp.tid()) * COLUMNS
     stop = wp.min(first + COLUMNS, table_out.shape[1])
     for i in range(1, table_out.shape[0]):
@@ -152,7 +153,7 @@ def sum_columns_kernel(
 
 
 sum_rows = row_launcher(sum_rows_kernel, like=lambda frame, _: frame.shape[:1])
-"""Write the sums along each row; first part of the table.
+"""Write the running sums along each row: the first pass.
 
 Args:
     frame: (H, W) vec3ub, RGB.
@@ -161,7 +162,7 @@ Args:
 
 
 def column_groups(width: int) -> int:
-    """Return how many threads ``sum_columns`` takes for rows of ``width`` pixels."""
+    """Return the number of threads of ``sum_columns`` for rows of ``width`` pixels."""
     return -(-width // int(COLUMNS))
 
 
