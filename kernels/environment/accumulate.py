@@ -1,24 +1,23 @@
-"""The environment over time.
+"""Accumulation of the environment over time.
 
-Every texel keeps a radiance m and a confidence k and is drawn toward what the current frame says, x with confidence c:
+Every texel keeps a radiance m and a confidence k. It approaches the radiance x, of confidence c, of the current frame:
 
     m += a (x - m),   a = a0 c / (a0 c + (1 - a0) k),   a0 = 1 - exp(-time_step / tau):
 
-the plain exponential mean where c = k, quicker where the new view is the better one, slower where it is the worse, and
-nothing at c = 0. A texel that was never seen takes x whole. The form m + a (x - m) is exact where x = m: nothing
-drifts. k is drawn toward c in the same way and fades with ``FORGET_TIME``, so that what has not been seen for long
-gives way to what is.
+an exponential mean if c = k, faster if the new view is the more confident one, slower if it is the less confident, and
+without effect at c = 0. A texel that was never observed takes x. The form m + a (x - m) is exact if x = m, so nothing
+drifts. k approaches c in the same way, and fades with ``FORGET_TIME``, so that light that has not been observed for
+long is soon replaced.
 
-tau is ``FOLLOW_TIME`` and drops toward ``FOLLOW_TIME / HASTE`` where the light really changes. Noise and the jitter of
-the tracked pose make large differences of both signs in single texels; a change of the environment moves a whole
-neighbourhood one way, and stays. So the signed mean of x - m is taken over sectors of ``SECTOR_SIZE`` texels squared,
-and what counts is its smaller value in two successive frames of one sign: one corrupt frame is worth no haste, and is
-forgotten as fast as it came.
+tau is ``FOLLOW_TIME``, and falls toward ``FOLLOW_TIME / HASTE`` where the light changes. Noise and the jitter of the
+tracked pose cause large differences of both signs in single texels. A change of the environment has one sign over a
+neighbourhood, and lasts. So the signed mean of x - m is taken over sectors of ``SECTOR_SIZE`` texels squared. The
+smaller of its values in two successive frames is used, if both have one sign, so that a single corrupt frame does not
+shorten tau.
 
-A texel that clips in a channel says no more than that its radiance is x at least. Where a camera's gain drifts, the
-frames of a lower gain have shown more: m, scaled by the gain since, lies above x. There x counts as m, and the share
-that clips as the one that is known: the light does not fall because the exposure rises. Without a drift no m lies above
-what clips.
+In a clipped channel x is only a lower bound. If the camera's gain drifts, earlier frames of a lower gain have shown
+more: m, scaled by the change of gain since, lies above x. Then m and its clipped share are kept, so that the light does
+not fall because the exposure rises. Without a drift m does not lie above a clipped x.
 """
 
 from __future__ import annotations
@@ -38,24 +37,24 @@ FOLLOW_TIME = wp.constant(wp.float32(0.15))
 HASTE = wp.constant(wp.float32(6.0))
 """Factor by which a significant change is followed faster."""
 FORGET_TIME = wp.constant(wp.float32(20.0))
-"""Time constant in seconds with which the confidence of what is not seen fades."""
+"""Time constant, seconds, with which the confidence of texels that are not observed fades."""
 SECTOR_SIZE = 8
 """Texels along the side of a sector in which change is measured."""
 LEAST_CHANGE = wp.constant(wp.float32(0.03))
 MOST_CHANGE = wp.constant(wp.float32(0.15))
-"""Relative change of a sector's mean at which haste begins and is full."""
+"""Relative change of a sector's mean at which tau is shortest; it begins to fall at ``LEAST_CHANGE``."""
 DARK = wp.constant(wp.float32(0.01))
 """Radiance below which changes count as noise."""
 LEAST_EXCESS = wp.constant(wp.float32(0.02))
 MOST_EXCESS = wp.constant(wp.float32(0.1))
-"""Excess of what is known over what clips, relative, at which it begins to count and counts in full."""
+"""Relative excess of m over a clipped x at which m is kept in full; it begins to be kept at ``LEAST_EXCESS``."""
 ALL_CLIPPED = wp.constant(wp.float32(0.9))
-"""Share of a texel from which on it is taken to clip as a whole: elsewhere noise lies to both sides."""
+"""Clipped share from which on a texel counts as wholly clipped; below it x - m has noise of both signs."""
 
 
 @wp.func
 def known_beyond_clipping(x: wp.vec3, m: wp.vec3, clipped: wp.vec3) -> wp.vec3:
-    """Return the degree to which each channel clips below its known radiance, 0 to 1."""
+    """Return the degree, 0 to 1, to which each channel is clipped below its known radiance m."""
     beyond = wp.vec3(0.0, 0.0, 0.0)
     for channel in range(3):
         excess = m[channel] - x[channel]
@@ -73,7 +72,7 @@ def measure_change_kernel(
     # Out:
     change_out: wp.array2d[wp.vec2],  # this frame's signed relative change, and the one before
 ):
-    """Mean signed change of one sector, by one block."""
+    """Measure the mean signed change of one sector, by one block."""
     sector_row, sector_column, lane = wp.tid()
     height = view.radiance.shape[0]
     width = view.radiance.shape[1]
@@ -107,7 +106,7 @@ def measure_change_kernel(
 
 @wp.func
 def lasting_change(change: wp.array2d[wp.vec2], row: wp.int32, column: wp.int32) -> wp.float32:
-    """Size of a sector's change as far as two frames agree on it; rows end at the poles, columns wrap."""
+    """Return the smaller change of a sector in two frames, 0 if signs differ; rows are clamped, columns wrap."""
     width = change.shape[1]
     c = change[wp.clamp(row, 0, change.shape[0] - 1), (column + width) % width]
     if c[0] * c[1] <= 0.0:
@@ -125,7 +124,7 @@ def accumulate_environment_kernel(
     # In and out:
     environment_out: EnvironmentView,
 ):
-    """One texel a thread, in place."""
+    """Accumulate one texel, in place."""
     band_row, j = wp.tid()
     i = row_start + band_row
     x = view.radiance[i, j]
@@ -170,7 +169,7 @@ def accumulate_environment_kernel(
 
 
 def change_shape(height: int, width: int) -> tuple[int, int]:
-    """Rows and columns of the sectors in which change is measured for a map of this size."""
+    """Return the rows and columns of sectors in which change is measured, for a map of this size."""
     return max(1, height // SECTOR_SIZE), max(1, width // SECTOR_SIZE)
 
 
@@ -180,13 +179,13 @@ def measure_change(view: EnvironmentView, environment: EnvironmentView, change_o
     Args:
         view: (h, w) this frame's light.
         environment: (h, w) accumulated light.
-        change_out: ``wp.vec2`` of ``change_shape(h, w)``: the change in -1..1, and what stood there before.
+        change_out: ``wp.vec2`` of ``change_shape(h, w)``: the change in -1..1, and that of the previous frame.
     """
     launch_tiles(measure_change_kernel, change_out.shape, [view, environment], [change_out], block_dim=SECTOR_SIZE**2)
 
 
 accumulate_environment = row_launcher(accumulate_environment_kernel, like=lambda *given: given[-1].radiance)
-"""Draw the accumulated light toward a frame's; outputs are read and written in place and start at zero.
+"""Move the accumulated light toward a frame's light; outputs are updated in place and start at zero.
 
 Args:
     view: (h, w) this frame's light.

@@ -1,23 +1,22 @@
-"""One map of the environment from unwrapped frames of several exposures.
+"""Merging of unwrapped frames of several exposures to one map of the environment.
 
-Frame k is exposed t_k / t_0 = r_k as long as the reference, whose camera values everything else is in. What it says of
-a texel, x_k, therefore means the radiance x_k / r_k. Where nothing clips, the estimate of least variance weights each
+Frame k has r_k = t_k / t_0 times the exposure time of the reference, in whose camera values radiance is given. So its
+value x_k of a texel means the radiance x_k / r_k. Where no exposure clips, the estimate of least variance weights each
 by its inverse variance [GAWTSL10]. With shot noise that grows with the signal and a floor of read noise and rounding,
 var(x) = FLOOR^2 + SHOT x, that is
 
     L = sum w_k x_k / r_k / sum w_k,   w_k = c_k r_k^2 / (FLOOR^2 + SHOT x_k),
 
-with c_k the confidence of the view: the longest exposure that does not clip has nearly all the say. A running mean
-keeps equal values exactly.
+with c_k the confidence of the view. The longest unclipped exposure has nearly all the weight. A running mean keeps
+equal values exactly.
 
-An exposure has none in a channel where anything within ``REACH`` of the texel clips. That is wider than the texel's own
-footprint on purpose: tracking places the ball a fraction of a pixel differently in every frame, and an emitter that the
-short exposure shows half a texel beside the place where the long one clips would lose, to the dark of the long
-exposure, what lies over its edge. Around an emitter, all comes from one exposure that shows it whole.
+In a channel that clips anywhere within ``REACH`` of the texel, an exposure has no weight. The reach is wider than the
+texel's own footprint, because tracking places the ball a fraction of a pixel differently in every frame. Otherwise an
+emitter that the short exposure shows half a texel beside the clipped area of the long one would lose the part over its
+edge to the dark surroundings in the long exposure. With it, an emitter and its surroundings come from one exposure.
 
-What clips still says that there is no less light than that: where an emitter has just been switched on, the short
-exposure does not know it yet. Where all exposures clip, the shortest that sees the texel stands, with its share at
-clipping.
+A clipped value is a lower bound of the result: if an emitter was just switched on, the latest short exposure does not
+show it yet. Where all exposures clip, the shortest that observes the texel is used, with its clipped share.
 
 References:
     [GAWTSL10] Granados, Ajdin, Wand, Theobalt, Seidel, Lensch, "Optimal HDR reconstruction with linear digital
@@ -38,10 +37,10 @@ from warp_ar.kernels.structs import EnvironmentView
 wp.set_module_options({"enable_backward": False})
 
 REACH = math.radians(2.0)
-"""Angle by which a frame's map may be off: half a pixel of a ball that is 80 pixels across moves what it mirrors by
-1.8 degrees."""
+"""Largest angular error of a frame's map: half a pixel of a ball of 80 pixels across moves reflections by 1.8
+degrees."""
 FLOOR = wp.constant(wp.float32(0.002))
-"""Standard deviation of a dark camera value: read noise, and half a code."""
+"""Standard deviation of a dark camera value: read noise, and rounding by half a code."""
 SHOT = wp.constant(wp.float32(0.0004))
 """Variance per camera value: 2,500 electrons at clipping."""
 
@@ -51,7 +50,7 @@ class BracketExposure:
     """One of the exposures between which frames alternate."""
 
     ratio: wp.float32  # exposure time over the reference's
-    trust: wp.float32  # 1; 0 where there has been no such frame lately
+    trust: wp.float32  # 1; 0 if there was no such frame lately
 
 
 @wp.struct
@@ -59,9 +58,9 @@ class ExposureStack:
     """The latest unwrapped frame of every exposure, longest first, (K, h, w) each."""
 
     radiance: wp.array3d[wp.vec3]  # in camera values of the exposure over the ball's reflectance
-    confidence: wp.array3d[wp.float32]  # 0 or NaN: not seen
-    clipped: wp.array3d[wp.vec3]  # share at clipping, per channel
-    spread: wp.array3d[wp.vec3]  # of ``spread_clipping``
+    confidence: wp.array3d[wp.float32]  # 0 or NaN: not observed
+    clipped: wp.array3d[wp.vec3]  # clipped share, per channel
+    spread: wp.array3d[wp.vec3]  # largest clipped share nearby, from ``spread_clipping``
 
 
 @wp.kernel(enable_backward=False)
@@ -72,7 +71,7 @@ def spread_clipping_kernel(
     # In and out:
     stack_out: ExposureStack,
 ):
-    """Largest share at clipping along the row, one texel a thread."""
+    """Find the largest clipped share near a texel along its row."""
     clipped = stack_out.clipped
     band_row, j, k = wp.tid()
     i = row_start + band_row
@@ -94,7 +93,7 @@ def spread_clipping_kernel(
 spread_clipping = row_launcher(
     spread_clipping_kernel, like=lambda reach, stack: (*stack.clipped.shape[1:], len(stack.clipped))
 )
-"""Find what clips near every texel: first half, along the rows; ``merge_exposures`` does the columns.
+"""Find the largest clipped share near every texel along its row; ``merge_exposures`` does the same along columns.
 
 Args:
     reach: Radians.
@@ -112,7 +111,7 @@ def merge_exposures_kernel(
     # Out:
     view_out: EnvironmentView,
 ):
-    """One texel a thread."""
+    """Merge one texel."""
     radiance = stack.radiance
     clipped = stack.clipped
     band_row, j = wp.tid()
@@ -166,6 +165,6 @@ Args:
     exposures: ``BracketExposure`` (K), longest first; the reference, whose ratio is 1, is one of them.
     stack: (K, h, w); its ``spread`` from ``spread_clipping``, with the same ``reach``.
     reach: Radians.
-    view_out: (h, w): radiance in camera values of the reference, confidence of the view that saw the texel best,
-        the share that clips in all exposures.
+    view_out: (h, w): radiance in camera values of the reference, the highest confidence of all exposures, and the share
+        that clips in all of them.
 """

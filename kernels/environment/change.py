@@ -1,4 +1,4 @@
-"""Change of the environment since its readers last saw it."""
+"""Change of the environment since the stages that read it last ran."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ wp.set_module_options({"enable_backward": False})
 
 CHANGE_FLOOR = 0.0005
 CHANGE_SHARE = 0.01
-"""An environment has changed once some texel moved by more than ``CHANGE_FLOOR + CHANGE_SHARE * value``, about one
-8-bit step. Any normalised filter F of the map with weights that are not negative (a mirror's sample, a glossy lobe,
-irradiance / pi) is then off by at most ``CHANGE_FLOOR + CHANGE_SHARE * F`` while its readers do not run."""
+"""Relative change that is tolerated. An environment has changed if some texel changed by more than ``CHANGE_FLOOR +
+CHANGE_SHARE * value``, about one 8-bit step. Until then, any normalised filter F of the map with weights that are not
+negative (a mirror's sample, a glossy lobe, irradiance / pi) is off by at most ``CHANGE_FLOOR + CHANGE_SHARE * F``."""
 
 
 @wp.kernel(enable_backward=False)
@@ -26,7 +26,7 @@ def measure_difference_kernel(
     # Out:
     difference_out: wp.array[wp.float32],
 ):
-    """Largest change of one row a thread."""
+    """Find the largest change of one row."""
     i = row_start + wp.tid()
     largest = wp.float32(0.0)
     for j in range(environment.shape[1]):
@@ -39,12 +39,12 @@ def measure_difference_kernel(
 
 
 measure_difference = row_launcher(measure_difference_kernel)
-"""Largest change of each row against a map that readers have seen, in units of what is tolerated.
+"""Measure the largest change of each row against the map that was last read, over the tolerated change.
 
 Args:
     environment: ``wp.vec3`` (h, w).
-    published: ``wp.vec3`` (h, w).
-    difference_out: ``wp.float32`` (h): largest |difference| over what is tolerated; above 1 it has changed.
+    published: ``wp.vec3`` (h, w), the map that was last read.
+    difference_out: ``wp.float32`` (h): largest |difference| over the tolerated one; above 1 the map has changed.
 """
 
 
@@ -55,13 +55,13 @@ def scale_radiance_kernel(
     # Out:
     radiance_out: wp.array2d[wp.vec3],
 ):
-    """One texel a thread."""
+    """Scale one texel."""
     i, j = wp.tid()
     radiance_out[i, j] = wp.cw_mul(radiance_out[i, j], factor)
 
 
 def scale_radiance(radiance_out: wp.array, factor: Sequence[float]) -> None:
-    """Multiply a map.
+    """Multiply a map by a colour.
 
     Args:
         radiance_out: ``wp.vec3`` (h, w).

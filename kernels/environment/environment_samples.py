@@ -1,26 +1,27 @@
-"""The environment as a set of directions, each with the light that it stands for.
+"""Samples of the environment: directions, each with the radiance and the solid angle that it stands for.
 
-The environment becomes ``count * sets`` samples, drawn again whenever it changes. A surface's irradiance is the sum
+``count * sets`` samples are drawn whenever the environment changes. A surface's irradiance is the sum
 
     E = sum over samples of  measure * radiance * max(n.w, 0) * visible,   measure = 1 / (number of samples * pdf).
 
-Density. Half of the samples follow what arrives at the receiver, radiance times the weight of the direction, so that a
-emitter of one texel and the sky around it get samples by their light; half follow the weight alone, so that no sample
-stands for more than twice its share of the hemisphere and what objects reflect is sampled evenly. The weight is 0.3 +
-max(w.z, 0): mostly directions above the receiver, some for surfaces of other orientations. Texels are picked by
-inverting the cumulative sums of rows and of the texels in a row; within a texel a sample is uniform.
+Density. The density of half of the samples is proportional to radiance times a weight of the direction, so that an
+emitter of one texel and the sky around it get samples by their light. That of the other half is proportional to the
+weight alone, so that no sample stands for more than twice its share of the hemisphere, and objects that reflect light
+are sampled evenly. The weight is 0.3 + max(w.z, 0): mostly directions above the receiver, some for surfaces of other
+orientations. Texels are picked by inverting the cumulative sums of rows and of the texels in a row; within a texel
+samples are uniform.
 
 Points. The first two dimensions of Sobol's sequence are a (0, 2)-sequence in base 2: every aligned block of 2^m
-consecutive points, and all blocks together, have one point in each elementary interval of their size. A block is a set:
-pixels of a tile take one set each, their mean has the error of all sets together [KH01].
+consecutive points, and all blocks together, have one point in each elementary interval of their size. A block is a set.
+The pixels of a tile use one set each, and their mean has the error of all sets together [KH01].
 
-Several balls. Where the light is interpolated between the environments of several mirror balls, each has samples of its
-own, in turn: of every ``slots`` samples, the least power of two that is no less than the number of balls, each ball has
-one or two. So the first part of a set, and all sets together, hold aligned blocks of every ball's sequence. A ball's
-samples sum to its own irradiance; ``probe_weights`` says what it counts at a point.
+Several balls. If the light is interpolated between several mirror balls, their samples alternate. ``slots`` is the
+least power of two that is not less than the number of balls; of every ``slots`` samples each ball has one or two. So
+the first part of a set, and all sets together, hold aligned blocks of every ball's sequence. The samples of a ball sum
+to its own irradiance; ``probe_weights`` gives the ball's weight at a point.
 
-Near emitters. A sample carries the distance at which its light starts; infinity for an environment. An emitter at a
-known distance is thereby an emitter at its place: see ``sample_toward``.
+Near emitters. A sample stores the distance of its source, infinite for the environment. The direction of an emitter at
+a known distance depends on the lit point: see ``sample_toward``.
 
 References:
     [KH01] Keller, Heidrich 2001, Interleaved Sampling.
@@ -43,13 +44,13 @@ wp.set_module_options({"enable_backward": False})
 
 PI = wp.constant(wp.float32(math.pi))
 SIDE_WEIGHT = wp.constant(wp.float32(0.3))
-"""Weight of directions that the receiver does not see, beside the cosine of those that it does."""
+"""Weight that all directions have in addition to the cosine of those above the receiver."""
 FAR_AWAY = wp.constant(wp.float32(1.0e30))
-"""Distance of light that is part of the environment."""
+"""Distance of the environment's light, metres."""
 EMITTER_COSINE = wp.constant(wp.float32(math.cos(math.radians(12.0))))
 """Cosine of the largest angle between an emitter's direction and light that belongs to it."""
 MIN_EMITTER_DISTANCE = wp.constant(wp.float32(0.05))
-"""Metres from the ball within which no emitter is taken to be."""
+"""Least distance of an emitter from the ball, metres."""
 # Typed: literals above 2^31 in a kernel make the compiler warn.
 TOP_BIT = wp.constant(wp.uint32(0x80000000))
 
@@ -58,16 +59,16 @@ TOP_BIT = wp.constant(wp.uint32(0x80000000))
 class EnvironmentSample:
     """One direction of the environment."""
 
-    direction: wp.vec3  # unit, world, as seen from where the environment was captured
+    direction: wp.vec3  # unit, world, from ``origin``
     radiance: wp.vec3
     measure: wp.float32  # solid angle that the sample stands for
     distance: wp.float32  # metres from ``origin`` to the light; FAR_AWAY for the environment
-    origin: wp.vec3  # where it was captured: the ball's centre, or for an emitter the place that mirrors it
+    origin: wp.vec3  # the ball's centre, or for an emitter the point of the ball that reflects it to the camera
 
 
 @wp.struct
 class SampleSets:
-    """Samples of the environment, set after set; each is known in two forms."""
+    """Samples of the environment, set after set, as records and, for culling, as separate arrays."""
 
     directions: wp.array[wp.vec3]
     flux: wp.array[wp.vec3]  # radiance times solid angle
@@ -85,7 +86,7 @@ class Incidence:
 
 @wp.func
 def sample_toward(sample: EnvironmentSample, point: wp.vec3) -> Incidence:
-    """A sample as ``point`` sees it: an emitter at a known distance d0 from the ball turns, and grows by (d0 / d)^2."""
+    """Return a sample seen from ``point``; an emitter at distance d0 gets a new direction, and measure (d0 / d)^2."""
     result = Incidence()
     result.direction = sample.direction
     result.distance = FAR_AWAY
@@ -101,7 +102,7 @@ def sample_toward(sample: EnvironmentSample, point: wp.vec3) -> Incidence:
 
 @wp.func
 def slots_of(balls: wp.int32) -> wp.int32:
-    """Samples after which it is the first ball's turn again."""
+    """Return the period after which the order of balls repeats, in samples."""
     slots = wp.int32(1)
     while slots < balls:
         slots *= 2
@@ -110,19 +111,19 @@ def slots_of(balls: wp.int32) -> wp.int32:
 
 @wp.func
 def ball_of_sample(index: wp.int32, balls: wp.int32) -> wp.int32:
-    """Whose environment a sample is of."""
+    """Return the ball to whose environment a sample belongs."""
     return (index % slots_of(balls)) % balls
 
 
 @wp.func
 def turns_of(ball: wp.int32, balls: wp.int32) -> wp.int32:
-    """Samples of ``slots_of`` that are a ball's."""
+    """Return a ball's number of samples in each period of ``slots_of``."""
     return 1 + (slots_of(balls) - 1 - ball) / balls
 
 
 @wp.func
 def sobol_second(index: wp.uint32) -> wp.float32:
-    """Second dimension of Sobol's sequence; the first is ``radical_inverse``."""
+    """Return the second dimension of Sobol's sequence; the first is ``radical_inverse``."""
     bits = wp.uint32(0)
     direction = TOP_BIT
     i = index
@@ -136,19 +137,19 @@ def sobol_second(index: wp.uint32) -> wp.float32:
 
 @wp.func
 def direction_weight(cos_theta: wp.float32) -> wp.float32:
-    """Return the weight of directions at an angle to +z."""
+    """Return the weight of directions at the angle theta to +z."""
     return SIDE_WEIGHT + wp.max(cos_theta, 0.0)
 
 
 @wp.func
 def row_edge(row: wp.int32, height: wp.int32) -> wp.float32:
-    """Cosine of the polar angle where a row of a map begins."""
+    """Return the cosine of the polar angle at which a row of a map begins."""
     return wp.cos(PI * wp.float32(row) / wp.float32(height))
 
 
 @wp.func
 def row_weight(row: wp.int32, height: wp.int32, width: wp.int32) -> wp.float32:
-    """Weight of one texel of a row: its solid angle times that of its middle direction."""
+    """Return the weight of one texel of a row: its solid angle times the weight of its central direction."""
     top = row_edge(row, height)
     bottom = row_edge(row + 1, height)
     return direction_weight(0.5 * (top + bottom)) * (top - bottom) * 2.0 * PI / wp.float32(width)
@@ -161,7 +162,7 @@ def sum_along_rows_kernel(
     # Out:
     cumulative_out: wp.array2d[wp.float32],
 ):
-    """Running sums of brightness along one row; compensated, so that a sun does not swallow the sky beside it."""
+    """Write the running sums of brightness along one row, compensated so that a sun does not absorb the sky."""
     i = wp.tid()
     total = float(0.0)
     lost = float(0.0)
@@ -180,7 +181,7 @@ def sum_rows_kernel(
     # Out:
     rows_out: wp.array[wp.vec2],
 ):
-    """Sum of (weighted brightness, weight) over the rows up to one, by one block."""
+    """Sum (weighted brightness, weight) over the rows up to one, by one block."""
     i, lane = wp.tid()
     height = cumulative.shape[0]
     width = cumulative.shape[1]
@@ -206,7 +207,7 @@ def draw_samples_kernel(
     flux_out: wp.array[wp.vec3],
     samples_out: wp.array[EnvironmentSample],
 ):
-    """Invert the cumulative sums of the mixture for one point, if it is this ball's turn."""
+    """Draw one sample by inverting the cumulative sums of the mixture, if the sample is this ball's."""
     index = wp.tid() + row_start
     if ball_of_sample(index, turn[1]) != turn[0]:
         return
@@ -217,7 +218,7 @@ def draw_samples_kernel(
     height = environment.shape[0]
     width = environment.shape[1]
     total = rows[height - 1]
-    # Each kind of density gives half; a black environment gives all to the weight alone.
+    # Half of the samples have each density; in a black environment all have the weight alone.
     bright_share = wp.where(total[0] > 0.0, 0.5 / wp.max(total[0], 1.0e-37), 0.0)
     even_share = wp.where(total[0] > 0.0, 0.5, 1.0) / total[1]
     u = radical_inverse(number) + 0.5 / wp.float32(count)
@@ -286,7 +287,7 @@ def list_texels_kernel(
     flux_out: wp.array[wp.vec3],
     samples_out: wp.array[EnvironmentSample],
 ):
-    """Every texel of a map as a sample at its centre, as often as it is this ball's turn."""
+    """Write one texel of a map as a sample at its centre, once for each of the ball's samples in a period."""
     i, j = wp.tid()
     i += row_start
     height = environment.shape[0]
@@ -319,7 +320,7 @@ def place_emitters_kernel(
     # Out:
     samples_out: wp.array[EnvironmentSample],
 ):
-    """Give the samples that show an emitter the distance of the emitter that they are nearest to."""
+    """Give a sample that shows an emitter the distance of the emitter nearest to its direction."""
     index = wp.tid() + row_start
     if ball_of_sample(index, turn[1]) != turn[0]:
         return
@@ -337,21 +338,21 @@ def place_emitters_kernel(
 
 
 place_emitters = row_launcher(place_emitters_kernel)
-"""Turn the samples of near emitters from directions into places.
+"""Give the samples of near emitters a distance.
 
-A sample shows an emitter if it is as bright as clipping and within ``EMITTER_COSINE`` of its direction.
+A sample shows an emitter if it is as bright as clipping and within ``EMITTER_COSINE`` of the emitter's direction.
 
 Args:
-    emitters: (k,) emitters; those without direction are none, those at infinity stay directions.
+    emitters: (k,) emitters. One without direction is ignored; samples of one at infinity stay distant.
     turn: As for ``draw_samples``.
-    samples_out: (n,) samples, drawn from an environment captured where the emitters' distances are from.
+    samples_out: (n,) samples, drawn from the environment of the ball to which the emitters' distances refer.
 """
 
 
 def sum_environment(
     environment: wp.array2d[wp.vec3], cumulative_out: wp.array2d[wp.float32], rows_out: wp.array[wp.vec2]
 ) -> None:
-    """Cumulative sums that ``draw_samples`` inverts.
+    """Compute the cumulative sums that ``draw_samples`` inverts.
 
     Args:
         environment: (h, w) radiance; NaN and negative values count as none.
@@ -370,10 +371,10 @@ Args:
     environment: (h, w) radiance.
     cumulative: From ``sum_environment``.
     rows_sums: From ``sum_environment``.
-    origin: Where the environment was captured, world.
-    turn: Number of the ball that the environment is of, and how many balls share the samples.
-    directions_out: (n,) unit directions of the samples, by themselves for culling.
-    flux_out: (n,) their radiance times solid angle, likewise.
+    origin: Position at which the environment was captured, world.
+    turn: Index of the environment's ball, and number of balls that share the samples.
+    directions_out: (n,) unit directions of the samples, for culling.
+    flux_out: (n,) radiance times solid angle of the samples, for culling.
     samples_out: (n,), n a power of two.
 """
 
@@ -383,9 +384,9 @@ list_texels = row_launcher(list_texels_kernel, outputs=3, like=lambda environmen
 
 Args:
     environment: (h, w) radiance.
-    origin: Where the environment was captured, world.
+    origin: Position at which the environment was captured, world.
     turn: As for ``draw_samples``.
     directions_out: (h * w * slots,) directions of the samples.
-    flux_out: As many, their radiance times solid angle.
-    samples_out: As many.
+    flux_out: (h * w * slots,) radiance times solid angle of the samples.
+    samples_out: (h * w * slots,) samples.
 """

@@ -1,10 +1,10 @@
-"""The environment, whole.
+"""Completion of the environment where no ball shows it.
 
-What no ball shows is taken from its confident neighbours by push and pull [GGSC96]: down a pyramid go means of
-radiance weighted by confidence and solid angle, up again each texel is completed from its coarser level, as far as it
-lacks confidence. Both are normalised, and in forms that are exact for equal values: a constant environment stays
-constant under any mask. Texels of a coarser level cover shares of finer ones by exact overlap, so every size works.
-Without any confidence there is no light: the map is zero.
+Missing texels are filled from their confident neighbours by push-pull [GGSC96]. Coarser levels of a pyramid hold means
+of radiance weighted by confidence and solid angle; then, from coarse to fine, each texel is completed from its coarser
+level in proportion to its missing trust. Both steps are normalised, in forms that are exact for equal values, so a
+constant environment stays constant under any mask. Coarser texels weight finer ones by their exact overlap, so maps may
+have any size. Without any confidence the map is zero.
 
 References:
     [GGSC96] Gortler, Grzeszczuk, Szeliski, Cohen, "The Lumigraph", SIGGRAPH 1996, section 3.4.
@@ -27,12 +27,12 @@ wp.set_module_options({"enable_backward": False})
 FULL_TRUST = wp.constant(wp.float32(0.5))
 """Confidence above which a texel is kept as it is."""
 SUPPORT = wp.constant(wp.float32(4.0))
-"""A coarser texel is fully trusted once a quarter of it is: smaller holes are then filled from nearby only."""
+"""Factor from mean trust to a coarser texel's trust, at most 1: full trust from a quarter on keeps filling local."""
 
 
 @wp.func
 def band_solid_angle(start: wp.float32, stop: wp.float32, height: wp.int32) -> wp.float32:
-    """Solid angle of the rows from start to stop per unit of longitude; a product of sines: no cancellation."""
+    """Return the solid angle of the rows from start to stop, per radian of longitude, without cancellation."""
     half = 0.5 * PI / wp.float32(height)
     return 2.0 * wp.sin((start + stop) * half) * wp.sin((stop - start) * half)
 
@@ -41,7 +41,7 @@ def band_solid_angle(start: wp.float32, stop: wp.float32, height: wp.int32) -> w
 def sample_level_row(
     levels: wp.array[wp.vec4], offset: wp.int32, height: wp.int32, width: wp.int32, row: wp.int32, x: wp.float32
 ) -> wp.vec3:
-    """Linear sample along one row of a level, across the seam and the poles; see ``latlong.beside_in_row``."""
+    """Sample one row of a level linearly, across the seam and the poles; see ``latlong.beside_in_row``."""
     first, second, t = beside_in_row(row, x, height, width)
     a = levels[offset + first[0] * width + first[1]]
     b = levels[offset + second[0] * width + second[1]]
@@ -57,7 +57,7 @@ def seed_fill_kernel(
     # Out:
     levels_out: wp.array[wp.vec4],  # radiance and trust
 ):
-    """Level 0: radiance, and how far it is to be kept."""
+    """Write a texel of level 0: radiance, and trust in it."""
     band_row, j = wp.tid()
     i = row_start + band_row
     value = radiance[i, j]
@@ -80,7 +80,7 @@ def pulled(
     width: wp.int32,
     most: wp.float32,
 ) -> wp.vec4:
-    """Texel of the next coarser level: means over exactly what it covers, of values up to ``most``."""
+    """Return a texel of the next coarser level: the mean over its exact area, of values limited to ``most``."""
     top = wp.float32(i * fine_height) / wp.float32(height)
     bottom = wp.float32((i + 1) * fine_height) / wp.float32(height)
     left = wp.float32(j * fine_width) / wp.float32(width)
@@ -116,7 +116,7 @@ def pull_level_kernel(
     # Out:
     levels_out: wp.array[wp.vec4],
 ):
-    """Next coarser level."""
+    """Write a texel of the next coarser level."""
     band_row, j = wp.tid()
     i = row_start + band_row
     levels_out[offset + i * width + j] = pulled(
@@ -136,7 +136,7 @@ def completed(
     coarse_height: wp.int32,
     coarse_width: wp.int32,
 ) -> wp.vec3:
-    """A texel, completed from the coarser level as far as it lacks trust."""
+    """Return a texel, completed from the coarser level in proportion to its missing trust."""
     texel = levels[offset + i * width + j]
     value = wp.vec3(texel[0], texel[1], texel[2])
     if texel[3] < 1.0 and coarse_height > 0:
@@ -166,7 +166,7 @@ def push_level_kernel(
     band_row, j = wp.tid()
     i = row_start + band_row
     value = completed(levels_out, i, j, offset, height, width, coarse_offset, coarse_height, coarse_width)
-    # Trust stays: nothing reads it again but this texel.
+    # Trust is not read again.
     levels_out[offset + i * width + j] = wp.vec4(value[0], value[1], value[2], 1.0)
 
 
@@ -190,7 +190,7 @@ def finish_fill_kernel(
 
 
 def fill_level_shapes(height: int, width: int) -> tuple[tuple[int, int], ...]:
-    """Rows and columns of the fill pyramid's levels, from the map itself to a single texel."""
+    """Return rows and columns of the fill pyramid's levels, from the map itself to a single texel."""
     shapes = [(height, width)]
     while shapes[-1] != (1, 1):
         rows, columns = shapes[-1]
@@ -207,7 +207,7 @@ seed_fill = row_launcher(seed_fill_kernel, like=lambda radiance, *_: radiance)
 """Write level 0 of the fill pyramid.
 
 Args:
-    radiance: Light that is known in part, ``wp.vec3`` (h, w).
+    radiance: Partly known light, ``wp.vec3`` (h, w).
     confidence: ``wp.float32`` (h, w) in 0..1.
     levels_out: ``wp.vec4`` (``fill_level_offsets(h, w)[-1]``): radiance and trust.
 """
@@ -220,7 +220,7 @@ def push_pull(levels_out: wp.array, height: int, width: int, *, most: float = ma
         levels_out: As ``seed_fill`` left it; changed in place.
         height: Rows of level 0.
         width: Columns of level 0.
-        most: Radiance that a texel counts for at most: no share of an emitter is spread over what is unseen beside it.
+        most: Upper bound of a texel's radiance in means, so that an emitter does not spread over missing neighbours.
     """
     shapes, offsets = fill_level_shapes(height, width), fill_level_offsets(height, width)
     levels: list[tuple[Any, ...]] = [(offset, *shape) for offset, shape in zip(offsets, shapes, strict=False)]
@@ -231,11 +231,11 @@ def push_pull(levels_out: wp.array, height: int, width: int, *, most: float = ma
 
 
 def finish_fill(levels: wp.array, environment_out: wp.array, *, rows: Rows | None = None) -> None:
-    """Complete level 0 into the map that everything reads.
+    """Complete level 0 and write it as the environment map.
 
     Args:
         levels: As ``push_pull`` left it.
-        environment_out: ``wp.vec3`` (h, w): finite, not negative; zero if nothing at all is known.
+        environment_out: ``wp.vec3`` (h, w): finite, not negative; zero if no texel is known.
         rows: Band of rows, None for all.
     """
     height, width = environment_out.shape

@@ -1,15 +1,15 @@
-"""Directions that no ball shows, looked up in the camera's own picture.
+"""Completion of the environment by the camera's frame, in directions that no ball shows.
 
-Behind the ball, and near its rim, where a pixel is many degrees, the map of the environment is filled from neighbours.
-A good part of it stands in the picture, beyond and beside the ball. A direction d from the ball's centre is looked up
+The ball does not show directions behind it, and near its rim a pixel covers many degrees. The frame shows many of these
+directions, behind and beside the ball. The radiance of a direction d from the ball's centre is read
 
-- where a proxy is in the way: at the pixel of the point that is hit, if the camera sees that point, and if it lies
-  ``OWN_SHADOW`` radii from every ball: closer, the picture shows the ball's own shadow, which no object elsewhere sees;
-- elsewhere at infinity: at the pixel in which the camera looks along d, if it sees past balls and proxies there.
+- if a proxy is met: at the pixel of the point that is hit, if the camera sees that point and it lies at least
+  ``OWN_SHADOW`` radii from every ball. Closer points lie in the ball's own shadow, which other objects do not see;
+- otherwise, at infinity: at the pixel whose ray has the direction d, if no ball or proxy is in its way.
 
-What is near and not modelled is seen from another side than the ball would see it, so the picture is trusted less than
-the ball, ``FRAME_TRUST``, and only for that part of a texel's trust which the ball leaves open. A texel is the mean of
-``SIDE`` x ``SIDE`` directions, by the share that is seen.
+Near surfaces that are not modelled are seen from another side than the ball's. So the frame has a lower trust,
+``FRAME_TRUST``, and fills only the part of a texel's trust that the ball leaves open. A texel is the mean of the
+visible ones of ``SIDE`` x ``SIDE`` directions, and its trust is scaled by their share.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ wp.set_module_options({"enable_backward": False})
 SIDE = wp.constant(3)
 """Directions along the side of a texel."""
 FRAME_TRUST = wp.constant(wp.float32(0.8))
-"""Trust in a texel from the picture; one from a ball has 1."""
+"""Trust in a texel that the frame shows; one that a ball shows has 1."""
 BALL_MARGIN = wp.constant(wp.float32(1.08))
 """Factor on a ball's radius for hiding surfaces, because its outline is blurred."""
 OWN_SHADOW = wp.constant(wp.float32(6.0))
-"""Distance in radii within which a ball shades surfaces: its shadow in light 10 degrees above them."""
+"""Distance from a ball, in radii, within which it shades surfaces: its shadow in light 10 degrees above them."""
 CLOSE = wp.constant(wp.float32(1.0e-3))
 """Relative distance within which a camera ray's hit is the surface itself."""
 ENOUGH = wp.constant(wp.float32(0.999))
-"""Trust from which a ball needs no help of the picture."""
+"""Trust from which on a texel is not completed by the frame."""
 
 
 @wp.func
@@ -66,9 +66,9 @@ def shaded_by_ball(probes: wp.array[Probe], point: wp.vec3) -> wp.bool:
 
 @functools.cache
 def make_see_texel(proxies: tuple[int, ...]) -> wp.Function:
-    """``see_texel(picture, params, probes, scene, shape, ball, i, j) -> vec4``: radiance and number of directions seen.
+    """``see_texel(picture, params, probes, scene, shape, ball, i, j) -> vec4``: sum and number of visible directions.
 
-    The radiance is their sum.
+    The first three components are the sum of radiance over the directions of texel (i, j) that the frame shows.
     """
     trace = make_trace(TraceConfig(objects=(), proxies=proxies))
 
@@ -87,7 +87,7 @@ def make_see_texel(proxies: tuple[int, ...]) -> wp.Function:
         frame = picture.frame
         total = wp.vec3(0.0, 0.0, 0.0)
         count = wp.float32(0.0)
-        side = wp.int32(SIDE)  # a variable: the loops stay loops
+        side = wp.int32(SIDE)  # a variable: the loops are not unrolled
         for row_of_texel in range(side):
             y = wp.float32(i) + (wp.float32(row_of_texel) + 0.5) / wp.float32(SIDE)
             for column_of_texel in range(side):
@@ -117,7 +117,7 @@ def make_see_texel(proxies: tuple[int, ...]) -> wp.Function:
 
 @wp.func
 def with_seen(known: wp.vec4, seen: wp.vec4) -> wp.vec4:
-    """A texel of which the ball knows a part, and what ``see_texel`` found."""
+    """Complete the trust of a texel, ``known`` from balls, by the result of ``see_texel``."""
     count = seen[3]
     if count <= 0.0 or known[3] >= ENOUGH:
         return known
@@ -158,15 +158,15 @@ def make_fill_frame_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
 
 
 fill_frame = row_launcher(make_fill_frame_kernel, like=lambda *given: given[4])
-"""Put what the frame shows into a seeded fill pyramid, where balls left trust open.
+"""Add the frame's radiance to level 0 of a seeded fill pyramid, for texels that balls do not trust fully.
 
 Args:
     proxies: Kinds of proxy in the scene.
-    picture: (frame rows, columns) the camera's; its rays are not read.
+    picture: (frame rows, columns) the camera's frame; rays are not read.
     params: ``FrameParams`` (1): the camera.
-    probes: ``Probe`` (P), at least one; all hide what is behind them.
-    scene: Its proxies are seen where they are.
+    probes: ``Probe`` (P), at least one; all hide surfaces behind them.
+    scene: Its proxies are known surfaces.
     shape: Rows and columns of the map.
-    ball: The one whose light the map is.
-    levels_out: From ``fill.seed_fill``; its level 0 changes.
+    ball: Index of the map's ball.
+    levels_out: From ``fill.seed_fill``; level 0 is changed.
 """

@@ -1,7 +1,7 @@
-"""Irradiance of the environment at a point: that of one mirror ball's map, or interpolated between those of several.
+"""Irradiance of the environment at a point: of one mirror ball's map, or interpolated between several balls.
 
-Objects and the receiver are lit by it alike. Emitters whose places are known are seen from the point, in every ball's
-map; what a ball counts there says ``probe_weights``.
+Objects and the receiver use the same functions. Emitters of known position light the point from their position, in
+every ball's map. ``probe_weights`` gives the weights of the balls.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class OtherBalls:
-    """The light at the mirror balls after the first, one of each after another; empty where there is one ball."""
+    """The environment at the mirror balls after the first, one array entry per ball; empty if there is one ball."""
 
-    places: wp.array[wp.vec4]  # of all balls, the first one's too, and their trusts
+    places: wp.array[wp.vec4]  # centres and trusts of all balls, the first included
     irradiance_sh: wp.array2d[wp.vec3]
     irradiance_map: wp.array3d[wp.vec3]
     levels: wp.array2d[wp.vec3]  # prefiltered
@@ -37,8 +37,8 @@ def make_irradiance_at(form: Literal["sh", "map"], emitters: bool, several: bool
     """``irradiance_at(sh, latlong, emitters, others, point, normal) -> vec3``.
 
     Args:
-        form: Whether irradiance is nine coefficients, ``sh``, or a map, ``latlong``; the other is not read.
-        emitters: Whether places of emitters are known.
+        form: ``sh`` if irradiance is given by nine coefficients, ``map`` if by a latlong map; the other is not read.
+        emitters: Whether positions of emitters are known.
         several: Whether the light of several balls is interpolated.
     """
 

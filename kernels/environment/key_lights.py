@@ -5,13 +5,13 @@ with normal n receives, by the first two bands of the cosine lobe (pi and 2 pi /
 
     E(n) = phi / 4 + n . V / 2.
 
-So the direction in which a surface receives most is s = V / |V|, and facets toward and away from it differ by
+So a surface that faces s = V / |V| receives most, and the relative difference between surfaces toward and away from s,
 
     (E(s) - E(-s)) / (E(s) + E(-s)) = 2 |V| / phi,
 
-the directionality: 0 in a uniform environment and between two equal opposite lights, 1 (clamped) for a sun and still
-for a window that is half a black sky. Both are means over all directions: they move smoothly where lights of about one
-strength take turns.
+is the directionality. It is 0 in a uniform environment and between two equal opposite lights, and 1 (clamped) for a sun
+and for a bright hemisphere in a black environment. Both values are means over all directions, so they change smoothly
+when another light becomes the strongest.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def sum_rows_kernel(
     # Out:
     sums_out: wp.array[wp.vec4],  # luminance times direction, and luminance, over the row's solid angle
 ):
-    """Flow of one row a thread."""
+    """Sum one row."""
     i = wp.tid()
     height = environment.shape[0]
     width = environment.shape[1]
@@ -51,7 +51,7 @@ def find_key_light_kernel(
     # Out:
     key_lights_out: wp.array[KeyLight],
 ):
-    """Direction and directionality of the sum over all rows."""
+    """Find direction and directionality from the sums of all rows."""
     total = wp.vec4(0.0, 0.0, 0.0, 0.0)
     for i in range(sums.shape[0]):
         total += sums[i]
@@ -71,7 +71,7 @@ def find_key_light(environment: wp.array, sums_out: wp.array, key_lights_out: wp
     Args:
         environment: ``wp.vec3`` (h, w), finite and not negative.
         sums_out: Scratch, ``wp.vec4`` (h).
-        key_lights_out: ``KeyLight`` (1). Without any light it looks toward +z with directionality 0.
+        key_lights_out: ``KeyLight`` (1). Without any light its direction is +z and its directionality 0.
     """
     launch(sum_rows_kernel, environment.shape[0], [environment], [sums_out])
     launch(find_key_light_kernel, 1, [sums_out], [key_lights_out])

@@ -1,22 +1,22 @@
 """Weights of several mirror balls in the light at a point between them.
 
-Gradient bands [Johansen09, section 6.3]. From the place c of ball i toward that of another, j, the point x stands at
+Gradient bands [Johansen09, section 6.3]. On the line from the centre c_i of ball i to that of another ball, j, the
+point x has the coordinate
 
     t_ij = clamp((x - c_i).(c_j - c_i) / |c_j - c_i|^2, 0, 1),
 
-0 beside i and behind it, 1 beside j and beyond it. With a trust T of every ball in 0..1 the weights are
+0 at i and behind it, 1 at j and beyond it. With a trust T of every ball in 0..1 the weights are
 
     w_i ~ T_i min over j of (1 - T_j t_ij),    sum w_i = 1.
 
-Of two balls that are trusted alike the light is interpolated along the line from one to the other, linearly, and is
-that of one ball alone beside it and behind it, as seen from the other. At a ball's place all others' weights are zero,
-for any number of them. Weights are continuous in places and trusts: a ball whose trust falls to zero goes out without a
-jump, and the others share the room as if it had never been there. The least weight does not vanish where some T is 1:
-of those balls the nearest has all t <= 1/2.
+Between two balls of equal trust the light is interpolated linearly along the line from one to the other; beyond either
+ball it is that ball's alone. At a ball's centre the weights of all others are zero, for any number of balls, if its
+trust is 1. Weights are continuous in positions and trusts: a ball whose trust falls to zero has no influence on the
+others. The sum of weights does not vanish if some T is 1: the nearest of those balls has all t <= 1/2.
 
-Trust follows what the frame shows of a ball: the share of directions whose light it tells, over ``ENOUGH``, smoothed by
-``TRUST_TIME``. Only ratios count, so trusts are kept with the greatest of them at 1: while no ball is seen, all stay.
-A ball that is lost stays for the weights where it was last seen; there its light is what is remembered of it.
+Trust follows the share of a ball's directions that the frame shows, over ``ENOUGH``, smoothed by ``TRUST_TIME``. Only
+ratios matter, so trusts are scaled to a maximum of 1; while no ball is seen they do not change. A ball that is no
+longer seen keeps its last position and its accumulated environment.
 
 References:
     [Johansen09] Johansen 2009, Automated Semi-Procedural Animation for Character Locomotion, master's thesis, Aarhus.
@@ -37,17 +37,17 @@ TRUST_TIME = wp.constant(wp.float32(0.4))
 ENOUGH = wp.constant(wp.float32(0.5))
 """Share of measured texels in a ball's map from which the ball is trusted fully."""
 SEEN_AT_ALL = wp.constant(wp.float32(0.02))
-"""Least visible share at which a ball's place is updated."""
+"""Least visible share at which a ball's position is updated."""
 
 
 @wp.func
 def probe_weight(places: wp.array[wp.vec4], ball: wp.int32, point: wp.vec3) -> wp.float32:
-    """Weight of a ball at a point, not normalised.
+    """Return the weight of a ball at a point, not normalised.
 
     Args:
         places: (P,) centre of each ball, and its trust.
-        ball: Which.
-        point: Where light is asked for.
+        ball: Index of the ball.
+        point: Lit point, world.
     """
     place = places[ball]
     center = wp.vec3(place[0], place[1], place[2])
@@ -56,7 +56,7 @@ def probe_weight(places: wp.array[wp.vec4], ball: wp.int32, point: wp.vec3) -> w
         other = places[index]
         across = wp.vec3(other[0], other[1], other[2]) - center
         squared = wp.dot(across, across)
-        if squared > 0.0:  # else it is the ball itself, or one at its place
+        if squared > 0.0:  # else it is the ball itself, or one at the same position
             t = wp.clamp(wp.dot(point - center, across) / squared, 0.0, 1.0)
             least = wp.min(least, 1.0 - other[3] * t)
     return place[3] * least
@@ -64,7 +64,7 @@ def probe_weight(places: wp.array[wp.vec4], ball: wp.int32, point: wp.vec3) -> w
 
 @wp.func
 def probe_share(places: wp.array[wp.vec4], ball: wp.int32, point: wp.vec3) -> wp.float32:
-    """Weight of a ball at a point, of all balls' together; the first one's where none was ever seen."""
+    """Return the normalised weight of a ball at a point; if no ball was ever seen, the first has the weight 1."""
     total = float(0.0)
     for index in range(places.shape[0]):
         total += probe_weight(places, index, point)
@@ -81,7 +81,7 @@ def measure_seen_kernel(
     # Out:
     seen_out: wp.array2d[wp.float32],
 ):
-    """Corners of one row of a map at which one ball tells the light."""
+    """Measure the share of texel corners of one row whose light one ball shows."""
     ball, row = wp.tid()
     count = wp.float32(0.0)
     for column in range(corners.shape[1]):
@@ -101,7 +101,7 @@ def update_places_kernel(
     # In and out:
     places_out: wp.array[wp.vec4],
 ):
-    """All balls, which are few, by one thread: the greatest trust of all is asked for."""
+    """Update all balls, which are few, by one thread: the greatest trust of all is needed."""
     blend = 1.0 - wp.exp(-wp.max(params[0].time_step, 0.0) / TRUST_TIME)
     known = float(0.0)
     for ball in range(places_out.shape[0]):
@@ -128,7 +128,7 @@ def update_places_kernel(
 
 
 def measure_seen(corners: wp.array, size: tuple[int, int], seen_out: wp.array) -> None:
-    """Share of every ball's map that the frame shows, row by row.
+    """Measure the share of every ball's map that the frame shows, row by row.
 
     Args:
         corners: From ``unwrap.project_corners``, (h + 1, w + 1, P).
@@ -139,12 +139,12 @@ def measure_seen(corners: wp.array, size: tuple[int, int], seen_out: wp.array) -
 
 
 def update_places(seen: wp.array, probes: wp.array, params: wp.array, places_out: wp.array) -> None:
-    """Draw every ball's trust toward what is seen of it; places and trusts are read and written in place, from zero.
+    """Move every ball's trust toward its visible share; positions and trusts are updated in place, from zero.
 
     Args:
         seen: From ``measure_seen``, (P, h + 1).
         probes: ``Probe`` (P).
         params: ``FrameParams`` (1): ``time_step`` and ``environment_reset``.
-        places_out: (P,) ``wp.vec4``: where each ball was last seen, metres, and its trust; the greatest is 1.
+        places_out: (P,) ``wp.vec4``: last known position of each ball, metres, and its trust; the greatest is 1.
     """
     launch(update_places_kernel, 1, [seen, probes, params], [places_out])

@@ -1,4 +1,4 @@
-"""The mirror ball unwrapped: which light arrives at it from every direction.
+"""Unwrapping of the mirror ball: the latlong map of the light that arrives at it from every direction.
 
 The environment is taken to be distant: the light from direction d is the same everywhere on the ball. Seen from the
 ball's centre, with the axis a toward the camera and D = distance / radius, the ball's point with normal n at angle
@@ -9,18 +9,18 @@ theta, D - cos theta) on the other side of the axis, and so reflects light that 
 
 which is theta + atan2(D sin theta, D cos theta - 1) written without the difference of two nearly equal numbers. On the
 visible cap, 0 <= theta <= acos(1 / D), f rises from 0 to acos(1 / D) + pi / 2 and is concave, so Newton's method finds
-theta for a given d; what lies beyond is the blind cone behind the ball. The iteration turns n by e / f', where e, the
-angle still missing, is the cross product of the reflected direction and d: square roots only, and nothing is divided by
-the sine of an angle that can be zero (light that returns straight to the camera).
+theta for a given d; directions beyond are in the blind cone behind the ball. The iteration turns n by e / f', where e,
+the remaining angle, is the cross product of the reflected direction and d. It needs square roots only, and does not
+divide by the sine of an angle that can be zero (light that returns straight to the camera).
 
-The point is then projected through the lens to where the frame shows it. This is done at the texels' corners; within a
-texel, samples are placed by bilinear interpolation between its corners, as many as its footprint is long in pixels, so
-that each pixel of the ball counts.
+The point is then projected through the lens into the frame. This is done at the texels' corners. Samples within a texel
+are placed by bilinear interpolation between its corners, as many as its footprint is long in pixels, so that every
+pixel of the ball is used.
 
-Confidence is 0 where the ball says nothing (blind, outside the frame, hidden by a proxy or by another ball) and where
-what lies behind the ball could leak in: pixels nearer than ``RIM_START`` to the silhouette. It rises over the next
-``RIM_WIDTH`` pixels, and is scaled by density / (density + ``HALF_DENSITY``), the share that a ball of that many pixels
-per steradian is worth.
+Confidence is 0 for directions that the frame does not show (in the blind cone, outside the frame, hidden by a proxy or
+another ball), and within ``RIM_START`` pixels of the silhouette, where light from behind the ball could leak in. It
+rises over the next ``RIM_WIDTH`` pixels. It is scaled by density / (density + ``HALF_DENSITY``), with the density of
+pixels per steradian.
 """
 
 import functools
@@ -44,21 +44,21 @@ RIM_WIDTH = wp.constant(1.5)
 """Pixels over which confidence then rises to its full value."""
 
 ALL_ALIKE = -1
-"""Number of no ball."""
+"""Index that stands for a map made of all balls."""
 BORROWED = wp.constant(wp.float32(1.0e-3))
-"""Share of its vote that a ball has in the map of another one."""
+"""Factor on the weight of a ball in the map of another ball."""
 
 MAX_SAMPLES = wp.constant(8)  # per side of a texel
 HALF_DENSITY = wp.constant(wp.float32(4.0))  # pixels per steradian: a ball of 8 pixels across
 NEWTON_STEPS = wp.constant(12)  # 2 to 4 are taken from half a metre; more only where the camera almost touches the ball
 CONVERGED = wp.constant(wp.float32(1.0e-7))  # squared angle: 0.02 degrees, which the step then taken squares once more
 FOLD_TOLERANCE = wp.constant(wp.float32(3.0))  # pixels
-CONTACT = wp.constant(wp.float32(0.02))  # radii: what touches the ball does not hide the point that it touches
+CONTACT = wp.constant(wp.float32(0.02))  # radii: a surface that touches the ball does not hide the point of contact
 
 
 @wp.func
 def reflecting_normal(distance: wp.float32, cos_psi: wp.float32, sin_psi: wp.float32) -> wp.vec2:
-    """Normal (along the axis, across it) of the ball's point that reflects light from angle psi to the camera.
+    """Return the normal (along the axis, across it) of the ball's point that reflects light from angle psi.
 
     Args:
         distance: From the ball's centre to the camera, in radii; above 1.
@@ -93,7 +93,7 @@ def reflecting_normal(distance: wp.float32, cos_psi: wp.float32, sin_psi: wp.flo
 
 @wp.func
 def any_perpendicular(axis: wp.vec3) -> wp.vec3:
-    """Some unit vector across a unit vector."""
+    """Return some unit vector perpendicular to a unit vector."""
     other = wp.vec3(1.0, 0.0, 0.0)
     if wp.abs(axis[0]) > 0.6:
         other = wp.vec3(0.0, 1.0, 0.0)
@@ -102,9 +102,9 @@ def any_perpendicular(axis: wp.vec3) -> wp.vec3:
 
 @functools.cache
 def make_hidden_by_proxies(kinds: tuple[int, ...]) -> wp.Function:
-    """``hidden_by_proxies(scene, origin, ray, t_max, pad) -> bool``: whether a proxy stands before a point of a ball.
+    """``hidden_by_proxies(scene, origin, ray, t_max, pad) -> bool``: whether a proxy hides a point of a ball.
 
-    Proxies grow by ``pad`` metres, the rim's width: what lies right beside them in the picture may show them.
+    Proxies are enlarged by ``pad`` metres, the rim's width: pixels right beside a proxy may show it.
     """
 
     @wp.func(name=f"hidden_by_proxies_{'_'.join(map(str, kinds))}", module="unique")
@@ -128,7 +128,7 @@ def make_hidden_by_proxies(kinds: tuple[int, ...]) -> wp.Function:
                 if shape.kind == MESH:
                     if meets_mesh(shape, o, d, t_max):
                         return True
-                    # A mesh does not grow: four rays around this one look for it instead.
+                    # A mesh cannot be enlarged: four rays around this one test it instead.
                     across = any_perpendicular(wp.normalize(d)) * (pad / shape.scale)
                     up = wp.cross(wp.normalize(d), across)
                     if meets_mesh(shape, o, d + across, t_max) or meets_mesh(shape, o, d - across, t_max):
@@ -142,13 +142,15 @@ def make_hidden_by_proxies(kinds: tuple[int, ...]) -> wp.Function:
 
 @wp.func
 def is_folded(camera: FrameParams, rays: wp.array2d[wp.vec2], point: wp.vec3, at: wp.vec3) -> wp.bool:
-    """Return whether the pixel of a point looks elsewhere, as under a polynomial lens beyond its field of view.
+    """Return whether a point's projection is false, as that of a polynomial lens beyond its field of view.
+
+    It is false if the ray of the pixel does not lead to the point.
 
     Args:
-        camera: Of the frame.
-        rays: Of its pixels.
-        point: From the camera, along the world's axes.
-        at: Column and row.
+        camera: Camera of the frame.
+        rays: Rays of its pixels.
+        point: Point relative to the camera, in world axes.
+        at: Column and row of its projection.
     """
     i = wp.int32(wp.round(wp.clamp(at[1], 0.0, wp.float32(rays.shape[0] - 1))))
     j = wp.int32(wp.round(wp.clamp(at[0], 0.0, wp.float32(rays.shape[1] - 1))))
@@ -216,12 +218,12 @@ def make_project_corners_kernel(kinds: tuple[int, ...]) -> wp.Kernel:
         rim_sine = wp.sqrt((1.0 - least) * (1.0 + least))
         if cos_psi <= -rim_sine:
             return  # blind cone: psi >= acos(1 / D) + pi / 2
-        if sin_psi <= 1.0e-6:  # straight back: any plane through the axis will do
+        if sin_psi <= 1.0e-6:  # light returns to the camera: any plane through the axis serves
             side = any_perpendicular(axis)
         side = wp.normalize(side)
 
         n = reflecting_normal(distance, cos_psi, sin_psi)
-        # Relative to the camera from the start: far from the world's origin nothing cancels.
+        # Relative to the camera from the start: no cancellation far from the world's origin.
         point = probe.radius * (n[0] * axis + n[1] * side) - to_camera
         rim = probe.radius * (least * axis + rim_sine * side) - to_camera
         pixel = project(camera, point)
@@ -247,14 +249,14 @@ def make_project_corners_kernel(kinds: tuple[int, ...]) -> wp.Kernel:
 
 
 project_corners = row_launcher(make_project_corners_kernel)
-"""Find where the frame shows the reflected light of every texel corner's direction.
+"""Find the pixel in which each ball shows the light from the direction of every texel corner.
 
 Args:
-    kinds: Of proxies in the scene.
+    kinds: Kinds of proxy in the scene.
     params: ``FrameParams`` (1): the camera.
     probes: ``Probe`` (P).
     rays: Undistorted normalised coordinates of the frame's pixel centres, ``wp.vec2`` (frame rows, columns).
-    scene: What can hide the balls: its proxies.
+    scene: Its proxies can hide the balls.
     corners_out: ``wp.vec3`` (h + 1, w + 1, P): pixel column, pixel row, and pixels from there to the ball's
         silhouette; the last is -1 where the direction is not seen.
 """
@@ -262,7 +264,7 @@ Args:
 
 @wp.func
 def mix(a: wp.vec3, b: wp.vec3, t: wp.float32) -> wp.vec3:
-    """From a to b; exact where both are equal."""
+    """Interpolate from a to b; exact if both are equal."""
     return a + t * (b - a)
 
 
@@ -293,7 +295,7 @@ class Footprint:
 
 @wp.func
 def footprint_samples(a0: wp.vec3, a1: wp.vec3, b0: wp.vec3, b1: wp.vec3) -> wp.int32:
-    """Samples along one side of a footprint: one per pixel of the longer of its two edges."""
+    """Return the samples along one side of a footprint: one per pixel of the longer of two opposite edges."""
     a = wp.vec2(a1[0] - a0[0], a1[1] - a0[1])
     b = wp.vec2(b1[0] - b0[0], b1[1] - b0[1])
     longest = wp.sqrt(wp.max(wp.dot(a, a), wp.dot(b, b)))
@@ -332,7 +334,7 @@ def make_average_footprint(linear: bool) -> wp.Function:
                 right = mix(texel.c01, texel.c11, y)
             at = mix(left, right, (wp.float32(b) + 0.5) / wp.float32(count_x))
             out.possible += area
-            # At the frame's border the same ramp as at the rim.
+            # Confidence rises from the frame's border as from the rim.
             inside = wp.min(wp.min(at[0], last_column - at[0]), wp.min(at[1], last_row - at[1]))
             ramp = wp.clamp(wp.min(at[2] - RIM_START, inside) / RIM_WIDTH, 0.0, 1.0)
             if inside >= 0.0 and ramp > 0.0:
@@ -402,7 +404,7 @@ def make_gather_probe_kernel(linear: bool = False) -> wp.Kernel:
                     pixels = 0.5 * wp.abs(across[0] * along[1] - across[1] * along[0])
                     density = pixels / texel_solid_angle(row, texel.height, width)
                     certainty = found.total / found.possible * density / (density + HALF_DENSITY)
-                    # Of several balls the sharper one has the say: a vote per pixel.
+                    # The ball that shows the direction in more pixels gets more weight.
                     vote = certainty * density
                     if own >= 0 and index != own:
                         vote *= BORROWED
@@ -424,11 +426,11 @@ gather_probe = row_launcher(make_gather_probe_kernel, like=lambda *given: given[
 Args:
     linear: Whether the frame is linear.
     frame: ``wp.vec3ub`` (frame rows, columns), RGB codes; or ``wp.vec3``, linear radiance.
-    decode_table: Linear value of each code, ``wp.vec3`` (256); for a linear frame where it clips, and where beside
-        another channel that does, (2,).
+    decode_table: Linear value of each code, ``wp.vec3`` (256). For a linear frame, (2,): the values from which channels
+        count as clipped, alone and beside a clipped channel.
     probes: ``Probe`` (P); reflectances must be positive.
     corners: From ``project_corners``, (h + 1, w + 1, P).
-    own: The ball whose light is asked for: others then tell only of what it does not see. ``ALL_ALIKE``: all balls
-        make one map, in which the one that sees more sharply has the say.
-    view_out: (h, w); of every texel its footprint's mean, and the share of it that is at clipping.
+    own: Index of the map's ball; others fill only directions that it does not show. ``ALL_ALIKE``: all balls make one
+        map, weighted by their pixels per steradian.
+    view_out: (h, w); the mean over every texel's footprint, its confidence, and its clipped share.
 """

@@ -1,46 +1,48 @@
-"""Surroundings of a virtual object at close range: the receiver that it stands on, other objects, itself.
+"""Near field of virtual objects: light from the receiver that they stand on, from other objects, and from themselves.
 
-Per pixel of an object, two objects replace what the distant environment alone would give ``shade``:
+Per pixel of an object, two values replace the light of the distant environment alone in ``shade``:
 
-*Irradiance*, the sum over one set of the environment's samples, each traced: a proxy in the way shows the camera's
-picture of it (see ``reflect``), darkened by the objects' own shadows and brightened by virtual light; an object in the
-way shows what the distant environment makes of it. So an object's underside sees the shadow that it stands in, not an
-empty receiver. Few samples are a bad sum: there it is the environment's irradiance, which is known, and of the samples
-only what those change that meet something. Where nothing is near that has no noise.
+*Irradiance* is the sum over one set of the environment's samples, for each of which a ray is traced. A ray that meets a
+proxy returns its radiance in the frame (see ``reflect``), with the shadows of virtual objects and with virtual light. A
+ray that meets an object returns the object's radiance under the distant environment. So an object's underside receives
+light from its own shadow, not from an unshaded receiver. A sum of few samples is noisy. Then the result is the
+environment's irradiance, which is known, plus the changes by those samples that meet something: without noise where
+nothing is near.
 
-*Mirrored*, radiance of what is near and a share; ``shade`` adds (1 - share) of the prefiltered environment. A mirror
-sends rays from places all over the pixel, for what a curved one shows in neighbouring pixels may lie far apart; each
-reads what it meets as wide as its part of the pixel is there, the environment as well, and the share is 1. A glossy
-lobe sends a few, another few from each pixel of a tile. What is near hides part of the lobe, and what it hides may be
-much darker than the rest: at the rim of a window that a receiver cuts off, half of the rays meet the receiver and
-hardly any of the light is gone. So every ray reads the environment as well. With the means over the rays
+*Reflected* is the radiance of near surfaces, and a share: ``shade`` adds (1 - share) of the prefiltered environment. A
+mirror sends rays from several points of the pixel, because neighbouring pixels of a curved mirror may show distant
+points. Each ray is filtered over its part of the pixel, in the environment as well, and the share is 1. A glossy lobe
+sends a few rays, different ones from each pixel of a tile. Near surfaces hide part of the lobe, and that part may be
+darker than the rest: where a receiver cuts a window off just outside its edge, half of the rays meet the receiver and
+hardly any light is lost. So every ray reads the environment as well. With the means over the rays
 
     s  share of the rays that meet something near,      N  their radiance, 0 for the others,
     B  the environment along all rays,                  M  the environment along those that meet nothing,
 
-the lobe holds N + M. M is noisy where much of the lobe is open, and there L, the environment prefiltered with the
-whole lobe, is known: M = (|M| / |B|) L, as L is B without noise. Where hardly any of it is open the noise of M is a
-small part of the sum, and L may be all that is hidden. Hence
+the lobe reflects N + M. M is noisy where much of the lobe is open. There L, the environment prefiltered with the whole
+lobe, serves: M = (|M| / |B|) L, since L is B without noise. Where little of the lobe is open, the noise of M is a small
+part of the sum, and most of L may be hidden. Hence the reflected radiance is
 
     | N + s M + (1 - s) (|M| / |B|) L |,    |.| the brightness: share = 1 - (1 - s) |M| / |B|.
 
-Both are averaged over one tile's worth of neighbours on the same object whose normals agree, as ``environment_shadow``
-does; mirrors are not. Where a pixel has rays enough of its own, neighbours count less for what a lobe holds the more
-their normals differ: exp(-theta^2 / (2 alpha^2)), alpha the lobe's width, as 1 - cos theta = theta^2 / 2. Normals of a
-thin tube turn by ten degrees from pixel to pixel, and a mean over them would hold what twice that angle shows.
+Both values are averaged over neighbours on the same object with similar normals, in a window of a tile's size, as in
+``environment_shadow``. Mirrors are not averaged. If a pixel has enough rays of its own, its neighbours' lobes have the
+weight exp(-theta^2 / (2 alpha^2)), theta the angle between the normals and alpha the lobe's width (with 1 - cos theta =
+theta^2 / 2). Otherwise a thin tube, whose normals turn by ten degrees per pixel, would reflect a mean over twice that
+angle.
 
-**Rays** go toward samples of the environment, into a glossy lobe, or from places all over the pixel of a mirror.
-A ray among n stands for the solid angle 1 / (n pdf). The environment's level of the same width is read, twice as wide
-so that neighbours overlap: for a half vector h, GGX has pdf D = k^2 / pi, k = alpha / (sin^2 + alpha^2 cos^2) of the
-angle between h and n, which is 1 / alpha at the peak, where a lobe's n-th has the width alpha / sqrt n. So
+**Rays** go toward samples of the environment, into a glossy lobe, or from several points in the pixel of a mirror.
+One ray of n stands for the solid angle 1 / (n pdf). The environment is read from the level of twice that width, so that
+neighbouring rays overlap. For a half vector h, GGX has the pdf D = k^2 / pi, k = alpha / (sin^2 + alpha^2 cos^2) of the
+angle between h and n. At the peak k = 1 / alpha, and one ray of n has the width alpha / sqrt n. So
 
     | width = 2 / (k sqrt n) |,    Phong: 2 alpha / sqrt(n cos^e), e its exponent.
 
-With one width for all, the few rays in the long tails of GGX would show emitters as squares of a tile's size.
+With one width for all rays, the few in the long tails of GGX would show emitters as squares of a tile's size.
 
-A mirror's rays stand for the parts of its pixel, and spread as its neighbours say: how origin and direction of the
-mirrored ray differ from pixel to pixel, whatever the shape. The picture of the receiver is read as wide as a ray of a
-mirror or a lobe is there (``frame_levels``), and so are the environment and the textures of other objects.
+A mirror's rays stand for parts of its pixel. Their footprints are found from differences of the reflected ray's origin
+and direction between neighbouring pixels, for any shape. The frame (``frame_levels``), the environment, and textures of
+other objects are filtered over the footprint of a ray.
 """
 
 from __future__ import annotations
@@ -83,25 +85,25 @@ from warp_ar.kernels.structs import METALLIC_ROUGHNESS, PHONG, FrameParams, Hit,
 wp.set_module_options({"enable_backward": False})
 
 SHARP_ALPHA = 0.02
-"""Width of a lobe below which it is a mirror."""
+"""Lobe width alpha below which a surface is a mirror."""
 SHARP = wp.constant(wp.float32(SHARP_ALPHA))
 RAY_WIDTH = 2.0
-"""Width of one ray of many, over the width that its share of the lobe has."""
+"""Width at which a lobe's ray reads the environment, over the width of its share of the lobe."""
 LOBE_ANGLE = 1.0
-"""Side of such a ray's footprint in the frame, as an angle, over its width. The whole share of a ray has a side of
-1.77, but so wide a footprint would cross the edges of its surface."""
+"""Side of the footprint of a lobe's ray in the frame, as an angle, over the ray's width. A ray's whole share has a side
+of 1.77, but so wide a footprint would cross the edges of surfaces."""
 SAME_SURFACE = wp.constant(wp.float32(0.5))
-"""Least cosine between the normals of neighbours that estimate a mirror's curvature."""
+"""Least cosine between the normals of neighbours from which a mirror's curvature is estimated."""
 MIN_LIGHT = wp.constant(wp.float32(1.0e-6))
-"""Brightness, in camera values, below which a lobe's share is 0 over 0."""
+"""Brightness |B|, in camera values, below which |M| / |B| is not computed."""
 NO_RAY = wp.constant(wp.float32(-1.0))
-"""Share of a pixel whose rays all ran into its surface: it knows nothing of its lobe."""
+"""Share that marks a pixel whose rays all went into its own surface: its lobe was not sampled."""
 SAME_NORMAL = wp.constant(wp.float32(math.cos(math.radians(20.0))))
-"""Cosine of the angle up to which neighbours' normals are those of one surface."""
+"""Least cosine between the normals of neighbours that are averaged."""
 
 
 OWN_RAYS = 4
-"""Rays into a lobe from which on neighbours count by how much their normals differ."""
+"""Number of a pixel's rays into a lobe from which on neighbours are weighted by the difference of normals."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,7 +117,7 @@ class NearFieldConfig:
     lobe_count: int
     """Rays per pixel into a glossy lobe; 0 if no object has one."""
     mirror_samples: int
-    """Places within a pixel from which a mirror sends a ray, a square number; 0 if no object is one."""
+    """Points within a pixel from which a mirror sends a ray, a square number; 0 if no object is a mirror."""
     side: int
     """Pixels along a tile."""
     ratio: bool
@@ -123,13 +125,13 @@ class NearFieldConfig:
     added: bool
     """True if virtual lights light the receiver."""
     known: bool = False
-    """True if irradiance is the environment's known one plus the change by samples that hit something; else the sum
-    of all samples."""
+    """True if irradiance is that of the environment plus the change by samples that meet something; False if it is the
+    sum of all samples."""
 
 
 @wp.func
 def lobe_alpha(model: wp.int32, roughness: wp.float32, shininess: wp.float32) -> wp.float32:
-    """Width of a surface's lobe; 0 for a mirror."""
+    """Return the width alpha of a surface's lobe; 0 for a mirror."""
     if model == METALLIC_ROUGHNESS:
         return roughness * roughness
     if model == PHONG:
@@ -139,30 +141,33 @@ def lobe_alpha(model: wp.int32, roughness: wp.float32, shininess: wp.float32) ->
 
 @wp.func
 def ggx_ray_width(cos_theta: wp.float32, alpha: wp.float32) -> wp.float32:
-    """Width of a ray, times the root of their number, whose half vector is this far from the normal."""
+    """Return the width of a ray times the square root of their number; ``cos_theta`` of half vector and normal."""
     cos2 = wp.min(cos_theta * cos_theta, 1.0)
     return (1.0 - cos2) / alpha + alpha * cos2
 
 
 @wp.func
 def phong_ray_width(cos_theta: wp.float32, exponent: wp.float32, alpha: wp.float32) -> wp.float32:
-    """The same for a ray this far from the mirror direction; no wider than the hemisphere."""
+    """Return the width of a Phong lobe's ray times the square root of their number, at most 1.
+
+    ``cos_theta`` is the cosine between the ray and the mirror direction.
+    """
     return wp.min(alpha * wp.exp(-0.5 * exponent * wp.log(wp.max(cos_theta, 1.0e-3))), 1.0)
 
 
 @wp.struct
 class NearRay:
-    """A ray that leaves a pixel of an object, and what stands behind the near field on its way."""
+    """A ray that leaves a pixel of an object, and the environment's light along it."""
 
     origin: wp.vec3
     direction: wp.vec3
-    reach: wp.float32  # metres
+    reach: wp.float32  # length, metres
     spread: wp.float32  # width over length
-    point: wp.vec3  # that it leaves, without offset
-    radiance: wp.vec3  # a sample's of the environment
-    weight: wp.float32  # that sample's cosine and measure, times its share
-    leaves: wp.bool  # into the open; else into the surface
-    covers: wp.bool  # a part of what a pixel mirrors: what it meets is read as wide as that
+    point: wp.vec3  # point that it leaves, without offset
+    radiance: wp.vec3  # radiance of the environment's sample
+    weight: wp.float32  # cosine times measure of the sample, times its ball's share
+    leaves: wp.bool  # whether it leaves the surface; False: it goes into it
+    covers: wp.bool  # whether it has a footprint, over which the surface that it meets is filtered
 
 
 @wp.struct
@@ -171,25 +176,25 @@ class SeenPoint:
 
     hit: Hit
     wo: wp.vec3
-    normal: wp.vec3  # for shading; this one and the next on the camera's side
-    geometric: wp.vec3  # of the surface that rays meet
+    normal: wp.vec3  # for shading, on the camera's side
+    geometric: wp.vec3  # of the surface itself, on the camera's side
     surface: Surface
     alpha: wp.float32  # width of its lobe; 0 for a mirror
     pixel: wp.vec2  # undistorted (x / z, y / z)
-    place: wp.int32  # of the pixel in its tile
-    footprint: Footprint  # of a mirror's whole pixel
+    place: wp.int32  # index of the pixel in its tile
+    footprint: Footprint  # of the whole pixel, for a mirror
 
 
 def ray_width(config: NearFieldConfig) -> float:
-    """Width of a ray of a tile's lobes, over ``NearRay.spread``."""
+    """Return the width of a lobe's ray, among all rays of a tile, over ``NearRay.spread``."""
     return RAY_WIDTH / (math.sqrt(max(config.lobe_count, 1)) * config.side)
 
 
 @functools.cache
 def make_footprint_of(config: NearFieldConfig) -> wp.Function:
-    """``footprint_of(at, ray) -> Footprint``: of a ray that covers a part of what a pixel mirrors.
+    """``footprint_of(at, ray) -> Footprint``: ray differentials of a ray.
 
-    A mirror's is its part of the pixel, a lobe's a square around its direction.
+    For a mirror they span the ray's part of the pixel, for a lobe a square around the ray's direction.
     """
     part = 1.0 / math.sqrt(max(config.mirror_samples, 1))
     share = LOBE_ANGLE * ray_width(config)
@@ -218,7 +223,7 @@ def make_footprint_of(config: NearFieldConfig) -> wp.Function:
 def look_up_proxy(
     params: FrameParams, picture: Picture, layers: ReceiverLayers, ray: NearRay, fp: Footprint, proxy: Hit, at: wp.vec2
 ) -> wp.vec3:
-    """The picture of a proxy, shown at ``at``, as wide as the ray is that meets it."""
+    """Return the radiance of a proxy's point, which the frame shows at ``at``, filtered over the ray's footprint."""
     normal = proxy.geometric_normal
     across = covered_on(fp.origin_x, fp.turn_x, proxy.t, ray.direction, normal)
     along = covered_on(fp.origin_y, fp.turn_y, proxy.t, ray.direction, normal)
@@ -230,14 +235,14 @@ def look_up_proxy(
 
 @wp.func
 def spread_at(fp: Footprint, t: wp.float32) -> wp.float32:
-    """Width over length that a ray has when it has come so far: the side of a square of the area that it covers."""
+    """Return a ray's width over its length at distance t; the width is the side of a square of the footprint's area."""
     area = wp.length(wp.cross(fp.origin_x + t * fp.turn_x, fp.origin_y + t * fp.turn_y))
     return wp.sqrt(area) / wp.max(t, 1.0e-6)
 
 
 @wp.func
 def mirrored_level(fp: Footprint, height: wp.int32) -> wp.float32:
-    """Level of the environment for what a mirror's ray covers beyond a texel, which level 0 shows by itself.
+    """Return the environment's level for the footprint of a mirror's ray, less the texel that level 0 has anyway.
 
     A GGX lobe of width alpha has the peak density of a solid angle of 4 pi alpha^2.
     """
@@ -248,9 +253,9 @@ def mirrored_level(fp: Footprint, height: wp.int32) -> wp.float32:
 
 @functools.cache
 def make_look_near(config: NearFieldConfig) -> wp.Function:
-    """``look_near(...) -> vec4``: radiance of what is near along a ray, and 1; zero where only the environment is.
+    """``look_near(...) -> vec4``: (radiance, 1) of a near surface on a ray; zero if it meets only the environment.
 
-    The receiver's radiance is that of the picture so far: its shadows and its virtual light included.
+    The receiver's radiance includes virtual shadows and virtual light.
     """
     footprint_of = make_footprint_of(config)
     trace = make_trace(config.distant.trace)
@@ -301,18 +306,18 @@ def make_look_near(config: NearFieldConfig) -> wp.Function:
 
 @wp.struct
 class Step:
-    """Difference of a mirrored ray from that of a pixel's neighbour."""
+    """Difference of the reflected rays of a neighbour and of a pixel."""
 
     found: wp.bool
-    origin: wp.vec3
-    turn: wp.vec3
+    origin: wp.vec3  # difference of the origins, metres
+    turn: wp.vec3  # difference of the unit directions
 
 
 @wp.func
 def step_to(
     params: FrameParams, picture: Picture, visible: VisibleObjects, at: SeenPoint, i: wp.int32, j: wp.int32
 ) -> Step:
-    """To pixel (i, j), where it shows the same object with no crease between."""
+    """Return the step to pixel (i, j); not found if it shows another object, or if there is a crease between."""
     out = Step()
     if not inside_rect(i, j, params.object_rect):
         return out
@@ -341,7 +346,7 @@ def shorter_step(
     axis: wp.vec3,
     angle: wp.float32,
 ) -> Step:
-    """Of two neighbours the one that lies more on the same surface; without any, a pixel of a plane mirror."""
+    """Return the smaller step of those to two opposite neighbours; if none is found, that of a plane mirror."""
     out = step_to(params, picture, visible, at, pixel[0] - aside[0], pixel[1] - aside[1])
     second = step_to(params, picture, visible, at, pixel[0] + aside[0], pixel[1] + aside[1])
     if second.found and (not out.found or wp.length_sq(second.turn) < wp.length_sq(out.turn)):
@@ -356,7 +361,7 @@ def shorter_step(
 def pixel_footprint(
     params: FrameParams, picture: Picture, visible: VisibleObjects, at: SeenPoint, pixel: wp.vec2i, angle: wp.float32
 ) -> Footprint:
-    """Return the change of the mirrored ray over a pixel, which is ``angle`` wide, by its neighbours."""
+    """Return the differentials of the reflected ray over a pixel of width ``angle``, by differences to neighbours."""
     axes = frame_from_normal(reflect(at.wo, at.normal))
     across = wp.vec3(axes[0, 0], axes[1, 0], axes[2, 0])
     down = wp.vec3(axes[0, 1], axes[1, 1], axes[2, 1])
@@ -372,7 +377,7 @@ def pixel_footprint(
 
 @functools.cache
 def make_see_point(config: NearFieldConfig) -> wp.Function:
-    """``see_point(params, picture, scene, dfg, visible, i, j) -> SeenPoint``: what pixel (i, j) shows of an object."""
+    """``see_point(params, picture, scene, dfg, visible, i, j) -> SeenPoint``: point of an object in pixel (i, j)."""
     surface_at = make_surface(config.distant.models, config.distant.textures)
     side = config.side
 
@@ -410,7 +415,7 @@ def make_see_point(config: NearFieldConfig) -> wp.Function:
 
 @wp.func
 def make_sample_ray(sample: EnvironmentSample, at: SeenPoint, share: wp.float32) -> NearRay:
-    """Toward a sample of the environment; its weight is 0 where the surface does not see it."""
+    """Return the ray toward a sample of the environment; its weight is 0 if the sample is behind the surface."""
     out = NearRay()
     toward = sample_toward(sample, at.hit.point)
     cosine = wp.dot(at.normal, toward.direction)
@@ -428,7 +433,7 @@ def make_sample_ray(sample: EnvironmentSample, at: SeenPoint, share: wp.float32)
 
 @wp.func
 def make_lobe_ray(u: wp.vec2, at: SeenPoint) -> NearRay:
-    """Into the lobe of a glossy surface, by two numbers of [0, 1)."""
+    """Return a ray into the lobe of a glossy surface, drawn by two numbers in [0, 1)."""
     out = NearRay()
     if at.surface.model == PHONG:
         center = reflect(at.wo, at.normal)
@@ -452,7 +457,7 @@ def make_lobe_ray(u: wp.vec2, at: SeenPoint) -> NearRay:
 
 @functools.cache
 def make_mirror_ray(config: NearFieldConfig) -> wp.Function:
-    """``mirror_ray(params, scene, at, k) -> NearRay``: from what a pixel's sample ``k`` shows of a mirror."""
+    """``mirror_ray(params, scene, at, k) -> NearRay``: reflected ray of sample ``k`` of a mirror's pixel."""
     closest_visible = make_primary(config.distant.trace)
     sample_direction = make_sample_direction(config.mirror_samples)
 
@@ -483,8 +488,8 @@ def make_mirror_ray(config: NearFieldConfig) -> wp.Function:
 def make_pick_ray(config: NearFieldConfig) -> wp.Function:
     """``pick_ray(params, scene, samples, places, at, n, diffuse) -> NearRay``: ray number ``n`` of a pixel.
 
-    The first ``diffuse`` go toward samples of the environment, of several balls at ``places``, the others into the
-    lobe.
+    The first ``diffuse`` rays go toward samples of the environment, the others into the lobe. ``places`` holds the
+    positions of several balls.
     """
     mirror_ray = make_mirror_ray(config) if config.mirror_samples > 0 else None
     side, lobes = config.side, config.lobe_count
@@ -503,8 +508,8 @@ def make_pick_ray(config: NearFieldConfig) -> wp.Function:
         ray = NearRay()
         if wp.static(config.distant.diffuse != "none"):
             if n < diffuse:
-                # A sample's measure is its share of all sets. A set is in the order of its sequence: any first part of
-                # it is a smaller set.
+                # A sample's measure refers to the samples of all sets. A set is a block of a sequence, in order: its
+                # first samples are a smaller set.
                 stride = samples.shape[0] / wp.static(side * side)
                 share = wp.float32(stride * side * side) / wp.static(float(config.count))
                 chosen = at.place * stride + n
@@ -529,7 +534,7 @@ def make_pick_ray(config: NearFieldConfig) -> wp.Function:
 
 @functools.cache
 def make_look_beyond(config: NearFieldConfig) -> wp.Function:
-    """``look_beyond(distant, ray) -> vec3``: the environment along a lobe's ray, as wide as the ray."""
+    """``look_beyond(distant, ray) -> vec3``: the environment along a lobe's ray, filtered to the ray's width."""
     radiance_along = make_radiance_along(config.distant)
     width = ray_width(config)
 
@@ -543,16 +548,16 @@ def make_look_beyond(config: NearFieldConfig) -> wp.Function:
 
 @wp.struct
 class NearLight:
-    """Light that reaches the pixels of objects from near by; empty where no material asks for it."""
+    """Light of the near field at the pixels of objects; arrays that no material needs are empty."""
 
     irradiance: wp.array2d[wp.vec3]
-    reflected: wp.array2d[wp.vec4]  # premultiplied near radiance, and its share of the rays
-    transmitted: wp.array2d[wp.vec4]  # the environment along rays that pass the near field, and its brightness on all
+    reflected: wp.array2d[wp.vec4]  # N, near radiance, and s, the share of rays that meet something near
+    transmitted: wp.array2d[wp.vec4]  # M, the environment along rays that meet nothing, and |B|
 
 
 @functools.cache
 def make_count_rays(config: NearFieldConfig) -> wp.Function:
-    """``count_rays(at) -> vec2i``: rays of a pixel toward samples of the environment, and into its lobe."""
+    """``count_rays(at) -> vec2i``: number of rays toward samples of the environment, and into the lobe."""
 
     @wp.func(module="unique")
     def count_rays(at: SeenPoint) -> wp.vec2i:
@@ -573,8 +578,8 @@ def make_count_rays(config: NearFieldConfig) -> wp.Function:
 def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
     """Kernel specialised to ``config``; equal configs share one kernel.
 
-    Rays of all kinds go through one loop, so that the walk through the scene is there once: a copy for each kind, and
-    for each turn of an unrolled loop, takes NVRTC nine times as long.
+    All kinds of rays go through one loop, so that the code that traces them is there once. A copy for each kind, and
+    for each iteration of an unrolled loop, takes NVRTC nine times as long.
     """
     see_point, count_rays = make_see_point(config), make_count_rays(config)
     pick_ray, look_near = make_pick_ray(config), make_look_near(config)
@@ -612,7 +617,7 @@ def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
         total = wp.vec3(0.0)
         reflected = wp.vec4(0.0)
         transmitted = wp.vec4(0.0)
-        leaving = float(0.0)  # rays; those into the surface are part of its reflectance
+        leaving = float(0.0)  # rays that leave the surface; the loss of others is part of its reflectance
         for n in range(diffuse + rays[1]):
             ray = pick_ray(params, scene, samples, distant.others.places, at, n, diffuse)
             near = wp.vec4(0.0)
@@ -663,7 +668,7 @@ def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
 
 @functools.cache
 def make_alpha_at(config: NearFieldConfig) -> wp.Function:
-    """``alpha_at(scene, hit, origin) -> float32``: width of the lobe of what a pixel shows from ``origin``."""
+    """``alpha_at(scene, hit, origin) -> float32``: lobe width alpha at a hit seen from ``origin``."""
 
     @wp.func(module="unique")
     def alpha_at(scene: RayScene, hit: Hit, origin: wp.vec3) -> wp.float32:
@@ -681,15 +686,15 @@ def make_alpha_at(config: NearFieldConfig) -> wp.Function:
 
 @wp.func
 def fill_lobe(near: wp.vec4, transmitted: wp.vec4) -> wp.vec4:
-    """Return the light that ``shade`` adds, and the share of the prefiltered environment that it leaves out.
+    """Return the radiance that ``shade`` adds, N + s M, and the share of the prefiltered environment that it omits.
 
     Args:
         near: Means over rays: N and s.
-        transmitted: M, and the brightness of B.
+        transmitted: M and |B|.
     """
     out = near
     missed = brightness(wp.vec3(transmitted[0], transmitted[1], transmitted[2]))
-    # What passes is no more than all; rounding may say otherwise.
+    # |M| / |B| is at most 1 but for rounding.
     left = wp.where(transmitted[3] > MIN_LIGHT, wp.min(missed / transmitted[3], 1.0), 1.0)
     left *= 1.0 - near[3]
     for channel in range(3):
@@ -727,7 +732,7 @@ def make_filter_kernel(config: NearFieldConfig) -> wp.Kernel:
             return
         normal = hits[i, j].normal
         alpha = float(0.0)
-        falling = float(0.0)  # of weights with 1 less the cosine between normals
+        falling = float(0.0)  # rate at which weights fall with 1 - cosine between normals
         if wp.static(config.distant.specular):
             alpha = alpha_at(scene, hits[i, j], params[0].camera_position)
             if wp.static(config.lobe_count >= OWN_RAYS):
@@ -736,7 +741,7 @@ def make_filter_kernel(config: NearFieldConfig) -> wp.Kernel:
         light = wp.vec3(0.0)
         glossy = wp.vec4(0.0)
         weights = float(0.0)
-        lobes = float(0.0)  # weights of pixels of which a ray left the surface
+        lobes = float(0.0)  # sum of the weights of pixels with a ray that left the surface
         distant = wp.vec4(0.0)
         reach = wp.static(side // 2)
         for a in range(-reach, reach + 1):
@@ -770,24 +775,24 @@ def make_filter_kernel(config: NearFieldConfig) -> wp.Kernel:
 
 
 estimate_near_field = row_launcher(make_near_field_kernel, like=lambda params, picture, *_: picture.rays)
-"""Estimate what surrounds the objects, each pixel with one set of samples.
+"""Estimate the near field of the objects, each pixel with one set of samples.
 
 Args:
-    config: What the scene calls for; what it leaves out may be None, or empty in a struct.
+    config: Features of the scene; arguments that it does not use may be None, or empty in a struct.
     params: (1,) FrameParams: camera, object_rect and light_rect.
-    picture: (H, W) the camera's.
-    layers: (H, W) what virtual objects and lights change in it.
+    picture: (H, W) the camera's frame and rays.
+    layers: (H, W) virtual shadows and virtual light on the receiver.
     scene: Objects and proxies.
     distant: The environment.
     samples: Samples of the environment, set after set.
-    visible: (H, W) as ``trace_pixels`` writes.
+    visible: (H, W) from ``trace_pixels``.
     near_out: (H, W) estimates of single pixels; written only where an object is visible.
 """
 
 
 filter_near_field = row_launcher(make_filter_kernel, like=lambda params, scene, visible, *_: visible.objects)
-"""Average the estimates over tiles, along objects only; arguments as those of ``estimate_near_field``.
+"""Average the estimates over neighbours on the same object; arguments as for ``estimate_near_field``.
 
-Of ``near_out``, irradiance and reflected are written; the last of reflected becomes the share of the prefiltered
-environment that ``shade`` leaves out.
+``irradiance`` and ``reflected`` of ``near_out`` are written. The fourth component of ``reflected`` becomes the share of
+the prefiltered environment that ``shade`` omits.
 """

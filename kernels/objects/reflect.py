@@ -1,10 +1,10 @@
-"""Light along a ray that leaves a surface: of the receiver in the picture, virtual objects, the environment.
+"""Radiance along a ray that leaves a surface: of the receiver in the frame, of virtual objects, of the environment.
 
-The receiver is known twice: as part of the environment, seen from the mirror ball, and as the camera's picture, which
-the proxies place in space. Near an object the two differ by parallax, so a ray that meets a proxy looks the point up in
-the picture. A point outside the picture, on a face turned away, or hidden from the camera by a proxy or a ball, is
-looked up in the environment instead. Proxies are taken as matt: they look the same from the camera and from the point.
-Emitters of the environment that are known by their places are seen, and light objects, from there (see ``emitters``).
+The receiver's radiance is known from two sources: the environment, as seen from the mirror ball, and the camera's
+frame, whose points the proxies place in space. Near an object the two differ by parallax, so a ray that meets a proxy
+uses the frame. The environment is used for points outside the frame, on faces turned away from the camera, or hidden
+from it by a proxy or a ball. Proxies are taken to be matt: their radiance toward the camera and toward the ray is the
+same. Emitters of the environment whose positions are known are seen, and light objects, from there (see ``emitters``).
 The light of several mirror balls is interpolated (see ``probe_weights``).
 """
 
@@ -41,16 +41,16 @@ from warp_ar.kernels.structs import (
 wp.set_module_options({"enable_backward": False})
 
 HIDDEN_MARGIN = wp.constant(wp.float32(1.0e-3))
-"""Share of the camera's distance within which a proxy is the point itself and does not hide it."""
+"""Relative distance from a point, along the camera's ray, within which a proxy does not hide the point."""
 RAY_SPREAD = wp.constant(wp.float32(0.1))
-"""Angle in radians that one of a few dozen rays stands for, in the pictures on what it meets."""
+"""Angle, radians, of one of a few dozen rays, for look-ups in textures of the surface that it meets."""
 
 DiffuseForm = Literal["none", "sh", "map"]
 
 
 @dataclasses.dataclass(frozen=True)
 class DistantLightConfig:
-    """Forms of the environment that exist, and what the objects make of it."""
+    """Forms of the environment, and features of the objects that reflect it."""
 
     trace: TraceConfig
     """Kinds of shape."""
@@ -59,23 +59,23 @@ class DistantLightConfig:
     textures: bool
     """True if any material has a texture or emits, or any object's triangles have materials of their own."""
     diffuse: DiffuseForm
-    """Source of the environment's irradiance: nine coefficients, a latlong map, or nowhere."""
+    """Form of the environment's irradiance: nine coefficients, a latlong map, or none."""
     specular: bool
     """True if the prefiltered environment is read."""
     known: bool
     """True if the environment is known, from mirror balls or from a file."""
     emitters: bool = False
-    """True if emitters of the environment are known by their places."""
+    """True if positions of the environment's emitters are known."""
     several: bool = False
-    """True if the light is interpolated between that of several mirror balls."""
+    """True if the light is interpolated between several mirror balls."""
     gathered: bool = True
-    """True if rays that happen to meet what emits bring its light; else ``area_lights`` are looked for themselves."""
+    """True if rays that meet an emitting object return its light; False if ``area_lights`` adds it."""
 
     def general(self, form: DiffuseForm) -> DistantLightConfig:
-        """For any scene, textures or not: forms that it does not call for may be empty.
+        """Return a configuration for any scene, in which forms that the scene does not need may be empty.
 
         Args:
-            form: Where irradiance comes from in scenes that call for it.
+            form: Form of irradiance for scenes that need it.
         """
         models = tuple(sorted(map(int, (LAMBERT, PHONG, MIRROR, METALLIC_ROUGHNESS))))
         diffuse: DiffuseForm = form if self.known else "none"
@@ -85,14 +85,14 @@ class DistantLightConfig:
 
 @wp.struct
 class DistantLight:
-    """The environment in all its forms; what a ``DistantLightConfig`` leaves out may be empty."""
+    """The environment in all its forms; forms that a ``DistantLightConfig`` does not use may be empty."""
 
     environment: wp.array2d[wp.vec3]
     irradiance_sh: wp.array[wp.vec3]  # nine coefficients
     irradiance_map: wp.array2d[wp.vec3]  # latlong
     levels: wp.array[wp.vec3]  # prefiltered, as ``sample_levels`` reads them
     level_height: wp.int32  # rows of level 0
-    dfg: wp.array2d[wp.vec2]  # of ``integrate_dfg``, for METALLIC_ROUGHNESS
+    dfg: wp.array2d[wp.vec2]  # from ``integrate_dfg``, for METALLIC_ROUGHNESS
     probes: wp.array[Probe]
     emitters: wp.array[Emitter]
     others: OtherBalls
@@ -100,7 +100,7 @@ class DistantLight:
 
 @wp.func
 def look_up(picture: Picture, x: wp.float32, y: wp.float32) -> wp.vec3:
-    """Bilinear sample of a frame's linear radiance; x and y are inside the outermost pixel centres."""
+    """Sample a frame's linear radiance bilinearly at (x, y), inside the outermost pixel centres."""
     j = wp.min(wp.int32(x), picture.frame.shape[1] - 2)
     i = wp.min(wp.int32(y), picture.frame.shape[0] - 2)
     fx = x - wp.float32(j)
@@ -112,7 +112,7 @@ def look_up(picture: Picture, x: wp.float32, y: wp.float32) -> wp.vec3:
 
 @wp.func
 def look_up_layer(layer: wp.array2d[wp.vec3], x: wp.float32, y: wp.float32) -> wp.vec3:
-    """Bilinear sample of a layer over the frame, places as in ``look_up``."""
+    """Sample a layer of the frame bilinearly, with coordinates as in ``look_up``."""
     j = wp.min(wp.int32(x), layer.shape[1] - 2)
     i = wp.min(wp.int32(y), layer.shape[0] - 2)
     fx = x - wp.float32(j)
@@ -124,19 +124,19 @@ def look_up_layer(layer: wp.array2d[wp.vec3], x: wp.float32, y: wp.float32) -> w
 
 @wp.func
 def knows_irradiance(distant: DistantLight) -> wp.bool:
-    """Return whether this scene calls for irradiance: a kernel of several scenes has it compiled in."""
+    """Return whether this scene has irradiance; kernels for any scene contain the code in either case."""
     return distant.irradiance_map.shape[0] > 0 or distant.irradiance_sh.shape[0] > 0
 
 
 @wp.func
 def knows_levels(distant: DistantLight) -> wp.bool:
-    """Return whether this scene calls for the prefiltered environment."""
+    """Return whether this scene has the prefiltered environment."""
     return distant.levels.shape[0] > 0
 
 
 @functools.cache
 def make_find_in_frame(trace: TraceConfig) -> wp.Function:
-    """``find_in_frame(params, picture, scene, probes, hit) -> vec2``: (x, y) of a point of a proxy, or x = -1."""
+    """``find_in_frame(params, picture, scene, probes, hit) -> vec2``: pixel (x, y) of a proxy's point; x = -1: none."""
     occluded_by_proxies = make_trace(trace).occluded_by_proxies
 
     @wp.func(module="unique")
@@ -167,7 +167,7 @@ def make_find_in_frame(trace: TraceConfig) -> wp.Function:
 def make_shade_unoccluded(config: DistantLightConfig) -> wp.Function:
     """``shade_unoccluded(scene, distant, hit, direction, spread) -> vec3``: radiance under the environment alone.
 
-    ``spread`` is the angle that the ray stands for.
+    ``spread`` is the angle of the ray's cone.
     """
     surface_at = make_surface(config.models, config.textures)
     glossy = make_reflected_radiance(config)
@@ -203,7 +203,7 @@ def make_shade_unoccluded(config: DistantLightConfig) -> wp.Function:
 
 @functools.cache
 def make_distant_irradiance(config: DistantLightConfig) -> wp.Function:
-    """``distant_irradiance(distant, point, normal) -> vec3``: under the environment; 0 if none is known."""
+    """``distant_irradiance(distant, point, normal) -> vec3``: the environment's irradiance; 0 if none is known."""
     form: Literal["sh", "map"] = "sh" if config.diffuse == "sh" else "map"
     irradiance_at = make_irradiance_at(form, config.emitters, config.several)
 
@@ -222,9 +222,9 @@ def make_distant_irradiance(config: DistantLightConfig) -> wp.Function:
 
 @functools.cache
 def make_radiance_along(config: DistantLightConfig, captured: bool = False) -> wp.Function:
-    """``radiance_along(distant, point, direction, level) -> vec3``: a level of the environment, as a point sees it.
+    """``radiance_along(distant, point, direction, level) -> vec3``: prefiltered environment, with parallax correction.
 
-    If ``captured``, the environment itself, whatever the level, with emitters where the balls saw them.
+    If ``captured``, it is the unfiltered environment, with emitters in the directions in which the balls show them.
     """
     placed = config.emitters and not captured
 
@@ -264,7 +264,7 @@ def make_reflected_radiance(config: DistantLightConfig) -> wp.Function:
     """``reflected_radiance(distant, model, roughness, shininess, point, direction, floor) -> vec3``: as a lobe sees it.
 
     The lobe is that of a surface at ``point``, around ``direction`` (unit). ``floor`` is the least level to read: 0 for
-    what is looked at, more for what is only one ray of many.
+    a surface that the camera sees, more for one of many rays.
     """
     radiance_along = make_radiance_along(config)
 

@@ -1,16 +1,16 @@
-"""Virtual objects as the camera would see them: lit by environment and virtual lights, with smooth edges.
+"""Shading of virtual objects: lit by the environment and by virtual lights, with anti-aliased edges.
 
 The result is premultiplied: RGB is radiance times coverage, alpha the share of the pixel that virtual objects cover.
 
-Edges. Inside a surface one sample per pixel is enough. Where a neighbour sees another object, a surface farther off the
-tangent plane than two pixels' footprint, or a normal turned by more than 30 degrees, the pixel is traced again with n^2
-samples and averaged (a box filter, as a camera's pixels have). The samples are n-rooks in both axes, for n = 2 the
-rotated grid: no two of them share a row or column, so near-vertical and near-horizontal edges pass through n^2 shades,
-not n. The near field of a sample is taken from the pixel around it whose normal is most like its own.
+Edges. Inside a surface one sample per pixel suffices. A pixel is an edge if a neighbour shows another object, a point
+farther from the tangent plane than two pixel footprints, or a normal that differs by more than 30 degrees. It is then
+traced again with n^2 samples and averaged (by a box filter, like that of a camera's pixels). The samples are n-rooks
+along both axes, for n = 2 the rotated grid: no two share a row or column, so nearly vertical and nearly horizontal
+edges get n^2 shades, not n. A sample uses the near field of the pixel around it whose normal is most similar.
 
-Normals. Surfaces are seen from both sides: normals are turned toward the viewer. An interpolated normal can still point
-away at a silhouette; it is then tipped just as far as makes it perpendicular to the view, continuously, so that the
-mirror direction leaves the surface.
+Normals. Surfaces are two-sided: normals are turned toward the viewer. At a silhouette an interpolated normal can still
+point away. It is then tilted until it is perpendicular to the view, which is continuous, so that the mirror direction
+leaves the surface.
 """
 
 from __future__ import annotations
@@ -69,14 +69,14 @@ EDGE_COSINE = wp.constant(wp.float32(math.cos(math.radians(30.0))))
 MIN_FACING = wp.constant(wp.float32(1.0e-3))
 
 ALONE = wp.constant(-1)
-"""Number of the one sample of a pixel without an edge."""
+"""Index of the only sample of a pixel without an edge."""
 SAMPLED, LISTED, LEFT = "sampled", "listed", "left"
-"""Treatments of edges in a kernel of ``make_shade_kernel``."""
+"""Treatments of edges by a kernel of ``make_shade_kernel``."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ShadeConfig:
-    """Features that a scene calls for; others are not compiled in."""
+    """Features that a scene needs; others are not compiled in."""
 
     distant: DistantLightConfig
     """Kinds of shape, of material and of the environment."""
@@ -87,12 +87,12 @@ class ShadeConfig:
     soft: bool = False
     """True if lights with a radius cast soft shadows."""
     near_field: bool = False
-    """True if ``near_field`` says what surrounds the objects."""
+    """True if objects receive light from the near field (``near_field``)."""
     area_samples: int = 0
-    """Samples of what emits, per point; ``area_lights.POINT_SAMPLES``: as lights at points; 0: nothing emits."""
+    """Samples of emitting objects, per point; ``area_lights.POINT_SAMPLES``: as point lights; 0: nothing emits."""
 
     def general(self, form: DiffuseForm, *, soft: bool) -> ShadeConfig:
-        """For any scene with as many mirror balls; ``form`` as in ``DistantLightConfig.general``."""
+        """Return a configuration for any scene with as many mirror balls; ``form`` as in ``DistantLightConfig``."""
         distant = self.distant.general(form)
         return dataclasses.replace(self, distant=distant, lights=ALL_LIGHTS, soft=soft)
 
@@ -102,22 +102,22 @@ class ShadeConfig:
 
 @wp.struct
 class ObjectLight:
-    """All that lights virtual objects; what a ``ShadeConfig`` leaves out may be empty."""
+    """Light on virtual objects; parts that a ``ShadeConfig`` does not use may be empty."""
 
     lights: wp.array[Light]
-    distant: DistantLight  # neither its map nor its probes are read
-    near: NearLight  # of ``filter_near_field``
+    distant: DistantLight  # its ``environment`` and ``probes`` are not read
+    near: NearLight  # from ``filter_near_field``
 
 
 def make_object_light(
     distant: DistantLight, lights: wp.array | None = None, near: NearLight | None = None
 ) -> ObjectLight:
-    """The environment, virtual lights and what is near together.
+    """Return an ``ObjectLight`` of the environment, virtual lights and the near field.
 
     Args:
-        distant: Of the environment, see ``reflect.DistantLight``.
+        distant: Light of the environment, see ``reflect.DistantLight``.
         lights: (n,) Light; None without virtual lights.
-        near: (H, W) each, as ``near_field.filter_near_field`` writes; None where objects show the environment alone.
+        near: (H, W) each, from ``near_field.filter_near_field``; None if objects reflect the environment alone.
     """
     return filled(ObjectLight(), distant=distant, lights=lights, near=near)
 
@@ -126,14 +126,14 @@ def make_object_light(
 class NearPoint:
     """Near field at a point of an object."""
 
-    known: wp.bool  # False: the distant environment is all that the point receives
+    known: wp.bool  # False: the point is lit by the distant environment alone
     irradiance: wp.vec3
-    reflected: wp.vec4  # radiance that adds to the prefiltered environment, and the share of that which it replaces
+    reflected: wp.vec4  # radiance added to the prefiltered environment, and the share of the latter that it replaces
 
 
 @wp.func
 def face_viewer(normal: wp.vec3, geometric_normal: wp.vec3, wo: wp.vec3):
-    """Both normals of a surface on the viewer's side, the one for shading at least a little."""
+    """Turn both normals of a surface toward the viewer; the shading normal keeps a cosine of ``MIN_FACING``."""
     shading = normal
     geometric = geometric_normal
     if wp.dot(geometric, wo) < 0.0:
@@ -147,7 +147,7 @@ def face_viewer(normal: wp.vec3, geometric_normal: wp.vec3, wo: wp.vec3):
 
 @functools.cache
 def make_lit_by_areas(config: ShadeConfig) -> wp.Function:
-    """``lit_by_areas(scene, hit, surface, normal, geometric, wo, turn) -> vec3``: radiance by what emits."""
+    """``lit_by_areas(scene, hit, surface, normal, geometric, wo, turn) -> vec3``: reflected light of emitters."""
     trace, samples = config.distant.trace, config.area_samples
     reflect_direct = make_reflect_direct(config.distant.models)
     is_lit = make_shadow(trace)
@@ -188,7 +188,7 @@ def make_lit_by_areas(config: ShadeConfig) -> wp.Function:
 def make_sent_unlit(config: ShadeConfig) -> wp.Function:
     """``sent_unlit(distant, hit, surface, normal, wo, near) -> vec3``: radiance without virtual lights.
 
-    Of what it sends itself and of the environment, as far as ``near`` does not know better.
+    It is the sum of emitted light and reflected light, of the environment and of the near field ``near``.
     """
     forms = config.distant
     glossy = make_reflected_radiance(forms)
@@ -208,7 +208,7 @@ def make_sent_unlit(config: ShadeConfig) -> wp.Function:
                 share = surface.occlusion
             if wp.static(config.near_field):
                 if near.known:
-                    # A picture of occlusion shows what rays find as well: the darker of the two holds.
+                    # The occlusion texture and near-field rays find the same occluders: use the darker of the two.
                     if share < 1.0:
                         more = wp.max(near.irradiance - irradiance, wp.vec3(0.0))
                         irradiance = wp.min(share * irradiance, near.irradiance) + more
@@ -230,7 +230,7 @@ def make_sent_unlit(config: ShadeConfig) -> wp.Function:
                     hidden = 1.0 - specular_occlusion(surface.occlusion, wp.dot(normal, wo), surface.roughness)
                     if wp.static(config.near_field):
                         if near.known:
-                            hidden = 0.0  # rays know
+                            hidden = 0.0  # near-field rays have found the occlusion
                     reflected *= 1.0 - hidden
                 radiance += wp.cw_mul(surface.reflectance, reflected)
         return radiance
@@ -240,9 +240,9 @@ def make_sent_unlit(config: ShadeConfig) -> wp.Function:
 
 @functools.cache
 def make_shade_hit(config: ShadeConfig) -> wp.Function:
-    """``shade_hit``: radiance that leaves a hit against the ray's ``direction`` (not unit).
+    """``shade_hit(...) -> vec3``: radiance from a hit toward the origin of a ray of ``direction`` (not unit).
 
-    ``turn`` is for ``visible_share``, ``spread`` the width of the ray at t = 1 in metres.
+    ``turn`` is passed to ``visible_share``; ``spread`` is the width of the ray at t = 1, metres.
     """
     forms = config.distant
     surface_at = make_surface(forms.models, forms.textures)
@@ -291,7 +291,7 @@ def make_shade_hit(config: ShadeConfig) -> wp.Function:
 def differs(
     i: wp.int32, j: wp.int32, found: wp.int32, reach: wp.float32, rect: wp.vec4i, visible: VisibleObjects, hit: Hit
 ) -> wp.bool:
-    """Return whether a neighbour sees another surface than this pixel."""
+    """Return whether a neighbour shows another surface than this pixel, as the module's text defines edges."""
     other = wp.int32(-1)
     if inside_rect(i, j, rect):
         other = visible.objects[i, j]
@@ -307,9 +307,9 @@ def differs(
 
 @wp.func
 def most_alike(visible: VisibleObjects, i: wp.int32, j: wp.int32, hit: Hit) -> wp.vec2i:
-    """Of a pixel and its eight neighbours, the one that sees what is most like a hit; (-1, -1): none sees its object.
+    """Return the pixel, of a pixel and its eight neighbours, whose normal is most similar to a hit's.
 
-    Normals decide, nearness where they are the same.
+    Equal normals are decided by distance. The result is (-1, -1) if none shows the hit's object.
     """
     objects = visible.objects
     hits = visible.hits
@@ -330,7 +330,7 @@ def most_alike(visible: VisibleObjects, i: wp.int32, j: wp.int32, hit: Hit) -> w
 
 @functools.cache
 def make_shade_sample(config: ShadeConfig) -> wp.Function:
-    """``shade_sample``: radiance and coverage of one sample of a pixel; of ``ALONE``, its centre's hit."""
+    """``shade_sample(...) -> vec4``: radiance and coverage of one sample of a pixel; ``ALONE`` is its centre's hit."""
     shade_hit = make_shade_hit(config)
     closest_visible = make_primary(config.distant.trace)
     centre_direction, sample_direction = make_sample_direction(1), make_sample_direction(config.edge_samples)
@@ -378,13 +378,14 @@ def make_shade_sample(config: ShadeConfig) -> wp.Function:
 
 @functools.cache
 def make_shade_kernel(config: ShadeConfig, edges: str = SAMPLED) -> wp.Kernel:
-    """Kernel of ``shade``, specialised to ``config``, and to what becomes of ``edges``.
+    """Kernel of ``shade``, specialised to ``config`` and to the treatment of edges.
 
     Args:
-        config: What the scene calls for.
-        edges: ``SAMPLED`` in place; ``LISTED``, and nothing else done about them; or ``LEFT``: only where the list did
-            not hold all are they sampled in place, all of them. Which ones it held depends on the order of threads, and
-            kernels that are compiled separately differ in the last place.
+        config: Features of the scene.
+        edges: ``SAMPLED``: edges are sampled in place. ``LISTED``: edges are listed, and left to another kernel.
+            ``LEFT``: all edges are sampled in place if the list did not hold all of them, else none. (The edges that a
+            full list holds depend on the order of threads, and kernels that are compiled separately differ in the last
+            place.)
     """
     shade_sample = make_shade_sample(config)
 
@@ -481,18 +482,18 @@ def shade(
     edge_lists: EdgeLists | None = None,
     rows: Rows | None = None,
 ) -> None:
-    """Shade what ``trace_pixels`` found.
+    """Shade the objects that ``trace_pixels`` found.
 
-    Given ``edge_lists``, edges are sampled on their own, with the same result but for the last places, where CUDA's
-    compiler contracts a product and a sum in one of the kernels alone.
+    Given ``edge_lists``, edges are listed and sampled in a kernel of their own. The result is the same but for the last
+    places, where CUDA's compiler fuses a product and a sum in one kernel alone.
 
     Args:
-        config: What the scene calls for; what it leaves out may be None.
-        params: Frame values: camera and object_rect.
+        config: Features of the scene; arguments that it does not use may be None.
+        params: (1,) FrameParams: camera and object_rect.
         rays: (H, W) undistorted x / z and y / z of each pixel centre.
-        scene: What rays meet, and what it is made of.
-        light: From ``make_object_light``; what is near is needed if ``config.near_field``.
-        visible: (H, W) as ``trace_pixels`` writes.
+        scene: Shapes, materials and textures.
+        light: From ``make_object_light``; its near field is needed if ``config.near_field``.
+        visible: (H, W) from ``trace_pixels``.
         virtual_out: (H, W) premultiplied linear RGB and coverage; zero outside ``params.object_rect``.
         edge_lists: Scratch, for a launch over all rows.
         rows: Band of rows; None means all.

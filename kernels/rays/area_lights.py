@@ -1,34 +1,34 @@
-"""Objects that emit, as lights: where on them a point looks for light, and what comes from there.
+"""Light of emitting objects: sampling of points on them, seen from a point that they light.
 
-A surface of radiance L, seen from a point under the solid angle dOmega, gives it the irradiance L cos dOmega. The
-estimate is a sum over n places on the emitting triangles of all objects,
+A surface of radiance L that covers the solid angle dOmega, seen from a point, gives it the irradiance L cos dOmega. The
+estimate is a sum over n points on the emitting triangles of all objects,
 
-    E = sum over k of L_k cos_k visible_k / (n p_k),    p the density of the place per solid angle.                  (1)
+    E = sum over k of L_k cos_k visible_k / (n p_k),    p the density of the point per solid angle.                  (1)
 
-A triangle is picked with a chance in proportion to its area times its mean emission, P, by one number for each of n
-equal parts of the table: with the triangles of a mesh in their order neighbours in the table are neighbours in space,
-and the places are spread over the light. In it, a triangle that is seen under a solid angle Omega worth the name is
-sampled evenly in that angle [Arv95], p = P / Omega: a term of (1) is never above Omega L / (n P), and nothing grows
-beyond bounds where a light touches a receiver. A smaller one is sampled evenly by area, p = P d^2 / (A cos_light).
-A sphere is sampled evenly in the cone that it is seen under [SW91].
+A triangle is picked with the probability P, proportional to its area times its mean emission, by one number in each of
+n equal parts of the cumulative table (stratification). Triangles stand in the order of their mesh, in which neighbours
+in the table are mostly neighbours in space, so the points are spread over the light. A triangle of not too small a
+solid angle Omega is sampled uniformly in solid angle [Arv95], p = P / Omega. Then a term of (1) is at most
+Omega L / (n P), bounded even where a light touches a receiver. A smaller triangle is sampled uniformly by area,
+p = P d^2 / (A cos_light). A sphere is sampled uniformly in the cone of directions that it covers [SW91].
 
-A ray to a place costs more than the place. So of ``CANDIDATES`` places one is drawn, with a chance in proportion to
-w = |L_k| cos_k / p_k, and stands for all of them: its term is multiplied by (sum of w) / (candidates w_k) [Tal05]. What
-is not hidden has the noise of all candidates then, what is half hidden that of the rays.
+A shadow ray costs more than a sample point. So one of ``CANDIDATES`` points is drawn, with a probability proportional
+to w = |L_k| cos_k / p_k, and its term is multiplied by (sum of w) / (candidates w_k) [Tal05]. Unoccluded light then has
+the noise of all candidates, partly occluded light that of the rays.
 
-Highlights are the light's own shape. The lobe of a surface is integrated in one of two ways, whichever is narrower:
-where the lobe's solid angle is less than that of the object's bounding sphere, by rays into the lobe; else by (1). The
-choice depends on point and object alone, and each direction is counted once: there is no bias.
+Highlights have the shape of the emitting object. The lobe of a surface is integrated by rays into the lobe if its solid
+angle is less than that of the object's bounding sphere, else by (1). The choice depends on point and object alone, and
+each direction is counted once, so there is no bias.
 
-As points: each emitting object is all at the middle of its bounding box. Toward a direction w it has the intensity
+As point lights: each emitting object is at the centre of its bounding box. Toward a direction w it has the intensity
 
     I(w) = (1 - |f|) / 4 S + max(f . w, 0) S,    S the integral of L over its area, f the mean normal.               (2)
 
 That is exact for a flat light (|f| = 1) and for a sphere (f = 0), and the mean over all directions is right for all
 that are convex.
 
-Numbers are fixed: pixel (i, j) of every tile of 4 x 4 has its own shift of one sequence, so a picture of what stands
-still stands still. Noise falls as 1 / n, not as 1 / sqrt n, where nothing hides part of the light.
+Sample numbers are fixed: pixel (i, j) of every tile of 4 x 4 has its own shift of one sequence, so noise does not
+change between frames of a scene at rest. Where nothing hides part of the light, noise falls as 1 / n, not 1 / sqrt n.
 
 References:
     [Arv95] Arvo, "Stratified Sampling of Spherical Triangles", SIGGRAPH 1995.
@@ -60,23 +60,23 @@ from warp_ar.kernels.textures import SurfacePoint, point_of_triangle
 wp.set_module_options({"enable_backward": False})
 
 POINT_SAMPLES = 1
-"""Number of samples that stands for lights at one point."""
+"""Number of samples that stands for point lights."""
 CANDIDATES = 4
-"""Places of which one is looked at from the point, where samples are few."""
+"""Candidate points of which one gets a shadow ray, if samples are few."""
 MANY_SAMPLES = 128
-"""Number of samples from which on each is a place of its own."""
+"""Number of samples from which on each has one candidate."""
 LEAST_FACING = wp.constant(wp.float32(0.05))
-"""Weight of a place that a surface does not face: its lobe may still look there."""
+"""Constant added to the cosine in a candidate's weight: a lobe may reflect light that the cosine makes small."""
 # Solid angles between which a triangle is sampled by its angle. Directions lose 1e-7 / angle^2 to float32: 1e-3 here,
 # where all of a triangle is seen nearly alike anyway. Above, it is nearly a half space.
 LEAST_SOLID_ANGLE = wp.constant(wp.float32(1.0e-2))
 MOST_SOLID_ANGLE = wp.constant(wp.float32(6.2))
-# Of a triangle's size. A point that is no higher is on the light: where it lies, inside or beside the triangle and over
-# which side, is rounding, and neighbours could both take it for theirs.
+# Least height of a point over a triangle, relative to the triangle's size. A lower point lies on the light: rounding
+# decides its side and whether it is inside the triangle, and two neighbouring triangles could both count it.
 LEAST_HEIGHT = wp.constant(wp.float32(1.0e-6))
-# What of the way to a light is looked at for what hides it: the light itself must not.
+# Length of shadow rays over the distance to the light, so that they do not meet the light itself.
 NEARLY = wp.constant(wp.float32(1.0 - 1.0e-4))
-# Steps of the sequence whose points fill a square evenly for any number of them: powers of 1 / the plastic number.
+# Steps of the R2 sequence, whose points fill a square evenly for any count: powers of 1 / the plastic number.
 STEP_U = wp.constant(wp.float32(0.7548776662466927))
 STEP_V = wp.constant(wp.float32(0.5698402909980532))
 STEP_W = wp.constant(wp.float32(0.6180339887498949))  # the golden ratio's, for one number
@@ -85,23 +85,23 @@ FOUR_PI = wp.constant(wp.float32(4.0 * math.pi))
 
 @wp.struct
 class AreaSample:
-    """A place on an emitting object, seen from a point, as if nothing stood between."""
+    """A sample point on an emitting object, seen from a lit point, occlusion ignored."""
 
-    wi: wp.vec3  # unit, toward it
+    wi: wp.vec3  # unit, toward the sample point
     distance: wp.float32  # metres
-    irradiance_normal: wp.vec3  # that it stands for, over the chance of having been picked; zero: none comes from there
+    irradiance_normal: wp.vec3  # irradiance of a surface that faces it, over its probability; zero: no light
     object: wp.int32
 
 
 @wp.func
 def fraction(x: wp.float32) -> wp.float32:
-    """Part after the point, below 1."""
+    """Return the fractional part of a number, below 1."""
     return wp.min(x - wp.floor(x), 0.99999994)
 
 
 @wp.func
 def area_numbers(k: wp.int32, count: wp.int32, turn: wp.float32) -> wp.vec3:
-    """Numbers of sample k of ``count``: one for the table, two for the place; ``turn`` is that of ``tile_turn``."""
+    """Return numbers of sample k of ``count``: one picks the triangle, two the point; ``turn`` from ``tile_turn``."""
     rank = 16.0 * turn
     pick = (wp.float32(k) + turn + 1.0 / 32.0) / wp.float32(count)
     place = wp.float32(k) + 0.5
@@ -112,7 +112,7 @@ def area_numbers(k: wp.int32, count: wp.int32, turn: wp.float32) -> wp.vec3:
 
 @wp.func
 def find_share(shares: wp.array[wp.float32], pick: wp.float32) -> wp.int32:
-    """First entry of a table of growing shares that is above a number in [0, 1)."""
+    """Return the first entry of a table of growing shares that is above ``pick``, a number in [0, 1)."""
     low = wp.int32(0)
     high = shares.shape[0] - 1
     while low < high:
@@ -126,26 +126,26 @@ def find_share(shares: wp.array[wp.float32], pick: wp.float32) -> wp.int32:
 
 @wp.func
 def solid_angle(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.float32:
-    """Of a triangle whose corners lie in three unit directions (van Oosterom and Strackee)."""
+    """Return the solid angle of a triangle with corners in three unit directions (van Oosterom and Strackee)."""
     volume = wp.abs(wp.dot(a, wp.cross(b, c)))
     return 2.0 * wp.atan2(volume, 1.0 + wp.dot(a, b) + wp.dot(b, c) + wp.dot(c, a))
 
 
 @wp.func
 def safe_sqrt(x: wp.float32) -> wp.float32:
-    """Root of what rounding may have made negative."""
+    """Return the square root of a number, 0 if rounding made it negative."""
     return wp.sqrt(wp.max(x, 0.0))
 
 
 @wp.func
 def unit_across(v: wp.vec3, axis: wp.vec3) -> wp.vec3:
-    """Unit part of a vector across a unit axis."""
+    """Return the component of a vector perpendicular to a unit axis, normalised."""
     return wp.normalize(v - wp.dot(v, axis) * axis)
 
 
 @wp.func
 def angle_between(a: wp.vec3, b: wp.vec3) -> wp.float32:
-    """Angle between two vectors of any length, exact where it is small."""
+    """Return the angle between two vectors of any length, accurate for small angles."""
     return wp.atan2(wp.length(wp.cross(a, b)), wp.dot(a, b))
 
 
@@ -153,7 +153,7 @@ def angle_between(a: wp.vec3, b: wp.vec3) -> wp.float32:
 def sample_spherical_triangle(
     a: wp.vec3, b: wp.vec3, c: wp.vec3, angle: wp.float32, u: wp.float32, v: wp.float32
 ) -> wp.vec3:
-    """Even direction in a triangle of unit directions and solid angle ``angle`` [Arv95].
+    """Draw a uniform direction in a spherical triangle of solid angle ``angle`` [Arv95].
 
     u picks a sub-triangle a, b, c' of u times the area, c' on the edge from a to c; v a point on the arc from b to c'.
     """
@@ -176,10 +176,10 @@ def sample_spherical_triangle(
 
 
 # With s = r / d the cone's half angle has 1 - cos = 1 - sqrt(1 - s^2) = s^2 / (1 + sqrt(1 - s^2)): no cancellation far
-# away. Even in the cone is even in 1 - cos, and 1 / p is its solid angle 2 pi (1 - cos).
+# away. Directions uniform in the cone are uniform in 1 - cos, and 1 / p is the cone's solid angle 2 pi (1 - cos).
 @wp.func
 def draw_on_sphere(scene: RayScene, shape: Shape, point: wp.vec3, u: wp.float32, v: wp.float32) -> AreaSample:
-    """Even direction in the cone of an emitting sphere; none from inside, for its front is outside."""
+    """Draw a uniform direction in the cone of an emitting sphere; no light inside, for its front is outside."""
     sample = AreaSample()
     radius = shape.scale * shape.extent[0]
     away = shape.position - point
@@ -209,15 +209,15 @@ def draw_on_sphere(scene: RayScene, shape: Shape, point: wp.vec3, u: wp.float32,
 def draw_on_triangle(
     scene: RayScene, shape: Shape, face: wp.int32, front: wp.bool, point: wp.vec3, u: wp.float32, v: wp.float32
 ) -> AreaSample:
-    """A place on a triangle: even in the solid angle where that is worth the name, else by area."""
+    """Draw a point on a triangle: uniform in solid angle, or by area if its solid angle is small."""
     sample = AreaSample()
-    # Relative to the point: what is far from the origin loses its digits there.
+    # Coordinates relative to the point: differences far from the origin would lose digits.
     eye = to_local_point(shape, point)
     p = wp.mesh_get_point(shape.mesh, 3 * face) - eye
     q = wp.mesh_get_point(shape.mesh, 3 * face + 1) - eye
     r = wp.mesh_get_point(shape.mesh, 3 * face + 2) - eye
     facing = float(1.0)
-    if shape.stretch != 0.0:  # angles are the world's: the triangle is taken there, but for its scale
+    if shape.stretch != 0.0:  # angles are those in the world: map the triangle there, except for the scale
         p = shape.rotation * p
         q = shape.rotation * q
         r = shape.rotation * r
@@ -254,7 +254,7 @@ def draw_on_triangle(
     uvs = scene.vertex_uvs
     rest = 1.0 - weights[0] - weights[1]
     uv = weights[0] * uvs[corner] + weights[1] * uvs[corner + 1] + rest * uvs[corner + 2]
-    # Pictures are read as wide as a part of the triangle: what is finer is noise.
+    # Textures are filtered over a part of the triangle: finer detail would be noise.
     width = 0.25 * wp.sqrt(doubled) * shape.scale
     at = point_of_triangle(scene, corner, weights, uv, width, shape.scale)
     material = shape.material
@@ -270,7 +270,7 @@ def draw_on_triangle(
 
 @wp.func
 def draw_on_area(scene: RayScene, point: wp.vec3, numbers: wp.vec3) -> AreaSample:
-    """One sample of all emitting objects; equation (1) is the mean of those of n of ``area_numbers``."""
+    """Draw one sample of all emitting objects; equation (1) is the mean over n triples of ``area_numbers``."""
     shares = scene.emitting_shares
     index = find_share(shares, numbers[0])
     before = float(0.0)
@@ -292,7 +292,7 @@ def draw_on_area(scene: RayScene, point: wp.vec3, numbers: wp.vec3) -> AreaSampl
 
 @wp.func
 def area_radius(shape: Shape) -> wp.float32:
-    """Of a sphere around the middle of an object that holds it, metres."""
+    """Return the radius, metres, of a sphere around the centre of an object that encloses it."""
     if shape.kind == SPHERE:
         return shape.scale * shape.extent[0]
     return shape.scale * wp.length(shape.extent)
@@ -300,20 +300,20 @@ def area_radius(shape: Shape) -> wp.float32:
 
 @wp.func
 def light_as_point(scene: RayScene, light: AreaLight, point: wp.vec3) -> AreaSample:
-    """Equation (2). What is round hides itself: the way to it ends at its bounding sphere."""
+    """Return the object as a point light, equation (2); for round objects, shadow rays end at the bounding sphere."""
     sample = AreaSample()
     shape = scene.objects[light.object]
     away = shape.position - point
     radius = area_radius(shape)
     distance = wp.length(away)
     flat = wp.min(wp.length(light.facing), 1.0)
-    # Within the light there is no direction to it; so near one that is flat the inverse square means nothing.
+    # There is no direction to the light from within it, and no inverse square so close to a flat one.
     if distance <= 1.0e-4 or (flat < 0.5 and distance <= radius):
         return sample
     sample.wi = away / distance
     share = 0.25 * (1.0 - flat) + wp.max(-wp.dot(shape.rotation * light.facing, sample.wi), 0.0)
     scale = shape.scale * shape.scale
-    if shape.stretch != 0.0:  # areas that face one way go by the cofactors; of all ways, by their mean
+    if shape.stretch != 0.0:  # areas of one normal scale by the cofactors, areas of all normals by their mean
         volume = wp.abs(wp.determinant(shape.rotation))
         facing = volume * (wp.transpose(shape.inverse) * light.facing)
         share = 0.25 * (1.0 - flat) * wp.pow(volume, 2.0 / 3.0) + wp.max(-wp.dot(facing, sample.wi), 0.0)
@@ -325,9 +325,9 @@ def light_as_point(scene: RayScene, light: AreaLight, point: wp.vec3) -> AreaSam
 
 @functools.cache
 def make_area_sample(samples: int) -> wp.Function:
-    """``area_sample(scene, point, normal, k, count, turn) -> AreaSample``: number k of ``area_count``, a summand.
+    """``area_sample(scene, point, normal, k, count, turn) -> AreaSample``: term k of ``area_count`` terms of (1).
 
-    ``normal`` is that of the surface that receives it.
+    ``normal`` is the normal of the lit surface.
     """
     candidates = 1 if samples >= MANY_SAMPLES else CANDIDATES
 
@@ -345,7 +345,7 @@ def make_area_sample(samples: int) -> wp.Function:
             total = float(0.0)
             worth = float(0.0)
             u = fraction((wp.float32(k) + 0.5) * STEP_W + 16.0 * turn * STEP_U)
-            tries = wp.int32(wp.static(candidates))  # a variable: the loop stays one
+            tries = wp.int32(wp.static(candidates))  # a variable: the loop is not unrolled
             for c in range(tries):
                 sample = draw_on_area(scene, point, area_numbers(k * tries + c, count * tries, turn))
                 weight = brightness(sample.irradiance_normal) * (LEAST_FACING + wp.max(wp.dot(normal, sample.wi), 0.0))
@@ -368,7 +368,7 @@ def make_area_sample(samples: int) -> wp.Function:
 
 @functools.cache
 def make_area_count(samples: int) -> wp.Function:
-    """``area_count(scene) -> int``: summands of equation (1), or lights at points; 0 where nothing emits."""
+    """``area_count(scene) -> int``: number of terms of equation (1), or of point lights; 0 if nothing emits."""
 
     @wp.func(name=f"area_count_{samples}", module="unique")
     def area_count(scene: RayScene) -> wp.int32:
@@ -381,10 +381,10 @@ def make_area_count(samples: int) -> wp.Function:
 
 @wp.func
 def lobe_solid_angle(surface: Surface) -> wp.float32:
-    """About how wide the lobe of a surface is; 0 for a mirror.
+    """Return the approximate solid angle of a surface's lobe; 0 for a mirror.
 
     Half of GGX's normals lie within tan = alpha, and reflection doubles angles: a cone of 2 alpha. Phong's
-    (n + 1) / (2 pi) cos^n is as wide as its peak says.
+    (n + 1) / (2 pi) cos^n has the solid angle of the inverse of its peak.
     """
     if surface.model == PHONG:
         return 2.0 * wp.pi / (surface.shininess + 1.0)
@@ -396,7 +396,7 @@ def lobe_solid_angle(surface: Surface) -> wp.float32:
 
 @wp.func
 def looks_by_lobe(shape: Shape, point: wp.vec3, lobe: wp.float32) -> wp.bool:
-    """Return whether rays into a lobe of a solid angle find what an object sends there, not samples on the object."""
+    """Return whether an object's light in a lobe of solid angle ``lobe`` is found by rays, not by points on it."""
     away = shape.position - point
     square = wp.dot(away, away)
     radius = area_radius(shape)
@@ -408,7 +408,7 @@ def looks_by_lobe(shape: Shape, point: wp.vec3, lobe: wp.float32) -> wp.bool:
 
 @wp.func
 def draw_lobe(surface: Surface, normal: wp.vec3, wo: wp.vec3, u: wp.vec2) -> wp.vec3:
-    """Unit direction of a ray into the lobe of a surface."""
+    """Draw the unit direction of a ray into the lobe of a surface."""
     if surface.model == PHONG:
         return frame_from_normal(reflect(wo, normal)) * sample_phong_lobe(u, surface.shininess)
     if surface.model == METALLIC_ROUGHNESS:
@@ -420,7 +420,7 @@ def draw_lobe(surface: Surface, normal: wp.vec3, wo: wp.vec3, u: wp.vec2) -> wp.
 
 @wp.func
 def lobe_weight(surface: Surface, normal: wp.vec3, wo: wp.vec3, wi: wp.vec3) -> wp.vec3:
-    """Return the lobe's reflection from a direction of ``draw_lobe``, over the density with which that is drawn."""
+    """Return the lobe's reflection of light from ``wi``, over the density of ``draw_lobe``."""
     if surface.model == METALLIC_ROUGHNESS:
         half = wp.normalize(wi + wo)
         alpha = surface.roughness * surface.roughness
@@ -434,7 +434,7 @@ def lobe_weight(surface: Surface, normal: wp.vec3, wo: wp.vec3, wi: wp.vec3) -> 
 
 @wp.func
 def without_lobe(surface: Surface) -> Surface:
-    """The diffuse part alone."""
+    """Return the surface without its lobe."""
     result = surface
     result.reflectance = wp.vec3(0.0)
     result.f0 = wp.vec3(0.0)
@@ -444,10 +444,10 @@ def without_lobe(surface: Surface) -> Surface:
 
 @functools.cache
 def make_area_reflection(trace: TraceConfig, samples: int) -> wp.Function:
-    """``area_reflection(scene, hit, surface, normal, geometric, wo, turn) -> vec3``: what emits, in narrow lobes.
+    """``area_reflection(scene, hit, surface, normal, geometric, wo, turn) -> vec3``: emitters in narrow lobes.
 
-    Radiance toward ``wo`` of all that ``looks_by_lobe`` leaves to rays, of as many of them as there are samples; a
-    mirror needs one.
+    It is the radiance toward ``wo`` of objects for which ``looks_by_lobe`` holds, by ``samples`` rays, or one for a
+    mirror.
     """
     functions = make_trace(trace)
     closest_object, occluded_by_proxies = functions.closest_object, functions.occluded_by_proxies

@@ -1,7 +1,7 @@
-"""Triangles that let rays pass, and normals that a picture tilts: what only some meshes have.
+"""Alpha, single-sided triangles and normal maps of meshes.
 
-A triangle may be cut out by its alpha, let a share of rays pass, or show one side alone; a normal map tilts the normal
-of what is met. ``kernels/rays/trace.py`` compiles this in where a scene's ``TraceConfig.detail`` says so.
+A triangle may be cut out by its alpha (masked), let a share of rays pass (blended), or be visible from one side alone.
+A normal map tilts the shading normal. ``kernels/rays/trace.py`` includes this code if ``TraceConfig.detail`` is set.
 
 References:
     [WM17] Wyman, McGuire, "Hashed Alpha Testing", I3D 2017.
@@ -19,17 +19,17 @@ from warp_ar.kernels.textures import point_of_triangle, sample_texture, slant
 wp.set_module_options({"enable_backward": False})
 
 MOST_LAYERS = wp.constant(64)
-"""Triangles of one mesh that a ray passes; behind them it sees nothing of it."""
+"""Largest number of triangles of one mesh that a ray passes through; it meets no further ones."""
 
 
 @wp.func
 def is_there(
     scene: RayScene, shape: Shape, contact: Contact, origin: wp.vec3, direction: wp.vec3, sided: wp.bool
 ) -> wp.bool:
-    """Return whether a triangle holds up a ray in the shape's coordinates; if ``sided``, not from behind.
+    """Return whether a triangle stops a ray in the shape's coordinates; if ``sided``, not from behind.
 
-    Blended triangles hold up as large a share of rays as their alpha says, by a threshold for each cell of space that
-    is about a pixel wide: it stays with the surface when the camera moves [WM17].
+    Blended triangles stop a share of rays equal to their alpha, by a threshold hashed from cells of space about a pixel
+    wide. So the pattern stays with the surface when the camera moves [WM17].
     """
     corner = shape.first_vertex + 3 * contact.face
     index = shape.material
@@ -68,10 +68,10 @@ def is_there(
 def intersect_solid(
     scene: RayScene, shape: Shape, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32, sided: wp.bool
 ) -> Contact:
-    """Closest face of a mesh that holds up a ray: those that do not are passed, ``MOST_LAYERS`` at most.
+    """Return the closest face of a mesh that stops a ray; up to ``MOST_LAYERS`` faces are passed through.
 
-    A ray goes on a little behind what it passed: further than rounding could have put it before, so that it does not
-    meet the same face for ever.
+    A ray continues a little behind a face that it passed, by more than rounding, so that it does not meet the same face
+    again.
     """
     found = Contact()
     found.t = FAR
@@ -94,7 +94,7 @@ def intersect_solid(
 
 @wp.func
 def bumped(scene: RayScene, shape: Shape, hit: Hit, normal: wp.vec3, direction: wp.vec3) -> wp.vec3:
-    """Unit normal of a mesh in its own coordinates as its normal map tilts it, if it has one."""
+    """Return the unit normal of a mesh in its own coordinates, tilted by its normal map if there is one."""
     index = shape.material
     if scene.triangle_materials.shape[0] > 0:
         index += scene.triangle_materials[hit.corner / 3]

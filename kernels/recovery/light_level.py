@@ -1,17 +1,17 @@
-"""Level of recovered light, now over that of the frame it was recovered from: by the card, in every frame.
+"""Level of recovered light: its radiance now over its radiance in the estimate's frame, measured on the card.
 
-An estimate of what clips takes effect some frames after the one it is of, and the next comes later still; a lamp that
-is dimmed changes in between, and goes on clipping in the ball. With E what the card receives, e that part of it which
-the map shows, and ' what they are now, the level of what the map does not show is
+An estimate of clipped light takes effect some frames after the frame from which it was made, and the next follows later
+still. A lamp may be dimmed in between and still clip in the ball. Let E be the irradiance of the card, e the part of it
+that the environment map contains, and let ' mark values of the current frame. The level of the rest is
 
-    f = (E' - e') / (E - e) = (r - q (1 - s)) / s,    r = E' / E,  q = e' / e,  s = (E - e) / E,
+    f = (E' - e') / (E - e) = (r - q (1 - s)) / s,    r = E' / E,  q = e' / e,  s = (E - e) / E.
 
-where r is the median, over the card's paper and ink, of what points show now over what they showed then, q is read off
-the map, as a surface that faces upward receives it, and s comes with the estimate. Points of the card must agree:
-where a hand covers some or a shadow's edge passes, the level stays as it was.
+r is the median over points of the card of their radiance now over their radiance then. q is computed from the map, as
+the irradiance of a surface that faces upward. s comes with the estimate. If too few points of the card agree (a hand
+covers some, or a shadow's edge passes), the level does not change.
 
-Noise must not flicker: a change of r / (1 - s + s f) by less than ``STILL`` is none, and by ``FOLLOWED`` is followed in
-full; between them in proportion.
+To keep noise from flickering, a change of r / (1 - s + s f) below ``STILL`` is ignored, one above ``FOLLOWED`` is
+followed in full, and one between them in proportion.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ STILL = wp.constant(wp.float32(0.01))
 FOLLOWED = wp.constant(wp.float32(0.03))
 """Relative change from which the level follows the card in full."""
 LEAST_SHARE = wp.constant(wp.float32(0.1))
-"""Least share of the card's light that is missing in the map; a smaller one is within the map's error."""
+"""Least share s of the card's light that the map lacks; a smaller one is within the map's error."""
 LEAST_POINTS = wp.constant(wp.int32(8))
-"""Least number of the card's points seen in both frames."""
+"""Least number of the card's points that both frames show."""
 AGREEING = wp.constant(wp.float32(0.7))
-"""Least share of these points whose light changed alike."""
+"""Least share of these points whose ratio of radiance agrees with the median."""
 SPREAD = wp.constant(wp.float32(0.1))
-"""Largest relative difference between changes that count as alike."""
+"""Largest relative difference of a ratio that agrees with the median."""
 MOST = wp.constant(wp.float32(1.5))
 """Highest level; a larger rise of the card is probably another lamp."""
 DARK = wp.constant(wp.float32(0.0016))
-"""Radiance below which a point says nothing: quantisation."""
+"""Radiance below which a point is not used, because of quantisation."""
 
 
 @tile_kernel
@@ -70,7 +70,7 @@ def add_rows_kernel(
     # Out:
     upward_out: wp.array[wp.float32],
 ):
-    """The sum of all rows, in their order."""
+    """Sum all rows, in their order."""
     c = wp.tid()
     total = wp.float32(0.0)
     for i in range(rows.shape[0]):
@@ -110,7 +110,7 @@ def follow_level_kernel(
     # Out:
     level_out: wp.array[wp.float32],
 ):
-    """The point whose change is the median writes the level of its channel."""
+    """Write the level of one channel, by the thread of the point whose ratio is the median."""
     c, own = wp.tid()
     change = change_of(now[own], then[own], c)
     unseen = share[c]
@@ -130,7 +130,7 @@ def follow_level_kernel(
     if count < LEAST_POINTS or below != count / 2 or wp.float32(alike) < AGREEING * wp.float32(count):
         return
     shown = wp.where(upward_then[c] > 0.0, upward_now[c] / wp.max(upward_then[c], 1.0e-9), 1.0)
-    # What the card would show if the level were what it was.
+    # Ratio r that the card would have at level 1.
     expected = unseen + (1.0 - unseen) * shown
     off = change / expected - 1.0
     follows = wp.clamp((wp.abs(off) - STILL) / (FOLLOWED - STILL), 0.0, 1.0)
@@ -140,13 +140,13 @@ def follow_level_kernel(
 def follow_level(
     now: wp.array, then: wp.array, upward: tuple[wp.array, wp.array], share: wp.array, level_out: wp.array
 ) -> None:
-    """Update the level of recovered light from the card; without a verdict it stays.
+    """Update the level of recovered light from the card; it does not change if points disagree or are too few.
 
     Args:
-        now: What the card's points show, ``Observation`` (n).
-        then: What they showed in the frame that the estimate is of, ``Observation`` (n).
+        now: Radiance of the card's points in the current frame, ``Observation`` (n).
+        then: Their radiance in the estimate's frame, ``Observation`` (n).
         upward: From ``sum_upward``, now and then.
-        share: Of the card's light then that the map does not show, by channel, float32 (3).
+        share: Share s of the card's light then that the map lacks, by channel, float32 (3).
         level_out: Radiance of recovered light over that of the estimate, by channel, float32 (3).
     """
     launch(follow_level_kernel, (3, now.shape[0]), [now, then, *upward, share], [level_out])
@@ -162,7 +162,7 @@ def apply_level_kernel(
     recovered_out: wp.array2d[wp.vec3],
     emitters_out: wp.array[Emitter],
 ):
-    """Both times the level."""
+    """Multiply recovered radiance and emitters by the level."""
     row, column = wp.tid()
     factor = wp.vec3(level[0], level[1], level[2])
     recovered_out[row, column] = wp.cw_mul(factor, recovered[row, column])
@@ -175,13 +175,13 @@ def apply_level_kernel(
 def apply_level(
     recovered: wp.array, emitters: wp.array, level: wp.array, recovered_out: wp.array, emitters_out: wp.array
 ) -> None:
-    """Light of an estimate at the level that it has now.
+    """Scale the light of an estimate to its current level.
 
     Args:
-        recovered: Radiance that a wholly clipped texel lacks, ``wp.vec3``, of cells.
+        recovered: Radiance that a wholly clipped texel lacks, per cell, ``wp.vec3`` (rows, columns).
         emitters: ``Emitter`` (k), at most as many as there are columns of cells.
         level: From ``follow_level``, float32 (3).
-        recovered_out: As ``recovered``.
-        emitters_out: As ``emitters``.
+        recovered_out: Scaled radiance, of the shape of ``recovered``.
+        emitters_out: Scaled emitters, of the shape of ``emitters``.
     """
     launch(apply_level_kernel, recovered.shape, [recovered, emitters, level], [recovered_out, emitters_out])

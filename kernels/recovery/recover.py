@@ -1,16 +1,14 @@
-"""Both sides of the equations of recovery: radiance of surfaces, and the light that each receives from each cell.
+"""Linear equations of recovery: radiance of surface points, and light transfer from cells of the environment.
 
-The ball clips where emitters and windows are. Surfaces that the scene models (the white card, planes, boxes) do not, or
-not there, and are lit by the same light. A surface point x with normal n and reflectance rho that shows the camera the
-radiance L receives
+Emitters and windows clip in the ball. Surfaces that the scene models (the white card, planes, boxes) are lit by them
+and mostly do not clip. A surface point x with normal n, reflectance rho and radiance L toward the camera receives
 
-    E(x) = pi L / rho = sum over the environment's cells m of T(x, m) radiance(m),     T(x, m) = cos solid_angle
-    visibility.
+    E(x) = pi L / rho = sum over cells m of the environment of  T(x, m) radiance(m),
+    T(x, m) = cos(n, m) solid_angle(m) visibility(x, m).
 
-The kernels here fill the two sides: ``observe_surfaces`` measures L, ``trace_transfer`` works out T, ``trace_emitters``
-the same for emitters at finite distances. ``kernels/recovery/recover_cells.py`` has the cells;
-``warp_ar.light.recovery`` solves
-for what is missing in the clipped ones.
+``observe_surfaces`` measures L. ``trace_transfer`` computes T for cells, ``trace_emitters`` for emitters at finite
+distances. ``kernels/recovery/recover_cells.py`` makes the cells; ``warp_ar.light.recovery`` solves for the missing
+radiance of the clipped ones.
 """
 
 import functools
@@ -31,23 +29,23 @@ from warp_ar.kernels.structs import FrameParams, Probe, RayScene
 wp.set_module_options({"enable_backward": False})
 
 PATCH = wp.constant(5)
-"""Points along the side of the patch over which a surface point is averaged."""
+"""Points along the side of the square patch over which a surface point's radiance is averaged."""
 BALL_MARGIN = wp.constant(wp.float32(1.08))
 """Factor on a ball's radius for hiding surfaces, because its outline is blurred."""
 FAR_FROM_BALL = wp.constant(wp.float32(10.0))
 """Distance in radii beyond which light reflected by a ball is ignored: (R / 2 s)^2, less than 1/400 of the light
 itself."""
 GRAZING = wp.constant(wp.float32(1.0e-3))
-"""Cosine below which a ball mirrors nothing: light at grazing angles is seen directly past the outline."""
+"""Cosine below which reflection at a ball is ignored: such light passes the ball's outline directly."""
 CLOSE = wp.constant(wp.float32(1.0e-3))
 """Relative distance within which a camera ray's hit is the surface itself."""
 
 
 @wp.struct
 class SurfacePoint:
-    """A place on a physical surface."""
+    """A square patch of a physical surface."""
 
-    position: wp.vec3
+    position: wp.vec3  # centre
     normal: wp.vec3
     tangent: wp.vec3  # unit, along the patch's first side
     half: wp.float32  # half the side of the patch, metres
@@ -59,13 +57,13 @@ class Observation:
 
     radiance: wp.vec3  # mean over the patch, linear camera values
     deviation: wp.vec3  # standard deviation over the patch
-    clipped: wp.vec3  # share of the patch at clipping
-    visible: wp.float32  # share of the patch that the camera sees, 0 where it sees none
+    clipped: wp.vec3  # clipped share of the patch
+    visible: wp.float32  # share of the patch that the camera sees
 
 
 @wp.func
 def surface_error(scene: RayScene, point: SurfacePoint) -> wp.float32:
-    """Return a bound on the distance of a point from its surface, metres. The largest proxy bounds all."""
+    """Return a bound on a point's distance from its surface by rounding, metres; the largest proxy's for all."""
     size = wp.float32(0.0)
     for index in range(scene.proxies.shape[0]):
         size = wp.max(size, scene.proxies[index].scale * wp.length(scene.proxies[index].extent))
@@ -74,7 +72,7 @@ def surface_error(scene: RayScene, point: SurfacePoint) -> wp.float32:
 
 @wp.func
 def distance_to_sphere(center: wp.vec3, radius: wp.float32, origin: wp.vec3, direction: wp.vec3) -> wp.float32:
-    """Distance along a unit direction to a sphere that the ray meets from outside; negative if it does not."""
+    """Return the distance along a unit direction to a sphere that the ray meets from outside; negative for none."""
     to_center = center - origin
     along = wp.dot(to_center, direction)
     off = to_center - along * direction
@@ -88,16 +86,16 @@ def distance_to_sphere(center: wp.vec3, radius: wp.float32, origin: wp.vec3, dir
 def hidden_share(
     center: wp.vec3, radius: wp.float32, origin: wp.vec3, direction: wp.vec3, cell_angle: wp.float32
 ) -> wp.float32:
-    """Share of a disc of angular radius ``cell_angle`` around ``direction`` that a ball hides.
+    """Return the share of a disc of angular radius ``cell_angle`` around ``direction`` that a ball hides.
 
-    Both are taken to meet along a straight edge: (3 t - t^3) / 4 + 1 / 2 with t in -1..1 is within 2 % of a disc's
-    exact share.
+    The ball's outline is taken to be straight over the disc: (3 t - t^3) / 4 + 1 / 2 with t in -1..1 is within 2 % of
+    the disc's exact share beyond a straight edge.
     """
     to_center = center - origin
     away = wp.length(to_center)
     if away <= radius:
         return 0.0
-    # atan2 of both: exact for small angles.
+    # atan2 of sine and cosine: accurate for small angles.
     side = wp.length(wp.cross(to_center, direction))
     t = (wp.asin(radius / away) - wp.atan2(side, wp.dot(to_center, direction))) / cell_angle
     t = wp.clamp(t, -1.0, 1.0)
@@ -106,11 +104,11 @@ def hidden_share(
 
 @wp.func
 def mirrored_irradiance(probe: Probe, point: SurfacePoint, light: wp.vec3) -> wp.float32:
-    """Irradiance at a surface point by way of a ball, per unit irradiance of a parallel beam from direction ``light``.
+    """Return the irradiance at a surface point by reflection at a ball, per unit irradiance of a parallel beam.
 
-    The ball's point with normal n that mirrors the beam to x halves the angle a between both. There a convex mirror
-    has the focal lengths R cos a / 2 (in the plane of incidence) and R / (2 cos a) (across it); at the distance s the
-    beam is wider by
+    The beam comes from the direction ``light``. At the ball's point with normal n that reflects it to x, a is the angle
+    of incidence. There a convex mirror has the focal lengths R cos a / 2 (in the plane of incidence) and R / (2 cos a)
+    (across it). At the distance s the cross-section of the beam has grown by the factor
 
         (1 + 2 s / (R cos a)) (1 + 2 s cos a / R).
     """
@@ -124,7 +122,7 @@ def mirrored_irradiance(probe: Probe, point: SurfacePoint, light: wp.vec3) -> wp
     sin_psi = wp.length(side)
     least = 1.0 / distance
     if cos_psi <= -wp.sqrt((1.0 - least) * (1.0 + least)):
-        return 0.0  # the point lies in the ball's shadow, where no ray is mirrored to
+        return 0.0  # the point lies in the ball's shadow, which no reflected ray reaches
     if sin_psi > 1.0e-6:
         side = side / sin_psi
     n = reflecting_normal(distance, cos_psi, sin_psi)
@@ -171,7 +169,7 @@ def make_observe_surfaces_kernel(proxies: tuple[int, ...], linear: bool = False)
         if wp.dot(point.normal, camera.camera_position - point.position) > 0.0:
             squares = wp.vec3(0.0, 0.0, 0.0)
             count = wp.float32(0.0)
-            side = wp.int32(PATCH)  # a variable: the loops stay loops, and the kernel a seventh of its size
+            side = wp.int32(PATCH)  # a variable: loops are not unrolled, and the kernel is a seventh of the size
             for a in range(side):
                 for b in range(side):
                     u = (2.0 * wp.float32(a) + 1.0) / wp.float32(PATCH) - 1.0
@@ -217,8 +215,8 @@ Args:
     proxies: Kinds of proxy in the scene.
     linear: Whether the frame is linear.
     frame: ``wp.vec3ub`` (frame rows, columns), RGB codes; or ``wp.vec3``, linear radiance.
-    decode_table: Linear value of each code, ``wp.vec3`` (256); for a linear frame where it clips, and where beside
-        another channel that does, ``wp.vec3`` (2).
+    decode_table: Linear value of each code, ``wp.vec3`` (256). For a linear frame, ``wp.vec3`` (2): the values from
+        which channels count as clipped, alone and beside a clipped channel.
     params: ``FrameParams`` (1): the camera.
     probes: ``Probe`` (P): they hide surfaces.
     scene: Its proxies hide surfaces as well.
@@ -227,11 +225,11 @@ Args:
 """
 
 
-# Visibility. From x a cell is hidden in part or whole by a ball, softly: the cell is taken as a disc of its own size,
-# the ball as an edge in front of it. The ball also throws the light of every cell onto the point, as a convex mirror
-# does; that is kept apart, for real balls scatter some of it. Where a proxy is in the way, its radiance is what the
-# ball shows of it: the share goes to the cell in which the ball sees the point that was hit (no parallax is left for
-# what is modelled). The horizon needs no mention: what lies below a surface has no cosine.
+# Visibility. A ball may hide part of a cell: the cell is taken to be a disc of its own size, the ball's outline a
+# straight edge before it. The ball also reflects the light of every cell onto the point, as a convex mirror. That light
+# is kept apart, because real balls scatter some of it. If a proxy hides the cell, its radiance is that which the ball
+# shows: the transfer is added to the cell in which the ball sees the point that was hit, so modelled surfaces have no
+# parallax error. Cells below the surface's horizon have a negative cosine and are left out.
 @functools.cache
 def make_trace_transfer_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
     """Kernel of ``trace_transfer`` for the given kinds of proxy."""
@@ -285,20 +283,20 @@ def make_trace_transfer_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
 
 
 trace_transfer = row_launcher(make_trace_transfer_kernel, outputs=3, like=lambda points, *_: points)
-"""Irradiance that a surface point receives from each cell of the environment, per unit of the cell's radiance.
+"""Compute the irradiance of surface points by each cell of the environment, per unit of the cell's radiance.
 
-Nothing of it changes from frame to frame, so each point is traced once: when the camera first sees it.
+It does not change between frames, so each point is traced once, when the camera first sees it.
 
 Args:
     proxies: Kinds of proxy in the scene.
     points: ``SurfacePoint`` (n).
     observations: ``Observation`` (n): points that the camera does not see are left out.
-    cells: ``Cell`` (rows, columns): middles and solid angles.
-    probes: ``Probe`` (P), at least one; the environment is the one that the first sees.
+    cells: ``Cell`` (rows, columns): centres and solid angles.
+    probes: ``Probe`` (P), at least one; the environment is that of the first.
     scene: Its proxies hide the environment.
-    traced_out: 1 where a point has been traced, 0 before, ``wp.int32`` (n).
-    transfer_out: Straight, past balls and proxies, ``wp.float32`` (n, rows * columns).
-    mirrored_out: By way of balls, ``wp.float32`` (n, rows * columns).
+    traced_out: 1 if a point was traced, else 0, ``wp.int32`` (n).
+    transfer_out: Direct transfer, with occlusion by balls and proxies, ``wp.float32`` (n, rows * columns).
+    mirrored_out: Transfer by reflection at balls, ``wp.float32`` (n, rows * columns).
 """
 
 
@@ -350,7 +348,7 @@ def make_trace_emitters_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
 
 
 trace_emitters = row_launcher(make_trace_emitters_kernel)
-"""Irradiance that a surface point receives from emitters, per unit of their radiant intensity.
+"""Compute the irradiance of surface points by emitters, per unit of the emitters' radiant intensity.
 
 Args:
     proxies: Kinds of proxy in the scene.

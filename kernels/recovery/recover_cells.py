@@ -1,8 +1,8 @@
-"""Cells of the environment, in which recovery looks for light that the camera could not hold.
+"""Cells of the environment: the unknowns of recovery, blocks of texels that may lack light by clipping.
 
 The environment is condensed to ``CELL_ROWS`` x ``CELL_COLUMNS`` cells of a latlong grid (5.6 degrees), each with its
-mean radiance, its share at clipping, and the direction in which that share lies (``condense_cells``). What was found
-missing is put back into the map by ``add_recovered``.
+mean radiance, its clipped share, and the mean direction of that share (``condense_cells``). ``add_recovered`` adds
+recovered radiance to the map.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ wp.set_module_options({"enable_backward": False})
 CELL_ROWS = wp.constant(32)
 CELL_COLUMNS = 64
 FULL_TRUST = wp.constant(wp.float32(0.5))
-"""Confidence above which a texel counts as seen; as for filling."""
+"""Confidence above which a texel counts as observed; as for filling."""
 LOST = 0.02
-"""Clipped share from which a cell's light is where it clips, not where nothing is seen, and the cell is in a region."""
+"""Clipped share from which on a cell belongs to a clipped region, and its missing light is that of clipped texels."""
 _LOST = wp.constant(wp.float32(LOST))
 BEYOND = wp.constant(wp.float32(0.25))
-"""Share of what clips in a cell that lies beyond proxies from which what clips on them there is the same light."""
+"""Share of a cell's clipped texels beyond proxies from which on its clipped texels on proxies show the same light."""
 MOST_LEFT = wp.constant(wp.float32(4.0))
-"""Largest factor on the light of what still clips in a cell, for less of it clipping."""
+"""Largest factor on the recovered radiance of clipped texels if fewer texels of the cell clip than before."""
 
 
 @wp.struct
@@ -37,23 +37,23 @@ class Cell:
     """A part of the environment."""
 
     radiance: wp.vec3  # mean, as captured
-    clipped: wp.vec3  # mean share that may lack light: at clipping, or, in a cell that shows no light, not seen
-    missing: wp.vec3  # the same, saturation boundaries counting less
-    hidden: wp.float32  # mean share that is not seen; 0 in a cell that shows some light
-    modelled: wp.float32  # 1 where the first ball looks at a proxy, 0 where at the environment beyond
-    middle: wp.vec3  # unit
-    direction: wp.vec3  # unit: of what is at clipping, or of the cell's middle
+    clipped: wp.vec3  # mean share that may lack light: clipped, or, in a cell that shows no light, not observed
+    missing: wp.vec3  # the same, with less weight on saturation boundaries
+    hidden: wp.float32  # mean share that is not observed; 0 in a cell that shows some light
+    modelled: wp.float32  # 1 if the first ball sees a proxy in this direction, 0 if the environment beyond
+    middle: wp.vec3  # unit, direction of the cell's centre
+    direction: wp.vec3  # unit, mean direction of the clipped share, or of the centre
     solid_angle: wp.float32
 
 
 def cell_shape(height: int, width: int) -> tuple[int, int]:
-    """Rows and columns of cells for a map of this size."""
+    """Return the rows and columns of cells for a map of this size."""
     return min(CELL_ROWS, height), min(CELL_COLUMNS, width)
 
 
 @wp.func
 def trust(confidence: wp.float32) -> wp.float32:
-    """Return the degree to which a texel counts as seen, 0..1; 0 for NaN."""
+    """Return the degree to which a texel counts as observed, 0..1; 0 for NaN."""
     t = wp.clamp(confidence / FULL_TRUST, 0.0, 1.0)
     return wp.where(confidence > 0.0, t * t * (3.0 - 2.0 * t), 0.0)
 
@@ -73,7 +73,7 @@ def make_leave_out_edges_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
         # Out:
         missing_out: wp.array2d[wp.vec3],
     ):
-        """One cell, of those of ``cell_shape``."""
+        """Correct the texels of one cell."""
         band_row, column = wp.tid()
         row = row_start + band_row
         height = clipped.shape[0]
@@ -95,7 +95,7 @@ def make_leave_out_edges_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
                             on += area
                         else:
                             missing_out[i, j] = wp.vec3(0.0, 0.0, 0.0)
-            # A second time where both clip, and enough of it beyond.
+            # A second pass if texels on proxies and beyond clip, and enough of them beyond.
             turn += 1
             if not (on > 0.0 and beyond > BEYOND * (on + beyond)):
                 turn = wp.int32(2)
@@ -104,18 +104,18 @@ def make_leave_out_edges_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
 
 
 leave_out_edges = row_launcher(make_leave_out_edges_kernel, like=lambda clipped, *_: cell_shape(*clipped.shape))
-"""Let proxies lack nothing beside what clips behind their edge.
+"""Leave out clipped texels on proxies whose light comes from behind the proxy's edge.
 
-A pixel of the ball that shows the edge of a table and the light behind it clips, and so may its neighbours: texels
-of the table lack light then that comes from beyond it. Where a quarter of what clips in a cell or more lies beyond
-proxies, what clips on them there is left out.
+A pixel of the ball that shows the edge of a table and a light behind it clips, and so may its neighbours. So texels of
+the table seem to lack light that comes from beyond it. If at least a quarter of a cell's clipped share lies beyond
+proxies, the clipped texels on proxies are left out.
 
 Args:
     proxies: Kinds of proxy in the scene.
-    clipped: Share at clipping per channel, ``wp.vec3`` (h, w).
+    clipped: Clipped share per channel, ``wp.vec3`` (h, w).
     probes: ``Probe`` (P), at least one: the ball.
     scene: Its proxies are known surfaces.
-    missing_out: From ``weigh_boundaries``, ``wp.vec3`` (h, w); set to 0 there.
+    missing_out: From ``weigh_boundaries``, ``wp.vec3`` (h, w); set to 0 in the texels that are left out.
 """
 
 
@@ -146,7 +146,7 @@ def make_condense_cells_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
         cell = Cell()
         toward = wp.vec3(0.0, 0.0, 0.0)
         lost_toward = wp.vec3(0.0, 0.0, 0.0)
-        # Of what was not left out.
+        # Sums over texels that were not left out.
         kept = wp.vec3(0.0, 0.0, 0.0)
         kept_toward = wp.vec3(0.0, 0.0, 0.0)
         for i in range(row * height // rows, (row + 1) * height // rows):
@@ -189,23 +189,23 @@ def make_condense_cells_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
 
 
 condense_cells = row_launcher(make_condense_cells_kernel)
-"""Condense a map to cells. What clips and yet lacks nothing, for ``leave_out_edges`` said so, does not count.
+"""Condense a map to cells. Clipped texels that ``leave_out_edges`` left out do not count.
 
 Args:
     proxies: Kinds of proxy in the scene.
-    radiance: ``wp.vec3`` (h, w), complete.
-    confidence: How well each texel was seen, ``wp.float32`` (h, w).
-    clipped: Share at clipping per channel, ``wp.vec3`` (h, w).
-    missing: The same from ``weigh_boundaries``.
+    radiance: ``wp.vec3`` (h, w), completed.
+    confidence: Confidence of each texel, ``wp.float32`` (h, w).
+    clipped: Clipped share per channel, ``wp.vec3`` (h, w).
+    missing: Clipped share from ``weigh_boundaries``, ``wp.vec3`` (h, w).
     probes: ``Probe`` (P), at least one.
-    scene: Its proxies are known surfaces: what clips there is lit, not a light.
+    scene: Its proxies are known surfaces: clipped texels on them are lit, not emitters.
     cells_out: ``Cell``, ``cell_shape(h, w)``.
 """
 
 
 @wp.func
 def missing_share(confidence: wp.float32, missing: wp.vec3, unseen: wp.float32) -> wp.vec3:
-    """Share of a texel that lacks light, where ``unseen`` is what counts of one that is not seen."""
+    """Return the share of a texel that lacks light; ``unseen`` is the weight of the part that is not observed."""
     trusted = trust(confidence)
     return trusted * missing + unseen * (1.0 - trusted) * wp.vec3(1.0, 1.0, 1.0)
 
@@ -222,7 +222,7 @@ def add_recovered_kernel(
     # Out:
     recovered_out: wp.array2d[wp.vec3],
 ):
-    """Every texel of a cell plus its share of the cell's recovered radiance."""
+    """Add to one texel its share of its cell's recovered radiance."""
     band_row, column = wp.tid()
     row = row_start + band_row
     height = radiance.shape[0]
@@ -252,17 +252,18 @@ def add_recovered_kernel(
 
 
 add_recovered = row_launcher(add_recovered_kernel, like=lambda *given: given[-2])
-"""Give texels back what they lost.
+"""Add recovered radiance to the texels that lack light.
 
-Where more or less of a cell clips than when its radiance was recovered, the energy stays what was found: a
-thousandth that clips can have a high radiance, and in the next frame be half of the cell; a video codec takes the
-weakest channel of an emitter across the limit and back. Below a quarter of the share the energy falls with it.
+If the clipped share of a cell has changed since its radiance was recovered, its recovered energy stays the same. (A
+clipped thousandth of a cell may have a high radiance, and grow to half of the cell in the next frame; a video codec
+moves the weakest channel of an emitter across clipping and back.) Only below a quarter of the share does the energy
+fall with the share.
 
 Args:
     radiance: As captured and completed, ``wp.vec3`` (h, w).
-    confidence: How well each texel was seen, ``wp.float32`` (h, w).
-    missing: Share at clipping per channel from ``weigh_boundaries``, ``wp.vec3`` (h, w).
-    cells: ``Cell``, ``cell_shape(h, w)``, of when that was.
+    confidence: Confidence of each texel, ``wp.float32`` (h, w).
+    missing: Clipped share per channel from ``weigh_boundaries``, ``wp.vec3`` (h, w).
+    cells: ``Cell``, ``cell_shape(h, w)``, of the frame from which light was recovered.
     recovered: Radiance that a wholly clipped texel lacks, per cell: ``wp.vec3``, ``cell_shape(h, w)``.
     recovered_out: ``wp.vec3`` (h, w).
 """
@@ -270,7 +271,7 @@ Args:
 
 @wp.func
 def cell_of(direction: wp.vec3, rows: wp.int32, columns: wp.int32) -> wp.int32:
-    """Index of the cell that holds a direction."""
+    """Return the index of the cell that contains a direction."""
     at = latlong_from_direction(direction, rows, columns)
     row = wp.clamp(wp.int32(at[0]), 0, rows - 1)
     return row * columns + wp.clamp(wp.int32(at[1]), 0, columns - 1)

@@ -1,23 +1,24 @@
-"""Light that clips in the mirror balls, put back in the maps of the balls after the first.
+"""Recovered light in the maps of the mirror balls after the first.
 
-It is recovered in the first ball's map, M, from F, that map as captured: the recovered radiance is M - F. Another
-ball, at c, sees the part of it that comes from near emitters along other directions, and stronger or weaker. Where such
-emitters are known by their places, it is turned (``relocate``):
+Clipped light is recovered in the first ball's map: F is the map as captured, M with recovered light, so the recovered
+radiance is M - F. At another ball the light of near emitters comes from other directions, stronger or weaker. If the
+positions of such emitters are known, recovered light is moved by their parallax (``relocate``):
 
     M'(d) = F'(d) + g(d) max(M - F, 0)(turned(d)),
 
-with ``correct_parallax`` for the turn and ``solid_angle_gain`` for g.
+with ``correct_parallax`` for the turned direction and ``solid_angle_gain`` for g.
 
-Where none is, the other ball tells itself in which directions its light clips, and what it lacks is taken to be as much
-as the first one does, as of light far away (``share_recovered``). With a' the solid angle and s' the share of its
-texels that lack light, and e_k what was found in cell k of the first ball's map, radiance times solid angle,
+If no position is known, the other ball's clipped texels give the directions, and the missing energy is taken to be that
+of the first ball, as for distant light (``share_recovered``). With a' the solid angle and s' the missing share of a
+texel of the other ball, and e_k the energy recovered in cell k of the first ball, radiance times solid angle,
 
     M'(d) = F'(d) + s'(d) sum over k of w_k(d) e_k / sum over d of a' s' w_k,
-    w_k(d) = 1 / (|d - d_k|^2 + NEARBY^2)^2:
+    w_k(d) = 1 / (|d - d_k|^2 + NEARBY^2)^2.
 
-of one lamp all goes where the other ball sees it, of several each to the nearest. What nothing in the other map clips
-for, and what was found where the first ball sees nothing, stays in its direction. Shares are no measure of how large a
-lamp is: one of a pixel or two has another share in every picture.
+So the energy of a single lamp goes to the clipped texels of the other map, and that of several lamps each to the
+nearest ones. Energy without clipped texels in the other map, and energy recovered where the first ball shows nothing,
+keeps its direction. The energy, not the radiance, is transferred, because the clipped share is no measure of a lamp's
+size: that of a lamp of one or two pixels differs between frames.
 """
 
 from __future__ import annotations
@@ -34,12 +35,12 @@ wp.set_module_options({"enable_backward": False})
 
 
 NEARBY = wp.constant(wp.float32(0.2))
-"""Distance of unit directions within which cells count alike: a lamp's own, and the next beside it."""
+"""Distance of unit directions below which weights of cells are nearly equal: those of one lamp and its neighbours."""
 
 
 @wp.func
 def any_near(emitters: wp.array[Emitter]) -> wp.bool:
-    """Return whether an emitter is known by its place."""
+    """Return whether the position of any emitter is known."""
     near = bool(False)
     for k in range(emitters.shape[0]):
         near = near or (emitters[k].distance > 0.0 and emitters[k].distance < MAX_DISTANCE)
@@ -59,7 +60,7 @@ def relocate_kernel(
     # Out:
     environment_out: wp.array2d[wp.vec3],
 ):
-    """A texel, where an emitter is known by its place; else all is left as it is."""
+    """Write one texel if the position of an emitter is known; else do nothing."""
     i, j = wp.tid()
     i += row_start
     if not any_near(emitters):
@@ -75,7 +76,7 @@ def relocate_kernel(
 
 @wp.func
 def kinship(a: wp.vec3, b: wp.vec3) -> wp.float32:
-    """Weight of a unit direction for another."""
+    """Return the weight w of a unit direction for another."""
     away = a - b
     near = wp.dot(away, away) + NEARBY * NEARBY
     return 1.0 / (near * near)
@@ -92,7 +93,7 @@ def send_recovered_kernel(
     # Out:
     sent_out: wp.array2d[wp.vec3],
 ):
-    """A cell's e over the sum that it is shared by; -1 where it stays in its direction."""
+    """Write a cell's energy e over its sum of weights; -1 if the energy keeps its direction."""
     i, j = wp.tid()
     i += row_start
     cell = cells[i, j]
@@ -133,7 +134,7 @@ def share_recovered_kernel(
     # Out:
     environment_out: wp.array2d[wp.vec3],
 ):
-    """A texel, where no emitter is known by its place."""
+    """Write one texel if the position of no emitter is known."""
     i, j = wp.tid()
     i += row_start
     if any_near(emitters):
@@ -165,61 +166,61 @@ def move_emitters_kernel(
     # Out:
     emitters_out: wp.array[Emitter],
 ):
-    """One emitter a thread."""
+    """Move one emitter."""
     k = wp.tid()
     place = places[ball]
     emitters_out[k] = seen_from(emitters[k], wp.vec3(place[0], place[1], place[2]))
 
 
 relocate = row_launcher(relocate_kernel)
-"""Add what was recovered in the first ball's map to another's, turned, where an emitter is known by its place.
+"""Add light recovered in the first ball's map to another ball's map, with parallax, if a position is known.
 
 Args:
-    filled: (h, w) the other ball's light as captured and completed.
-    environment: (h, w) the first ball's, with what was recovered.
-    captured: (h, w) the first ball's without.
-    emitters: Of the first ball's map.
-    places: (P,) of ``probe_weights.update_places``.
-    environment_out: (h, w) ``wp.vec3``.
-    ball: The other one's number.
+    filled: (h, w) map of the other ball, as captured and completed.
+    environment: (h, w) map of the first ball, with recovered light.
+    captured: (h, w) map of the first ball, without recovered light.
+    emitters: Emitters of the first ball's map.
+    places: (P,) from ``probe_weights.update_places``.
+    environment_out: (h, w) ``wp.vec3``, map of the other ball with recovered light.
+    ball: Index of the other ball.
 """
 
 
 send_recovered = row_launcher(send_recovered_kernel)
-"""Compute the light that each cell of the first ball's map sends to a unit of what clips in another's.
+"""Compute the energy that each cell of the first ball's map gives per unit of weighted missing share in another map.
 
 Args:
-    share: (h, w) what clips in the other map, of ``weigh_boundaries``.
-    confidence: (h, w) how well each of its texels was seen.
-    cells: ``Cell`` of the first ball's map when light was recovered in it.
-    recovered: Radiance that a wholly clipped texel of a cell lacks, as many.
-    sent_out: ``wp.vec3``, as many.
+    share: (h, w) missing share in the other map, from ``weigh_boundaries``.
+    confidence: (h, w) confidence of its texels.
+    cells: (rows, columns) ``Cell`` of the first ball's map, of the frame from which light was recovered.
+    recovered: (rows, columns) radiance that a wholly clipped texel of each cell lacks.
+    sent_out: (rows, columns) ``wp.vec3``.
 """
 
 
 share_recovered = row_launcher(share_recovered_kernel)
-"""Add what was recovered in the first ball's map where another's clips; not if an emitter has a place.
+"""Add light recovered in the first ball's map to clipped texels of another map, if no emitter's position is known.
 
 Args:
-    other: (h, w) ``wp.vec3``, the other ball's light as captured and completed.
-    missing: As for ``send_recovered``.
-    confidence: Likewise.
-    environment: (h, w) the first ball's, with what was recovered.
-    captured: (h, w) the first ball's without.
-    emitters: Of the first ball's map; None: the method knows none.
-    cells: As for ``send_recovered``.
-    sent: From there.
-    environment_out: (h, w) ``wp.vec3``.
+    filled: (h, w) ``wp.vec3``, map of the other ball, as captured and completed.
+    share: (h, w) missing share in the other map, as for ``send_recovered``.
+    confidence: (h, w) confidence of its texels.
+    environment: (h, w) map of the first ball, with recovered light.
+    captured: (h, w) map of the first ball, without recovered light.
+    emitters: Emitters of the first ball's map; None if the method finds no positions.
+    cells: (rows, columns) as for ``send_recovered``.
+    sent: (rows, columns) from ``send_recovered``.
+    environment_out: (h, w) ``wp.vec3``, map of the other ball with recovered light.
 """
 
 
 def move_emitters(emitters: wp.array, places: wp.array, emitters_out: wp.array, *, ball: int) -> None:
-    """Emitters as another ball's map holds them.
+    """Write the emitters as another ball's map shows them.
 
     Args:
-        emitters: ``Emitter``, of the first ball's map.
-        places: (P,) of ``probe_weights.update_places``.
-        emitters_out: As many.
-        ball: The other one's number.
+        emitters: (k,) ``Emitter`` of the first ball's map.
+        places: (P,) from ``probe_weights.update_places``.
+        emitters_out: (k,) ``Emitter`` of the other ball's map.
+        ball: Index of the other ball.
     """
     launch(move_emitters_kernel, emitters.shape[0], [emitters, places, ball], [emitters_out])

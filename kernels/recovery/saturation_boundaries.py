@@ -1,7 +1,7 @@
-"""Saturation boundaries: how likely what clips in the ball's picture is the light itself.
+"""Weights of clipped texels at saturation boundaries, where a pixel shows only part of a light.
 
-A pixel at a light's boundary shows part of the light, and clips all the same if that is bright: what clips is larger
-than the light by up to a pixel. ``weigh_boundaries`` makes it count less.
+A pixel at a light's boundary clips if the light is bright, although it shows only part of the light. So the clipped
+area is larger than the light by up to a pixel. ``weigh_boundaries`` lowers the weight of such texels.
 """
 
 from __future__ import annotations
@@ -15,11 +15,12 @@ from warp_ar.kernels.structs import FrameParams, Probe
 wp.set_module_options({"enable_backward": False})
 
 MAX_HALF_PIXEL = wp.constant(wp.float32(0.1))
-"""Radians: balls of less than ten pixels are taken to have ten."""
+"""Largest angle of half a pixel, radians: balls of less than ten pixels are taken to have ten."""
 WIDE = wp.constant(wp.float32(6.0))
-"""Half pixels: what is wider clips hardly beyond its boundary, for it exceeds clipping by less than an emitter does."""
+"""Standard deviation of the wide mean, in half pixels. Wider lights (windows) are not much brighter than clipping, so
+their clipped area hardly exceeds them."""
 SHARPNESS = wp.constant(wp.float32(2.0))
-"""Exponent of the share around a texel of the smallest emitter."""
+"""Exponent of the mean clipped share around a texel, for the smallest emitter."""
 BOUNDARY_REACH = wp.constant(2)
 """Samples of a Gaussian to each side, one standard deviation apart."""
 
@@ -28,9 +29,10 @@ BOUNDARY_REACH = wp.constant(2)
 def mean_around(
     clipped: wp.array2d[wp.vec3], i: wp.int32, j: wp.int32, deviation: wp.float32, near_pole: wp.float32
 ) -> wp.vec3:
-    """Gaussian mean around a texel, of a standard deviation in radians.
+    """Return the Gaussian mean of the clipped share around a texel; ``deviation`` in radians.
 
-    ``near_pole`` standard deviations from a pole it is taken around directions, elsewhere along rows and columns.
+    Within ``near_pole`` standard deviations of a pole, samples are placed on the sphere, elsewhere along rows and
+    columns.
     """
     height = wp.float32(clipped.shape[0])
     width = wp.float32(clipped.shape[1])
@@ -39,7 +41,7 @@ def mean_around(
     total_weight = wp.float32(0.0)
     a = wp.int32(-BOUNDARY_REACH)
     if sine < near_pole * deviation:
-        # A circle of latitude is no straight line here.
+        # Near a pole a circle of latitude is strongly curved.
         direction = direction_from_latlong(wp.float32(i) + 0.5, wp.float32(j) + 0.5, clipped.shape[0], clipped.shape[1])
         across = wp.normalize(wp.cross(direction, wp.vec3(1.0, 0.0, 0.0)))
         upward = wp.cross(across, direction)
@@ -55,7 +57,7 @@ def mean_around(
         return total / total_weight
     down_step = deviation * height / PI
     across_step = deviation * width / (2.0 * PI * sine)
-    # One row of samples at a time, those unrolled: their loads do not wait for each other.
+    # The inner loop is unrolled, so that its loads do not wait for each other; the outer one is not.
     while a <= BOUNDARY_REACH:
         y = wp.float32(i) + down_step * wp.float32(a)
         row = wp.int32(wp.floor(y))
@@ -80,7 +82,7 @@ def weigh_boundaries_kernel(
     # Out:
     missing_out: wp.array2d[wp.vec3],
 ):
-    """A texel times a power of the mean around it."""
+    """Weight one texel by a power of the mean around it."""
     i, j = wp.tid()
     i += row_start
     share = clipped[i, j]
@@ -89,13 +91,13 @@ def weigh_boundaries_kernel(
         return
     to_ball = probes[0].center - params[0].camera_position
     pixels = params[0].focal[0] * probes[0].radius / wp.length(to_ball)
-    # A pixel in the middle of the ball is 1 / pixels radians of its normals, twice that of what they mirror.
+    # At the ball's centre a pixel covers 1 / pixels radians of normals, and twice that of reflected directions.
     half_pixel = wp.clamp(1.0 / pixels, 0.0, MAX_HALF_PIXEL)
-    # One copy of the mean for both widths: two take compilers twice as long.
+    # One loop for both widths: two copies of the code would compile twice as long.
     around = wp.float32(0.0)
     turn = wp.int32(0)
     while turn < 2:
-        # Along rows and columns nearly everywhere: how wide something is need not be known exactly.
+        # For the wide mean, sampling along rows and columns is exact enough nearly everywhere.
         deviation = wp.where(turn == 0, half_pixel, WIDE * half_pixel)
         mean = wp.max(mean_around(clipped, i, j, deviation, wp.where(turn == 0, wp.float32(6.0), wp.float32(1.5))))
         turn += 1
@@ -109,19 +111,18 @@ def weigh_boundaries_kernel(
 
 
 weigh_boundaries = row_launcher(weigh_boundaries_kernel, like=lambda clipped, *_: clipped)
-"""Weigh what clips by how likely it is the light itself: saturation boundaries count less.
+"""Weight clipped texels by the probability that they show the light itself; saturation boundaries get less weight.
 
-A pixel at a light's boundary shows part of the light, and clips all the same if that is bright: what clips in the
-ball's picture is larger than the light by up to a pixel. A texel counts by the mean share at clipping around it,
-in the channel that clips most and by a Gaussian of half a pixel's standard deviation, to the power
+The weight of a texel is the mean clipped share around it, by a Gaussian of half a pixel's standard deviation and in
+the channel that clips most, to the power
 
     2 max(0, 1 - 2 w),    w the same mean by a Gaussian of three pixels.
 
-An emitter of a few pixels becomes as small as it is, and so do its shadows and highlights. Windows keep theirs
-(w is a half there): they are not so much brighter than clipping that a pixel clips of which they are a small part.
+So an emitter of a few pixels gets its true size, and so do its shadows and highlights. Windows keep their clipped area
+(w is 1/2 at their boundary): they are not bright enough that a pixel clips of which they cover a small part.
 
 Args:
-    clipped: Share at clipping per channel, ``wp.vec3`` (h, w).
+    clipped: Clipped share per channel, ``wp.vec3`` (h, w).
     params: ``FrameParams`` (1): the camera.
     probes: ``Probe`` (P), at least one: the ball.
     missing_out: ``wp.vec3`` (h, w), 0 where nothing clips.
